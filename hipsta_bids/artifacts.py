@@ -1,0 +1,171 @@
+"""The typed values that pass between stages.
+
+Points are rows in RAS millimetres (float64), indices are int32. Every array is checked and made
+read-only at construction, so that nothing downstream has to check again. Axes of the sheet:
+x runs medial to lateral, y posterior to anterior, z interior to exterior, in both hemispheres.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hipsta_bids.schemes import Scheme
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int32]
+Bool = NDArray[np.bool_]
+
+
+def _set(
+    obj: object, name: str, dtype: type[np.generic], shape: tuple[int | None, ...]
+) -> NDArray[Any]:
+    """Store an attribute as a read-only array of a given type; ``None`` in shape is any length."""
+    array = np.array(getattr(obj, name), dtype=dtype)
+    if array.ndim != len(shape) or any(
+        n is not None and n != m for n, m in zip(shape, array.shape, strict=True)
+    ):
+        raise ValueError(f"{type(obj).__name__}.{name}: shape {array.shape}, expected {shape}")
+    array.flags.writeable = False
+    object.__setattr__(obj, name, array)
+    return array
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LabelVolume:
+    """A segmentation in the package's own vocabulary."""
+
+    tissue: NDArray[np.uint8]
+    """(I, J, K), values of :class:`~hipsta_bids.schemes.Tissue`."""
+    part: NDArray[np.uint8]
+    """(I, J, K), values of :class:`~hipsta_bids.schemes.Part`."""
+    affine: Float
+    """(4, 4), voxel index to RAS mm."""
+    scheme: Scheme
+
+    def __post_init__(self) -> None:
+        shape = np.shape(self.tissue)
+        _set(self, "tissue", np.uint8, (None, None, None))
+        _set(self, "part", np.uint8, shape)
+        affine = _set(self, "affine", np.float64, (4, 4))
+        if not np.isfinite(affine).all() or abs(np.linalg.det(affine[:3, :3])) < 1e-9:
+            raise ValueError("LabelVolume.affine is singular or not finite")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Surface:
+    """A closed triangle mesh, outward oriented, with two planar caps."""
+
+    vertices: Float
+    """(V, 3) RAS mm."""
+    triangles: Int
+    """(F, 3)."""
+    posterior_cap: Bool
+    """(V,) vertices in the posterior end plane."""
+    anterior_cap: Bool
+    """(V,) vertices in the anterior end plane."""
+
+    def __post_init__(self) -> None:
+        vertices = _set(self, "vertices", np.float64, (None, 3))
+        _set(self, "triangles", np.int32, (None, 3))
+        _set(self, "posterior_cap", np.bool_, (len(vertices),))
+        _set(self, "anterior_cap", np.bool_, (len(vertices),))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TetMesh:
+    """A tetrahedral mesh whose first vertices are those of the surface, in the same order."""
+
+    vertices: Float
+    """(V, 3) RAS mm."""
+    tetrahedra: Int
+    """(T, 4), positive volume."""
+
+    def __post_init__(self) -> None:
+        _set(self, "vertices", np.float64, (None, 3))
+        _set(self, "tetrahedra", np.int32, (None, 4))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Coordinates:
+    """Three harmonic functions on a tetrahedral mesh."""
+
+    values: Float
+    """(V, 3) in [-1, 1]: medial-lateral, posterior-anterior, interior-exterior."""
+
+    def __post_init__(self) -> None:
+        _set(self, "values", np.float64, (None, 3))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Sheet:
+    """The hippocampal body on a regular grid of its own coordinates."""
+
+    points: Float
+    """(Nx, Ny, Nz, 3) RAS mm, NaN where undefined; the middle z level is the mid-surface."""
+    valid: Bool
+    """(Nx, Ny) columns measured directly, not filled from neighbours."""
+
+    def __post_init__(self) -> None:
+        points = _set(self, "points", np.float64, (None, None, None, 3))
+        _set(self, "valid", np.bool_, points.shape[:2])
+
+
+class Status(StrEnum):
+    """How a hemisphere ended."""
+
+    OK = "ok"
+    REPAIRED = "repaired"
+    FLAGGED = "flagged"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Flag:
+    """Something a person should look at before trusting a map."""
+
+    reason: str
+    """Machine-readable slug in kebab case."""
+    message: str
+    """One line for people: what, where, what to try."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class HemisphereMaps:
+    """All that the participant level measures in one hemisphere."""
+
+    sheet: Sheet
+    thickness: Float
+    """(Nx, Ny) mm, wall to wall; NaN where undefined (as in the other maps)."""
+    curvature_interior: Float
+    """(Nx, Ny) mean curvature, 1/mm; positive where the sheet curls round its interior."""
+    curvature: Float
+    """(Nx, Ny) of the mid-surface."""
+    curvature_exterior: Float
+    subfield: NDArray[np.uint8]
+    """(Nx, Ny) values of Tissue."""
+    summary: Mapping[str, float]
+    """One number per summary column (see the output table for units)."""
+    qc: Mapping[str, Any]
+    """JSON-serialisable numbers and words that say whether to trust the map."""
+    repairs: tuple[str, ...] = ()
+    """What was changed, one line each; empty if nothing was."""
+    flags: tuple[Flag, ...] = ()
+    mesh: TetMesh
+    coordinates: Coordinates
+
+    def __post_init__(self) -> None:
+        shape = self.sheet.points.shape[:2]
+        for name in ("thickness", "curvature_interior", "curvature", "curvature_exterior"):
+            _set(self, name, np.float64, shape)
+        _set(self, "subfield", np.uint8, shape)
+
+    @property
+    def status(self) -> Status:
+        """``flagged`` outranks ``repaired``; ``failed`` hemispheres have no maps."""
+        if self.flags:
+            return Status.FLAGGED
+        return Status.REPAIRED if self.repairs else Status.OK

@@ -1,0 +1,79 @@
+"""Errors that a user can act on, and the exit codes that go with them.
+
+A message says what is wrong, where, and what to try, on one line. Any exception that is not
+a :class:`HipstaError` is a bug in this package and shows its traceback.
+"""
+
+from enum import IntEnum
+
+
+class ExitCode(IntEnum):
+    """What the command line returns (64-73 as in BSD's sysexits.h)."""
+
+    OK = 0
+    SOME_FAILED = 1
+    USAGE = 64
+    BAD_DATA = 65
+    NOTHING_TO_DO = 66
+    INTERNAL = 70
+    NOT_WRITABLE = 73
+
+
+class HipstaError(Exception):
+    """Base of all foreseen errors.
+
+    Parameters
+    ----------
+    message : str
+        One line: what, where, what to try.
+    reason : str
+        Machine-readable slug in kebab case, written to ``status.tsv``.
+    """
+
+    exit_code = ExitCode.BAD_DATA
+
+    def __init__(self, message: str, *, reason: str) -> None:
+        super().__init__(message)
+        self.reason = reason
+
+    def __reduce__(self) -> tuple[object, tuple[object, ...]]:
+        """Survive pickling between processes (the default forgets keyword arguments)."""
+        return _rebuild, (type(self), str(self), self.reason)
+
+
+def _rebuild(kind: type[HipstaError], message: str, reason: str) -> HipstaError:
+    return kind(message, reason=reason)
+
+
+class InputError(HipstaError):
+    """A file or folder that the user gave cannot be used."""
+
+
+class NothingToDoError(HipstaError):
+    """No segmentation matches the request."""
+
+    exit_code = ExitCode.NOTHING_TO_DO
+
+
+class UsageError(HipstaError):
+    """The command line itself is wrong."""
+
+    exit_code = ExitCode.USAGE
+
+
+class SettingsError(UsageError):
+    """A setting is unknown or out of range."""
+
+
+class SchemeError(HipstaError):
+    """A segmentation protocol file is wrong, or does not fit the labels."""
+
+
+class OutputError(HipstaError):
+    """The output folder cannot be written."""
+
+    exit_code = ExitCode.NOT_WRITABLE
+
+
+class GeometryError(HipstaError):
+    """The shape does not allow a trustworthy map; the reason names the step."""

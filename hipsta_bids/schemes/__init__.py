@@ -1,0 +1,15 @@
+"""Segmentation protocols: one TOML file each, and the loader that validates them."""
+
+from hipsta_bids.schemes.scheme import Label, Scheme, load_scheme, scheme_names, translate
+from hipsta_bids.schemes.tissues import MEDIAL_TO_LATERAL, Part, Tissue
+
+__all__ = [
+    "MEDIAL_TO_LATERAL",
+    "Label",
+    "Part",
+    "Scheme",
+    "Tissue",
+    "load_scheme",
+    "scheme_names",
+    "translate",
+]
