@@ -1,0 +1,69 @@
+# Set-up and checks. On a bare machine with Python >= 3.11, make and git:
+#   make demo    make the environment, make a synthetic dataset, measure it, compare with the truth
+#   make test    lint, types, layer contracts and tests, exactly as in CI
+
+VENV ?= .venv
+DEMO ?= demo
+
+# The first interpreter that really runs, is new enough and can make environments: a name on the
+# PATH is no proof, since version managers put launchers there that fail when called.
+USABLE := import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))
+PYTHON ?= $(shell for python in python3.13 python3.12 python3.11 python3; do \
+	"$$python" -c '$(USABLE)' >/dev/null 2>&1 && echo "$$python" && break; done)
+
+BIN := $(VENV)/bin
+# Changes to either file mean that the environment is out of date.
+STAMP := $(VENV)/.made-from-lock
+
+.PHONY: help env demo test lint types layers unit format lock clean
+help:
+	@sed -n '2,/^$$/s/^# \{0,1\}//p' Makefile
+
+env: $(STAMP)
+
+$(STAMP): requirements-dev.lock pyproject.toml
+	@"$(PYTHON)" -c '$(USABLE)' >/dev/null 2>&1 || { echo "hipsta_bids needs Python 3.11 or newer\
+	 with its venv module (on Debian and Ubuntu: the package python3-venv). None was found;\
+	 name one with: make PYTHON=/path/to/python3 ..." >&2; exit 1; }
+	@echo "Making the environment in $(VENV) from requirements-dev.lock (some minutes at first)"
+	"$(PYTHON)" -m venv "$(VENV)"
+	"$(BIN)/python" -m pip install --quiet --disable-pip-version-check --require-hashes \
+		-r requirements-dev.lock
+	"$(BIN)/python" -m pip install --quiet --disable-pip-version-check --no-deps \
+		--no-build-isolation -e .
+	@touch "$@"
+
+demo: $(STAMP)
+	"$(BIN)/hipsta-bids" demo "$(DEMO)"
+
+test: lint types layers unit
+
+lint: $(STAMP)
+	"$(BIN)/python" -m ruff check .
+	"$(BIN)/python" -m ruff format --check .
+
+types: $(STAMP)
+	"$(BIN)/python" -m mypy --strict
+
+layers: $(STAMP)
+	"$(BIN)/lint-imports" --no-cache
+
+unit: $(STAMP)
+	"$(BIN)/python" -m pytest -n 2
+
+format: $(STAMP)
+	"$(BIN)/python" -m ruff format .
+	"$(BIN)/python" -m ruff check --fix .
+
+# The locks hold every version and hash, for Python 3.11 and later on Linux and macOS. The second
+# repeats the first and adds the tools for development.
+COMPILE = "$(BIN)/python" -m uv pip compile pyproject.toml --quiet --universal \
+	--python-version 3.11 --fork-strategy fewest --generate-hashes --no-emit-index-url \
+	--no-emit-find-links --custom-compile-command "make lock" $(LOCK_FLAGS)
+lock: $(STAMP)
+	"$(BIN)/python" -m pip install --quiet --disable-pip-version-check "uv>=0.8"
+	$(COMPILE) --output-file requirements.lock
+	$(COMPILE) --extra dev --constraints requirements.lock --output-file requirements-dev.lock
+
+clean:
+	rm -rf demo build .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
