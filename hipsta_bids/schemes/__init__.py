@@ -1,6 +1,7 @@
 """Segmentation protocols: one TOML file each, and the loader that validates them."""
 
-from hipsta_bids.schemes.scheme import Label, Scheme, load_scheme, scheme_names, translate
+from hipsta_bids.schemes.loader import load_scheme, scheme_names, scheme_table
+from hipsta_bids.schemes.scheme import Label, Scheme, translate
 from hipsta_bids.schemes.tissues import MEDIAL_TO_LATERAL, Part, Tissue
 
 __all__ = [
@@ -11,5 +12,6 @@ __all__ = [
     "Tissue",
     "load_scheme",
     "scheme_names",
+    "scheme_table",
     "translate",
 ]

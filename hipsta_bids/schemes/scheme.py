@@ -1,16 +1,27 @@
-"""Segmentation protocols as data."""
+"""Segmentation protocols as data, and the translation of their codes."""
 
-import tomllib
-from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import resources
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hipsta_bids.errors import SchemeError
-from hipsta_bids.schemes.tissues import MEDIAL_TO_LATERAL, Part, Tissue
+from hipsta_bids.schemes.tissues import Part, Tissue
+
+#: Tissues outside the hippocampal formation proper: they never decide where to crop.
+OUTSIDE = frozenset(
+    {
+        Tissue.BACKGROUND,
+        Tissue.ENTORHINAL,
+        Tissue.BA35,
+        Tissue.BA36,
+        Tissue.PARAHIPPOCAMPAL,
+        Tissue.OTHER,
+    }
+)
+
+#: How many codes an error message lists before it says how many more there are.
+SHOWN = 12
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,9 +48,98 @@ class Scheme:
     title: str
     citation: str
     sheet: tuple[Tissue, ...]
-    """Tissues merged into the sheet, medial to lateral."""
+    """Tissues merged into the sheet, medial to lateral; empty where only parts are labeled."""
     layer: tuple[Tissue, ...]
     """Tissues whose voxels go to the nearest sheet tissue."""
     interior: tuple[Tissue, ...]
     """Tissues on the concave (interior) side of the sheet."""
     labels: tuple[Label, ...]
+    tool: str = ""
+    """The software that writes these codes (``freesurfer``, ``ashs``, ``hippunfold``), if any."""
+    unlisted: str = "error"
+    """What a code that is not listed means: ``error``, or ``other`` (outside the hippocampus)."""
+    right_offset: int = 0
+    """Added to right-hand codes in files that carry both hemispheres; 0 if there are none."""
+
+    @property
+    def codes(self) -> frozenset[int]:
+        """All codes of the protocol, without the background."""
+        return frozenset(label.code for label in self.labels)
+
+    def fits(self, values: frozenset[int]) -> bool:
+        """Say whether the values found in one hemisphere can come from this protocol.
+
+        Every value has to be listed, and each tissue of the sheet and at least one of its interior
+        has to occur.
+
+        Parameters
+        ----------
+        values : frozenset of int
+            The distinct codes of one hemisphere, without the background.
+
+        Returns
+        -------
+        bool
+        """
+        if not self.sheet or not values <= self.codes:
+            return False
+        found = {label.tissue for label in self.labels if label.code in values}
+        return found.issuperset(self.sheet) and not found.isdisjoint(self.interior)
+
+
+def translate(
+    codes: NDArray[np.integer], scheme: Scheme
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Translate the codes of a protocol into tissues and parts.
+
+    Parameters
+    ----------
+    codes : array of int, any shape
+        Codes of one hemisphere; 0 is background.
+    scheme : Scheme
+
+    Returns
+    -------
+    tissue, part : array of uint8, same shape
+        Values of :class:`Tissue` and :class:`Part`.
+
+    Raises
+    ------
+    SchemeError
+        ``unknown-labels`` if a code is not listed (unless ``scheme.unlisted`` is ``other``);
+        ``wrong-scheme`` if no label of the sheet occurs (of any part, for a parts-only scheme).
+    """
+    top = max(scheme.codes)
+    # One row per code, and a last one that stands for every code outside the table.
+    tissues = np.full(top + 2, Tissue.OTHER, dtype=np.uint8)
+    parts = np.full(top + 2, Part.UNKNOWN, dtype=np.uint8)
+    listed = np.zeros(top + 2, dtype=bool)
+    tissues[0], listed[0] = Tissue.BACKGROUND, True
+    for label in scheme.labels:
+        tissues[label.code], parts[label.code] = label.tissue, label.part
+        listed[label.code] = True
+
+    rows = np.where((codes >= 0) & (codes <= top), codes, top + 1).astype(np.intp)
+    occurs = np.bincount(rows.ravel(), minlength=top + 2) > 0
+    if scheme.unlisted == "error" and (occurs & ~listed).any():
+        unknown = np.unique(codes[~listed[rows]])
+        raise SchemeError(
+            f"labels {_some(unknown)} are not in the protocol {scheme.name}; if the protocol is "
+            "right, copy its TOML file, add the labels, and pass it with --scheme",
+            reason="unknown-labels",
+        )
+    wanted = scheme.sheet or tuple(Tissue)[1:]
+    if not (occurs & np.isin(tissues, wanted)).any():
+        found = np.unique(codes[codes != 0])
+        raise SchemeError(
+            f"no label of the sheet of {scheme.name} occurs (found {_some(found)}): "
+            "another protocol was used",
+            reason="wrong-scheme",
+        )
+    return tissues[rows], parts[rows]
+
+
+def _some(values: NDArray[np.integer]) -> str:
+    """List the first few values."""
+    more = f" and {len(values) - SHOWN} more" if len(values) > SHOWN else ""
+    return ", ".join(str(value) for value in values[:SHOWN].tolist()) + more
