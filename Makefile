@@ -27,9 +27,9 @@ $(STAMP): requirements-dev.lock pyproject.toml
 	 name one with: make PYTHON=/path/to/python3 ..." >&2; exit 1; }
 	@echo "Making the environment in $(VENV) from requirements-dev.lock (some minutes at first)"
 	"$(PYTHON)" -m venv "$(VENV)"
-	"$(BIN)/python" -m pip install --quiet --disable-pip-version-check --require-hashes \
+	"$(BIN)/python" -m pip install -qq --disable-pip-version-check --require-hashes \
 		-r requirements-dev.lock
-	"$(BIN)/python" -m pip install --quiet --disable-pip-version-check --no-deps \
+	"$(BIN)/python" -m pip install -qq --disable-pip-version-check --no-deps \
 		--no-build-isolation -e .
 	@touch "$@"
 
@@ -61,7 +61,7 @@ COMPILE = "$(BIN)/python" -m uv pip compile pyproject.toml --quiet --universal \
 	--python-version 3.11 --fork-strategy fewest --generate-hashes --no-emit-index-url \
 	--no-emit-find-links --custom-compile-command "make lock" $(LOCK_FLAGS)
 lock: $(STAMP)
-	"$(BIN)/python" -m pip install --quiet --disable-pip-version-check "uv>=0.8"
+	"$(BIN)/python" -m pip install -qq --disable-pip-version-check "uv>=0.8"
 	$(COMPILE) --output-file requirements.lock
 	$(COMPILE) --extra dev --constraints requirements.lock --output-file requirements-dev.lock
 
