@@ -1,0 +1,221 @@
+"""From sheet coordinates to scanner space and back.
+
+The mid-curve is swept along a straight or circular long axis; the wall is all that lies within
+half the thickness of the mid-surface, along its normal. Three frames are in use:
+
+section
+    (lateral, superior) mm in the plane of the cross-section, the mid-curve's centroid at 0.
+body
+    (lateral, superior, anterior) mm, the middle of the body at 0.
+scanner
+    RAS mm: tilted like a hippocampus and moved to its place; right is left, mirrored.
+"""
+
+from functools import cached_property
+
+import numpy as np
+
+from hipsta_bids.artifacts import Float
+from hipsta_bids.errors import SettingsError
+from hipsta_bids.phantom.curve import MidCurve
+from hipsta_bids.phantom.spec import PhantomSpec
+
+#: RAS mm of the middle of a left body, and its pitch in rad (anterior end down), both about as in
+#: an adult brain in scanner space.
+CENTER = (-25.0, -20.0, -15.0)
+PITCH = 0.45
+
+#: rad, largest deviation from orthogonality in a pose.
+_RIGID_TOLERANCE = 1e-6
+
+
+class Body:
+    """The shape of a phantom, without labels.
+
+    Sheet coordinates are u (medial to lateral, 0 to 1), v (posterior to anterior, 0 to 1; head
+    and tail lie beyond) and n (mm from the mid-surface, positive on the exterior side).
+
+    Parameters
+    ----------
+    spec : PhantomSpec
+        What to build.
+
+    Raises
+    ------
+    SettingsError
+        If the wall folds (half the thickness reaches the radius of curvature) or its turns
+        overlap.
+    """
+
+    def __init__(self, spec: PhantomSpec) -> None:
+        self.spec = spec
+        self.curve = MidCurve(spec.section_bend, spec.width)
+        self._refuse_folds()
+        self._refuse_overlap()
+
+    def thickness(self, u: Float, v: Float) -> Float:
+        """Thickness of the wall along its mid-surface's normal, mm."""
+        return self.thickness_jet(u, v)[0]
+
+    def thickness_jet(self, u: Float, v: Float) -> tuple[Float, Float, Float, Float, Float]:
+        """Thickness (mm), its derivatives by arc length s and long axis w, and d2/ds2, d2/dw2.
+
+        The sinusoids are added, so that the mixed derivative is zero.
+        """
+        spec = self.spec
+        u, v = np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64))
+        amplitude = spec.thickness * spec.variation / len(spec.variation_axis)
+        by_s, by_w = 2.0 * np.pi / spec.width, 2.0 * np.pi / spec.length
+        x, y = (amplitude * (axis in spec.variation_axis) for axis in "xy")
+        a, b = 2.0 * np.pi * u, 2.0 * np.pi * v
+        return (
+            spec.thickness + x * np.sin(a) + y * np.sin(b),
+            x * by_s * np.cos(a),
+            y * by_w * np.cos(b),
+            -x * by_s**2 * np.sin(a),
+            -y * by_w**2 * np.sin(b),
+        )
+
+    @cached_property
+    def thickest(self) -> float:
+        """Largest thickness anywhere, mm."""
+        return self.spec.thickness * (1.0 + self.spec.variation)
+
+    def place(
+        self, u: Float, v: Float, n: Float, *, hemi: str = "L", pose: Float | None = None
+    ) -> Float:
+        """Scanner coordinates (..., 3), RAS mm, of sheet coordinates (u, v, n).
+
+        Parameters
+        ----------
+        u, v, n : arrays that broadcast
+            Sheet coordinates; n in mm.
+        hemi : {"L", "R"}
+            Right is the mirror image of left.
+        pose : (4, 4) array, optional
+            Rigid motion applied last.
+
+        Raises
+        ------
+        SettingsError
+            If ``hemi`` is unknown or ``pose`` is not rigid.
+        """
+        u, v, n = np.broadcast_arrays(*(np.asarray(x, np.float64) for x in (u, v, n)))
+        s = u * self.spec.width
+        section = self.curve.position(s) + n[..., None] * self.curve.normal(s)
+        w = (v - 0.5) * self.spec.length
+        rotation, shift = placement(hemi, pose)
+        return np.asarray(self._sweep(section, w) @ rotation.T + shift)
+
+    def locate(
+        self,
+        points: Float,
+        *,
+        hemi: str = "L",
+        pose: Float | None = None,
+        reach: float = np.inf,
+    ) -> Float:
+        """Sheet coordinates (N, 3) of scanner points (N, 3): the inverse of :meth:`place`.
+
+        Rows are (u, v, n), of the nearest place on the mid-surface. They are NaN for points
+        beyond the flat ends u = 0 and u = 1, or farther than ``reach`` (mm) from the mid-surface.
+        The other parameters and errors are those of :meth:`place`.
+        """
+        rotation, shift = placement(hemi, pose)
+        section, w = self._unsweep((points - shift) @ rotation)
+        s, n = self.curve.project(section, reach=reach)
+        v = np.where(np.isnan(s), np.nan, w / self.spec.length + 0.5)
+        return np.column_stack([s / self.spec.width, v, n])
+
+    def _sweep(self, section: Float, w: Float) -> Float:
+        """Section points (..., 2) carried to arc length ``w`` of the long axis: body (..., 3).
+
+        A straight axis is the limit of no bend; sinc carries it without a special case.
+        """
+        bend, angle = self.spec.bend, w * self.spec.bend
+        medial, superior = -section[..., 0], section[..., 1]
+        rise = w * np.sin(angle / 2.0) * np.sinc(angle / (2.0 * np.pi))
+        along = w * np.sinc(angle / np.pi)
+        shrink = 1.0 - bend * medial
+        return np.stack([-(medial * np.cos(angle) + rise), superior, along * shrink], axis=-1)
+
+    def _unsweep(self, body: Float) -> tuple[Float, Float]:
+        """Inverse of :meth:`_sweep`: section points (N, 2) and arc lengths (N,) of the axis."""
+        bend = self.spec.bend
+        lateral, superior, anterior = body.T
+        if bend == 0.0:
+            return np.column_stack([lateral, superior]), anterior
+        inward = 1.0 + bend * lateral
+        w = np.arctan2(bend * anterior, inward) / bend
+        medial = (1.0 - np.hypot(inward, bend * anterior)) / bend
+        return np.column_stack([-medial, superior]), w
+
+    def _refuse_folds(self) -> None:
+        """Refuse a wall that is thicker than twice its smallest radius of curvature."""
+        u = np.linspace(0.0, 1.0, 1001)
+        section = np.abs(self.curve.curvature(u * self.spec.width)).max()
+        reach = self.curve.position(u * self.spec.width)[:, 0]
+        medial = np.max(-np.sign(self.spec.bend) * reach) + self.thickest / 2.0
+        if section * self.thickest / 2.0 >= 1.0:
+            raise SettingsError(
+                f"phantom: the wall folds: half its thickness of up to {self.thickest:g} mm "
+                f"reaches the smallest radius of curvature, {1.0 / section:.2f} mm; "
+                "make it thinner or bend it less",
+                reason="phantom-folds",
+            )
+        if abs(self.spec.bend) * medial >= 1.0:
+            raise SettingsError(
+                f"phantom: the long axis bends too sharply ({self.spec.bend:g} 1/mm) for a cross-"
+                f"section that reaches {medial:.1f} mm towards its center; bend it less",
+                reason="phantom-folds",
+            )
+
+    def _refuse_overlap(self) -> None:
+        """Refuse a wall of which one turn runs into another.
+
+        Two walls overlap exactly if, from a boundary point of one, some place of the mid-curve is
+        nearer than its own.
+        """
+        u, v = np.meshgrid(np.linspace(0.0, 1.0, 801), np.linspace(0.0, 1.0, 5), indexing="ij")
+        half = self.thickness(u, v).ravel() / 2.0
+        s = u.ravel() * self.spec.width
+        for side in (-1.0, 1.0):
+            boundary = self.curve.position(s) + side * half[:, None] * self.curve.normal(s)
+            nearest = self.curve.distance(boundary)
+            worst = int(np.argmin(nearest - half))
+            if nearest[worst] < half[worst] - 1e-6:  # mm, far above rounding
+                raise SettingsError(
+                    "phantom: turns of the wall overlap near "
+                    f"u = {s[worst] / self.spec.width:.2f}; make it thinner, narrower or bend it "
+                    "less",
+                    reason="phantom-overlap",
+                )
+
+
+def placement(hemi: str, pose: Float | None) -> tuple[Float, Float]:
+    """Body to scanner: an orthogonal (3, 3) matrix and a shift (3,) in RAS mm."""
+    if hemi not in ("L", "R"):
+        raise SettingsError(
+            f"phantom: hemi {hemi!r} is unknown; choose L or R", reason="phantom-hemi"
+        )
+    cos, sin = np.cos(PITCH), np.sin(PITCH)
+    mirror = np.diag([1.0 if hemi == "L" else -1.0, 1.0, 1.0])
+    # Columns: where lateral, superior and anterior point in a left hemisphere.
+    axes = np.array([[-1.0, 0.0, 0.0], [0.0, sin, cos], [0.0, cos, -sin]])
+    rotation, shift = mirror @ axes, mirror @ np.array(CENTER)
+    if pose is not None:
+        pose = np.asarray(pose, dtype=np.float64)
+        check_rotation(pose[:3, :3])
+        rotation, shift = pose[:3, :3] @ rotation, pose[:3, :3] @ shift + pose[:3, 3]
+    return rotation, shift
+
+
+def check_rotation(matrix: Float) -> None:
+    """Refuse what is not a proper rotation (3, 3) with a SettingsError."""
+    error = np.abs(matrix @ matrix.T - np.eye(3)).max()
+    if not error < _RIGID_TOLERANCE or np.linalg.det(matrix) < 0.0:
+        raise SettingsError(
+            "phantom: the pose or grid rotation is not rigid; give a rotation matrix without "
+            "scaling or mirroring",
+            reason="phantom-pose",
+        )

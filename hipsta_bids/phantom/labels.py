@@ -1,0 +1,303 @@
+"""A phantom drawn on a voxel grid, in the labels of any protocol."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hipsta_bids.artifacts import Bool, Float, Int, LabelVolume
+from hipsta_bids.errors import SchemeError, SettingsError
+from hipsta_bids.phantom.body import Body, check_rotation
+from hipsta_bids.schemes import Label, Part, Scheme, Tissue
+
+#: Subfields of the sheet and the u at which each begins. The share of CA2 is small, as in life.
+SUBFIELD_STARTS: tuple[tuple[Tissue, float], ...] = (
+    (Tissue.PRESUBICULUM, 0.0),
+    (Tissue.SUBICULUM, 0.15),
+    (Tissue.CA1, 0.35),
+    (Tissue.CA2, 0.75),
+    (Tissue.CA3, 0.82),
+)
+
+#: What to draw where a protocol lacks a tissue, first choice first.
+_STAND_INS: Mapping[Tissue, tuple[Tissue, ...]] = MappingProxyType(
+    {
+        Tissue.PRESUBICULUM: (Tissue.SUBICULUM,),
+        Tissue.CA2: (Tissue.CA2_3, Tissue.CA3),
+        Tissue.CA3: (Tissue.CA2_3,),
+        Tissue.CA4: (Tissue.DENTATE_GYRUS,),
+        Tissue.DENTATE_GYRUS: (Tissue.CA4,),
+    }
+)
+
+#: Without head and tail labels, the body is known by slices that hold these (Diers et al. 2023,
+#: section 2.1: NeuroImage 276:120182), so they must not go on beyond it.
+_BODY_ONLY = (Tissue.CA2, Tissue.CA2_3, Tissue.CA3)
+
+#: mm of dentate gyrus before CA4 begins, going inwards.
+_GYRUS_DEPTH = 0.8
+
+_CHUNK = 400_000  # points located at once: about 200 MB of temporary arrays
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Grid:
+    """A voxel grid: number of voxels and the affine from index to RAS mm."""
+
+    shape: tuple[int, int, int]
+    affine: Float
+
+
+def make_grid(
+    points: Float,
+    *,
+    voxel_size: tuple[float, float, float],
+    axes: str,
+    rotation: Float | None,
+    border: float,
+) -> Grid:
+    """Lay a grid round points.
+
+    The lattice is fixed in space (a voxel center lies at the origin of RAS), so that moving the
+    phantom by part of a voxel changes its voxels.
+
+    Parameters
+    ----------
+    points : (N, 3) array
+        RAS mm, to be covered.
+    voxel_size : tuple of float
+        mm along the three voxel axes.
+    axes : str
+        Where the voxel axes point, such as ``RAS`` or ``LIA``.
+    rotation : (3, 3) array, optional
+        Turns the grid, for oblique slices.
+    border : float
+        mm of background to add on every side.
+
+    Raises
+    ------
+    SettingsError
+        If the axes, the voxel size or the rotation make no sense.
+    """
+    if not all(size > 0.0 for size in voxel_size):
+        raise SettingsError(
+            f"phantom: voxel size {voxel_size} must be positive", reason="phantom-setting"
+        )
+    directions = _axis_directions(axes)
+    if rotation is not None:
+        rotation = np.asarray(rotation, dtype=np.float64)
+        check_rotation(rotation)
+        directions = rotation @ directions
+    matrix = directions * np.asarray(voxel_size)
+    index = points @ np.linalg.inv(matrix).T
+    pad = border / np.asarray(voxel_size)
+    low = np.floor(index.min(axis=0) - pad)
+    count = (np.ceil(index.max(axis=0) + pad) - low).astype(int) + 1
+    affine = np.eye(4)
+    affine[:3, :3] = matrix
+    affine[:3, 3] = matrix @ low
+    return Grid(shape=(int(count[0]), int(count[1]), int(count[2])), affine=affine)
+
+
+def draw(
+    body: Body,
+    grid: Grid,
+    scheme: Scheme,
+    *,
+    hemi: str,
+    pose: Float | None,
+    supersample: int | tuple[int, int, int],
+) -> NDArray[np.intp]:
+    """Label every voxel.
+
+    Parameters
+    ----------
+    body : Body
+        The shape.
+    grid : Grid
+        Where to draw it.
+    scheme : Scheme
+        Protocol whose labels to use.
+    hemi, pose
+        See :meth:`Body.place`.
+    supersample : int or tuple of int
+        1 labels a voxel by its center; more takes the most frequent label among so many points
+        along each voxel axis.
+
+    Returns
+    -------
+    (I, J, K) array
+        Positions in ``scheme.labels``, plus 1; 0 is background.
+
+    Raises
+    ------
+    SchemeError
+        If the protocol has no label for a tissue of the sheet.
+    """
+    table = _label_table(scheme)
+    index = np.indices(grid.shape).reshape(3, -1).T.astype(np.float64)
+    codes = np.concatenate(
+        [table[_regions(body, part, grid, hemi, pose)] for part in _chunks(index, 1)]
+    ).reshape(grid.shape)
+    counts = np.broadcast_to(np.asarray(supersample, dtype=int), 3)
+    if (counts > 1).any():
+        offsets = _sub_voxels(counts)
+        mixed = np.argwhere(_near_borders(codes)).astype(np.float64)
+        votes = [
+            _majority(
+                table[_regions(body, (part[:, None] + offsets).reshape(-1, 3), grid, hemi, pose)],
+                per_voxel=len(offsets),
+                kinds=len(scheme.labels) + 1,
+            )
+            for part in _chunks(mixed, len(offsets))
+        ]
+        codes[tuple(mixed.astype(int).T)] = np.concatenate(votes)
+    return codes
+
+
+def subfield_at(u: Float) -> NDArray[np.uint8]:
+    """Tissue of the sheet at positions ``u`` in [0, 1], in the finest division."""
+    starts = np.array([start for _, start in SUBFIELD_STARTS])
+    tissues = np.array([tissue for tissue, _ in SUBFIELD_STARTS], dtype=np.uint8)
+    return np.asarray(tissues[np.searchsorted(starts, u, side="right") - 1])
+
+
+def label_for(scheme: Scheme, tissue: Tissue, part: Part) -> Label | None:
+    """Label that a protocol gives a tissue of a part; None if it leaves it out.
+
+    First the tissue (or its stand-in) in this part, then a label for the whole part, then the
+    tissue wherever it is.
+    """
+    by_meaning = {(label.tissue, label.part): label for label in reversed(scheme.labels)}
+    tissues = (tissue, *_STAND_INS.get(tissue, ()))
+    wanted = [(choice, part) for choice in tissues] + [(Tissue.HIPPOCAMPUS, part)]
+    if part is Part.BODY or tissue not in _BODY_ONLY:
+        wanted += [(choice, Part.UNKNOWN) for choice in tissues]
+    return next((by_meaning[key] for key in wanted if key in by_meaning), None)
+
+
+def encode(volume: LabelVolume) -> NDArray[np.int32]:
+    """Codes (I, J, K) of a label volume in its own protocol, to write it as that tool would.
+
+    Where several labels mean the same tissue of the same part, the first one is written.
+
+    Raises
+    ------
+    SchemeError
+        If a voxel's tissue and part have no label in the protocol.
+    """
+    table = np.zeros((max(Tissue) + 1, max(Part) + 1), dtype=np.int32)
+    for label in reversed(volume.scheme.labels):
+        table[label.tissue, label.part] = label.code
+    codes = table[volume.tissue, volume.part]
+    if np.any((codes == 0) & (volume.tissue != Tissue.BACKGROUND)):
+        raise SchemeError(
+            f"scheme {volume.scheme.name} has no code for some tissues of this volume; "
+            "write it in the scheme it was made with",
+            reason="phantom-scheme",
+        )
+    return codes
+
+
+# Regions are numbered part by part: for each part, the sheet's subfields, the same again for the
+# molecular layer beneath each, then dentate gyrus and CA4. Region 0 is outside.
+_PARTS = (Part.TAIL, Part.BODY, Part.HEAD)
+_SHEET = len(SUBFIELD_STARTS)
+_PER_PART = 2 * _SHEET + 2
+
+
+def _label_table(scheme: Scheme) -> NDArray[np.intp]:
+    """Position in ``scheme.labels`` plus 1 for each region number."""
+    table = [0]
+    position = {id(label): i + 1 for i, label in enumerate(scheme.labels)}
+    for part in _PARTS:
+        sheet = [label_for(scheme, tissue, part) for tissue, _ in SUBFIELD_STARTS]
+        layer = label_for(scheme, Tissue.MOLECULAR_LAYER, part)
+        inner = [label_for(scheme, tissue, part) for tissue in (Tissue.DENTATE_GYRUS, Tissue.CA4)]
+        if part is Part.BODY and None in sheet:
+            raise SchemeError(
+                f"phantom: scheme {scheme.name} has no label for some subfield of the sheet; "
+                "choose another scheme",
+                reason="phantom-scheme",
+            )
+        layers = [None if own is None else layer or own for own in sheet]
+        table += [position[id(x)] if x is not None else 0 for x in (*sheet, *layers, *inner)]
+    return np.array(table, dtype=np.intp)
+
+
+def _regions(
+    body: Body, index: Float, grid: Grid, hemi: str, pose: Float | None
+) -> NDArray[np.intp]:
+    """Region number (N,) at voxel coordinates (N, 3)."""
+    spec = body.spec
+    points = index @ grid.affine[:3, :3].T + grid.affine[:3, 3]
+    reach = body.thickest / 2.0 + spec.interior_depth
+    u, v, n = body.locate(points, hemi=hemi, pose=pose, reach=reach).T
+    region = np.zeros(len(points), dtype=np.intp)
+    beyond = spec.end_length / spec.length
+    near = np.flatnonzero((v >= -beyond) & (v <= 1.0 + beyond))  # NaN compares false
+    u, v, n = u[near], v[near], n[near]
+    half = body.thickness(u, v) / 2.0
+    band = np.searchsorted([start for _, start in SUBFIELD_STARTS], u, side="right")
+    layer = n < -half + spec.layer_thickness
+    wall = band + _SHEET * layer
+    depth = -half - n
+    inner = (depth > 0.0) & (depth <= spec.interior_depth) & (u >= spec.interior_start)
+    local = np.where(np.abs(n) <= half, wall, 0)
+    local[inner] = np.where(depth[inner] <= _GYRUS_DEPTH, 2 * _SHEET + 1, 2 * _SHEET + 2)
+    part = (v >= 0.0).astype(int) + (v > 1.0)
+    region[near] = np.where(local > 0, part * _PER_PART + local, 0)
+    return region
+
+
+def _axis_directions(axes: str) -> Float:
+    """Matrix (3, 3) whose columns are the unit directions of the voxel axes in RAS."""
+    names = {"R": 0, "L": 0, "A": 1, "P": 1, "S": 2, "I": 2}
+    if sorted(names.get(letter, -1) for letter in axes) != [0, 1, 2]:
+        raise SettingsError(
+            f"phantom: axes {axes!r} must name each direction once, such as RAS or LIA",
+            reason="phantom-setting",
+        )
+    directions = np.zeros((3, 3))
+    for column, letter in enumerate(axes):
+        directions[names[letter], column] = 1.0 if letter in "RAS" else -1.0
+    return directions
+
+
+def _sub_voxels(counts: Int) -> Float:
+    """Offsets (M, 3), in voxels, of the points that vote for a voxel's label."""
+    steps = [(np.arange(count) + 0.5) / count - 0.5 for count in counts]
+    return np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def _near_borders(codes: NDArray[np.intp]) -> Bool:
+    """Voxels that touch (by face, edge or corner) a voxel of another label."""
+    low = high = codes
+    for axis in range(3):
+        low = _extreme(low, axis, np.minimum)
+        high = _extreme(high, axis, np.maximum)
+    return np.asarray(low != high)
+
+
+def _extreme(codes: NDArray[np.intp], axis: int, choose: np.ufunc) -> NDArray[np.intp]:
+    """Smallest or largest value among a voxel and its two neighbors along an axis."""
+    padded = np.pad(codes, [(1, 1) if i == axis else (0, 0) for i in range(3)], mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 3, axis=axis)
+    return np.asarray(choose.reduce(windows, axis=-1))
+
+
+def _majority(labels: NDArray[np.intp], *, per_voxel: int, kinds: int) -> NDArray[np.intp]:
+    """Most frequent label (N,) of each run of ``per_voxel`` labels; ties take the lowest."""
+    voxels = len(labels) // per_voxel
+    keys = np.repeat(np.arange(voxels), per_voxel) * kinds + labels
+    counts = np.bincount(keys, minlength=voxels * kinds).reshape(voxels, kinds)
+    return np.asarray(counts.argmax(axis=1))
+
+
+def _chunks(rows: Float, points_each: int) -> Iterator[Float]:
+    """Rows in runs that keep the number of points located at once below ``_CHUNK``."""
+    step = max(1, _CHUNK // points_each)
+    for start in range(0, len(rows), step):
+        yield rows[start : start + step]

@@ -1,0 +1,96 @@
+"""The phantom itself: a specification that can be drawn and that knows its own truth."""
+
+import numpy as np
+
+from hipsta_bids.artifacts import Float, LabelVolume
+from hipsta_bids.phantom.body import Body
+from hipsta_bids.phantom.labels import draw, make_grid
+from hipsta_bids.phantom.spec import PhantomSpec
+from hipsta_bids.schemes import Scheme
+
+
+class Phantom:
+    """An analytic hippocampal body with exact truth.
+
+    Parameters
+    ----------
+    spec : PhantomSpec
+        What to build.
+
+    Raises
+    ------
+    SettingsError
+        If the wall folds or its turns overlap.
+    """
+
+    def __init__(self, spec: PhantomSpec) -> None:
+        self.spec = spec
+        self.body = Body(spec)
+
+    def label_volume(
+        self,
+        scheme: Scheme,
+        *,
+        hemi: str = "L",
+        voxel_size: tuple[float, float, float] = (0.4, 0.4, 0.4),
+        pose: Float | None = None,
+        axes: str = "RAS",
+        grid_rotation: Float | None = None,
+        supersample: int | tuple[int, int, int] = 1,
+        border: float = 3.0,
+    ) -> LabelVolume:
+        """Draw the phantom as a segmentation in the package's vocabulary.
+
+        Parameters
+        ----------
+        scheme : Scheme
+            Protocol whose labels to use. Where it has no head or tail labels, CA2 and CA3 end
+            with the body.
+        hemi : {"L", "R"}
+            Right is the mirror image of left.
+        voxel_size : tuple of float
+            mm along the three voxel axes.
+        pose : (4, 4) array, optional
+            Rigid motion of the phantom in RAS mm.
+        axes : str
+            Where the voxel axes point, such as ``RAS`` or ``LIA``.
+        grid_rotation : (3, 3) array, optional
+            Turns the grid, for oblique slices.
+        supersample : int or tuple of int
+            1 labels a voxel by its center; more takes the most frequent label among so many
+            points along each voxel axis.
+        border : float
+            mm of background on every side.
+
+        Raises
+        ------
+        SettingsError
+            If a parameter makes no sense.
+        SchemeError
+            If the protocol has no label for a tissue of the sheet.
+        """
+        grid = make_grid(
+            self._outline(hemi, pose),
+            voxel_size=voxel_size,
+            axes=axes,
+            rotation=grid_rotation,
+            border=border,
+        )
+        labels = draw(self.body, grid, scheme, hemi=hemi, pose=pose, supersample=supersample)
+        tissue = np.array([0, *(label.tissue for label in scheme.labels)], dtype=np.uint8)
+        part = np.array([0, *(label.part for label in scheme.labels)], dtype=np.uint8)
+        return LabelVolume(
+            tissue=tissue[labels], part=part[labels], affine=grid.affine, scheme=scheme
+        )
+
+    def _outline(self, hemi: str, pose: Float | None) -> Float:
+        """Points (N, 3), RAS mm, that span head, body and tail with all they enclose."""
+        beyond = self.spec.end_length / self.spec.length
+        half = self.body.thickest / 2.0
+        u, v, n = np.meshgrid(
+            np.linspace(0.0, 1.0, 101),
+            np.linspace(-beyond, 1.0 + beyond, 21),
+            [-half - self.spec.interior_depth, half],
+            indexing="ij",
+        )
+        return self.body.place(u, v, n, hemi=hemi, pose=pose).reshape(-1, 3)
