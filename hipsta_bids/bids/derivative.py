@@ -1,0 +1,237 @@
+"""The files of the output dataset as a whole: description, settings, what to cite."""
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from hipsta_bids import __version__
+from hipsta_bids.bids import files
+from hipsta_bids.bids.names import DATASET_FILES, ignore_patterns
+from hipsta_bids.errors import InputError, SettingsError, UsageError
+from hipsta_bids.schemes import Scheme
+from hipsta_bids.settings import Settings
+from hipsta_bids.settings_file import flatten, resolve, settings_hash
+
+NAME = "hipsta_bids"
+BIDS_VERSION = "1.11.0"
+
+#: Set in container images, read into ``GeneratedBy``: type, tag and address of the container.
+CONTAINER_VARIABLES = {
+    "Type": "HIPSTA_BIDS_CONTAINER_TYPE",
+    "Tag": "HIPSTA_BIDS_CONTAINER_TAG",
+    "URI": "HIPSTA_BIDS_CONTAINER_URI",
+}
+
+
+def check_not_foreign(root: Path) -> None:
+    """Refuse to write into a dataset that another program made.
+
+    Parameters
+    ----------
+    root : Path
+        The output folder; it need not exist.
+
+    Raises
+    ------
+    UsageError
+        If its description names other software.
+    InputError
+        If its description cannot be read.
+    """
+    path = root / DATASET_FILES["description"]
+    if not path.exists():
+        return
+    makers = generated_by(files.read_json(path))
+    if NAME not in makers:
+        raise UsageError(
+            f"{root}: already a dataset of {', '.join(makers) or 'another kind'}; choose an output"
+            " folder of its own",
+            reason="foreign-output",
+        )
+
+
+def generated_by(description: Mapping[str, Any]) -> list[str]:
+    """Names of the software that a dataset description says it was made by."""
+    entries = description.get("GeneratedBy")
+    return [
+        str(entry.get("Name"))
+        for entry in (entries if isinstance(entries, list) else [])
+        if isinstance(entry, Mapping)
+    ]
+
+
+def settle_settings(root: Path, settings: Settings) -> str:
+    """Record the resolved settings, or check that they are those of the earlier runs here.
+
+    One folder holds results of one set of settings only: maps made with different ones must
+    not be pooled, so this holds for every run, ``--force`` or not.
+
+    Parameters
+    ----------
+    root : Path
+        The output dataset.
+    settings : Settings
+        Those of this run.
+
+    Returns
+    -------
+    str
+        Their hash.
+
+    Raises
+    ------
+    SettingsError
+        If the folder has results with other settings; the message names them.
+    OutputError
+        If the file cannot be written.
+    InputError
+        If an earlier file cannot be read.
+    """
+    path = root / DATASET_FILES["settings"]
+    digest = settings_hash(settings)
+    if path.exists():
+        earlier = files.read_json(path)
+        if earlier.get("hash") == digest:
+            return digest
+        theirs = flatten(earlier.get("settings", {}))
+        ours = flatten(resolve(settings))
+        changes = [
+            f"{key} was {theirs.get(key, 'not there')}, now {ours.get(key, 'not there')}"
+            for key in dict.fromkeys((*theirs, *ours))
+            if theirs.get(key) != ours.get(key)
+        ]
+        raise SettingsError(
+            f"{root}: holds results with other settings ({'; '.join(changes) or 'hash differs'});"
+            " use a new output folder, or delete this one to redo all of it",
+            reason="other-settings",
+        )
+    content = {"hash": digest, "version": __version__, "settings": resolve(settings)}
+    files.write_json(path, content)
+    return digest
+
+
+def write_description(root: Path, sources: Mapping[str, Path]) -> None:
+    """Write ``dataset_description.json`` and ``.bidsignore``.
+
+    Sources of earlier runs into the same folder are kept.
+
+    Parameters
+    ----------
+    root : Path
+        The output dataset.
+    sources : mapping of str to Path
+        Input datasets by the names used in the quality records' ``bids:<name>:`` addresses.
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written.
+    InputError
+        If an earlier description cannot be read.
+    """
+    path = root / DATASET_FILES["description"]
+    earlier = files.read_json(path) if path.exists() else {}
+    entries = [_source(folder) for folder in sources.values()]
+    known = {entry["URL"] for entry in entries}
+    kept = [e for e in earlier.get("SourceDatasets", []) if e.get("URL") not in known]
+    links = {name: folder.resolve().as_uri() for name, folder in sources.items()}
+    made_by = {
+        "Name": NAME,
+        "Version": __version__,
+        "Description": "Thickness, curvature and shape of the hippocampal body from subfields",
+    }
+    container = {
+        key: os.environ[variable]
+        for key, variable in CONTAINER_VARIABLES.items()
+        if os.environ.get(variable)
+    }
+    description = {
+        "Name": "Hippocampal thickness and curvature maps",
+        "BIDSVersion": BIDS_VERSION,
+        "DatasetType": "derivative",
+        "GeneratedBy": [made_by | ({"Container": container} if container else {})],
+        "SourceDatasets": sorted(kept + entries, key=lambda entry: str(entry["URL"])),
+        "DatasetLinks": dict(sorted((earlier.get("DatasetLinks", {}) | links).items())),
+    }
+    files.write_json(path, description)
+    files.write_text(root / DATASET_FILES["ignore"], "\n".join(ignore_patterns()) + "\n")
+
+
+def _source(folder: Path) -> dict[str, str]:
+    """Where a source dataset is, with its identifier and version if its description has them."""
+    entry = {"URL": folder.resolve().as_uri()}
+    try:
+        description = files.read_json(folder / DATASET_FILES["description"])
+    except InputError:  # most FreeSurfer and ASHS folders have none
+        return entry
+    for key, theirs in (("DOI", "DatasetDOI"), ("Version", "DatasetVersion")):
+        if isinstance(description.get(theirs), str):
+            entry[key] = description[theirs]
+    return entry
+
+
+def source_names(folders: Iterable[tuple[str, Path]]) -> dict[str, Path]:
+    """Give each source dataset a name of its own.
+
+    Parameters
+    ----------
+    folders : iterable of (str, Path)
+        Wished name and folder; folders may repeat.
+
+    Returns
+    -------
+    dict of str to Path
+        Letters, digits, ``-`` and ``_`` only; numbered where two folders wish the same name.
+    """
+    names: dict[str, Path] = {}
+    for wish, folder in dict.fromkeys(folders):
+        base = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "-" for c in wish)
+        name, number = base, 2
+        while names.get(name, folder) != folder:
+            name, number = f"{base}-{number}", number + 1
+        names[name] = folder
+    return names
+
+
+def source_address(path: Path, sources: Mapping[str, Path]) -> str:
+    """Spell an input file as a BIDS address, ``bids:<dataset>:<path in it>``.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    sources : mapping of str to Path
+        Datasets by name.
+
+    Returns
+    -------
+    str
+        The plain path if the file is in none of them.
+    """
+    for name, folder in sources.items():
+        if path.is_relative_to(folder):
+            return f"bids:{name}:{path.relative_to(folder).as_posix()}"
+    return str(path)
+
+
+def write_citation(root: Path, settings: Settings, schemes: Sequence[Scheme]) -> None:
+    """Write ``CITATION.md``: a methods paragraph with this run's settings, and the references.
+
+    Parameters
+    ----------
+    root : Path
+        The output dataset.
+    settings : Settings
+        Those of this run.
+    schemes : sequence of Scheme
+        Segmentation protocols in use.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written.
+    """
+    from hipsta_bids.bids.citation import citation_text  # noqa: PLC0415  (text only when written)
+
+    files.write_text(root / DATASET_FILES["citation"], citation_text(settings, schemes))

@@ -1,0 +1,212 @@
+"""The one table of outputs, and the one function that spells their paths.
+
+Entities follow the order of BIDS 1.11 (``sub ses hemi space seg desc``). What the standard has
+no rule for is listed in ``.bidsignore`` from the same table.
+"""
+
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+
+
+@dataclass(frozen=True, kw_only=True)
+class HemisphereName:
+    """The BIDS identity of one result."""
+
+    subject: str
+    """Label without ``sub-``."""
+    session: str | None
+    """Label without ``ses-``; ``None`` where the dataset has no sessions."""
+    hemi: str
+    """``L`` or ``R``."""
+    seg: str
+    """Name of the segmentation protocol."""
+
+    @property
+    def stem(self) -> str:
+        """What all file names of this hemisphere's subject and session begin with."""
+        session = f"_ses-{self.session}" if self.session else ""
+        return f"sub-{self.subject}{session}_hemi-{self.hemi}"
+
+    @property
+    def folder(self) -> PurePosixPath:
+        """Folder of the results, relative to the output dataset."""
+        session = [f"ses-{self.session}"] if self.session else []
+        return PurePosixPath(f"sub-{self.subject}", *session, "anat")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Output:
+    """One row of the output table."""
+
+    key: str
+    suffix: str
+    extension: str
+    description: str
+    desc: str | None = None
+    space: str | None = None
+    optional: bool = False
+    """Written on request only."""
+    in_standard: bool = False
+    """Whether BIDS 1.11 has a rule for this name."""
+
+
+_SURFACES = ("interior", "midthickness", "exterior")
+
+#: Every file of one hemisphere. The quality record comes last: it is written when all else is
+#: there, so that its presence means that the set is complete.
+OUTPUTS: tuple[Output, ...] = (
+    Output(
+        key="sheet",
+        desc="sheet",
+        suffix="morph",
+        extension=".tsv",
+        description="one row per sheet point: position, thickness, curvatures, subfield",
+    ),
+    Output(
+        key="sheet_sidecar",
+        desc="sheet",
+        suffix="morph",
+        extension=".json",
+        description="columns, units and definitions of the sheet table",
+    ),
+    Output(
+        key="summary",
+        desc="summary",
+        suffix="morph",
+        extension=".tsv",
+        description="one row: mean thickness, extents, volume, areas, and the same per subfield",
+    ),
+    Output(
+        key="summary_sidecar",
+        desc="summary",
+        suffix="morph",
+        extension=".json",
+        description="columns, units and definitions of the summary table",
+    ),
+    *(
+        Output(
+            key=f"{name}_surface",
+            suffix=name,
+            extension=".surf.gii",
+            description=f"{name} surface of the sheet in the scanner space of the subject",
+        )
+        for name in _SURFACES
+    ),
+    *(
+        Output(
+            key=f"{name}_unfold",
+            suffix=name,
+            space="unfold",
+            extension=".surf.gii",
+            description=f"{name} surface laid flat: medial to lateral, posterior to anterior",
+        )
+        for name in _SURFACES
+    ),
+    Output(
+        key="thickness",
+        suffix="thickness",
+        extension=".shape.gii",
+        description="thickness per surface vertex, mm",
+    ),
+    Output(
+        key="curvature",
+        suffix="curv",
+        extension=".shape.gii",
+        description="mean curvature of the mid-surface per vertex, 1/mm",
+    ),
+    Output(
+        key="subfields",
+        suffix="dseg",
+        extension=".label.gii",
+        description="subfield per surface vertex",
+        in_standard=True,
+    ),
+    Output(
+        key="mesh",
+        desc="tet",
+        suffix="mesh",
+        extension=".vtu",
+        description="tetrahedral mesh with its three coordinates (`--write-meshes`)",
+        optional=True,
+    ),
+    Output(
+        key="qc",
+        desc="qc",
+        suffix="metrics",
+        extension=".json",
+        description="status, reason, flags, inputs, and every number that says whether to trust"
+        " the maps",
+    ),
+)
+
+#: Files of the whole dataset, by the name of what they hold.
+DATASET_FILES: dict[str, str] = {
+    "description": "dataset_description.json",
+    "ignore": ".bidsignore",
+    "settings": "desc-settings.json",
+    "citation": "CITATION.md",
+    "status": "status.tsv",
+    "status_sidecar": "status.json",
+    "logs": "logs",
+}
+
+_BY_KEY = {output.key: output for output in OUTPUTS}
+
+
+def output_name(name: HemisphereName, key: str) -> str:
+    """Spell the file name of one output.
+
+    Parameters
+    ----------
+    name : HemisphereName
+        Whose result it is.
+    key : str
+        A key of :data:`OUTPUTS`.
+
+    Returns
+    -------
+    str
+        File name with its extension.
+    """
+    output = _BY_KEY[key]
+    entities = [
+        name.stem,
+        f"space-{output.space}" if output.space else None,
+        f"seg-{name.seg}",
+        f"desc-{output.desc}" if output.desc else None,
+        output.suffix,
+    ]
+    return "_".join(part for part in entities if part) + output.extension
+
+
+def output_path(name: HemisphereName, key: str) -> PurePosixPath:
+    """Spell the path of one output, relative to the output dataset.
+
+    Parameters
+    ----------
+    name : HemisphereName
+        Whose result it is.
+    key : str
+        A key of :data:`OUTPUTS`.
+
+    Returns
+    -------
+    PurePosixPath
+        ``sub-X[/ses-Y]/anat/sub-X[_ses-Y]_hemi-H[_space-S]_seg-P[_desc-D]_<suffix><extension>``.
+    """
+    return name.folder / output_name(name, key)
+
+
+def ignore_patterns() -> tuple[str, ...]:
+    """List the patterns of ``.bidsignore``: each output that BIDS 1.11 has no rule for.
+
+    Returns
+    -------
+    tuple of str
+        In the form of ``.gitignore``.
+    """
+    dataset = [DATASET_FILES[key] for key in ("settings", "citation", "status", "status_sidecar")]
+    patterns = dict.fromkeys(
+        f"*_{output.suffix}{output.extension}" for output in OUTPUTS if not output.in_standard
+    )
+    return (*dataset, f"{DATASET_FILES['logs']}/", *patterns)

@@ -1,0 +1,132 @@
+"""``status.tsv``: one row per hemisphere, kept over all runs into the same folder."""
+
+import contextlib
+import fcntl
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+
+from hipsta_bids.bids import files
+from hipsta_bids.bids.names import DATASET_FILES, HemisphereName
+from hipsta_bids.errors import InputError
+
+Row = Mapping[str, str]
+"""Cells by column."""
+
+STAGE_PREFIX = "seconds_"
+
+#: Columns that every row has, with their meaning; one column per stage follows.
+COLUMNS: dict[str, str] = {
+    "subject": "subject, with its sub- prefix",
+    "session": "session, with its ses- prefix",
+    "hemi": "L or R",
+    "seg": "segmentation protocol",
+    "status": "ok; repaired: small defects were mended; flagged: look before use;"
+    " failed: there are no maps",
+    "reason": "machine-readable reasons, joined by +",
+    "message": "what happened and what to try",
+    "version": "version of hipsta_bids",
+    "settings_hash": "SHA-256 of the resolved settings",
+    "input_hash": "SHA-256 of the input files and of how they are read",
+    "seconds": "elapsed time, s",
+    "cpu_seconds": "processor time, s",
+    "peak_memory_mb": "largest resident memory of the process, MB (1e6 bytes)",
+}
+
+_KEY = ("subject", "session", "hemi", "seg")
+
+
+def identity(name: HemisphereName) -> dict[str, str]:
+    """Cells that say whose row it is."""
+    return {
+        "subject": f"sub-{name.subject}",
+        "session": f"ses-{name.session}" if name.session else files.MISSING,
+        "hemi": name.hemi,
+        "seg": name.seg,
+    }
+
+
+def row_key(row: Row) -> tuple[str, ...]:
+    """Cells that tell rows apart."""
+    return tuple(row[key] for key in _KEY)
+
+
+def read_status(root: Path) -> list[dict[str, str]]:
+    """Read the rows of all runs so far.
+
+    Parameters
+    ----------
+    root : Path
+        The output dataset.
+
+    Returns
+    -------
+    list of dict
+        Empty if there is no table yet, or not a readable one: it is rebuilt as hemispheres end.
+    """
+    try:
+        rows = files.read_tsv(root / DATASET_FILES["status"])
+    except InputError:
+        return []
+    return [row for row in rows if all(key in row for key in _KEY)]
+
+
+def update_status(root: Path, rows: Iterable[Row]) -> None:
+    """Replace or add rows; those of other hemispheres stay.
+
+    Safe for several runs at a time into the same folder, as on a cluster.
+
+    Parameters
+    ----------
+    root : Path
+        The output dataset.
+    rows : iterable of mapping
+        Cells by column.
+
+    Raises
+    ------
+    OutputError
+        If the table cannot be written; the earlier one is then unharmed.
+    """
+    with _locked(root):
+        merged = {row_key(row): row for row in read_status(root)}
+        merged |= {row_key(row): dict(row) for row in rows}
+        ordered = [merged[key] for key in sorted(merged)]
+        stages = dict.fromkeys(
+            column for row in ordered for column in row if column.startswith(STAGE_PREFIX)
+        )
+        columns = (*COLUMNS, *stages)
+        files.write_tsv(
+            root / DATASET_FILES["status"],
+            columns,
+            ([row.get(column, files.MISSING) for column in columns] for row in ordered),
+        )
+
+
+def write_sidecar(root: Path) -> None:
+    """Write ``status.json``, which says what the columns are.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written.
+    """
+    described = {name: {"Description": text} for name, text in COLUMNS.items()}
+    described[f"{STAGE_PREFIX}*"] = {"Description": "elapsed time of one stage, s"}
+    files.write_json(root / DATASET_FILES["status_sidecar"], described)
+
+
+@contextlib.contextmanager
+def _locked(root: Path) -> Iterator[None]:
+    """Let one process at a time read, merge and write the table."""
+    folder = root / DATASET_FILES["logs"]
+    files.make_folder(folder)
+    path = folder / ".status.lock"
+    try:
+        handle = path.open("ab")
+    except OSError as error:
+        raise files.output_error(path, error) from error
+    with handle:
+        # Some network file systems have no locks: then single runs still work.
+        with contextlib.suppress(OSError):
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
