@@ -1,0 +1,160 @@
+"""The books of a run: rows of ``status.tsv`` and a log file, right at any moment."""
+
+import contextlib
+import logging
+from collections.abc import Generator, Sequence
+from datetime import UTC, datetime
+from os import getpid
+from pathlib import Path
+
+from hipsta_bids import __version__
+from hipsta_bids.artifacts import Status
+from hipsta_bids.bids import files
+from hipsta_bids.bids.names import DATASET_FILES
+from hipsta_bids.bids.status import STAGE_PREFIX, identity, read_status, row_key, update_status
+from hipsta_bids.errors import HipstaError, OutputError
+from hipsta_bids.job import Job, Outcome
+
+_LOG_FORMAT = "%(asctime)s %(levelname)s %(message)s"
+_LOGGER = logging.getLogger(__name__)
+
+
+def open_books(root: Path, done: Sequence[Outcome], todo: Sequence[Job]) -> None:
+    """Make the table right for the case that this process ends at any moment from here on.
+
+    Parameters
+    ----------
+    root : Path
+        The output dataset.
+    done : sequence of Outcome
+        What earlier runs did.
+    todo : sequence of Job
+        What this run is going to do: recorded as not finished until it is.
+
+    Raises
+    ------
+    OutputError
+        If the table cannot be written.
+    """
+    known = {row_key(row): row.get("status") for row in read_status(root)}
+    rows = [
+        row
+        for row in map(_row, done)
+        # Rows that are there already also have the times, which the quality record has not.
+        if known.get(row_key(row)) != row["status"]
+    ]
+    for job in todo:
+        error = HipstaError(
+            "the run ended before this hemisphere; run the same command again",
+            reason="not-finished",
+        )
+        pending = Outcome(
+            job=job, status=Status.FAILED, reason=error.reason, message=str(error), error=error
+        )
+        rows.append(_row(pending))
+    update_status(root, rows)
+
+
+def keep_books(outcome: Outcome, root: Path) -> None:
+    """Write one outcome to the table and to the log.
+
+    Parameters
+    ----------
+    outcome : Outcome
+        How a hemisphere ended.
+    root : Path
+        The output dataset.
+
+    Raises
+    ------
+    OutputError
+        If the table cannot be written.
+    """
+    name = outcome.job.place.name
+    title = f"{name.stem}_seg-{name.seg}"
+    if outcome.skipped:
+        _LOGGER.info("%s: unchanged, skipped (%s)", title, outcome.status)
+        return
+    for stage, seconds in outcome.stages.items():
+        _LOGGER.info("%s: %s %.3f s", title, stage, seconds)
+    _LOGGER.info("%s: %s %s %s", title, outcome.status, outcome.reason or "", outcome.message or "")
+    if outcome.trace:
+        _LOGGER.error("%s: %s", title, outcome.trace)
+    try:
+        update_status(root, [_row(outcome)])
+    except OutputError:
+        # The error of the hemisphere says more, and it will be reported.
+        if not isinstance(outcome.error, OutputError):
+            raise
+
+
+def _row(outcome: Outcome) -> dict[str, str]:
+    """Spell one row of ``status.tsv``."""
+    measured = {
+        "seconds": outcome.seconds,
+        "cpu_seconds": outcome.cpu_seconds,
+        "peak_memory_mb": outcome.peak_memory_mb,
+        **{f"{STAGE_PREFIX}{stage}": spent for stage, spent in outcome.stages.items()},
+    }
+    return {
+        **identity(outcome.job.place.name),
+        "status": str(outcome.status),
+        "reason": outcome.reason or files.MISSING,
+        "message": outcome.message or files.MISSING,
+        "version": __version__,
+        "settings_hash": outcome.job.settings_hash,
+        "input_hash": outcome.input_hash or files.MISSING,
+        **{
+            name: files.MISSING if value is None else f"{value:.3f}"
+            for name, value in measured.items()
+        },
+    }
+
+
+@contextlib.contextmanager
+def log_file(root: Path, verbosity: int) -> Generator[Path]:
+    """Log this run to a file of its own.
+
+    Parameters
+    ----------
+    root : Path
+        The output dataset.
+    verbosity : int
+        Above 0, debugging messages too.
+
+    Yields
+    ------
+    Path
+        The file.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be made.
+    """
+    folder = root / DATASET_FILES["logs"]
+    files.make_folder(folder)
+    path = folder / f"run-{datetime.now(UTC):%Y%m%dT%H%M%S}-{getpid()}.log"
+    try:
+        handler = _QuietHandler(path, encoding="utf-8")
+    except OSError as error:
+        raise files.output_error(path, error) from error
+    handler.setFormatter(logging.Formatter(_LOG_FORMAT))
+    logger = logging.getLogger("hipsta_bids")
+    level = logger.level
+    logger.setLevel(logging.DEBUG if verbosity else logging.INFO)
+    logger.addHandler(handler)
+    try:
+        yield path
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(level)
+        with contextlib.suppress(OSError):
+            handler.close()
+
+
+class _QuietHandler(logging.FileHandler):
+    """Loses lines rather than the run when the disk is full; that is reported elsewhere."""
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802  (logging's name)
+        del record

@@ -1,0 +1,251 @@
+"""One hemisphere from files to files: read, measure, write. This is what workers run."""
+
+import hashlib
+import json
+import traceback
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from hipsta_bids import __version__
+from hipsta_bids.artifacts import Status
+from hipsta_bids.bids import files, results
+from hipsta_bids.bids.derivative import source_address
+from hipsta_bids.bids.inputs import HemisphereInput
+from hipsta_bids.bids.results import ResultPlace
+from hipsta_bids.cost import CostClock
+from hipsta_bids.errors import HipstaError, OutputError
+from hipsta_bids.settings import Settings
+
+INTERNAL = "internal-error"
+"""Reason of a failure that is a bug."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """All that a worker needs to know about one hemisphere."""
+
+    item: HemisphereInput
+    place: ResultPlace
+    settings: Settings
+    settings_hash: str
+    sources: tuple[tuple[str, Path], ...]
+    """Input datasets by name."""
+    write_meshes: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """How one hemisphere ended."""
+
+    job: Job
+    status: Status
+    reason: str | None = None
+    message: str | None = None
+    error: HipstaError | None = None
+    """Set if it failed for a foreseen reason."""
+    trace: str | None = None
+    """Set if it failed by a bug."""
+    skipped: bool = False
+    """An earlier run had done it."""
+    input_hash: str | None = None
+    thickness: float | None = None
+    """Mean over the sheet, mm."""
+    stages: dict[str, float] = field(default_factory=dict)
+    """Seconds per stage."""
+    seconds: float | None = None
+    cpu_seconds: float | None = None
+    peak_memory_mb: float | None = None
+
+
+def warm_up() -> None:
+    """Load the libraries, so that no hemisphere's time includes it."""
+    import hipsta_bids.bids.images  # noqa: PLC0415  (loaded in workers only)
+    import hipsta_bids.participant  # noqa: F401, PLC0415
+
+
+def run_job(job: Job) -> Outcome:
+    """Measure one hemisphere and write its results; never raises a foreseen error.
+
+    Parameters
+    ----------
+    job : Job
+        What to do.
+
+    Returns
+    -------
+    Outcome
+        ``failed`` hemispheres leave nothing but their quality record.
+    """
+    from hipsta_bids.bids.images import read_label_volume  # noqa: PLC0415  (workers only)
+    from hipsta_bids.participant import measure_hemisphere  # noqa: PLC0415
+
+    clock = CostClock()
+    record = base_record(job)
+    hashed = None
+    try:
+        with clock("read"):
+            hashed, record["inputs"] = hash_inputs(job)
+            record["input_hash"] = hashed
+            volume = read_label_volume(job.item)
+        maps = measure_hemisphere(volume, job.item.hemi, job.settings, clock)
+        with clock("write"):
+            results.write_results(
+                job.place, maps, job.item.scheme, record, write_meshes=job.write_meshes
+            )
+    except Exception as error:  # noqa: BLE001  (one hemisphere's bug must not end the others)
+        foreseen = foresee(error, job.place.root)
+        trace = None if foreseen else traceback.format_exc()
+        return fail(job, foreseen or unforeseen(error), trace=trace, record=record, **clock.spent())
+    status, reason, message = results.verdict(maps)
+    return Outcome(
+        job=job,
+        status=status,
+        reason=reason,
+        message=message,
+        input_hash=hashed,
+        thickness=maps.summary.get("thickness_mean"),
+        **clock.spent(),
+    )
+
+
+def fail(
+    job: Job,
+    error: HipstaError,
+    *,
+    trace: str | None = None,
+    record: dict[str, Any] | None = None,
+    **spent: Any,  # noqa: ANN401  (fields of Outcome)
+) -> Outcome:
+    """Record that a hemisphere failed, and remove what it had.
+
+    Parameters
+    ----------
+    job : Job
+        Whose failure.
+    error : HipstaError
+        Why.
+    trace : str, optional
+        Traceback, if it is a bug.
+    record : dict, optional
+        What is known about its inputs.
+    **spent
+        Times and memory, as fields of :class:`Outcome`.
+
+    Returns
+    -------
+    Outcome
+        With the error of writing instead, if not even the record can be written.
+    """
+    record = base_record(job) if record is None else record
+    try:
+        results.write_failure(job.place, error, record)
+    except OutputError as worse:
+        if not isinstance(error, OutputError):
+            error = worse
+    return Outcome(
+        job=job,
+        status=Status.FAILED,
+        reason=error.reason,
+        message=str(error),
+        error=None if trace else error,
+        trace=trace,
+        input_hash=record.get("input_hash"),
+        **spent,
+    )
+
+
+def foresee(error: Exception, root: Path) -> HipstaError | None:
+    """Tell what a user can act on from a bug.
+
+    Parameters
+    ----------
+    error : Exception
+        What was raised.
+    root : Path
+        The output dataset, for messages.
+
+    Returns
+    -------
+    HipstaError or None
+        ``None`` for a bug.
+    """
+    if isinstance(error, HipstaError):
+        return error
+    if isinstance(error, MemoryError):
+        return HipstaError(
+            "out of memory; use fewer processes (--n-procs) or a machine with more",
+            reason="out-of-memory",
+        )
+    if isinstance(error, OSError) and files.is_disk_full(error):
+        return files.output_error(Path(error.filename) if error.filename else root, error)
+    return None
+
+
+def unforeseen(error: Exception) -> HipstaError:
+    """Word a bug as an error; its traceback goes to the log."""
+    what = " ".join(f"{type(error).__name__}: {error}".split())
+    return HipstaError(f"internal error ({what}); please report it with the log", reason=INTERNAL)
+
+
+def base_record(job: Job) -> dict[str, Any]:
+    """Begin the quality record with what is known before any input is read."""
+    item = job.item
+    sources = dict(job.sources)
+    return {
+        "version": __version__,
+        "settings_hash": job.settings_hash,
+        "input_hash": None,
+        "inputs": [{"file": source_address(path, sources)} for path in item.files],
+        "scheme": item.scheme.name,
+        "scheme_title": item.scheme.title,
+        "chosen_because": item.why,
+        "passed_over": [
+            {"file": source_address(Path(path), sources), "reason": why}
+            for path, why in item.passed_over
+        ],
+        "notes": item.notes,
+    }
+
+
+def hash_inputs(job: Job) -> tuple[str, list[dict[str, str]]]:
+    """Hash the input files and how they are read.
+
+    Parameters
+    ----------
+    job : Job
+        Whose inputs.
+
+    Returns
+    -------
+    tuple of (str, list of dict)
+        One hash of everything that decides what is measured, besides settings and version; and
+        address and hash per file.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be read.
+    """
+    item, sources = job.item, dict(job.sources)
+    hashes = [
+        {"file": source_address(path, sources), "sha256": files.sha256_of(path)}
+        for path in item.files
+    ]
+    reading = [
+        [entry["sha256"] for entry in hashes],
+        # The wording of the protocols (titles, citations) does not change what is read.
+        [
+            [label.code, int(label.tissue), int(label.part)]
+            for scheme in (item.scheme, item.parts_scheme)
+            if scheme is not None
+            for label in scheme.labels
+        ],
+        [
+            [int(tissue) for tissue in group]
+            for group in (item.scheme.sheet, item.scheme.layer, item.scheme.interior)
+        ],
+        item.code_offset,
+        item.hemi,
+    ]
+    return hashlib.sha256(json.dumps(reading).encode()).hexdigest(), hashes

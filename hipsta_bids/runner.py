@@ -1,0 +1,277 @@
+"""Runs hemispheres side by side, keeps going after a failure, and keeps the books."""
+
+import contextlib
+import logging
+import math
+from collections import Counter
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from hipsta_bids import __version__
+from hipsta_bids.artifacts import Status
+from hipsta_bids.bids import derivative, files, results
+from hipsta_bids.bids.inputs import HemisphereInput
+from hipsta_bids.bids.names import HemisphereName
+from hipsta_bids.bids.results import ResultPlace
+from hipsta_bids.bids.status import write_sidecar
+from hipsta_bids.bookkeeping import keep_books, log_file, open_books
+from hipsta_bids.errors import ExitCode, HipstaError, InputError, OutputError, SchemeError
+from hipsta_bids.job import INTERNAL, Job, Outcome, fail, hash_inputs, run_job, warm_up
+from hipsta_bids.pool import WorkerLost, WorkerPlan, run_jobs
+from hipsta_bids.schemes import Scheme
+from hipsta_bids.settings import Settings
+
+WORKER_GB = 0.6
+"""Memory that one worker may need, GB: 500 MB for a hemisphere, and its helper process."""
+
+_LOGGER = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """What never changes a result."""
+
+    n_procs: int = 1
+    """Hemispheres measured at the same time."""
+    mem_gb: float | None = None
+    """Upper limit for all workers together; ``None`` is no limit."""
+    work_dir: Path | None = None
+    """Scratch folder; ``None`` is the system's."""
+    stop_on_first_crash: bool = False
+    verbosity: int = 0
+    force: bool = False
+    """Redo hemispheres that are up to date."""
+    write_meshes: bool = False
+    timeout: float = 600.0
+    """Seconds per hemisphere."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunResult:
+    """What a run did."""
+
+    outcomes: tuple[Outcome, ...]
+    """Of all hemispheres that ended or were skipped."""
+    n_requested: int
+    log: Path
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Hemispheres per status, skipped ones under the status that they have."""
+        return Counter(str(outcome.status) for outcome in self.outcomes)
+
+    @property
+    def exit_code(self) -> ExitCode:
+        """The gravest of what happened.
+
+        A disk that cannot be written outranks a bug, a bug outranks failed hemispheres. When
+        every hemisphere failed because of its input, the data are to blame.
+        """
+        failed = [outcome for outcome in self.outcomes if outcome.status == Status.FAILED]
+        if any(isinstance(outcome.error, OutputError) for outcome in failed):
+            return ExitCode.NOT_WRITABLE
+        if any(outcome.reason == INTERNAL for outcome in failed):
+            return ExitCode.INTERNAL
+        if not failed and len(self.outcomes) == self.n_requested:
+            return ExitCode.OK
+        if len(failed) == self.n_requested and all(
+            isinstance(outcome.error, (InputError, SchemeError)) for outcome in failed
+        ):
+            return ExitCode.BAD_DATA
+        return ExitCode.SOME_FAILED
+
+
+def run_participants(
+    items: Sequence[HemisphereInput],
+    out_dir: Path,
+    settings: Settings,
+    options: RunOptions,
+    report: Callable[[Outcome], None],
+) -> RunResult:
+    """Measure hemispheres and write the output dataset.
+
+    Parameters
+    ----------
+    items : sequence of HemisphereInput
+        What to measure.
+    out_dir : Path
+        The output dataset; made if need be.
+    settings : Settings
+        What changes results.
+    options : RunOptions
+        What does not.
+    report : callable
+        Called in this process with each outcome as it comes.
+
+    Returns
+    -------
+    RunResult
+        Failed hemispheres are in it, not raised.
+
+    Raises
+    ------
+    OutputError
+        If the output folder cannot be written, at the start or for want of space later.
+    SettingsError
+        If it holds results with other settings.
+    UsageError
+        If it is a dataset of other software.
+    """
+    derivative.check_not_foreign(out_dir)
+    files.check_writable(out_dir)
+    digest = derivative.settle_settings(out_dir, settings)
+    sources = derivative.source_names((item.source, item.source_path) for item in items)
+    derivative.write_description(out_dir, sources)
+    derivative.write_citation(out_dir, settings, _schemes(items))
+    write_sidecar(out_dir)
+    jobs = [
+        Job(
+            item=item,
+            place=ResultPlace(root=out_dir, name=hemisphere_name(item)),
+            settings=settings,
+            settings_hash=digest,
+            sources=tuple(sources.items()),
+            write_meshes=options.write_meshes,
+        )
+        for item in items
+    ]
+    with log_file(out_dir, options.verbosity) as log:
+        _LOGGER.info("hipsta_bids %s, settings %s, %d hemispheres", __version__, digest, len(jobs))
+        outcomes = []
+        for outcome in _outcomes(jobs, out_dir, options, log):
+            keep_books(outcome, out_dir)
+            outcomes.append(outcome)
+            report(outcome)
+            if isinstance(outcome.error, OutputError):
+                break  # the next one would fail just so
+            if options.stop_on_first_crash and outcome.status == Status.FAILED:
+                break
+        result = RunResult(outcomes=tuple(outcomes), n_requested=len(jobs), log=log)
+        _LOGGER.info("done: %s, exit code %d", dict(result.counts), result.exit_code)
+    return result
+
+
+def hemisphere_name(item: HemisphereInput) -> HemisphereName:
+    """Name the results of one input."""
+    return HemisphereName(
+        subject=item.subject, session=item.session, hemi=item.hemi, seg=item.scheme.name
+    )
+
+
+def n_workers(options: RunOptions, n_jobs: int) -> int:
+    """How many workers the limits on processes and memory allow, at least one."""
+    by_memory = math.inf if options.mem_gb is None else options.mem_gb // WORKER_GB
+    return int(max(1, min(options.n_procs, by_memory, n_jobs)))
+
+
+def finished(job: Job) -> Outcome | None:
+    """Recognize a hemisphere that an earlier run has done just so.
+
+    Parameters
+    ----------
+    job : Job
+        What would be done.
+
+    Returns
+    -------
+    Outcome or None
+        Its outcome if all files are there and inputs, settings and version are unchanged.
+        Failed hemispheres are always tried again: what stood in the way may be gone.
+    """
+    try:
+        record = files.read_json(job.place.path("qc"))
+        status = Status(record.get("status", ""))
+    except (InputError, ValueError):
+        return None
+    same = (
+        status != Status.FAILED
+        and record.get("version") == __version__
+        and record.get("settings_hash") == job.settings_hash
+        and all(path.exists() for path in job.place.paths(optional=job.write_meshes))
+    )
+    if not same:
+        return None
+    try:
+        digest, _ = hash_inputs(job)
+    except InputError:
+        return None
+    if record.get("input_hash") != digest:
+        return None
+    return Outcome(
+        job=job,
+        status=status,
+        reason=record.get("reason"),
+        message=record.get("message"),
+        input_hash=digest,
+        skipped=True,
+    )
+
+
+def _outcomes(
+    jobs: Sequence[Job], root: Path, options: RunOptions, log: Path
+) -> Generator[Outcome]:
+    """Give the outcomes of all hemispheres: first what is done already, then the others."""
+    done, todo = [], []
+    for job in jobs:
+        earlier = None if options.force else finished(job)
+        if earlier is None:
+            todo.append(job)
+        else:
+            done.append(earlier)
+            yield earlier
+    open_books(root, done, todo)
+    for job in todo:
+        if job.item.problem is not None:
+            yield fail(job, job.item.problem)
+    able = [job for job in todo if job.item.problem is None]
+    pool = run_jobs(_plan(options, len(able), log), able)
+    try:
+        for job, answer in pool:
+            yield _lost(job, answer, options) if isinstance(answer, WorkerLost) else answer
+    except BaseException:
+        pool.close()
+        for job in able:
+            # What was being written has no quality record yet.
+            if not job.place.path("qc").exists():
+                with contextlib.suppress(OutputError):
+                    results.remove_results(job.place)
+        raise
+
+
+def _plan(options: RunOptions, n_jobs: int, log: Path) -> WorkerPlan:
+    scratch = () if options.work_dir is None else (("TMPDIR", str(options.work_dir)),)
+    return WorkerPlan(
+        work=run_job,
+        n_workers=n_workers(options, n_jobs),
+        timeout=options.timeout,
+        log=log,
+        warm_up=warm_up,
+        environment=scratch,
+    )
+
+
+def _lost(job: Job, loss: WorkerLost, options: RunOptions) -> Outcome:
+    """Turn the loss of a worker into a failure of its hemisphere."""
+    if loss.timed_out:
+        error = HipstaError(
+            f"not done within {options.timeout:g} s; look at the segmentation, or raise --timeout",
+            reason="timeout",
+        )
+    else:
+        error = HipstaError(
+            f"the process died ({loss.cause}); if memory ran out use fewer --n-procs, else report"
+            " it with the log",
+            reason="worker-died",
+        )
+    return fail(job, error, seconds=loss.seconds)
+
+
+def _schemes(items: Sequence[HemisphereInput]) -> list[Scheme]:
+    """List the protocols in use, each once."""
+    found = {}
+    for item in items:
+        for scheme in (item.scheme, item.parts_scheme):
+            if scheme is not None:
+                found[scheme.name] = scheme
+    return [found[name] for name in sorted(found)]
