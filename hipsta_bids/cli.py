@@ -1,0 +1,241 @@
+"""The command line: arguments to settings and options, errors to exit codes."""
+
+import contextlib
+import os
+import signal
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING
+
+from hipsta_bids.console import Progress, complain, say, say_result, say_table
+from hipsta_bids.errors import ExitCode, HipstaError, UsageError
+from hipsta_bids.parser import LEVELS, build_parser
+
+if TYPE_CHECKING:
+    from argparse import Namespace
+
+    from hipsta_bids.bids.inputs import HemisphereInput, InputRequest
+    from hipsta_bids.runner import RunOptions
+
+_SIGNALED = 128  # shells report death by signal n as 128 + n
+
+
+class _TerminatedError(BaseException):
+    """SIGTERM, as an exception that unwinds like Ctrl-C does."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        Arguments without the program's name; those of this process by default.
+
+    Returns
+    -------
+    int
+        An :class:`ExitCode`, or 128 plus the number of the signal that stopped the run.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    try:
+        with _terminable():
+            return int(_dispatch(arguments))
+    except HipstaError as error:
+        complain(f"hipsta-bids: {error}")
+        return int(error.exit_code)
+    except KeyboardInterrupt:
+        complain("hipsta-bids: stopped by Ctrl-C; run the same command again to complete")
+        return _SIGNALED + signal.SIGINT
+    except _TerminatedError:
+        complain("hipsta-bids: stopped by SIGTERM; run the same command again to complete")
+        return _SIGNALED + signal.SIGTERM
+    except BrokenPipeError:
+        # The reader of the output is gone (as in `| head`); do not fail again at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        return _SIGNALED + signal.SIGPIPE
+    except Exception:  # noqa: BLE001  (any other exception is a bug: show it whole)
+        traceback.print_exc()
+        complain("hipsta-bids: internal error; please report it with the lines above")
+        return int(ExitCode.INTERNAL)
+
+
+@contextlib.contextmanager
+def _terminable() -> Iterator[None]:
+    """Let SIGTERM unwind the run, so that workers end and the books are closed."""
+
+    def stop(_signal: int, _frame: FrameType | None) -> None:
+        raise _TerminatedError
+
+    try:
+        before = signal.signal(signal.SIGTERM, stop)
+    except ValueError:  # not in the main thread: whoever embeds this handles signals
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _dispatch(arguments: list[str]) -> ExitCode:
+    """Tell the other commands from the BIDS App, whose dataset may have any name."""
+    commands: dict[str, Callable[[list[str]], ExitCode]] = {
+        "schemes": _schemes,
+        "settings": _settings,
+        "demo-data": _demo_data,
+        "demo": _demo,
+    }
+    is_app = any(level in arguments[1:] for level in (*LEVELS, "group"))
+    if arguments and arguments[0] in commands and not is_app:
+        return commands[arguments[0]](arguments[1:])
+    return _participant(build_parser().parse_args(arguments))
+
+
+def _participant(options: "Namespace") -> ExitCode:
+    from hipsta_bids.settings_file import load_settings  # noqa: PLC0415  (start-up time)
+
+    _check_folders(options)
+    settings = load_settings(options.settings)
+    from hipsta_bids.bids.dataset import (  # noqa: PLC0415  (heavy)
+        find_hemispheres,
+        selection_table,
+    )
+
+    items = find_hemispheres(_request(options))
+    if options.dry_run:
+        say_table(selection_table(items))
+        return ExitCode.OK
+    _check_output_is_no_input(options.output_dir, items)
+    from hipsta_bids.runner import run_participants  # noqa: PLC0415  (heavy)
+
+    progress = Progress(len(items), options.verbose)
+    try:
+        result = run_participants(
+            items, options.output_dir, settings, _run_options(options), progress.report
+        )
+    finally:
+        progress.close()
+    say_result(result, options.output_dir)
+    return result.exit_code
+
+
+def _check_folders(options: "Namespace") -> None:
+    if options.output_dir.resolve() == options.bids_dir.resolve():
+        raise UsageError(
+            f"{options.output_dir}: the output folder is the BIDS dataset itself; use for example"
+            f" {options.bids_dir / 'derivatives' / 'hipsta_bids'}",
+            reason="output-is-input",
+        )
+
+
+def _check_output_is_no_input(out_dir: Path, items: "Sequence[HemisphereInput]") -> None:
+    if out_dir.resolve() in {item.source_path.resolve() for item in items}:
+        raise UsageError(
+            f"{out_dir}: the output folder holds the segmentations; choose another one",
+            reason="output-is-input",
+        )
+
+
+def _request(options: "Namespace") -> "InputRequest":
+    from hipsta_bids.bids.inputs import InputRequest  # noqa: PLC0415  (heavy)
+
+    derivatives = dict(options.derivatives)
+    if len(derivatives) != len(options.derivatives):
+        raise UsageError("--derivatives: a name occurs twice; give each its own", reason="usage")
+    return InputRequest(
+        bids_dir=options.bids_dir,
+        derivatives=derivatives,
+        freesurfer_dir=options.freesurfer_dir,
+        ashs_dir=options.ashs_dir,
+        hippunfold_dir=options.hippunfold_dir,
+        participant_labels=tuple(options.participant_label),
+        session_labels=tuple(options.session_label),
+        hemis=tuple(dict.fromkeys(options.hemi)),
+        fs_analysis=options.fs_analysis,
+        ashs_atlas=options.ashs_atlas,
+        scheme=options.scheme,
+        bids_filter_file=options.bids_filter_file,
+        bids_database_dir=options.bids_database_dir,
+    )
+
+
+def _run_options(options: "Namespace") -> "RunOptions":
+    from hipsta_bids.bids.files import check_writable  # noqa: PLC0415  (start-up time)
+    from hipsta_bids.runner import WORKER_GB, RunOptions  # noqa: PLC0415  (heavy)
+
+    if options.mem is not None and options.mem < WORKER_GB:
+        raise UsageError(
+            f"--mem: {options.mem * 1000:g} MB is less than one hemisphere may need"
+            f" ({WORKER_GB * 1000:g} MB); for gigabytes write 8G",
+            reason="too-little-memory",
+        )
+    if options.work_dir is not None:
+        check_writable(options.work_dir)
+    return RunOptions(
+        n_procs=options.n_procs,
+        mem_gb=options.mem,
+        work_dir=options.work_dir,
+        stop_on_first_crash=options.stop_on_first_crash,
+        verbosity=options.verbose,
+        force=options.force,
+        write_meshes=options.write_meshes,
+        timeout=options.timeout,
+    )
+
+
+def _no_arguments(arguments: list[str], command: str) -> None:
+    if arguments:
+        raise UsageError(f"{command} takes no arguments (see hipsta-bids --help)", reason="usage")
+
+
+def _one_folder(arguments: list[str], command: str) -> Path:
+    if len(arguments) != 1 or arguments[0].startswith("-"):
+        raise UsageError(f"{command} takes one folder: hipsta-bids {command} DIR", reason="usage")
+    return Path(arguments[0])
+
+
+def _schemes(arguments: list[str]) -> ExitCode:
+    _no_arguments(arguments, "schemes")
+    from hipsta_bids.bids.dataset import scheme_table  # noqa: PLC0415  (heavy)
+
+    say_table(scheme_table())
+    return ExitCode.OK
+
+
+def _settings(arguments: list[str]) -> ExitCode:
+    _no_arguments(arguments, "settings")
+    from hipsta_bids.settings import Settings  # noqa: PLC0415  (start-up time)
+    from hipsta_bids.settings_file import settings_toml  # noqa: PLC0415  (start-up time)
+
+    say(settings_toml(Settings()).rstrip())
+    return ExitCode.OK
+
+
+def _demo_data(arguments: list[str]) -> ExitCode:
+    folder = _one_folder(arguments, "demo-data")
+    from hipsta_bids.demo import write_demo_data  # noqa: PLC0415  (heavy)
+
+    write_demo_data(folder)
+    say(f"demo dataset: {folder}")
+    return ExitCode.OK
+
+
+def _demo(arguments: list[str]) -> ExitCode:
+    """Write the demo dataset, run on it, and print true beside measured thickness."""
+    folder = _one_folder(arguments, "demo")
+    from hipsta_bids.demo import compare_with_truth, write_demo_data  # noqa: PLC0415  (heavy)
+
+    data, out = folder / "bids", folder / "out"
+    write_demo_data(data)
+    code = _participant(build_parser().parse_args([str(data), str(out), "participant"]))
+    for line in compare_with_truth(data, out):
+        say(line)
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,291 @@
+"""What the command line looks like. Loads nothing heavy, so that ``--help`` is instant."""
+
+import argparse
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from hipsta_bids import __version__
+from hipsta_bids.errors import UsageError
+
+LEVELS = ("participant",)
+
+EPILOG = """\
+other commands:
+  hipsta-bids schemes          list the segmentation protocols that are known
+  hipsta-bids settings         print all settings with their meaning, as TOML
+  hipsta-bids demo-data DIR    write a synthetic dataset with known thickness
+  hipsta-bids demo DIR         write it, run on it, and compare with the truth
+
+exit codes:
+  0    all hemispheres done
+  1    some hemisphere failed, the rest is complete (see status.tsv)
+  64   wrong use of the command line, wrong settings
+  65   bad data: an input folder cannot be read, or every hemisphere's input is unusable
+  66   nothing to process
+  70   internal error: please report it
+  73   the output folder cannot be written, or the disk is full
+  130  stopped by Ctrl-C (143: by SIGTERM); run the same command again to complete
+"""
+
+_MEMORY_UNITS = {"K": 1e-6, "M": 1e-3, "G": 1.0, "T": 1e3}
+
+
+class Parser(argparse.ArgumentParser):
+    """Raises instead of exiting, so that there is one place that makes exit codes."""
+
+    def error(self, message: str) -> NoReturn:
+        """Turn argparse's complaint into the package's own error."""
+        raise UsageError(f"{message} (see {self.prog} --help)", reason="usage")
+
+
+def build_parser() -> Parser:
+    """Describe the participant level's command line.
+
+    Returns
+    -------
+    Parser
+        Raises :class:`UsageError` on wrong use.
+    """
+    parser = Parser(
+        prog="hipsta-bids",
+        description="BIDS App: hippocampal thickness, curvature and shape maps from subfield"
+        " segmentations",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("bids_dir", type=Path, help="a BIDS dataset")
+    parser.add_argument("output_dir", type=Path, help="where the output dataset goes")
+    parser.add_argument("analysis_level", type=_level, help="participant")
+    parser.add_argument("--version", action="version", version=f"hipsta_bids {__version__}")
+    _add_selection(parser)
+    _add_segmentations(parser)
+    _add_processing(parser)
+    return parser
+
+
+def _add_selection(parser: Parser) -> None:
+    group = parser.add_argument_group("what to process")
+    _add(
+        group,
+        ("--participant-label", "--participant_label"),
+        ("LABEL", "subjects, with or without sub- (default: all)"),
+        nargs="+",
+        type=_label("sub-"),
+        default=[],
+    )
+    _add(
+        group,
+        ("--session-label", "--session_label"),
+        ("LABEL", "sessions, with or without ses- (default: all)"),
+        nargs="+",
+        type=_label("ses-"),
+        default=[],
+    )
+    _add(
+        group,
+        ("--hemi",),
+        ("H", "hemispheres, L and R (default: both)"),
+        nargs="+",
+        type=_hemi,
+        default=["L", "R"],
+    )
+    _add(
+        group,
+        ("--bids-filter-file", "--bids_filter_file"),
+        ("FILE", "JSON with the entities of the segmentations, in fMRIPrep's form"),
+        type=Path,
+    )
+    _add(
+        group,
+        ("--bids-database-dir", "--bids_database_dir"),
+        ("DIR", "folder of a PyBIDS database, for speed"),
+        type=Path,
+    )
+    _add(
+        group,
+        ("--skip-bids-validation", "--skip_bids_validation"),
+        (None, "accepted for other BIDS Apps' sake; the raw dataset is never validated"),
+        action="store_true",
+    )
+    _add(
+        group,
+        ("--dry-run", "--dry_run"),
+        (None, "print what would be processed and why, and end"),
+        action="store_true",
+    )
+
+
+def _add_segmentations(parser: Parser) -> None:
+    group = parser.add_argument_group("where the segmentations are")
+    _add(
+        group,
+        ("-d", "--derivatives"),
+        (
+            "NAME=PATH",
+            "datasets with segmentations (default: BIDS_DIR/derivatives/*, BIDS_DIR/sourcedata/*)",
+        ),
+        nargs="+",
+        action="extend",
+        type=_named_path,
+        default=[],
+    )
+    _add(
+        group,
+        ("--freesurfer-dir", "--freesurfer_dir", "--fs-subjects-dir", "--fs_subjects_dir"),
+        ("DIR", "FreeSurfer's subjects folder"),
+        type=Path,
+    )
+    _add(group, ("--ashs-dir", "--ashs_dir"), ("DIR", "folder of ASHS runs"), type=Path)
+    _add(
+        group,
+        ("--hippunfold-dir", "--hippunfold_dir"),
+        ("DIR", "HippUnfold's output dataset"),
+        type=Path,
+    )
+    _add(
+        group,
+        ("--fs-analysis", "--fs_analysis"),
+        ("NAME", "FreeSurfer analysis to use where there are several, such as T1 or T1-T2"),
+    )
+    _add(
+        group,
+        ("--ashs-atlas", "--ashs_atlas"),
+        ("SCHEME", "atlas of the ASHS runs, a name from `hipsta-bids schemes`"),
+    )
+    _add(
+        group,
+        ("--scheme",),
+        ("FILE.toml", "a protocol of your own for the BIDS dseg files"),
+        type=Path,
+    )
+
+
+def _add_processing(parser: Parser) -> None:
+    group = parser.add_argument_group("how to process")
+    _add(
+        group,
+        ("--settings",),
+        ("FILE.toml", "settings that change results (see `hipsta-bids settings`)"),
+        type=Path,
+    )
+    _add(
+        group,
+        ("--write-meshes", "--write_meshes"),
+        (None, "also write the tetrahedral meshes (VTU)"),
+        action="store_true",
+    )
+    _add(group, ("--force",), (None, "redo what is up to date"), action="store_true")
+    _add(
+        group,
+        ("--n-procs", "--nprocs", "--n_procs", "--n-cpus", "--n_cpus"),
+        ("N", "hemispheres at the same time, one processor each (default: all processors)"),
+        type=_positive_int,
+        default=_processors(),
+    )
+    _add(
+        group,
+        ("--mem", "--mem-mb", "--mem_mb"),
+        ("SIZE", "memory for all processes together: 8000 (MB) or 8G"),
+        type=_gigabytes,
+    )
+    _add(
+        group,
+        ("--timeout",),
+        ("S", "seconds after which a hemisphere is given up (default: 600)"),
+        type=_positive_float,
+        default=600.0,
+    )
+    _add(group, ("-w", "--work-dir", "--work_dir"), ("DIR", "scratch folder"), type=Path)
+    _add(
+        group,
+        ("--stop-on-first-crash", "--stop_on_first_crash"),
+        (None, "stop at the first hemisphere that fails"),
+        action="store_true",
+    )
+    _add(
+        group,
+        ("-v", "--verbose"),
+        (None, "say more; twice for still more"),
+        action="count",
+        default=0,
+    )
+
+
+def _add(
+    group: Any,  # noqa: ANN401  (argparse has no public name for groups)
+    flags: Sequence[str],
+    texts: tuple[str | None, str],
+    **options: Any,  # noqa: ANN401  (passed on)
+) -> None:
+    metavar, text = texts
+    if metavar is not None:
+        options["metavar"] = metavar
+    group.add_argument(*flags, help=text, **options)
+
+
+def _level(text: str) -> str:
+    if text not in LEVELS:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} does not exist; this version has the participant level only"
+        )
+    return text
+
+
+def _label(prefix: str) -> Any:  # noqa: ANN401  (a converter for argparse)
+    def convert(text: str) -> str:
+        label = text.removeprefix(prefix)
+        if not label.isalnum():
+            raise argparse.ArgumentTypeError(f"{text!r} is not a BIDS label (letters and digits)")
+        return label
+
+    return convert
+
+
+def _hemi(text: str) -> str:
+    hemi = text.upper()
+    if hemi not in {"L", "R"}:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a hemisphere; use L or R")
+    return hemi
+
+
+def _named_path(text: str) -> tuple[str, Path]:
+    name, equals, path = text.partition("=")
+    if equals and name and path:
+        return name, Path(path)
+    folder = Path(text)
+    if equals or not folder.name:
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form NAME=PATH")
+    return folder.name, folder
+
+
+def _positive_int(text: str) -> int:
+    if not text.isascii() or not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above 0")
+    return int(text)
+
+
+def _positive_float(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
+    return value
+
+
+def _gigabytes(text: str) -> float:
+    """Read a size as fMRIPrep does: megabytes unless a unit follows."""
+    number = text.upper().removesuffix("B")
+    unit = number[-1:] if number[-1:] in _MEMORY_UNITS else "M"
+    return _positive_float(number.removesuffix(unit)) * _MEMORY_UNITS[unit]
+
+
+def _processors() -> int:
+    """Count the processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
