@@ -44,6 +44,7 @@ lint: $(STAMP)
 
 types: $(STAMP)
 	"$(BIN)/python" -m mypy --strict
+	"$(BIN)/python" -m mypy --strict tools/*.py
 
 layers: $(STAMP)
 	"$(BIN)/lint-imports" --no-cache
