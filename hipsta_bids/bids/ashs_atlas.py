@@ -1,0 +1,187 @@
+"""Which atlas an ASHS segmentation was made with: the same numbers mean different tissues."""
+
+import re
+from collections.abc import Callable
+from functools import cached_property
+from pathlib import Path
+
+from hipsta_bids.bids.images import label_values
+from hipsta_bids.bids.inputs import InputRequest
+from hipsta_bids.bids.label_tables import find_table, read_table
+from hipsta_bids.errors import HipstaError, InputError, SchemeError
+from hipsta_bids.schemes import Scheme, agrees, load_scheme, scheme_from_names, scheme_names
+
+_TOOL = "ashs"
+
+#: Stands in where the atlas is not known: the hemisphere fails, but has a name in the outputs.
+_UNKNOWN = Scheme(
+    name=_TOOL,
+    title="ASHS, atlas not identified",
+    citation="",
+    sheet=(),
+    layer=(),
+    interior=(),
+    labels=(),
+    tool=_TOOL,
+)
+
+_Sample = Callable[[], list[tuple[Path, str, bool]]]
+
+
+def ashs_schemes() -> tuple[Scheme, ...]:
+    """List the bundled protocols of ASHS's atlases."""
+    return tuple(scheme for name in scheme_names() if (scheme := load_scheme(name)).tool == _TOOL)
+
+
+def choose_atlas(request: InputRequest, user_scheme: Scheme | None) -> tuple[Scheme, str] | None:
+    """Take the atlas from the options, if they give one.
+
+    Parameters
+    ----------
+    request : InputRequest
+    user_scheme : Scheme or None
+        The user's protocol, which describes the labels if no atlas is named.
+
+    Returns
+    -------
+    tuple of Scheme and str, or None
+        The protocol, and the option that gave it.
+
+    Raises
+    ------
+    SchemeError
+        If the atlas is not known, or its file not valid.
+    """
+    if request.ashs_atlas is not None:
+        key = _plain(request.ashs_atlas)
+        for scheme in ashs_schemes():
+            if key in {_plain(scheme.name), _plain(scheme.name).removeprefix(_TOOL)}:
+                return scheme, "--ashs-atlas"
+        return load_scheme(request.ashs_atlas), "--ashs-atlas"
+    return None if user_scheme is None else (user_scheme, "--scheme")
+
+
+class AtlasFinder:
+    """Identifies the atlas of each segmentation of one dataset.
+
+    In this order: the option; a label table beside or above the file; the values, if only one
+    atlas has such values; and, as one dataset is made with one atlas, the values of a sample of the
+    dataset's files, if all of them that fit one atlas only fit the same one.
+
+    Parameters
+    ----------
+    root : Path
+        The dataset.
+    option : tuple of Scheme and str, or None
+        As :func:`choose_atlas` returns it.
+    sample : function
+        Lists files of the dataset: path, hemisphere, and whether the file carries both.
+    """
+
+    def __init__(self, root: Path, option: tuple[Scheme, str] | None, sample: _Sample) -> None:
+        self._root = root
+        self._option = option
+        self._sample = sample
+        self._values: dict[tuple[Path, str], frozenset[int]] = {}
+        self._tables: dict[Path, Scheme] = {}
+
+    def identify(
+        self, path: Path, hemi: str, *, bilateral: bool
+    ) -> tuple[Scheme, str, HipstaError | None]:
+        """Identify one file's atlas.
+
+        Parameters
+        ----------
+        path : Path
+        hemi : str
+        bilateral : bool
+            The file carries both hemispheres.
+
+        Returns
+        -------
+        scheme : Scheme
+        why : str
+        problem : HipstaError or None
+            Set if the atlas is not certain; the protocol is then a placeholder.
+        """
+        if self._option is not None:
+            return self._option[0], f"atlas from {self._option[1]}", None
+        try:
+            table = find_table(path, self._root)
+            if table is not None:
+                return self._from_table(table), f"atlas from {table.name}", None
+            return *self._from_values(path, hemi, bilateral=bilateral), None
+        except (SchemeError, InputError) as problem:
+            return _UNKNOWN, "atlas not identified", problem
+
+    def _from_table(self, path: Path) -> Scheme:
+        if path not in self._tables:
+            rows = read_table(path)
+            fitting = [scheme for scheme in ashs_schemes() if agrees(scheme, rows)]
+            self._tables[path] = (
+                fitting[0]
+                if len(fitting) == 1
+                else scheme_from_names(rows, name="ashsCustom", origin=path.name)
+            )
+        return self._tables[path]
+
+    def _from_values(self, path: Path, hemi: str, *, bilateral: bool) -> tuple[Scheme, str]:
+        shared = self._shared
+        if shared is not None and (path, hemi) not in self._values:
+            # Not opened here; reading it later will fail if its values do not fit.
+            return shared[0], f"atlas from the labels of {shared[1]} other files of the dataset"
+        fitting = self._fitting(path, hemi, bilateral=bilateral)
+        if len(fitting) == 1:
+            return fitting[0], "only this atlas has such labels"
+        if shared is not None and shared[0] in fitting:
+            others = f"those of {shared[1]} other files of the dataset only this one"
+            return shared[0], f"its labels fit {_names(fitting)}, {others}"
+        values = ", ".join(map(str, sorted(self._read(path, hemi, bilateral=bilateral))))
+        if fitting:
+            raise SchemeError(
+                f"{path}: labels {values} fit {_names(fitting)}; "
+                "say which atlas was used with --ashs-atlas",
+                reason="ambiguous-atlas",
+            )
+        raise SchemeError(
+            f"{path}: labels {values} fit no bundled ASHS atlas "
+            f"({_names(list(ashs_schemes()))}); describe them in a TOML file and pass it with "
+            "--scheme",
+            reason="unknown-atlas",
+        )
+
+    @cached_property
+    def _shared(self) -> tuple[Scheme, int] | None:
+        """The atlas of the dataset and how many files of a sample prove it."""
+        proofs: list[Scheme] = []
+        for path, hemi, bilateral in self._sample():
+            try:
+                fitting = self._fitting(path, hemi, bilateral=bilateral)
+            except InputError:  # its own hemisphere will report it
+                continue
+            if len(fitting) == 1:
+                proofs += fitting
+        return (proofs[0], len(proofs)) if len(set(proofs)) == 1 else None
+
+    def _fitting(self, path: Path, hemi: str, *, bilateral: bool) -> list[Scheme]:
+        values = self._read(path, hemi, bilateral=bilateral)
+        return [scheme for scheme in ashs_schemes() if scheme.fits(values)]
+
+    def _read(self, path: Path, hemi: str, *, bilateral: bool) -> frozenset[int]:
+        """Read the codes of one hemisphere, in the range of the left one."""
+        if (path, hemi) not in self._values:
+            values = label_values(path)
+            if bilateral:
+                (offset,) = {scheme.right_offset for scheme in ashs_schemes()}
+                own = (v for v in values if (v > offset) == (hemi == "R"))
+                values = frozenset(v - offset if hemi == "R" else v for v in own)
+            self._values[path, hemi] = values
+        return self._values[path, hemi]
+
+
+def _plain(name: str) -> str:
+    return re.sub("[^a-z0-9]", "", name.lower())
+
+
+def _names(schemes: list[Scheme]) -> str:
+    return " and ".join(scheme.name for scheme in schemes)

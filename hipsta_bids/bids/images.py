@@ -1,0 +1,254 @@
+"""The only place where images are opened for reading."""
+
+import zlib
+from pathlib import Path
+from typing import Any
+
+import nibabel as nib
+import numpy as np
+from nibabel.filebasedimages import ImageFileError
+from nibabel.spatialimages import HeaderDataError
+from numpy.typing import NDArray
+
+from hipsta_bids.artifacts import LabelVolume
+from hipsta_bids.bids.inputs import HemisphereInput
+from hipsta_bids.errors import InputError, SchemeError
+from hipsta_bids.schemes import Part, Scheme, Tissue, load_scheme, scheme_names, translate
+from hipsta_bids.schemes.scheme import OUTSIDE
+
+#: Kept around the hippocampal labels [mm], where the image extends that far.
+MARGIN = 5.0
+
+#: Voxel edges [mm] outside of this range are taken for a wrong header.
+VOXEL_SIZES = (0.05, 5.0)
+
+#: How far the affines of files that are combined may differ [mm, and 1 per voxel].
+SAME_GRID = 1e-3
+
+#: All that nibabel and its decompressors raise on damaged files.
+_READ_ERRORS = (
+    OSError,
+    EOFError,
+    ValueError,
+    OverflowError,
+    zlib.error,
+    ImageFileError,
+    HeaderDataError,
+)
+
+_Box = tuple[slice, slice, slice]
+
+
+def read_label_volume(item: HemisphereInput) -> LabelVolume:
+    """Read one hemisphere's segmentation.
+
+    The volume is cropped to the hippocampal labels (not the cortical ones) plus 5 mm on each side,
+    as far as the image goes. The affine is the image's own, moved by the crop: scanner RAS
+    for MGZ, sform before qform for NIfTI. A NIfTI without either has no known left and right, and
+    is refused.
+
+    Parameters
+    ----------
+    item : HemisphereInput
+
+    Returns
+    -------
+    LabelVolume
+
+    Raises
+    ------
+    HipstaError
+        ``item.problem``, if there is one.
+    InputError
+        ``unreadable-image``, ``not-3d``, ``bad-affine``, ``bad-voxel-size``,
+        ``non-integer-labels``, ``empty-labels`` or ``grid-mismatch``.
+    SchemeError
+        ``unknown-labels`` or ``wrong-scheme``.
+    """
+    if item.problem is not None:
+        raise item.problem
+    path, *others = item.files
+    data, affine = _open(path)
+    box = _bounding_box(data != 0, path)
+    codes = _one_hemisphere(_integers(data[box], path), item, path)
+    shape = data.shape
+    del data
+    tissue, part = _translate(codes, item.scheme, path)
+    for other in others:
+        more, other_affine = _open(other)
+        if more.shape != shape or not np.allclose(other_affine, affine, rtol=0, atol=SAME_GRID):
+            raise InputError(
+                f"{other}: its grid differs from that of {path.name}, with which it is combined; "
+                "use files of the same run",
+                reason="grid-mismatch",
+            )
+        _, parts = _translate(_integers(more[box], other), item.parts_scheme or item.scheme, other)
+        part = np.where(parts == Part.UNKNOWN, part, parts)
+    part = np.where(tissue == Tissue.BACKGROUND, np.uint8(Part.UNKNOWN), part)
+    inner = _bounding_box(~np.isin(tissue, tuple(OUTSIDE)), path, affine)
+    start = np.array([a.start + b.start for a, b in zip(box, inner, strict=True)])
+    return LabelVolume(
+        tissue=tissue[inner],
+        part=part[inner],
+        affine=_shift(affine, start),
+        scheme=item.scheme,
+    )
+
+
+def label_values(path: Path) -> frozenset[int]:
+    """List the distinct codes of a segmentation, without the background.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    frozenset of int
+
+    Raises
+    ------
+    InputError
+        As :func:`read_label_volume`.
+    """
+    data, _ = _open(path)
+    box = _bounding_box(data != 0, path)
+    values = np.unique(_integers(data[box], path))
+    return frozenset(values[values != 0].tolist())
+
+
+def _open(path: Path) -> tuple[NDArray[Any], NDArray[np.float64]]:
+    """Load an image's voxels, in the type on disk, and its affine; check both."""
+    try:
+        # keep_file_open=False, mmap=False: no handle outlives this call, wherever it fails.
+        image = nib.load(path, mmap=False)
+        if not isinstance(image, nib.Nifti1Pair | nib.MGHImage):
+            raise InputError(
+                f"{path}: {type(image).__name__} is not a format for labels; convert it to NIfTI",
+                reason="unreadable-image",
+            )
+        data = np.asanyarray(image.dataobj)
+        affine = np.asarray(image.affine, dtype=np.float64)
+    except _READ_ERRORS as error:
+        message = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(
+            f"{path}: cannot be read as an image ({message}); copy or make the file again",
+            reason="unreadable-image",
+        ) from error
+    while data.ndim > 3 and data.shape[-1] == 1:  # noqa: PLR2004 (space has three dimensions)
+        data = data[..., 0]
+    if data.ndim != 3:  # noqa: PLR2004
+        raise InputError(
+            f"{path}: has shape {' x '.join(map(str, data.shape))}, but labels are one 3-D volume; "
+            "extract the volume",
+            reason="not-3d",
+        )
+    _check_affine(image, affine, path)
+    return data, affine
+
+
+def _check_affine(image: Any, affine: NDArray[np.float64], path: Path) -> None:  # noqa: ANN401 (nibabel's classes are untyped)
+    linear = affine[:3, :3]
+    no_orientation = isinstance(image, nib.Nifti1Pair) and not (
+        int(image.header["sform_code"]) or int(image.header["qform_code"])
+    )
+    if no_orientation:
+        raise InputError(
+            f"{path}: the header has neither an sform nor a qform, so left and right are unknown; "
+            "copy the orientation from the image that was segmented",
+            reason="bad-affine",
+        )
+    if not np.isfinite(affine).all():
+        raise InputError(
+            f"{path}: the affine contains NaN or infinity; repair the header",
+            reason="bad-affine",
+        )
+    sizes = np.linalg.norm(linear, axis=0)
+    volume = abs(np.linalg.det(linear))
+    # Relative, so that small voxels are not mistaken for flat ones.
+    if volume <= 1e-6 * np.prod(sizes):
+        raise InputError(
+            f"{path}: the affine is singular (its axes lie in one plane); repair the header",
+            reason="bad-affine",
+        )
+    if sizes.min() < VOXEL_SIZES[0] or sizes.max() > VOXEL_SIZES[1]:
+        raise InputError(
+            f"{path}: voxels of {' x '.join(f'{size:.3g}' for size in sizes)} mm are outside of "
+            f"{VOXEL_SIZES[0]} to {VOXEL_SIZES[1]} mm; check the header's units",
+            reason="bad-voxel-size",
+        )
+
+
+def _bounding_box(
+    inside: NDArray[np.bool_], path: Path, affine: NDArray[np.float64] | None = None
+) -> _Box:
+    """Find the box round all true voxels; with an affine, add the margin."""
+    if not inside.any():
+        raise InputError(
+            f"{path}: all labels are zero; check that the segmentation finished",
+            reason="empty-labels",
+        )
+    # Each axis is projected on its own; ranges of indices are all that is kept.
+    hits = [np.flatnonzero(inside.any(axis=axes)) for axes in ((1, 2), (0, 2), (0, 1))]
+    extra = np.zeros(3, dtype=int)
+    if affine is not None:
+        extra = np.ceil(MARGIN / np.linalg.norm(affine[:3, :3], axis=0)).astype(int)
+    first, second, third = (
+        slice(max(int(hit[0] - pad), 0), min(int(hit[-1] + pad) + 1, size))
+        for hit, pad, size in zip(hits, extra, inside.shape, strict=True)
+    )
+    return first, second, third
+
+
+def _integers(data: NDArray[Any], path: Path) -> NDArray[np.integer[Any]]:
+    """Convert labels to integers, if they are whole numbers."""
+    if np.issubdtype(data.dtype, np.integer):
+        return data
+    whole = np.issubdtype(data.dtype, np.floating) and bool(
+        (
+            np.isfinite(data) & (data == np.rint(data)) & (np.abs(data) < np.iinfo(np.int32).max)
+        ).all()
+    )
+    if not whole:
+        raise InputError(
+            f"{path}: labels are not whole numbers; was it resampled with interpolation? "
+            "Use nearest neighbor",
+            reason="non-integer-labels",
+        )
+    return data.astype(np.int32)
+
+
+def _one_hemisphere(
+    codes: NDArray[np.integer[Any]], item: HemisphereInput, path: Path
+) -> NDArray[np.integer[Any]]:
+    """Keep one hemisphere's labels of a file that carries both, without the offset."""
+    if not item.bilateral:
+        return codes
+    offset = item.scheme.right_offset
+    own = codes > offset if item.code_offset else (codes > 0) & (codes < offset)
+    if not own.any():
+        raise InputError(
+            f"{path}: no labels of hemisphere {item.hemi} in this file of both hemispheres",
+            reason="empty-labels",
+        )
+    return np.where(own, codes - np.asarray(item.code_offset, codes.dtype), 0)
+
+
+def _translate(
+    codes: NDArray[np.integer[Any]], scheme: Scheme, path: Path
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Translate codes; on failure name the file and the protocols that would fit."""
+    try:
+        return translate(codes, scheme)
+    except SchemeError as error:
+        values = frozenset(np.unique(codes[codes != 0]).tolist())
+        fitting = [name for name in scheme_names() if load_scheme(name).fits(values)]
+        hint = f"; the labels fit {' and '.join(fitting)}" if fitting else ""
+        raise SchemeError(f"{path}: {error}{hint}", reason=error.reason) from error
+
+
+def _shift(affine: NDArray[np.float64], start: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Give the affine of a crop that begins at a voxel index."""
+    moved = affine.copy()
+    moved[:3, 3] += affine[:3, :3] @ start
+    return moved
