@@ -1,6 +1,26 @@
-"""Analytic hippocampal bodies with known truth."""
+"""Analytic hippocampal bodies with known truth, and synthetic datasets of them."""
 
+from hipsta_bids.phantom.dataset import (
+    TRUTH_TABLE,
+    Hemisphere,
+    rigid_motion,
+    write_dataset,
+    write_demo_dataset,
+)
+from hipsta_bids.phantom.labels import encode
 from hipsta_bids.phantom.phantom import Phantom
 from hipsta_bids.phantom.spec import KINDS, PhantomSpec
+from hipsta_bids.phantom.truth import PhantomTruth
 
-__all__ = ["KINDS", "Phantom", "PhantomSpec"]
+__all__ = [
+    "KINDS",
+    "TRUTH_TABLE",
+    "Hemisphere",
+    "Phantom",
+    "PhantomSpec",
+    "PhantomTruth",
+    "encode",
+    "rigid_motion",
+    "write_dataset",
+    "write_demo_dataset",
+]

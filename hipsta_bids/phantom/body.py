@@ -151,22 +151,24 @@ class Body:
         return np.column_stack([-medial, superior]), w
 
     def _refuse_folds(self) -> None:
-        """Refuse a wall that is thicker than twice its smallest radius of curvature."""
-        u = np.linspace(0.0, 1.0, 1001)
-        section = np.abs(self.curve.curvature(u * self.spec.width)).max()
-        reach = self.curve.position(u * self.spec.width)[:, 0]
-        medial = np.max(-np.sign(self.spec.bend) * reach) + self.thickest / 2.0
-        if section * self.thickest / 2.0 >= 1.0:
+        """Refuse a wall or an axis that is bent more sharply than its own extent allows."""
+        spec = self.spec
+        s = np.linspace(0.0, spec.width, 1001)
+        sharpest = np.abs(self.curve.curvature(s)).max()
+        if sharpest * self.thickest / 2.0 >= 1.0:
             raise SettingsError(
                 f"phantom: the wall folds: half its thickness of up to {self.thickest:g} mm "
-                f"reaches the smallest radius of curvature, {1.0 / section:.2f} mm; "
+                f"reaches the smallest radius of curvature, {1.0 / sharpest:.2f} mm; "
                 "make it thinner or bend it less",
                 reason="phantom-folds",
             )
-        if abs(self.spec.bend) * medial >= 1.0:
+        inward = np.max(-np.sign(spec.bend) * self.curve.position(s)[:, 0]) + self.thickest / 2.0
+        turned = abs(spec.bend) * (spec.length + 2.0 * spec.end_length)
+        if abs(spec.bend) * inward >= 1.0 or turned >= np.pi:
             raise SettingsError(
-                f"phantom: the long axis bends too sharply ({self.spec.bend:g} 1/mm) for a cross-"
-                f"section that reaches {medial:.1f} mm towards its center; bend it less",
+                f"phantom: the long axis bends too sharply ({spec.bend:g} 1/mm) for a cross-"
+                f"section that reaches {inward:.1f} mm towards its center and a length of "
+                f"{spec.length + 2.0 * spec.end_length:g} mm with head and tail; bend it less",
                 reason="phantom-folds",
             )
 

@@ -4,8 +4,10 @@ import numpy as np
 
 from hipsta_bids.artifacts import Float, LabelVolume
 from hipsta_bids.phantom.body import Body
-from hipsta_bids.phantom.labels import draw, make_grid
+from hipsta_bids.phantom.grid import make_grid
+from hipsta_bids.phantom.labels import draw, subfield_at
 from hipsta_bids.phantom.spec import PhantomSpec
+from hipsta_bids.phantom.truth import SURFACES, PhantomTruth, mean_curvature, summarize
 from hipsta_bids.schemes import Scheme
 
 
@@ -81,6 +83,36 @@ class Phantom:
         part = np.array([0, *(label.part for label in scheme.labels)], dtype=np.uint8)
         return LabelVolume(
             tissue=tissue[labels], part=part[labels], affine=grid.affine, scheme=scheme
+        )
+
+    def truth(
+        self, u: Float, v: Float, *, hemi: str = "L", pose: Float | None = None
+    ) -> PhantomTruth:
+        """Tell what a perfect method would measure.
+
+        Parameters
+        ----------
+        u, v : arrays that broadcast
+            Positions on the sheet, each from 0 to 1: medial to lateral in equal arc length of
+            the mid-curve, posterior to anterior.
+        hemi, pose
+            As in :meth:`label_volume`; they move the points and nothing else.
+
+        Raises
+        ------
+        SettingsError
+            If ``hemi`` is unknown or ``pose`` is not rigid.
+        """
+        u, v = np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64))
+        bent = {name: mean_curvature(self.body, u, v, at=at) for name, at in SURFACES.items()}
+        return PhantomTruth(
+            thickness=self.body.thickness(u, v),
+            points=self.body.place(u, v, np.zeros_like(u), hemi=hemi, pose=pose),
+            curvature_interior=bent["interior"],
+            curvature=bent["mid"],
+            curvature_exterior=bent["exterior"],
+            subfield=subfield_at(u),
+            summary=summarize(self.body),
         )
 
     def _outline(self, hemi: str, pose: Float | None) -> Float:

@@ -71,6 +71,8 @@ class PhantomSpec:
             limits = _LIMITS.get(field.name)
             if limits is not None:
                 _check_range(field.name, getattr(self, field.name), *limits)
+        for value in self.curvature or ():
+            _check_range("curvature", value, -10.0, 10.0)
         thinnest = self.thickness * (1.0 - self.variation)
         if self.layer_thickness >= thinnest:
             raise SettingsError(

@@ -1,0 +1,258 @@
+"""Synthetic BIDS datasets: segmentations of phantoms, laid out as other tools do, and the truth."""
+
+import gzip
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import nibabel as nib
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hipsta_bids import __version__
+from hipsta_bids.artifacts import Float, LabelVolume
+from hipsta_bids.bids import files
+from hipsta_bids.errors import SettingsError
+from hipsta_bids.phantom.labels import encode
+from hipsta_bids.phantom.phantom import Phantom
+from hipsta_bids.phantom.spec import PhantomSpec
+from hipsta_bids.schemes import load_scheme
+
+#: Name of the table of true values, at the top of the dataset.
+TRUTH_TABLE = "phantom_truth.tsv"
+
+BIDS_VERSION = "1.11.0"
+
+#: Columns of the truth table: definition and unit.
+TRUTH_COLUMNS: Mapping[str, tuple[str, str | None]] = MappingProxyType(
+    {
+        "subject": ("subject, with its sub- prefix", None),
+        "hemi": ("L or R", None),
+        "kind": ("shape of the cross-section", None),
+        "thickness_mean": ("mean thickness over the sheet, uniform in both its axes", "mm"),
+        "extent_x": ("arc length of the mid-curve, medial to lateral", "mm"),
+        "extent_y": ("mean length of the mid-surface, posterior to anterior", "mm"),
+        "extent_z": ("mean thickness, interior to exterior", "mm"),
+        "volume": ("volume of the sheet", "mm^3"),
+        "area_interior": ("area of the interior surface", "mm^2"),
+        "area_mid": ("area of the mid-surface", "mm^2"),
+        "area_exterior": ("area of the exterior surface", "mm^2"),
+    }
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """How a tool names and encodes its segmentations."""
+
+    scheme: str
+    """Bundled protocol."""
+    path: str
+    """Of one hemisphere, below the tool's folder."""
+    sides: Mapping[str, str]
+    """How the tool spells L and R."""
+
+
+#: Tools whose folders can be imitated; the name is that of the folder in ``derivatives``.
+LAYOUTS: Mapping[str, Layout] = MappingProxyType(
+    {
+        "freesurfer": Layout(
+            scheme="freesurfer",
+            path="{subject}/mri/{side}.hippoAmygLabels-T1.v22.mgz",
+            sides={"L": "lh", "R": "rh"},
+        ),
+        "ashs": Layout(
+            scheme="ashsABC3T",
+            path="{subject}/final/{subject}_{side}_lfseg_corr_usegray.nii.gz",
+            sides={"L": "left", "R": "right"},
+        ),
+    }
+)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Hemisphere:
+    """One phantom of a dataset."""
+
+    subject: str
+    """Label without ``sub-``."""
+    hemi: str
+    """``L`` or ``R``."""
+    spec: PhantomSpec
+    pose: Float | None = None
+    """(4, 4) rigid motion in RAS mm."""
+
+
+def write_dataset(
+    out: Path,
+    hemispheres: Sequence[Hemisphere],
+    *,
+    layouts: Sequence[str] = ("freesurfer",),
+    voxel_size: tuple[float, float, float] = (0.4, 0.4, 0.4),
+    axes: str = "LIA",
+    supersample: int | tuple[int, int, int] = 1,
+) -> None:
+    """Write phantoms as a BIDS dataset with derivatives and a table of the truth.
+
+    The same input gives the same bytes. Existing files of the same name are replaced.
+
+    Parameters
+    ----------
+    out : Path
+        Top folder; made if need be.
+    hemispheres : sequence of Hemisphere
+        What to write.
+    layouts : sequence of str
+        Any of ``LAYOUTS``; each gets its own folder in ``derivatives``.
+    voxel_size, axes, supersample
+        See :meth:`Phantom.label_volume`.
+
+    Raises
+    ------
+    SettingsError
+        If a layout is unknown or a phantom impossible.
+    OutputError
+        If a file cannot be written.
+    """
+    unknown = [name for name in layouts if name not in LAYOUTS]
+    if unknown:
+        raise SettingsError(
+            f"phantom: layout {unknown[0]!r} is unknown; choose from {', '.join(LAYOUTS)}",
+            reason="phantom-setting",
+        )
+    truth = []
+    for item in hemispheres:
+        phantom = Phantom(item.spec)
+        truth.append(_truth_row(item, phantom))
+        for name in layouts:
+            layout = LAYOUTS[name]
+            volume = phantom.label_volume(
+                load_scheme(layout.scheme),
+                hemi=item.hemi,
+                pose=item.pose,
+                voxel_size=voxel_size,
+                axes=axes,
+                supersample=supersample,
+            )
+            place = layout.path.format(subject=f"sub-{item.subject}", side=layout.sides[item.hemi])
+            _write_image(out / "derivatives" / name / place, volume)
+    _write_tables(out, hemispheres, truth)
+    _write_descriptions(out, layouts)
+
+
+def write_demo_dataset(out: Path) -> None:
+    """Write a dataset of two subjects in FreeSurfer's layout: four shapes, 1.6 to 2.2 mm thick.
+
+    Parameters
+    ----------
+    out : Path
+        Top folder; made if need be. The truth is in ``phantom_truth.tsv`` there.
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written.
+    """
+    shapes = {
+        ("demo1", "L"): PhantomSpec(kind="spiral", thickness=1.6),
+        ("demo1", "R"): PhantomSpec(kind="spiral", thickness=2.0, variation=0.2),
+        ("demo2", "L"): PhantomSpec(kind="arc", thickness=2.2, width=18.85, bend=0.01),
+        ("demo2", "R"): PhantomSpec(kind="tight", thickness=1.8, layer_thickness=0.5),
+    }
+    poses = {
+        "demo1": rigid_motion((4.0, -3.0, 2.0), (1.3, -2.1, 0.7)),
+        "demo2": rigid_motion((-5.0, 2.0, -4.0), (-0.6, 3.4, 5.2)),
+    }
+    write_dataset(
+        out,
+        [
+            Hemisphere(subject=subject, hemi=hemi, spec=spec, pose=poses[subject])
+            for (subject, hemi), spec in shapes.items()
+        ],
+    )
+
+
+def rigid_motion(degrees: tuple[float, float, float], shift: tuple[float, float, float]) -> Float:
+    """Make a (4, 4) rigid motion: turns about R, A and S in this order, then a shift in mm."""
+    motion = np.eye(4)
+    motion[:3, :3] = Rotation.from_euler("xyz", degrees, degrees=True).as_matrix()
+    motion[:3, 3] = shift
+    return motion
+
+
+def _truth_row(item: Hemisphere, phantom: Phantom) -> dict[str, str]:
+    values = phantom.truth(np.array(0.5), np.array(0.5)).summary
+    row = {"subject": f"sub-{item.subject}", "hemi": item.hemi, "kind": item.spec.kind}
+    return row | {name: f"{value:.4f}" for name, value in values.items()}
+
+
+def _write_image(path: Path, volume: LabelVolume) -> None:
+    """Write codes as a compressed MGH or NIfTI image, as the name says."""
+    codes = encode(volume)
+    image: Any
+    if path.suffix == ".mgz":
+        image = nib.MGHImage(codes, volume.affine)
+    else:
+        image = nib.Nifti1Image(codes.astype(np.int16), volume.affine)
+        image.header.set_xyzt_units("mm")
+    # Without a time stamp, so that writing the same phantom again does not look like new input.
+    files.write_bytes(path, gzip.compress(image.to_bytes(), compresslevel=6, mtime=0))
+
+
+def _write_tables(
+    out: Path, hemispheres: Sequence[Hemisphere], truth: Sequence[Mapping[str, str]]
+) -> None:
+    files.write_tsv(
+        out / TRUTH_TABLE, list(TRUTH_COLUMNS), [[row[c] for c in TRUTH_COLUMNS] for row in truth]
+    )
+    sidecar: dict[str, Any] = {
+        name: {"Description": text} | ({"Units": unit} if unit else {})
+        for name, (text, unit) in TRUTH_COLUMNS.items()
+    }
+    sidecar["Specifications"] = {
+        f"sub-{item.subject}_hemi-{item.hemi}": asdict(item.spec) for item in hemispheres
+    }
+    files.write_json((out / TRUTH_TABLE).with_suffix(".json"), sidecar)
+    files.write_text(out / ".bidsignore", "phantom_truth.*\n")
+    subjects = dict.fromkeys(f"sub-{item.subject}" for item in hemispheres)
+    files.write_tsv(out / "participants.tsv", ["participant_id"], [[name] for name in subjects])
+    files.write_json(
+        out / "participants.json",
+        {"participant_id": {"Description": "synthetic subject; there is no image behind it"}},
+    )
+
+
+def _write_descriptions(out: Path, layouts: Sequence[str]) -> None:
+    files.write_text(out / "README", _README)
+    files.write_json(
+        out / "dataset_description.json",
+        {
+            "Name": "Synthetic hippocampal bodies with known thickness",
+            "BIDSVersion": BIDS_VERSION,
+            "DatasetType": "raw",
+        },
+    )
+    for name in layouts:
+        # Not made by us as far as finding inputs goes, which passes over its own outputs.
+        maker = {
+            "Name": "phantom",
+            "Version": __version__,
+            "Description": f"Analytic shapes in the labels and folders of {name}",
+        }
+        files.write_json(
+            out / "derivatives" / name / "dataset_description.json",
+            {
+                "Name": f"Synthetic segmentations in the layout of {name}",
+                "BIDSVersion": BIDS_VERSION,
+                "DatasetType": "derivative",
+                "GeneratedBy": [maker],
+            },
+        )
+
+
+_README = """\
+Synthetic hippocampal bodies: analytic shapes drawn as segmentations, nobody's brain.
+The exact thickness, extents, areas and volume of each are in phantom_truth.tsv.
+"""
