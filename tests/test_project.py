@@ -1,0 +1,207 @@
+"""Guards for what no single module owns: locks, documents, and their agreement with the code."""
+
+import ast
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+import yaml
+
+import hipsta_bids
+from hipsta_bids.bids.names import DATASET_FILES, OUTPUTS, HemisphereName, output_name
+from hipsta_bids.errors import ExitCode
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+LOCKS = ("requirements.lock", "requirements-dev.lock")
+
+
+def canonical(requirement: str) -> str:
+    """Reduce a requirement to the name of its package, as PEP 503 spells it."""
+    match = re.match(r"[A-Za-z0-9._-]+", requirement)
+    assert match is not None
+    return re.sub(r"[-_.]+", "-", match.group()).lower()
+
+
+def locked(name: str) -> dict[str, str]:
+    """Version and marker by package, as one text, from a lock."""
+    lines = (ROOT / name).read_text(encoding="utf-8").splitlines()
+    entries = [line.removesuffix(" \\").split("==", 1) for line in lines if "==" in line[:60]]
+    return {package: rest for package, rest in entries if re.match(r"[a-z0-9]", package)}
+
+
+def tracked_files() -> list[Path]:
+    """All text files under version control, or to be."""
+    git = shutil.which("git")
+    if git is None or not (ROOT / ".git").exists():
+        pytest.skip("not a clone: there is no list of tracked files")
+    listed = subprocess.run(
+        [git, "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
+        text=True,
+    ).stdout
+    paths = [ROOT / name for name in listed.split("\0") if name]
+    return [path for path in paths if path.is_file() and path.suffix != ".png"]
+
+
+@pytest.mark.parametrize(
+    ("lock", "requirements"),
+    [
+        ("requirements.lock", PROJECT["dependencies"]),
+        (
+            "requirements-dev.lock",
+            [*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["dev"]],
+        ),
+    ],
+)
+def test_lock_covers_every_dependency(lock, requirements):
+    missing = {canonical(requirement) for requirement in requirements} - locked(lock).keys()
+    assert not missing, f"run `make lock`: {lock} lacks {sorted(missing)}"
+
+
+@pytest.mark.parametrize("lock", LOCKS)
+def test_lock_has_a_hash_for_every_package_and_no_address(lock):
+    text = (ROOT / lock).read_text(encoding="utf-8")
+    entries = re.split(r"\n(?=[a-z0-9])", text)[1:]
+    assert len(entries) == len(locked(lock))
+    assert all("--hash=sha256:" in entry for entry in entries)
+    assert "://" not in text
+    assert not re.search(r"^\s*-+(index|find|extra)", text, re.MULTILINE)
+
+
+def test_every_import_is_a_declared_dependency():
+    distributions = {"bids": "pybids", "skimage": "scikit-image"}
+    declared = {canonical(requirement) for requirement in PROJECT["dependencies"]}
+    trees = (
+        ast.parse(path.read_text(encoding="utf-8")) for path in (ROOT / "hipsta_bids").rglob("*.py")
+    )
+    nodes = [node for tree in trees for node in ast.walk(tree)]
+    names = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    names |= {node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)}
+    packages = {name.split(".")[0] for name in names} - sys.stdlib_module_names - {"hipsta_bids"}
+    assert {distributions.get(name, name) for name in packages} <= declared
+
+
+def test_both_locks_hold_the_same_versions():
+    run, dev = (locked(lock) for lock in LOCKS)
+    assert run.items() <= dev.items()
+
+
+def test_no_machine_paths_or_package_hosts():
+    # Spelled in pieces, or this file would find itself.
+    personal = "|".join(["/home" + "/", "/root" + "/", "/Users" + "/", "/work" + "/"])
+    hosts = "|".join(["pypi" + r"\.org", "python" + r"hosted", "anaconda" + r"\.org"])
+    pattern = re.compile(rf"(?<![\w.~*$)}}-])(?:{personal})|{hosts}")
+    found = [
+        f"{path.relative_to(ROOT)}:{number}: {line.strip()}"
+        for path in tracked_files()
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1)
+        if pattern.search(line)
+    ]
+    assert not found, "\n".join(found)
+
+
+def test_no_segmentations_or_other_large_files_are_tracked():
+    limit = 500_000  # bytes; the larger lock has 190 kB
+    large = [path.name for path in tracked_files() if path.stat().st_size > limit]
+    images = [path.name for path in tracked_files() if path.name.endswith((".mgz", ".nii.gz"))]
+    assert not large
+    assert not images
+
+
+def test_license_is_whole():
+    text = (ROOT / "LICENSE").read_text(encoding="utf-8")
+    assert "GNU AFFERO GENERAL PUBLIC LICENSE\n                       Version 3" in text
+    assert "\n  17. Interpretation of Sections 15 and 16.\n" in text
+    assert text.rstrip().endswith("<https://www.gnu.org/licenses/>.")
+
+
+def test_changelog_names_this_version():
+    changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert f"\n## [{hipsta_bids.__version__}]" in changelog
+
+
+def test_citation_file_is_complete_and_up_to_date():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    # What the schema of version 1.2.0 requires.
+    assert {"cff-version", "message", "title", "authors"} <= citation.keys()
+    assert citation["cff-version"] == "1.2.0"
+    assert str(citation["version"]) == hipsta_bids.__version__
+    assert citation["license"] == PROJECT["license"]
+    assert all({"type", "title", "authors"} <= entry.keys() for entry in citation["references"])
+
+
+def test_readme_lists_the_exit_codes():
+    section = README.split("### Exit codes")[1].split("\n## ")[0]
+    codes = {int(code) for cell in re.findall(r"^\| ([\d, ]+) \|", section, re.MULTILINE)
+             for code in cell.split(", ")}  # fmt: skip
+    signals = {128 + 2, 128 + 15}  # SIGINT and SIGTERM, as shells report them
+    assert codes == set(ExitCode) | signals
+
+
+def test_readme_lists_the_outputs_of_the_table():
+    name = HemisphereName(subject="X", session=None, hemi="L", seg="P")
+    expected = [output_name(name, output.key).removeprefix(name.stem) for output in OUTPUTS]
+    section = README.split("## Outputs")[1].split("For the whole dataset:")[0]
+    assert re.findall(r"^\| `([^`]+)` \|", section, re.MULTILINE) == expected
+
+
+def test_readme_lists_the_files_of_the_dataset():
+    section = README.split("For the whole dataset:")[1].split("\n### ")[0]
+    listed = {name.rstrip("/") for name in re.findall(r"`([^`]+)`(?=[, ].*\|)", section)}
+    assert listed == set(DATASET_FILES.values())
+
+
+@pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md", "docs/architecture.md"])
+def test_links_lead_somewhere(page):
+    text = (ROOT / page).read_text(encoding="utf-8")
+    targets = re.findall(r"\]\(([^)#]+)", text)
+    local = [target for target in targets if "://" not in target]
+    missing = [target for target in local if not (ROOT / page).parent.joinpath(target).exists()]
+    assert not missing
+
+
+def test_architecture_page_names_each_module():
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    package = ROOT / "hipsta_bids"
+    modules = {path.name for path in package.glob("*.py") if path.name != "__init__.py"}
+    folders = {f"{path.parent.name}/" for path in package.glob("*/__init__.py")}
+    missing = [name for name in sorted(modules | folders) if f"`{name}`" not in page]
+    assert not missing
+
+
+def test_every_top_level_module_has_a_layer():
+    tools = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]
+    contracts = tools["importlinter"]["contracts"]
+    layers = next(contract["layers"] for contract in contracts if contract["type"] == "layers")
+    named = {module for layer in layers for module in layer.replace(":", "|").split(" | ")}
+    package = ROOT / "hipsta_bids"
+    files = {path.stem for path in package.glob("*.py")} - {"__init__"}
+    folders = {path.parent.name for path in package.glob("*/__init__.py")}
+    assert {f"hipsta_bids.{name}" for name in files | folders} == named
+
+
+def test_every_setting_says_what_it_means():
+    path = ROOT / "hipsta_bids" / "settings.py"
+    classes = [
+        node
+        for node in ast.parse(path.read_text(encoding="utf-8")).body
+        if isinstance(node, ast.ClassDef)
+    ]
+    assert {node.name for node in classes} > {"Settings"}
+    undocumented = [
+        f"{node.name}.{field.target.id}"
+        for node in classes
+        if node.name != "Settings"
+        for field, after in zip(node.body, [*node.body[1:], None], strict=True)
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
+        if not (isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant))
+    ]
+    assert not undocumented
