@@ -22,11 +22,12 @@ help:
 env: $(STAMP)
 
 $(STAMP): requirements-dev.lock pyproject.toml
-	@"$(PYTHON)" -c '$(USABLE)' >/dev/null 2>&1 || { echo "hipsta_bids needs Python 3.11 or newer\
-	 with its venv module (on Debian and Ubuntu: the package python3-venv). None was found;\
-	 name one with: make PYTHON=/path/to/python3 ..." >&2; exit 1; }
+	@"$(BIN)/python" -c '$(USABLE)' >/dev/null 2>&1 || "$(PYTHON)" -c '$(USABLE)' >/dev/null 2>&1 \
+	|| { echo "hipsta_bids needs Python 3.11 or newer with its venv module (on Debian and Ubuntu:\
+	 the package python3-venv). None was found; name one with:\
+	 make PYTHON=/path/to/python3 ..." >&2; exit 1; }
 	@echo "Making the environment in $(VENV) from requirements-dev.lock (some minutes at first)"
-	"$(PYTHON)" -m venv "$(VENV)"
+	@"$(BIN)/python" -c '$(USABLE)' >/dev/null 2>&1 || "$(PYTHON)" -m venv --clear "$(VENV)"
 	"$(BIN)/python" -m pip install -qq --disable-pip-version-check --require-hashes \
 		-r requirements-dev.lock
 	"$(BIN)/python" -m pip install -qq --disable-pip-version-check --no-deps \
