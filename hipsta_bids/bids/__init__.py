@@ -1,0 +1,1 @@
+"""The dataset side: finds inputs, opens images, spells output names, writes files."""
