@@ -50,13 +50,20 @@ def _from_index(bids_dir: Path, database_dir: Path) -> frozenset[str]:
             validate=False,
             derivatives=False,
             database_path=database_dir,
-            is_derivative=not (bids_dir / "dataset_description.json").exists(),
             indexer=BIDSLayoutIndexer(validate=False, index_metadata=False, ignore=_IGNORED),
         )
-        return frozenset(layout.get_subjects())
+        made_for = Path(layout.root)
+        subjects = frozenset(layout.get_subjects())
     except (OSError, ValueError, TypeError, SQLAlchemyError) as error:
+        first_line = str(error).partition("\n")[0]
         raise InputError(
-            f"{database_dir}: pybids cannot use this database ({' '.join(str(error).split())}); "
+            f"{database_dir}: pybids cannot use this database ({first_line}); "
             "give an empty folder, and it will be made",
             reason="unreadable-database",
         ) from error
+    if made_for.resolve() != bids_dir.resolve():
+        raise InputError(
+            f"{database_dir}: this database was made for {made_for}; give an empty folder",
+            reason="unreadable-database",
+        )
+    return subjects

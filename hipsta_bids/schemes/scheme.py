@@ -128,12 +128,12 @@ def translate(
             "right, copy its TOML file, add the labels, and pass it with --scheme",
             reason="unknown-labels",
         )
-    wanted = scheme.sheet or tuple(Tissue)[1:]
-    if not (occurs & np.isin(tissues, wanted)).any():
+    wanted = np.isin(tissues, scheme.sheet) if scheme.sheet else parts != Part.UNKNOWN
+    if not (occurs & wanted).any():
         found = np.unique(codes[codes != 0])
         raise SchemeError(
-            f"no label of the sheet of {scheme.name} occurs (found {_some(found)}): "
-            "another protocol was used",
+            f"no label of {'the sheet' if scheme.sheet else 'a part'} of {scheme.name} occurs "
+            f"(found {_some(found)}): another protocol was used",
             reason="wrong-scheme",
         )
     return tissues[rows], parts[rows]
