@@ -28,6 +28,10 @@ PITCH = 0.45
 #: rad, largest deviation from orthogonality in a pose.
 _RIGID_TOLERANCE = 1e-6
 
+#: mm of arc length within which two places of the mid-curve are the same: above the accuracy of
+#: projection, below what a voxel can show.
+_SAME_PLACE = 0.02
+
 
 class Body:
     """The shape of a phantom, without labels.
@@ -175,21 +179,19 @@ class Body:
     def _refuse_overlap(self) -> None:
         """Refuse a wall of which one turn runs into another.
 
-        Two walls overlap exactly if, from a boundary point of one, some place of the mid-curve is
-        nearer than its own.
+        Two turns overlap exactly if, from a boundary point of one, some other place of the
+        mid-curve is nearer than its own, or as near where they coincide.
         """
         u, v = np.meshgrid(np.linspace(0.0, 1.0, 801), np.linspace(0.0, 1.0, 5), indexing="ij")
         half = self.thickness(u, v).ravel() / 2.0
         s = u.ravel() * self.spec.width
         for side in (-1.0, 1.0):
             boundary = self.curve.position(s) + side * half[:, None] * self.curve.normal(s)
-            nearest = self.curve.distance(boundary)
-            worst = int(np.argmin(nearest - half))
-            if nearest[worst] < half[worst] - 1e-6:  # mm, far above rounding
+            astray = np.abs(self.curve.foot(boundary) - s) > _SAME_PLACE
+            if astray.any():
                 raise SettingsError(
-                    "phantom: turns of the wall overlap near "
-                    f"u = {s[worst] / self.spec.width:.2f}; make it thinner, narrower or bend it "
-                    "less",
+                    f"phantom: turns of the wall overlap near u = {u.ravel()[astray][0]:.2f}; "
+                    "make it thinner, narrower or bend it less",
                     reason="phantom-overlap",
                 )
 

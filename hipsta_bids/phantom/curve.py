@@ -115,11 +115,10 @@ class MidCurve:
         n[near[keep]] = across[keep]
         return s, n
 
-    def distance(self, points: Float) -> Float:
-        """Distance (N,) in mm of points (N, 2) from the curve, its end points included."""
+    def foot(self, points: Float) -> Float:
+        """Arc length (N,), mm, of the nearest place to points (N, 2), the ends included."""
         nearest = np.asarray(self._tree.query(points)[1])
-        foot = self._refine(points, self._seeds[nearest])
-        return np.asarray(np.linalg.norm(points - self.position(foot), axis=1))
+        return self._refine(points, self._seeds[nearest])
 
     def _refine(self, points: Float, s: Float) -> Float:
         """Newton steps on (point - curve) . tangent = 0, from starts within half a seed step."""

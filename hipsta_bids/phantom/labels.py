@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hipsta_bids.artifacts import Bool, Float, Int, LabelVolume
-from hipsta_bids.errors import SchemeError
+from hipsta_bids.errors import SchemeError, SettingsError
 from hipsta_bids.phantom.body import Body
 from hipsta_bids.phantom.grid import Grid
 from hipsta_bids.schemes import Label, Part, Scheme, Tissue
@@ -74,15 +74,21 @@ def draw(
 
     Raises
     ------
+    SettingsError
+        If there is nothing to sample.
     SchemeError
         If the protocol has no label for a tissue of the sheet.
     """
+    counts = np.broadcast_to(np.asarray(supersample, dtype=int), 3)
+    if (counts < 1).any():
+        raise SettingsError(
+            f"phantom: supersample must be 1 or more, not {supersample}", reason="phantom-setting"
+        )
     table = _label_table(scheme)
     index = np.indices(grid.shape).reshape(3, -1).T.astype(np.float64)
     codes = np.concatenate(
         [table[_regions(body, part, grid, hemi, pose)] for part in _chunks(index, 1)]
     ).reshape(grid.shape)
-    counts = np.broadcast_to(np.asarray(supersample, dtype=int), 3)
     if (counts > 1).any():
         offsets = _sub_voxels(counts)
         mixed = np.argwhere(_near_borders(codes)).astype(np.float64)
