@@ -101,11 +101,15 @@ def _participant(options: "Namespace") -> ExitCode:
     _check_folders(options)
     settings = load_settings(options.settings)
     from hipsta_bids.bids.dataset import (  # noqa: PLC0415  (heavy)
+        dataset_notes,
         find_hemispheres,
         selection_table,
     )
 
-    items = find_hemispheres(_request(options))
+    request = _request(options)
+    items = find_hemispheres(request)
+    for note in dataset_notes(request, items):
+        say(f"note: {note}")
     if options.dry_run:
         say_table(selection_table(items))
         return ExitCode.OK
@@ -200,7 +204,7 @@ def _one_folder(arguments: list[str], command: str) -> Path:
 
 def _schemes(arguments: list[str]) -> ExitCode:
     _no_arguments(arguments, "schemes")
-    from hipsta_bids.bids.dataset import scheme_table  # noqa: PLC0415  (heavy)
+    from hipsta_bids.schemes import scheme_table  # noqa: PLC0415  (heavy)
 
     say_table(scheme_table())
     return ExitCode.OK
