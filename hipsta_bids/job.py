@@ -245,7 +245,6 @@ def hash_inputs(job: Job) -> tuple[str, list[dict[str, str]]]:
             [int(tissue) for tissue in group]
             for group in (item.scheme.sheet, item.scheme.layer, item.scheme.interior)
         ],
-        item.code_offset,
-        item.hemi,
+        [item.scheme.unlisted, item.bilateral, item.code_offset, item.hemi],
     ]
     return hashlib.sha256(json.dumps(reading).encode()).hexdigest(), hashes

@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
@@ -279,9 +280,10 @@ def _positive_float(text: str) -> float:
 
 def _gigabytes(text: str) -> float:
     """Read a size as fMRIPrep does: megabytes unless a unit follows."""
-    number = text.upper().removesuffix("B")
-    unit = number[-1:] if number[-1:] in _MEMORY_UNITS else "M"
-    return _positive_float(number.removesuffix(unit)) * _MEMORY_UNITS[unit]
+    match = re.fullmatch(r"(\d+\.?\d*)\s*([KMGT]?)B?", text.strip().upper())
+    if match is None:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a size; write 8000 (MB) or 8G")
+    return _positive_float(match[1]) * _MEMORY_UNITS[match[2] or "M"]
 
 
 def _processors() -> int:
