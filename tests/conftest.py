@@ -1,0 +1,1 @@
+"""Makes the stand-ins beside it importable from every folder of tests."""
