@@ -7,7 +7,9 @@ from typing import Any
 import nibabel as nib
 import numpy as np
 from nibabel.filebasedimages import ImageFileError
+from nibabel.openers import ImageOpener
 from nibabel.spatialimages import HeaderDataError
+from nibabel.wrapstruct import WrapStructError
 from numpy.typing import NDArray
 
 from hipsta_bids.artifacts import LabelVolume
@@ -30,10 +32,12 @@ _READ_ERRORS = (
     OSError,
     EOFError,
     ValueError,
+    KeyError,
     OverflowError,
     zlib.error,
     ImageFileError,
     HeaderDataError,
+    WrapStructError,
 )
 
 _Box = tuple[slice, slice, slice]
@@ -69,7 +73,8 @@ def read_label_volume(item: HemisphereInput) -> LabelVolume:
         raise item.problem
     path, *others = item.files
     data, affine = _open(path)
-    box = _bounding_box(data != 0, path)
+    # A first crop in the type on disk saves memory; it is wide enough for the final one.
+    box = _bounding_box(data != 0, affine, path)
     codes = _one_hemisphere(_integers(data[box], path), item, path)
     shape = data.shape
     del data
@@ -85,7 +90,7 @@ def read_label_volume(item: HemisphereInput) -> LabelVolume:
         _, parts = _translate(_integers(more[box], other), item.parts_scheme or item.scheme, other)
         part = np.where(parts == Part.UNKNOWN, part, parts)
     part = np.where(tissue == Tissue.BACKGROUND, np.uint8(Part.UNKNOWN), part)
-    inner = _bounding_box(~np.isin(tissue, tuple(OUTSIDE)), path, affine)
+    inner = _bounding_box(~np.isin(tissue, tuple(OUTSIDE)), affine, path)
     start = np.array([a.start + b.start for a, b in zip(box, inner, strict=True)])
     return LabelVolume(
         tissue=tissue[inner],
@@ -112,21 +117,19 @@ def label_values(path: Path) -> frozenset[int]:
         As :func:`read_label_volume`.
     """
     data, _ = _open(path)
-    box = _bounding_box(data != 0, path)
-    values = np.unique(_integers(data[box], path))
-    return frozenset(values[values != 0].tolist())
+    values = np.unique(_integers(data[data != 0], path))
+    if not values.size:
+        raise _empty(path)
+    return frozenset(values.tolist())
 
 
 def _open(path: Path) -> tuple[NDArray[Any], NDArray[np.float64]]:
     """Load an image's voxels, in the type on disk, and its affine; check both."""
     try:
-        # keep_file_open=False, mmap=False: no handle outlives this call, wherever it fails.
-        image = nib.load(path, mmap=False)
-        if not isinstance(image, nib.Nifti1Pair | nib.MGHImage):
-            raise InputError(
-                f"{path}: {type(image).__name__} is not a format for labels; convert it to NIfTI",
-                reason="unreadable-image",
-            )
+        # nibabel leaves files open on some of its paths; reading the bytes here does not.
+        with ImageOpener(str(path)) as stream:
+            contents = stream.read()
+        image = _format(path, contents).from_bytes(contents)
         data = np.asanyarray(image.dataobj)
         affine = np.asarray(image.affine, dtype=np.float64)
     except _READ_ERRORS as error:
@@ -145,6 +148,23 @@ def _open(path: Path) -> tuple[NDArray[Any], NDArray[np.float64]]:
         )
     _check_affine(image, affine, path)
     return data, affine
+
+
+def _format(path: Path, contents: bytes) -> type[Any]:
+    """Tell the format by the file's name and, between the versions of NIfTI, its first bytes."""
+    if path.suffix in {".mgz", ".mgh"}:
+        return nib.MGHImage
+    # NIfTI begins with the size of its header, which tells the versions apart.
+    sizes = {int.from_bytes(contents[:4], order) for order in ("little", "big")}
+    newer = nib.Nifti2Header.template_dtype.itemsize in sizes
+    return nib.Nifti2Image if newer else nib.Nifti1Image
+
+
+def _empty(path: Path) -> InputError:
+    return InputError(
+        f"{path}: all labels are zero; check that the segmentation finished",
+        reason="empty-labels",
+    )
 
 
 def _check_affine(image: Any, affine: NDArray[np.float64], path: Path) -> None:  # noqa: ANN401 (nibabel's classes are untyped)
@@ -179,20 +199,14 @@ def _check_affine(image: Any, affine: NDArray[np.float64], path: Path) -> None: 
         )
 
 
-def _bounding_box(
-    inside: NDArray[np.bool_], path: Path, affine: NDArray[np.float64] | None = None
-) -> _Box:
-    """Find the box round all true voxels; with an affine, add the margin."""
+def _bounding_box(inside: NDArray[np.bool_], affine: NDArray[np.float64], path: Path) -> _Box:
+    """Find the box round all true voxels, and add the margin as far as the image goes."""
     if not inside.any():
-        raise InputError(
-            f"{path}: all labels are zero; check that the segmentation finished",
-            reason="empty-labels",
-        )
+        raise _empty(path)
     # Each axis is projected on its own; ranges of indices are all that is kept.
     hits = [np.flatnonzero(inside.any(axis=axes)) for axes in ((1, 2), (0, 2), (0, 1))]
-    extra = np.zeros(3, dtype=int)
-    if affine is not None:
-        extra = np.ceil(MARGIN / np.linalg.norm(affine[:3, :3], axis=0)).astype(int)
+    # Headers keep single precision: 0.4999999 mm voxels are 0.5 mm voxels.
+    extra = np.ceil(MARGIN / np.linalg.norm(affine[:3, :3], axis=0) - 1e-4).astype(int)
     first, second, third = (
         slice(max(int(hit[0] - pad), 0), min(int(hit[-1] + pad) + 1, size))
         for hit, pad, size in zip(hits, extra, inside.shape, strict=True)
