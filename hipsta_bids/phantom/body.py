@@ -14,6 +14,7 @@ scanner
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from hipsta_bids.artifacts import Float
 from hipsta_bids.errors import SettingsError
@@ -86,7 +87,13 @@ class Body:
         return self.spec.thickness * (1.0 + self.spec.variation)
 
     def place(
-        self, u: Float, v: Float, n: Float, *, hemi: str = "L", pose: Float | None = None
+        self,
+        u: ArrayLike,
+        v: ArrayLike,
+        n: ArrayLike,
+        *,
+        hemi: str = "L",
+        pose: Float | None = None,
     ) -> Float:
         """Scanner coordinates (..., 3), RAS mm, of sheet coordinates (u, v, n).
 
@@ -104,10 +111,12 @@ class Body:
         SettingsError
             If ``hemi`` is unknown or ``pose`` is not rigid.
         """
-        u, v, n = np.broadcast_arrays(*(np.asarray(x, np.float64) for x in (u, v, n)))
-        s = u * self.spec.width
-        section = self.curve.position(s) + n[..., None] * self.curve.normal(s)
-        w = (v - 0.5) * self.spec.length
+        across, along, off = np.broadcast_arrays(
+            *(np.asarray(x, dtype=np.float64) for x in (u, v, n))
+        )
+        s = across * self.spec.width
+        section = self.curve.position(s) + off[..., None] * self.curve.normal(s)
+        w = (along - 0.5) * self.spec.length
         rotation, shift = placement(hemi, pose)
         return np.asarray(self._sweep(section, w) @ rotation.T + shift)
 

@@ -1,6 +1,7 @@
 """The phantom itself: a specification that can be drawn and that knows its own truth."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from hipsta_bids.artifacts import Float, LabelVolume
 from hipsta_bids.phantom.body import Body
@@ -86,7 +87,7 @@ class Phantom:
         )
 
     def truth(
-        self, u: Float, v: Float, *, hemi: str = "L", pose: Float | None = None
+        self, u: ArrayLike, v: ArrayLike, *, hemi: str = "L", pose: Float | None = None
     ) -> PhantomTruth:
         """Tell what a perfect method would measure.
 
@@ -103,15 +104,15 @@ class Phantom:
         SettingsError
             If ``hemi`` is unknown or ``pose`` is not rigid.
         """
-        u, v = np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64))
-        bent = {name: mean_curvature(self.body, u, v, at=at) for name, at in SURFACES.items()}
+        x, y = np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64))
+        bent = {name: mean_curvature(self.body, x, y, at=at) for name, at in SURFACES.items()}
         return PhantomTruth(
-            thickness=self.body.thickness(u, v),
-            points=self.body.place(u, v, np.zeros_like(u), hemi=hemi, pose=pose),
+            thickness=self.body.thickness(x, y),
+            points=self.body.place(x, y, 0.0, hemi=hemi, pose=pose),
             curvature_interior=bent["interior"],
             curvature=bent["mid"],
             curvature_exterior=bent["exterior"],
-            subfield=subfield_at(u),
+            subfield=subfield_at(x),
             summary=summarize(self.body),
         )
 

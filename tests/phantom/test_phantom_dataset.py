@@ -87,7 +87,11 @@ def test_the_same_dataset_has_the_same_bytes(tmp_path):
     item = Hemisphere(subject="01", hemi="L", spec=SMALL)
     for name in ("first", "second"):
         write_dataset(tmp_path / name, [item], layouts=tuple(LAYOUTS), voxel_size=COARSE)
-    assert tree(tmp_path / "first") == tree(tmp_path / "second")
+    first = tree(tmp_path / "first")
+    assert first == tree(tmp_path / "second")
+    packed = [content for path, content in first.items() if path.suffix in (".mgz", ".gz")]
+    assert len(packed) == len(LAYOUTS)
+    assert all(content[4:8] == bytes(4) for content in packed)  # gzip's time stamp (RFC 1952)
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
