@@ -129,12 +129,12 @@ class AtlasFinder:
         shared = self._shared
         if shared is not None and (path, hemi) not in self._values:
             # Not opened here; reading it later will fail if its values do not fit.
-            return shared[0], f"atlas from the labels of {shared[1]} other files of the dataset"
+            return shared[0], f"atlas from the labels of {_others(shared[1])}"
         fitting = self._fitting(path, hemi, bilateral=bilateral)
         if len(fitting) == 1:
             return fitting[0], "only this atlas has such labels"
         if shared is not None and shared[0] in fitting:
-            others = f"those of {shared[1]} other files of the dataset only this one"
+            others = f"those of {_others(shared[1])} only this one"
             return shared[0], f"its labels fit {_names(fitting)}, {others}"
         values = ", ".join(map(str, sorted(self._read(path, hemi, bilateral=bilateral))))
         if fitting:
@@ -181,6 +181,10 @@ class AtlasFinder:
 
 def _plain(name: str) -> str:
     return re.sub("[^a-z0-9]", "", name.lower())
+
+
+def _others(count: int) -> str:
+    return f"{count} other file{'' if count == 1 else 's'} of the dataset"
 
 
 def _names(schemes: list[Scheme]) -> str:
