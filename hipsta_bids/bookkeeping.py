@@ -2,6 +2,7 @@
 
 import contextlib
 import logging
+import time
 from collections.abc import Generator, Sequence
 from datetime import UTC, datetime
 from os import getpid
@@ -16,6 +17,7 @@ from hipsta_bids.errors import HipstaError, OutputError
 from hipsta_bids.job import Job, Outcome
 
 _LOG_FORMAT = "%(asctime)s %(levelname)s %(message)s"
+_CHEAP_WRITE = 0.1  # s; quicker writes are never put off
 _LOGGER = logging.getLogger(__name__)
 
 
@@ -55,21 +57,67 @@ def open_books(root: Path, done: Sequence[Outcome], todo: Sequence[Job]) -> None
     update_status(root, rows)
 
 
-def keep_books(outcome: Outcome, root: Path) -> None:
-    """Write one outcome to the table and to the log.
+class Books:
+    """The table and the log, written as hemispheres end.
 
     Parameters
     ----------
-    outcome : Outcome
-        How a hemisphere ended.
     root : Path
         The output dataset.
-
-    Raises
-    ------
-    OutputError
-        If the table cannot be written.
     """
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+        self._pending: list[dict[str, str]] = []
+        self._next_write = 0.0
+
+    def enter(self, outcome: Outcome) -> None:
+        """Write one outcome to the log and to the table.
+
+        Parameters
+        ----------
+        outcome : Outcome
+            How a hemisphere ended.
+
+        Raises
+        ------
+        OutputError
+            If the table cannot be written.
+        """
+        _log(outcome)
+        if outcome.skipped:
+            return
+        self._pending.append(_row(outcome))
+        try:
+            if time.monotonic() >= self._next_write:
+                self.close()
+        except OutputError:
+            if not isinstance(outcome.error, OutputError):
+                raise
+            # The hemisphere's own error says more, and ends the run; the table keeps the row that
+            # calls it not finished.
+            self._pending = []
+
+    def close(self) -> None:
+        """Write what has not been written yet.
+
+        Raises
+        ------
+        OutputError
+            If the table cannot be written.
+        """
+        if not self._pending:
+            return
+        start = time.monotonic()
+        update_status(self._root, self._pending)
+        self._pending = []
+        cost = time.monotonic() - start
+        # Tables of many thousand rows may take a twentieth of the time, not more.
+        wait = 0.0 if cost < _CHEAP_WRITE else 20 * cost
+        self._next_write = time.monotonic() + wait
+
+
+def _log(outcome: Outcome) -> None:
     name = outcome.job.place.name
     title = f"{name.stem}_seg-{name.seg}"
     if outcome.skipped:
@@ -80,12 +128,6 @@ def keep_books(outcome: Outcome, root: Path) -> None:
     _LOGGER.info("%s: %s %s %s", title, outcome.status, outcome.reason or "", outcome.message or "")
     if outcome.trace:
         _LOGGER.error("%s: %s", title, outcome.trace)
-    try:
-        update_status(root, [_row(outcome)])
-    except OutputError:
-        # The error of the hemisphere says more, and it will be reported.
-        if not isinstance(outcome.error, OutputError):
-            raise
 
 
 def _row(outcome: Outcome) -> dict[str, str]:

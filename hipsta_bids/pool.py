@@ -166,6 +166,9 @@ def _poll(slots: list[_Slot], timeout: float) -> list[tuple[_Slot, Any]]:
 
 
 def _lose(slot: _Slot, *, timed_out: bool) -> WorkerLost:
+    if not timed_out:
+        # The pipe breaks a moment before the process ends; its exit code tells more than ours.
+        wait([slot.process.sentinel], _GRACE)
     _kill(slot)
     return WorkerLost(
         timed_out=timed_out,
@@ -204,12 +207,15 @@ def _inherited(plan: WorkerPlan) -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
-        if in_main:
+        if handler is not None:  # none where it was not Python that set it
             signal.signal(signal.SIGINT, handler)
 
 
 def _kill(slot: _Slot) -> None:
-    """End a worker and the helpers it started, which share its process group."""
+    """End a worker and the helpers it started, which share its process group.
+
+    The worker must not have been waited for before: until then its number cannot be another's.
+    """
     with contextlib.suppress(ProcessLookupError, PermissionError, TypeError):
         os.killpg(slot.process.pid, signal.SIGKILL)  # type: ignore[arg-type]  # None: TypeError
     slot.process.kill()
@@ -218,16 +224,14 @@ def _kill(slot: _Slot) -> None:
 
 
 def _stop(slots: list[_Slot]) -> None:
-    """Let idle workers end by themselves, so that they close their helpers; kill busy ones."""
+    """Let idle workers end by themselves, so that they tidy up; then kill all that is left."""
     idle = [slot for slot in slots if slot.ready and slot.job is None]
     for slot in idle:
         slot.connection.close()
     for slot in idle:
-        slot.process.join(_GRACE)
+        wait([slot.process.sentinel], _GRACE)
     for slot in slots:
-        # The number of a worker that has ended may already be another process's.
-        if slot not in idle or slot.process.exitcode is None:
-            _kill(slot)
+        _kill(slot)
     slots.clear()
 
 

@@ -4,7 +4,7 @@ import contextlib
 import logging
 import math
 from collections import Counter
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from hipsta_bids.bids.inputs import HemisphereInput
 from hipsta_bids.bids.names import HemisphereName
 from hipsta_bids.bids.results import ResultPlace
 from hipsta_bids.bids.status import write_sidecar
-from hipsta_bids.bookkeeping import keep_books, log_file, open_books
+from hipsta_bids.bookkeeping import Books, log_file, open_books
 from hipsta_bids.errors import ExitCode, HipstaError, InputError, OutputError, SchemeError
 from hipsta_bids.job import INTERNAL, Job, Outcome, fail, hash_inputs, run_job, warm_up
 from hipsta_bids.pool import WorkerLost, WorkerPlan, run_jobs
@@ -138,18 +138,35 @@ def run_participants(
     ]
     with log_file(out_dir, options.verbosity) as log:
         _LOGGER.info("hipsta_bids %s, settings %s, %d hemispheres", __version__, digest, len(jobs))
-        outcomes = []
-        for outcome in _outcomes(jobs, out_dir, options, log):
-            keep_books(outcome, out_dir)
-            outcomes.append(outcome)
-            report(outcome)
-            if isinstance(outcome.error, OutputError):
-                break  # the next one would fail just so
-            if options.stop_on_first_crash and outcome.status == Status.FAILED:
-                break
+        books = Books(out_dir)
+        # Closed at once, whatever ends the loop, so that no worker outlives it.
+        with (
+            contextlib.closing(books),
+            contextlib.closing(_outcomes(jobs, out_dir, options, log)) as found,
+        ):
+            outcomes = _run(found, books, options, report)
         result = RunResult(outcomes=tuple(outcomes), n_requested=len(jobs), log=log)
         _LOGGER.info("done: %s, exit code %d", dict(result.counts), result.exit_code)
     return result
+
+
+def _run(
+    outcomes: Iterable[Outcome],
+    books: Books,
+    options: RunOptions,
+    report: Callable[[Outcome], None],
+) -> list[Outcome]:
+    """Book and report outcomes as they come, until all are there or one ends the run."""
+    kept = []
+    for outcome in outcomes:
+        books.enter(outcome)
+        kept.append(outcome)
+        report(outcome)
+        if isinstance(outcome.error, OutputError):
+            break  # the next one would fail just so
+        if options.stop_on_first_crash and outcome.status == Status.FAILED:
+            break
+    return kept
 
 
 def hemisphere_name(item: HemisphereInput) -> HemisphereName:

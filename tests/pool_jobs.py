@@ -1,0 +1,29 @@
+"""What workers do in the tests of the pool; light, since each worker loads it."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+
+
+def work(job):
+    act, _, number = job.partition(" ")
+    if act == "square":
+        return int(number) ** 2
+    if act == "exit":
+        os._exit(int(number))
+    if act == "kill":
+        os.kill(os.getpid(), int(number))
+    if act == "raise":
+        raise ValueError("asked to")
+    if act == "sleep":
+        time.sleep(float(number))
+    if act == "helper":
+        helper = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+        return [os.getpid(), helper.pid]
+    return json.dumps(dict(os.environ))
+
+
+def broken_start():
+    raise ModuleNotFoundError("not installed")
