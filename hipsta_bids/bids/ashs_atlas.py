@@ -33,32 +33,29 @@ def ashs_schemes() -> tuple[Scheme, ...]:
     return tuple(scheme for name in scheme_names() if (scheme := load_scheme(name)).tool == _TOOL)
 
 
-def choose_atlas(request: InputRequest, user_scheme: Scheme | None) -> tuple[Scheme, str] | None:
-    """Take the atlas from the options, if they give one.
+def choose_atlas(request: InputRequest) -> Scheme | None:
+    """Take the atlas from ``--ashs-atlas``, if it is given.
 
     Parameters
     ----------
     request : InputRequest
-    user_scheme : Scheme or None
-        The user's protocol, which describes the labels if no atlas is named.
 
     Returns
     -------
-    tuple of Scheme and str, or None
-        The protocol, and the option that gave it.
+    Scheme or None
 
     Raises
     ------
     SchemeError
         If the atlas is not known, or its file not valid.
     """
-    if request.ashs_atlas is not None:
-        key = _plain(request.ashs_atlas)
-        for scheme in ashs_schemes():
-            if key in {_plain(scheme.name), _plain(scheme.name).removeprefix(_TOOL)}:
-                return scheme, "--ashs-atlas"
-        return load_scheme(request.ashs_atlas), "--ashs-atlas"
-    return None if user_scheme is None else (user_scheme, "--scheme")
+    if request.ashs_atlas is None:
+        return None
+    key = _plain(request.ashs_atlas)
+    for scheme in ashs_schemes():
+        if key in {_plain(scheme.name), _plain(scheme.name).removeprefix(_TOOL)}:
+            return scheme
+    return load_scheme(request.ashs_atlas)
 
 
 class AtlasFinder:
@@ -72,13 +69,13 @@ class AtlasFinder:
     ----------
     root : Path
         The dataset.
-    option : tuple of Scheme and str, or None
+    option : Scheme or None
         As :func:`choose_atlas` returns it.
     sample : function
         Lists files of the dataset: path, hemisphere, and whether the file carries both.
     """
 
-    def __init__(self, root: Path, option: tuple[Scheme, str] | None, sample: _Sample) -> None:
+    def __init__(self, root: Path, option: Scheme | None, sample: _Sample) -> None:
         self._root = root
         self._option = option
         self._sample = sample
@@ -105,7 +102,7 @@ class AtlasFinder:
             Set if the atlas is not certain; the protocol is then a placeholder.
         """
         if self._option is not None:
-            return self._option[0], f"atlas from {self._option[1]}", None
+            return self._option, "atlas from --ashs-atlas", None
         try:
             table = find_table(path, self._root)
             if table is not None:
@@ -145,8 +142,8 @@ class AtlasFinder:
             )
         raise SchemeError(
             f"{path}: labels {values} fit no bundled ASHS atlas "
-            f"({_names(list(ashs_schemes()))}); describe them in a TOML file and pass it with "
-            "--scheme",
+            f"({_names(list(ashs_schemes()))}); describe them in a TOML file and give it to "
+            "--ashs-atlas",
             reason="unknown-atlas",
         )
 

@@ -70,7 +70,7 @@ def find_hemispheres(request: InputRequest) -> tuple[HemisphereInput, ...]:
         ``no-segmentation`` or ``no-match``: nothing was found, or nothing of what is asked for.
     """
     selection = make_selection(request)
-    option = choose_atlas(request, selection.scheme)
+    option = choose_atlas(request)
     forget_folders()
     forget_tables()
     sources = list_sources(request)
@@ -139,7 +139,7 @@ def dataset_notes(request: InputRequest, items: Iterable[HemisphereInput]) -> tu
 def _search(
     source: Source,
     selection: Selection,
-    option: tuple[Scheme, str] | None,
+    option: Scheme | None,
 ) -> Iterator[HemisphereInput]:
     """Search one dataset for all kinds of segmentations."""
     folders = [folder for folder in subject_folders(source.path) if selection.wants_folder(folder)]

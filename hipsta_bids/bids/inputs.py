@@ -31,7 +31,8 @@ class InputRequest:
     ashs_atlas: str | None = None
     """Name of a bundled ASHS protocol (with or without ``ashs``), or a protocol file."""
     scheme: Path | None = None
-    """The user's protocol file, for labels that no bundled protocol describes."""
+    """The user's protocol file, for labels that no bundled protocol describes (for ASHS's, see
+    ``ashs_atlas``)."""
     bids_filter_file: Path | None = None
     bids_database_dir: Path | None = None
 

@@ -147,7 +147,7 @@ def test_a_folder_that_cannot_be_listed(tmp_path, monkeypatch):
     monkeypatch.setattr(scan.os, "scandir", scandir)
     # By default nobody asked for it; named by the user, it has to be readable.
     assert len(find(tmp_path)) == 2
-    with pytest.raises(InputError, match="cannot list the folder.*Permission denied") as caught:
+    with pytest.raises(InputError, match=r"cannot list the folder.*Permission denied") as caught:
         find(tmp_path, derivatives={"x": closed})
     assert caught.value.reason == "unreadable-folder"
 

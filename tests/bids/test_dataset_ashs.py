@@ -235,9 +235,12 @@ def test_a_users_protocol_describes_other_atlases(tmp_path):
         "]\n",
         encoding="utf-8",
     )
-    assert only(tmp_path, scheme=scheme).scheme.name == "mine"
+    # --scheme is for files without a protocol of their own; ASHS's have an option of their own.
+    assert only(tmp_path, scheme=scheme).problem is not None
     assert only(tmp_path, ashs_atlas=str(scheme)).scheme.name == "mine"
     # It says nothing of how to tell the hemispheres apart.
     save_values(folder(tmp_path, "sub-02") / f"x_{GRAY}", [1, 2])
-    problems = [item.problem for item in find(tmp_path, scheme=scheme) if item.subject == "02"]
+    problems = [
+        item.problem for item in find(tmp_path, ashs_atlas=str(scheme)) if item.subject == "02"
+    ]
     assert [problem.reason for problem in problems] == ["unknown-hemisphere"] * 2
