@@ -137,14 +137,17 @@ def scheme_from_names(rows: Iterable[NamedCode], *, name: str, origin: str) -> S
 def agrees(scheme: Scheme, rows: Iterable[NamedCode]) -> bool:
     """Say whether a label table describes a given protocol.
 
-    The table has to list every label of the sheet and its interior, and no code may mean one
-    tissue in the table and another one in the protocol.
+    The table has to list every label of the sheet and its interior, and each code that it lists
+    has to mean the same tissue in the protocol. Codes whose names say nothing may be missing there.
     """
     table = {row.code: _label(row, 0).tissue for row in rows if row.code > 0}
+    protocol = {label.code: label.tissue for label in scheme.labels}
     needed = {*scheme.sheet, *scheme.interior}
-    return all(
-        table.get(label.code, None if label.tissue in needed else label.tissue) is label.tissue
-        for label in scheme.labels
+    complete = all(code in table for code, tissue in protocol.items() if tissue in needed)
+    silent = {Tissue.OTHER, Tissue.BACKGROUND}
+    return complete and all(
+        protocol.get(code, tissue if tissue in silent else None) is tissue
+        for code, tissue in table.items()
     )
 
 
