@@ -1,7 +1,8 @@
 """Every number that changes a result: default, unit, meaning.
 
 One frozen dataclass per stage; a stage receives its own part only and has no defaults of its own.
-What does not change a result (jobs, verbosity, folders) is in :class:`hipsta_bids.runner.RunOptions`.
+What does not change a result (jobs, verbosity, folders) is in
+:class:`hipsta_bids.runner.RunOptions`.
 """
 
 from dataclasses import dataclass, field
@@ -14,6 +15,161 @@ class BodySettings:
     layer_rule: str = "nearest-sheet"
     """Who gets the molecular layer: ``nearest-sheet`` (the nearest sheet subfield; Diers et al.
     2023) or ``nearest-label`` (the nearest label; voxels nearest to DG or CA4 are left out)."""
+    min_length: float = 5.0
+    """Shortest body that is measured, mm."""
+    min_end_voxels: int = 50
+    """Fewer head or tail voxels than this count as no label."""
+    plane_reach: float = 3.0
+    """End planes are fitted to labels within this distance of the interface, mm."""
+    end_margin: float = 0.0
+    """Taken off either end where head or tail labels are missing, mm."""
+    head_piece: float = 1.5
+    """Without head labels: the body ends where a slice shows two pieces above this area, mm2."""
+    head_growth: float = 1.35
+    """Without head labels: ... or twice running an area above this multiple of the median."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GridSettings:
+    """The working grid on which the surface is made."""
+
+    spacing: float = 0.3
+    """Distance of grid nodes and so the edge length of the meshes, mm."""
+    smoothing: float = 0.85
+    """Standard deviation of the Gaussian, in in-plane voxels of the segmentation."""
+    margin: float = 1.5
+    """Free space around the body, mm."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TopologySettings:
+    """Repair of holes, bridges, islands and cavities."""
+
+    levels: int = 16
+    """Steps in which field values are ordered while growing and shrinking."""
+    rounds: int = 12
+    """Most rounds of repair."""
+    small_cost: float = 5.0
+    """Membranes cheaper than this are applied together; dearer ones one a round."""
+    closing_nodes: int = 3
+    """A filled hole is thickened by a closing with this radius, grid nodes."""
+    flag_cut_cost: float = 2.0
+    """Flag a cut that overrules more evidence than this (sum of the field)."""
+    flag_fill_cost: float = 25.0
+    """Flag a filled hole that overrules more evidence than this (sum of the field)."""
+    flag_fraction: float = 0.05
+    """Flag a repair, or all together, beyond this fraction of the body."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfaceSettings:
+    """The closed surface of the body."""
+
+    taubin_iterations: int = 8
+    """Pairs of shrinking and inflating steps."""
+    taubin_shrink: float = 0.5
+    """Step towards the mean of the neighbors, fraction."""
+    taubin_inflate: float = -0.53
+    """Step back, fraction."""
+    untangle_tries: int = 2
+    """How often a surface that intersects itself is smoothed more."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TetraSettings:
+    """The tetrahedral mesh."""
+
+    radius_edge_ratio: float = 2.0
+    """Worst ratio of circumradius to shortest edge (TetGen's q)."""
+    timeout: float = 60.0
+    """Give up after this time, s."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoundarySettings:
+    """Medial and lateral boundary strips, and which side is interior."""
+
+    anisotropy: float = 3.5
+    """Diffusion across a bend of curvature k is slowed by exp(-anisotropy k), mm."""
+    curvature_smoothing: int = 3
+    """Smoothing steps of the curvature tensor."""
+    lapy_curvature: float = 0.3
+    """LaPy's curvature over curvature x mean edge length (measured on cylinders)."""
+    label_neighbors: int = 30
+    """Voxels around a vertex whose labels tell how lateral it is."""
+    lateral_share: float = 0.1
+    """Share of the vertices that count as most lateral."""
+    axial_stretch: float = 4.0
+    """Steps along the axis count this much longer, so that distances run across it."""
+    rim_floor: float = 0.05
+    """Cost of a path per mm along a rim; depth below the rim adds its square, mm2."""
+    rim_zone: float = 1.5
+    """Depth of the rim zones, multiples of 2 volume / wall area."""
+    rim_reach: float = 0.75
+    """The zones hold at least all within this distance of the rim path, in the same unit."""
+    max_distance: float = 1.0
+    """The two rules may differ by this much, mm; beyond it the rims are taken."""
+    strip_width: float = 1.0
+    """Width of the boundary strips, multiples of 2 volume / wall area."""
+    probe_distances: tuple[float, ...] = (0.4, 0.8, 1.2)
+    """Distances at which interior labels are looked for, mm outside the wall."""
+    min_probe_share: float = 0.02
+    """Fewer hits than this share count as no interior labels."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SheetSettings:
+    """The grid of the sheet, in coordinates from -1 to 1 along each axis.
+
+    The grid of Hipsta (Diers et al. 2023) is x_extent 0.9, y_extent 0.975, z_extent 0.9.
+    """
+
+    x_nodes: int = 41
+    """Nodes from medial to lateral."""
+    y_nodes: int = 21
+    """Nodes from posterior to anterior."""
+    z_nodes: int = 9
+    """Nodes from interior to exterior, odd so that the middle one is the mid-surface."""
+    x_extent: float = 0.95
+    """The grid spans plus and minus this along x."""
+    y_extent: float = 1.0
+    """The grid spans plus and minus this along y."""
+    z_extent: float = 1.0
+    """The grid spans plus and minus this along z; 1 is the whole wall."""
+    max_filled: float = 0.2
+    """Refuse a sheet with a larger fraction of columns that could not be measured."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasureSettings:
+    """Measures on the sheet."""
+
+    curvature_window: int = 9
+    """Grid nodes over which a local polynomial is fitted, odd."""
+    curvature_order: int = 3
+    """Order of the local polynomials."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckSettings:
+    """What makes a map doubtful (flag) or wrong (refusal)."""
+
+    min_voxels_across: float = 2.5
+    """Refuse sheets thinner than this many in-plane voxels."""
+    min_label_order: float = 0.45
+    """Refuse if the rank correlation of x with the medial-to-lateral order of labels is lower."""
+    flag_thickness_ratio: float = 0.15
+    """Flag if the mean thickness departs from 2 volume / area by more than this fraction."""
+    max_thickness_ratio: float = 0.35
+    """Refuse beyond this fraction."""
+    flag_folded: float = 0.05
+    """Flag if a larger fraction of the volume has coordinates turned inside out."""
+    flag_filled: float = 0.02
+    """Flag if a larger fraction of the columns had to be filled from neighbors."""
+    flag_bending: float = 0.5
+    """Flag if the sheet turns round its exterior side by more than this, rad."""
+    flag_rim_distance: float = 1.5
+    """Flag if the rim paths and the boundary curves differ by more than this, mm."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,3 +177,11 @@ class Settings:
     """All settings of the participant level."""
 
     body: BodySettings = field(default_factory=BodySettings)
+    grid: GridSettings = field(default_factory=GridSettings)
+    topology: TopologySettings = field(default_factory=TopologySettings)
+    surface: SurfaceSettings = field(default_factory=SurfaceSettings)
+    tetra: TetraSettings = field(default_factory=TetraSettings)
+    boundaries: BoundarySettings = field(default_factory=BoundarySettings)
+    sheet: SheetSettings = field(default_factory=SheetSettings)
+    measures: MeasureSettings = field(default_factory=MeasureSettings)
+    checks: CheckSettings = field(default_factory=CheckSettings)

@@ -1,0 +1,163 @@
+"""The working grid: planes that turn from one end of the body to the other."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from hipsta_bids.artifacts import Float
+from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry.body import Body
+from hipsta_bids.settings import GridSettings
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class WedgeGrid:
+    """A grid whose lines run along the long axis between the two end planes.
+
+    Grid coordinates (a, b, w) count nodes: a and b across the axis, w along it from the posterior
+    plane (0) to the anterior plane (``shape[2] - 1``). So the end planes are grid planes, and
+    nothing has to be cut later.
+    """
+
+    shape: tuple[int, int, int]
+    spacing: float
+    """Distance of nodes across the axis, mm; along the axis it is close to it."""
+    origin: Float
+    """(3,) RAS mm of a = b = 0, anywhere along the axis."""
+    across: Float
+    """(2, 3) unit vectors of a and b."""
+    axis: Float
+    """(3,) unit vector of w."""
+    posterior: Float
+    """(3,) height of the posterior plane above ``origin`` along the axis: c0 + c1 a + c2 b, mm."""
+    anterior: Float
+    """(3,) the same for the anterior plane."""
+
+    def to_ras(self, nodes: Float) -> Float:
+        """RAS mm of (N, 3) grid coordinates."""
+        a, b, w = nodes.T
+        low = self._height(self.posterior, a, b)
+        high = self._height(self.anterior, a, b)
+        along = low + (high - low) * w / (self.shape[2] - 1)
+        return np.asarray(
+            self.origin
+            + self.spacing * (a[:, None] * self.across[0] + b[:, None] * self.across[1])
+            + along[:, None] * self.axis
+        )
+
+    def to_nodes(self, points: Float) -> Float:
+        """Grid coordinates of (N, 3) RAS mm: the inverse of :meth:`to_ras`."""
+        local = points - self.origin
+        a, b = (local @ self.across.T / self.spacing).T
+        low = self._height(self.posterior, a, b)
+        high = self._height(self.anterior, a, b)
+        w = (local @ self.axis - low) / (high - low) * (self.shape[2] - 1)
+        return np.column_stack([a, b, w])
+
+    def node_points(self, clamp: float) -> Float:
+        """RAS mm of all nodes, (A, B, W, 3), kept ``clamp`` mm away from the end planes."""
+        a, b = np.meshgrid(np.arange(self.shape[0]), np.arange(self.shape[1]), indexing="ij")
+        low = self._height(self.posterior, a, b)
+        high = self._height(self.anterior, a, b)
+        share = np.linspace(0, 1, self.shape[2])
+        along = low[..., None] + (high - low)[..., None] * share
+        along = np.clip(along, (low + clamp)[..., None], (high - clamp)[..., None])
+        base = self.spacing * (a[..., None] * self.across[0] + b[..., None] * self.across[1])
+        return np.asarray(self.origin + base[:, :, None, :] + along[..., None] * self.axis)
+
+    def _height(self, plane: Float, a: Float, b: Float) -> Float:
+        return np.asarray(plane[0] + plane[1] * a + plane[2] * b)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Field:
+    """A smooth function on a wedge grid, positive inside the body."""
+
+    grid: WedgeGrid
+    values: np.ndarray[tuple[int, ...], np.dtype[np.float32]]
+    """(A, B, W), between -0.5 and 0.5."""
+
+
+def resample_body(body: Body, settings: GridSettings) -> Field:
+    """Sample the body's mask on a wedge grid and smooth it.
+
+    Parameters
+    ----------
+    body : Body
+    settings : GridSettings
+
+    Returns
+    -------
+    Field
+
+    Raises
+    ------
+    GeometryError
+        ``ends-crossed`` where the end planes meet inside the body.
+    """
+    grid = _fit_grid(body, settings)
+    points = grid.node_points(clamp=body.ends.half_slice)
+    inverse = np.linalg.inv(body.affine)
+    voxels = points.reshape(-1, 3) @ inverse[:3, :3].T + inverse[:3, 3]
+    mask = (body.tissue > 0).astype(np.float32)
+    values = ndimage.map_coordinates(mask, voxels.T, order=1, output=np.float32)
+    sigma = settings.smoothing * in_plane_voxel(body.affine) / settings.spacing
+    smooth = ndimage.gaussian_filter(
+        values.reshape(grid.shape), sigma, mode=("constant", "constant", "nearest"), truncate=3.0
+    )
+    return Field(grid=grid, values=smooth - np.float32(0.5))
+
+
+def in_plane_voxel(affine: Float) -> float:
+    """Geometric mean of the two smaller voxel edges, mm."""
+    edges = np.sort(np.linalg.norm(affine[:3, :3], axis=0))
+    return float(np.sqrt(edges[0] * edges[1]))
+
+
+def _fit_grid(body: Body, settings: GridSettings) -> WedgeGrid:
+    _, points = body.inside_points()
+    axis = body.ends.axis
+    centre = points.mean(axis=0)
+    flat = (points - centre) - np.outer((points - centre) @ axis, axis)
+    _, vectors = np.linalg.eigh(flat.T @ flat)
+    across = np.stack([vectors[:, 2], np.cross(axis, vectors[:, 2])])
+    reach = flat @ across.T
+    margin = settings.margin + float(np.linalg.norm(body.affine[:3, :3], axis=0).min())
+    low = reach.min(axis=0) - margin
+    size = np.ceil((reach.max(axis=0) + margin - low) / settings.spacing).astype(int) + 1
+    origin = centre + low @ across
+    planes = [
+        _plane_height(point, normal, origin, across * settings.spacing, axis)
+        for point, normal in (
+            (body.ends.posterior_point, body.ends.posterior_normal),
+            (body.ends.anterior_point, body.ends.anterior_normal),
+        )
+    ]
+    corners = np.array([[1, a, b] for a in (0, size[0]) for b in (0, size[1])])
+    gaps = corners @ (planes[1] - planes[0])
+    mean_gap = float(gaps.mean())
+    if gaps.min() < 0.15 * mean_gap or mean_gap <= 0:
+        raise GeometryError(
+            f"the end planes meet beside the body (gap {gaps.min():.1f} to {gaps.max():.1f} mm): "
+            "check the head and tail labels",
+            reason="ends-crossed",
+        )
+    length = body.ends.length(points)
+    return WedgeGrid(
+        shape=(int(size[0]), int(size[1]), max(round(length / settings.spacing) + 1, 8)),
+        spacing=settings.spacing,
+        origin=origin,
+        across=across,
+        axis=axis,
+        posterior=planes[0],
+        anterior=planes[1],
+    )
+
+
+def _plane_height(
+    point: Float, normal: Float, origin: Float, steps: Float, axis: Float
+) -> Float:
+    """Height of a plane above the grid's base as a linear function of the node numbers."""
+    along = normal @ axis
+    return np.array([(point - origin) @ normal, *(-(steps @ normal))]) / along

@@ -1,0 +1,153 @@
+"""The sheet: the body on a regular grid of its own coordinates."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from hipsta_bids.artifacts import Bool, Coordinates, Float, Sheet, TetMesh
+from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry.body import Body
+from hipsta_bids.settings import SheetSettings
+
+
+def sample_sheet(mesh: TetMesh, coordinates: Coordinates, settings: SheetSettings) -> Sheet:
+    """Find the points of the body that have the grid's coordinates.
+
+    Each tetrahedron is also one in coordinate space; a grid node inside it lies at the same
+    barycentric place in the body.
+
+    Parameters
+    ----------
+    mesh : TetMesh
+    coordinates : Coordinates
+    settings : SheetSettings
+
+    Returns
+    -------
+    Sheet
+        Columns with a node in no tetrahedron are filled from their neighbors and not valid.
+
+    Raises
+    ------
+    GeometryError
+        ``sheet-incomplete`` if more than ``max_filled`` of the columns cannot be measured.
+    """
+    axes = sheet_levels(settings)
+    points = _invert(mesh, coordinates.values, axes)
+    missing = ~np.isfinite(points).all(axis=(2, 3))
+    share = float(missing.mean())
+    if share > settings.max_filled:
+        raise GeometryError(
+            f"{share:.0%} of the sheet's columns lie in no tetrahedron: the coordinates fold; "
+            "check the labels near the end planes",
+            reason="sheet-incomplete",
+        )
+    return Sheet(points=_filled(points), valid=~missing)
+
+
+def sheet_levels(settings: SheetSettings) -> tuple[Float, Float, Float]:
+    """Coordinates of the grid's nodes along x, y and z."""
+    return (
+        np.linspace(-settings.x_extent, settings.x_extent, settings.x_nodes),
+        np.linspace(-settings.y_extent, settings.y_extent, settings.y_nodes),
+        np.linspace(-settings.z_extent, settings.z_extent, settings.z_nodes),
+    )
+
+
+def folded_fraction(mesh: TetMesh, coordinates: Coordinates) -> float:
+    """Fraction of the body's volume whose coordinates are turned inside out.
+
+    The common orientation is that of the majority.
+    """
+    edges = mesh.vertices[mesh.tetrahedra[:, 1:]] - mesh.vertices[mesh.tetrahedra[:, :1]]
+    volume = np.linalg.det(edges) / 6
+    turned = coordinates.values[mesh.tetrahedra]
+    inner = np.linalg.det(turned[:, 1:] - turned[:, :1])
+    sign = np.sign((volume * inner).sum())
+    return float(volume[inner * sign < 0].sum() / volume.sum())
+
+
+def label_sheet(sheet: Sheet, body: Body) -> NDArray[np.uint8]:
+    """Subfield of each column, (Nx, Ny): the most frequent of the labels along it."""
+    index, points = body.inside_points()
+    _, nearest = cKDTree(points).query(sheet.points.reshape(-1, 3))
+    labels = body.tissue[tuple(index[nearest].T)].reshape(sheet.points.shape[:3])
+    kinds = np.unique(labels)
+    votes = np.stack([(labels == kind).sum(axis=2) for kind in kinds], axis=-1)
+    return np.asarray(kinds[votes.argmax(axis=-1)], dtype=np.uint8)
+
+
+def _invert(mesh: TetMesh, values: Float, axes: tuple[Float, Float, Float]) -> Float:
+    """(Nx, Ny, Nz, 3) points with the grid's coordinates; NaN where no tetrahedron has them."""
+    shape = tuple(len(axis) for axis in axes)
+    first = np.array([axis[0] for axis in axes])
+    step = np.array([(axis[-1] - axis[0]) / (len(axis) - 1) for axis in axes])
+    nodes = (values - first) / step
+    corners = nodes[mesh.tetrahedra]
+    slack = 1e-6  # nodes on the outer faces must not fall out by rounding
+    low = np.maximum(np.ceil(corners.min(axis=1) - slack), 0).astype(int)
+    high = np.minimum(np.floor(corners.max(axis=1) + slack), np.array(shape) - 1).astype(int)
+    count = np.maximum(high - low + 1, 0)
+    hits = np.flatnonzero(count.prod(axis=1))
+    number = count[hits].prod(axis=1)
+    cell = np.repeat(hits, number)
+    rank = np.arange(len(cell)) - np.repeat(np.cumsum(number) - number, number)
+    node = np.column_stack(
+        [
+            rank // (count[cell, 1] * count[cell, 2]),
+            rank // count[cell, 2] % count[cell, 1],
+            rank % count[cell, 2],
+        ]
+    )
+    node += low[cell]
+    weights, known = _barycentric(corners[cell], node.astype(float))
+    worst = np.where(known, weights.min(axis=1), -np.inf)
+    flat = np.ravel_multi_index(tuple(node.T), shape)
+    inside = worst > -1e-3  # noqa: PLR2004 -- a thousandth of a tetrahedron bridges rounding gaps
+    # Where folds make two tetrahedra claim a node, the one that holds it most centrally wins.
+    order = np.lexsort((worst[inside], flat[inside]))
+    winner = np.flatnonzero(inside)[order]
+    owner = flat[winner]
+    last = np.append(owner[1:] != owner[:-1], True)
+    winner, owner = winner[last], owner[last]
+    points = np.full((int(np.prod(shape)), 3), np.nan)
+    places = mesh.vertices[mesh.tetrahedra[cell[winner]]]
+    points[owner] = np.einsum("ni,nid->nd", weights[winner], places)
+    return points.reshape(*shape, 3)
+
+
+def _barycentric(corners: Float, points: Float) -> tuple[Float, Bool]:
+    """Barycentric weights (N, 4), and whether the tetrahedron is not flat."""
+    edges = corners[:, 1:] - corners[:, :1]
+    a, b, c = edges[:, 0], edges[:, 1], edges[:, 2]
+    local = points - corners[:, 0]
+    det = np.einsum("ij,ij->i", a, np.cross(b, c))
+    known = np.abs(det) > 1e-12  # noqa: PLR2004 -- grid steps cubed
+    safe = np.where(known, det, 1.0)
+    weights = np.empty((len(points), 4))
+    weights[:, 1] = np.einsum("ij,ij->i", local, np.cross(b, c)) / safe
+    weights[:, 2] = np.einsum("ij,ij->i", local, np.cross(c, a)) / safe
+    weights[:, 3] = np.einsum("ij,ij->i", local, np.cross(a, b)) / safe
+    weights[:, 0] = 1 - weights[:, 1:].sum(axis=1)
+    return weights, known
+
+
+def _filled(points: Float) -> Float:
+    """Replace missing points by normalised averages of their neighbors in the same z level."""
+    missing = ~np.isfinite(points).all(axis=-1)
+    if not missing.any():
+        return points
+    known = (~missing).astype(float)
+    values = np.where(missing[..., None], 0.0, points)
+    sigma = (1.0, 1.0, 0.0)
+    while missing.any():
+        weight = ndimage.gaussian_filter(known, sigma, truncate=4.0)
+        mean = ndimage.gaussian_filter(values, (*sigma, 0.0), truncate=4.0)
+        reach = missing & (weight > 1e-4)  # noqa: PLR2004 -- some neighbor within the kernel
+        if not reach.any():
+            break
+        values[reach] = mean[reach] / weight[reach][:, None]
+        known[reach] = 1.0
+        missing &= ~reach
+    return np.where(missing[..., None], np.nan, values)

@@ -1,0 +1,144 @@
+"""From a solid field to a closed triangle surface with planar end caps."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from skimage.measure import marching_cubes
+
+from hipsta_bids.artifacts import Bool, Float, Int, Surface
+from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry.grid import Field
+from hipsta_bids.settings import SurfaceSettings
+
+
+def extract_surface(field: Field, settings: SurfaceSettings) -> Surface:
+    """Extract the zero level of a field, closed by planar caps, and smooth it.
+
+    Beyond the end planes the field counts as strongly negative, so that marching cubes puts the
+    caps into the end planes and their vertices are known.
+
+    Parameters
+    ----------
+    field : Field
+        Its positive part is one solid piece without tunnels.
+    settings : SurfaceSettings
+
+    Returns
+    -------
+    Surface
+
+    Raises
+    ------
+    GeometryError
+        ``surface-topology`` if the surface is not one sphere.
+
+    Notes
+    -----
+    Smoothing: Taubin 1995, SIGGRAPH '95:351-358.
+    """
+    outside = -1e4 * float(np.abs(field.values).max())
+    padded = np.pad(field.values, 1, constant_values=outside)
+    nodes, faces, _, _ = marching_cubes(padded, level=0.0)
+    nodes = nodes.astype(np.float64) - 1.0
+    last = field.grid.shape[2] - 1
+    nodes[:, 2] = np.clip(nodes[:, 2], 0, last)
+    # Crossings against the free space outside land within 1e-4 of a step from the end plane.
+    posterior, anterior = nodes[:, 2] < 1e-3, nodes[:, 2] > last - 1e-3  # noqa: PLR2004
+    nodes[posterior, 2], nodes[anterior, 2] = 0, last
+    faces = faces.astype(np.int32)
+    _check_sphere(len(nodes), faces)
+    nodes = _taubin(nodes, faces, (posterior, anterior), settings)
+    vertices = field.grid.to_ras(nodes)
+    if signed_volume(vertices, faces) < 0:
+        faces = faces[:, ::-1]
+    return Surface(
+        vertices=vertices, triangles=faces, posterior_cap=posterior, anterior_cap=anterior
+    )
+
+
+def signed_volume(vertices: Float, triangles: Int) -> float:
+    """Volume enclosed by outward triangles, mm3."""
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+
+
+def triangle_areas(vertices: Float, triangles: Int) -> Float:
+    """Areas, (F,), mm2."""
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
+
+
+def lateral_triangles(surface: Surface) -> Bool:
+    """(F,) whether a triangle belongs to the wall, not to a cap."""
+    caps = [cap[surface.triangles].all(axis=1) for cap in (surface.posterior_cap, surface.anterior_cap)]
+    return ~(caps[0] | caps[1])
+
+
+def mean_wall_thickness(surface: Surface) -> float:
+    """2 volume / wall area, mm: the thickness of a sheet whose two sides make up its wall."""
+    areas = triangle_areas(surface.vertices, surface.triangles)
+    volume = signed_volume(surface.vertices, surface.triangles)
+    return 2 * volume / float(areas[lateral_triangles(surface)].sum())
+
+
+def unique_edges(cells: Int) -> Int:
+    """(E, 2) edges of triangles (F, 3) or tetrahedra (T, 4), each once, lower vertex first."""
+    first, second = np.triu_indices(cells.shape[1], k=1)
+    pairs = np.sort(np.stack([cells[:, first].ravel(), cells[:, second].ravel()], axis=1))
+    code = np.unique(pairs[:, 0].astype(np.int64) << 32 | pairs[:, 1])
+    return np.column_stack([code >> 32, code & 0xFFFFFFFF]).astype(np.int32)
+
+
+def _check_sphere(count: int, faces: Int) -> None:
+    edges = unique_edges(faces)
+    euler = count - len(edges) + len(faces)
+    pieces, _ = sparse.csgraph.connected_components(_adjacency(edges, count), directed=False)
+    if euler != 2 or pieces != 1 or 2 * len(edges) != 3 * len(faces):  # noqa: PLR2004
+        raise GeometryError(
+            f"the surface is not one closed sphere (Euler number {euler}, {pieces} pieces): "
+            "correct the labels by hand",
+            reason="surface-topology",
+        )
+
+
+def _adjacency(edges: Int, count: int) -> sparse.csr_array:
+    ones = np.ones(2 * len(edges))
+    both = np.vstack([edges, edges[:, ::-1]])
+    return sparse.csr_array((ones, (both[:, 0], both[:, 1])), shape=(count, count))
+
+
+def _taubin(
+    nodes: Float, faces: Int, caps: tuple[Bool, Bool], settings: SurfaceSettings
+) -> Float:
+    """Smooth in grid coordinates; caps stay in their planes, their rims move along themselves."""
+    edges = unique_edges(faces)
+    cap = caps[0] | caps[1]
+    on_cap = caps[0][faces].all(axis=1) | caps[1][faces].all(axis=1)
+    rim = np.zeros(len(nodes), dtype=bool)
+    rim[faces[~on_cap]] = True
+    rim &= cap
+    weights = _adjacency(edges, len(nodes)).tocoo()
+    rim_edge = _rim_edges(faces[on_cap], len(nodes))
+    keep = ~rim[weights.row]
+    graph = sparse.csr_array(
+        (weights.data[keep], (weights.row[keep], weights.col[keep])), shape=weights.shape
+    )
+    graph = graph + _adjacency(rim_edge, len(nodes))
+    graph = graph.multiply(1 / np.maximum(graph.sum(axis=1), 1)[:, None]).tocsr()
+    free = np.ones((len(nodes), 3))
+    free[cap, 2] = 0
+    nodes = nodes.copy()
+    for _ in range(settings.taubin_iterations):
+        for factor in (settings.taubin_shrink, settings.taubin_inflate):
+            nodes += factor * free * (graph @ nodes - nodes)
+    return nodes
+
+
+def _rim_edges(cap_faces: Int, count: int) -> Int:
+    """Edges that belong to one cap triangle only."""
+    pairs: NDArray[np.int32] = np.sort(
+        np.vstack([cap_faces[:, [0, 1]], cap_faces[:, [1, 2]], cap_faces[:, [2, 0]]])
+    )
+    code, times = np.unique(pairs[:, 0].astype(np.int64) * count + pairs[:, 1], return_counts=True)
+    once = code[times == 1]
+    return np.column_stack([once // count, once % count]).astype(np.int32)

@@ -1,0 +1,168 @@
+"""TetGen in a process of its own.
+
+TetGen aborts the whole process on some self-intersecting surfaces, sometimes without an
+exception. This module is run as a program that checks and meshes one surface after the other, and
+holds the client that starts it, waits, and starts a new one after a crash. Messages are pickles
+with a length in front, over the standard streams.
+"""
+
+import atexit
+import os
+import pickle
+import select
+import struct
+import subprocess
+import sys
+import time
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int32]
+
+_HEADER = struct.Struct("<Q")
+
+
+class TetgenClient:
+    """Sends surfaces to a worker process; one client per process of the caller."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
+        self._owner = 0
+
+    def mesh(
+        self, vertices: Float, triangles: Int, options: dict[str, Any], timeout: float
+    ) -> tuple[Float, NDArray[Any]] | str:
+        """Tetrahedralize one closed surface.
+
+        Parameters
+        ----------
+        vertices : (V, 3) array
+        triangles : (F, 3) array
+        options : dict
+            Keywords of TetGen.
+        timeout : float
+            s
+
+        Returns
+        -------
+        tuple or str
+            Vertices (V, 3) and tetrahedra (T, 4), or why there are none.
+        """
+        reply = self._ask(("mesh", vertices, triangles, options), timeout)
+        return reply if isinstance(reply, str) else (reply[0], reply[1])
+
+    def intersections(self, vertices: Float, triangles: Int, timeout: float) -> int | str:
+        """Number of triangles that intersect others, or why it is not known."""
+        reply = self._ask(("intersections", vertices, triangles), timeout)
+        return reply if isinstance(reply, str) else int(reply)
+
+    def _ask(self, request: tuple[Any, ...], timeout: float) -> Any:  # noqa: ANN401 -- any reply
+        process = self._running()
+        try:
+            _write(_pipe(process.stdin), request)
+            return _read(_pipe(process.stdout), deadline=time.monotonic() + timeout)
+        except (BrokenPipeError, EOFError):
+            code = self._stop()
+            return f"TetGen crashed (exit status {code})"
+        except TimeoutError:
+            self._stop()
+            return f"TetGen took longer than {timeout:g} s"
+
+    def _running(self) -> subprocess.Popen[bytes]:
+        if self._process is None or self._owner != os.getpid() or self._process.poll() is not None:
+            environment = dict(os.environ, OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", __name__],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                env=environment,
+            )
+            self._owner = os.getpid()
+            atexit.register(self._stop)
+        return self._process
+
+    def _stop(self) -> int | None:
+        process, self._process = self._process, None
+        atexit.unregister(self._stop)
+        if process is None or self._owner != os.getpid():
+            return None
+        for stream in (process.stdin, process.stdout):
+            if stream is not None:
+                try:
+                    stream.close()
+                except BrokenPipeError:
+                    pass
+        process.kill()
+        return process.wait()
+
+
+def _pipe(stream: IO[bytes] | None) -> IO[bytes]:
+    if stream is None:
+        raise EOFError
+    return stream
+
+
+def _write(stream: IO[bytes], message: object) -> None:
+    data = pickle.dumps(message, protocol=pickle.HIGHEST_PROTOCOL)
+    stream.write(_HEADER.pack(len(data)))
+    stream.write(data)
+    stream.flush()
+
+
+def _read(stream: IO[bytes], deadline: float | None = None) -> Any:  # noqa: ANN401 -- any message
+    (size,) = _HEADER.unpack(_exactly(stream, _HEADER.size, deadline))
+    return pickle.loads(_exactly(stream, size, deadline))  # noqa: S301 -- our own child or parent
+
+
+def _exactly(stream: IO[bytes], size: int, deadline: float | None) -> bytes:
+    """Read ``size`` bytes past any buffer, or raise EOFError or TimeoutError."""
+    parts = bytearray()
+    while len(parts) < size:
+        if deadline is not None:
+            left = deadline - time.monotonic()
+            if left <= 0 or not select.select([stream], [], [], left)[0]:
+                raise TimeoutError
+        part = os.read(stream.fileno(), min(size - len(parts), 1 << 20))
+        if not part:
+            raise EOFError
+        parts += part
+    return bytes(parts)
+
+
+def _serve() -> None:
+    """Answer requests until the caller goes away."""
+    # The libraries print; their words must not land between the messages.
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    while True:
+        try:
+            kind, *arguments = _read(sys.stdin.buffer)
+        except EOFError:
+            return
+        try:
+            _write(answers, _mesh(*arguments) if kind == "mesh" else _count(*arguments))
+        except (RuntimeError, ValueError, TypeError) as error:
+            _write(answers, f"TetGen failed: {error}")
+
+
+def _mesh(vertices: Float, triangles: Int, options: dict[str, Any]) -> tuple[Float, NDArray[Any]]:
+    from tetgen import TetGen  # noqa: PLC0415 -- only the child needs it
+
+    points, cells, *_ = TetGen(vertices, triangles).tetrahedralize(**options)
+    return np.asarray(points), np.asarray(cells)
+
+
+def _count(vertices: Float, triangles: Int) -> int:
+    from pymeshfix import PyTMesh  # noqa: PLC0415 -- only the child needs it
+
+    mesh = PyTMesh()
+    mesh.load_array(vertices, triangles)
+    return len(mesh.select_intersecting_triangles())
+
+
+if __name__ == "__main__":
+    _serve()

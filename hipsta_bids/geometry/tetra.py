@@ -1,0 +1,88 @@
+"""From a closed surface to a tetrahedral mesh."""
+
+import numpy as np
+
+from hipsta_bids.artifacts import Float, Int, Surface, TetMesh
+from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry.tetgen_worker import TetgenClient
+from hipsta_bids.settings import TetraSettings
+
+_CLIENT = TetgenClient()
+
+
+def tetrahedralize(surface: Surface, settings: TetraSettings) -> TetMesh:
+    """Fill a surface with tetrahedra; its vertices come first and stay in place.
+
+    Parameters
+    ----------
+    surface : Surface
+    settings : TetraSettings
+
+    Returns
+    -------
+    TetMesh
+
+    Raises
+    ------
+    GeometryError
+        ``tetrahedralization`` if TetGen fails, crashes or takes too long.
+
+    Notes
+    -----
+    TetGen: Si 2015, ACM Trans Math Softw 41:11. ``nobisect`` keeps the surface as it is, so that
+    boundary sets found on the surface are valid in the volume.
+    """
+    options = {
+        "plc": True,
+        "quality": True,
+        "minratio": settings.radius_edge_ratio,
+        "nobisect": True,
+        "quiet": True,
+    }
+    result = _CLIENT.mesh(surface.vertices, surface.triangles, options, settings.timeout)
+    if isinstance(result, str):
+        raise GeometryError(
+            f"{result}: the surface may intersect itself; check the labels for touching parts",
+            reason="tetrahedralization",
+        )
+    vertices, cells = result
+    cells = cells.astype(np.int32)
+    if not np.array_equal(vertices[: len(surface.vertices)], surface.vertices):
+        raise GeometryError("TetGen moved vertices of the surface", reason="tetrahedralization")
+    volume = tetra_volumes(vertices, cells)
+    cells[volume < 0] = cells[volume < 0][:, [0, 2, 1, 3]]
+    return TetMesh(vertices=vertices, tetrahedra=cells[volume != 0])
+
+
+def count_intersections(surface: Surface, settings: TetraSettings) -> int:
+    """Count triangles that intersect others; -1 if the check itself failed.
+
+    Notes
+    -----
+    MeshFix: Attene 2010, Visual Computer 26:1393-1406. Only its count is used.
+    """
+    count = _CLIENT.intersections(surface.vertices, surface.triangles, settings.timeout)
+    return -1 if isinstance(count, str) else count
+
+
+def tetra_volumes(vertices: Float, tetrahedra: Int) -> Float:
+    """Signed volumes, (T,), mm3."""
+    edges = vertices[tetrahedra[:, 1:]] - vertices[tetrahedra[:, :1]]
+    return np.asarray(np.einsum("ij,ij->i", edges[:, 0], np.cross(edges[:, 1], edges[:, 2])) / 6)
+
+
+def tetra_quality(mesh: TetMesh) -> Float:
+    """Mean ratio of each tetrahedron, (T,): 1 for a regular one, 0 for a flat one.
+
+    Liu & Joe 1994, BIT 34:268-287: 12 (3 volume)^(2/3) / sum of squared edge lengths.
+    """
+    edges = _edge_vectors(mesh)
+    volume = tetra_volumes(mesh.vertices, mesh.tetrahedra)
+    return np.asarray(12 * np.cbrt(3 * volume) ** 2 / (edges**2).sum(axis=(1, 2)))
+
+
+def _edge_vectors(mesh: TetMesh) -> Float:
+    """Edge vectors of each tetrahedron, (T, 6, 3), mm."""
+    first, second = np.triu_indices(4, k=1)
+    corners = mesh.vertices[mesh.tetrahedra]
+    return np.asarray(corners[:, second] - corners[:, first])
