@@ -1,5 +1,6 @@
 """Each kind of bad input, through the command line: one line, the right code, nothing lost."""
 
+import ctypes
 import errno
 import gzip
 import json
@@ -17,13 +18,17 @@ import pytest
 
 from hipsta_bids import cli
 from hipsta_bids.bids import files
+from hipsta_bids.bids.derivative import settle_settings
 from hipsta_bids.bids.names import OUTPUTS, HemisphereName, output_path
 from hipsta_bids.bids.status import read_status
 from hipsta_bids.errors import ExitCode
 from hipsta_bids.phantom import Hemisphere, PhantomSpec, write_dataset
+from hipsta_bids.settings import BodySettings, Settings
 
-GOOD = PhantomSpec(kind="spiral", thickness=2.0, length=10.0)
+GOOD = PhantomSpec(kind="spiral", thickness=2.0, length=8.0)
+COARSE = "[grid]\nspacing = 0.5\n"  # mm; these tests look at files, not at maps
 SHORT = PhantomSpec(kind="spiral", thickness=2.0, length=3.0, end_length=10.0)  # 5 mm are needed
+FREESURFER = Path("bids/derivatives/freesurfer")
 COMMAND = (sys.executable, "-m", "hipsta_bids.cli")
 
 
@@ -45,6 +50,7 @@ def good(tmp_path_factory):
         ],
         voxel_size=(0.5, 0.5, 0.5),
     )
+    (folder / "coarse.toml").write_text(COARSE)
     return folder
 
 
@@ -55,6 +61,11 @@ def bids_dir(good, tmp_path):
     shutil.copytree(good, folder)
     shutil.rmtree(label_file(folder, "short").parents[1])
     return folder
+
+
+def arguments(bids_dir, out, *options):
+    settings = ["--settings", str(bids_dir / "coarse.toml")]
+    return [str(bids_dir), str(out), "participant", *settings, *options]
 
 
 def spoil_header(path, field, value):
@@ -121,7 +132,7 @@ COMPLETE = {row.key for row in OUTPUTS if not row.optional}
 
 def test_bad_hemispheres_fail_alone(good, tmp_path, capsys):
     bids_dir, out = spoiled(good, tmp_path / "bids", FAULTS), tmp_path / "out"
-    code = cli.main([str(bids_dir), str(out), "participant", "--n-procs", "2"])
+    code = cli.main(arguments(bids_dir, out, "--n-procs", "2"))
     said = capsys.readouterr()
     assert code == ExitCode.SOME_FAILED
     found = {(row["subject"], row["hemi"]): row for row in read_status(out)}
@@ -143,8 +154,8 @@ def test_bad_hemispheres_fail_alone(good, tmp_path, capsys):
 
 def test_all_inputs_unusable_is_bad_data(good, tmp_path, capsys):
     bids_dir = spoiled(good, tmp_path / "bids", ["empty", "noimage"])
-    arguments = [str(bids_dir), str(tmp_path / "out"), "participant"]
-    code = cli.main([*arguments, "--participant-label", "empty", "noimage", "--n-procs", "1"])
+    wanted = ("--participant-label", "empty", "noimage", "--n-procs", "1")
+    code = cli.main(arguments(bids_dir, tmp_path / "out", *wanted))
     assert code == ExitCode.BAD_DATA
     assert len(capsys.readouterr().err.splitlines()) == 2
     assert {row["status"] for row in read_status(tmp_path / "out")} == {"failed"}
@@ -181,22 +192,49 @@ def test_unusable_folders_get_one_line(tmp_path, prepare, options, code, message
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may read and write everything")
-@pytest.mark.parametrize("which", ["bids", "out"])
-def test_forbidden_folders(bids_dir, tmp_path, which, capsys):
+def obey_permissions():
+    """Take from root what lets it ignore permissions (linux/prctl.h, linux/capability.h)."""
+    drop, override, search = 24, 1, 2
+    for capability in (override, search):
+        ctypes.CDLL(None).prctl(drop, capability)
+
+
+@pytest.mark.skipif(
+    os.geteuid() == 0 and sys.platform != "linux", reason="root may read and write everything"
+)
+@pytest.mark.parametrize(
+    ("which", "code", "message"),
+    [
+        ("bids", ExitCode.BAD_DATA, "cannot list the folder"),
+        (FREESURFER, ExitCode.BAD_DATA, "cannot list the folder"),
+        ("out", ExitCode.NOT_WRITABLE, "not allowed to write there"),
+    ],
+)
+@pytest.mark.usefixtures("bids_dir")
+def test_forbidden_folders_get_one_line(tmp_path, which, code, message):
     (tmp_path / "out").mkdir()
-    (tmp_path / which).chmod(0)
+    (tmp_path / which).chmod(0o111 if which == "out" else 0)
     try:
-        code = cli.main([str(bids_dir), str(tmp_path / "out"), "participant"])
+        done = subprocess.run(
+            [*COMMAND, "bids", "out", "participant", "--freesurfer-dir", str(FREESURFER)],
+            cwd=tmp_path,
+            preexec_fn=obey_permissions,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
     finally:
         (tmp_path / which).chmod(0o700)
-    assert code == {"bids": ExitCode.BAD_DATA, "out": ExitCode.NOT_WRITABLE}[which]
-    assert capsys.readouterr().err.count("\n") == 1
+    assert done.returncode == code, done.stderr
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert list((tmp_path / "out").iterdir()) == []
 
 
 def test_wanted_participant_that_does_not_exist(bids_dir, tmp_path, capsys):
-    arguments = [str(bids_dir), str(tmp_path / "out"), "participant"]
-    assert cli.main([*arguments, "--participant-label", "gone"]) == ExitCode.NOTHING_TO_DO
+    wanted = ("--participant-label", "gone")
+    code = cli.main(arguments(bids_dir, tmp_path / "out", *wanted))
+    assert code == ExitCode.NOTHING_TO_DO
     assert "gone" in capsys.readouterr().err
 
 
@@ -205,7 +243,7 @@ def test_read_only_output_is_refused_before_work(bids_dir, tmp_path, monkeypatch
         raise OSError(errno.EROFS, "Read-only file system")
 
     monkeypatch.setattr(files, "_write_through", read_only)
-    code = cli.main([str(bids_dir), str(tmp_path / "out"), "participant"])
+    code = cli.main(arguments(bids_dir, tmp_path / "out"))
     said = capsys.readouterr()
     assert code == ExitCode.NOT_WRITABLE
     assert "not allowed to write there" in said.err
@@ -215,7 +253,7 @@ def test_read_only_output_is_refused_before_work(bids_dir, tmp_path, monkeypatch
 
 def test_output_in_place_of_a_file(bids_dir, tmp_path, capsys):
     (tmp_path / "out").write_text("precious")
-    code = cli.main([str(bids_dir), str(tmp_path / "out"), "participant"])
+    code = cli.main(arguments(bids_dir, tmp_path / "out"))
     assert code == ExitCode.NOT_WRITABLE
     assert capsys.readouterr().err.count("\n") == 1
     assert (tmp_path / "out").read_text() == "precious"
@@ -227,17 +265,14 @@ def limit_file_size():
 
 
 def test_full_disk_then_space_again(bids_dir, tmp_path):
-    command = [*COMMAND, str(bids_dir), str(tmp_path / "out"), "participant", "--n-procs", "1"]
+    command = [*COMMAND, *arguments(bids_dir, tmp_path / "out", "--hemi", "L")]
     done = subprocess.run(
         command, preexec_fn=limit_file_size, capture_output=True, text=True, check=False
     )
     assert done.returncode == ExitCode.NOT_WRITABLE
     assert "no space left" in done.stderr
     assert done.stderr.count("\n") == 1
-    assert {row["reason"] for row in read_status(tmp_path / "out")} == {
-        "disk-full",
-        "not-finished",
-    }
+    assert [row["reason"] for row in read_status(tmp_path / "out")] == ["disk-full"]
     assert outputs(tmp_path / "out", "good", "L") == {"qc"}
     assert not list((tmp_path / "out").rglob("*.tmp"))
 
@@ -247,7 +282,7 @@ def test_full_disk_then_space_again(bids_dir, tmp_path):
 
 def test_killed_in_the_middle_then_rerun_completes(bids_dir, tmp_path, capsys):
     out = tmp_path / "out"
-    command = [*COMMAND, str(bids_dir), str(out), "participant", "--n-procs", "1"]
+    command = [*COMMAND, *arguments(bids_dir, out, "--n-procs", "1")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         first = process.stdout.readline()
         process.send_signal(signal.SIGKILL)
@@ -274,13 +309,11 @@ def test_killed_in_the_middle_then_rerun_completes(bids_dir, tmp_path, capsys):
 
 
 def test_other_settings_into_the_same_folder(bids_dir, tmp_path, capsys):
-    arguments = [str(bids_dir), str(tmp_path / "out"), "participant", "--hemi", "L"]
-    assert cli.main(arguments) == ExitCode.OK
-    settings = tmp_path / "s.toml"
-    settings.write_text('[body]\nlayer_rule = "nearest-label"\n')
-    capsys.readouterr()
-    assert cli.main([*arguments, "--settings", str(settings)]) == ExitCode.USAGE
+    out = tmp_path / "out"
+    settle_settings(out, Settings(body=BodySettings(layer_rule="nearest-label")))
+    before = {path: path.read_bytes() for path in out.iterdir()}
+    assert cli.main([str(bids_dir), str(out), "participant"]) == ExitCode.USAGE
     said = capsys.readouterr().err
-    assert "body.layer_rule was nearest-sheet, now nearest-label" in said
+    assert "body.layer_rule was nearest-label, now nearest-sheet" in said
     assert said.count("\n") == 1
-    assert outputs(tmp_path / "out", "good", "L") == COMPLETE
+    assert {path: path.read_bytes() for path in out.iterdir()} == before
