@@ -138,10 +138,10 @@ def verdict(maps: HemisphereMaps) -> tuple[Status, str | None, str | None]:
     Returns
     -------
     tuple of (Status, str or None, str or None)
-        Status; machine-readable reason, several joined by ``+``; and message. Reason and message
-        are ``None`` if there is nothing to say.
+        Status; machine-readable reason, several joined by ``+``; and message, about the flags if
+        there are any, else about the repairs. ``None`` if there is nothing to say.
     """
-    notes = [flag.message for flag in maps.flags] + list(maps.repairs)
+    notes = [flag.message for flag in maps.flags] or list(maps.repairs)
     reasons = list(dict.fromkeys(flag.reason for flag in maps.flags))
     if maps.repairs:
         reasons.append("repaired")

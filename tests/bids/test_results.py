@@ -243,7 +243,7 @@ def test_verdict_names_flags_before_repairs():
     assert verdict(make_maps(flags=flags, repairs=("x",))) == (
         "flagged",
         "a+repaired",
-        "one; two; x",
+        "one; two",
     )
 
 
