@@ -33,7 +33,7 @@ class BodySettings:
 class GridSettings:
     """The working grid on which the surface is made."""
 
-    spacing: float = 0.3
+    spacing: float = 0.35
     """Distance of grid nodes and so the edge length of the meshes, mm."""
     smoothing: float = 0.85
     """Standard deviation of the Gaussian, in in-plane voxels of the segmentation."""
@@ -45,7 +45,7 @@ class GridSettings:
 class TopologySettings:
     """Repair of holes, bridges, islands and cavities."""
 
-    levels: int = 16
+    levels: int = 6
     """Steps in which field values are ordered while growing and shrinking."""
     rounds: int = 12
     """Most rounds of repair."""

@@ -290,8 +290,11 @@ def _consistent_values(values: NDArray[np.float32], after: Bool) -> NDArray[np.f
         faces &= a[:, 1:, 1:] != a[:, 1:, :-1]
         _mark(np.moveaxis(corners, axis, 0), faces, cube=False)
     opposite = np.zeros(tuple(n - 1 for n in after.shape), dtype=bool)
-    total = ndimage.convolve(after.astype(np.int8), np.ones((2, 2, 2), np.int8), origin=-1)
-    total = total[:-1, :-1, :-1]
+    total = after.astype(np.int8)
+    for axis in range(3):
+        total = np.take(total, range(1, total.shape[axis]), axis) + np.take(
+            total, range(total.shape[axis] - 1), axis
+        )
     for dx, dy in ((0, 0), (0, 1), (1, 0), (1, 1)):
         first = after[dx : dx - 1 or None, dy : dy - 1 or None, :-1]
         last = after[1 - dx : -dx or None, 1 - dy : -dy or None, 1:]
