@@ -51,7 +51,7 @@ class LabelVolume:
         _set(self, "tissue", np.uint8, (None, None, None))
         _set(self, "part", np.uint8, shape)
         affine = _set(self, "affine", np.float64, (4, 4))
-        if not np.isfinite(affine).all() or abs(np.linalg.det(affine[:3, :3])) < 1e-9:
+        if not np.isfinite(affine).all() or not np.linalg.det(affine[:3, :3]):
             raise ValueError("LabelVolume.affine is singular or not finite")
 
 
@@ -112,6 +112,11 @@ class Sheet:
     def __post_init__(self) -> None:
         points = _set(self, "points", np.float64, (None, None, None, 3))
         _set(self, "valid", np.bool_, points.shape[:2])
+
+    @property
+    def middle(self) -> int:
+        """Number of the z level of the mid-surface."""
+        return int(self.points.shape[2] // 2)
 
 
 class Status(StrEnum):

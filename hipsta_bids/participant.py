@@ -7,34 +7,24 @@ tetrahedra, boundaries, coordinates, sheet, measures.
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import replace
-from typing import Any
 
-import numpy as np
-
-from hipsta_bids.artifacts import (
-    Coordinates,
-    Flag,
-    Float,
-    HemisphereMaps,
-    LabelVolume,
-    Sheet,
-    Surface,
-    TetMesh,
-)
-from hipsta_bids.geometry.body import Body, check_side, extract_body
+from hipsta_bids.artifacts import Coordinates, HemisphereMaps, LabelVolume, Sheet, Surface
+from hipsta_bids.geometry.body import check_side, extract_body
 from hipsta_bids.geometry.boundaries import Boundaries, find_boundaries
 from hipsta_bids.geometry.checks import check_label_order, check_thickness, check_voxels_across
 from hipsta_bids.geometry.coordinates import solve_coordinates
-from hipsta_bids.geometry.grid import in_plane_voxel, resample_body
+from hipsta_bids.geometry.grid import resample_body
 from hipsta_bids.geometry.measures import (
+    SheetMeasures,
     bending_angle,
     mean_curvature,
     measure_thickness,
     summarize,
 )
-from hipsta_bids.geometry.sheet import folded_fraction, label_sheet, sample_sheet
-from hipsta_bids.geometry.surface import extract_surface, mean_wall_thickness, signed_volume
-from hipsta_bids.geometry.tetra import count_intersections, tetra_quality, tetrahedralize
+from hipsta_bids.geometry.quality import Evidence, find_flags, quality_metrics
+from hipsta_bids.geometry.sheet import folded_fraction, label_sheet, sample_sheet, whole_body
+from hipsta_bids.geometry.surface import extract_surface, signed_volume
+from hipsta_bids.geometry.tetra import count_intersections, tetrahedralize
 from hipsta_bids.geometry.topology import SolidField, repair_topology
 from hipsta_bids.settings import Settings
 
@@ -69,8 +59,7 @@ def measure_hemisphere(
     with clock("surface"):
         solid = repair_topology(resample_body(body, settings.grid), settings.topology)
         surface = extract_surface(solid.field, settings.surface)
-        wall = mean_wall_thickness(surface)
-        across = check_voxels_across(wall, in_plane_voxel(body.affine), settings.checks)
+        across = check_voxels_across(surface, body, settings.checks)
     with clock("tetrahedra"):
         surface, crossings = _untangled(solid, surface, settings)
         mesh = tetrahedralize(surface, settings.tetra)
@@ -85,50 +74,48 @@ def measure_hemisphere(
         if boundaries.side_rule == "bending" and bending < 0:
             sheet, coordinates, boundaries = _turned(sheet, coordinates, boundaries)
             bending = -bending
+        whole = sample_sheet(mesh, coordinates, whole_body(settings.sheet))
         subfield = label_sheet(sheet, body)
+    evidence = Evidence(
+        body=body,
+        side=side,
+        solid=solid,
+        surface=surface,
+        voxels_across=across,
+        crossings=crossings,
+        mesh=mesh,
+        boundaries=boundaries,
+        label_order=order,
+        sheet=sheet,
+        bending=bending,
+        folded=folded_fraction(mesh, coordinates),
+    )
     with clock("measures"):
         thickness = measure_thickness(sheet)
-        layers = {
-            name: mean_curvature(
-                sheet.points[:, :, level], sheet.points[:, :, -1] - sheet.points[:, :, 0],
-                settings.measures,
-            )
-            for name, level in (
-                ("curvature_interior", 0),
-                ("curvature", sheet.points.shape[2] // 2),
-                ("curvature_exterior", -1),
-            )
-        }
-        expected = boundaries.sheet_thickness
-        flags = [
-            *check_thickness(thickness, expected, settings.checks),
-            *_flags(solid, boundaries, sheet, bending, folded_fraction(mesh, coordinates), settings),
-        ]
-        summary = summarize(
-            sheet, thickness, subfield, volume.scheme.sheet,
-            signed_volume(surface.vertices, surface.triangles),
+        doubts = check_thickness(thickness, boundaries.sheet_thickness, settings.checks)
+        return HemisphereMaps(
+            sheet=sheet,
+            thickness=thickness,
+            curvature_interior=mean_curvature(sheet, 0, settings.measures),
+            curvature=mean_curvature(sheet, sheet.middle, settings.measures),
+            curvature_exterior=mean_curvature(sheet, -1, settings.measures),
+            subfield=subfield,
+            summary=summarize(
+                SheetMeasures(sheet=sheet, thickness=thickness, subfield=subfield),
+                SheetMeasures(
+                    sheet=whole,
+                    thickness=measure_thickness(whole),
+                    subfield=label_sheet(whole, body),
+                ),
+                volume.scheme.sheet,
+                signed_volume(surface.vertices, surface.triangles),
+            ),
+            qc=quality_metrics(evidence),
+            repairs=tuple(map(str, solid.repairs)),
+            flags=(*doubts, *find_flags(evidence, settings)),
+            mesh=mesh,
+            coordinates=coordinates,
         )
-    return HemisphereMaps(
-        sheet=sheet,
-        thickness=thickness,
-        subfield=subfield,
-        summary=summary,
-        qc=_qc(body, solid, surface, mesh, coordinates, boundaries, sheet)
-        | {
-            "medial_offset_mm": side,
-            "voxels_across": across,
-            "intersecting_triangles": crossings,
-            "label_order": order,
-            "bending_rad": bending,
-            "thickness_mean_mm": summary["thickness_mean"],
-            "thickness_expected_mm": expected,
-        },
-        repairs=tuple(map(str, solid.repairs)),
-        flags=tuple(flags),
-        mesh=mesh,
-        coordinates=coordinates,
-        **layers,
-    )
 
 
 def _untangled(solid: SolidField, surface: Surface, settings: Settings) -> tuple[Surface, int]:
@@ -138,9 +125,7 @@ def _untangled(solid: SolidField, surface: Surface, settings: Settings) -> tuple
         if crossings <= 0:
             break
         steps = settings.surface.taubin_iterations * (1 + extra)
-        surface = extract_surface(
-            solid.field, replace(settings.surface, taubin_iterations=steps)
-        )
+        surface = extract_surface(solid.field, replace(settings.surface, taubin_iterations=steps))
         crossings = count_intersections(surface, settings.tetra)
     return surface, crossings
 
@@ -154,96 +139,3 @@ def _turned(
         Coordinates(values=coordinates.values * [1, 1, -1]),
         replace(boundaries, interior=boundaries.exterior, exterior=boundaries.interior),
     )
-
-
-def _flags(
-    solid: SolidField,
-    boundaries: Boundaries,
-    sheet: Sheet,
-    bending: float,
-    folded: float,
-    settings: Settings,
-) -> list[Flag]:
-    checks = settings.checks
-    filled = 1 - float(sheet.valid.mean())
-    rows = [
-        *(
-            (repair.large, "large-repair", f"{repair}: a large repair, look at the labels there")
-            for repair in solid.repairs
-        ),
-        (
-            solid.changed_fraction > settings.topology.flag_fraction,
-            "much-repaired",
-            f"{solid.changed_fraction:.1%} of the body was changed by repairs: look at the labels",
-        ),
-        (
-            boundaries.rim_distance > checks.flag_rim_distance,
-            "boundary-doubtful",
-            f"the medial or lateral boundary is uncertain by {boundaries.rim_distance:.1f} mm: "
-            "look at the ends of the ribbon in each slice",
-        ),
-        (
-            boundaries.side_rule == "labels" and bending < -checks.flag_bending,
-            "side-doubtful",
-            f"interior labels lie on the outer side of the bend ({bending:.1f} rad): "
-            "check the dentate gyrus labels",
-        ),
-        (
-            folded > checks.flag_folded,
-            "folded",
-            f"the coordinates fold in {folded:.1%} of the volume: look at the map",
-        ),
-        (
-            filled > checks.flag_filled,
-            "columns-filled",
-            f"{filled:.1%} of the columns were filled from their neighbors: look at the map",
-        ),
-    ]
-    return [Flag(reason=reason, message=message) for wrong, reason, message in rows if wrong]
-
-
-def _qc(
-    body: Body,
-    solid: SolidField,
-    surface: Surface,
-    mesh: TetMesh,
-    coordinates: Coordinates,
-    boundaries: Boundaries,
-    sheet: Sheet,
-) -> dict[str, Any]:
-    """Numbers and words that say whether to trust the map."""
-    ends = body.ends
-    return {
-        "voxel_size_mm": np.linalg.norm(body.affine[:3, :3], axis=0).round(4).tolist(),
-        "body_voxels": int(np.count_nonzero(body.inside)),
-        "layer_voxels": body.layer_voxels,
-        "body_length_mm": ends.length(body.inside_points()[1]),
-        "posterior_end_rule": ends.posterior_rule,
-        "anterior_end_rule": ends.anterior_rule,
-        "posterior_plane": _plane(ends.posterior_point, ends.posterior_normal),
-        "anterior_plane": _plane(ends.anterior_point, ends.anterior_normal),
-        "euler_before": solid.euler_before,
-        "euler_after": 1,
-        "changed_fraction": solid.changed_fraction,
-        "surface_vertices": len(surface.vertices),
-        "surface_euler": 2,
-        "posterior_cap_vertices": int(surface.posterior_cap.sum()),
-        "anterior_cap_vertices": int(surface.anterior_cap.sum()),
-        "tetrahedra": len(mesh.tetrahedra),
-        "tetra_quality_median": float(np.median(tetra_quality(mesh))),
-        "tetra_quality_p01": float(np.quantile(tetra_quality(mesh), 0.01)),
-        "boundary_rule": boundaries.rule,
-        "boundary_distance_mm": boundaries.distance,
-        "boundary_rim_distance_mm": boundaries.rim_distance,
-        "boundary_strip_mm": boundaries.strip_width,
-        "side_rule": boundaries.side_rule,
-        "side_margin": boundaries.side_margin,
-        "folded_fraction": folded_fraction(mesh, coordinates),
-        "filled_columns": int(np.count_nonzero(~sheet.valid)),
-        "filled_fraction": float(1 - sheet.valid.mean()),
-        "regions_outside": "head and tail (as in Diers et al. 2023)",
-    }
-
-
-def _plane(point: Float, normal: Float) -> dict[str, list[float]]:
-    return {"point_ras_mm": point.round(3).tolist(), "normal_ras": normal.round(4).tolist()}

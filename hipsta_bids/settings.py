@@ -24,9 +24,9 @@ class BodySettings:
     end_margin: float = 0.0
     """Taken off either end where head or tail labels are missing, mm."""
     head_piece: float = 1.5
-    """Without head labels: the body ends where a slice shows two pieces above this area, mm2."""
+    """Without end labels: the body ends where a slice shows two pieces above this area, mm2."""
     head_growth: float = 1.35
-    """Without head labels: ... or twice running an area above this multiple of the median."""
+    """Without end labels: ... or twice running an area above this multiple of the median."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,11 +105,13 @@ class BoundarySettings:
     """Cost of a path per mm along a rim; depth below the rim adds its square, mm2."""
     rim_zone: float = 1.5
     """Depth of the rim zones, multiples of 2 volume / wall area."""
+    rim_bands: tuple[float, ...] = (1.0, 0.75, 0.75)
+    """Half widths of the bands in which curves are moved to the middle of the rims, same unit."""
     rim_reach: float = 0.75
     """The zones hold at least all within this distance of the rim path, in the same unit."""
     max_distance: float = 1.0
     """The two rules may differ by this much, mm; beyond it the rims are taken."""
-    strip_width: float = 1.0
+    strip_width: float = 1.1
     """Width of the boundary strips, multiples of 2 volume / wall area."""
     probe_distances: tuple[float, ...] = (0.4, 0.8, 1.2)
     """Distances at which interior labels are looked for, mm outside the wall."""

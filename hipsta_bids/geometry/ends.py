@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from hipsta_bids.artifacts import Bool, Float, LabelVolume
@@ -28,9 +29,10 @@ class EndPlanes:
     axis: Float
     """(3,) unit vector, posterior to anterior, between the two normals."""
     posterior_rule: str
-    """``labels`` or ``subfields`` (the paper's automatic rule)."""
+    """``labels``, ``subfields`` (the paper's automatic rule), or ``cross-section`` (that rule ran
+    beyond the body and was cut short)."""
     anterior_rule: str
-    """``labels``, ``subfields``, or ``cross-section`` (the rule ran into the head)."""
+    """As above."""
     half_slice: float
     """Half of a voxel's extent along the axis, mm."""
 
@@ -48,7 +50,7 @@ class EndPlanes:
 
 
 def find_end_planes(
-    volume: LabelVolume, sheet: np.ndarray[tuple[int, ...], np.dtype[np.uint8]], settings: BodySettings
+    volume: LabelVolume, sheet: NDArray[np.uint8], settings: BodySettings
 ) -> EndPlanes:
     """Find the planes between tail and body, and body and head.
 
@@ -72,8 +74,10 @@ def find_end_planes(
     GeometryError
         ``no-body`` where no slice fulfils the rule, ``ends-crossed`` where the planes meet.
     """
-    hippocampal = (volume.tissue > 0) & (volume.tissue <= Tissue.HIPPOCAMPUS) & ~np.isin(
-        volume.tissue, (Tissue.FIMBRIA, Tissue.FISSURE, Tissue.CYST, Tissue.HATA)
+    hippocampal = (
+        (volume.tissue > 0)
+        & (volume.tissue <= Tissue.HIPPOCAMPUS)
+        & ~np.isin(volume.tissue, (Tissue.FIMBRIA, Tissue.FISSURE, Tissue.CYST, Tissue.HATA))
     )
     index = np.argwhere(hippocampal)
     points = index @ volume.affine[:3, :3].T + volume.affine[:3, 3]
@@ -96,15 +100,11 @@ def find_end_planes(
             "labels",
         )
     if len(planes) < 2:  # noqa: PLR2004 -- two ends
-        # Where one end is labelled, the other is cut parallel to it.
+        # Where one end is labeled, the other is cut parallel to it.
         across = next((normal for _, normal, _ in planes.values()), axis)
-        low, high, high_rule = _automatic_range(volume, sheet, across, planes, settings)
-        for end, level, rule in (
-            ("posterior", low, "subfields"),
-            ("anterior", high, high_rule),
-        ):
-            if end not in planes:
-                planes[end] = (level * across, across, rule)  # type: ignore[index]
+        found = _automatic_range(volume, sheet, across, planes, settings)
+        for end, (level, rule) in found.items():
+            planes.setdefault(end, (level * across, across, rule))
     return _checked(planes, axis, half_slice)
 
 
@@ -133,23 +133,29 @@ def _checked(
     )
 
 
-def _long_axis(points: Float, parts: np.ndarray[tuple[int, ...], np.dtype[np.uint8]]) -> Float:
-    """First principal axis, pointing from tail to head (by labels, otherwise by +y in RAS)."""
-    centred = points - points.mean(axis=0)
-    _, vectors = np.linalg.eigh(centred.T @ centred)
+def _long_axis(points: Float, parts: NDArray[np.uint8]) -> Float:
+    """Find the unit vector from tail to head.
+
+    Between the centers of the labeled head and tail; otherwise the first principal axis, turned
+    towards whichever end is labeled, or to the front (+y in RAS).
+    """
+    head, tail = points[parts == Part.HEAD], points[parts == Part.TAIL]
+    if len(head) and len(tail):
+        between = head.mean(axis=0) - tail.mean(axis=0)
+        return np.asarray(between / np.linalg.norm(between))
+    centered = points - points.mean(axis=0)
+    _, vectors = np.linalg.eigh(centered.T @ centered)
     axis: Float = vectors[:, -1]
-    sides = [points[parts == part] @ axis for part in (Part.TAIL, Part.BODY, Part.UNKNOWN, Part.HEAD)]
-    known = [side.mean() for side in sides if len(side)]
-    if len(known) > 1:
-        sign = known[-1] - known[0]
+    if len(head):
+        forward = float(head.mean(axis=0) @ axis - points.mean(axis=0) @ axis)
+    elif len(tail):
+        forward = float(points.mean(axis=0) @ axis - tail.mean(axis=0) @ axis)
     else:
-        sign = axis[1]
-    return axis if sign >= 0 else -axis
+        forward = float(axis[1])
+    return axis if forward >= 0 else -axis
 
 
-def _separating_plane(
-    below: Float, above: Float, axis: Float, reach: float
-) -> tuple[Float, Float]:
+def _separating_plane(below: Float, above: Float, axis: Float, reach: float) -> tuple[Float, Float]:
     """Plane between two label classes by ridge-penalised logistic regression near the interface.
 
     Parameters
@@ -170,9 +176,7 @@ def _separating_plane(
     level = 0.5 * (np.quantile(low, 0.995) + np.quantile(high, 0.005))
     point, normal = level * axis, axis
     for _ in range(3):  # the window follows the plane's tilt
-        near = [
-            p[np.abs((p - point) @ normal) < reach] for p in (below, above)
-        ]
+        near = [p[np.abs((p - point) @ normal) < reach] for p in (below, above)]
         if min(len(p) for p in near) < 10:  # noqa: PLR2004 -- four parameters need some voxels
             break
         point, normal = _logistic_plane(near[0], near[1], axis)
@@ -204,103 +208,116 @@ def _logistic_plane(below: Float, above: Float, axis: Float) -> tuple[Float, Flo
     return point, normal
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Slices:
+    """Cross-sections at equal steps along an axis."""
+
+    axis: Float
+    first: float
+    """Level of the first slice along the axis, mm."""
+    step: float
+
+    def level(self, number: float) -> float:
+        return float(self.first + self.step * number)
+
+
 def _automatic_range(
     volume: LabelVolume,
-    sheet: np.ndarray[tuple[int, ...], np.dtype[np.uint8]],
+    sheet: NDArray[np.uint8],
     axis: Float,
     known: dict[End, tuple[Float, Float, str]],
     settings: BodySettings,
-) -> tuple[float, float, str]:
-    """Posterior and anterior level along the axis by the subfields that the slices show, mm."""
+) -> dict[End, tuple[float, str]]:
+    """Levels along the axis, mm, and rules of the ends that have no labels."""
     index = np.argwhere(sheet > 0)
-    points = index @ volume.affine[:3, :3].T + volume.affine[:3, 3]
-    values = sheet[sheet > 0]
-    along = points @ axis
+    along = (index @ volume.affine[:3, :3].T + volume.affine[:3, 3]) @ axis
     step = float(np.abs(axis @ volume.affine[:3, :3]).max())
-    first = along.min()
-    slices = np.floor((along - first) / step + 0.5).astype(int)
-    count = slices.max() + 1
-    counts = {t: np.bincount(slices[values == t], minlength=count) for t in np.unique(values)}
-    zero = np.zeros(count, dtype=int)
-    ca1 = counts.get(Tissue.CA1, zero) > 0
-    ca23 = sum((counts.get(t, zero) for t in (Tissue.CA2, Tissue.CA2_3, Tissue.CA3)), zero) > 0
+    slices = _Slices(axis=axis, first=float(along.min()), step=step)
+    number = np.floor((along - slices.first) / step + 0.5).astype(int)
+    values = sheet[sheet > 0]
+    count = int(number.max()) + 1
+    ca1 = np.bincount(number[values == Tissue.CA1], minlength=count) > 0
+    lateral = np.isin(values, (Tissue.CA2, Tissue.CA2_3, Tissue.CA3))
+    ca23 = np.bincount(number[lateral], minlength=count) > 0
+    levels = slices.first + step * np.arange(count)
     if "posterior" in known:
-        floor = float(np.median((known["posterior"][0] @ axis)))
-        eligible = first + step * np.arange(count) > floor
-    else:
-        eligible = np.ones(count, dtype=bool)
-    both = np.flatnonzero(ca1 & ca23 & eligible)
+        ca23 &= levels > known["posterior"][0] @ axis
+    if "anterior" in known:
+        ca23 &= levels < known["anterior"][0] @ axis
+    both = np.flatnonzero(ca1 & ca23)
     if not len(both):
         raise GeometryError(
             "no slice across the long axis has both CA1 and CA2/CA3, and there are no head and "
             "tail labels: cannot tell where the body lies",
             reason="no-body",
         )
-    low, high = both[0], np.flatnonzero(ca23 & eligible)[-1]
-    rule = "subfields"
-    if "anterior" not in known:
-        guarded = _before_the_head(sheet > 0, volume.affine, axis, (first, step), (low, high), settings)
-        if guarded < high:
-            high, rule = guarded, "cross-section"
+    low, high = int(both[0]), int(np.flatnonzero(ca23)[-1])
+    first, last = _body_like(sheet > 0, volume.affine, slices, (low, high), settings)
     # Each kept slice reaches half a step to both sides.
-    return (
-        float(first + step * (low - 0.5) + settings.end_margin),
-        float(first + step * (high + 0.5) - settings.end_margin),
-        rule,
-    )
+    return {
+        "posterior": (
+            slices.level(first - 0.5) + settings.end_margin,
+            "cross-section" if first > low else "subfields",
+        ),
+        "anterior": (
+            slices.level(last + 0.5) - settings.end_margin,
+            "cross-section" if last < high else "subfields",
+        ),
+    }
 
 
-def _before_the_head(
-    mask: Bool,
-    affine: Float,
-    axis: Float,
-    slicing: tuple[float, float],
-    bounds: tuple[int, int],
-    settings: BodySettings,
-) -> int:
-    """Last slice that still looks like the body.
+def _body_like(
+    mask: Bool, affine: Float, slices: _Slices, bounds: tuple[int, int], settings: BodySettings
+) -> tuple[int, int]:
+    """First and last slice, counted from the middle, that look like the body.
 
-    Where CA2/CA3 is labelled in the head, the rule of the paper runs deep into it. Going anterior
-    from the middle, the body ends where the cross-section falls into two large pieces, or grows
-    well beyond the posterior median twice running.
+    Where CA2/CA3 is labeled in the head or in the tail's bend, the rule of the paper runs deep
+    into them. The body ends where the cross-section falls into two large pieces, or twice running
+    exceeds the usual area.
     """
-    first, step = slicing
-    low, high = bounds
-    side = np.cross(axis, [1.0, 0, 0] if abs(axis[0]) < 0.9 else [0, 1.0, 0])  # noqa: PLR2004
+    section, pixel = _sections(mask, affine, slices, bounds)
+    area = section.sum(axis=(1, 2)) * pixel**2
+    count = len(area)
+    usual = float(np.median(area[count // 4 : count - count // 4]))
+    in_slice = np.zeros((3, 3, 3), dtype=bool)
+    in_slice[1] = True  # pieces are sought within each slice
+    pieces, total = ndimage.label(section, structure=in_slice)
+    sizes = np.bincount(pieces.ravel(), minlength=total + 1)[1:] * pixel**2
+    owner = np.zeros(total, dtype=int)
+    number = np.broadcast_to(np.arange(count)[:, None, None], section.shape)
+    owner[pieces[section] - 1] = number[section]
+    split = np.bincount(owner[sizes > settings.head_piece], minlength=count) > 1
+    wide = area > settings.head_growth * usual
+    twice = np.zeros(count, dtype=bool)
+    twice[:-1] |= wide[:-1] & wide[1:]
+    twice[1:] |= wide[1:] & wide[:-1]
+    odd = np.flatnonzero(split | twice)
+    before, after = odd[odd < count // 2], odd[odd > count // 2]
+    first = int(before[-1]) + 1 if len(before) else 0
+    last = int(after[0]) - 1 if len(after) else count - 1
+    return bounds[0] + first, bounds[0] + last
+
+
+def _sections(
+    mask: Bool, affine: Float, slices: _Slices, bounds: tuple[int, int]
+) -> tuple[Bool, float]:
+    """Sample the mask in the slices between bounds, (N, A, B); also the pixel edge, mm."""
+    axis = slices.axis
+    side = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     side = side / np.linalg.norm(side)
     up = np.cross(axis, side)
-    pixel = float(np.min(np.linalg.norm(affine[:3, :3], axis=0)))
-    inverse = np.linalg.inv(affine)
+    pixel = float(np.linalg.norm(affine[:3, :3], axis=0).min())
     points = np.argwhere(mask) @ affine[:3, :3].T + affine[:3, 3]
-    a, b = points @ side, points @ up
-    grid_a = np.arange(a.min() - 1, a.max() + 1, pixel)
-    grid_b = np.arange(b.min() - 1, b.max() + 1, pixel)
-    levels = first + step * np.arange(low, high + 1)
+    a, b = (
+        np.arange(reach.min() - 1, reach.max() + 1, pixel) for reach in (points @ side, points @ up)
+    )
+    levels = slices.first + slices.step * np.arange(bounds[0], bounds[1] + 1)
     where = (
-        grid_a[None, :, None, None] * side
-        + grid_b[None, None, :, None] * up
+        a[None, :, None, None] * side
+        + b[None, None, :, None] * up
         + levels[:, None, None, None] * axis
     )
-    voxel = where @ inverse[:3, :3].T + inverse[:3, 3]
-    section = (
-        ndimage.map_coordinates(
-            mask.astype(np.float32), np.moveaxis(voxel, -1, 0), order=1, output=np.float32
-        )
-        > 0.5  # noqa: PLR2004 -- the mask's level
-    )
-    area = section.sum(axis=(1, 2)) * pixel**2
-    middle = len(levels) // 2
-    usual = float(np.median(area[: middle + 1]))
-    in_slice = np.zeros((3, 3, 3), dtype=bool)
-    in_slice[1] = True  # components are sought within each slice
-    pieces, count = ndimage.label(section, structure=in_slice)
-    sizes = np.bincount(pieces.ravel(), minlength=count + 1)[1:] * pixel**2
-    owner = np.zeros(count, dtype=int)
-    planes = np.broadcast_to(np.arange(len(levels))[:, None, None], section.shape)
-    owner[pieces[section] - 1] = planes[section]
-    large = np.bincount(owner[sizes > settings.head_piece], minlength=len(levels))
-    wide = area > settings.head_growth * usual
-    stop = (large > 1) | (wide & np.roll(wide, 1)) | (wide & np.roll(wide, -1))
-    stop[: middle + 1] = False
-    hits = np.flatnonzero(stop)
-    return int(low + (hits[0] - 1 if len(hits) else len(levels) - 1))
+    inverse = np.linalg.inv(affine)
+    voxels = np.moveaxis(where @ inverse[:3, :3].T + inverse[:3, 3], -1, 0)
+    field = ndimage.map_coordinates(mask.astype(np.float32), voxels, order=1, output=np.float32)
+    return field > 0.5, pixel  # noqa: PLR2004 -- halfway between outside and inside

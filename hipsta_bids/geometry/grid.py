@@ -57,7 +57,8 @@ class WedgeGrid:
 
     def node_points(self, clamp: float) -> Float:
         """RAS mm of all nodes, (A, B, W, 3), kept ``clamp`` mm away from the end planes."""
-        a, b = np.meshgrid(np.arange(self.shape[0]), np.arange(self.shape[1]), indexing="ij")
+        counts = (np.arange(n, dtype=np.float64) for n in self.shape[:2])
+        a, b = np.meshgrid(*counts, indexing="ij")
         low = self._height(self.posterior, a, b)
         high = self._height(self.anterior, a, b)
         share = np.linspace(0, 1, self.shape[2])
@@ -155,9 +156,7 @@ def _fit_grid(body: Body, settings: GridSettings) -> WedgeGrid:
     )
 
 
-def _plane_height(
-    point: Float, normal: Float, origin: Float, steps: Float, axis: Float
-) -> Float:
+def _plane_height(point: Float, normal: Float, origin: Float, steps: Float, axis: Float) -> Float:
     """Height of a plane above the grid's base as a linear function of the node numbers."""
     along = normal @ axis
     return np.array([(point - origin) @ normal, *(-(steps @ normal))]) / along

@@ -49,12 +49,10 @@ def stiffness(vertices: Float, tetrahedra: Int, tensor: Float | None = None) -> 
 def lumped_mass(vertices: Float, tetrahedra: Int) -> Float:
     """Diagonal of the lumped mass matrix, (V,), mm3."""
     share = np.repeat(tetra_volumes(vertices, tetrahedra) / 4, 4)
-    return np.bincount(tetrahedra.ravel(), weights=share, minlength=len(vertices))
+    return np.bincount(tetrahedra.ravel(), share, minlength=len(vertices)).astype(np.float64)
 
 
-def solve_dirichlet(
-    matrix: sparse.csc_array, fixed: NDArray[np.intp], values: Float
-) -> Float:
+def solve_dirichlet(matrix: sparse.csc_array, fixed: NDArray[np.intp], values: Float) -> Float:
     """Harmonic function with given values at some vertices and free boundary elsewhere.
 
     Parameters

@@ -1,5 +1,7 @@
 """Thickness, curvature, extents and areas of a sheet."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import savgol_filter
@@ -18,7 +20,7 @@ def measure_thickness(sheet: Sheet) -> Float:
     return np.asarray(steps.sum(axis=2))
 
 
-def mean_curvature(points: Float, outward: Float, settings: MeasureSettings) -> Float:
+def mean_curvature(sheet: Sheet, level: int, settings: MeasureSettings) -> Float:
     """Mean curvature of one layer of the sheet, (Nx, Ny), 1/mm.
 
     Positive where the layer curls round its interior side, as on a cylinder whose axis lies on the
@@ -26,10 +28,9 @@ def mean_curvature(points: Float, outward: Float, settings: MeasureSettings) -> 
 
     Parameters
     ----------
-    points : (Nx, Ny, 3) array
-        One z level of a sheet, RAS mm.
-    outward : (Nx, Ny, 3) array
-        Any vectors towards the exterior side.
+    sheet : Sheet
+    level : int
+        Number of the layer along z.
     settings : MeasureSettings
 
     Returns
@@ -42,6 +43,8 @@ def mean_curvature(points: Float, outward: Float, settings: MeasureSettings) -> 
     Geometry of Curves and Surfaces, section 3.3; smoothing differentiation by Savitzky & Golay
     1964, Anal Chem 36:1627-1639).
     """
+    points = sheet.points[:, :, level]
+    outward = sheet.points[:, :, -1] - sheet.points[:, :, 0]
     du = _derivative(points, settings, (1, 0))
     dv = _derivative(points, settings, (0, 1))
     duu = _derivative(points, settings, (2, 0))
@@ -60,7 +63,7 @@ def bending_angle(sheet: Sheet, settings: MeasureSettings) -> float:
 
     The mean over y of the curvature integrated along x; negative if the sheet curls the other way.
     """
-    mid = sheet.points[:, :, sheet.points.shape[2] // 2]
+    mid = sheet.points[:, :, sheet.middle]
     outward = sheet.points[:, :, -1] - sheet.points[:, :, 0]
     du = _derivative(mid, settings, (1, 0))
     duu = _derivative(mid, settings, (2, 0))
@@ -76,7 +79,7 @@ def layer_area(points: Float) -> Float:
     return np.asarray(0.5 * np.linalg.norm(np.cross(a, b), axis=-1))
 
 
-def column_volume(sheet: Sheet, thickness: Float) -> Float:
+def column_volume(sheet: Sheet) -> Float:
     """Volume round each column, (Nx, Ny), mm3, by the trapezoidal rule over layers."""
     areas = np.stack(
         [node_shares(layer_area(sheet.points[:, :, k])) for k in range(sheet.points.shape[2])],
@@ -95,57 +98,61 @@ def node_shares(cells: Float) -> Float:
     return shares
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SheetMeasures:
+    """A sheet with what was measured on it."""
+
+    sheet: Sheet
+    thickness: Float
+    """(Nx, Ny) mm."""
+    subfield: NDArray[np.uint8]
+    """(Nx, Ny) values of Tissue."""
+
+
 def summarize(
-    sheet: Sheet,
-    thickness: Float,
-    subfield: NDArray[np.uint8],
-    tissues: tuple[Tissue, ...],
-    mesh_volume: float,
+    measured: SheetMeasures, whole: SheetMeasures, tissues: tuple[Tissue, ...], volume: float
 ) -> dict[str, float]:
     """One number per measure for the whole body and per subfield.
 
     Parameters
     ----------
-    sheet : Sheet
-    thickness : (Nx, Ny) array, mm
-    subfield : (Nx, Ny) array of Tissue values
+    measured : SheetMeasures
+        Where thickness is measured.
+    whole : SheetMeasures
+        The same body from rim to rim, end to end and wall to wall, for lengths, areas and volumes.
     tissues : tuple of Tissue
         The subfields of the protocol; absent ones are NaN.
-    mesh_volume : float
-        mm3
+    volume : float
+        Of the mesh, mm3.
 
     Returns
     -------
     dict
         Keys as in the output table: thickness and extents in mm, areas in mm2, volumes in mm3.
     """
-    middle = sheet.points.shape[2] // 2
-    mid = sheet.points[:, :, middle]
-    valid = sheet.valid
+    points, valid = whole.sheet.points, measured.sheet.valid
+    mid = points[:, :, whole.sheet.middle]
     mid_area = node_shares(layer_area(mid))
-    volume = column_volume(sheet, thickness)
+    columns = column_volume(whole.sheet)
     summary = {
-        "thickness_mean": float(thickness[valid].mean()),
+        "thickness_mean": float(measured.thickness[valid].mean()),
         "extent_x": float(np.linalg.norm(np.diff(mid, axis=0), axis=-1).sum(axis=0).mean()),
         "extent_y": float(np.linalg.norm(np.diff(mid, axis=1), axis=-1).sum(axis=1).mean()),
-        "extent_z": float(thickness.mean()),
-        "volume": mesh_volume,
-        "area_interior": float(layer_area(sheet.points[:, :, 0]).sum()),
+        "extent_z": float(measured.thickness.mean()),
+        "volume": volume,
+        "area_interior": float(layer_area(points[:, :, 0]).sum()),
         "area_mid": float(mid_area.sum()),
-        "area_exterior": float(layer_area(sheet.points[:, :, -1]).sum()),
+        "area_exterior": float(layer_area(points[:, :, -1]).sum()),
     }
-    for tissue in tissues:
-        here = subfield == tissue
-        known = here & valid
-        summary[f"thickness_mean_{tissue.name}"] = (
-            float(thickness[known].mean()) if known.any() else float("nan")
-        )
-    for tissue in tissues:
-        here = subfield == tissue
-        summary[f"area_{tissue.name}"] = float(mid_area[here].sum()) if here.any() else float("nan")
-    for tissue in tissues:
-        here = subfield == tissue
-        summary[f"volume_{tissue.name}"] = float(volume[here].sum()) if here.any() else float("nan")
+    parts = (
+        ("thickness_mean", measured.subfield[valid], measured.thickness[valid], np.mean),
+        ("area", whole.subfield, mid_area, np.sum),
+        ("volume", whole.subfield, columns, np.sum),
+    )
+    for name, labels, values, merge in parts:
+        for tissue in tissues:
+            here = values[labels == tissue]
+            summary[f"{name}_{tissue.name}"] = float(merge(here)) if here.size else float("nan")
     return summary
 
 
@@ -153,7 +160,6 @@ def _derivative(points: Float, settings: MeasureSettings, order: tuple[int, int]
     """Smoothed partial derivative with respect to the node numbers."""
     for axis, times in enumerate(order):
         window = min(settings.curvature_window, points.shape[axis] - 1 + points.shape[axis] % 2)
-        points = savgol_filter(
-            points, window, polyorder=min(settings.curvature_order, window - 1), deriv=times, axis=axis
-        )
+        degree = min(settings.curvature_order, window - 1)
+        points = savgol_filter(points, window, polyorder=degree, deriv=times, axis=axis)
     return points

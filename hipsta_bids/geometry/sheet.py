@@ -1,5 +1,7 @@
 """The sheet: the body on a regular grid of its own coordinates."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -35,7 +37,7 @@ def sample_sheet(mesh: TetMesh, coordinates: Coordinates, settings: SheetSetting
     """
     axes = sheet_levels(settings)
     points = _invert(mesh, coordinates.values, axes)
-    missing = ~np.isfinite(points).all(axis=(2, 3))
+    missing = np.asarray(~np.isfinite(points).all(axis=(2, 3)))
     share = float(missing.mean())
     if share > settings.max_filled:
         raise GeometryError(
@@ -53,6 +55,14 @@ def sheet_levels(settings: SheetSettings) -> tuple[Float, Float, Float]:
         np.linspace(-settings.y_extent, settings.y_extent, settings.y_nodes),
         np.linspace(-settings.z_extent, settings.z_extent, settings.z_nodes),
     )
+
+
+def whole_body(settings: SheetSettings) -> SheetSettings:
+    """Describe the grid that reaches from rim to rim, end to end and wall to wall.
+
+    Columns on the rims themselves have no thickness, but lengths and areas need them.
+    """
+    return replace(settings, x_extent=1.0, y_extent=1.0, z_extent=1.0, z_nodes=5, max_filled=1.0)
 
 
 def folded_fraction(mesh: TetMesh, coordinates: Coordinates) -> float:
@@ -135,7 +145,7 @@ def _barycentric(corners: Float, points: Float) -> tuple[Float, Bool]:
 
 def _filled(points: Float) -> Float:
     """Replace missing points by normalised averages of their neighbors in the same z level."""
-    missing = ~np.isfinite(points).all(axis=-1)
+    missing = np.asarray(~np.isfinite(points).all(axis=-1))
     if not missing.any():
         return points
     known = (~missing).astype(float)

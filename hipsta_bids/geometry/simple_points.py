@@ -1,5 +1,4 @@
-"""Digital topology on voxel grids: Euler number, simple points, growing and shrinking without
-a change of topology.
+"""Digital topology on voxel grids: Euler number, simple points, growing and shrinking.
 
 The object is 6-connected, the background 26-connected. A voxel is simple if changing it keeps the
 topology of both: one 6-connected piece of object in its 18-neighborhood touches it by a face, and
@@ -45,9 +44,7 @@ def euler_number(mask: Bool) -> int:
     ]
     cubes = squares[0][:, :, 1:] & squares[0][:, :, :-1]
     count = np.count_nonzero
-    return int(
-        count(mask) - sum(map(count, edges)) + sum(map(count, squares)) - count(cubes)
-    )
+    return int(count(mask) - sum(map(count, edges)) + sum(map(count, squares)) - count(cubes))
 
 
 def grow(start: Bool, allowed: Bool, field: NDArray[np.float32], levels: int) -> Bool:
@@ -122,7 +119,9 @@ def _sweep(state: Bool, free: Bool, *, add: bool) -> None:
         marked[queue] = False
 
 
-def _on_frontier(flat: Bool, queue: NDArray[np.int64], shifts: NDArray[np.int64], add: bool) -> NDArray[np.int64]:
+def _on_frontier(
+    flat: Bool, queue: NDArray[np.int64], shifts: NDArray[np.int64], add: bool
+) -> NDArray[np.int64]:
     near = np.zeros(len(queue), dtype=bool)
     for shift in shifts:
         near |= flat[queue + shift] == add

@@ -1,7 +1,6 @@
 """From a solid field to a closed triangle surface with planar end caps."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from skimage.measure import marching_cubes
 
@@ -38,7 +37,7 @@ def extract_surface(field: Field, settings: SurfaceSettings) -> Surface:
     """
     outside = -1e4 * float(np.abs(field.values).max())
     padded = np.pad(field.values, 1, constant_values=outside)
-    nodes, faces, _, _ = marching_cubes(padded, level=0.0)
+    nodes, faces, _, _ = marching_cubes(padded, level=0.0)  # type: ignore[no-untyped-call]
     nodes = nodes.astype(np.float64) - 1.0
     last = field.grid.shape[2] - 1
     nodes[:, 2] = np.clip(nodes[:, 2], 0, last)
@@ -70,8 +69,10 @@ def triangle_areas(vertices: Float, triangles: Int) -> Float:
 
 def lateral_triangles(surface: Surface) -> Bool:
     """(F,) whether a triangle belongs to the wall, not to a cap."""
-    caps = [cap[surface.triangles].all(axis=1) for cap in (surface.posterior_cap, surface.anterior_cap)]
-    return ~(caps[0] | caps[1])
+    caps = [
+        cap[surface.triangles].all(axis=1) for cap in (surface.posterior_cap, surface.anterior_cap)
+    ]
+    return np.asarray(~(caps[0] | caps[1]))
 
 
 def mean_wall_thickness(surface: Surface) -> float:
@@ -107,9 +108,7 @@ def _adjacency(edges: Int, count: int) -> sparse.csr_array:
     return sparse.csr_array((ones, (both[:, 0], both[:, 1])), shape=(count, count))
 
 
-def _taubin(
-    nodes: Float, faces: Int, caps: tuple[Bool, Bool], settings: SurfaceSettings
-) -> Float:
+def _taubin(nodes: Float, faces: Int, caps: tuple[Bool, Bool], settings: SurfaceSettings) -> Float:
     """Smooth in grid coordinates; caps stay in their planes, their rims move along themselves."""
     edges = unique_edges(faces)
     cap = caps[0] | caps[1]
@@ -136,9 +135,7 @@ def _taubin(
 
 def _rim_edges(cap_faces: Int, count: int) -> Int:
     """Edges that belong to one cap triangle only."""
-    pairs: NDArray[np.int32] = np.sort(
-        np.vstack([cap_faces[:, [0, 1]], cap_faces[:, [1, 2]], cap_faces[:, [2, 0]]])
-    )
+    pairs = np.sort(np.vstack([cap_faces[:, [0, 1]], cap_faces[:, [1, 2]], cap_faces[:, [2, 0]]]))
     code, times = np.unique(pairs[:, 0].astype(np.int64) * count + pairs[:, 1], return_counts=True)
     once = code[times == 1]
     return np.column_stack([once // count, once % count]).astype(np.int32)

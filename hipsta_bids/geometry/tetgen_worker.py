@@ -7,6 +7,7 @@ with a length in front, over the standard streams.
 """
 
 import atexit
+import contextlib
 import os
 import pickle
 import select
@@ -55,7 +56,7 @@ class TetgenClient:
         return reply if isinstance(reply, str) else (reply[0], reply[1])
 
     def intersections(self, vertices: Float, triangles: Int, timeout: float) -> int | str:
-        """Number of triangles that intersect others, or why it is not known."""
+        """Count triangles that intersect others, or say why that is not known."""
         reply = self._ask(("intersections", vertices, triangles), timeout)
         return reply if isinstance(reply, str) else int(reply)
 
@@ -74,7 +75,7 @@ class TetgenClient:
     def _running(self) -> subprocess.Popen[bytes]:
         if self._process is None or self._owner != os.getpid() or self._process.poll() is not None:
             environment = dict(os.environ, OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
-            self._process = subprocess.Popen(
+            self._process = subprocess.Popen(  # noqa: S603 -- our own module
                 [sys.executable, "-m", __name__],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
@@ -92,10 +93,8 @@ class TetgenClient:
             return None
         for stream in (process.stdin, process.stdout):
             if stream is not None:
-                try:
+                with contextlib.suppress(BrokenPipeError):
                     stream.close()
-                except BrokenPipeError:
-                    pass
         process.kill()
         return process.wait()
 

@@ -32,7 +32,7 @@ class Repair:
     voxels: int
     """Changed nodes of the working grid."""
     cost: float
-    """Sum of the field's distance from its level over these nodes: how much evidence was overruled."""
+    """How much evidence was overruled: sum of the field's distance from its level."""
     position: tuple[float, float, float]
     """Center, RAS mm."""
     large: bool
@@ -58,7 +58,8 @@ class SolidField:
     touched: Bool
     """(A, B, W) nodes whose side was changed."""
     euler_before: int
-    """Euler number of the body with its end plates; 1 is right."""
+    """Euler number of the body's voxels; 1 is right."""
+    euler_after: int
     changed_fraction: float
     """Changed nodes over the nodes of the body."""
 
@@ -116,6 +117,7 @@ def repair_topology(field: Field, settings: TopologySettings) -> SolidField:
         repairs=repairs,
         touched=after != before,
         euler_before=euler_before,
+        euler_after=_euler(state),
         changed_fraction=float(np.count_nonzero(after != before) / size),
     )
 
@@ -124,7 +126,7 @@ Edit = tuple[Kind, NDArray[np.intp]]
 
 
 def _with_plates(state: NDArray[Any], value: float) -> NDArray[Any]:
-    """A copy with solid plates beyond both ends."""
+    """Return a copy with solid plates beyond both ends."""
     solid = state.copy()
     solid[1:-1, 1:-1, 1] = value
     solid[1:-1, 1:-1, -2] = value
@@ -211,7 +213,7 @@ def _one_round(
 
 
 def _inner_ball(solid: Bool, values: NDArray[np.float32]) -> Bool:
-    """A ball to grow from: the largest level set that is one, or a single voxel."""
+    """Find a ball to grow from: the largest level set that is one, or a single voxel."""
     for level in _LEVELS:
         pieces, count = ndimage.label(solid & (values > level), structure=_FACES)
         if not count:
@@ -225,7 +227,7 @@ def _inner_ball(solid: Bool, values: NDArray[np.float32]) -> Bool:
 
 
 def _outer_ball(solid: Bool, values: NDArray[np.float32]) -> Bool:
-    """A ball to shrink from: the smallest level set that is one, or the full box."""
+    """Find a ball to shrink from: the smallest level set that is one, or the full box."""
     box = np.zeros_like(solid)
     box[1:-1, 1:-1, 1:-1] = True
     for level in _LEVELS:

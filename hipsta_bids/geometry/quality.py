@@ -1,0 +1,122 @@
+"""What a map rests on: numbers that say whether to trust it, and flags."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hipsta_bids.artifacts import Flag, Float, Sheet, Surface, TetMesh
+from hipsta_bids.geometry.body import Body
+from hipsta_bids.geometry.boundaries import Boundaries
+from hipsta_bids.geometry.tetra import tetra_quality
+from hipsta_bids.geometry.topology import SolidField
+from hipsta_bids.settings import Settings
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Evidence:
+    """What the stages of one hemisphere found out on their way."""
+
+    body: Body
+    side: float
+    """How far the medial subfields lie medially of CA1, mm."""
+    solid: SolidField
+    surface: Surface
+    voxels_across: float
+    crossings: int
+    """Triangles that intersect others."""
+    mesh: TetMesh
+    boundaries: Boundaries
+    label_order: float
+    """Rank correlation of x with the labels' order."""
+    sheet: Sheet
+    bending: float
+    """Turn round the interior side, rad."""
+    folded: float
+    """Fraction of the volume whose coordinates are turned inside out."""
+
+
+def find_flags(evidence: Evidence, settings: Settings) -> list[Flag]:
+    """List what a person should look at before using the map."""
+    checks = settings.checks
+    solid, boundaries = evidence.solid, evidence.boundaries
+    filled = 1 - float(evidence.sheet.valid.mean())
+    rows: list[tuple[bool, str, str]] = [
+        (repair.large, "large-repair", f"{repair}: a large repair, look at the labels there")
+        for repair in solid.repairs
+    ]
+    rows += [
+        (
+            solid.changed_fraction > settings.topology.flag_fraction,
+            "much-repaired",
+            f"{solid.changed_fraction:.1%} of the body was changed by repairs: look at the labels",
+        ),
+        (
+            boundaries.rim_distance > checks.flag_rim_distance,
+            "boundary-doubtful",
+            f"the medial or lateral boundary is uncertain by {boundaries.rim_distance:.1f} mm",
+        ),
+        (
+            boundaries.side_rule == "labels" and evidence.bending < -checks.flag_bending,
+            "side-doubtful",
+            f"dentate gyrus labels lie on the outer side of the bend ({evidence.bending:.1f} rad)",
+        ),
+        (
+            evidence.folded > checks.flag_folded,
+            "folded",
+            f"the coordinates fold in {evidence.folded:.1%} of the volume: look at the map",
+        ),
+        (
+            filled > checks.flag_filled,
+            "columns-filled",
+            f"{filled:.1%} of the columns were filled from their neighbors: look at the map",
+        ),
+    ]
+    return [Flag(reason=reason, message=message) for wrong, reason, message in rows if wrong]
+
+
+def quality_metrics(evidence: Evidence) -> dict[str, Any]:
+    """Numbers and words that say whether to trust the map, JSON-serializable."""
+    body, ends, solid = evidence.body, evidence.body.ends, evidence.solid
+    surface, boundaries = evidence.surface, evidence.boundaries
+    quality = tetra_quality(evidence.mesh)
+    valid = evidence.sheet.valid
+    return {
+        "voxel_size_mm": np.linalg.norm(body.affine[:3, :3], axis=0).round(4).tolist(),
+        "body_voxels": int(np.count_nonzero(body.inside)),
+        "layer_voxels": body.layer_voxels,
+        "body_length_mm": ends.length(body.inside_points()[1]),
+        "medial_offset_mm": evidence.side,
+        "posterior_end_rule": ends.posterior_rule,
+        "anterior_end_rule": ends.anterior_rule,
+        "posterior_plane": _plane(ends.posterior_point, ends.posterior_normal),
+        "anterior_plane": _plane(ends.anterior_point, ends.anterior_normal),
+        "voxels_across": evidence.voxels_across,
+        "euler_before": solid.euler_before,
+        "euler_after": solid.euler_after,
+        "changed_fraction": solid.changed_fraction,
+        "surface_vertices": len(surface.vertices),
+        "posterior_cap_vertices": int(surface.posterior_cap.sum()),
+        "anterior_cap_vertices": int(surface.anterior_cap.sum()),
+        "intersecting_triangles": evidence.crossings,
+        "tetrahedra": len(evidence.mesh.tetrahedra),
+        "tetra_quality_median": float(np.median(quality)),
+        "tetra_quality_p01": float(np.quantile(quality, 0.01)),
+        "boundary_rule": boundaries.rule,
+        "boundary_distance_mm": boundaries.distance,
+        "boundary_rim_distance_mm": boundaries.rim_distance,
+        "boundary_strip_mm": boundaries.strip_width,
+        "side_rule": boundaries.side_rule,
+        "side_margin": boundaries.side_margin,
+        "label_order": evidence.label_order,
+        "bending_rad": evidence.bending,
+        "folded_fraction": evidence.folded,
+        "filled_columns": int(np.count_nonzero(~valid)),
+        "filled_fraction": float(1 - valid.mean()),
+        "thickness_expected_mm": boundaries.sheet_thickness,
+        "regions_outside": "head and tail (as in Diers et al. 2023)",
+    }
+
+
+def _plane(point: Float, normal: Float) -> dict[str, list[float]]:
+    return {"point_ras_mm": point.round(3).tolist(), "normal_ras": normal.round(4).tolist()}

@@ -1,0 +1,134 @@
+"""The wall of the body: its surface without the caps."""
+
+import numpy as np
+from lapy import Solver, TriaMesh
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.spatial import cKDTree
+
+from hipsta_bids.artifacts import Bool, Float, Int, Surface
+from hipsta_bids.geometry.body import Body
+from hipsta_bids.geometry.surface import lateral_triangles, unique_edges
+from hipsta_bids.settings import BoundarySettings
+
+
+class Wall:
+    """The surface without its caps, with vertices numbered anew."""
+
+    def __init__(self, surface: Surface, body: Body, settings: BoundarySettings) -> None:
+        triangles = surface.triangles[lateral_triangles(surface)]
+        self.index = np.unique(triangles).astype(np.int32)
+        number = np.full(len(surface.vertices), -1, dtype=np.int32)
+        number[self.index] = np.arange(len(self.index))
+        self.vertices = surface.vertices[self.index]
+        self.triangles = number[triangles]
+        self.posterior = surface.posterior_cap[self.index]
+        self.anterior = surface.anterior_cap[self.index]
+        below = body.ends.height(self.vertices, "posterior")
+        above = -body.ends.height(self.vertices, "anterior")
+        self.share = np.clip(below / (below + above), 0, 1)
+        self.edges = unique_edges(self.triangles)
+        self.lengths = np.linalg.norm(np.diff(self.vertices[self.edges], axis=1)[:, 0], axis=1)
+
+        # LaPy's curvature is an angle per edge, so it grows with the edge length; in 1/mm it is
+        # divided by that and a factor (see the settings). Outward triangles have negative
+        # curvature where the surface is convex: the second weight slows diffusion across the rims.
+        strength = settings.anisotropy / (settings.lapy_curvature * float(self.lengths.mean()))
+        solver = Solver(
+            TriaMesh(self.vertices.copy(), self.triangles.copy()),
+            lump=True,
+            aniso=(0.0, strength),
+            aniso_smooth=settings.curvature_smoothing,
+        )
+        self.matrix = sparse.csc_array(solver.stiffness)
+        self.mass: Float = solver.mass.diagonal()
+
+    def near(self, curve: Float, reach: float) -> Bool:
+        """Vertices within ``reach`` mm of a curve and connected to it along the wall."""
+        gap, _ = cKDTree(curve).query(self.vertices, distance_upper_bound=reach)
+        close = np.isfinite(gap)
+        closest = int(cKDTree(self.vertices).query(curve[len(curve) // 2])[1])
+        close[closest] = True
+        inside = close[self.edges].all(axis=1)
+        links = edge_graph(self.edges[inside], np.ones(np.count_nonzero(inside)), len(close))
+        _, piece = sparse.csgraph.connected_components(links, directed=False)
+        return np.asarray(close & (piece == piece[closest]))
+
+    def with_rim(self, side: Bool, strips: tuple[Bool, Bool]) -> Bool:
+        """Add to a side the strips' vertices next to it, so that they share an edge.
+
+        Without it no point would have the coordinates of the edges between them.
+        """
+        strip = strips[0] | strips[1]
+        first, second = self.edges.T
+        grown = side.copy()
+        grown[second[side[first] & strip[second]]] = True
+        grown[first[side[second] & strip[first]]] = True
+        return grown
+
+    def sides(self, strips: Bool) -> tuple[Bool, Bool] | None:
+        """Find the two large pieces of the wall without the strips; crumbs belong to neither."""
+        both = self.edges[~strips[self.edges].any(axis=1)]
+        links = edge_graph(both, np.ones(len(both)), len(strips))
+        _, piece = sparse.csgraph.connected_components(links, directed=False)
+        size = np.bincount(piece, weights=~strips)
+        first, second = np.argsort(size)[::-1][:2]
+        # Each side makes up most of a half; a leak leaves one piece and crumbs.
+        if size[second] < 0.2 * size[first]:
+            return None
+        sides = (~strips & (piece == first), ~strips & (piece == second))
+        ends = all((side & end).any() for side in sides for end in (self.posterior, self.anterior))
+        return sides if ends else None
+
+
+def edge_graph(edges: Int, weights: Float, count: int) -> sparse.csr_array:
+    """Make a symmetric graph of edges (E, 2) with weights (E,)."""
+    both = np.vstack([edges, edges[:, ::-1]])
+    return sparse.csr_array((np.tile(weights, 2), (both[:, 0], both[:, 1])), shape=(count, count))
+
+
+def end_to_end(wall: Wall, values: Float) -> tuple[Float, Float] | None:
+    """Zero lines that run from the posterior to the anterior end, if there are exactly two."""
+    side = values > 0
+    crossing = side[wall.edges[:, 0]] != side[wall.edges[:, 1]]
+    if not crossing.any():
+        return None
+    first, second = wall.edges[crossing].T
+    share = values[first] / (values[first] - values[second])
+    points = wall.vertices[first] + share[:, None] * (wall.vertices[second] - wall.vertices[first])
+    mixed = np.flatnonzero(np.ptp(side[wall.triangles].astype(np.int8), axis=1))
+    pieces = _connected_crossings(wall, mixed, crossing)
+    curves = []
+    for piece in range(pieces.max() + 1):
+        chosen = pieces == piece
+        ends = wall.edges[crossing][chosen]
+        if wall.posterior[ends].any() and wall.anterior[ends].any():
+            curves.append(points[chosen])
+    return (curves[0], curves[1]) if len(curves) == 2 else None  # noqa: PLR2004
+
+
+def _connected_crossings(wall: Wall, mixed: NDArray[np.intp], crossing: Bool) -> NDArray[np.int32]:
+    """Piece number of each crossed edge; two crossed edges of one triangle belong together."""
+    code = wall.edges[:, 0].astype(np.int64) << 32 | wall.edges[:, 1]
+    code = code[crossing]
+    triangles = wall.triangles[mixed]
+    pairs = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]], axis=2)
+    codes = pairs[..., 0].astype(np.int64) << 32 | pairs[..., 1]
+    place = np.searchsorted(code, codes).clip(max=len(code) - 1)
+    hit = code[place] == codes
+    links = place[hit].reshape(-1, 2)  # a zero line crosses two edges of a triangle
+    graph = sparse.csr_array(
+        (np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(len(code),) * 2
+    )
+    return np.asarray(sparse.csgraph.connected_components(graph, directed=False)[1])
+
+
+def vertex_normals(wall: Wall) -> Float:
+    """(V, 3) unit outward normals, weighted by area."""
+    a, b, c = (wall.vertices[wall.triangles[:, k]] for k in range(3))
+    faces = np.repeat(np.cross(b - a, c - a), 3, axis=0)
+    index = wall.triangles.ravel()
+    total = np.column_stack(
+        [np.bincount(index, weights=faces[:, k], minlength=len(wall.vertices)) for k in range(3)]
+    )
+    return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1), 1e-12)[:, None])
