@@ -47,7 +47,8 @@ def extract_surface(field: Field, settings: SurfaceSettings) -> Surface:
     faces = faces.astype(np.int32)
     _check_sphere(len(nodes), faces)
     nodes = _taubin(nodes, faces, (posterior, anterior), settings)
-    vertices = field.grid.to_ras(nodes)
+    # TetGen turns differences of 1e-14 mm, as between orders of the voxel axes, into other meshes.
+    vertices = field.grid.to_ras(nodes).round(6)
     if signed_volume(vertices, faces) < 0:
         faces = faces[:, ::-1]
     return Surface(
