@@ -101,12 +101,15 @@ def repair_topology(field: Field, settings: TopologySettings) -> SolidField:
         wrong = [plates for plates in (False, True) if _euler(state, plates=plates) != 1]
         if not wrong:
             break
-        edits += _one_round(state, padded, settings, plates=wrong[0])
+        # Only once the body itself is sound: the inside of a closed tube is no pit.
+        pits = _fill_cavities(state, plates=True) if wrong[0] else []
+        edits += pits or _one_round(state, padded, settings, plates=wrong[0])
         edits += _remove_islands(state) + _fill_cavities(state)
     else:
         raise GeometryError(
             f"the labels have holes or bridges that could not be repaired (Euler number "
-            f"{_euler(state)} instead of 1): correct the labels by hand",
+            f"{_euler(state)}, with closed ends {_euler(state, plates=True)}, instead of 1): correct "
+            "the labels by hand",
             reason="topology",
         )
     after = state[_INNER]
@@ -162,13 +165,17 @@ def _remove_islands(state: Bool) -> list[Edit]:
     ]
 
 
-def _fill_cavities(state: Bool) -> list[Edit]:
-    """Fill background that does not reach the border (in place)."""
-    pieces, count = ndimage.label(~state, structure=_ALL)
+def _fill_cavities(state: Bool, *, plates: bool = False) -> list[Edit]:
+    """Fill background that does not reach the border (in place).
+
+    With plates, pits that open at an end plane only are cavities too.
+    """
+    solid = _with_plates(state, True) if plates else state
+    pieces, count = ndimage.label(~solid, structure=_ALL)
     if count == 1:
         return []
     outside = int(pieces[0, 0, 0])
-    state |= pieces != outside
+    state |= (pieces > 0) & (pieces != outside)
     return [("cavity", np.argwhere(pieces == n)) for n in range(1, count + 1) if n != outside]
 
 

@@ -1,0 +1,166 @@
+"""Small bodies, meshes and fields with known answers, shared by the tests of the geometry."""
+
+from dataclasses import dataclass
+from itertools import permutations
+
+import numpy as np
+from scipy import ndimage
+
+from hipsta_bids.artifacts import Coordinates, LabelVolume, Sheet, Surface, TetMesh
+from hipsta_bids.geometry.body import Body, extract_body
+from hipsta_bids.geometry.boundaries import Boundaries, find_boundaries
+from hipsta_bids.geometry.coordinates import solve_coordinates
+from hipsta_bids.geometry.ends import EndPlanes
+from hipsta_bids.geometry.grid import Field, WedgeGrid, resample_body
+from hipsta_bids.geometry.sheet import sample_sheet
+from hipsta_bids.geometry.surface import extract_surface
+from hipsta_bids.geometry.tetra import tetrahedralize
+from hipsta_bids.geometry.topology import SolidField, repair_topology
+from hipsta_bids.phantom import Phantom, PhantomSpec
+from hipsta_bids.schemes import load_scheme
+from hipsta_bids.settings import Settings
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Case:
+    """One phantom, what is known of it, and every stage's result."""
+
+    phantom: Phantom
+    volume: LabelVolume
+    body: Body
+    field: Field
+    solid: SolidField
+    surface: Surface
+    mesh: TetMesh
+    boundaries: Boundaries
+    coordinates: Coordinates
+    sheet: Sheet
+
+
+def solve_case(phantom, *, scheme="freesurfer", settings=None, **drawing):
+    """Run the stages of the participant level one after the other."""
+    chosen = settings or Settings()
+    volume = phantom.label_volume(load_scheme(scheme), **drawing)
+    body = extract_body(volume, chosen.body)
+    field = resample_body(body, chosen.grid)
+    solid = repair_topology(field, chosen.topology)
+    surface = extract_surface(solid.field, chosen.surface)
+    mesh = tetrahedralize(surface, chosen.tetra)
+    boundaries = find_boundaries(surface, mesh, body, chosen.boundaries)
+    coordinates = solve_coordinates(mesh, boundaries)
+    return Case(
+        phantom=phantom,
+        volume=volume,
+        body=body,
+        field=field,
+        solid=solid,
+        surface=surface,
+        mesh=mesh,
+        boundaries=boundaries,
+        coordinates=coordinates,
+        sheet=sample_sheet(mesh, coordinates, chosen.sheet),
+    )
+
+
+def short_phantom(**changes):
+    """An 8 mm long phantom: everything at half the work."""
+    spec = {"kind": "arc", "length": 8.0, "width": 12.0, "curvature": (0.2, 0.2)} | changes
+    return Phantom(PhantomSpec(**spec))
+
+
+def rotation(axis, degrees):
+    """(3, 3) rotation about one of the three axes."""
+    angle = np.radians(degrees)
+    first, second = (k for k in range(3) if k != axis)
+    matrix = np.eye(3)
+    matrix[first, first] = matrix[second, second] = np.cos(angle)
+    matrix[first, second], matrix[second, first] = -np.sin(angle), np.sin(angle)
+    return matrix
+
+
+def rigid(degrees=(20.0, -35.0, 50.0), shift=(11.0, -7.0, 4.0)):
+    """(4, 4) rigid motion."""
+    pose = np.eye(4)
+    for axis, angle in enumerate(degrees):
+        pose[:3, :3] = rotation(axis, angle) @ pose[:3, :3]
+    pose[:3, 3] = shift
+    return pose
+
+
+def straight_ends(length, *, tilt=0.0):
+    """End planes of a body along +z from 0 to ``length`` mm; the anterior one may be tilted."""
+    normal = rotation(1, tilt) @ [0.0, 0.0, 1.0]
+    middle = normal + [0.0, 0.0, 1.0]
+    return EndPlanes(
+        posterior_point=np.zeros(3),
+        posterior_normal=np.array([0.0, 0.0, 1.0]),
+        anterior_point=np.array([0.0, 0.0, length]),
+        anterior_normal=normal,
+        axis=middle / np.linalg.norm(middle),
+        posterior_rule="labels",
+        anterior_rule="labels",
+        half_slice=0.0,
+    )
+
+
+def straight_grid(shape, spacing=0.5):
+    """A working grid without tilt: node (a, b, w) lies at ``spacing`` (a, b, w) mm."""
+    return WedgeGrid(
+        shape=shape,
+        spacing=spacing,
+        origin=np.zeros(3),
+        across=np.eye(3)[:2],
+        axis=np.array([0.0, 0.0, 1.0]),
+        posterior=np.zeros(3),
+        anterior=np.array([spacing * (shape[2] - 1), 0.0, 0.0]),
+    )
+
+
+def field_of(mask, *, sigma=0.8, spacing=0.5):
+    """Smooth a mask as the resampling does; small sigma keeps details of a node or two."""
+    smooth = ndimage.gaussian_filter(
+        mask.astype(np.float32), sigma, mode=("constant", "constant", "nearest"), truncate=3.0
+    )
+    return Field(grid=straight_grid(mask.shape, spacing), values=(smooth - 0.5).astype(np.float32))
+
+
+def ribbon_mask(shape=(42, 42, 30), *, radius=12.0, half=2.5, opening=100.0):
+    """A C in each slice: arms of ``2 half`` nodes round the middle, open towards +a."""
+    a, b, _ = np.indices(shape)
+    x, y = a - (shape[0] - 1) / 2, b - (shape[1] - 1) / 2
+    ring = np.abs(np.hypot(x, y) - radius) <= half
+    return ring & (np.abs(np.degrees(np.arctan2(y, x))) > opening / 2)
+
+
+def box_mesh(cells, size=(1.0, 1.0, 1.0)):
+    """A box cut into cubes and each cube into six tetrahedra (Kuhn's division)."""
+    axes = [np.linspace(0.0, length, n + 1) for n, length in zip(cells, size, strict=True)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    number = np.arange(len(points)).reshape([n + 1 for n in cells])
+    corner = np.stack(np.meshgrid(*map(np.arange, cells), indexing="ij"), axis=-1).reshape(-1, 3)
+    tetrahedra = []
+    for order in permutations(range(3)):
+        path = [corner]
+        for axis in order:
+            path.append(path[-1] + np.eye(3, dtype=int)[axis])
+        cell = np.stack([number[tuple(p.T)] for p in path], axis=1)
+        odd = np.linalg.det(np.eye(3)[list(order)]) < 0
+        tetrahedra.append(cell[:, [0, 2, 1, 3]] if odd else cell)
+    return TetMesh(vertices=points, tetrahedra=np.vstack(tetrahedra))
+
+
+def plain_body(tissue, affine, ends):
+    """A body straight from an array of sheet tissue, all of it between the end planes."""
+    return Body(
+        tissue=tissue.astype(np.uint8),
+        interior=np.zeros(tissue.shape, dtype=bool),
+        affine=affine,
+        ends=ends,
+        layer_voxels=0,
+        inside=tissue > 0,
+    )
+
+
+def degrees_between(first, second):
+    """Angle of two unit vectors, degrees."""
+    return float(np.degrees(np.arccos(np.clip(first @ second, -1.0, 1.0))))

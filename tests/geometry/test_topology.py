@@ -1,0 +1,275 @@
+"""Holes, bridges, islands, cavities and torn caps put into a ribbon, and taken out again."""
+
+import numpy as np
+import pytest
+from geometry_cases import field_of, ribbon_mask
+from scipy import ndimage
+
+from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry.grid import Field
+from hipsta_bids.geometry.simple_points import euler_number
+from hipsta_bids.geometry.surface import extract_surface
+from hipsta_bids.geometry.topology import repair_topology
+from hipsta_bids.settings import SurfaceSettings, TopologySettings
+
+TOPOLOGY = TopologySettings()
+SHAPE = (42, 42, 30)
+MIDDLE = 20.5  # of the ring, nodes; its mid-line has a radius of 12
+SPACING = 0.5
+
+
+def repaired(mask, **changes):
+    """Repair a mask's field; check what must hold whatever was wrong."""
+    solid = repair_topology(field_of(mask, spacing=SPACING), TopologySettings(**changes))
+    positive = solid.field.values > 0
+    assert euler_number(positive) == solid.euler_after == 1
+    assert ndimage.label(positive)[1] == 1
+    surface = extract_surface(solid.field, SurfaceSettings())  # refuses all but one sphere
+    for cap in (surface.posterior_cap, surface.anterior_cap):
+        assert cap.any()
+    return solid
+
+
+def only_repair(solid, kind):
+    assert [repair.kind for repair in solid.repairs] == [kind]
+    return solid.repairs[0]
+
+
+def distance(repair, nodes):
+    """From where a repair says it is to where it belongs, mm."""
+    return float(np.linalg.norm(np.array(repair.position) - SPACING * np.asarray(nodes)))
+
+
+def test_sound_ribbons_are_left_alone():
+    field = field_of(ribbon_mask())
+    solid = repaired(ribbon_mask())
+    assert solid.repairs == ()
+    assert solid.changed_fraction == 0
+    assert solid.euler_before == 1
+    assert not solid.touched.any()
+    # Only values at the level itself may be moved off it.
+    np.testing.assert_allclose(solid.field.values, field.values, atol=0.15)
+    same = np.abs(field.values) > 0.1
+    np.testing.assert_array_equal(solid.field.values[same], field.values[same])
+
+
+def test_sound_phantoms_are_left_alone(case):
+    assert case.solid.repairs == ()
+    assert not case.solid.touched.any()
+    assert case.solid.euler_before == case.solid.euler_after == 1
+
+
+def with_hole():
+    """A channel through the wall at the far side of the C."""
+    mask = ribbon_mask()
+    mask[:16, 19:22, 13:16] = False
+    return mask, "fill", (MIDDLE - 12, 20, 14)
+
+
+def with_bridge():
+    """A rod between the two arms across the opening."""
+    mask = ribbon_mask()
+    mask[27:30, 10:32, 14:17] = True
+    return mask, "cut", (28, MIDDLE, 15)
+
+
+def with_island():
+    mask = ribbon_mask()
+    mask[19:23, 19:23, 10:15] = True
+    return mask, "island", (20.5, 20.5, 12)
+
+
+def with_cavity():
+    mask = ribbon_mask(half=4.0)
+    mask[7:10, 19:22, 13:16] = False
+    return mask, "cavity", (8, 20, 14)
+
+
+def with_slit():
+    """A long narrow cut through the wall, along the body."""
+    mask = ribbon_mask()
+    mask[:16, 20:22, 8:22] = False
+    return mask, "fill", (MIDDLE - 12, 20.5, 14.5)
+
+
+@pytest.mark.parametrize("damage", [with_hole, with_bridge, with_island, with_cavity, with_slit])
+def test_each_defect_is_named_and_placed(damage):
+    mask, kind, where = damage()
+    solid = repaired(mask)
+    assert solid.euler_before != 1
+    repair = only_repair(solid, kind)
+    # Position is the center of what was changed; a cut falls anywhere along the bridge's 7 nodes.
+    assert distance(repair, where) < 2.5
+    assert repair.voxels > 0
+    assert repair.cost > 0
+    assert f"RAS {repair.position[0]:.1f}" in str(repair)
+    before = field_of(mask).values > 0
+    share = np.count_nonzero(solid.touched) / np.count_nonzero(before)
+    assert solid.changed_fraction == pytest.approx(share)
+    np.testing.assert_array_equal(solid.touched, before != (solid.field.values > 0))
+
+
+def test_repairs_come_near_the_sound_ribbon():
+    sound = field_of(ribbon_mask()).values > 0
+    for damage in (with_hole, with_bridge, with_slit, with_island):
+        mask, *_ = damage()
+        before = field_of(mask).values > 0
+        after = repaired(mask).field.values > 0
+        # A repair takes back more of the damage than it adds to it.
+        assert np.count_nonzero(after != sound) <= np.count_nonzero(before != sound)
+
+
+def test_a_filled_hole_is_thick():
+    mask, *_ = with_hole()
+    after = repaired(mask).field.values > 0
+    column = after[:20, 20, 14]
+    assert np.count_nonzero(column) >= 3  # of 5 nodes; a bare membrane has one
+
+
+def test_a_cap_in_two_pieces_becomes_one():
+    """A notch that divides the end's cross-section is a tunnel once the end is closed."""
+    mask = ribbon_mask()
+    mask[:16, 19:22, :4] = False
+    solid = repaired(mask)
+    repair = only_repair(solid, "fill")
+    assert distance(repair, (MIDDLE - 12, 20, 1)) < 2.5
+    for plane in (0, -1):
+        assert ndimage.label(solid.field.values[..., plane] > 0)[1] == 1
+
+
+def test_a_bridge_in_an_end_plane_is_cut():
+    """It would leave one outline in two at the cap: the C closed to an O."""
+    mask = ribbon_mask()
+    mask[27:30, 10:32, :2] = True
+    solid = repaired(mask)
+    assert only_repair(solid, "cut").position[2] < 2.0
+    for plane in (0, -1):
+        section = np.pad(solid.field.values[..., plane] > 0, 1)
+        assert ndimage.label(~section)[1] == 1
+
+
+def test_a_tunnel_that_opens_at_an_end_plane_is_closed():
+    """A burrow from the posterior cap, along the wall, out through its side."""
+    mask = ribbon_mask(half=4.0)
+    mask[7:10, 19:22, :10] = False
+    mask[:10, 19:22, 7:10] = False
+    solid = repaired(mask)
+    assert [repair.kind for repair in solid.repairs] == ["fill", "cavity"]  # a lid, then the rest
+    for plane in (0, -1):
+        section = np.pad(solid.field.values[..., plane] > 0, 1)
+        assert ndimage.label(~section)[1] == 1
+
+
+def test_a_pit_in_an_end_plane_is_filled():
+    """Without it the cap would be a ring, and the wall two pieces."""
+    mask = ribbon_mask(half=4.0)
+    mask[7:10, 19:22, :5] = False
+    repair = only_repair(repaired(mask), "cavity")
+    assert distance(repair, (8, 20, 2)) < 1.0  # two nodes: the Gaussian closes the bottom
+
+
+def test_a_tube_is_cut_open_and_not_filled():
+    """Tips that touch all along the body make a tunnel from end to end."""
+    mask = ribbon_mask(opening=0.0)
+    mask[28:, 20:22] = False
+    mask[30:35, 20:22] = True  # joined along the whole length
+    solid = repaired(mask)
+    assert {repair.kind for repair in solid.repairs} == {"cut"}
+    assert solid.changed_fraction < 0.1
+
+
+def test_a_pit_from_the_outside_is_no_defect():
+    mask = ribbon_mask(half=4.0)
+    mask[:9, 19:22, 13:16] = False
+    assert repaired(mask).repairs == ()
+
+
+def test_several_defects_are_all_found():
+    mask = ribbon_mask()
+    mask[:16, 19:22, 4:7] = False
+    mask[27:30, 10:32, 14:17] = True
+    mask[19:23, 19:23, 20:24] = True
+    kinds = sorted(repair.kind for repair in repaired(mask).repairs)
+    assert kinds == ["cut", "fill", "island"]
+
+
+@pytest.mark.parametrize("kind", ["cut", "fill"])
+def test_repairs_that_overrule_much_are_large(kind):
+    mask, wanted, _ = with_bridge() if kind == "cut" else with_hole()
+    assert wanted == kind
+    cost = only_repair(repaired(mask), kind).cost
+    name = f"flag_{kind}_cost"
+    assert only_repair(repaired(mask, **{name: cost / 2}), kind).large
+    assert not only_repair(repaired(mask, **{name: cost * 2}), kind).large
+
+
+def test_repairs_of_much_of_the_body_are_large():
+    mask, kind, _ = with_island()
+    assert not only_repair(repaired(mask), kind).large
+    assert only_repair(repaired(mask, flag_fraction=1e-3), kind).large
+
+
+def test_an_interrupted_body_is_refused():
+    mask = ribbon_mask()
+    mask[..., 13:18] = False
+    with pytest.raises(GeometryError, match="no connected path of its labels") as caught:
+        repair_topology(field_of(mask), TOPOLOGY)
+    assert caught.value.reason == "body-interrupted"
+
+
+def test_a_body_that_vanishes_is_refused():
+    mask = np.zeros(SHAPE, dtype=bool)
+    mask[20, 10:30] = True  # one node thick: gone after smoothing
+    with pytest.raises(GeometryError, match="nothing is left of the body") as caught:
+        repair_topology(field_of(mask, sigma=1.2), TOPOLOGY)
+    assert caught.value.reason == "sheet-too-thin"
+
+
+def test_giving_up_is_an_error():
+    mask, *_ = with_hole()
+    with pytest.raises(GeometryError, match="could not be repaired") as caught:
+        repair_topology(field_of(mask), TopologySettings(rounds=0))
+    assert caught.value.reason == "topology"
+
+
+def noisy_field(seed):
+    """A ribbon with a share of its voxels flipped, so that every kind of defect occurs."""
+    rng = np.random.default_rng(seed)
+    mask = ribbon_mask((30, 30, 16), radius=8.0, half=2.5)
+    share = rng.uniform(0.1, 0.35)
+    near = ndimage.binary_dilation(mask, iterations=2)
+    return field_of(mask ^ (near & (rng.random(mask.shape) < share)), sigma=0.7)
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_noisy_ribbons_become_one_sphere(seed):
+    field = noisy_field(seed)
+    solid = repair_topology(field, TOPOLOGY)
+    positive = solid.field.values > 0
+    assert euler_number(positive) == 1
+    surface = extract_surface(solid.field, SurfaceSettings(taubin_iterations=0))
+    assert surface.posterior_cap.any()
+    assert surface.anterior_cap.any()
+    # With plates beyond both ends it stays one ball: each cap is one disc.
+    plated = np.pad(positive, ((1, 1), (1, 1), (0, 0)))
+    plated = np.concatenate([np.ones_like(plated[..., :1]), plated, plated[..., :1] | True], axis=2)
+    assert euler_number(plated) == 1
+
+
+def test_noise_really_breaks_the_topology():
+    numbers = [euler_number(noisy_field(seed).values > 0) for seed in range(60)]
+    assert np.count_nonzero(np.array(numbers) != 1) > 40
+
+
+def test_ambiguous_cubes_keep_foreground_corners_apart():
+    """Two columns that touch along an edge only: two pieces for us, and for marching cubes."""
+    mask = np.zeros((16, 16, 12), dtype=bool)
+    mask[3:8, 3:8] = True
+    mask[8:13, 8:13] = True
+    mask[3:13, 3:13, 8:] = True
+    values = np.where(mask, 0.5, -0.5).astype(np.float32)
+    solid = repair_topology(
+        Field(grid=field_of(mask).grid, values=values), TopologySettings(closing_nodes=1)
+    )
+    extract_surface(solid.field, SurfaceSettings())
+    assert euler_number(solid.field.values > 0) == 1
