@@ -1,0 +1,217 @@
+"""End planes: fitted to labels, found by the automatic rule, refused where they make no sense."""
+
+import numpy as np
+import pytest
+from geometry_cases import degrees_between, rigid, rotation, short_phantom
+
+from hipsta_bids.artifacts import LabelVolume
+from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry.body import extract_body
+from hipsta_bids.geometry.ends import find_end_planes
+from hipsta_bids.schemes import Part, Tissue, load_scheme
+from hipsta_bids.settings import BodySettings
+
+FREESURFER, HIPPUNFOLD = load_scheme("freesurfer"), load_scheme("hippunfold")
+BODY = BodySettings()
+
+
+def rod(tail_normal, head_normal, *, voxel=(0.4, 0.4, 0.4), half_body=8.2, pose=None):
+    """A rod along +y of 18 x 34 x 14 mm; tail and head begin at planes with these normals."""
+    shape = tuple(int(np.ceil(n / v)) for n, v in zip((18.0, 34.0, 14.0), voxel, strict=True))
+    index = np.indices(shape).reshape(3, -1).T
+    points = (index - (np.array(shape) - 1) / 2) * voxel
+    offset = [0.0, half_body, 0.0]
+    part = np.full(len(points), Part.BODY)
+    part[(points + offset) @ tail_normal < 0] = Part.TAIL
+    part[(points - offset) @ head_normal > 0] = Part.HEAD
+    affine = np.diag([*voxel, 1.0])
+    affine[:3, 3] = -(np.array(shape) - 1) / 2 * voxel
+    return LabelVolume(
+        tissue=np.full(shape, Tissue.CA1),
+        part=part.reshape(shape),
+        affine=affine if pose is None else pose @ affine,
+        scheme=FREESURFER,
+    )
+
+
+def ends_of(volume, settings=BODY):
+    return find_end_planes(volume, volume.tissue, settings)
+
+
+@pytest.mark.parametrize("slice_mm", [0.4, 1.0, 2.0])
+@pytest.mark.parametrize(
+    ("tail", "head"), [((0, 0), (0, 0)), ((12, 8), (-10, 5)), ((-20, 10), (0, 25))]
+)
+def test_planar_interfaces_are_found(tail, head, slice_mm):
+    normals = [rotation(0, a) @ rotation(2, b) @ [0.0, 1.0, 0.0] for a, b in (tail, head)]
+    ends = ends_of(rod(*normals, voxel=(0.4, slice_mm, 0.4)))
+    assert ends.posterior_rule == ends.anterior_rule == "labels"
+    # The study behind the rule found 1.3 degrees at slices of 2 mm.
+    assert degrees_between(ends.posterior_normal, normals[0]) < 1.5
+    assert degrees_between(ends.anterior_normal, normals[1]) < 1.5
+    # Labels by voxel center say nothing about the place within half a slice.
+    middle = np.array([[0.0, -8.2, 0.0], [0.0, 8.2, 0.0]])
+    assert abs(ends.height(middle[:1], "posterior")[0]) < 0.5 * slice_mm
+    assert abs(ends.height(middle[1:], "anterior")[0]) < 0.5 * slice_mm
+
+
+def test_a_tilt_of_one_step_between_thick_slices_is_found_roughly():
+    normal = rotation(0, 15) @ [0.0, 1.0, 0.0]
+    ends = ends_of(rod(normal, normal, voxel=(0.4, 2.0, 0.4)))
+    # 14 mm times tan(15 degrees) is less than two slices: the labels show a step or two only.
+    assert degrees_between(ends.posterior_normal, normal) < 3.0
+    assert degrees_between(ends.anterior_normal, normal) < 3.0
+
+
+def test_planes_move_with_the_volume():
+    pose = rigid(degrees=(10.0, 20.0, -30.0))
+    normals = [rotation(0, 15) @ [0.0, 1.0, 0.0], rotation(2, -10) @ [0.0, 1.0, 0.0]]
+    still, moved = ends_of(rod(*normals)), ends_of(rod(*normals, pose=pose))
+    for end in ("posterior", "anterior"):
+        turned = pose[:3, :3] @ getattr(still, f"{end}_normal")
+        # The same voxels in another place: only rounding and where Newton's steps end differ.
+        np.testing.assert_allclose(getattr(moved, f"{end}_normal"), turned, atol=1e-4)
+
+
+def test_normals_and_axis_point_from_tail_to_head():
+    volume = rod([0.0, 1.0, 0.0], [0.0, 1.0, 0.0])
+    backward = LabelVolume(
+        tissue=volume.tissue, part=volume.part[:, ::-1], affine=volume.affine, scheme=FREESURFER
+    )
+    assert ends_of(volume).axis[1] > 0.99  # the axis itself, but for rounding
+    assert ends_of(backward).axis[1] < -0.99
+
+
+def test_heights_and_length():
+    ends = ends_of(rod([0.0, 1.0, 0.0], [0.0, 1.0, 0.0]))
+    points = np.array([[0.0, 0.0, 0.0], [1.0, 3.0, -1.0]])
+    # The interface lies midway between voxel centers; the widest margin is what the fit seeks.
+    np.testing.assert_allclose(ends.height(points, "posterior"), [8.2, 11.2], atol=0.02)
+    np.testing.assert_allclose(ends.height(points, "anterior"), [-8.2, -5.2], atol=0.02)
+    assert ends.length(points) == pytest.approx(16.4, abs=0.04)  # both ends
+    assert ends.half_slice == pytest.approx(0.2, abs=1e-2)  # half of 0.4 mm
+
+
+def test_phantom_ends_are_where_they_were_drawn(case):
+    hemi = "L" if case.phantom.spec.kind != "spiral" else "R"
+    for end, v in (("posterior", 0.0), ("anterior", 1.0)):
+        plane = case.phantom.body.place(np.linspace(0.1, 0.9, 9), v, 0.0, hemi=hemi)
+        # A voxel is 0.4 mm; half of it.
+        assert np.abs(case.body.ends.height(plane, end)).max() < 0.2
+
+
+@pytest.mark.parametrize("scheme", ["ashsPMC", "hippunfold"])
+@pytest.mark.parametrize("slice_mm", [0.4, 1.0])
+def test_rule_of_the_paper_finds_the_body_without_head_and_tail_labels(scheme, slice_mm):
+    phantom = short_phantom(length=14.0)
+    volume = phantom.label_volume(load_scheme(scheme), voxel_size=(0.4, slice_mm, 0.4))
+    body = extract_body(volume, BODY)
+    assert "labels" not in (body.ends.posterior_rule, body.ends.anterior_rule)
+    u = np.linspace(0.1, 0.9, 9)
+    for end, v in (("posterior", 0.0), ("anterior", 1.0)):
+        height = body.ends.height(phantom.body.place(u, v, 0.0), end)
+        # To the slice, and the principal axis of a bent body leans a little against its sweep.
+        assert abs(height.mean()) < 0.75 * slice_mm + 0.4
+
+
+def test_end_margin_shortens_the_body_at_both_ends():
+    volume = short_phantom(length=14.0).label_volume(HIPPUNFOLD)
+    whole = extract_body(volume, BODY).ends
+    less = extract_body(volume, BodySettings(end_margin=1.5)).ends
+    point = np.zeros((1, 3))
+    assert whole.height(point, "posterior") - less.height(point, "posterior") == pytest.approx(1.5)
+    assert less.height(point, "anterior") - whole.height(point, "anterior") == pytest.approx(1.5)
+
+
+def test_end_margin_leaves_labelled_ends_alone(arc):
+    less = extract_body(arc.volume, BodySettings(end_margin=1.5)).ends
+    np.testing.assert_array_equal(less.posterior_point, arc.body.ends.posterior_point)
+    np.testing.assert_array_equal(less.anterior_point, arc.body.ends.anterior_point)
+
+
+def without(volume, part):
+    """The same labels with one part's name taken away."""
+    return LabelVolume(
+        tissue=volume.tissue,
+        part=np.where(volume.part == part, Part.BODY, volume.part),
+        affine=volume.affine,
+        scheme=volume.scheme,
+    )
+
+
+@pytest.mark.parametrize(("lost", "kept"), [(Part.HEAD, "posterior"), (Part.TAIL, "anterior")])
+def test_an_end_without_labels_is_cut_parallel_to_the_other(arc, lost, kept):
+    ends = extract_body(without(arc.volume, lost), BODY).ends
+    other = "anterior" if kept == "posterior" else "posterior"
+    np.testing.assert_array_equal(ends.posterior_normal, ends.anterior_normal)
+    np.testing.assert_allclose(
+        getattr(ends, f"{kept}_point"), getattr(arc.body.ends, f"{kept}_point")
+    )
+    assert getattr(ends, f"{kept}_rule") == "labels"
+    assert getattr(ends, f"{other}_rule") != "labels"
+
+
+def test_few_head_voxels_count_as_none(arc):
+    head = np.argwhere(arc.volume.part == Part.HEAD)
+    part = arc.volume.part.copy()
+    part[tuple(head[49:].T)] = Part.BODY
+    volume = LabelVolume(
+        tissue=arc.volume.tissue, part=part, affine=arc.volume.affine, scheme=FREESURFER
+    )
+    assert extract_body(volume, BODY).ends.anterior_rule != "labels"
+
+
+def sheet_with_head(*, twofold):
+    """A slab along +y, CA1 beside CA2, that changes its cross-section from y = 20 mm on."""
+    shape = (40, 64, 30)  # 0.5 mm voxels: 20 x 32 x 15 mm
+    tissue = np.zeros(shape, dtype=np.uint8)
+    tissue[4:24, :, 12:16] = Tissue.CA1
+    tissue[24:34, :, 12:16] = Tissue.CA2
+    if twofold:
+        tissue[4:34, 40:, 4:8] = Tissue.CA2  # a second layer of the digitations
+    else:
+        tissue[4:34, 40:, 12:22] = Tissue.CA2  # a swelling
+    return LabelVolume(
+        tissue=tissue,
+        part=np.zeros(shape),
+        affine=np.diag([0.5, 0.5, 0.5, 1.0]),
+        scheme=HIPPUNFOLD,
+    )
+
+
+@pytest.mark.parametrize("twofold", [True, False])
+def test_body_stops_before_the_head_where_ca2_goes_on_into_it(twofold):
+    ends = ends_of(sheet_with_head(twofold=twofold))
+    assert ends.anterior_rule == "cross-section"
+    middle = np.array([[9.5, 19.75, 6.75]])
+    # To a slice of 0.5 mm; the principal axis leans towards the asymmetric head by a few degrees.
+    assert abs(ends.height(middle, "anterior")[0]) < 1.0
+
+
+def test_a_plain_rod_has_no_head_to_stop_at():
+    volume = sheet_with_head(twofold=True)
+    tissue = volume.tissue.copy()
+    tissue[:, :, :12] = 0
+    ends = ends_of(
+        LabelVolume(tissue=tissue, part=volume.part, affine=volume.affine, scheme=HIPPUNFOLD)
+    )
+    assert ends.anterior_rule == "subfields"
+    far = np.array([[9.5, 31.5, 6.75]])
+    assert abs(ends.height(far, "anterior")[0]) < 0.5 + 1e-6  # half a slice beyond the last center
+
+
+def test_no_slice_with_ca1_and_ca2_is_refused():
+    volume = sheet_with_head(twofold=True)
+    tissue = np.where(volume.tissue == Tissue.CA2, Tissue.CA1, volume.tissue)
+    with pytest.raises(GeometryError, match="no slice across the long axis has both") as caught:
+        ends_of(
+            LabelVolume(tissue=tissue, part=volume.part, affine=volume.affine, scheme=HIPPUNFOLD)
+        )
+    assert caught.value.reason == "no-body"
+
+
+def test_an_interface_along_the_body_is_refused():
+    steep = rotation(0, 70) @ [0.0, 1.0, 0.0]
+    with pytest.raises(GeometryError, match=r"end plane is tilted by \d\d degrees") as caught:
+        ends_of(rod([0.0, 1.0, 0.0], steep, half_body=5.0))
+    assert caught.value.reason == "end-plane-tilted"

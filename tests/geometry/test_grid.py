@@ -1,0 +1,148 @@
+"""The working grid between two planes, and the smoothed mask on it."""
+
+import numpy as np
+import pytest
+from geometry_cases import plain_body, rigid, rotation, straight_ends
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry.ends import EndPlanes
+from hipsta_bids.geometry.grid import in_plane_voxel, resample_body
+from hipsta_bids.settings import GridSettings
+
+EXACT = 1e-9  # rounding of coordinates of some ten mm
+
+
+def test_nodes_to_ras_and_back(case):
+    grid = case.field.grid
+    nodes = np.random.default_rng(1).uniform(-2, 60, size=(200, 3))
+    np.testing.assert_allclose(grid.to_nodes(grid.to_ras(nodes)), nodes, atol=EXACT)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.floats(-25, 25), st.floats(0, 5))
+def test_ras_to_nodes_and_back_with_tilted_planes(tilt, phase):
+    grid = resample_body(box_body(tilt=tilt), GridSettings()).grid
+    points = np.random.default_rng(int(10 * phase)).uniform(-3, 12, size=(50, 3))
+    np.testing.assert_allclose(grid.to_ras(grid.to_nodes(points)), points, atol=EXACT)
+
+
+def test_end_planes_are_grid_planes(case):
+    grid, ends = case.field.grid, case.body.ends
+    nodes = np.random.default_rng(2).uniform(0, 40, size=(100, 3))
+    for end, plane in (("posterior", 0), ("anterior", grid.shape[2] - 1)):
+        nodes[:, 2] = plane
+        np.testing.assert_allclose(ends.height(grid.to_ras(nodes), end), 0, atol=EXACT)
+
+
+def test_node_points_are_the_nodes_places(arc):
+    grid = arc.field.grid
+    index = np.argwhere(np.ones(grid.shape, dtype=bool)).astype(float)
+    places = grid.node_points(clamp=0.0).reshape(-1, 3)
+    np.testing.assert_allclose(places, grid.to_ras(index), atol=EXACT)
+
+
+def test_clamped_nodes_keep_away_from_the_end_planes():
+    ends = straight_ends(8.0)
+    grid = resample_body(box_body(), GridSettings()).grid
+    places = grid.node_points(clamp=0.6)
+    assert places[..., 2].min() == pytest.approx(0.6)
+    assert places[..., 2].max() == pytest.approx(ends.anterior_point[2] - 0.6)
+    free = grid.node_points(clamp=0.0)
+    inner = (free[..., 2] > 0.6) & (free[..., 2] < 7.4)
+    np.testing.assert_allclose(places[inner], free[inner], atol=EXACT)
+
+
+def test_spacing_is_the_settings_across_and_close_to_it_along(case):
+    grid = case.field.grid
+    steps = np.diff(grid.to_ras(np.array([[5.0, 5, 5], [6, 5, 5], [5, 6, 5], [5, 5, 6]])), axis=0)
+    assert np.linalg.norm(steps[0]) == pytest.approx(0.35, rel=0.01)  # sheared by the planes' tilt
+    along = np.diff(grid.to_ras(np.array([[20.0, 10, 5], [20, 10, 6]])), axis=0)
+    assert np.linalg.norm(along) == pytest.approx(0.35, rel=0.1)  # whole steps, planes not parallel
+
+
+def box_body(*, tilt=0.0, voxel=0.4, length=8.0):
+    """A box of 6 x 2.4 mm through planes at z = 0 and ``length``; it goes on beyond them."""
+    count = np.ceil(np.array([8.0, 4.4, length + 6.0]) / voxel).astype(int)
+    affine = np.diag([voxel, voxel, voxel, 1.0])
+    affine[:3, 3] = [-1.0, -1.0, -3.0]
+    index = np.indices(tuple(count)).reshape(3, -1).T
+    points = index @ affine[:3, :3].T + affine[:3, 3]
+    inside = ((points[:, :2] >= 0) & (points[:, :2] <= [6.0, 2.4])).all(axis=1)
+    ends = straight_ends(length, tilt=tilt)
+    body = plain_body(inside.reshape(count).astype(int), affine, ends)
+    between = (ends.height(points, "posterior") > 0) & (ends.height(points, "anterior") < 0)
+    body.inside[...] &= between.reshape(count)
+    return body
+
+
+def test_field_is_positive_inside_and_negative_outside(case):
+    field = case.field
+    places = field.grid.node_points(clamp=0.0).reshape(-1, 3)
+    hemi = "R" if case.phantom.spec.kind == "spiral" else "L"
+    u, _, n = case.phantom.body.locate(places, hemi=hemi, reach=3.0).T
+    values = field.values.ravel()
+    deep = (np.abs(n) < 0.6) & (u > 0.06) & (u < 0.94)  # 0.4 mm inside the wall of 2 mm
+    far = ~(np.abs(n) < 1.5) & ~np.isnan(n)  # 0.5 mm outside
+    assert deep.sum() > 1000
+    assert far.sum() > 1000
+    assert (values[deep] > 0).all()
+    assert (values[far] < 0).all()
+    assert values.min() >= -0.5
+    assert values.max() <= 0.5 + 1e-6  # float32
+
+
+def test_field_reaches_both_ends_at_full_strength():
+    field = resample_body(box_body(), GridSettings())
+    middle = field.values[..., field.grid.shape[2] // 2]
+    for plane in (0, -1):
+        # No fading towards the end planes: the box goes on, and beyond them nothing is read.
+        np.testing.assert_allclose(field.values[..., plane], middle, atol=1e-6)
+
+
+def test_labels_beyond_the_end_planes_do_not_count():
+    whole = box_body()
+    cut = box_body()
+    cut.tissue[:, :, : int(2.5 / 0.4)] = 0  # the tail, half a millimetre off the plane
+    np.testing.assert_array_equal(
+        resample_body(cut, GridSettings()).values, resample_body(whole, GridSettings()).values
+    )
+
+
+def test_field_is_free_at_the_sides(case):
+    values = case.field.values
+    edge = np.concatenate([values[[0, -1]].ravel(), values[:, [0, -1]].ravel()])
+    assert (edge < -0.49).all()  # nothing but background within the margin
+
+
+@pytest.mark.parametrize(
+    ("edges", "wanted"), [((0.4, 0.4, 2.0), 0.4), ((1.5, 0.3, 0.5), np.sqrt(0.15))]
+)
+def test_in_plane_voxel(edges, wanted):
+    affine = rigid() @ np.diag([*edges, 1.0])
+    assert in_plane_voxel(affine) == pytest.approx(wanted)
+
+
+def test_planes_that_meet_beside_the_body_are_refused():
+    body = box_body(tilt=0.0)
+    ends = body.ends
+    normal = rotation(1, 60) @ ends.anterior_normal
+    middle = normal + ends.posterior_normal
+    crossed = plain_body(
+        body.tissue,
+        body.affine,
+        EndPlanes(
+            posterior_point=ends.posterior_point,
+            posterior_normal=ends.posterior_normal,
+            anterior_point=ends.anterior_point,
+            anterior_normal=normal,
+            axis=middle / np.linalg.norm(middle),
+            posterior_rule="labels",
+            anterior_rule="labels",
+            half_slice=0.2,
+        ),
+    )
+    with pytest.raises(GeometryError, match="the end planes meet beside the body") as caught:
+        resample_body(crossed, GridSettings())
+    assert caught.value.reason == "ends-crossed"
