@@ -14,6 +14,7 @@ import select
 import struct
 import subprocess
 import sys
+import tempfile
 import time
 from typing import IO, Any
 
@@ -74,6 +75,7 @@ class TetgenClient:
 
     def _running(self) -> subprocess.Popen[bytes]:
         if self._process is None or self._owner != os.getpid() or self._process.poll() is not None:
+            self._stop()
             environment = dict(os.environ, OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
             self._process = subprocess.Popen(  # noqa: S603 -- our own module
                 [sys.executable, "-m", __name__],
@@ -151,7 +153,12 @@ def _serve() -> None:
 def _mesh(vertices: Float, triangles: Int, options: dict[str, Any]) -> tuple[Float, NDArray[Any]]:
     from tetgen import TetGen  # noqa: PLC0415 -- only the child needs it
 
-    points, cells, *_ = TetGen(vertices, triangles).tetrahedralize(**options)
+    # TetGen writes the triangles that it could not use into the working folder.
+    with (
+        tempfile.TemporaryDirectory(prefix="tetgen-", ignore_cleanup_errors=True) as aside,
+        contextlib.chdir(aside),
+    ):
+        points, cells, *_ = TetGen(vertices, triangles).tetrahedralize(**options)
     return np.asarray(points), np.asarray(cells)
 
 

@@ -1,0 +1,231 @@
+"""Tetrahedra, and the process that makes them: it may die, the caller may not."""
+
+import os
+import signal
+import threading
+import time
+
+import numpy as np
+import pytest
+from geometry_cases import box_mesh
+
+from hipsta_bids.artifacts import Surface, TetMesh
+from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry import tetra
+from hipsta_bids.geometry.surface import signed_volume
+from hipsta_bids.geometry.tetgen_worker import TetgenClient
+from hipsta_bids.geometry.tetra import (
+    count_intersections,
+    tetra_quality,
+    tetra_volumes,
+    tetrahedralize,
+)
+from hipsta_bids.settings import TetraSettings
+
+SETTINGS = TetraSettings()
+OPTIONS = {"plc": True, "quality": True, "minratio": 2.0, "nobisect": True, "quiet": True}
+
+CORNERS = np.array([[x, y, z] for x in (0.0, 1) for y in (0.0, 1) for z in (0.0, 1)])
+SQUARES = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+CUBE = np.array([t for a, b, c, d in SQUARES for t in ((a, b, c), (a, c, d))], dtype=np.int32)
+
+
+def cube(shift=(0.0, 0.0, 0.0)):
+    return as_surface(CORNERS + shift, CUBE)
+
+
+def as_surface(vertices, triangles):
+    none = np.zeros(len(vertices), dtype=bool)
+    return Surface(vertices=vertices, triangles=triangles, posterior_cap=none, anterior_cap=none)
+
+
+def crossing_cubes():
+    """Two cubes that run into each other."""
+    return as_surface(
+        np.vstack([CORNERS, 0.9 * CORNERS + [0.5, 0.21, 0.33]]), np.vstack([CUBE, CUBE + 8])
+    )
+
+
+@pytest.fixture
+def client(monkeypatch):
+    """A client of its own, so that killing its process disturbs nobody."""
+    fresh = TetgenClient()
+    monkeypatch.setattr(tetra, "_CLIENT", fresh)
+    yield fresh
+    fresh._stop()
+
+
+def test_volume_is_that_of_the_surface(case):
+    volumes = tetra_volumes(case.mesh.vertices, case.mesh.tetrahedra)
+    surface = case.surface
+    wanted = signed_volume(surface.vertices, surface.triangles)
+    assert volumes.min() > 0
+    assert volumes.sum() == pytest.approx(wanted, rel=1e-9)  # rounding of sums
+
+
+def test_vertices_of_the_surface_come_first(case):
+    surface = case.surface
+    np.testing.assert_array_equal(case.mesh.vertices[: len(surface.vertices)], surface.vertices)
+
+
+def test_faces_of_the_surface_are_kept(arc):
+    """So boundary sets found on the surface bound the volume too."""
+    cells = arc.mesh.tetrahedra
+    faces = np.sort(np.vstack([np.delete(cells, k, axis=1) for k in range(4)]))
+    count = len(arc.mesh.vertices)
+    code, times = np.unique(faces.astype(np.int64) @ [count**2, count, 1], return_counts=True)
+    outer = np.sort(np.sort(arc.surface.triangles).astype(np.int64) @ [count**2, count, 1])
+    np.testing.assert_array_equal(code[times == 1], outer)
+    assert times.max() == 2
+
+
+def test_every_vertex_is_used(case):
+    assert len(np.unique(case.mesh.tetrahedra)) == len(case.mesh.vertices)
+
+
+def test_quality_of_known_tetrahedra():
+    regular = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], dtype=float)
+    corner = np.vstack([np.zeros(3), np.eye(3)])
+    flat = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 1e-9]], dtype=float)
+    wanted = [1.0, 12 * (0.5) ** (2 / 3) / 9, 0.0]
+    for vertices, value in zip((regular, corner, flat), wanted, strict=True):
+        cell = [[0, 1, 2, 3]]
+        if tetra_volumes(vertices, np.array(cell))[0] < 0:
+            cell = [[0, 2, 1, 3]]
+        mesh = TetMesh(vertices=vertices, tetrahedra=cell)
+        assert tetra_quality(mesh)[0] == pytest.approx(value, abs=1e-5)  # (1e-9)^(2/3)
+
+
+def test_quality_of_phantoms(case):
+    quality = tetra_quality(case.mesh)
+    assert quality.max() <= 1 + 1e-12
+    assert np.median(quality) > 0.5  # TetGen's usual range at a radius-edge ratio of 2
+
+
+def test_box_volumes():
+    mesh = box_mesh((2, 3, 4), (1.0, 2.0, 3.0))
+    volumes = tetra_volumes(mesh.vertices, mesh.tetrahedra)
+    np.testing.assert_allclose(volumes, 6.0 / (24 * 6), rtol=1e-12)  # rounding
+
+
+@pytest.mark.usefixtures("client")
+def test_intersections_are_counted():
+    assert count_intersections(cube(), SETTINGS) == 0
+    assert count_intersections(crossing_cubes(), SETTINGS) > 0
+
+
+@pytest.mark.usefixtures("client")
+def test_a_self_intersecting_surface_is_an_error_and_the_next_call_works():
+    with pytest.raises(GeometryError, match="the surface may intersect itself") as caught:
+        tetrahedralize(crossing_cubes(), SETTINGS)
+    assert caught.value.reason == "tetrahedralization"
+    assert_works()
+
+
+@pytest.mark.usefixtures("client")
+@pytest.mark.parametrize("what", ["nan", "index", "open"])
+def test_garbage_is_an_error_and_the_next_call_works(what):
+    vertices, triangles = CORNERS.copy(), CUBE.copy()
+    if what == "nan":
+        vertices[3] = np.nan
+    elif what == "index":
+        triangles[0, 0] = 10_000
+    else:
+        triangles = triangles[:1]
+    with pytest.raises(GeometryError, match="TetGen") as caught:
+        # TetGen never ends on NaN.
+        tetrahedralize(as_surface(vertices, triangles), TetraSettings(timeout=3.0))
+    assert caught.value.reason == "tetrahedralization"
+    assert_works()
+
+
+@pytest.mark.usefixtures("client")
+def test_tetgen_leaves_no_files_behind(tmp_path, monkeypatch):
+    """It writes what it could not use into the working folder."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(GeometryError, match="intersect"):
+        tetrahedralize(crossing_cubes(), SETTINGS)
+    assert not list(tmp_path.iterdir())
+
+
+def assert_works():
+    mesh = tetrahedralize(cube(), SETTINGS)
+    assert tetra_volumes(mesh.vertices, mesh.tetrahedra).sum() == pytest.approx(1.0)
+
+
+def kill_soon(client, *, after=0.2):
+    """Kill the client's process while it is at work."""
+    timer = threading.Timer(after, lambda: os.kill(client._process.pid, signal.SIGABRT))
+    timer.start()
+    return timer
+
+
+def test_a_crash_while_meshing_is_told_and_the_next_call_works(client, arc):
+    assert not isinstance(client.intersections(CORNERS, CUBE, 30.0), str)  # the process is up
+    first = client._process.pid
+    timer = kill_soon(client)
+    busy = {"maxvolume": 1e-6, "fixedvolume": True, "nobisect": False}
+    answer = client.mesh(arc.surface.vertices, arc.surface.triangles, OPTIONS | busy, 60.0)
+    timer.join()
+    assert answer == f"TetGen crashed (exit status {-signal.SIGABRT})"
+    assert_works()
+    assert client._process.pid != first
+
+
+def test_a_process_that_died_between_calls_is_replaced(client):
+    assert_works()
+    client._process.kill()
+    client._process.wait()
+    assert_works()
+
+
+def test_taking_too_long_is_told_and_the_next_call_works(client, arc):
+    busy = {"maxvolume": 1e-6, "fixedvolume": True, "nobisect": False}
+    assert_works()
+    process = client._process
+    start = time.monotonic()
+    answer = client.mesh(arc.surface.vertices, arc.surface.triangles, OPTIONS | busy, 0.3)
+    assert answer == "TetGen took longer than 0.3 s"
+    assert time.monotonic() - start < 5.0  # the time-out and the end of a process
+    assert process.poll() is not None  # it does not go on working unseen
+    assert_works()
+
+
+@pytest.mark.usefixtures("client")
+def test_a_time_out_is_a_geometry_error(arc):
+    with pytest.raises(GeometryError, match=r"TetGen took longer than 0\.001 s") as caught:
+        tetrahedralize(arc.surface, TetraSettings(timeout=1e-3))
+    assert caught.value.reason == "tetrahedralization"
+
+
+@pytest.mark.usefixtures("client")
+def test_a_failed_check_is_told_from_no_intersections(arc):
+    assert count_intersections(arc.surface, TetraSettings(timeout=1e-3)) == -1
+
+
+def test_one_process_serves_many_calls(client):
+    assert_works()
+    first = client._process.pid
+    assert_works()
+    assert client._process.pid == first
+
+
+def test_moved_vertices_are_refused(client, monkeypatch):
+    mesh = tetrahedralize(cube(), SETTINGS)
+    moved = mesh.vertices.copy()
+    moved[0] += 1e-3
+    monkeypatch.setattr(client, "mesh", lambda *_: (moved, mesh.tetrahedra))
+    with pytest.raises(GeometryError, match="TetGen moved vertices"):
+        tetrahedralize(cube(), SETTINGS)
+
+
+def test_inverted_and_flat_tetrahedra_are_put_right(client, monkeypatch):
+    mesh = tetrahedralize(cube(), SETTINGS)
+    cells = mesh.tetrahedra[:, [1, 0, 2, 3]]
+    flat = np.array([[0, 1, 2, 3]])  # four corners of one side
+    monkeypatch.setattr(client, "mesh", lambda *_: (mesh.vertices, np.vstack([cells, flat])))
+    again = tetrahedralize(cube(), SETTINGS)
+    volumes = tetra_volumes(again.vertices, again.tetrahedra)
+    assert len(volumes) == len(mesh.tetrahedra)
+    assert volumes.min() > 0
+    assert volumes.sum() == pytest.approx(1.0)
