@@ -90,7 +90,7 @@ def rigid(degrees=(20.0, -35.0, 50.0), shift=(11.0, -7.0, 4.0)):
 def straight_ends(length, *, tilt=0.0):
     """End planes of a body along +z from 0 to ``length`` mm; the anterior one may be tilted."""
     normal = rotation(1, tilt) @ [0.0, 0.0, 1.0]
-    middle = normal + [0.0, 0.0, 1.0]
+    middle = normal + np.array([0.0, 0.0, 1.0])
     return EndPlanes(
         posterior_point=np.zeros(3),
         posterior_normal=np.array([0.0, 0.0, 1.0]),
