@@ -70,7 +70,9 @@ def summary_line(outcome: "Outcome") -> str:
         parts.append(f"{outcome.seconds:.1f} s")
     if outcome.skipped:
         parts.append("unchanged, skipped")
-    if outcome.reason:
+    if outcome.status == "repaired":
+        parts.append(f"{outcome.message.count('; ') + 1} repairs, see its quality metrics")
+    elif outcome.reason:
         parts.append(f"[{outcome.reason}] {outcome.message}")
     return "  ".join(parts)
 

@@ -89,9 +89,14 @@ class TetraSettings:
 class BoundarySettings:
     """Medial and lateral boundary strips, and which side is interior."""
 
-    anisotropy: float = 3.5
-    """Diffusion across a bend of curvature k is slowed by exp(-anisotropy k), mm."""
-    curvature_smoothing: int = 3
+    sharp_bend: float = 0.5
+    """Convex bends with less curvature than this do not slow diffusion, 1/mm."""
+    anisotropy: float = 8.0
+    """Diffusion across sharper ones, of curvature k, is slowed by exp(-anisotropy (k -
+    sharp_bend)), mm."""
+    least_diffusion: float = 0.1
+    """... but, where curves are moved to the middle of the rims, never below this."""
+    curvature_smoothing: int = 2
     """Smoothing steps of the curvature tensor."""
     lapy_curvature: float = 0.3
     """LaPy's curvature over curvature x mean edge length (measured on cylinders)."""
@@ -105,7 +110,7 @@ class BoundarySettings:
     """Cost of a path per mm along a rim; depth below the rim adds its square, mm2."""
     rim_zone: float = 1.5
     """Depth of the rim zones, multiples of 2 volume / wall area."""
-    rim_bands: tuple[float, ...] = (1.0, 0.75, 0.75)
+    rim_bands: tuple[float, ...] = (1.25, 1.0, 1.0)
     """Half widths of the bands in which curves are moved to the middle of the rims, same unit."""
     rim_reach: float = 0.75
     """The zones hold at least all within this distance of the rim path, in the same unit."""

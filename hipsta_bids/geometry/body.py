@@ -88,6 +88,9 @@ def extract_body(volume: LabelVolume, settings: BodySettings) -> Body:
 def check_side(body: Body, hemi: str) -> float:
     """Check that the subiculum lies towards the midline for the hemisphere that the file claims.
 
+    In subjects that lie feet first or on their side it may not; then the handedness decides, which
+    no rotation changes.
+
     Parameters
     ----------
     body : Body
@@ -101,7 +104,8 @@ def check_side(body: Body, hemi: str) -> float:
     Raises
     ------
     GeometryError
-        ``left-right-swapped`` if they lie on the far side by more than 1 mm.
+        ``left-right-swapped`` if they lie on the far side by more than 1 mm, and the body is not
+        of the handedness that the file claims.
     """
     values = body.tissue[body.inside]
     _, points = body.inside_points()
@@ -111,8 +115,10 @@ def check_side(body: Body, hemi: str) -> float:
         return float("nan")
     offset = points[medial, 0].mean() - points[lateral, 0].mean()
     offset = float(offset if hemi == "L" else -offset)
-    # Six real bodies show 4-8 mm; one millimetre leaves room for a rotated head.
-    if offset < -1.0:
+    # Six real bodies show 4-8 mm; one millimeter leaves room for a rotated head.
+    if offset < -1.0 and not _has_handedness(
+        body, points[medial].mean(axis=0), points[lateral].mean(axis=0), hemi
+    ):
         side = {"L": "left", "R": "right"}
         other = side["R" if hemi == "L" else "L"]
         raise GeometryError(
@@ -121,6 +127,25 @@ def check_side(body: Body, hemi: str) -> float:
             reason="left-right-swapped",
         )
     return offset
+
+
+def _has_handedness(body: Body, subiculum: Float, ca1: Float, hemi: str) -> bool:
+    """Say whether the body is certainly of the claimed side, wherever the subject lies.
+
+    Seen along the long axis, the way from the subiculum over CA1 to the interior labels turns one
+    way on the left and the other way on the right.
+    """
+    points = _millimetres(body.interior & (body.tissue == 0), body.affine)
+    points = points[
+        (body.ends.height(points, "posterior") > 0) & (body.ends.height(points, "anterior") < 0)
+    ]
+    if not len(points):
+        return False
+    first, second = ca1 - subiculum, points.mean(axis=0) - subiculum
+    turn = float(body.ends.axis @ np.cross(first, second))
+    turn /= float(np.linalg.norm(first) * np.linalg.norm(second))
+    # The sine of the angle is 0.18 to 0.50 in twelve real bodies.
+    return (turn if hemi == "L" else -turn) > 0.05  # noqa: PLR2004
 
 
 def _give_away_layer(volume: LabelVolume, rule: str) -> tuple[NDArray[np.uint8], int]:

@@ -133,15 +133,9 @@ def _separating(
 
 
 def _eigenfunction_curves(wall: Wall) -> tuple[Float, Float] | None:
-    """Middle lines of the first anisotropic eigenfunction, if exactly two run from end to end.
-
-    Its two plateaus balance each other over their areas. The middle between them, not zero, lies
-    on the rims where one side is larger.
-    """
-    _, functions = smallest_eigenfunctions(wall.matrix, wall.mass, 1)
-    values = functions[:, 0]
-    middle = 0.5 * (np.median(values[values > 0]) + np.median(values[values < 0]))
-    return end_to_end(wall, values - middle)
+    """Zero lines of the first anisotropic eigenfunction, if exactly two run from end to end."""
+    _, functions = smallest_eigenfunctions(wall.bend_aware, wall.mass, 1)
+    return end_to_end(wall, functions[:, 0])
 
 
 def _curve_distance(first: tuple[Float, Float], second: tuple[Float, Float]) -> float:

@@ -87,7 +87,7 @@ def _middle_lines(wall: Wall, zones: list[Bool]) -> tuple[Float, Float] | None:
         return None
     fixed = np.flatnonzero(sides[0] | sides[1])
     values = np.where(sides[1][fixed], 1.0, -1.0)
-    return end_to_end(wall, solve_dirichlet(wall.matrix, fixed, values))
+    return end_to_end(wall, solve_dirichlet(wall.evenly_aware, fixed, values))
 
 
 def _most_lateral(mesh: TetMesh, body: Body, settings: BoundarySettings) -> NDArray[np.intp]:

@@ -108,8 +108,8 @@ def repair_topology(field: Field, settings: TopologySettings) -> SolidField:
     else:
         raise GeometryError(
             f"the labels have holes or bridges that could not be repaired (Euler number "
-            f"{_euler(state)}, with closed ends {_euler(state, plates=True)}, instead of 1): correct "
-            "the labels by hand",
+            f"{_euler(state)}, with closed ends {_euler(state, plates=True)}, instead of 1): "
+            "correct the labels by hand",
             reason="topology",
         )
     after = state[_INNER]

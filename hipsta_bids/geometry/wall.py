@@ -1,14 +1,15 @@
 """The wall of the body: its surface without the caps."""
 
 import numpy as np
-from lapy import Solver, TriaMesh
+from lapy import TriaMesh
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial import cKDTree
 
 from hipsta_bids.artifacts import Bool, Float, Int, Surface
 from hipsta_bids.geometry.body import Body
-from hipsta_bids.geometry.surface import lateral_triangles, unique_edges
+from hipsta_bids.geometry.laplace import triangle_stiffness
+from hipsta_bids.geometry.surface import lateral_triangles, triangle_areas, unique_edges
 from hipsta_bids.settings import BoundarySettings
 
 
@@ -30,18 +31,32 @@ class Wall:
         self.edges = unique_edges(self.triangles)
         self.lengths = np.linalg.norm(np.diff(self.vertices[self.edges], axis=1)[:, 0], axis=1)
 
-        # LaPy's curvature is an angle per edge, so it grows with the edge length; in 1/mm it is
-        # divided by that and a factor (see the settings). Outward triangles have negative
-        # curvature where the surface is convex: the second weight slows diffusion across the rims.
-        strength = settings.anisotropy / (settings.lapy_curvature * float(self.lengths.mean()))
-        solver = Solver(
-            TriaMesh(self.vertices.copy(), self.triangles.copy()),
-            lump=True,
-            aniso=(0.0, strength),
-            aniso_smooth=settings.curvature_smoothing,
+        self.bend_aware, self.evenly_aware = self._stiffness(settings)
+        areas = triangle_areas(self.vertices, self.triangles)
+        count = len(self.vertices)
+        share = np.repeat(areas / 3, 3)
+        self.mass: Float = np.bincount(self.triangles.ravel(), share, count).astype(np.float64)
+
+    def _stiffness(self, settings: BoundarySettings) -> tuple[sparse.csc_array, sparse.csc_array]:
+        """Two stiffness matrices with diffusion across sharp convex bends slowed down.
+
+        The first without limit, so that the sharpest lines part the wall; the second down to a
+        least value, so that of two edges the sharper one does not win.
+
+        LaPy's curvature is an angle per edge, so it grows with the edge length; in 1/mm it is
+        divided by that and a factor (see the settings). On outward triangles it is negative where
+        the surface is convex.
+        """
+        mesh = TriaMesh(self.vertices.copy(), self.triangles.copy())
+        direction, _, least, _ = mesh.curvature_tria(smoothit=settings.curvature_smoothing)
+        bend = -least / (settings.lapy_curvature * float(self.lengths.mean()))
+        excess = np.maximum(bend - settings.sharp_bend, 0)
+        slowed = np.exp(-settings.anisotropy * excess)
+        limited = np.maximum(slowed, settings.least_diffusion)
+        return (
+            triangle_stiffness(self.vertices, self.triangles, direction, slowed),
+            triangle_stiffness(self.vertices, self.triangles, direction, limited),
         )
-        self.matrix = sparse.csc_array(solver.stiffness)
-        self.mass: Float = solver.mass.diagonal()
 
     def near(self, curve: Float, reach: float) -> Bool:
         """Vertices within ``reach`` mm of a curve and connected to it along the wall."""
