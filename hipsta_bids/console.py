@@ -70,7 +70,7 @@ def summary_line(outcome: "Outcome") -> str:
         parts.append(f"{outcome.seconds:.1f} s")
     if outcome.skipped:
         parts.append("unchanged, skipped")
-    if outcome.status == "repaired":
+    if outcome.status == "repaired" and outcome.message:
         parts.append(f"{outcome.message.count('; ') + 1} repairs, see its quality metrics")
     elif outcome.reason:
         parts.append(f"[{outcome.reason}] {outcome.message}")

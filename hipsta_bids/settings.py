@@ -7,6 +7,14 @@ What does not change a result (jobs, verbosity, folders) is in
 
 from dataclasses import dataclass, field
 
+from hipsta_bids.errors import SettingsError
+
+
+def _require(condition: bool, message: str) -> None:
+    """Refuse values that no stage could work with."""
+    if not condition:
+        raise SettingsError(f"settings: {message}", reason="setting-out-of-range")
+
 
 @dataclass(frozen=True, kw_only=True)
 class BodySettings:
@@ -28,6 +36,10 @@ class BodySettings:
     head_growth: float = 1.35
     """Without end labels: ... or twice running an area above this multiple of the median."""
 
+    def __post_init__(self) -> None:
+        rules = ("nearest-sheet", "nearest-label")
+        _require(self.layer_rule in rules, f"body.layer_rule must be {' or '.join(rules)}")
+
 
 @dataclass(frozen=True, kw_only=True)
 class GridSettings:
@@ -39,6 +51,11 @@ class GridSettings:
     """Standard deviation of the Gaussian, in in-plane voxels of the segmentation."""
     margin: float = 1.5
     """Free space around the body, mm."""
+
+    def __post_init__(self) -> None:
+        _require(0.1 <= self.spacing <= 1, "grid.spacing must lie between 0.1 and 1 mm")  # noqa: PLR2004 -- said there
+        _require(0 <= self.smoothing <= 3, "grid.smoothing must lie between 0 and 3 voxels")  # noqa: PLR2004 -- said there
+        _require(self.margin > 0, "grid.margin must be positive")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,6 +163,16 @@ class SheetSettings:
     max_filled: float = 0.2
     """Refuse a sheet with a larger fraction of columns that could not be measured."""
 
+    def __post_init__(self) -> None:
+        least = 3  # two walls and a middle
+        for axis in "xyz":
+            extent = getattr(self, f"{axis}_extent")
+            _require(0 < extent <= 1, f"sheet.{axis}_extent must lie above 0 and not above 1")
+            _require(
+                getattr(self, f"{axis}_nodes") >= least, f"sheet.{axis}_nodes must be at least 3"
+            )
+        _require(self.z_nodes % 2 == 1, "sheet.z_nodes must be odd")
+
 
 @dataclass(frozen=True, kw_only=True)
 class MeasureSettings:
@@ -155,6 +182,13 @@ class MeasureSettings:
     """Grid nodes over which a local polynomial is fitted, odd."""
     curvature_order: int = 3
     """Order of the local polynomials."""
+
+    def __post_init__(self) -> None:
+        _require(self.curvature_window % 2 == 1, "measures.curvature_window must be odd")
+        _require(
+            1 < self.curvature_order < self.curvature_window,
+            "measures.curvature_order must be at least 2 and below curvature_window",
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

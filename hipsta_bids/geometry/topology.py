@@ -152,7 +152,8 @@ def _remove_islands(state: Bool) -> list[Edit]:
     if not len(through):
         raise GeometryError(
             "the body is interrupted: no connected path of its labels leads from the "
-            "posterior to the anterior end plane; check the labels for missing slices",
+            "posterior to the anterior end plane; check the labels for missing slices and for a "
+            "sheet too thin for its voxels",
             reason="body-interrupted",
         )
     if count == len(through):
