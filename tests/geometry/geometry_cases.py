@@ -149,6 +149,23 @@ def box_mesh(cells, size=(1.0, 1.0, 1.0)):
     return TetMesh(vertices=points, tetrahedra=np.vstack(tetrahedra))
 
 
+def cylinder(radius, edge, length=8.0, *, outward=True):
+    """An open cylinder of nearly regular triangles."""
+    around = round(2 * np.pi * radius / edge)
+    rows = round(length / (edge * np.sqrt(0.75))) + 1
+    angle = (np.arange(around) + 0.5 * (np.arange(rows)[:, None] % 2)) * 2 * np.pi / around
+    height = np.broadcast_to(np.linspace(0, length, rows)[:, None], angle.shape)
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=-1)
+    number = np.arange(rows * around).reshape(rows, around)
+    a, b = number[:-1], np.roll(number, -1, axis=1)[:-1]
+    c, d = number[1:], np.roll(number, -1, axis=1)[1:]
+    even = np.arange(rows - 1)[:, None] % 2 == 0
+    first = np.stack([a, b, np.where(even, c, d)], axis=-1).reshape(-1, 3)
+    second = np.stack([np.where(even, b, a), d, c], axis=-1).reshape(-1, 3)
+    triangles = np.vstack([first, second])
+    return points.reshape(-1, 3), triangles if outward else triangles[:, ::-1]
+
+
 def plain_body(tissue, affine, ends):
     """A body straight from an array of sheet tissue, all of it between the end planes."""
     return Body(

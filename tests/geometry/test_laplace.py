@@ -3,7 +3,7 @@
 import lapy
 import numpy as np
 import pytest
-from geometry_cases import box_mesh, rigid
+from geometry_cases import box_mesh, cylinder, rigid
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import sparse
@@ -15,6 +15,7 @@ from hipsta_bids.geometry.laplace import (
     smallest_eigenfunctions,
     solve_dirichlet,
     stiffness,
+    triangle_stiffness,
 )
 
 EXACT = 1e-10  # rounding in a sparse solve
@@ -47,6 +48,39 @@ def test_stiffness_is_lapys(arc):
         theirs = lapy.Solver(tets).stiffness
         # Rounding: sums of a dozen terms.
         assert abs(ours - theirs).max() < 1e-12 * abs(theirs).max()
+
+
+def test_triangle_stiffness_is_lapys():
+    vertices, triangles = cylinder(1.5, 0.4)
+    mesh = lapy.TriaMesh(vertices, triangles)
+    direction, _, least, _ = mesh.curvature_tria(smoothit=3)
+    for strength in (0.0, 2.0, 20.0):
+        slowed = np.exp(-strength * np.abs(least))
+        ours = triangle_stiffness(vertices, triangles, direction, slowed)
+        theirs = lapy.Solver(mesh, lump=True, aniso=(0.0, strength), aniso_smooth=3).stiffness
+        # Rounding: sums of some terms.
+        assert abs(ours - theirs).max() < 1e-12 * abs(theirs).max()
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.4, 1.3])
+def test_diffusion_is_slowed_along_the_direction_only(angle):
+    grid = np.stack(np.meshgrid(np.arange(5.0), np.arange(4.0), indexing="ij"), axis=-1)
+    number = np.arange(20).reshape(5, 4)
+    a, b, c, d = number[:-1, :-1], number[1:, :-1], number[:-1, 1:], number[1:, 1:]
+    triangles = np.vstack([np.stack(t, axis=-1).reshape(-1, 3) for t in ((a, b, d), (a, d, c))])
+    vertices = np.pad(grid.reshape(-1, 2), ((0, 0), (0, 1)))
+    direction = np.array([np.cos(angle), np.sin(angle), 0.0])
+    share, slope = 0.3, np.array([0.7, -1.1, 0.0])
+    matrix = triangle_stiffness(
+        vertices,
+        triangles.astype(np.int32),
+        np.tile(direction, (len(triangles), 1)),
+        np.full(len(triangles), share),
+    )
+    along = slope @ direction
+    wanted = (slope @ slope - along**2 + share * along**2) * 12  # area of 4 x 3
+    values = vertices @ slope
+    assert values @ (matrix @ values) == pytest.approx(wanted, rel=EXACT)
 
 
 def test_lumped_mass_is_lapys(arc):

@@ -1,0 +1,170 @@
+"""Medial and lateral strips, interior and exterior side, where they are known to be."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from geometry_cases import short_phantom, solve_case
+from scipy.spatial import cKDTree
+
+from hipsta_bids.artifacts import Coordinates
+from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry.boundaries import find_boundaries
+from hipsta_bids.geometry.coordinates import solve_coordinates
+from hipsta_bids.geometry.measures import bending_angle
+from hipsta_bids.geometry.sheet import sample_sheet
+from hipsta_bids.geometry.surface import lateral_triangles, mean_wall_thickness
+from hipsta_bids.settings import BoundarySettings, MeasureSettings, SheetSettings
+
+SETTINGS = BoundarySettings()
+
+
+def hemi_of(case):
+    return "R" if case.volume.affine[0, 3] > 0 else "L"
+
+
+def rim(case, u):
+    """Points of a flat rim, all across the wall and from end to end."""
+    v, n = np.linspace(-0.05, 1.05, 81)[:, None], np.linspace(-1, 1, 21)[None]
+    return case.phantom.body.place(u, v, n, hemi=hemi_of(case)).reshape(-1, 3)
+
+
+def test_curves_run_along_the_rims(case):
+    """Medial is at u = 0 and lateral at u = 1, in the left and in the right hemisphere."""
+    for u, curve in ((0, case.boundaries.medial_curve), (1, case.boundaries.lateral_curve)):
+        gap, _ = cKDTree(rim(case, u)).query(curve)
+        assert gap.mean() < 0.5  # rims are rounded off by about a voxel of 0.4 mm
+        assert gap.max() < 1.0
+
+
+def test_curves_run_in_the_middle_of_the_rims(case):
+    middles = np.linspace(0, 1, 41)
+    for u, curve in ((0, case.boundaries.medial_curve), (1, case.boundaries.lateral_curve)):
+        line = case.phantom.body.place(u, middles, 0.0, hemi=hemi_of(case))
+        gap, _ = cKDTree(line).query(curve)
+        assert gap.mean() < 0.95  # the flat rim reaches 1 mm to both sides, to its corners
+
+
+def test_both_rules_agree_on_phantoms(case):
+    assert case.boundaries.distance < 1.0
+
+
+def test_rim_paths_lie_near_the_curves(case):
+    assert case.boundaries.rim_distance < 1.5  # paths keep to edges of the mesh, 0.35 mm long
+
+
+def test_strips_hold_the_rims(case):
+    for u, strip in ((0, case.boundaries.medial), (1, case.boundaries.lateral)):
+        gap, _ = cKDTree(rim(case, u)).query(case.surface.vertices[strip])
+        assert gap.max() < 0.75 * case.boundaries.strip_width
+    width = SETTINGS.strip_width * mean_wall_thickness(case.surface)
+    assert case.boundaries.strip_width == pytest.approx(width)
+
+
+def test_sides_lie_on_their_sides(case):
+    for sign, side in ((-1, case.boundaries.interior), (1, case.boundaries.exterior)):
+        points = case.surface.vertices[side]
+        u, _, n = case.phantom.body.locate(points, hemi=hemi_of(case)).T
+        inner = (u > 0.1) & (u < 0.9)
+        assert inner.sum() > 200
+        assert (sign * n[inner] > 0.5).all()  # wall at 1 mm, surface within half a voxel
+
+
+def test_sets_are_apart_and_cover_the_wall(case):
+    b = case.boundaries
+    assert not np.intersect1d(b.medial, b.lateral).size
+    assert not np.intersect1d(b.interior, b.exterior).size
+    np.testing.assert_array_equal(b.posterior, np.flatnonzero(case.surface.posterior_cap))
+    np.testing.assert_array_equal(b.anterior, np.flatnonzero(case.surface.anterior_cap))
+    wall = np.unique(case.surface.triangles[lateral_triangles(case.surface)])
+    covered = np.unique(np.concatenate([b.medial, b.lateral, b.interior, b.exterior]))
+    assert np.isin(covered, wall).all()
+    assert len(covered) > 0.99 * len(wall)  # crumbs beside the strips belong to no side
+
+
+def test_sides_share_edges_with_the_strips(case):
+    b = case.boundaries
+    for side in (b.interior, b.exterior):
+        for strip in (b.medial, b.lateral):
+            shared = np.intersect1d(side, strip)
+            # At least one vertex per 0.5 mm of the 8 mm long body.
+            assert len(shared) > 16
+
+
+def test_expected_thickness_is_the_phantoms(case):
+    assert case.boundaries.sheet_thickness == pytest.approx(2.0, rel=0.05)
+
+
+def test_interior_is_told_by_labels(case):
+    assert case.boundaries.side_rule == "labels"
+    assert case.boundaries.side_margin > 0.2  # dentate gyrus lines 55 % of one side only
+
+
+def without_labels(case):
+    body = replace(case.body, interior=np.zeros_like(case.body.interior))
+    return find_boundaries(case.surface, case.mesh, body, SETTINGS)
+
+
+def test_without_interior_labels_bending_has_to_decide(case):
+    found = without_labels(case)
+    assert found.side_rule == "bending"
+    assert np.isnan(found.side_margin)
+    sides = {tuple(found.interior), tuple(found.exterior)}
+    assert sides == {tuple(case.boundaries.interior), tuple(case.boundaries.exterior)}
+
+
+@pytest.mark.parametrize("name", ["arc", "spiral"])
+def test_bending_and_labels_name_the_same_side(name, request):
+    case = request.getfixturevalue(name)
+    values = case.coordinates.values
+    turned = sample_sheet(case.mesh, Coordinates(values=values * [1.0, 1.0, -1.0]), SheetSettings())
+    # Curls round the interior by 2.4 and 4.6 rad; turned round it must say the opposite.
+    assert bending_angle(case.sheet, MeasureSettings()) > 0.5
+    assert bending_angle(turned, MeasureSettings()) < -0.5
+
+
+def test_labels_on_the_other_side_change_sides(arc):
+    outside = arc.body.tissue == 0
+    index = np.argwhere(outside)
+    affine = arc.body.affine
+    points = index @ affine[:3, :3].T + affine[:3, 3]
+    _, _, n = arc.phantom.body.locate(points, hemi="L", reach=3.0).T
+    interior = np.zeros_like(outside)
+    interior[tuple(index[n > 1.0].T)] = True
+    found = find_boundaries(arc.surface, arc.mesh, replace(arc.body, interior=interior), SETTINGS)
+    np.testing.assert_array_equal(found.interior, arc.boundaries.exterior)
+    np.testing.assert_array_equal(found.exterior, arc.boundaries.interior)
+
+
+def test_a_mirrored_phantom_gives_the_mirrored_boundaries():
+    left, right = (solve_case(short_phantom(), hemi=hemi) for hemi in "LR")
+    for name in ("medial_curve", "lateral_curve"):
+        mirrored = getattr(right.boundaries, name) * [-1.0, 1.0, 1.0]
+        gap, _ = cKDTree(getattr(left.boundaries, name)).query(mirrored)
+        assert gap.mean() < 0.25  # grids of 0.4 mm lie differently in the two
+
+
+def test_the_eigenfunction_is_overruled_where_the_rules_disagree(arc):
+    strict = replace(SETTINGS, max_distance=-1.0)
+    found = find_boundaries(arc.surface, arc.mesh, arc.body, strict)
+    assert found.rule == "rims"
+    for u, curve in ((0, found.medial_curve), (1, found.lateral_curve)):
+        gap, _ = cKDTree(rim(arc, u)).query(curve)
+        assert gap.mean() < 0.5
+
+
+def test_strips_that_swallow_the_sides_are_refused(arc):
+    with pytest.raises(GeometryError, match="do not separate the interior") as caught:
+        find_boundaries(arc.surface, arc.mesh, arc.body, replace(SETTINGS, strip_width=12.0))
+    assert caught.value.reason == "boundaries"
+
+
+def test_coordinates_are_fixed_on_the_boundaries(case):
+    values = case.coordinates.values
+    b = case.boundaries
+    pairs = ((b.medial, b.lateral), (b.posterior, b.anterior), (b.interior, b.exterior))
+    for axis, (low, high) in enumerate(pairs):
+        assert (values[low, axis] == -1.0).all()
+        assert (values[high, axis] == 1.0).all()
+    again = solve_coordinates(case.mesh, b)
+    np.testing.assert_array_equal(again.values, values)

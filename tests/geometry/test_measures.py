@@ -1,0 +1,272 @@
+"""Thickness, curvature, areas and volumes of grids whose measures are known."""
+
+import numpy as np
+import pytest
+from geometry_cases import rigid
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hipsta_bids.artifacts import Sheet
+from hipsta_bids.geometry.measures import (
+    SheetMeasures,
+    bending_angle,
+    column_volume,
+    layer_area,
+    mean_curvature,
+    measure_thickness,
+    node_shares,
+    summarize,
+)
+from hipsta_bids.schemes import Tissue
+from hipsta_bids.settings import MeasureSettings
+
+MEASURES = MeasureSettings()
+EXACT = 1e-12  # relative rounding
+
+
+def sheet_of(points):
+    return Sheet(points=points, valid=np.ones(points.shape[:2], dtype=bool))
+
+
+def grid(nx=41, ny=21, nz=9):
+    return np.meshgrid(
+        np.linspace(0, 1, nx), np.linspace(0, 1, ny), np.linspace(0, 1, nz), indexing="ij"
+    )
+
+
+def plates(thickness=1.7):
+    """Two parallel plates of 12 x 8 mm."""
+    x, y, z = grid()
+    return sheet_of(np.stack([12 * x, 8 * y, thickness * z], axis=-1))
+
+
+def tube(radius=4.0, thickness=2.0, turn=np.pi):
+    """Part of a pipe, interior side within."""
+    x, y, z = grid()
+    r = radius + thickness * (z - 0.5)
+    return sheet_of(np.stack([r * np.cos(turn * x), r * np.sin(turn * x), 10 * y], axis=-1))
+
+
+def shell(radius=10.0, thickness=2.0):
+    """Part of a sphere, interior side within; away from the poles."""
+    x, y, z = grid()
+    r = radius + thickness * (z - 0.5)
+    polar, azimuth = np.pi * (0.35 + 0.3 * y), 1.2 * x
+    return sheet_of(
+        np.stack(
+            [
+                r * np.sin(polar) * np.cos(azimuth),
+                r * np.sin(polar) * np.sin(azimuth),
+                r * np.cos(polar),
+            ],
+            axis=-1,
+        )
+    )
+
+
+def quadric(first, second, extent=2.0):
+    """Height (first x^2 + second y^2) / 2 over a square; the interior side is above."""
+    x, y, z = grid(nx=41, ny=41)
+    x, y = extent * (x - 0.5), extent * (y - 0.5)
+    height = (first * x**2 + second * y**2) / 2 - 1.5 * (z - 0.5)
+    return sheet_of(np.stack([x, y, height], axis=-1))
+
+
+@given(st.floats(0.2, 5.0))
+@settings(max_examples=20, deadline=None)
+def test_thickness_of_plates(thickness):
+    np.testing.assert_allclose(measure_thickness(plates(thickness)), thickness, rtol=EXACT)
+
+
+def test_thickness_of_tube_and_shell():
+    np.testing.assert_allclose(measure_thickness(tube(thickness=1.3)), 1.3, rtol=EXACT)
+    np.testing.assert_allclose(measure_thickness(shell(thickness=2.4)), 2.4, rtol=EXACT)
+
+
+def test_thickness_is_the_length_of_the_line_not_of_its_chord():
+    x, y, z = grid(nz=201)
+    points = np.stack([10 * x + np.cos(np.pi * z), 8 * y, np.sin(np.pi * z)], axis=-1)
+    # Half a circle; 200 chords are short by (pi / 200)^2 / 24.
+    np.testing.assert_allclose(measure_thickness(sheet_of(points)), np.pi, rtol=2e-5)
+
+
+@given(
+    st.tuples(*[st.floats(-180, 180)] * 3), st.tuples(*[st.floats(-100, 100)] * 3), st.booleans()
+)
+@settings(max_examples=20, deadline=None)
+def test_rigid_motion_leaves_every_measure(degrees, shift, mirrored):
+    still, pose = tube(), rigid(degrees, shift)
+    if mirrored:
+        pose = pose @ np.diag([-1.0, 1.0, 1.0, 1.0])
+    moved = sheet_of(still.points @ pose[:3, :3].T + pose[:3, 3])
+    for measure in (
+        measure_thickness,
+        column_volume,
+        lambda s: mean_curvature(s, s.middle, MEASURES),
+        lambda s: bending_angle(s, MEASURES),
+    ):
+        # Rounding of coordinates of 100 mm, amplified by second differences.
+        np.testing.assert_allclose(measure(moved), measure(still), rtol=1e-7, atol=1e-9)
+
+
+@given(st.floats(0.3, 3.0))
+@settings(max_examples=10, deadline=None)
+def test_scaling(scale):
+    still = tube()
+    scaled = sheet_of(scale * still.points)
+    thickness, volume = measure_thickness(still), column_volume(still)
+    np.testing.assert_allclose(measure_thickness(scaled), scale * thickness)
+    np.testing.assert_allclose(column_volume(scaled), scale**3 * volume)
+    curvature = mean_curvature(still, still.middle, MEASURES)
+    np.testing.assert_allclose(mean_curvature(scaled, 4, MEASURES), curvature / scale)
+
+
+@pytest.mark.parametrize(("level", "radius"), [(0, 3.0), (4, 4.0), (-1, 5.0)])
+def test_curvature_of_a_tube_is_half_of_one_over_its_radius(level, radius):
+    curvature = mean_curvature(tube(), level, MEASURES)
+    # Cubic polynomials over 9 nodes of pi / 40 each; at the edges they are one-sided.
+    np.testing.assert_allclose(curvature[4:-4], 0.5 / radius, rtol=0.02)
+    np.testing.assert_allclose(curvature, 0.5 / radius, rtol=0.15)
+
+
+def test_curvature_of_a_sphere_is_one_over_its_radius():
+    curvature = mean_curvature(shell(), 4, MEASURES)
+    np.testing.assert_allclose(curvature[4:-4, 4:-4], 0.1, rtol=0.02)  # as above
+
+
+@pytest.mark.parametrize(
+    ("first", "second"), [(0.2, -0.2), (0.3, 0.1), (-0.2, -0.1), (0.0, 0.0), (0.25, -0.05)]
+)
+def test_curvature_in_the_middle_of_a_quadric(first, second):
+    curvature = mean_curvature(quadric(first, second), 4, MEASURES)
+    # Quadrics are fitted exactly by cubics.
+    assert curvature[20, 20] == pytest.approx((first + second) / 2, abs=1e-9)
+
+
+def test_curvature_changes_sign_with_the_sides():
+    still = tube()
+    turned = sheet_of(still.points[:, :, ::-1])
+    one, other = (mean_curvature(s, 4, MEASURES) for s in (still, turned))
+    np.testing.assert_allclose(other, -one)
+
+
+def test_curvature_does_not_depend_on_the_direction_of_the_axes():
+    still = shell()
+    for points in (still.points[::-1], still.points[:, ::-1]):
+        one = np.sort(mean_curvature(sheet_of(points), 4, MEASURES).ravel())
+        np.testing.assert_allclose(one, np.sort(mean_curvature(still, 4, MEASURES).ravel()))
+
+
+@pytest.mark.parametrize("turn", [0.5, np.pi, 4.7])
+def test_bending_angle_is_the_angle_of_the_arc(turn):
+    still = tube(turn=turn)
+    # Nodes stand for steps, of which there is one less; edges are one-sided fits.
+    assert bending_angle(still, MEASURES) == pytest.approx(turn, rel=0.05)
+    turned = sheet_of(still.points[:, :, ::-1])
+    assert bending_angle(turned, MEASURES) == pytest.approx(-turn, rel=0.05)
+
+
+def test_a_flat_sheet_does_not_bend():
+    assert bending_angle(plates(), MEASURES) == pytest.approx(0, abs=1e-9)
+
+
+def test_areas_of_layers():
+    flat = plates()
+    assert layer_area(flat.points[:, :, 4]).sum() == pytest.approx(96.0)
+    bent = tube()
+    # Chords of pi / 40 instead of arcs: short by (pi / 40)^2 / 24.
+    assert layer_area(bent.points[:, :, -1]).sum() == pytest.approx(np.pi * 50, rel=3e-4)
+
+
+@given(st.integers(0, 1000))
+@settings(max_examples=20, deadline=None)
+def test_shares_of_nodes_add_up(seed):
+    cells = np.random.default_rng(seed).random((7, 5))
+    shares = node_shares(cells)
+    assert shares.shape == (8, 6)
+    assert shares.sum() == pytest.approx(cells.sum())
+    assert shares[0, 0] == pytest.approx(cells[0, 0] / 4)
+    assert shares[3, 2] == pytest.approx(cells[2:4, 1:3].sum() / 4)
+
+
+def test_volumes_of_columns():
+    assert column_volume(plates()).sum() == pytest.approx(96.0 * 1.7)
+    truth = np.pi / 2 * (5**2 - 3**2) * 10
+    # Chords instead of arcs, as above.
+    assert column_volume(tube()).sum() == pytest.approx(truth, rel=3e-4)
+
+
+TISSUES = (Tissue.SUBICULUM, Tissue.CA1, Tissue.CA3)
+
+
+def measured(sheet, subfield):
+    return SheetMeasures(sheet=sheet, thickness=measure_thickness(sheet), subfield=subfield)
+
+
+def test_summary_of_plates():
+    sheet = plates(2.0)
+    subfield = np.full((41, 21), Tissue.SUBICULUM, dtype=np.uint8)
+    subfield[20:] = Tissue.CA1
+    both = measured(sheet, subfield)
+    summary = summarize(both, both, TISSUES, 191.0)
+    wanted = {
+        "thickness_mean": 2.0,
+        "extent_x": 12.0,
+        "extent_y": 8.0,
+        "extent_z": 2.0,
+        "volume": 191.0,
+        "area_interior": 96.0,
+        "area_mid": 96.0,
+        "area_exterior": 96.0,
+        "thickness_mean_SUBICULUM": 2.0,
+        "thickness_mean_CA1": 2.0,
+        # The border's nodes have half of their cells on either side: 19.5 and 20.5 of 40.
+        "area_SUBICULUM": 96.0 * 19.5 / 40,
+        "area_CA1": 96.0 * 20.5 / 40,
+        "volume_SUBICULUM": 192.0 * 19.5 / 40,
+        "volume_CA1": 192.0 * 20.5 / 40,
+    }
+    for name, value in wanted.items():
+        assert summary[name] == pytest.approx(value), name
+    absent = {f"{name}_CA3" for name in ("thickness_mean", "area", "volume")}
+    assert {name for name, value in summary.items() if np.isnan(value)} == absent
+    assert set(summary) == set(wanted) | absent
+
+
+def test_filled_columns_do_not_count_for_mean_thickness():
+    sheet = plates(2.0)
+    points, valid = sheet.points.copy(), sheet.valid.copy()
+    points[:5, :, :, 2] *= 3
+    valid[:5] = False
+    odd = Sheet(points=points, valid=valid)
+    subfield = np.full(valid.shape, Tissue.CA1, dtype=np.uint8)
+    summary = summarize(measured(odd, subfield), measured(sheet, subfield), TISSUES, 0.0)
+    assert summary["thickness_mean"] == pytest.approx(2.0)
+    assert summary["thickness_mean_CA1"] == pytest.approx(2.0)
+
+
+def test_small_grids_are_measured_with_smaller_windows():
+    x, y, z = grid(5, 4, 3)
+    points = np.stack([12 * x, 8 * y, 2 * z], axis=-1)
+    np.testing.assert_allclose(mean_curvature(sheet_of(points), 1, MEASURES), 0, atol=1e-12)
+
+
+def test_phantom_measures_are_the_truth(case):
+    thickness = measure_thickness(case.sheet)
+    # Voxels of 0.4 mm drawn by their centers.
+    assert thickness.mean() == pytest.approx(2.0, abs=0.05)
+    assert np.abs(thickness[4:-4] - 2.0).max() < 0.2
+
+
+@pytest.mark.parametrize("name", ["arc", "slab"])
+def test_phantom_curvature_is_the_truth(name, request):
+    case = request.getfixturevalue(name)
+    truth = case.phantom.truth(0.5, 0.5)
+    for level, wanted in (
+        (0, truth.curvature_interior),
+        (4, truth.curvature),
+        (8, truth.curvature_exterior),
+    ):
+        inner = mean_curvature(case.sheet, level, MEASURES)[6:-6, 4:-4]
+        # Second derivatives of voxelized walls: the mean over the middle of the sheet.
+        assert inner.mean() == pytest.approx(float(wanted), abs=0.02)

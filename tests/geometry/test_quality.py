@@ -1,0 +1,106 @@
+"""Flags, each with a case that must raise it, and the numbers behind them."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hipsta_bids.artifacts import Sheet
+from hipsta_bids.geometry.quality import Evidence, find_flags, quality_metrics
+from hipsta_bids.geometry.topology import Repair
+from hipsta_bids.settings import Settings
+
+SETTINGS = Settings()
+
+
+@pytest.fixture
+def evidence(arc):
+    """Nothing to complain about."""
+    return Evidence(
+        body=arc.body,
+        side=5.0,
+        solid=arc.solid,
+        surface=arc.surface,
+        voxels_across=5.0,
+        crossings=0,
+        mesh=arc.mesh,
+        boundaries=arc.boundaries,
+        label_order=0.95,
+        sheet=arc.sheet,
+        bending=2.4,
+        folded=0.0,
+    )
+
+
+def reasons(evidence):
+    return [flag.reason for flag in find_flags(evidence, SETTINGS)]
+
+
+def test_a_sound_hemisphere_has_no_flags(evidence):
+    assert reasons(evidence) == []
+
+
+def repair(*, large):
+    return Repair(kind="cut", voxels=30, cost=12.0, position=(1.0, 2.0, 3.0), large=large)
+
+
+def test_large_repairs_are_flagged_one_by_one(evidence):
+    repairs = (repair(large=True), repair(large=False), repair(large=True))
+    flags = find_flags(replace(evidence, solid=replace(evidence.solid, repairs=repairs)), SETTINGS)
+    assert [flag.reason for flag in flags] == ["large-repair"] * 2
+    assert "cut a bridge of 30 grid nodes at RAS 1.0 2.0 3.0 mm" in flags[0].message
+
+
+@pytest.mark.parametrize(("fraction", "wanted"), [(0.06, ["much-repaired"]), (0.04, [])])
+def test_much_repaired(evidence, fraction, wanted):
+    solid = replace(evidence.solid, changed_fraction=fraction)
+    assert reasons(replace(evidence, solid=solid)) == wanted
+
+
+@pytest.mark.parametrize(("gap", "wanted"), [(1.6, ["boundary-doubtful"]), (1.4, [])])
+def test_boundary_doubtful(evidence, gap, wanted):
+    boundaries = replace(evidence.boundaries, rim_distance=gap)
+    assert reasons(replace(evidence, boundaries=boundaries)) == wanted
+
+
+@pytest.mark.parametrize(
+    ("rule", "bending", "wanted"),
+    [
+        ("labels", -0.6, ["side-doubtful"]),
+        ("labels", -0.4, []),  # nearly flat: the bend says nothing
+        ("bending", -0.6, []),  # it is the bend that decided
+    ],
+)
+def test_side_doubtful(evidence, rule, bending, wanted):
+    boundaries = replace(evidence.boundaries, side_rule=rule)
+    assert reasons(replace(evidence, boundaries=boundaries, bending=bending)) == wanted
+
+
+@pytest.mark.parametrize(("folded", "wanted"), [(0.06, ["folded"]), (0.04, [])])
+def test_folded(evidence, folded, wanted):
+    assert reasons(replace(evidence, folded=folded)) == wanted
+
+
+@pytest.mark.parametrize(("columns", "wanted"), [(25, ["columns-filled"]), (10, [])])
+def test_columns_filled(evidence, columns, wanted):
+    valid = np.ones(evidence.sheet.valid.shape, dtype=bool)
+    valid.reshape(-1)[:columns] = False  # of 861, 2 % are 17
+    sheet = Sheet(points=evidence.sheet.points, valid=valid)
+    assert reasons(replace(evidence, sheet=sheet)) == wanted
+
+
+def test_metrics_are_json_and_complete(evidence):
+    metrics = quality_metrics(evidence)
+    again = json.loads(json.dumps(metrics))
+    assert again["body_voxels"] == np.count_nonzero(evidence.body.inside)
+    assert again["voxel_size_mm"] == [0.4, 0.4, 0.4]
+    assert again["body_length_mm"] == pytest.approx(8.0, abs=0.2)  # half a voxel
+    assert again["posterior_end_rule"] == again["anterior_end_rule"] == "labels"
+    assert again["euler_before"] == again["euler_after"] == 1
+    assert again["surface_vertices"] == len(evidence.surface.vertices)
+    assert again["tetrahedra"] == len(evidence.mesh.tetrahedra)
+    assert 0 < again["tetra_quality_p01"] < again["tetra_quality_median"] <= 1
+    assert again["filled_columns"] == 0
+    assert again["thickness_expected_mm"] == pytest.approx(2.0, rel=0.05)  # rims
+    assert np.linalg.norm(again["posterior_plane"]["normal_ras"]) == pytest.approx(1, abs=1e-3)

@@ -1,0 +1,167 @@
+"""The wall without its caps, curvature of known cylinders, and zero lines."""
+
+import numpy as np
+import pytest
+from geometry_cases import cylinder
+from lapy import Solver, TriaMesh
+
+from hipsta_bids.geometry.surface import lateral_triangles
+from hipsta_bids.geometry.wall import Wall, edge_graph, end_to_end, vertex_normals
+from hipsta_bids.settings import BoundarySettings
+
+SETTINGS = BoundarySettings()
+
+
+@pytest.fixture(scope="module")
+def wall(slab):
+    return Wall(slab.surface, slab.body, SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def place(slab, wall):
+    """Sheet coordinates (u, v, n) of the wall's vertices; u and n of rims too."""
+    body = slab.phantom.body
+    o, x, y, z = body.place([0.5, 0.6, 0.5, 0.5], [0.5, 0.5, 0.6, 0.5], [0.0, 0.0, 0.0, 0.1])
+    axes = np.stack([x - o, y - o, z - o], axis=1)  # the slab is flat: an affine map
+    u, v, n = np.linalg.solve(axes, (wall.vertices - o).T)
+    return 0.5 + 0.1 * u, 0.5 + 0.1 * v, 0.1 * n
+
+
+def lapy_curvature(radius, edge, *, outward=True):
+    """Both curvatures, the direction of the second, and the mean edge, away from the ends."""
+    points, triangles = cylinder(radius, edge, outward=outward)
+    _, direction, least, most = TriaMesh(points, triangles).curvature_tria(
+        smoothit=SETTINGS.curvature_smoothing
+    )
+    sides = np.roll(points[triangles], 1, axis=1) - points[triangles]
+    middle = points[triangles].mean(axis=1)[:, 2]
+    inner = (middle > 3) & (middle < 5)
+    mean_edge = np.linalg.norm(sides, axis=2).mean()
+    return least[inner].mean(), most[inner].mean(), direction[inner], mean_edge
+
+
+@pytest.mark.parametrize("radius", [1.0, 2.0, 4.0])
+@pytest.mark.parametrize("edge", [0.25, 0.35, 0.5])
+def test_lapys_curvature_is_the_setting_times_curvature_times_edge(radius, edge):
+    least, most, _, mean_edge = lapy_curvature(radius, edge)
+    # Convex is negative on outward triangles. Regular triangles give 1 / (2 sqrt 3) = 0.289.
+    assert -least * radius / mean_edge == pytest.approx(SETTINGS.lapy_curvature, rel=0.06)
+    assert abs(most) < 0.02 * abs(least)
+
+
+def test_orientation_decides_the_sign_of_lapys_curvature():
+    least, most, *_ = lapy_curvature(2.0, 0.35, outward=False)
+    assert most > 0
+    assert abs(least) < 0.02 * most
+
+
+def test_caps_are_left_out(slab, wall):
+    assert len(wall.triangles) == np.count_nonzero(lateral_triangles(slab.surface))
+    original = slab.surface.triangles[lateral_triangles(slab.surface)]
+    np.testing.assert_array_equal(wall.index[wall.triangles], original)
+    np.testing.assert_array_equal(wall.vertices, slab.surface.vertices[wall.index])
+    # An open tube: Euler number 0.
+    assert len(wall.vertices) - len(wall.edges) + len(wall.triangles) == 0
+
+
+def test_share_runs_from_the_posterior_to_the_anterior_end(wall, place):
+    np.testing.assert_allclose(wall.share, place[1], atol=0.03)  # planes are off by < 0.2 of 8 mm
+    np.testing.assert_allclose(wall.share[wall.posterior], 0, atol=1e-6)  # vertices are rounded
+    np.testing.assert_allclose(wall.share[wall.anterior], 1, atol=1e-6)
+
+
+def test_diffusion_is_slow_across_the_rims_only(wall, place):
+    """Energy of a function that steps across a region tells how fast diffusion is there."""
+    u, _, n = place
+    across_rim = np.clip(n / 0.5, -1, 1)  # from side to side round the rims
+    along_side = np.clip((u - 0.5) / 0.05, -1, 1)  # from rim to rim in the middle of the sides
+    for matrix in (wall.bend_aware, wall.evenly_aware):
+        # Over slope squared times area: two bands of 8 mm, 1 and 1.2 mm wide.
+        rim = across_rim @ (matrix @ across_rim) / (2 * 8 * 1.0 * 2.0**2)
+        side = along_side @ (matrix @ along_side) / (2 * 8 * 1.2 * (1 / 0.6) ** 2)
+        assert rim < 0.7
+        assert side > 0.85  # hardly slowed: waves of the voxels have little curvature
+
+
+def test_without_anisotropy_diffusion_is_even(slab):
+    wall = Wall(slab.surface, slab.body, BoundarySettings(anisotropy=0.0))
+    plain = Solver(TriaMesh(wall.vertices.copy(), wall.triangles.copy()), lump=True)
+    for matrix in (wall.bend_aware, wall.evenly_aware):
+        # Rounding: sums of some terms, thin triangles.
+        assert abs(matrix - plain.stiffness).max() < 1e-10 * abs(plain.stiffness).max()
+    np.testing.assert_allclose(wall.mass, plain.mass.diagonal(), rtol=1e-9)
+
+
+def test_stiffness_is_blind_to_constants(wall):
+    ones = np.ones(len(wall.vertices))
+    for matrix in (wall.bend_aware, wall.evenly_aware):
+        assert np.abs(matrix @ ones).max() < 1e-9
+    areas = wall.mass.sum()
+    assert areas == pytest.approx(2 * (12.0 + 2.0) * 8.0, rel=0.06)  # rims are rounded
+
+
+def test_near_is_connected_along_the_wall(slab, wall, place):
+    u, _, n = place
+    line = slab.phantom.body.place(0.5, np.linspace(0, 1, 41), 1.0)
+    near = wall.near(line, 2.5)  # reaches through the wall of 2 mm
+    assert near.any()
+    assert (n[near] > 0).all()
+    assert (np.abs(u[near] - 0.5) < 2.6 / 12).all()
+
+
+def test_sides_fall_apart_along_the_rims(wall, place):
+    u, _, n = place
+    sides = wall.sides((u < 0.08) | (u > 0.92))
+    assert sides is not None
+    first, second = (n[side].mean() for side in sides)
+    assert first * second < -0.5
+    assert not (sides[0] & sides[1]).any()
+
+
+def test_one_cut_or_a_leak_gives_no_sides(wall, place):
+    u, v, _ = place
+    assert wall.sides(u < 0.08) is None
+    leaky = ((u < 0.08) | (u > 0.92)) & ~((v > 0.4) & (v < 0.7) & (u > 0.5))
+    assert wall.sides(leaky) is None
+    assert wall.sides(np.abs(v - 0.5) < 0.1) is None  # pieces that do not reach both ends
+
+
+def test_rim_of_a_side_is_shared_with_the_strips(wall, place):
+    u, _, _ = place
+    strips = (u < 0.08, u > 0.92)
+    sides = wall.sides(strips[0] | strips[1])
+    grown = wall.with_rim(sides[0], strips)
+    added = grown & ~sides[0]
+    assert added.any()
+    assert not (added & ~(strips[0] | strips[1])).any()
+    neighbors = edge_graph(wall.edges, np.ones(len(wall.edges)), len(u)) @ sides[0]
+    assert (neighbors[added] > 0).all()
+
+
+def test_zero_lines_from_end_to_end(wall, place):
+    u, v, n = place
+    curves = end_to_end(wall, n)
+    assert curves is not None
+    assert len({bool(np.mean(wall_u(curve, wall, u)) < 0.5) for curve in curves}) == 2
+    across = end_to_end(wall, u - 0.5)  # once along each side
+    assert across is not None
+    assert np.abs(np.concatenate([wall_u(c, wall, u) for c in across]) - 0.5).max() < 0.05
+    assert end_to_end(wall, v - 0.5) is None  # round the body, not along it
+    assert end_to_end(wall, np.ones_like(u)) is None
+    assert end_to_end(wall, np.sin(12 * u)) is None  # more than two lines
+
+
+def wall_u(curve, wall, u):
+    """Position u of the wall's vertices nearest to a curve's points."""
+    gaps = np.linalg.norm(curve[:, None] - wall.vertices[None], axis=2)
+    return u[gaps.argmin(axis=1)]
+
+
+def test_normals_point_outward(slab, wall, place):
+    u, _, n = place
+    normals = vertex_normals(wall)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
+    o, z = slab.phantom.body.place([0.5, 0.5], [0.5, 0.5], [0.0, 1.0])
+    flat = (u > 0.15) & (u < 0.85)
+    # Voxels of 0.4 mm leave waves of a few degrees.
+    assert (np.sign(n[flat]) * (normals[flat] @ (z - o)) > 0.9).all()
