@@ -129,6 +129,15 @@ def test_curvature_of_a_tube_is_half_of_one_over_its_radius(level, radius):
     np.testing.assert_allclose(curvature, 0.5 / radius, rtol=0.15)
 
 
+def test_curvature_does_not_mind_oblique_grid_lines():
+    """A tube whose lines along y wind round it."""
+    x, y, z = grid(nx=81)
+    r, angle = 4.0 + 2.0 * (z - 0.5), np.pi * (x + 0.5 * y)
+    oblique = sheet_of(np.stack([r * np.cos(angle), r * np.sin(angle), 10 * y], axis=-1))
+    curvature = mean_curvature(oblique, 4, MEASURES)
+    np.testing.assert_allclose(curvature[4:-4, 4:-4], 0.125, rtol=0.02)  # as above
+
+
 def test_curvature_of_a_sphere_is_one_over_its_radius():
     curvature = mean_curvature(shell(), 4, MEASURES)
     np.testing.assert_allclose(curvature[4:-4, 4:-4], 0.1, rtol=0.02)  # as above
