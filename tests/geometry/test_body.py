@@ -163,6 +163,15 @@ def test_a_turned_head_is_not_taken_for_a_swap():
     assert check_side(extract_body(volume, BodySettings()), "L") > 0
 
 
+@pytest.mark.parametrize("degrees", [(0.0, 180.0, 0.0), (0.0, 0.0, 180.0), (0.0, 90.0, 0.0)])
+@pytest.mark.parametrize("claimed", ["L", "R"])
+def test_handedness_decides_where_the_subject_lies_otherwise(degrees, claimed):
+    """On the back turned round, or on a side, the subiculum may point away from x = 0."""
+    phantom = short_phantom(kind="spiral", curvature=None, width=20.0, length=10.0)
+    volume = phantom.label_volume(FREESURFER, hemi=claimed, pose=rigid(degrees))
+    assert np.isfinite(check_side(extract_body(volume, BodySettings()), claimed))
+
+
 def test_the_side_is_unknown_without_ca1(arc):
     tissue = np.where(arc.volume.tissue == Tissue.CA1, Tissue.SUBICULUM, arc.volume.tissue)
     volume = LabelVolume(

@@ -188,6 +188,21 @@ def test_body_stops_before_the_head_where_ca2_goes_on_into_it(twofold):
     assert abs(ends.height(middle, "anterior")[0]) < 1.0
 
 
+def test_body_stops_before_the_bend_of_the_tail_too():
+    volume = sheet_with_head(twofold=True)
+    turned = LabelVolume(
+        tissue=volume.tissue[:, ::-1],
+        part=volume.part,
+        affine=volume.affine,
+        scheme=HIPPUNFOLD,
+    )
+    # CA1 beside CA2 everywhere, so that only the second layer tells the tail from the body.
+    ends = ends_of(turned)
+    assert (ends.posterior_rule, ends.anterior_rule) == ("cross-section", "subfields")
+    middle = np.array([[9.5, 11.75, 6.75]])
+    assert abs(ends.height(middle, "posterior")[0]) < 1.0  # as above
+
+
 def test_a_plain_rod_has_no_head_to_stop_at():
     volume = sheet_with_head(twofold=True)
     tissue = volume.tissue.copy()
