@@ -42,7 +42,7 @@ def solve_case(phantom, *, scheme="freesurfer", settings=None, **drawing):
     chosen = settings or Settings()
     volume = phantom.label_volume(load_scheme(scheme), **drawing)
     body = extract_body(volume, chosen.body)
-    field = resample_body(body, chosen.grid)
+    field = resampled(body, chosen)
     solid = repair_topology(field, chosen.topology)
     surface = extract_surface(solid.field, chosen.surface)
     mesh = tetrahedralize(surface, chosen.tetra)
@@ -60,6 +60,12 @@ def solve_case(phantom, *, scheme="freesurfer", settings=None, **drawing):
         coordinates=coordinates,
         sheet=sample_sheet(mesh, coordinates, chosen.sheet),
     )
+
+
+def resampled(body, settings=None):
+    """The body's field with the settings of this stage."""
+    chosen = settings or Settings()
+    return resample_body(body, chosen.grid)
 
 
 def short_phantom(**changes):

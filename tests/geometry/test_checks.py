@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from geometry_cases import box_mesh, plain_body, short_phantom, straight_ends
+from geometry_cases import box_mesh, plain_body, resampled, short_phantom, straight_ends
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
@@ -16,7 +16,6 @@ from hipsta_bids.geometry.checks import (
     check_thickness,
     check_voxels_across,
 )
-from hipsta_bids.geometry.grid import resample_body
 from hipsta_bids.geometry.measures import measure_thickness
 from hipsta_bids.geometry.surface import extract_surface
 from hipsta_bids.geometry.topology import repair_topology
@@ -30,7 +29,7 @@ def surface_of(kind, voxel, thickness):
     phantom = short_phantom(kind=kind, curvature=None, thickness=thickness, length=10.0, width=20.0)
     volume = phantom.label_volume(load_scheme("freesurfer"), voxel_size=(voxel,) * 3)
     body = extract_body(volume, ALL.body)
-    solid = repair_topology(resample_body(body, ALL.grid), ALL.topology)
+    solid = repair_topology(resampled(body), ALL.topology)
     return extract_surface(solid.field, ALL.surface), body
 
 

@@ -2,14 +2,13 @@
 
 import numpy as np
 import pytest
-from geometry_cases import plain_body, rigid, rotation, straight_ends
+from geometry_cases import plain_body, resampled, rigid, rotation, straight_ends
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.ends import EndPlanes
-from hipsta_bids.geometry.grid import in_plane_voxel, resample_body
-from hipsta_bids.settings import GridSettings
+from hipsta_bids.geometry.grid import in_plane_voxel
 
 EXACT = 1e-9  # rounding of coordinates of some ten mm
 
@@ -23,7 +22,7 @@ def test_nodes_to_ras_and_back(case):
 @settings(max_examples=25, deadline=None)
 @given(st.floats(-25, 25), st.floats(0, 5))
 def test_ras_to_nodes_and_back_with_tilted_planes(tilt, phase):
-    grid = resample_body(box_body(tilt=tilt), GridSettings()).grid
+    grid = resampled(box_body(tilt=tilt)).grid
     points = np.random.default_rng(int(10 * phase)).uniform(-3, 12, size=(50, 3))
     np.testing.assert_allclose(grid.to_ras(grid.to_nodes(points)), points, atol=EXACT)
 
@@ -45,7 +44,7 @@ def test_node_points_are_the_nodes_places(arc):
 
 def test_clamped_nodes_keep_away_from_the_end_planes():
     ends = straight_ends(8.0)
-    grid = resample_body(box_body(), GridSettings()).grid
+    grid = resampled(box_body()).grid
     places = grid.node_points(clamp=0.6)
     assert places[..., 2].min() == pytest.approx(0.6)
     assert places[..., 2].max() == pytest.approx(ends.anterior_point[2] - 0.6)
@@ -94,7 +93,7 @@ def test_field_is_positive_inside_and_negative_outside(case):
 
 
 def test_field_reaches_both_ends_at_full_strength():
-    field = resample_body(box_body(), GridSettings())
+    field = resampled(box_body())
     middle = field.values[..., field.grid.shape[2] // 2]
     for plane in (0, -1):
         # No fading towards the end planes: the box goes on, and beyond them nothing is read.
@@ -105,9 +104,7 @@ def test_labels_beyond_the_end_planes_do_not_count():
     whole = box_body()
     cut = box_body()
     cut.tissue[:, :, : int(2.5 / 0.4)] = 0  # the tail, half a millimetre off the plane
-    np.testing.assert_array_equal(
-        resample_body(cut, GridSettings()).values, resample_body(whole, GridSettings()).values
-    )
+    np.testing.assert_array_equal(resampled(cut).values, resampled(whole).values)
 
 
 def test_field_is_free_at_the_sides(case):
@@ -144,5 +141,5 @@ def test_planes_that_meet_beside_the_body_are_refused():
         ),
     )
     with pytest.raises(GeometryError, match="the end planes meet beside the body") as caught:
-        resample_body(crossed, GridSettings())
+        resampled(crossed)
     assert caught.value.reason == "ends-crossed"
