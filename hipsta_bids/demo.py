@@ -6,8 +6,7 @@ from pathlib import Path
 from hipsta_bids.bids import files
 from hipsta_bids.bids.names import HemisphereName, output_path
 from hipsta_bids.bids.status import identity, read_status, row_key
-from hipsta_bids.errors import UsageError
-from hipsta_bids.phantom import TRUTH_TABLE, write_demo_dataset
+from hipsta_bids.phantom import TRUTH_TABLE, refuse_taken, write_demo_dataset
 
 _PROTOCOL = "freesurfer"  # the layout that the demo dataset has
 
@@ -27,16 +26,7 @@ def write_demo_data(folder: Path) -> None:
     OutputError
         If it cannot be written.
     """
-    try:
-        taken = folder.exists() and any(folder.iterdir())
-    except OSError as error:
-        raise files.output_error(folder, error) from error
-    if taken and not (folder / TRUTH_TABLE).exists():
-        raise UsageError(
-            f"{folder}: holds something other than a demo dataset; choose a new folder",
-            reason="folder-taken",
-        )
-    files.check_writable(folder)
+    refuse_taken(folder, "a demo dataset")
     write_demo_dataset(folder)
 
 

@@ -3,13 +3,14 @@
 from hipsta_bids.phantom.dataset import (
     TRUTH_TABLE,
     Hemisphere,
+    refuse_taken,
     rigid_motion,
     write_dataset,
     write_demo_dataset,
 )
 from hipsta_bids.phantom.labels import encode
 from hipsta_bids.phantom.phantom import Phantom
-from hipsta_bids.phantom.spec import KINDS, PhantomSpec
+from hipsta_bids.phantom.spec import KINDS, PhantomSpec, Thinning
 from hipsta_bids.phantom.truth import PhantomTruth
 
 __all__ = [
@@ -19,7 +20,9 @@ __all__ = [
     "Phantom",
     "PhantomSpec",
     "PhantomTruth",
+    "Thinning",
     "encode",
+    "refuse_taken",
     "rigid_motion",
     "write_dataset",
     "write_demo_dataset",

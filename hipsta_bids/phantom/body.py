@@ -11,10 +11,12 @@ scanner
     RAS mm: tilted like a hippocampus and moved to its place; right is left, mirrored.
 """
 
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.special import erf
 
 from hipsta_bids.artifacts import Float
 from hipsta_bids.errors import SettingsError
@@ -32,6 +34,68 @@ _RIGID_TOLERANCE = 1e-6
 #: mm of arc length within which two places of the mid-curve are the same: above the accuracy of
 #: projection, below what a voxel can show.
 _SAME_PLACE = 0.02
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ThicknessJet:
+    """Thickness of the wall and its derivatives by arc length s and long axis w.
+
+    In mm, 1, and 1/mm.
+    """
+
+    value: Float
+    s: Float
+    w: Float
+    ss: Float
+    sw: Float
+    ww: Float
+
+    def thinned(self, depth: float, across: "Window", along: "Window") -> "ThicknessJet":
+        """Take off ``depth`` mm times the product of two windows."""
+        return ThicknessJet(
+            value=self.value - depth * across[0] * along[0],
+            s=self.s - depth * across[1] * along[0],
+            w=self.w - depth * across[0] * along[1],
+            ss=self.ss - depth * across[2] * along[0],
+            sw=self.sw - depth * across[1] * along[1],
+            ww=self.ww - depth * across[0] * along[2],
+        )
+
+
+#: Value, first and second derivative of a window.
+Window = tuple[Float, Float, Float]
+
+
+def window_jet(at: Float, limits: tuple[float, float], extent: float, edge: float) -> Window:
+    """Window that is 1 between two limits and 0 outside, with edges like error functions.
+
+    Parameters
+    ----------
+    at : array
+        mm.
+    limits : tuple of float
+        Fractions of ``extent`` at which the window is one half; beyond 0 or 1 there is no edge.
+    extent : float
+        mm.
+    edge : float
+        Scale of the edges, mm.
+
+    Returns
+    -------
+    tuple of arrays
+        The window, its slope (1/mm) and second derivative (1/mm2).
+    """
+    value, slope, second = (np.zeros(np.shape(at)) for _ in range(3))
+    for limit, sign, open_end in ((limits[0], 1.0, 0.0), (limits[1], -1.0, 1.0)):
+        if sign * (limit - open_end) <= 0.0:
+            value = value + 0.5  # far inside an edge
+            continue
+        x = (at - limit * extent) / edge
+        bell = np.exp(-(x**2)) / (np.sqrt(np.pi) * edge)
+        value = value + 0.5 * sign * erf(x)
+        slope = slope + sign * bell
+        second = second - sign * 2.0 * x / edge * bell
+    return value, slope, second
 
 
 class Body:
@@ -60,31 +124,36 @@ class Body:
 
     def thickness(self, u: Float, v: Float) -> Float:
         """Thickness of the wall along its mid-surface's normal, mm."""
-        return self.thickness_jet(u, v)[0]
+        return self.thickness_jet(u, v).value
 
-    def thickness_jet(self, u: Float, v: Float) -> tuple[Float, Float, Float, Float, Float]:
-        """Thickness (mm), its derivatives by arc length s and long axis w, and d2/ds2, d2/dw2.
-
-        The sinusoids are added, so that the mixed derivative is zero.
-        """
+    def thickness_jet(self, u: Float, v: Float) -> ThicknessJet:
+        """Thickness and its derivatives; the sinusoids are added, so they have no mixed one."""
         spec = self.spec
         u, v = np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64))
+        u = u - spec.offset
         amplitude = spec.thickness * spec.variation / len(spec.variation_axis)
         by_s, by_w = 2.0 * np.pi / spec.width, 2.0 * np.pi / spec.length
         x, y = (amplitude * (axis in spec.variation_axis) for axis in "xy")
         a, b = 2.0 * np.pi * u, 2.0 * np.pi * v
-        return (
-            spec.thickness + x * np.sin(a) + y * np.sin(b),
-            x * by_s * np.cos(a),
-            y * by_w * np.cos(b),
-            -x * by_s**2 * np.sin(a),
-            -y * by_w**2 * np.sin(b),
+        jet = ThicknessJet(
+            value=spec.thickness + x * np.sin(a) + y * np.sin(b),
+            s=x * by_s * np.cos(a),
+            w=y * by_w * np.cos(b),
+            ss=-x * by_s**2 * np.sin(a),
+            sw=np.zeros(u.shape),
+            ww=-y * by_w**2 * np.sin(b),
         )
+        for thinning in spec.thinnings:
+            across = window_jet(u * spec.width, thinning.u, spec.width, thinning.edge)
+            along = window_jet(v * spec.length, thinning.v, spec.length, thinning.edge)
+            jet = jet.thinned(thinning.depth, across, along)
+        return jet
 
     @cached_property
     def thickest(self) -> float:
-        """Largest thickness anywhere, mm."""
-        return self.spec.thickness * (1.0 + self.spec.variation)
+        """Largest thickness anywhere, mm, or a little more."""
+        grown = sum(max(0.0, -thinning.depth) for thinning in self.spec.thinnings)
+        return self.spec.thickness * (1.0 + self.spec.variation) + grown
 
     def place(
         self,

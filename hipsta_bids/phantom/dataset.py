@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from hipsta_bids import __version__
 from hipsta_bids.artifacts import Float, LabelVolume
 from hipsta_bids.bids import files
-from hipsta_bids.errors import SettingsError
+from hipsta_bids.errors import SettingsError, UsageError
 from hipsta_bids.phantom.labels import encode
 from hipsta_bids.phantom.phantom import Phantom
 from hipsta_bids.phantom.spec import PhantomSpec
@@ -85,6 +85,16 @@ class Hemisphere:
     """(4, 4) rigid motion in RAS mm."""
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Participants:
+    """What ``participants.tsv`` says beside the names."""
+
+    columns: Mapping[str, Mapping[str, Any]]
+    """Descriptions by column, in the form of a BIDS sidecar."""
+    rows: Mapping[str, Sequence[str]]
+    """Values in the order of the columns, by subject label without ``sub-``."""
+
+
 def write_dataset(
     out: Path,
     hemispheres: Sequence[Hemisphere],
@@ -93,6 +103,7 @@ def write_dataset(
     voxel_size: tuple[float, float, float] = (0.4, 0.4, 0.4),
     axes: str = "LIA",
     supersample: int | tuple[int, int, int] = 1,
+    participants: Participants | None = None,
 ) -> None:
     """Write phantoms as a BIDS dataset with derivatives and a table of the truth.
 
@@ -108,6 +119,8 @@ def write_dataset(
         Any of ``LAYOUTS``; each gets its own folder in ``derivatives``.
     voxel_size, axes, supersample
         See :meth:`Phantom.label_volume`.
+    participants : Participants, optional
+        Covariates; by default subjects have names only.
 
     Raises
     ------
@@ -138,7 +151,8 @@ def write_dataset(
             )
             place = layout.path.format(subject=f"sub-{item.subject}", side=layout.sides[item.hemi])
             _write_image(out / "derivatives" / name / place, volume)
-    _write_tables(out, hemispheres, truth)
+    _write_truth(out, hemispheres, truth)
+    _write_participants(out, hemispheres, participants or Participants(columns={}, rows={}))
     _write_descriptions(out, layouts)
 
 
@@ -174,6 +188,28 @@ def write_demo_dataset(out: Path) -> None:
     )
 
 
+def refuse_taken(out: Path, what: str = "phantoms") -> None:
+    """Refuse a folder that holds something other than phantoms.
+
+    Raises
+    ------
+    UsageError
+        Likewise.
+    OutputError
+        If it cannot be looked into.
+    """
+    try:
+        taken = out.exists() and any(out.iterdir())
+    except OSError as error:
+        raise files.output_error(out, error) from error
+    if taken and not (out / TRUTH_TABLE).exists():
+        raise UsageError(
+            f"{out}: holds something other than {what}; choose a new folder",
+            reason="folder-taken",
+        )
+    files.check_writable(out)
+
+
 def rigid_motion(degrees: tuple[float, float, float], shift: tuple[float, float, float]) -> Float:
     """Make a (4, 4) rigid motion: turns about R, A and S in this order, then a shift in mm."""
     motion = np.eye(4)
@@ -201,7 +237,7 @@ def _write_image(path: Path, volume: LabelVolume) -> None:
     files.write_bytes(path, gzip.compress(image.to_bytes(), compresslevel=6, mtime=0))
 
 
-def _write_tables(
+def _write_truth(
     out: Path, hemispheres: Sequence[Hemisphere], truth: Sequence[Mapping[str, str]]
 ) -> None:
     files.write_tsv(
@@ -215,13 +251,20 @@ def _write_tables(
         f"sub-{item.subject}_hemi-{item.hemi}": asdict(item.spec) for item in hemispheres
     }
     files.write_json((out / TRUTH_TABLE).with_suffix(".json"), sidecar)
-    files.write_text(out / ".bidsignore", "phantom_truth.*\n")
-    subjects = dict.fromkeys(f"sub-{item.subject}" for item in hemispheres)
-    files.write_tsv(out / "participants.tsv", ["participant_id"], [[name] for name in subjects])
-    files.write_json(
-        out / "participants.json",
-        {"participant_id": {"Description": "synthetic subject; there is no image behind it"}},
+    files.write_text(out / ".bidsignore", "phantom_truth.*\nphantom_effect.*\nphantom_maps/\n")
+
+
+def _write_participants(
+    out: Path, hemispheres: Sequence[Hemisphere], participants: Participants
+) -> None:
+    subjects = dict.fromkeys(item.subject for item in hemispheres)
+    files.write_tsv(
+        out / "participants.tsv",
+        ["participant_id", *participants.columns],
+        [[f"sub-{name}", *participants.rows.get(name, ())] for name in subjects],
     )
+    about = {"Description": "synthetic subject; there is no image behind it"}
+    files.write_json(out / "participants.json", {"participant_id": about, **participants.columns})
 
 
 def _write_descriptions(out: Path, layouts: Sequence[str]) -> None:

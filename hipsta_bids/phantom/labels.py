@@ -105,10 +105,10 @@ def draw(
 
 
 def subfield_at(u: Float) -> NDArray[np.uint8]:
-    """Tissue of the sheet at positions ``u`` in [0, 1], in the finest division."""
+    """Tissue of the sheet at positions ``u``, in the finest division; the ends go on."""
     starts = np.array([start for _, start in SUBFIELD_STARTS])
     tissues = np.array([tissue for tissue, _ in SUBFIELD_STARTS], dtype=np.uint8)
-    return np.asarray(tissues[np.searchsorted(starts, u, side="right") - 1])
+    return np.asarray(tissues[np.searchsorted(starts[1:], u, side="right")])
 
 
 def label_for(scheme: Scheme, tissue: Tissue, part: Part) -> Label | None:
@@ -187,7 +187,8 @@ def _regions(
     near = np.flatnonzero((v >= -beyond) & (v <= 1.0 + beyond))  # NaN compares false
     u, v, n = u[near], v[near], n[near]
     half = body.thickness(u, v) / 2.0
-    band = np.searchsorted([start for _, start in SUBFIELD_STARTS], u, side="right")
+    starts = [start for _, start in SUBFIELD_STARTS[1:]]
+    band = 1 + np.searchsorted(starts, u - spec.offset, side="right")
     layer = n < -half + spec.layer_thickness
     wall = band + _SHEET * layer
     depth = -half - n

@@ -112,7 +112,7 @@ class Phantom:
             curvature_interior=bent["interior"],
             curvature=bent["mid"],
             curvature_exterior=bent["exterior"],
-            subfield=subfield_at(x),
+            subfield=subfield_at(x - self.spec.offset),
             summary=summarize(self.body),
         )
 

@@ -34,6 +34,23 @@ VARIATION_AXES = ("x", "y", "xy")
 
 
 @dataclass(frozen=True, kw_only=True)
+class Thinning:
+    """A region of the sheet in which the wall is thinner.
+
+    Its edges are smooth: at u and v of the limits, half of the depth is reached.
+    """
+
+    depth: float
+    """mm, taken off the thickness inside; negative thickens."""
+    u: tuple[float, float]
+    """Limits medial to lateral, in sheet coordinates; beyond 0 or 1 there is no edge."""
+    v: tuple[float, float]
+    """Limits posterior to anterior."""
+    edge: float = 1.0
+    """mm, scale of the edges' error functions: 84 % of a step happens within this distance."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class PhantomSpec:
     """An analytic hippocampal body. Two equal specifications are the same shape."""
 
@@ -63,6 +80,11 @@ class PhantomSpec:
     """mm, depth of the dentate gyrus and CA4 beneath the interior side."""
     interior_start: float = 0.45
     """Position u from which on dentate gyrus and CA4 line the interior side."""
+    thinnings: tuple[Thinning, ...] = ()
+    """Regions in which the wall is thinner. Where they overlap, depths add up."""
+    offset: float = 0.0
+    """By how much u the pattern of thickness (sinusoids and thinnings) and the borders of
+    subfields are shifted from medial to lateral; the shape stays."""
 
     def __post_init__(self) -> None:
         _check_choice("kind", self.kind, tuple(KINDS))
@@ -73,7 +95,19 @@ class PhantomSpec:
                 _check_range(field.name, getattr(self, field.name), *limits)
         for value in self.curvature or ():
             _check_range("curvature", value, -10.0, 10.0)
-        thinnest = self.thickness * (1.0 - self.variation)
+        for thinning in self.thinnings:
+            _check_range("thinning depth", thinning.depth, -10.0, 10.0)
+            _check_range("thinning edge", thinning.edge, 0.2, 10.0)
+            for limit in (*thinning.u, *thinning.v):
+                _check_range("thinning limit", limit, -1.0, 2.0)
+        depth = sum(max(0.0, thinning.depth) for thinning in self.thinnings)
+        thinnest = self.thickness * (1.0 - self.variation) - depth
+        if thinnest <= 0.0:
+            raise SettingsError(
+                f"phantom: thinning by {depth:g} mm leaves no wall of {self.thickness:g} mm; "
+                "thin it less",
+                reason="phantom-setting",
+            )
         if self.layer_thickness >= thinnest:
             raise SettingsError(
                 f"phantom: layer_thickness {self.layer_thickness:g} mm fills the wall, which is "
@@ -104,6 +138,7 @@ _LIMITS: Mapping[str, tuple[float, float]] = MappingProxyType(
         "layer_thickness": (0.0, 10.0),
         "interior_depth": (0.0, 10.0),
         "interior_start": (0.0, 1.0),
+        "offset": (-0.15, 0.15),
     }
 )
 

@@ -128,7 +128,9 @@ def _surface_jet(body: Body, u: Float, v: Float, at: float) -> _Jet:
     u, v = np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64))
     s = u * body.spec.width
     bend = body.spec.bend
-    n, n_s, n_w, n_ss, n_ww = (at * x for x in body.thickness_jet(u, v))
+    wall = body.thickness_jet(u, v)
+    n, n_s, n_w = at * wall.value, at * wall.s, at * wall.w
+    n_ss, n_sw, n_ww = at * wall.ss, at * wall.sw, at * wall.ww
     k, k_s = body.curve.curvature(s), body.curve.curvature_slope(s)
     mid_stretch, by_n = _axis_stretch(body, u)
     stretch = mid_stretch + n * by_n
@@ -139,7 +141,7 @@ def _surface_jet(body: Body, u: Float, v: Float, at: float) -> _Jet:
         s=_stack(grow, n_s, zero),
         w=_stack(zero, n_w, stretch),
         ss=_stack(k_s * n + 2.0 * k * n_s, n_ss - k * grow, zero),
-        sw=_stack(k * n_w, zero, -bend * (grow * medial_t + n_s * medial_m)),
+        sw=_stack(k * n_w, n_sw, -bend * (grow * medial_t + n_s * medial_m)),
         ww=_stack(
             bend * stretch * medial_t,
             n_ww + bend * stretch * medial_m,

@@ -1,0 +1,187 @@
+"""Synthetic cohorts: groups with a planted effect, covariates and known truth."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+import numpy as np
+
+from hipsta_bids.errors import UsageError
+from hipsta_bids.phantom.dataset import Hemisphere, rigid_motion
+from hipsta_bids.phantom.labels import SUBFIELD_STARTS
+from hipsta_bids.phantom.spec import KINDS, PhantomSpec, Thinning
+
+Range = tuple[float, float]
+
+
+def _regions() -> Mapping[str, tuple[Range, Range]]:
+    borders = [start for _, start in SUBFIELD_STARTS] + [1.0]
+    spans = {
+        tissue.name: (borders[i], borders[i + 1]) for i, (tissue, _) in enumerate(SUBFIELD_STARTS)
+    }
+    spans["CA2-3"] = (spans.pop("CA2")[0], spans.pop("CA3")[1])
+    spans["all"] = (0.0, 1.0)
+    ends = {"": (0.0, 1.0), "-posterior": (0.0, 0.5), "-anterior": (0.5, 1.0)}
+    return MappingProxyType(
+        {
+            f"{name if name.startswith('CA') else name.lower()}{end}": (u, v)
+            for name, u in spans.items()
+            for end, v in ends.items()
+        }
+    )
+
+
+#: Regions of the sheet in which an effect can be planted: ranges of u and v.
+REGIONS = _regions()
+
+
+@dataclass(frozen=True, kw_only=True)
+class CohortPlan:
+    """What a cohort looks like.
+
+    The thickness of a wall is ``thickness + age_slope * (age - 65) + site + subject + hemisphere``
+    with normal deviates for the last two; the planted thinning comes on top in every group but
+    the first. Width and length grow with the cube root of intracranial volume.
+    """
+
+    n_subjects: int = 20
+    """In all groups together; as equal as possible."""
+    groups: tuple[str, ...] = ("control", "patient")
+    """The first one has no effect; the others have it once, twice, and so on."""
+    thinning: float = 0.3
+    """mm, off the wall inside the region."""
+    region: str = "CA1-anterior"
+    """One of ``REGIONS``."""
+    shift: float = 0.0
+    """mm, by which the pattern of the wall and the subfields' borders lie more lateral in the
+    other groups; a method has to tell this from thinning."""
+    seed: int = 0
+    kind: str = "spiral"
+    """Shape of the cross-section."""
+    thickness: float = 1.8
+    """mm, mean of the cohort at the age of 65."""
+    variation: float = 0.12
+    """Thickness varies along x by plus and minus this fraction."""
+    subject_sd: float = 0.08
+    """mm"""
+    hemisphere_sd: float = 0.03
+    """mm"""
+    offset_sd: float = 0.3
+    """mm, of each subject's own shift along x."""
+    age_slope: float = -0.004
+    """mm per year."""
+    sites: tuple[float, ...] = (0.0, 0.03)
+    """mm that each site adds to thickness."""
+
+    def __post_init__(self) -> None:
+        if self.region not in REGIONS:
+            raise UsageError(
+                f"phantom: region {self.region!r} is unknown; choose from {', '.join(REGIONS)}",
+                reason="phantom-region",
+            )
+        if self.kind not in KINDS:
+            raise UsageError(
+                f"phantom: kind {self.kind!r} is unknown; choose from {', '.join(KINDS)}",
+                reason="phantom-setting",
+            )
+        if self.n_subjects < 1 or not self.groups or len(set(self.groups)) < len(self.groups):
+            raise UsageError(
+                "phantom: give at least one subject, and groups with different names",
+                reason="phantom-setting",
+            )
+
+
+#: Years, mL; sex and the means of intracranial volume of women and men.
+_AGES, _MEAN_AGE = (50.0, 80.0), 65.0
+_ICV, _ICV_SD, _ICV_MEAN = MappingProxyType({"F": 1400.0, "M": 1560.0}), 110.0, 1480.0
+_TURN, _SHIFT = 6.0, 3.0  # degrees and mm, SD of a head's position
+
+
+@dataclass(frozen=True, kw_only=True)
+class Subject:
+    """One row of ``participants.tsv`` and the shapes behind it."""
+
+    label: str
+    group: str
+    age: float
+    """Years."""
+    sex: str
+    icv: float
+    """mL."""
+    site: str
+    hemispheres: tuple[Hemisphere, ...]
+
+
+def make_cohort(plan: CohortPlan) -> list[Subject]:
+    """Draw subjects; the same plan gives the same cohort.
+
+    Each subject has a generator of its own, so that more subjects leave the first ones alone.
+
+    Raises
+    ------
+    SettingsError
+        If a phantom is impossible, such as a wall thinned to nothing.
+    """
+    return [_make_subject(plan, number) for number in range(plan.n_subjects)]
+
+
+def typical_shape(plan: CohortPlan, dose: int) -> PhantomSpec:
+    """Shape of a mean subject, with the planted effect so many times."""
+    return _spec(plan, thickness=plan.thickness, scale=1.0, offset=plan.shift * dose, dose=dose)
+
+
+def _make_subject(plan: CohortPlan, number: int) -> Subject:
+    random = np.random.default_rng((plan.seed, number))
+    dose = number % len(plan.groups)
+    age = round(float(random.uniform(*_AGES)), 1)
+    sex = "FM"[int(random.integers(2))]
+    icv = round(float(random.normal(_ICV[sex], _ICV_SD)), 1)
+    site = int(random.integers(len(plan.sites)))
+    wall = plan.thickness + plan.age_slope * (age - _MEAN_AGE) + plan.sites[site]
+    wall += plan.subject_sd * float(random.standard_normal())
+    scale = float(np.cbrt(icv / _ICV_MEAN))
+    offset = plan.shift * dose + plan.offset_sd * float(random.standard_normal())
+    pose = rigid_motion(_three(random, _TURN), _three(random, _SHIFT))
+    label = f"{number + 1:0{max(2, len(str(plan.n_subjects)))}d}"
+    hemispheres = []
+    for hemi in "LR":
+        own = wall + plan.hemisphere_sd * float(random.standard_normal())
+        spec = _spec(plan, thickness=own, scale=scale, offset=offset, dose=dose)
+        hemispheres.append(Hemisphere(subject=label, hemi=hemi, spec=spec, pose=pose))
+    return Subject(
+        label=label,
+        group=plan.groups[dose],
+        age=age,
+        sex=sex,
+        icv=icv,
+        site=f"site{site + 1}",
+        hemispheres=tuple(hemispheres),
+    )
+
+
+def _spec(
+    plan: CohortPlan, *, thickness: float, scale: float, offset: float, dose: int
+) -> PhantomSpec:
+    """Shape of one hemisphere; a larger one has the same bends, only wider."""
+    plain = PhantomSpec(kind=plan.kind)
+    bend = KINDS[plan.kind]
+    thinnings: tuple[Thinning, ...] = ()
+    if dose and plan.thinning:
+        u, v = REGIONS[plan.region]
+        thinnings = (Thinning(depth=plan.thinning * dose, u=u, v=v),)
+    return replace(
+        plain,
+        curvature=(bend.medial / scale, bend.lateral / scale),
+        thickness=thickness,
+        variation=plan.variation,
+        variation_axis="x",
+        width=plain.width * scale,
+        length=plain.length * scale,
+        thinnings=thinnings,
+        offset=offset / (plain.width * scale),
+    )
+
+
+def _three(random: np.random.Generator, sd: float) -> tuple[float, float, float]:
+    x, y, z = random.normal(0.0, sd, 3)
+    return float(x), float(y), float(z)
