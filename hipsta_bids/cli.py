@@ -88,6 +88,8 @@ def _dispatch(arguments: list[str]) -> ExitCode:
         "settings": _settings,
         "demo-data": _demo_data,
         "demo": _demo,
+        "phantom": _phantom,
+        "validate": _validate,
     }
     is_app = any(level in arguments[1:] for level in (*LEVELS, "group"))
     if arguments and arguments[0] in commands and not is_app:
@@ -239,6 +241,41 @@ def _demo(arguments: list[str]) -> ExitCode:
     for line in compare_with_truth(data, out):
         say(line)
     return code
+
+
+def _phantom(arguments: list[str]) -> ExitCode:
+    """Write a cohort of phantoms."""
+    from hipsta_bids.subcommands import phantom_parser  # noqa: PLC0415  (start-up time)
+
+    options = phantom_parser().parse_args(arguments)
+    from hipsta_bids.phantom.cohort import CohortPlan  # noqa: PLC0415  (heavy)
+    from hipsta_bids.phantom.cohort_dataset import write_cohort  # noqa: PLC0415  (heavy)
+
+    plan = CohortPlan(
+        n_subjects=options.n_subjects,
+        groups=tuple(options.groups),
+        thinning=options.thinning,
+        region=options.region,
+        shift=options.shift,
+        seed=options.seed,
+        kind=options.kind,
+        thickness=options.thickness,
+    )
+    write_cohort(options.out, plan, layout=options.layout, voxel_size=tuple(options.voxel_size))
+    say(f"synthetic dataset of {plan.n_subjects} subjects: {options.out}")
+    return ExitCode.OK
+
+
+def _validate(arguments: list[str]) -> ExitCode:
+    """Run the validation suites and write their report."""
+    from hipsta_bids.subcommands import validate_parser  # noqa: PLC0415  (start-up time)
+
+    options = validate_parser().parse_args(arguments)
+    from hipsta_bids.validation.report import PAGE, validate  # noqa: PLC0415  (heavy)
+
+    missed = validate(options.out, full=options.full, names=options.suite, report=say)
+    say(f"{missed} targets missed; report: {options.out / PAGE}")
+    return ExitCode.OK
 
 
 if __name__ == "__main__":

@@ -18,6 +18,8 @@ other commands:
   hipsta-bids settings         print all settings with their meaning, as TOML
   hipsta-bids demo-data DIR    write a synthetic dataset with known thickness
   hipsta-bids demo DIR         write it, run on it, and compare with the truth
+  hipsta-bids phantom DIR      write a synthetic cohort with a known effect (see its --help)
+  hipsta-bids validate         measure accuracy on phantoms, write a report (see its --help)
 
 exit codes:
   0    all hemispheres done

@@ -78,7 +78,8 @@ def test_lock_has_a_hash_for_every_package_and_no_address(lock):
 
 def test_every_import_is_a_declared_dependency():
     distributions = {"bids": "pybids", "skimage": "scikit-image"}
-    declared = {canonical(requirement) for requirement in PROJECT["dependencies"]}
+    extras = PROJECT["optional-dependencies"]["figures"]
+    declared = {canonical(requirement) for requirement in [*PROJECT["dependencies"], *extras]}
     trees = (
         ast.parse(path.read_text(encoding="utf-8")) for path in (ROOT / "hipsta_bids").rglob("*.py")
     )

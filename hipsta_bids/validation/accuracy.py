@@ -24,9 +24,6 @@ MAX_SIZE_ERROR = 2.0
 """Percent, of volume, areas and extents."""
 MAX_CURVATURE_ERROR = 5.0
 """Percent, of mean curvature in the middle of an arc."""
-MAX_SILENT_ERROR = 0.15
-"""mm; where the mean is farther off, the hemisphere has to be refused or flagged."""
-
 SIZES = ("volume", "area_interior", "area_mid", "area_exterior", "extent_x", "extent_y")
 
 
@@ -86,7 +83,7 @@ ROWS = _rows()
 
 
 def run(full: bool) -> Suite:
-    """Measure every row in several poses, and phantoms too thin for their voxels.
+    """Measure every row in several poses.
 
     Parameters
     ----------
@@ -99,8 +96,7 @@ def run(full: bool) -> Suite:
     """
     poses = POSES_FULL if full else POSES_QUICK
     cases = [case for number, row in enumerate(ROWS) for case in _poses(number, row, poses)]
-    limits = _limit_cases(full=full)
-    results = run_cases(measure_case, [*cases, *limits])
+    results = run_cases(measure_case, cases)
     groups = [results[i * poses : (i + 1) * poses] for i in range(len(ROWS))]
     measured = [[m for m in group if isinstance(m, Measured)] for group in groups]
     return Suite(
@@ -111,7 +107,6 @@ def run(full: bool) -> Suite:
             _thickness_table(groups),
             _curvature_table(measured),
             _size_table(measured),
-            _limit_table(limits, results[len(cases) :]),
         ),
         pictures=(_error_picture(measured),),
     )
@@ -245,43 +240,6 @@ def _size_table(measured: Sequence[Sequence[Measured]]) -> Table:
         columns=("phantom", "voxels, mm", *headings, "target", "met"),
         rows=tuple(rows),
         notes="Mean over the poses. Extents are arc lengths of the mid-surface.",
-    )
-
-
-def _limit_cases(*, full: bool) -> list[Case]:
-    """Sheets from comfortable to far too thin for their voxels."""
-    sizes = (0.4, 0.6, 0.8, 1.0) if full else (0.5, 1.0)
-    walls = (0.8, 1.2, 1.6, 3.0) if full else (0.8, 1.6)
-    return [
-        Case(
-            spec=PhantomSpec(kind="spiral", thickness=wall, curvature=(0.02, 0.35)),
-            voxel_size=(size, size, size),
-            pose=any_pose(np.random.default_rng((SEED, 100, i, j))),
-        )
-        for i, wall in enumerate(walls)
-        for j, size in enumerate(sizes)
-    ]
-
-
-def _limit_table(cases: Sequence[Case], results: Sequence[Measured | Refusal]) -> Table:
-    rows: list[tuple[Cell, ...]] = []
-    for case, result in zip(cases, results, strict=True):
-        start: tuple[Cell, ...] = (f"{case.spec.thickness:g}", f"{case.voxel_size[0]:g}")
-        across = f"{case.spec.thickness / case.voxel_size[0]:.1f}"
-        if isinstance(result, Refusal):
-            outcome = f"refused: {result.reason}"
-            rows.append((*start, across, outcome, None, None, not result.is_bug))
-            continue
-        bias = float(np.nanmean(result.error))
-        outcome = ", ".join([result.status, *result.flags])
-        told = bool(result.flags) or abs(bias) <= MAX_SILENT_ERROR
-        rows.append((*start, across, outcome, f"{bias:+.3f}", float(np.nanstd(result.error)), told))
-    return Table(
-        title="Sheets too thin for their voxels",
-        columns=("thickness, mm", "voxels, mm", "voxels across", "outcome", "bias", "SD", "met"),
-        rows=tuple(rows),
-        notes="One pose each. Met: the map is refused or flagged, or its mean is within"
-        f" {MAX_SILENT_ERROR:g} mm of the truth.",
     )
 
 

@@ -78,12 +78,16 @@ def validate(
 def page(suites: Sequence[Suite], *, full: bool) -> str:
     """Write the page in Markdown."""
     command = "hipsta-bids validate" + (" --full" if full else "")
-    libraries = ", ".join(f"{name} {version(name)}" for name in _LIBRARIES)
+    python = f"Python {platform.python_version()}"
+    libraries = ", ".join([python, *(f"{name} {version(name)}" for name in _LIBRARIES)])
+    intro = (
+        f"Written by `{command}` of hipsta_bids {__version__} ({libraries}). The same command"
+        " with the same versions gives the same numbers."
+    )
     parts = [
         f"<!-- Written by `{command}`; do not edit, run it again. -->",
         "# Validation",
-        f"Written by `{command}` of hipsta_bids {__version__} (Python {platform.python_version()},"
-        f" {libraries}). The same command with the same versions gives the same numbers.",
+        intro,
         markdown(_overview(suites)),
         *(_section(suite) for suite in suites),
     ]
@@ -136,7 +140,7 @@ def _new_figure(size: tuple[float, float]) -> "Figure":
         from matplotlib.figure import Figure  # noqa: PLC0415  (optional, heavy)
     except ImportError as error:
         raise UsageError(
-            "validate: figures need matplotlib; install it with: pip install 'hipsta_bids[figures]'",
+            "validate: figures need matplotlib; try: pip install 'hipsta_bids[figures]'",
             reason="matplotlib-missing",
         ) from error
     return Figure(figsize=size, layout="compressed")

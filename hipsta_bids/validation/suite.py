@@ -19,6 +19,7 @@ Cell = str | int | float | bool | None
 SUITES: Mapping[str, str] = MappingProxyType(
     {
         "accuracy": "hipsta_bids.validation.accuracy",
+        "limits": "hipsta_bids.validation.limits",
         "convergence": "hipsta_bids.validation.convergence",
         "invariance": "hipsta_bids.validation.invariance",
     }

@@ -1,0 +1,105 @@
+"""What ``hipsta-bids phantom`` and ``hipsta-bids validate`` look like. Loads nothing heavy."""
+
+import argparse
+from pathlib import Path
+
+from hipsta_bids.parser import Parser
+
+PHANTOM_EPILOG = """\
+regions: presubiculum, subiculum, CA1, CA2-3 or all, alone or with -anterior or -posterior
+
+what is written:
+  derivatives/LAYOUT/       segmentations, for the participant level
+  participants.tsv          group, age, sex, intracranial volume, site
+  phantom_truth.tsv         true thickness, extents, areas and volume of each hemisphere
+  phantom_maps/             true maps of each hemisphere
+  phantom_effect.tsv        where the effect was planted, and how large it is
+"""
+
+
+def phantom_parser() -> Parser:
+    """Describe ``hipsta-bids phantom``.
+
+    Returns
+    -------
+    Parser
+        Raises :class:`UsageError` on wrong use.
+    """
+    parser = Parser(
+        prog="hipsta-bids phantom",
+        description="write a synthetic BIDS dataset of hippocampal bodies with known truth",
+        epilog=PHANTOM_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    add = parser.add_argument
+    add("out", type=Path, metavar="OUT", help="new folder, or one of phantoms to write anew")
+    add("--layout", default="freesurfer", help="freesurfer (default) or ashs")
+    add("--n-subjects", type=int, default=20, metavar="N", help="in all groups (default: 20)")
+    add(
+        "--groups",
+        nargs="+",
+        default=["control", "patient"],
+        metavar="NAME",
+        help="the first has no effect, the second has it once, the third twice"
+        " (default: control patient)",
+    )
+    add(
+        "--thinning",
+        type=float,
+        default=0.3,
+        metavar="MM",
+        help="planted effect: the wall is so much thinner in the region (default: 0.3)",
+    )
+    add(
+        "--region",
+        default="CA1-anterior",
+        metavar="NAME",
+        help="where (default: CA1-anterior), see below",
+    )
+    add(
+        "--shift",
+        type=float,
+        default=0.0,
+        metavar="MM",
+        help="planted shift along x, to lateral, of the wall's pattern and subfields (default: 0)",
+    )
+    add("--kind", default="spiral", help="slab, arc, spiral (default), s-shape or tight")
+    add("--thickness", type=float, default=1.8, metavar="MM", help="cohort mean (default: 1.8)")
+    add(
+        "--voxel-size",
+        nargs=3,
+        type=float,
+        default=[0.4, 0.4, 0.4],
+        metavar="MM",
+        help="left-right, superior-inferior, anterior-posterior (default: 0.4 0.4 0.4)",
+    )
+    add("--seed", type=int, default=0, help="the same seed gives the same files (default: 0)")
+    return parser
+
+
+def validate_parser() -> Parser:
+    """Describe ``hipsta-bids validate``.
+
+    Returns
+    -------
+    Parser
+        Raises :class:`UsageError` on wrong use.
+    """
+    parser = Parser(
+        prog="hipsta-bids validate",
+        description="measure phantoms with known truth; write tables and figures",
+        epilog="The exit code is 0 whether or not targets are met: the report says which are.",
+        allow_abbrev=False,
+    )
+    add = parser.add_argument
+    add("--full", action="store_true", help="all cases, minutes instead of a quick selection")
+    add(
+        "--out",
+        type=Path,
+        default=Path("docs"),
+        metavar="DIR",
+        help="folder for validation.md and images/ (default: docs)",
+    )
+    add("--suite", nargs="+", default=[], metavar="NAME", help="only these suites")
+    return parser
