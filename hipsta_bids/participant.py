@@ -57,7 +57,9 @@ def measure_hemisphere(
         body = extract_body(volume, settings.body)
         side = check_side(body, hemi)
     with clock("surface"):
-        solid = repair_topology(resample_body(body, settings.grid), settings.topology)
+        solid = repair_topology(
+            resample_body(body, settings.grid, settings.slices), settings.topology
+        )
         surface = extract_surface(solid.field, settings.surface)
         across = check_voxels_across(surface, body, settings.checks)
     with clock("tetrahedra"):

@@ -59,6 +59,44 @@ class GridSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SliceSettings:
+    """Shapes between thick slices."""
+
+    min_ratio: float = 1.8
+    """Slices thicker than this many pixels are interpolated by shape."""
+    upsampling: int = 2
+    """Fine pixels per pixel."""
+    spacing: float = 0.35
+    """Largest distance of interpolated slices, mm."""
+    smoothing: float = 0.9
+    """Standard deviation of the Gaussian in a slice, pixels."""
+    tail: float = 0.3
+    """Thin parts keep at least this half width, mm."""
+    reach: float = 2.0
+    """Distances from the outline are kept up to this, mm."""
+    edge: float = 0.3
+    """Half width of the ramp across the outline, mm."""
+    max_fragments: int = 8
+    """Most fragments that are joined in a slice."""
+    max_rank_jump: int = 2
+    """Fragments are joined preferably to subfields at most so many ranks away."""
+    bridge: float = 0.45
+    """Half width of a bridge between fragments, mm."""
+    max_gap: float = 1.2
+    """Fragments are joined across at most this distance, mm."""
+    crumb_area: float = 1.5
+    """Fragments farther away are dropped if they are smaller than this, mm2."""
+    hole_area: float = 3.0
+    """Smaller holes in a slice are filled, mm2."""
+    flow_window: float = 2.0
+    """Window of the registration, mm."""
+    flow_iterations: int = 10
+    """Iterations of the registration per level."""
+    final_smoothing: float = 0.25
+    """Standard deviation of the Gaussian after interpolation, mm."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class TopologySettings:
     """Repair of holes, bridges, islands and cavities."""
 
@@ -68,8 +106,17 @@ class TopologySettings:
     """Most rounds of repair."""
     small_cost: float = 5.0
     """Membranes cheaper than this are applied together; dearer ones one a round."""
-    closing_nodes: int = 3
-    """A filled hole is thickened by a closing with this radius, grid nodes."""
+    plug_reach: int = 8
+    """A filled hole becomes as thick as the wall within this distance of it, grid nodes."""
+    oriented_nodes: int = 6
+    """Membranes of fewer nodes have no direction."""
+    cut_across: float = 0.36
+    """A cut severs the ribbon rather than a bridge if this share of it lies across the axis
+    (projected areas, squared)."""
+    fill_across: float = 0.5
+    """A fill spans the inside of a bend rather than a hole if this share lies across the axis."""
+    across_factor: float = 30.0
+    """Such membranes cost this much more."""
     flag_cut_cost: float = 2.0
     """Flag a cut that overrules more evidence than this (sum of the field)."""
     flag_fill_cost: float = 25.0
@@ -219,6 +266,7 @@ class Settings:
 
     body: BodySettings = field(default_factory=BodySettings)
     grid: GridSettings = field(default_factory=GridSettings)
+    slices: SliceSettings = field(default_factory=SliceSettings)
     topology: TopologySettings = field(default_factory=TopologySettings)
     surface: SurfaceSettings = field(default_factory=SurfaceSettings)
     tetra: TetraSettings = field(default_factory=TetraSettings)

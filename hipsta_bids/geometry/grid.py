@@ -8,7 +8,8 @@ from scipy import ndimage
 from hipsta_bids.artifacts import Float
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
-from hipsta_bids.settings import GridSettings
+from hipsta_bids.geometry.slices import FineVolume, has_thick_slices, interpolate_slices
+from hipsta_bids.settings import GridSettings, SliceSettings
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -80,13 +81,15 @@ class Field:
     """(A, B, W), between -0.5 and 0.5."""
 
 
-def resample_body(body: Body, settings: GridSettings) -> Field:
+def resample_body(body: Body, settings: GridSettings, slices: SliceSettings) -> Field:
     """Sample the body's mask on a wedge grid and smooth it.
 
     Parameters
     ----------
     body : Body
     settings : GridSettings
+    slices : SliceSettings
+        Used where slices are thick.
 
     Returns
     -------
@@ -98,14 +101,22 @@ def resample_body(body: Body, settings: GridSettings) -> Field:
         ``ends-crossed`` where the end planes meet inside the body.
     """
     grid = _fit_grid(body, settings)
+    if has_thick_slices(body.affine, slices):
+        source, sigma = interpolate_slices(body, slices), slices.final_smoothing
+    else:
+        source = FineVolume(values=(body.tissue > 0).astype(np.float32), affine=body.affine)
+        sigma = settings.smoothing * in_plane_voxel(body.affine)
     points = grid.node_points(clamp=body.ends.half_slice)
-    inverse = np.linalg.inv(body.affine)
+    inverse = np.linalg.inv(source.affine)
     voxels = points.reshape(-1, 3) @ inverse[:3, :3].T + inverse[:3, 3]
-    mask = (body.tissue > 0).astype(np.float32)
-    values = ndimage.map_coordinates(mask, voxels.T, order=1, output=np.float32)
-    sigma = settings.smoothing * in_plane_voxel(body.affine) / settings.spacing
+    values = ndimage.map_coordinates(
+        source.values, voxels.T, order=1, output=np.float32, mode="nearest"
+    )
     smooth = ndimage.gaussian_filter(
-        values.reshape(grid.shape), sigma, mode=("constant", "constant", "nearest"), truncate=3.0
+        values.reshape(grid.shape),
+        sigma / settings.spacing,
+        mode=("constant", "constant", "nearest"),
+        truncate=3.0,
     )
     return Field(grid=grid, values=smooth - np.float32(0.5))
 

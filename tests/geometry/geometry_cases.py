@@ -65,7 +65,7 @@ def solve_case(phantom, *, scheme="freesurfer", settings=None, **drawing):
 def resampled(body, settings=None):
     """The body's field with the settings of this stage."""
     chosen = settings or Settings()
-    return resample_body(body, chosen.grid)
+    return resample_body(body, chosen.grid, chosen.slices)
 
 
 def short_phantom(**changes):
