@@ -119,7 +119,7 @@ class TopologySettings:
     """Such membranes cost this much more."""
     flag_cut_cost: float = 2.0
     """Flag a cut that overrules more evidence than this (sum of the field)."""
-    flag_fill_cost: float = 25.0
+    flag_fill_cost: float = 50.0
     """Flag a filled hole that overrules more evidence than this (sum of the field)."""
     flag_fraction: float = 0.05
     """Flag a repair, or all together, beyond this fraction of the body."""
@@ -256,8 +256,9 @@ class CheckSettings:
     """Flag if a larger fraction of the columns had to be filled from neighbors."""
     flag_bending: float = 0.5
     """Flag if the sheet turns round its exterior side by more than this, rad."""
-    flag_rim_distance: float = 1.5
-    """Flag if the rim paths and the boundary curves differ by more than this, mm."""
+    flag_rim_distance: float = 1.25
+    """Flag if the rim paths and the boundary curves differ by more than this, multiples of the
+    sheet's thickness (along a flat rim a path may follow either edge)."""
 
 
 @dataclass(frozen=True, kw_only=True)

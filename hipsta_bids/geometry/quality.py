@@ -52,7 +52,7 @@ def find_flags(evidence: Evidence, settings: Settings) -> list[Flag]:
             f"{solid.changed_fraction:.1%} of the body was changed by repairs: look at the labels",
         ),
         (
-            boundaries.rim_distance > checks.flag_rim_distance,
+            boundaries.rim_distance > checks.flag_rim_distance * boundaries.sheet_thickness,
             "boundary-doubtful",
             f"the medial or lateral boundary is uncertain by {boundaries.rim_distance:.1f} mm",
         ),

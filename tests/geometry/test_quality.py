@@ -58,8 +58,9 @@ def test_much_repaired(evidence, fraction, wanted):
     assert reasons(replace(evidence, solid=solid)) == wanted
 
 
-@pytest.mark.parametrize(("gap", "wanted"), [(1.6, ["boundary-doubtful"]), (1.4, [])])
-def test_boundary_doubtful(evidence, gap, wanted):
+@pytest.mark.parametrize(("share", "wanted"), [(1.3, ["boundary-doubtful"]), (1.2, [])])
+def test_boundary_doubtful(evidence, share, wanted):
+    gap = share * evidence.boundaries.sheet_thickness
     boundaries = replace(evidence.boundaries, rim_distance=gap)
     assert reasons(replace(evidence, boundaries=boundaries)) == wanted
 
