@@ -9,7 +9,7 @@ import numpy as np
 
 from hipsta_bids.artifacts import Float
 from hipsta_bids.bids import files
-from hipsta_bids.phantom.cohort import CohortPlan, Subject, make_cohort, typical_shape
+from hipsta_bids.phantom.cohort import REGIONS, CohortPlan, Subject, make_cohort, typical_shape
 from hipsta_bids.phantom.dataset import Hemisphere, Participants, refuse_taken, write_dataset
 from hipsta_bids.phantom.phantom import Phantom
 
@@ -19,6 +19,8 @@ EFFECT_TABLE = "phantom_effect.tsv"
 
 #: Nodes of the true maps along x and y: as many as the default sheet has.
 NODES = (41, 21)
+
+_ROUNDING = 1e-9  # nodes on the border of a region belong to it
 
 
 def write_cohort(
@@ -128,7 +130,13 @@ def _write_effect(out: Path, plan: CohortPlan) -> None:
     planted = replace(with_effect.spec, offset=0.0)
     thinning = Phantom(planted).body.thickness(u, v) - without.body.thickness(u, v)
     observed = with_effect.body.thickness(u, v) - without.body.thickness(u, v)
-    inside = np.abs(thinning) > 0.5 * abs(plan.thinning) if plan.thinning else np.zeros(u.shape)
+    limits = REGIONS[plan.region]
+    inside = np.logical_and.reduce(
+        [
+            (low - _ROUNDING <= at) & (at <= high + _ROUNDING)
+            for at, (low, high) in zip((u, v), limits, strict=True)
+        ]
+    )
     _write_columns(
         out / EFFECT_TABLE,
         {
@@ -144,7 +152,9 @@ def _write_effect(out: Path, plan: CohortPlan) -> None:
     files.write_json(
         (out / EFFECT_TABLE).with_suffix(".json"),
         {
-            "in_region": {"Description": "1 where more than half of the effect was planted"},
+            "in_region": {
+                "Description": "1 within the limits of the region; at them, half of the effect"
+            },
             "difference": {
                 "Description": "thickness of the second group minus that of the first, at the same"
                 " anatomical place",
