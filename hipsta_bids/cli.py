@@ -274,7 +274,7 @@ def _validate(arguments: list[str]) -> ExitCode:
     from hipsta_bids.validation.report import PAGE, validate  # noqa: PLC0415  (heavy)
 
     missed = validate(options.out, full=options.full, names=options.suite, report=say)
-    say(f"{missed} targets missed; report: {options.out / PAGE}")
+    say(f"targets missed: {missed}; report: {options.out / PAGE}")
     return ExitCode.OK
 
 

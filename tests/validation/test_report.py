@@ -1,0 +1,134 @@
+"""From suites to the page, with suites that take no time."""
+
+import struct
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+from hipsta_bids import cli
+from hipsta_bids.errors import ExitCode, UsageError
+from hipsta_bids.validation import report
+from hipsta_bids.validation.report import markdown, page, render, show
+from hipsta_bids.validation.suite import SUITES, Picture, Suite, Table, run_suite
+
+TABLE = Table(
+    title="Bias",
+    columns=("case", "mm", "target", "met"),
+    rows=(("a|b", 0.01234, "≤ 0.02", True), ("c", float("nan"), "≤ 0.02", False)),
+    notes="Read it so.",
+)
+
+
+def line(figure):
+    figure.subplots().plot([0, 1], [1, 0])
+
+
+PICTURE = Picture(name="line", caption="A falling line.", draw=line, size=(3.0, 2.0))
+
+
+@pytest.fixture
+def one_suite(monkeypatch):
+    """Replace all suites by one; remembers how it was called."""
+    calls = []
+
+    def run(full):
+        calls.append(full)
+        return Suite(name="toy", title="Toys", text="Why.", tables=(TABLE,), pictures=(PICTURE,))
+
+    monkeypatch.setitem(sys.modules, "toy_suite", SimpleNamespace(run=run))
+    for module in ("hipsta_bids.validation.suite", "hipsta_bids.validation.report"):
+        monkeypatch.setattr(f"{module}.SUITES", {"toy": "toy_suite"})
+    return calls
+
+
+def test_a_table_in_markdown():
+    assert markdown(TABLE).splitlines() == [
+        "**Bias**",
+        "",
+        "| case | mm | target | met |",
+        "| --- | --- | --- | --- |",
+        r"| a\|b | 0.012 | ≤ 0.02 | yes |",
+        "| c | n/a | ≤ 0.02 | **no** |",
+        "",
+        "Read it so.",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("cell", "text"), [(None, "n/a"), (3, "3"), (1.0, "1.00"), (True, "yes"), ("≤ 1", "≤ 1")]
+)
+def test_cells(cell, text):
+    assert show(cell, 2) == text
+
+
+def test_targets_are_counted_and_numbers_are_not():
+    table = Table(title="t", columns=("n", "x"), rows=((1, True), (0, False), (0, None)))
+    assert (table.targets, table.missed) == (2, 1)
+
+
+def test_a_row_of_another_length_is_refused():
+    with pytest.raises(ValueError, match="a row has not 2 cells"):
+        Table(title="t", columns=("a", "b"), rows=((1,),))
+
+
+def test_page_says_that_it_is_generated_and_shows_all():
+    text = page([Suite(name="toy", title="Toys", tables=(TABLE,), pictures=(PICTURE,))], full=True)
+    assert text.startswith("<!-- Written by `hipsta-bids validate --full`; do not edit")
+    assert "| Toys | Bias | 2 | 1 |" in text
+    assert "![A falling line.](images/validation-line.png)" in text
+    assert text.count("**Bias**") == 1
+
+
+def test_figures_are_png_and_the_same_each_time():
+    first = render(PICTURE)
+    assert first[:8] == b"\x89PNG\r\n\x1a\n"
+    assert struct.unpack(">II", first[16:24]) == (300, 200)  # 3 x 2 inches, 100 dpi
+    assert first == render(PICTURE)
+
+
+def test_command_writes_the_report(tmp_path, capsys, one_suite):
+    assert cli.main(["validate", "--full", "--out", str(tmp_path / "a b")]) == ExitCode.OK
+    said = capsys.readouterr().out.splitlines()
+    assert said[0] == "Toys: 1 of 2 targets met"
+    assert said[1] == f"targets missed: 1; report: {tmp_path / 'a b' / 'validation.md'}"
+    assert one_suite == [True]
+    assert (tmp_path / "a b/images/validation-line.png").read_bytes() == render(PICTURE)
+    assert "## Toys\n\nWhy." in (tmp_path / "a b/validation.md").read_text(encoding="utf-8")
+
+
+def test_command_is_quick_by_default(tmp_path, one_suite):
+    assert cli.main(["validate", "--out", str(tmp_path)]) == ExitCode.OK
+    assert one_suite == [False]
+
+
+def test_unknown_suites_are_refused(tmp_path, capsys):
+    code = cli.main(["validate", "--suite", "speed", "--out", str(tmp_path)])
+    assert code == ExitCode.USAGE
+    assert "suite 'speed' is unknown; choose from accuracy" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("one_suite")
+def test_a_file_in_the_way_is_an_output_error(tmp_path):
+    (tmp_path / "out").write_text("taken")
+    assert cli.main(["validate", "--out", str(tmp_path / "out")]) == ExitCode.NOT_WRITABLE
+
+
+def test_without_matplotlib_nothing_is_measured(monkeypatch, tmp_path, one_suite):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)  # as if it were not installed
+    with pytest.raises(UsageError, match="figures need matplotlib; try: pip install"):
+        report.validate(tmp_path, full=False)
+    assert not one_suite
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", SUITES)
+def test_every_suite_can_be_imported(name):
+    from importlib import import_module  # noqa: PLC0415
+
+    assert callable(import_module(SUITES[name]).run)
+
+
+@pytest.mark.usefixtures("one_suite")
+def test_a_suite_is_found_by_its_name():
+    assert run_suite("toy", full=False).title == "Toys"
