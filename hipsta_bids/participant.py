@@ -8,7 +8,15 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import replace
 
-from hipsta_bids.artifacts import Coordinates, HemisphereMaps, LabelVolume, Sheet, Surface
+from hipsta_bids.artifacts import (
+    Coordinates,
+    HemisphereMaps,
+    LabelVolume,
+    Sheet,
+    Surface,
+    TetMesh,
+)
+from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import check_side, extract_body
 from hipsta_bids.geometry.boundaries import Boundaries, find_boundaries
 from hipsta_bids.geometry.checks import check_label_order, check_thickness, check_voxels_across
@@ -24,7 +32,7 @@ from hipsta_bids.geometry.measures import (
 from hipsta_bids.geometry.quality import Evidence, find_flags, quality_metrics
 from hipsta_bids.geometry.sheet import folded_fraction, label_sheet, sample_sheet, whole_body
 from hipsta_bids.geometry.surface import extract_surface, signed_volume
-from hipsta_bids.geometry.tetra import count_intersections, tetrahedralize
+from hipsta_bids.geometry.tetra import tetrahedralize
 from hipsta_bids.geometry.topology import SolidField, repair_topology
 from hipsta_bids.settings import Settings
 
@@ -63,8 +71,7 @@ def measure_hemisphere(
         surface = extract_surface(solid.field, settings.surface)
         across = check_voxels_across(surface, body, settings.checks)
     with clock("tetrahedra"):
-        surface, crossings = _untangled(solid, surface, settings)
-        mesh = tetrahedralize(surface, settings.tetra)
+        surface, mesh, smoothed = _filled(solid, surface, settings)
     with clock("boundaries"):
         boundaries = find_boundaries(surface, mesh, body, settings.boundaries)
     with clock("coordinates"):
@@ -84,7 +91,7 @@ def measure_hemisphere(
         solid=solid,
         surface=surface,
         voxels_across=across,
-        crossings=crossings,
+        smoothed=smoothed,
         mesh=mesh,
         boundaries=boundaries,
         label_order=order,
@@ -120,16 +127,19 @@ def measure_hemisphere(
         )
 
 
-def _untangled(solid: SolidField, surface: Surface, settings: Settings) -> tuple[Surface, int]:
-    """Smooth more where the surface intersects itself; whatever is left, TetGen decides."""
-    crossings = count_intersections(surface, settings.tetra)
-    for extra in range(1, settings.surface.untangle_tries + 1):
-        if crossings <= 0:
-            break
-        steps = settings.surface.taubin_iterations * (1 + extra)
-        surface = extract_surface(solid.field, replace(settings.surface, taubin_iterations=steps))
-        crossings = count_intersections(surface, settings.tetra)
-    return surface, crossings
+def _filled(
+    solid: SolidField, surface: Surface, settings: Settings
+) -> tuple[Surface, TetMesh, int]:
+    """Fill the surface; smooth it more where TetGen cannot, and say how often."""
+    for extra in range(settings.surface.untangle_tries):
+        try:
+            return surface, tetrahedralize(surface, settings.tetra), extra
+        except GeometryError:
+            steps = settings.surface.taubin_iterations * (2 + extra)
+            surface = extract_surface(
+                solid.field, replace(settings.surface, taubin_iterations=steps)
+            )
+    return surface, tetrahedralize(surface, settings.tetra), settings.surface.untangle_tries
 
 
 def _turned(

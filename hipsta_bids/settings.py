@@ -115,7 +115,7 @@ class TopologySettings:
     (projected areas, squared)."""
     fill_across: float = 0.5
     """A fill spans the inside of a bend rather than a hole if this share lies across the axis."""
-    across_factor: float = 30.0
+    across_factor: float = 100.0
     """Such membranes cost this much more."""
     flag_cut_cost: float = 2.0
     """Flag a cut that overrules more evidence than this (sum of the field)."""
@@ -136,7 +136,7 @@ class SurfaceSettings:
     taubin_inflate: float = -0.53
     """Step back, fraction."""
     untangle_tries: int = 2
-    """How often a surface that intersects itself is smoothed more."""
+    """How often a surface that TetGen cannot fill is smoothed more."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,8 +23,8 @@ class Evidence:
     solid: SolidField
     surface: Surface
     voxels_across: float
-    crossings: int
-    """Triangles that intersect others."""
+    smoothed: int
+    """How often the surface was smoothed more because TetGen could not fill it."""
     mesh: TetMesh
     boundaries: Boundaries
     label_order: float
@@ -98,7 +98,7 @@ def quality_metrics(evidence: Evidence) -> dict[str, Any]:
         "surface_vertices": len(surface.vertices),
         "posterior_cap_vertices": int(surface.posterior_cap.sum()),
         "anterior_cap_vertices": int(surface.anterior_cap.sum()),
-        "intersecting_triangles": evidence.crossings,
+        "extra_smoothing": evidence.smoothed,
         "tetrahedra": len(evidence.mesh.tetrahedra),
         "tetra_quality_median": float(np.median(quality)),
         "tetra_quality_p01": float(np.quantile(quality, 0.01)),

@@ -1,7 +1,7 @@
 """TetGen in a process of its own.
 
 TetGen aborts the whole process on some self-intersecting surfaces, sometimes without an
-exception. This module is run as a program that checks and meshes one surface after the other, and
+exception. This module is run as a program that meshes one surface after the other, and
 holds the client that starts it, waits, and starts a new one after a crash. Messages are pickles
 with a length in front, over the standard streams.
 """
@@ -53,13 +53,8 @@ class TetgenClient:
         tuple or str
             Vertices (V, 3) and tetrahedra (T, 4), or why there are none.
         """
-        reply = self._ask(("mesh", vertices, triangles, options), timeout)
+        reply = self._ask((vertices, triangles, options), timeout)
         return reply if isinstance(reply, str) else (reply[0], reply[1])
-
-    def intersections(self, vertices: Float, triangles: Int, timeout: float) -> int | str:
-        """Count triangles that intersect others, or say why that is not known."""
-        reply = self._ask(("intersections", vertices, triangles), timeout)
-        return reply if isinstance(reply, str) else int(reply)
 
     def _ask(self, request: tuple[Any, ...], timeout: float) -> Any:  # noqa: ANN401 -- any reply
         process = self._running()
@@ -136,16 +131,16 @@ def _exactly(stream: IO[bytes], size: int, deadline: float | None) -> bytes:
 
 def _serve() -> None:
     """Answer requests until the caller goes away."""
-    # The libraries print; their words must not land between the messages.
+    # TetGen prints; its words must not land between the messages.
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     while True:
         try:
-            kind, *arguments = _read(sys.stdin.buffer)
+            request = _read(sys.stdin.buffer)
         except EOFError:
             return
         try:
-            _write(answers, _mesh(*arguments) if kind == "mesh" else _count(*arguments))
+            _write(answers, _mesh(*request))
         except (RuntimeError, ValueError, TypeError) as error:
             _write(answers, f"TetGen failed: {error}")
 
@@ -160,14 +155,6 @@ def _mesh(vertices: Float, triangles: Int, options: dict[str, Any]) -> tuple[Flo
     ):
         points, cells, *_ = TetGen(vertices, triangles).tetrahedralize(**options)
     return np.asarray(points), np.asarray(cells)
-
-
-def _count(vertices: Float, triangles: Int) -> int:
-    from pymeshfix import PyTMesh  # noqa: PLC0415 -- only the child needs it
-
-    mesh = PyTMesh()
-    mesh.load_array(vertices, triangles)
-    return len(mesh.select_intersecting_triangles())
 
 
 if __name__ == "__main__":

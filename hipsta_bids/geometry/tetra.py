@@ -4,6 +4,7 @@ import numpy as np
 
 from hipsta_bids.artifacts import Float, Int, Surface, TetMesh
 from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry.surface import signed_volume
 from hipsta_bids.geometry.tetgen_worker import TetgenClient
 from hipsta_bids.settings import TetraSettings
 
@@ -50,19 +51,15 @@ def tetrahedralize(surface: Surface, settings: TetraSettings) -> TetMesh:
     if not np.array_equal(vertices[: len(surface.vertices)], surface.vertices):
         raise GeometryError("TetGen moved vertices of the surface", reason="tetrahedralization")
     volume = tetra_volumes(vertices, cells)
+    enclosed = signed_volume(surface.vertices, surface.triangles)
+    if not np.isclose(np.abs(volume).sum(), enclosed, rtol=1e-6):  # rounding of 1e5 elements
+        raise GeometryError(
+            f"the tetrahedra fill {np.abs(volume).sum():.1f} of {enclosed:.1f} mm3: the surface "
+            "intersects itself; check the labels for touching parts",
+            reason="tetrahedralization",
+        )
     cells[volume < 0] = cells[volume < 0][:, [0, 2, 1, 3]]
     return TetMesh(vertices=vertices, tetrahedra=cells[volume != 0])
-
-
-def count_intersections(surface: Surface, settings: TetraSettings) -> int:
-    """Count triangles that intersect others; -1 if the check itself failed.
-
-    Notes
-    -----
-    MeshFix: Attene 2010, Visual Computer 26:1393-1406. Only its count is used.
-    """
-    count = _CLIENT.intersections(surface.vertices, surface.triangles, settings.timeout)
-    return -1 if isinstance(count, str) else count
 
 
 def tetra_volumes(vertices: Float, tetrahedra: Int) -> Float:

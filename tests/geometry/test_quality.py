@@ -23,7 +23,7 @@ def evidence(arc):
         solid=arc.solid,
         surface=arc.surface,
         voxels_across=5.0,
-        crossings=0,
+        smoothed=0,
         mesh=arc.mesh,
         boundaries=arc.boundaries,
         label_order=0.95,
