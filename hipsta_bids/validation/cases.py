@@ -17,6 +17,9 @@ from hipsta_bids.settings import GridSettings, Settings
 #: Maps of curvature that are compared with the truth, interior to exterior.
 CURVATURES = ("curvature_interior", "curvature", "curvature_exterior")
 
+#: Nodes at each border of the grid that are its edge: rims and end planes.
+EDGE = 2
+
 _MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
 
 
@@ -59,6 +62,11 @@ class Measured:
     def error(self) -> Float:
         """Error of thickness, mm; NaN where the sheet has left the phantom's rims."""
         return self.thickness - self.true_thickness
+
+
+def without_edges(values: Float) -> Float:
+    """Take the edges off a map (Nx, Ny)."""
+    return values[EDGE:-EDGE, EDGE:-EDGE]
 
 
 def measure_case(case: Case) -> Measured:

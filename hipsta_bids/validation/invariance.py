@@ -170,7 +170,7 @@ def _pair_table(pairs: Sequence[Sequence[Measured | Refusal]]) -> Table:
         title="The same voxels in another form: change of thickness, mm",
         columns=("form", "mean", "mean absolute", "largest", "target, mean absolute", "met"),
         rows=tuple(rows),
-        notes=f"Average over {len(pairs)} pose(s).",
+        notes=f"Number of poses: {len(pairs)}.",
     )
 
 

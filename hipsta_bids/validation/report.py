@@ -112,7 +112,7 @@ def show(cell: Cell, digits: int) -> str:
         return "n/a"
     if isinstance(cell, bool):
         return "yes" if cell else "**no**"
-    return f"{cell:.{digits}f}" if isinstance(cell, float) else str(cell).replace("|", r"\|")
+    return f"{cell:.{digits}f}" if isinstance(cell, float) else str(cell)
 
 
 def render(picture: Picture) -> bytes:
@@ -176,4 +176,4 @@ def _section(suite: Suite) -> str:
 
 
 def _line(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
+    return "| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |"

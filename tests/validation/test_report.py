@@ -14,7 +14,7 @@ from hipsta_bids.validation.suite import SUITES, Picture, Suite, Table, run_suit
 
 TABLE = Table(
     title="Bias",
-    columns=("case", "mm", "target", "met"),
+    columns=("case", "|mm|", "target", "met"),
     rows=(("a|b", 0.01234, "≤ 0.02", True), ("c", float("nan"), "≤ 0.02", False)),
     notes="Read it so.",
 )
@@ -46,7 +46,7 @@ def test_a_table_in_markdown():
     assert markdown(TABLE).splitlines() == [
         "**Bias**",
         "",
-        "| case | mm | target | met |",
+        r"| case | \|mm\| | target | met |",
         "| --- | --- | --- | --- |",
         r"| a\|b | 0.012 | ≤ 0.02 | yes |",
         "| c | n/a | ≤ 0.02 | **no** |",

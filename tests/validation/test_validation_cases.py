@@ -143,7 +143,7 @@ def test_rows_are_those_that_were_promised():
 
 def constant(error, *, thickness=2.0, flags=()):
     """Maps with the same error, mm, at every point but for a pattern without mean."""
-    true = np.full((6, 4), thickness)
+    true = np.full((10, 8), thickness)
     pattern = np.where(np.indices(true.shape).sum(axis=0) % 2, 0.01, -0.01)
     return Measured(
         thickness=true + error + pattern,
@@ -171,6 +171,7 @@ def test_thickness_table_averages_poses_and_judges(monkeypatch):
     good, refused, none = (dict(zip(table.columns, row, strict=True)) for row in table.rows)
     assert (good["bias"], good["met"]) == ("+0.005", True)
     assert good["SD"] == pytest.approx(0.01)
+    assert good["SD without edges"] == pytest.approx(0.01)
     assert good["bias, pose by pose"] == "-0.010 to +0.020"
     assert (refused["bias"], refused["refused"], refused["met"]) == ("+0.030", 1, False)
     assert (none["bias"], none["refused"], none["met"]) == (None, 2, False)
