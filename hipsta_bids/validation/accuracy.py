@@ -183,8 +183,19 @@ def _thickness_table(groups: Sequence[Sequence[Measured | Refusal]]) -> Table:
             "met",
         ),
         rows=tuple(rows),
-        notes=_THICKNESS_NOTES.format(edge=EDGE),
+        notes=_THICKNESS_NOTES.format(edge=EDGE) + _refusals(groups),
     )
+
+
+def _refusals(groups: Sequence[Sequence[Measured | Refusal]]) -> str:
+    """Say why maps are missing; bullets of Markdown, or nothing."""
+    lines = [
+        f"- {row.name}, {row.voxels}: {result}"
+        for row, group in zip(ROWS, groups, strict=True)
+        for result in group
+        if isinstance(result, Refusal)
+    ]
+    return "\n".join(["\nRefused:\n", *lines]) if lines else ""
 
 
 def _curvature_table(measured: Sequence[Sequence[Measured]]) -> Table:

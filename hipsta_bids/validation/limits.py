@@ -56,7 +56,7 @@ def _table(cases: Sequence[Case], results: Sequence[Measured | Refusal]) -> Tabl
         start: tuple[Cell, ...] = (f"{case.spec.thickness:g}", f"{case.voxel_size[0]:g}")
         across = f"{case.spec.thickness / case.voxel_size[0]:.1f}"
         if isinstance(result, Refusal):
-            outcome = f"refused: {result.reason}"
+            outcome = str(result) if result.is_bug else f"refused: {result.reason}"
             rows.append((*start, across, outcome, None, None, not result.is_bug))
             continue
         bias = float(np.nanmean(result.error))

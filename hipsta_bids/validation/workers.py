@@ -20,6 +20,9 @@ class Refusal:
     """Of the error in kebab case; ``timeout``, ``worker-died`` or ``crash`` (a bug)."""
     message: str
 
+    def __str__(self) -> str:
+        return f"{self.reason}: {self.message}"
+
     @property
     def is_bug(self) -> bool:
         """Whether this is anything but a foreseen error."""
