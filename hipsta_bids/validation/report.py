@@ -77,7 +77,9 @@ def validate(
 
 def page(suites: Sequence[Suite], *, full: bool) -> str:
     """Write the page in Markdown."""
-    command = "hipsta-bids validate" + (" --full" if full else "")
+    names = [suite.name for suite in suites]
+    some = "" if names == list(SUITES) else " --suite " + " ".join(names)
+    command = "hipsta-bids validate" + (" --full" if full else "") + some
     python = f"Python {platform.python_version()}"
     libraries = ", ".join([python, *(f"{name} {version(name)}" for name in _LIBRARIES)])
     intro = (

@@ -74,7 +74,7 @@ def test_a_row_of_another_length_is_refused():
 
 def test_page_says_that_it_is_generated_and_shows_all():
     text = page([Suite(name="toy", title="Toys", tables=(TABLE,), pictures=(PICTURE,))], full=True)
-    assert text.startswith("<!-- Written by `hipsta-bids validate --full`; do not edit")
+    assert text.startswith("<!-- Written by `hipsta-bids validate --full --suite toy`; do not")
     assert "| Toys | Bias | 2 | 1 |" in text
     assert "![A falling line.](images/validation-line.png)" in text
     assert text.count("**Bias**") == 1
@@ -94,7 +94,9 @@ def test_command_writes_the_report(tmp_path, capsys, one_suite):
     assert said[1] == f"targets missed: 1; report: {tmp_path / 'a b' / 'validation.md'}"
     assert one_suite == [True]
     assert (tmp_path / "a b/images/validation-line.png").read_bytes() == render(PICTURE)
-    assert "## Toys\n\nWhy." in (tmp_path / "a b/validation.md").read_text(encoding="utf-8")
+    text = (tmp_path / "a b/validation.md").read_text(encoding="utf-8")
+    assert "`hipsta-bids validate --full`" in text  # all suites there are
+    assert "## Toys\n\nWhy." in text
 
 
 def test_command_is_quick_by_default(tmp_path, one_suite):
