@@ -19,7 +19,13 @@ from hipsta_bids.artifacts import (
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import check_side, extract_body
 from hipsta_bids.geometry.boundaries import Boundaries, find_boundaries
-from hipsta_bids.geometry.checks import check_label_order, check_thickness, check_voxels_across
+from hipsta_bids.geometry.checks import (
+    check_end_labels,
+    check_label_order,
+    check_thickness,
+    check_voxels_across,
+    name_subfields,
+)
 from hipsta_bids.geometry.coordinates import solve_coordinates
 from hipsta_bids.geometry.grid import resample_body
 from hipsta_bids.geometry.measures import (
@@ -66,7 +72,9 @@ def measure_hemisphere(
         side = check_side(body, hemi)
     with clock("surface"):
         solid = repair_topology(
-            resample_body(body, settings.grid, settings.slices), settings.topology
+            resample_body(body, settings.grid, settings.slices),
+            settings.topology,
+            name_subfields(body),
         )
         surface = extract_surface(solid.field, settings.surface)
         across = check_voxels_across(surface, body, settings.checks)
@@ -101,7 +109,8 @@ def measure_hemisphere(
     )
     with clock("measures"):
         thickness = measure_thickness(sheet)
-        doubts = check_thickness(thickness, boundaries.sheet_thickness, settings.checks)
+        doubts = check_end_labels(volume, body, settings.checks)
+        doubts += check_thickness(thickness, boundaries.sheet_thickness, settings.checks)
         return HemisphereMaps(
             sheet=sheet,
             thickness=thickness,

@@ -115,7 +115,9 @@ class TopologySettings:
     (projected areas, squared)."""
     fill_across: float = 0.5
     """A fill spans the inside of a bend rather than a hole if this share lies across the axis."""
-    across_factor: float = 100.0
+    lid_nodes: float = 6.0
+    """... unless it lies within this distance of an end plane, grid nodes."""
+    across_factor: float = 40.0
     """Such membranes cost this much more."""
     flag_cut_cost: float = 2.0
     """Flag a cut that overrules more evidence than this (sum of the field)."""
@@ -256,6 +258,18 @@ class CheckSettings:
     """Flag if a larger fraction of the columns had to be filled from neighbors."""
     flag_bending: float = 0.5
     """Flag if the sheet turns round its exterior side by more than this, rad."""
+    slice_ratio: float = 1.5
+    """Voxels are long if their longest edge is more than this many times the shortest."""
+    end_label_depth: float = 2.0
+    """Head or tail labels farther inside the body than this are out of place, mm."""
+    end_label_share: float = 0.005
+    """Flag them if they are more than this share of the body's voxels."""
+    notch_reach: tuple[float, ...] = (1.0, 2.0, 3.0)
+    """A cross-section is compared with those at these distances on both sides, mm."""
+    notch_share: tuple[float, ...] = (0.12, 0.3, 0.35)
+    """Flag if more than this share of what both sides have is missing, one per distance."""
+    flag_row_jump: float = 0.15
+    """Flag if the sheet's width changes by more than this from one row to the next."""
     flag_rim_distance: float = 1.25
     """Flag if the rim paths and the boundary curves differ by more than this, multiples of the
     sheet's thickness (along a flat rim a path may follow either edge)."""

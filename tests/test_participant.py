@@ -212,7 +212,7 @@ def test_a_hole_is_filled_and_reported(plain, damage):
     assert repair.startswith("filled a hole")
     place = np.array(repair.split("RAS ")[1].split()[:3], dtype=float)
     true = plain.phantom.body.place(0.5, 0.5, 0.0)
-    assert np.linalg.norm(place - true) < 1.0  # mm, half the thickness: it says where to look
+    assert np.linalg.norm(place - true) < 1.2  # mm, about half the thickness: it says where to look
     assert maps.qc["euler_before"] == 0
     assert_only_local_change(plain, maps, points=12)
 
@@ -254,11 +254,17 @@ def test_a_large_repair_is_flagged(damage, kind):
     if kind == "hole":
         volume = damage.erase(damage.shaft(0.5, 0.5, 2.0))
     else:
-        where = damage.bar((0.2, 0.5, -0.8), (0.8, 0.5, -0.8), 1.2)
+        where = damage.bar((0.2, 0.5, -0.8), (0.8, 0.5, -0.8), 1.0)
         volume = damage.relabel(where, Tissue.CA1)
     maps = measure(volume)
     assert maps.status == Status.FLAGGED
     assert "large-repair" in {flag.reason for flag in maps.flags}
+
+
+def test_a_bridge_thicker_than_the_wall_is_refused(damage):
+    """Which of the two is the bridge cannot be told; it must not be filled silently."""
+    where = damage.bar((0.2, 0.5, -0.8), (0.8, 0.5, -0.8), 1.2)
+    refused(damage.relabel(where, Tissue.CA1), "topology", r"the largest near RAS .* \(\w+\)")
 
 
 def refused(volume, reason, match, hemi="L", settings=None):
@@ -274,7 +280,7 @@ def test_missing_slices_are_refused(damage):
 
 def test_a_sheet_in_two_strips_is_refused(damage):
     slit = damage.sheet & (damage.u > 0.45) & (damage.u < 0.55)
-    refused(damage.erase(slit), "topology", "could not be repaired")
+    refused(damage.erase(slit), "body-split", r"2 strips from end to end, at RAS .* \(CA1\)")
 
 
 def test_a_body_that_is_too_short_is_refused(damage):
@@ -292,7 +298,7 @@ def test_labels_without_a_sheet_are_refused(damage):
 def test_a_tail_label_in_the_middle_is_refused(damage):
     inside = (damage.v > 0.45) & (damage.v < 0.55) & (damage.volume.tissue > 0)
     volume = damage.relabel(inside, Tissue.HIPPOCAMPUS, Part.TAIL)
-    refused(volume, "end-plane-tilted", "check the head and tail labels")
+    refused(volume, "end-labels-inside", "labels of the tail lie on both sides of the body")
 
 
 def test_the_other_hemisphere_is_refused(plain):

@@ -1,16 +1,18 @@
 """What must hold before a map is handed out."""
 
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from hipsta_bids.artifacts import Coordinates, Flag, Float, Surface, TetMesh
+from hipsta_bids.artifacts import Coordinates, Flag, Float, LabelVolume, Sheet, Surface, TetMesh
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
-from hipsta_bids.geometry.grid import in_plane_voxel
+from hipsta_bids.geometry.grid import Field, in_plane_voxel
 from hipsta_bids.geometry.surface import mean_wall_thickness
+from hipsta_bids.schemes import Part, Tissue
 from hipsta_bids.settings import CheckSettings
 
 
@@ -26,14 +28,15 @@ def check_voxels_across(surface: Surface, body: Body, settings: CheckSettings) -
     Returns
     -------
     float
-        In-plane voxels across the sheet, whose thickness is taken as 2 volume / wall area.
+        In-plane voxels across the sheet, whose thickness is taken as 2 volume / wall area. Where
+        the longest edge of the voxels lies across the long axis, it is what counts.
 
     Raises
     ------
     GeometryError
         ``sheet-too-thin``.
     """
-    thickness, voxel = mean_wall_thickness(surface), in_plane_voxel(body.affine)
+    thickness, voxel = mean_wall_thickness(surface), _voxel_across(body, settings)
     across = thickness / voxel
     if across < settings.min_voxels_across:
         raise GeometryError(
@@ -122,3 +125,148 @@ def check_thickness(thickness: Float, expected: float, settings: CheckSettings) 
     if ratio > settings.flag_thickness_ratio:
         return [Flag(reason="thickness-doubtful", message=f"{text}: look at the map")]
     return []
+
+
+def name_subfields(body: Body) -> Callable[[Float], str]:
+    """Make a function that names the subfields at (N, 3) points, RAS mm, medial first."""
+    index, points = body.inside_points()
+    tree, tissue = cKDTree(points), body.tissue[tuple(index.T)]
+
+    def names(at: Float) -> str:
+        found = np.unique(tissue[tree.query(at)[1]])
+        return ", ".join(Tissue(int(kind)).name for kind in found)
+
+    return names
+
+
+def check_image(body: Body, settings: CheckSettings) -> list[Flag]:
+    """Flag images whose voxels or borders do not suit the body.
+
+    Returns
+    -------
+    list of Flag
+        ``slices-along-axis`` where the longest edge of the voxels lies across the long axis,
+        ``image-border`` where the body reaches the border of the image.
+    """
+    edges = np.linalg.norm(body.affine[:3, :3], axis=0)
+    flags = []
+    if _sliced_lengthwise(body, settings):
+        flags.append(
+            Flag(
+                reason="slices-along-axis",
+                message=f"the longest voxel edge ({edges.max():.2f} mm) lies across the long axis: "
+                "check the header of the image; slices should lie across the hippocampus",
+            )
+        )
+    index, points = body.inside_points()
+    rim = ((index == 0) | (index == np.array(body.inside.shape) - 1)).any(axis=1)
+    if rim.any():
+        place = " ".join(f"{value:.1f}" for value in points[rim].mean(axis=0))
+        flags.append(
+            Flag(
+                reason="image-border",
+                message=f"{np.count_nonzero(rim)} voxels of the body lie at the border of the "
+                f"image, near RAS {place} mm: check that the image holds all of it",
+            )
+        )
+    return flags
+
+
+def _sliced_lengthwise(body: Body, settings: CheckSettings) -> bool:
+    """Whether the longest edge of the voxels is long, and lies across the long axis."""
+    edges = np.linalg.norm(body.affine[:3, :3], axis=0)
+    longest = int(np.argmax(edges))
+    along = abs(float(body.ends.axis @ body.affine[:3, longest])) / float(edges[longest])
+    return bool(edges.max() > settings.slice_ratio * edges.min() and along < 0.5)  # noqa: PLR2004 -- 60 degrees
+
+
+def _voxel_across(body: Body, settings: CheckSettings) -> float:
+    """Edge of the voxels across the sheet, mm."""
+    if _sliced_lengthwise(body, settings):
+        return float(np.linalg.norm(body.affine[:3, :3], axis=0).max())
+    return in_plane_voxel(body.affine)
+
+
+def check_end_labels(volume: LabelVolume, body: Body, settings: CheckSettings) -> list[Flag]:
+    """Flag head or tail labels in the middle of the body.
+
+    Returns
+    -------
+    list of Flag
+        ``end-labels-inside``.
+    """
+    labeled = np.isin(volume.part, (Part.HEAD, Part.TAIL)) & (volume.tissue > 0)
+    points = np.argwhere(labeled) @ volume.affine[:3, :3].T + volume.affine[:3, 3]
+    depth = np.minimum(body.ends.height(points, "posterior"), -body.ends.height(points, "anterior"))
+    inside = points[depth > settings.end_label_depth]
+    if len(inside) <= settings.end_label_share * max(len(body.inside_points()[0]), 1):
+        return []
+    place = " ".join(f"{value:.1f}" for value in inside.mean(axis=0))
+    return [
+        Flag(
+            reason="end-labels-inside",
+            message=f"{len(inside)} head or tail voxels lie inside the body, near RAS {place} mm: "
+            "correct these labels",
+        )
+    ]
+
+
+def check_cross_sections(field: Field, body: Body, settings: CheckSettings) -> list[Flag]:
+    """Flag a body of which a part is missing between cross-sections that have it.
+
+    Returns
+    -------
+    list of Flag
+        ``section-notch``.
+    """
+    solid = field.values > 0
+    length = body.ends.length(body.inside_points()[1])
+    step = length / (field.grid.shape[2] - 1)
+    worst, lost = 0.0, None
+    for reach, limit in zip(settings.notch_reach, settings.notch_share, strict=True):
+        k = max(round(reach / step), 1)
+        if 2 * k >= solid.shape[2]:
+            continue
+        before, here, after = solid[:, :, : -2 * k], solid[:, :, k:-k], solid[:, :, 2 * k :]
+        missing = before & after & ~here
+        share = missing.sum(axis=(0, 1)) / np.maximum(here.sum(axis=(0, 1)), 1)
+        at = int(share.argmax())
+        if share[at] > limit and share[at] / limit > worst:
+            worst = float(share[at] / limit)
+            nodes = np.argwhere(missing[:, :, at]).astype(float)
+            lost = np.column_stack([nodes, np.full(len(nodes), at + k)]), float(share[at])
+    if lost is None:
+        return []
+    points = field.grid.to_ras(lost[0])
+    place = " ".join(f"{value:.1f}" for value in points.mean(axis=0))
+    return [
+        Flag(
+            reason="section-notch",
+            message=f"a cross-section lacks what its neighbors have, {lost[1]:.0%} of its area, at "
+            f"RAS {place} mm ({name_subfields(body)(points)}): complete the labels there",
+        )
+    ]
+
+
+def check_rows(sheet: Sheet, settings: CheckSettings) -> list[Flag]:
+    """Flag a sheet whose medial-to-lateral length jumps from row to row.
+
+    Returns
+    -------
+    list of Flag
+        ``extent-jump``.
+    """
+    middle = sheet.points[:, :, sheet.middle]
+    lengths = np.linalg.norm(np.diff(middle, axis=0), axis=-1).sum(axis=0)
+    jumps = np.abs(np.diff(lengths)) / np.minimum(lengths[1:], lengths[:-1])
+    row = int(np.nanargmax(jumps))
+    if not jumps[row] > settings.flag_row_jump:
+        return []
+    place = " ".join(f"{value:.1f}" for value in np.nanmean(middle[:, row], axis=0))
+    return [
+        Flag(
+            reason="extent-jump",
+            message=f"the sheet's width changes by {jumps[row]:.0%} from one row to the next, near "
+            f"RAS {place} mm: look for missing or added parts in the labels",
+        )
+    ]

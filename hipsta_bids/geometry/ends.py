@@ -115,6 +115,12 @@ def _checked(
     middle = middle / np.linalg.norm(middle)
     for end, (_, normal, _) in planes.items():
         tilt = np.degrees(np.arccos(np.clip(normal @ axis, -1, 1)))
+        if tilt > 90:  # noqa: PLR2004 -- turned round
+            name = "tail" if end == "posterior" else "head"
+            raise GeometryError(
+                f"labels of the {name} lie on both sides of the body or inside it: correct them",
+                reason="end-labels-inside",
+            )
         if tilt > 50:  # noqa: PLR2004 -- beyond this the labels do not end across the long axis
             raise GeometryError(
                 f"the {end} end plane is tilted by {tilt:.0f} degrees against the long axis: "

@@ -8,6 +8,7 @@ import numpy as np
 from hipsta_bids.artifacts import Flag, Float, Sheet, Surface, TetMesh
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.boundaries import Boundaries
+from hipsta_bids.geometry.checks import check_cross_sections, check_image, check_rows
 from hipsta_bids.geometry.tetra import tetra_quality
 from hipsta_bids.geometry.topology import SolidField
 from hipsta_bids.settings import Settings
@@ -72,7 +73,13 @@ def find_flags(evidence: Evidence, settings: Settings) -> list[Flag]:
             f"{filled:.1%} of the columns were filled from their neighbors: look at the map",
         ),
     ]
-    return [Flag(reason=reason, message=message) for wrong, reason, message in rows if wrong]
+    found = [Flag(reason=reason, message=message) for wrong, reason, message in rows if wrong]
+    return [
+        *found,
+        *check_image(evidence.body, checks),
+        *check_cross_sections(solid.field, evidence.body, checks),
+        *check_rows(evidence.sheet, checks),
+    ]
 
 
 def quality_metrics(evidence: Evidence) -> dict[str, Any]:

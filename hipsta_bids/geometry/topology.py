@@ -1,5 +1,6 @@
 """Repair of a field's topology: one solid ribbon without holes, bridges or cavities."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -19,8 +20,11 @@ _PAD = ((1, 1), (1, 1), (2, 2))  # along the axis: a plate, then free space
 _INNER = (slice(1, -1), slice(1, -1), slice(2, -2))
 _LEVELS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4)
 _CORNER = np.array([1, 1, 2])
+_SLOPE = 0.4  # of a smoothed step per node, at the body's surface
 
 Kind = Literal["cut", "fill", "island", "cavity"]
+Locate = Callable[[Float], str]
+"""Names the subfields at (N, 3) points, RAS mm."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +39,8 @@ class Repair:
     """How much evidence was overruled: sum of the field's distance from its level."""
     position: tuple[float, float, float]
     """Center, RAS mm."""
+    subfield: str = ""
+    """Subfield there, if known."""
     large: bool
     """Worth a look: beyond the limits of :class:`TopologySettings`."""
 
@@ -45,8 +51,7 @@ class Repair:
             "island": "removed a separate piece",
             "cavity": "filled a cavity",
         }[self.kind]
-        place = " ".join(f"{value:.1f}" for value in self.position)
-        return f"{what} of {self.voxels} grid nodes at RAS {place} mm"
+        return f"{what} of {self.voxels} grid nodes at {_place(self.position, self.subfield)}"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -64,7 +69,9 @@ class SolidField:
     """Changed nodes over the nodes of the body."""
 
 
-def repair_topology(field: Field, settings: TopologySettings) -> SolidField:
+def repair_topology(
+    field: Field, settings: TopologySettings, locate: Locate | None = None
+) -> SolidField:
     """Make the positive part of a field one solid piece without tunnels.
 
     Solid plates beyond both ends turn several cap pieces into an ordinary tunnel. Growing from
@@ -76,6 +83,8 @@ def repair_topology(field: Field, settings: TopologySettings) -> SolidField:
     ----------
     field : Field
     settings : TopologySettings
+    locate : callable, optional
+        Names the subfields at points, for messages.
 
     Returns
     -------
@@ -84,7 +93,8 @@ def repair_topology(field: Field, settings: TopologySettings) -> SolidField:
     Raises
     ------
     GeometryError
-        ``topology`` where no repair is found.
+        ``sheet-too-thin``, ``body-interrupted``, ``body-split``, or ``topology`` where no repair
+        is found.
     """
     values = field.values
     before = values > 0
@@ -96,6 +106,8 @@ def repair_topology(field: Field, settings: TopologySettings) -> SolidField:
     state = np.pad(before, _PAD)
     euler_before = _euler(state)
     padded = np.pad(values, _PAD, constant_values=-1.0)
+    lifted = padded.copy()
+    _refuse_strips(state, field, settings, locate)
     edits = _remove_islands(state) + _fill_cavities(state)
     for _ in range(settings.rounds):
         wrong = [plates for plates in (False, True) if _euler(state, plates=plates) != 1]
@@ -103,20 +115,18 @@ def repair_topology(field: Field, settings: TopologySettings) -> SolidField:
             break
         # Only once the body itself is sound: the inside of a closed tube is no pit.
         pits = _fill_cavities(state, plates=True) if wrong[0] else []
-        edits += pits or _one_round(state, padded, settings, plates=wrong[0])
+        found = pits or _one_round(state, padded, lifted, settings, plates=wrong[0])
+        edits += found
+        if not found or _has_strips(state, settings):
+            raise _unrepaired(edits, state, field, locate)
         edits += _remove_islands(state) + _fill_cavities(state)
     else:
-        raise GeometryError(
-            f"the labels have holes or bridges that could not be repaired (Euler number "
-            f"{_euler(state)}, with closed ends {_euler(state, plates=True)}, instead of 1): "
-            "correct the labels by hand",
-            reason="topology",
-        )
+        raise _unrepaired(edits, state, field, locate)
     after = state[_INNER]
     size = int(np.count_nonzero(before))
-    repairs = tuple(_describe(kind, where, field, size, settings) for kind, where in edits)
+    repairs = tuple(_describe(edit, field, size, settings, locate) for edit in edits)
     return SolidField(
-        field=Field(grid=field.grid, values=_consistent_values(values, after)),
+        field=Field(grid=field.grid, values=_consistent_values(lifted[_INNER], after)),
         repairs=repairs,
         touched=after != before,
         euler_before=euler_before,
@@ -140,15 +150,70 @@ def _euler(state: Bool, *, plates: bool = False) -> int:
     return euler_number(_with_plates(state, True) if plates else state)
 
 
-def _remove_islands(state: Bool) -> list[Edit]:
-    """Remove pieces that do not reach from plate to plate (in place).
+def _through_pieces(state: Bool) -> tuple[NDArray[Any], int, NDArray[Any]]:
+    """Pieces of the body, their number, and which of them reach from plate to plate.
 
-    The plates are left out of the count, or a crumb that touches one of them would count as
-    connected.
+    The largest comes first. The plates are left out of the count, or a crumb that touches one of
+    them would count as connected.
     """
     pieces, count = ndimage.label(state[_INNER], structure=_FACES)
     through = np.intersect1d(pieces[:, :, 0], pieces[:, :, -1])
     through = through[through > 0]
+    sizes = np.bincount(pieces.ravel(), minlength=count + 1)[through]
+    return pieces, count, through[np.argsort(-sizes)]
+
+
+def _has_strips(state: Bool, settings: TopologySettings) -> bool:
+    """Whether two pieces of a fair size reach from plate to plate."""
+    pieces, _, through = _through_pieces(state)
+    sizes = [np.count_nonzero(pieces == n) for n in through[:2]]
+    return len(sizes) > 1 and bool(sizes[1] > settings.flag_fraction * sizes[0])
+
+
+def _refuse_strips(
+    state: Bool, field: Field, settings: TopologySettings, locate: Locate | None
+) -> None:
+    """Refuse a ribbon that a gap parts from end to end, and say where."""
+    if not _has_strips(state, settings):
+        return
+    pieces, _, through = _through_pieces(state)
+    gap, nearest = ndimage.distance_transform_edt(pieces != through[0], return_indices=True)
+    facing = np.argwhere((pieces == through[1]) & (gap <= gap[pieces == through[1]].min() + 1))
+    other = nearest[:, *facing.T].T
+    center = 0.5 * (facing.mean(axis=0) + other.mean(axis=0))
+    names = locate(field.grid.to_ras(np.vstack([facing, other]).astype(float))) if locate else ""
+    place = _place(field.grid.to_ras(center[None])[0], names)
+    raise GeometryError(
+        f"a gap parts the sheet into {len(through)} strips from end to end, at {place}: "
+        "fill it in the labels",
+        reason="body-split",
+    )
+
+
+def _unrepaired(
+    edits: list[Edit], state: Bool, field: Field, locate: Locate | None
+) -> GeometryError:
+    """Say where the largest of the repairs was tried that did not lead to one solid piece."""
+    _, where = max(edits, key=lambda edit: len(edit[1]), default=("cut", np.argwhere(state)))
+    point = field.grid.to_ras((where - _CORNER).mean(axis=0, keepdims=True))
+    place = _place(point[0], locate(point) if locate else "")
+    return GeometryError(
+        f"the labels have holes or bridges that could not be repaired (Euler number "
+        f"{_euler(state)}, with closed ends {_euler(state, plates=True)}, instead of 1), the "
+        f"largest near {place}: correct the labels there by hand",
+        reason="topology",
+    )
+
+
+def _place(point: Float | tuple[float, float, float], subfield: str) -> str:
+    """Spell a place for people."""
+    words = " ".join(f"{value:.1f}" for value in point)
+    return f"RAS {words} mm ({subfield})" if subfield else f"RAS {words} mm"
+
+
+def _remove_islands(state: Bool) -> list[Edit]:
+    """Remove all but the largest piece that reaches from plate to plate (in place)."""
+    pieces, count, through = _through_pieces(state)
     if not len(through):
         raise GeometryError(
             "the body is interrupted: no connected path of its labels leads from the "
@@ -156,13 +221,13 @@ def _remove_islands(state: Bool) -> list[Edit]:
             "sheet too thin for its voxels",
             reason="body-interrupted",
         )
-    if count == len(through):
+    if count == 1:
         return []
-    state[_INNER] &= np.isin(pieces, through)
+    state[_INNER] &= pieces == through[0]
     return [
         ("island", np.argwhere(pieces == n) + _CORNER)
         for n in range(1, count + 1)
-        if n not in through
+        if n != through[0]
     ]
 
 
@@ -181,12 +246,18 @@ def _fill_cavities(state: Bool, *, plates: bool = False) -> list[Edit]:
 
 
 def _one_round(
-    state: Bool, values: NDArray[np.float32], settings: TopologySettings, *, plates: bool
+    state: Bool,
+    values: NDArray[np.float32],
+    lifted: NDArray[np.float32],
+    settings: TopologySettings,
+    *,
+    plates: bool,
 ) -> list[Edit]:
     """Apply the cheapest membranes (in place): all small ones, or one large one.
 
     Without plates, tunnels of the body itself are found; with plates, pieces of an end's
-    cross-section that hang together only further inside.
+    cross-section that hang together only further inside. ``lifted`` gets the values of filled
+    holes.
     """
     weight = np.abs(values)
     if plates:
@@ -204,6 +275,7 @@ def _one_round(
             cost = float(weight[tuple(where.T)].sum())
             gain = _gain(solid, where, kind)
             if gain > 0:
+                cost *= _implausibility(kind, where, state.shape[2], settings)
                 candidates.append((cost / gain, kind, where))
     candidates.sort(key=lambda c: c[0])
     edits: list[Edit] = []
@@ -214,7 +286,7 @@ def _one_round(
             continue  # another membrane already dealt with this tunnel
         solid[tuple(where.T)] = kind == "fill"
         state[tuple(where.T)] = kind == "fill"
-        edits.append((kind, _thicken(state, where, settings) if kind == "fill" else where))
+        edits.append((kind, _thicken(state, lifted, where, settings) if kind == "fill" else where))
         if cost > settings.small_cost:
             break
     return edits
@@ -262,26 +334,66 @@ def _gain(state: Bool, where: NDArray[np.intp], kind: Kind) -> int:
     return euler_number(block) - before
 
 
-def _thicken(state: Bool, where: NDArray[np.intp], settings: TopologySettings) -> NDArray[np.intp]:
-    """Close the surface round a filled membrane (in place), if that keeps the topology."""
-    reach = settings.closing_nodes
-    low = np.maximum(where.min(axis=0) - 2 * reach - 1, _CORNER)
-    high = np.minimum(where.max(axis=0) + 2 * reach + 2, np.array(state.shape) - _CORNER)
+def _implausibility(
+    kind: Kind, where: NDArray[np.intp], depth: int, settings: TopologySettings
+) -> float:
+    """Factor for membranes that lie across the long axis.
+
+    The ribbon runs along the axis, so what fills a hole in it lies along the axis too, and so does
+    what cuts a bridge between two of its turns. A cut across the axis severs a strip of the
+    ribbon beside a hole; a fill across it spans the inside of a bend, unless it is the lid of a
+    tunnel that opens at an end plane.
+    """
+    level = float(where[:, 2].mean()) - _CORNER[2]
+    lid = kind == "fill" and min(level, depth - 2 * _CORNER[2] - 1 - level) < settings.lid_nodes
+    if len(where) < settings.oriented_nodes or lid:
+        return 1.0
+    areas = np.array(
+        [len(np.unique(np.delete(where, axis, axis=1), axis=0)) for axis in range(3)], dtype=float
+    )
+    across = areas[2] ** 2 / float(areas @ areas)
+    limit = settings.cut_across if kind == "cut" else settings.fill_across
+    return settings.across_factor if across > limit else 1.0
+
+
+def _thicken(
+    state: Bool,
+    lifted: NDArray[np.float32],
+    where: NDArray[np.intp],
+    settings: TopologySettings,
+) -> NDArray[np.intp]:
+    """Make a filled membrane as thick as the wall around it (in place), if the topology allows.
+
+    Half the wall's thickness is the median of the distance from its surface along its middle,
+    within ``plug_reach`` nodes of the membrane.
+    """
+    reach = settings.plug_reach
+    low = np.maximum(where.min(axis=0) - reach, _CORNER)
+    high = np.minimum(where.max(axis=0) + reach + 1, np.array(state.shape) - _CORNER)
     around = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-    block = np.pad(state[around], reach)
+    block = state[around]
     membrane = np.zeros_like(block)
-    membrane[tuple((where - low + reach).T)] = True
-    near = ndimage.distance_transform_edt(~membrane) <= reach
-    dilated = ndimage.distance_transform_edt(~block) <= reach
-    closed = (ndimage.distance_transform_edt(dilated) > reach) & near
-    inner = (slice(reach, -reach),) * 3
-    added = (closed & ~block)[inner]
+    membrane[tuple((where - low).T)] = True
+    off = ndimage.distance_transform_edt(~membrane)
+    half = _half_thickness(block & (off > 0), off <= reach)
+    plug = np.clip(_SLOPE * (half - off), -0.5, 0.5).astype(np.float32)
+    added = (plug > 0) & ~block
     trial = state.copy()
     trial[around] |= added
     if euler_number(trial) != euler_number(state):
         return where
     state[around] |= added
+    lifted[around] = np.maximum(lifted[around], np.where(off < half + 1, plug, -1))
     return np.vstack([where, np.argwhere(added) + low])
+
+
+def _half_thickness(wall: Bool, near: Bool) -> float:
+    """Half the thickness of a wall, in nodes: the median depth of its middle."""
+    padded = np.pad(wall, 1, mode="edge")  # what goes on beyond the block has no surface there
+    depth = ndimage.distance_transform_edt(padded)[1:-1, 1:-1, 1:-1]
+    ridge = wall & near & (depth >= ndimage.maximum_filter(depth, 3)) & (depth > 1)
+    # A node's depth is the distance from the next node outside, half a step beyond the surface.
+    return float(np.median(depth[ridge])) - 0.5 if ridge.any() else 1.0
 
 
 def _consistent_values(values: NDArray[np.float32], after: Bool) -> NDArray[np.float32]:
@@ -326,8 +438,9 @@ def _mark(corners: Bool, cells: Bool, *, cube: bool) -> None:
 
 
 def _describe(
-    kind: Kind, where: NDArray[np.intp], field: Field, size: int, settings: TopologySettings
+    edit: Edit, field: Field, size: int, settings: TopologySettings, locate: Locate | None
 ) -> Repair:
+    kind, where = edit
     nodes: Float = where - _CORNER
     centre = field.grid.to_ras(nodes.mean(axis=0, keepdims=True))[0]
     inside = np.clip(where - _CORNER, 0, np.array(field.grid.shape) - 1)
@@ -341,5 +454,6 @@ def _describe(
         voxels=len(where),
         cost=cost,
         position=(float(centre[0]), float(centre[1]), float(centre[2])),
+        subfield=locate(centre[None]) if locate else "",
         large=bool(cost > limit or len(where) > settings.flag_fraction * size),
     )

@@ -268,8 +268,6 @@ def test_ambiguous_cubes_keep_foreground_corners_apart():
     mask[8:13, 8:13] = True
     mask[3:13, 3:13, 8:] = True
     values = np.where(mask, 0.5, -0.5).astype(np.float32)
-    solid = repair_topology(
-        Field(grid=field_of(mask).grid, values=values), TopologySettings(closing_nodes=1)
-    )
+    solid = repair_topology(Field(grid=field_of(mask).grid, values=values), TOPOLOGY)
     extract_surface(solid.field, SurfaceSettings())
     assert euler_number(solid.field.values > 0) == 1
