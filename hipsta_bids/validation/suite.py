@@ -22,6 +22,7 @@ SUITES: Mapping[str, str] = MappingProxyType(
         "limits": "hipsta_bids.validation.limits",
         "convergence": "hipsta_bids.validation.convergence",
         "invariance": "hipsta_bids.validation.invariance",
+        "defects": "hipsta_bids.validation.defects",
     }
 )
 

@@ -1,0 +1,251 @@
+"""What becomes of damaged labels: repaired, flagged or refused, and how far the maps move."""
+
+from contextlib import nullcontext
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from hipsta_bids.artifacts import Float, HemisphereMaps, LabelVolume, Status
+from hipsta_bids.participant import measure_hemisphere
+from hipsta_bids.phantom import Phantom, PhantomSpec
+from hipsta_bids.phantom.defects import Place, Site, make_defect
+from hipsta_bids.schemes import load_scheme
+from hipsta_bids.settings import Settings
+from hipsta_bids.validation.suite import Cell, Suite, Table
+from hipsta_bids.validation.workers import Refusal, run_cases
+
+NEAR = 2.0
+"""mm; columns within this distance of a changed voxel are near the defect."""
+WRONG = 0.3
+"""mm; a column that differs by more than this is off."""
+MAX_WRONG = 0.02
+"""Largest share of columns that are off in an accepted map."""
+MAX_SHIFT = 0.15
+"""mm; largest change of a column elsewhere in an accepted map."""
+TIMEOUT = 60.0
+"""s per case."""
+
+SPECS = {
+    "spiral": PhantomSpec(kind="spiral", thickness=2.0, length=12.0),
+    "tight": PhantomSpec(kind="tight", thickness=1.6, length=12.0),
+}
+
+MIDDLE: Place = (0.5, 0.5)
+#: Kind, size (see the kind's description) and place. The quick selection takes every third.
+PLAN: tuple[tuple[str, float, Place], ...] = (
+    *(("hole", r, p) for r in (0.4, 0.8, 1.3, 2.0) for p in (MIDDLE, (0.2, 0.35), (0.82, 0.6))),
+    ("cavity", 0.4, MIDDLE),
+    ("cavity", 0.8, MIDDLE),
+    *(("bridge-ca3-subiculum", r, MIDDLE) for r in (0.4, 0.8, 1.2, 2.0)),
+    *(("bridge-ca1-ca1", r, MIDDLE) for r in (0.4, 0.8, 1.2)),
+    *(("island", r, MIDDLE) for r in (0.5, 1.0, 3.0)),
+    *(("salt", share, MIDDLE) for share in (0.03, 0.08, 0.15)),
+    *(("protrusion", r, MIDDLE) for r in (0.6, 1.0)),
+    *(("leak", r, MIDDLE) for r in (0.75, 1.5, 3.0)),
+    *(("slit", w, p) for w in (0.4, 0.8, 1.2) for p in (MIDDLE, (0.15, 0.5))),
+    *(("gap", w, p) for w in (0.4, 0.8, 2.0) for p in (MIDDLE, (0.78, 0.5))),
+    *(("missing-subfield", 1.0, (u, 0.5)) for u in (0.07, 0.25, 0.5, 0.78)),
+    *(("missing-slices", t, MIDDLE) for t in (0.3, 1.0, 2.0)),
+    *(("tail-inside", t, (0.5, v)) for t in (0.4, 2.0) for v in (0.5, 0.8)),
+    *(("head-inside", t, (0.5, v)) for t in (0.4, 2.0) for v in (0.5, 0.8)),
+    *(("cut-short", length, MIDDLE) for length in (3.0, 6.0, 8.0)),
+    *(("notch", t, (u, 0.5)) for t in (0.5, 2.0) for u in (0.5, 0.75)),
+    *(("waist", depth, MIDDLE) for depth in (0.5, 0.7)),
+    *(("wrong-voxels", factor, MIDDLE) for factor in (2.0, 4.0)),
+    *(("at-border", lost, MIDDLE) for lost in (0.0, 1.0)),
+    ("ends-flush", 1.0, MIDDLE),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """One phantom with one defect."""
+
+    phantom: str
+    """One of :data:`SPECS`."""
+    kind: str
+    size: float
+    place: Place
+
+
+@dataclass(frozen=True, kw_only=True)
+class Damage:
+    """What a defect did to a map."""
+
+    status: str
+    reasons: tuple[str, ...]
+    """Of flags, or why it was refused."""
+    near_wrong: int = 0
+    """Columns near the defect that are off."""
+    far_wrong: int = 0
+    """The same elsewhere."""
+    shift: float = 0.0
+    """Largest change elsewhere, mm."""
+    mean: float = 0.0
+    """Change of the mean thickness, mm."""
+    columns: int = 1
+    """All columns of the sheet."""
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the map was handed out as sound."""
+        return self.status in (Status.OK, Status.REPAIRED)
+
+    @property
+    def sound(self) -> bool:
+        """Whether an accepted map is right; others need not be."""
+        share = (self.near_wrong + self.far_wrong) / self.columns
+        return not self.accepted or (share <= MAX_WRONG and self.shift <= MAX_SHIFT)
+
+
+def run(full: bool) -> Suite:
+    """Damage phantoms in many ways and measure them.
+
+    Parameters
+    ----------
+    full : bool
+        Every case on both phantoms instead of every third on one.
+
+    Returns
+    -------
+    Suite
+    """
+    names = tuple(SPECS) if full else tuple(SPECS)[:1]
+    plan = PLAN if full else PLAN[::3]
+    trials = [Trial(phantom=name, kind=k, size=s, place=p) for name in names for k, s, p in plan]
+    results = [
+        _refused(result) if isinstance(result, Refusal) else result
+        for result in run_cases(measure_trial, trials, timeout=TIMEOUT)
+    ]
+    return Suite(
+        name="defects",
+        title="Damaged labels",
+        text="Each defect is put into a phantom, and the map compared with that of the undamaged "
+        "one, column by column. A map that is handed out as `ok` or `repaired` has to be right; "
+        "`flagged` ones say where to look, and refused ones (`failed`) why.",
+        tables=(_cases(trials, results), _totals(results)),
+    )
+
+
+def measure_trial(trial: Trial) -> Damage:
+    """Measure one damaged phantom and compare it with the undamaged one.
+
+    Raises
+    ------
+    GeometryError
+        If the package refuses the damaged labels.
+    """
+    _, reference = _undamaged(trial.phantom)
+    defect = make_defect(_site(trial.phantom), trial.kind, trial.size, trial.place)
+    return compare(_measure(defect.volume), reference, defect.changed)
+
+
+def compare(maps: HemisphereMaps, reference: HemisphereMaps, changed: Float) -> Damage:
+    """Compare the maps of damaged labels with those of the undamaged ones.
+
+    Parameters
+    ----------
+    maps, reference : HemisphereMaps
+    changed : (N, 3) array
+        Centers of the changed voxels, RAS mm.
+
+    Returns
+    -------
+    Damage
+    """
+    points = reference.sheet.points
+    distance = np.asarray(cKDTree(changed).query(points.reshape(-1, 3))[0])
+    near = distance.reshape(points.shape[:3]).min(axis=2) <= NEAR
+    change = maps.thickness - reference.thickness
+    off = ~(np.abs(change) <= WRONG)  # a missing column is off too
+    return Damage(
+        status=maps.status,
+        reasons=tuple(dict.fromkeys(flag.reason for flag in maps.flags)),
+        near_wrong=int(np.count_nonzero(off & near)),
+        far_wrong=int(np.count_nonzero(off & ~near)),
+        shift=float(np.abs(change[~near]).max(initial=0.0)),
+        mean=float(np.nanmean(change)),
+        columns=change.size,
+    )
+
+
+@cache
+def _undamaged(name: str) -> tuple[LabelVolume, HemisphereMaps]:
+    volume = Phantom(SPECS[name]).label_volume(load_scheme("freesurfer"))
+    return volume, _measure(volume)
+
+
+@cache
+def _site(name: str) -> Site:
+    volume, maps = _undamaged(name)
+    return Site(volume, maps.sheet)
+
+
+def _measure(volume: LabelVolume) -> HemisphereMaps:
+    return measure_hemisphere(volume, "L", Settings(), lambda _: nullcontext())
+
+
+def _refused(refusal: Refusal) -> Damage:
+    status = "crash" if refusal.is_bug else Status.FAILED
+    return Damage(status=status, reasons=(refusal.reason,))
+
+
+def _cases(trials: list[Trial], results: list[Damage]) -> Table:
+    rows: list[tuple[Cell, ...]] = []
+    for trial, result in zip(trials, results, strict=True):
+        measured = result.status not in (Status.FAILED, "crash")
+        numbers: tuple[Cell, ...] = (None,) * 4
+        if measured:
+            numbers = (result.near_wrong, result.far_wrong, result.shift, result.mean)
+        rows.append(
+            (
+                trial.phantom,
+                trial.kind,
+                f"{trial.size:g}",
+                f"{trial.place[0]:g}, {trial.place[1]:g}",
+                str(result.status),
+                ", ".join(result.reasons) or "-",
+                *numbers,
+                result.sound and result.status != "crash",
+            )
+        )
+    return Table(
+        title="Defects",
+        columns=(
+            "phantom",
+            "defect",
+            "size",
+            "place (u, v)",
+            "status",
+            "reason",
+            f"columns off by > {WRONG:g} mm within {NEAR:g} mm",
+            "the same elsewhere",
+            "largest change elsewhere (mm)",
+            "change of mean (mm)",
+            "sound",
+        ),
+        rows=tuple(rows),
+        notes="Sizes are radii, widths, depths or lengths in mm; a share of voxels for salt; a "
+        f"factor for wrong voxels. Sound: no crash, and if accepted at most {MAX_WRONG:.0%} of "
+        f"the columns off by > {WRONG:g} mm and none moved by > {MAX_SHIFT:g} mm elsewhere.",
+        digits=2,
+    )
+
+
+def _totals(results: list[Damage]) -> Table:
+    words = ("ok", "repaired", "flagged", "failed", "crash")
+    statuses = [str(result.status) for result in results]
+    return Table(
+        title="How damaged labels ended",
+        columns=("outcome", "cases", "of them sound"),
+        rows=tuple(
+            (
+                word,
+                statuses.count(word),
+                sum(r.sound for r, s in zip(results, statuses, strict=True) if s == word),
+            )
+            for word in words
+        ),
+    )

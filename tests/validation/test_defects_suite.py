@@ -1,0 +1,102 @@
+"""The suite of damaged labels: verdicts, tables, and what must hold for chosen defects."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hipsta_bids.errors import GeometryError
+from hipsta_bids.validation import defects
+from hipsta_bids.validation.defects import Damage, Trial, compare, measure_trial
+from hipsta_bids.validation.workers import Refusal
+
+SPIRAL = defects.SPECS["spiral"]
+
+
+def trial(kind, size, place=(0.5, 0.5)):
+    return Trial(phantom="spiral", kind=kind, size=size, place=place)
+
+
+@pytest.mark.parametrize("place", [(0.5, 0.5), (0.2, 0.35), (0.82, 0.6)])
+def test_holes_are_filled_to_the_walls_thickness(place):
+    found = measure_trial(trial("hole", 0.8, place))
+    assert found.status == "repaired"
+    assert found.shift < 0.2  # mm, roughness of a new mesh: elsewhere the labels are the same
+    # Of about 100 columns near it; a plug of the wall's own thickness leaves few.
+    assert found.near_wrong <= 6
+
+
+def test_a_hole_beside_a_rim_is_not_cut_open():
+    found = measure_trial(trial("hole", 1.6, (0.2, 0.35)))
+    assert found.status == "flagged"
+    assert found.reasons[0] == "large-repair"
+    assert found.near_wrong + found.far_wrong <= 6  # 42 columns moved when it was cut open
+    assert found.shift < 0.2  # mm, roughness of a new mesh
+
+
+def test_a_notch_is_flagged_with_its_place():
+    found = measure_trial(trial("notch", 2.0))
+    assert "section-notch" in found.reasons
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "reason"),
+    [
+        ("gap", 0.8, "body-split"),
+        ("tail-inside", 2.0, "end-labels-inside"),
+        ("missing-slices", 1.0, "body-interrupted"),
+        ("wrong-voxels", 4.0, "sheet-too-thin"),
+    ],
+)
+def test_refusals_name_the_defect(kind, size, reason):
+    with pytest.raises(GeometryError, match=r"check|correct|fill|use") as caught:
+        measure_trial(trial(kind, size))
+    assert caught.value.reason == reason
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "reason"),
+    [("at-border", 1.0, "image-border"), ("wrong-voxels", 2.0, "slices-along-axis")],
+)
+def test_doubtful_images_are_flagged(kind, size, reason):
+    assert reason in measure_trial(trial(kind, size)).reasons
+
+
+def test_columns_are_counted_near_and_far():
+    _, reference = defects._undamaged("spiral")
+    shifted = reference.thickness.copy()
+    shifted[0, 0] += 0.5
+    shifted[-1, -1] -= 0.2
+    damaged = replace(reference, thickness=shifted)
+    found = compare(damaged, reference, reference.sheet.points[0, 0])
+    assert (found.near_wrong, found.far_wrong) == (1, 0)
+    assert found.shift == pytest.approx(0.2)
+    assert found.mean == pytest.approx(0.3 / shifted.size)
+    assert not found.sound
+    assert replace(found, shift=0.1).sound
+    assert replace(found, status="flagged").sound
+
+
+def test_many_wrong_columns_are_not_sound():
+    assert Damage(status="ok", reasons=(), near_wrong=2, columns=100).sound
+    assert not Damage(status="ok", reasons=(), near_wrong=3, columns=100).sound
+
+
+def test_the_tables_show_every_case_and_miss_crashes(monkeypatch):
+    def some(work, cases, *, timeout):
+        assert work is measure_trial
+        assert timeout == 60.0
+        results = [Damage(status="ok", reasons=(), columns=861) for _ in cases]
+        results[1] = Refusal(reason="topology", message="no")
+        results[2] = Refusal(reason="crash", message="bug")
+        return results
+
+    monkeypatch.setattr(defects, "run_cases", some)
+    suite = defects.run(False)
+    cases, totals = suite.tables
+    assert len(cases.rows) == len(defects.PLAN[::3])
+    assert len(defects.run(True).tables[0].rows) == 2 * len(defects.PLAN)
+    assert cases.rows[1][4:7] == ("failed", "topology", None)
+    assert cases.missed == 1
+    assert {row[0]: row[1] for row in totals.rows}["crash"] == 1
+    assert np.sum([row[1] for row in totals.rows]) == len(cases.rows)
