@@ -11,7 +11,15 @@ from hipsta_bids.geometry.boundaries import Boundaries
 from hipsta_bids.geometry.checks import check_cross_sections, check_image, check_rows
 from hipsta_bids.geometry.tetra import tetra_quality
 from hipsta_bids.geometry.topology import SolidField
+from hipsta_bids.schemes import Tissue
 from hipsta_bids.settings import Settings
+
+#: What every protocol labels along the sheet, from medial to lateral.
+_PARTS = {
+    "subiculum": (Tissue.PRESUBICULUM, Tissue.SUBICULUM),
+    "CA1": (Tissue.CA1,),
+    "CA2 or CA3": (Tissue.CA2, Tissue.CA2_3, Tissue.CA3),
+}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -42,9 +50,18 @@ def find_flags(evidence: Evidence, settings: Settings) -> list[Flag]:
     checks = settings.checks
     solid, boundaries = evidence.solid, evidence.boundaries
     filled = 1 - float(evidence.sheet.valid.mean())
+    present = set(np.unique(evidence.body.tissue[evidence.body.inside]).tolist())
     rows: list[tuple[bool, str, str]] = [
         (repair.large, "large-repair", f"{repair}: a large repair, look at the labels there")
         for repair in solid.repairs
+    ]
+    rows += [
+        (
+            not present & set(tissues),
+            "subfield-missing",
+            f"the body has no {name}: the sheet ends there; look at the labels",
+        )
+        for name, tissues in _PARTS.items()
     ]
     rows += [
         (

@@ -9,6 +9,7 @@ import pytest
 from hipsta_bids.artifacts import Sheet
 from hipsta_bids.geometry.quality import Evidence, find_flags, quality_metrics
 from hipsta_bids.geometry.topology import Repair
+from hipsta_bids.schemes import Tissue
 from hipsta_bids.settings import Settings
 
 SETTINGS = Settings()
@@ -39,6 +40,16 @@ def reasons(evidence):
 
 def test_a_sound_hemisphere_has_no_flags(evidence):
     assert reasons(evidence) == []
+
+
+@pytest.mark.parametrize(
+    "absent", [(Tissue.PRESUBICULUM, Tissue.SUBICULUM), (Tissue.CA1,), (Tissue.CA2_3,)]
+)
+def test_a_missing_end_of_the_ribbon_is_flagged(evidence, absent):
+    inside = evidence.body.inside & ~np.isin(evidence.body.tissue, absent)
+    assert reasons(replace(evidence, body=replace(evidence.body, inside=inside))) == [
+        "subfield-missing"
+    ]
 
 
 def repair(*, large):
