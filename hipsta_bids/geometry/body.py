@@ -1,6 +1,7 @@
 """From subfield labels to the hippocampal body: one ribbon between two end planes."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +31,16 @@ class Body:
 
     def inside_points(self) -> tuple[NDArray[np.intp], Float]:
         """Voxel indices (N, 3) and RAS mm (N, 3) of the sheet between the end planes."""
+        return self._inside_points
+
+    @cached_property
+    def _inside_points(self) -> tuple[NDArray[np.intp], Float]:
+        """Found once: a dozen steps ask for it, and the volume is large."""
         index = np.argwhere(self.inside)
-        return index, index @ self.affine[:3, :3].T + self.affine[:3, 3]
+        points = index @ self.affine[:3, :3].T + self.affine[:3, 3]
+        index.flags.writeable = False
+        points.flags.writeable = False
+        return index, points
 
 
 def extract_body(volume: LabelVolume, settings: BodySettings) -> Body:
