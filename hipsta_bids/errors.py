@@ -77,3 +77,7 @@ class OutputError(HipstaError):
 
 class GeometryError(HipstaError):
     """The shape does not allow a trustworthy map; the reason names the step."""
+
+
+class ModelError(HipstaError):
+    """A statistical model cannot be fitted to these data; the reason names the obstacle."""

@@ -1,0 +1,1 @@
+"""Group level: registration of profiles, point-wise models, classification; pure functions."""
