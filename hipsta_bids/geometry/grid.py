@@ -128,17 +128,24 @@ def in_plane_voxel(affine: Float) -> float:
 
 
 def _fit_grid(body: Body, settings: GridSettings) -> WedgeGrid:
+    """Lay the grid round the body.
+
+    Its nodes across the axis form a lattice that hangs at one voxel and follows one edge of the
+    voxels, so that damage or an edit of the labels does not move the nodes elsewhere.
+    """
     _, points = body.inside_points()
     axis = body.ends.axis
-    centre = points.mean(axis=0)
-    flat = (points - centre) - np.outer((points - centre) @ axis, axis)
-    _, vectors = np.linalg.eigh(flat.T @ flat)
-    across = np.stack([vectors[:, 2], np.cross(axis, vectors[:, 2])])
+    inverse = np.linalg.inv(body.affine)
+    nearest = np.rint(inverse[:3, :3] @ body.ends.posterior_point + inverse[:3, 3])
+    anchor = body.affine[:3, :3] @ nearest + body.affine[:3, 3]
+    flat = (points - anchor) - np.outer((points - anchor) @ axis, axis)
+    across = _directions_across(body, flat)
     reach = flat @ across.T
     margin = settings.margin + float(np.linalg.norm(body.affine[:3, :3], axis=0).min())
-    low = reach.min(axis=0) - margin
-    size = np.ceil((reach.max(axis=0) + margin - low) / settings.spacing).astype(int) + 1
-    origin = centre + low @ across
+    first = np.floor((reach.min(axis=0) - margin) / settings.spacing)
+    last = np.ceil((reach.max(axis=0) + margin) / settings.spacing)
+    size = (last - first).astype(int) + 1
+    origin = anchor + settings.spacing * first @ across
     planes = [
         _plane_height(point, normal, origin, across * settings.spacing, axis)
         for point, normal in (
@@ -165,6 +172,32 @@ def _fit_grid(body: Body, settings: GridSettings) -> WedgeGrid:
         posterior=planes[0],
         anterior=planes[1],
     )
+
+
+def _directions_across(body: Body, flat: Float) -> Float:
+    """Find two unit vectors (2, 3) across the axis.
+
+    The first follows the edge of the voxels that points most to lateral.
+
+    Parameters
+    ----------
+    body : Body
+    flat : (N, 3) array
+        The body's points without their part along the axis, mm.
+    """
+    axis = body.ends.axis
+    edges = body.affine[:3, :3].T
+    edges = edges / np.linalg.norm(edges, axis=1, keepdims=True)
+    projected = edges - np.outer(edges @ axis, axis)
+    length = np.linalg.norm(projected, axis=1)
+    rank = body.tissue[body.inside].astype(np.float64)
+    lateral = (flat - flat.mean(axis=0)).T @ (rank - rank.mean())
+    along = projected @ lateral
+    usable = length > 0.5  # noqa: PLR2004 -- not the edge along the axis
+    best = int(np.argmax(np.where(usable, np.abs(along) / np.maximum(length, 0.5), -1.0)))
+    side = -1.0 if along[best] < 0 else 1.0
+    first = side * projected[best] / length[best]
+    return np.stack([first, np.cross(axis, first)])
 
 
 def _plane_height(point: Float, normal: Float, origin: Float, steps: Float, axis: Float) -> Float:

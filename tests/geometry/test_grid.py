@@ -1,5 +1,7 @@
 """The working grid between two planes, and the smoothed mask on it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from geometry_cases import plain_body, resampled, rigid, rotation, straight_ends
@@ -74,6 +76,32 @@ def box_body(*, tilt=0.0, voxel=0.4, length=8.0):
     between = (ends.height(points, "posterior") > 0) & (ends.height(points, "anterior") < 0)
     body.inside[...] &= between.reshape(count)
     return body
+
+
+def test_damage_moves_no_node_elsewhere():
+    """A hole and an island: the field a few voxels away stays what it was, bit by bit."""
+    sound, damaged = box_body(), box_body()
+    for array in (damaged.tissue, damaged.inside):
+        array[8:12, :8, 16:20] = 0
+        array[19, 9, 20] = 1
+    damaged = replace(damaged)  # forget the points that were found before
+    assert (damaged.inside != sound.inside).any()
+    before, after = resampled(sound), resampled(damaged)
+    offset = np.rint(after.grid.to_nodes(before.grid.to_ras(np.zeros((1, 3)))))[0].astype(int)
+    count = np.minimum(before.values.shape, np.array(after.values.shape) - offset)
+    a, b, w = (np.arange(max(0, -o), n) for o, n in zip(offset, count, strict=True))
+    index = np.stack(np.meshgrid(a, b, w, indexing="ij"), axis=-1)
+    np.testing.assert_allclose(
+        after.grid.to_ras((index + offset).reshape(-1, 3).astype(float)),
+        before.grid.to_ras(index.reshape(-1, 3).astype(float)),
+        atol=EXACT,
+    )
+    mine = before.values[tuple(np.moveaxis(index, -1, 0))]
+    other = after.values[tuple(np.moveaxis(index + offset, -1, 0))]
+    ends = w[(w < 5) | (w > w.max() - 5)] - w[0]  # 3 mm from the damage
+    np.testing.assert_array_equal(mine[..., ends] > 0, other[..., ends] > 0)
+    np.testing.assert_allclose(mine[..., ends], other[..., ends], atol=1e-6)  # single precision
+    assert np.abs(mine - other).max() > 0.3
 
 
 def test_field_is_positive_inside_and_negative_outside(case):
