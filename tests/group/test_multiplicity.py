@@ -11,10 +11,11 @@ from hipsta_bids.group.multiplicity import (
 )
 
 #: Example of Benjamini and Hochberg (1995), used again in the paper of 2006.
-P = np.array(
-    "0.0001 0.0004 0.0019 0.0095 0.0201 0.0278 0.0298 0.0344 0.0459 "
-    "0.324 0.4262 0.5719 0.6528 0.759 1.0".split(),
-    dtype=float,
+P = np.concatenate(
+    [
+        [0.0001, 0.0004, 0.0019, 0.0095, 0.0201, 0.0278, 0.0298, 0.0344, 0.0459],
+        [0.324, 0.4262, 0.5719, 0.6528, 0.759, 1.0],
+    ]
 )
 
 

@@ -1,0 +1,153 @@
+"""Permutation tests: statistics of the model, exact counts, family-wise error, power."""
+
+from dataclasses import replace
+from itertools import permutations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from hipsta_bids.errors import ModelError
+from hipsta_bids.group.contrasts import Contrast
+from hipsta_bids.group.glm import fit_points
+from hipsta_bids.group.permutation import permute
+from hipsta_bids.group.sheet_graph import enhance, find_clusters
+from hipsta_bids.group_settings import GlmSettings, MultiplicitySettings
+
+SETTINGS = MultiplicitySettings(permutations=400)
+SHEET = (9, 7)
+GROUP = Contrast("group", np.array([0.0, 1.0, 0.0]))
+
+
+def case(seed=0, subjects=40):
+    random = np.random.default_rng(seed)
+    group = np.arange(subjects) % 2
+    matrix = np.column_stack([np.ones(subjects), group, random.normal(70, 5, subjects)])
+    return random, matrix, random.standard_normal((subjects, 63)) + 0.02 * matrix[:, 2:]
+
+
+@pytest.mark.parametrize("contrast", [GROUP, Contrast("both", np.eye(3)[1:])])
+def test_statistic_is_that_of_the_model(contrast):
+    _, matrix, maps = case()
+    maps[:, 5] = 1.0
+    few = replace(SETTINGS, permutations=2)
+    (expected,) = fit_points(maps, matrix, [contrast], GlmSettings()).tests
+    found = permute(maps, matrix, contrast, SHEET, settings=few)
+    np.testing.assert_allclose(found.statistic, expected.statistic, rtol=1e-9)  # rounding
+
+
+def test_uncorrected_p_approaches_that_of_all_permutations():
+    """Six subjects have 720 orders; a fair sample of them has their p-value."""
+    random = np.random.default_rng(1)
+    matrix = np.column_stack([np.ones(6), np.arange(6.0)])
+    maps = random.standard_normal((6, 4)) + 0.5 * matrix[:, 1:]
+    slope = Contrast("slope", np.array([0.0, 1.0]))
+    found = permute(maps, matrix, slope, (2, 2), settings=replace(SETTINGS, permutations=6000))
+    orders = np.array(list(permutations(range(6))))
+    for point in range(4):
+        r = np.abs([np.corrcoef(maps[order, point], matrix[:, 1])[0, 1] for order in orders])
+        exact = (r >= r[0] - 1e-9).mean()
+        # Three standard deviations of a share of 6000, at most .0194.
+        assert found.p_uncorrected[point] == pytest.approx(exact, abs=0.02)
+
+
+def test_large_samples_give_the_p_of_the_t_test():
+    _, matrix, maps = case(2, subjects=80)
+    found = permute(maps, matrix, GROUP, SHEET, settings=replace(SETTINGS, permutations=4000))
+    (test,) = fit_points(maps, matrix, [GROUP], GlmSettings()).tests
+    # Four standard deviations of a share of 4000 (63 of them are compared).
+    np.testing.assert_allclose(found.p_uncorrected, test.p, atol=0.032)
+
+
+def test_family_wise_error_is_kept_on_null_maps():
+    few = replace(SETTINGS, permutations=60)
+    smallest = []
+    for seed in range(120):
+        _, matrix, maps = case(seed, subjects=24)
+        found = permute(maps, matrix, GROUP, SHEET, settings=replace(few, seed=seed))
+        smallest.append((found.p_max.min(), found.p_enhanced.min()))
+    rates = (np.array(smallest) <= 0.1).mean(axis=0)
+    # Binomial SD .027 around .1; three of them.
+    assert (rates <= 0.182).all()
+    assert (rates >= 0.018).all()
+
+
+def test_enhancement_finds_weak_wide_effects_that_the_maximum_misses():
+    hits = np.zeros(2)
+    for seed in range(10):
+        _, matrix, maps = case(seed)
+        maps.reshape(-1, *SHEET)[matrix[:, 1] == 1, 2:7, 1:6] += 0.75
+        found = permute(maps, matrix, GROUP, SHEET, settings=replace(SETTINGS, permutations=200))
+        hits += [(p <= 0.05).sum() for p in (found.p_max, found.p_enhanced)]
+    assert hits[1] > 2 * hits[0]
+
+
+def test_blocks_keep_a_site_effect_from_looking_like_a_group_effect():
+    """Group and site go together and the site shifts values: only shuffling inside sites holds."""
+    rejections = np.zeros(2)
+    trials = 60
+    for seed in range(trials):
+        random = np.random.default_rng(seed)
+        site = np.repeat([0, 1], 20)
+        group = random.random(40) < np.where(site, 0.8, 0.2)
+        matrix = np.column_stack([np.ones(40), group])
+        maps = random.standard_normal((40, 4)) + 1.0 * site[:, None]
+        few = replace(SETTINGS, permutations=60, seed=seed)
+        for i, blocks in enumerate((None, site)):
+            contrast = Contrast("group", np.array([0.0, 1.0]))
+            found = permute(maps, matrix, contrast, (2, 2), settings=few, blocks=blocks)
+            rejections[i] += found.p_max.min() <= 0.05
+    free, within = rejections / trials
+    assert within <= 0.05 + 3 * np.sqrt(0.05 * 0.95 / trials)  # three binomial SDs
+    assert free > 0.4
+
+
+def test_mean_is_tested_by_flipping_signs():
+    random = np.random.default_rng(3)
+    maps = random.standard_normal((20, 63))
+    maps[:, 30] += 2
+    mean = Contrast("mean", np.array([1.0]))
+    found = permute(maps, np.ones((20, 1)), mean, SHEET, settings=SETTINGS)
+    expected = stats.ttest_1samp(maps, 0).statistic
+    np.testing.assert_allclose(found.statistic, expected, rtol=1e-9)  # rounding
+    assert found.p_max[30] == 1 / 400
+    assert (np.delete(found.p_max, 30) > 0.05).all()
+
+
+def test_seed_repeats_and_missing_points_stay_missing():
+    _, matrix, maps = case(4)
+    maps[:, 7] = np.nan
+    maps[3, 8] = np.nan
+    one, two = (permute(maps, matrix, GROUP, SHEET, settings=SETTINGS) for _ in range(2))
+    np.testing.assert_array_equal(one.p_enhanced, two.p_enhanced)
+    assert np.isnan(one.p_max[7])
+    assert np.isfinite(np.delete(one.p_max, 7)).all()
+    with pytest.raises(ModelError, match="sheet of 9 x 8"):
+        permute(maps, matrix, GROUP, (9, 8), settings=SETTINGS)
+
+
+def test_enhancement_of_a_plateau_is_the_sum_of_its_heights():
+    sheet = np.zeros((1, 6, 5))
+    sheet[0, 1:3, 1:4] = 1.0  # six points of height 1
+    sheet[0, 4, 0] = -0.5
+    settings = MultiplicitySettings(tfce_step=0.25)
+    raised = enhance(sheet, settings)[0]
+    heights = np.array([0.25, 0.5, 0.75, 1.0])
+    assert raised[1, 1] == pytest.approx(np.sqrt(6) * (heights**2).sum() * 0.25)
+    assert raised[4, 0] == pytest.approx(-(heights[:2] ** 2).sum() * 0.25)
+    assert np.count_nonzero(raised) == 7
+
+
+def test_clusters_are_split_by_sign_and_by_neighbors():
+    significant = np.zeros((5, 5), dtype=bool)
+    significant[[0, 1, 2, 2], [0, 1, 1, 2]] = True
+    statistic = np.ones((5, 5))
+    statistic[2, 2] = -4
+    statistic[1, 1] = 3
+    names = np.where(np.arange(25).reshape(5, 5) < 5, "CA1", "CA2")
+    eight = find_clusters(significant, statistic, names, 8)
+    assert [cluster.extent for cluster in eight] == [3, 1]
+    assert eight[0].peak == (1, 1)
+    assert eight[0].shares == {"CA1": pytest.approx(1 / 3), "CA2": pytest.approx(2 / 3)}
+    assert eight[1].peak == (2, 2)
+    assert [c.extent for c in find_clusters(significant, statistic, names, 4)] == [2, 1, 1]
