@@ -3,32 +3,32 @@
 The object is 6-connected, the background 26-connected. A voxel is simple if changing it keeps the
 topology of both: one 6-connected piece of object in its 18-neighborhood touches it by a face, and
 one 26-connected piece of background lies in its 26-neighborhood (Bertrand & Malandain 1994,
-Pattern Recognition Letters 15:169-175). Neighborhoods are 27-bit integers, so that a whole batch
-of voxels is tested by a few integer operations on arrays.
+Pattern Recognition Letters 15:169-175).
+
+Where the first holds, an Euler number decides the second. The background covers some of the
+corners, edges and faces of the voxel's cube. What it leaves bare of the cube's surface is in one
+piece, as the object is; so by Alexander duality what it covers is in one piece if and only if
+covered corners - edges + faces are 1. All of this but the corners depends on the 18-neighborhood
+only, whose 2^18 states are tabulated once.
 """
+
+from functools import cache
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hipsta_bids.artifacts import Bool
 
-Bits = NDArray[np.int32]
+Bits = NDArray[np.uint32]
+Index = NDArray[np.intp]
 
-_OFFSETS = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)])
-_DISTANCE = np.abs(_OFFSETS).sum(axis=1)
-
-
-def _mask(chosen: Bool) -> np.int32:
-    return np.int32(sum(1 << int(k) for k in np.flatnonzero(chosen)))
-
-
-_N6 = _mask(_DISTANCE == 1)
-_N18 = _mask((_DISTANCE == 1) | (_DISTANCE == 2))  # noqa: PLR2004 -- face and edge neighbors
-_N26 = _mask(_DISTANCE > 0)
-# Which bits may move by one step along an axis without leaving the 3 x 3 x 3 block.
-_UP = [_mask(_OFFSETS[:, axis] < 1) for axis in range(3)]
-_DOWN = [_mask(_OFFSETS[:, axis] > -1) for axis in range(3)]
-_STEP = (9, 3, 1)
+_BLOCK = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)])
+_CORNERS, _EDGES, _FACES = (_BLOCK[np.abs(_BLOCK).sum(axis=1) == n] for n in (3, 2, 1))
+_CLOSE = np.vstack([_FACES, _EDGES])
+NEIGHBORS = np.vstack([_CORNERS, _CLOSE])
+"""Offsets of the 26 neighbors in the order in which their bits are numbered."""
 
 
 def euler_number(mask: Bool) -> int:
@@ -84,80 +84,112 @@ def shrink(start: Bool, kept: Bool, field: NDArray[np.float32], levels: int) -> 
     return state
 
 
+def are_simple(neighbors: Bool) -> Bool:
+    """Whether voxels are simple.
+
+    Parameters
+    ----------
+    neighbors : (N, 26) array of bool
+        Which of their neighbors are object, in the order of ``NEIGHBORS``.
+
+    Returns
+    -------
+    (N,) array of bool
+    """
+    packed = np.packbits(neighbors, axis=1, bitorder="little")
+    bits = np.ascontiguousarray(packed).view("<u4")[:, 0]
+    table = _table()
+    close = bits >> np.uint32(len(_CORNERS))
+    bare = table.bare_but_for[close] & bits.astype(np.uint8)
+    return np.asarray(np.bitwise_count(bare) == table.wanted[close])
+
+
 def _sweep(state: Bool, free: Bool, *, add: bool) -> None:
     """Change free simple voxels in place until none is left.
 
     Voxels of one of the eight sub-grids of every second voxel are never neighbors, so changing
     them together is the same as one after the other.
     """
-    flat = state.reshape(-1)
+    flat, free = state.reshape(-1), free.reshape(-1)
     strides = np.array([state.shape[1] * state.shape[2], state.shape[2], 1])
-    shifts = (_OFFSETS @ strides).astype(np.int64)
-    free_flat = free.reshape(-1)
-    queue = np.flatnonzero(free_flat & (flat != add))
-    # Only voxels on the frontier of the state can be simple.
-    queue = _on_frontier(flat, queue, shifts, add)
-    marked = np.zeros(flat.shape, dtype=bool)
+    shifts = NEIGHBORS @ strides
+    queue = _on_frontier(flat, np.flatnonzero(free & (flat != add)), shifts, add)
+    place = np.zeros(flat.shape, dtype=np.int32)
     while len(queue):
-        grid = np.stack(np.unravel_index(queue, state.shape))
-        colour = (grid % 2).T @ np.array([4, 2, 1])
-        changed = []
-        for part in range(8):
-            batch = queue[colour == part]
-            if not len(batch):
-                continue
-            batch = batch[_simple(_neighborhood(flat, batch, shifts))]
-            flat[batch] = add
-            changed.append(batch)
-        moved = np.concatenate(changed)
-        if not len(moved):
-            return
-        near = (moved[:, None] + shifts[None, :]).ravel()
-        near = near[free_flat[near] & (flat[near] != add)]
-        marked[near] = True
-        queue = np.flatnonzero(marked)
-        marked[queue] = False
+        moved = _change_simple(flat, queue, shifts, strides, add)
+        near = (moved[:, None] + shifts).ravel()
+        near = near[free[near] & (flat[near] != add)]
+        number = np.arange(len(near), dtype=np.int32)
+        place[near] = number
+        queue = near[place[near] == number]  # each voxel once
 
 
-def _on_frontier(
-    flat: Bool, queue: NDArray[np.int64], shifts: NDArray[np.int64], add: bool
-) -> NDArray[np.int64]:
+def _change_simple(flat: Bool, queue: Index, shifts: Index, strides: Index, add: bool) -> Index:
+    """Change the simple ones of some voxels in place, sub-grid by sub-grid, and return them."""
+    first, rest = np.divmod(queue, strides[0])
+    second, third = np.divmod(rest, strides[1])
+    part = ((first & 1) << 2 | (second & 1) << 1 | third & 1).astype(np.uint8)
+    queue = queue[np.argsort(part, kind="stable")]
+    ends = np.bincount(part, minlength=8).cumsum()
+    changed = []
+    for begin, end in pairwise([0, *ends]):
+        if begin < end:
+            batch = queue[begin:end]
+            simple = batch[are_simple(flat[batch[:, None] + shifts])]
+            flat[simple] = add
+            changed.append(simple)
+    return np.concatenate(changed)
+
+
+def _on_frontier(flat: Bool, queue: Index, shifts: Index, add: bool) -> Index:
+    """Voxels that touch the state; no other can be simple."""
     near = np.zeros(len(queue), dtype=bool)
     for shift in shifts:
         near |= flat[queue + shift] == add
     return queue[near]
 
 
-def _neighborhood(flat: Bool, index: NDArray[np.int64], shifts: NDArray[np.int64]) -> Bits:
-    bits = np.zeros(len(index), dtype=np.int32)
-    for position, shift in enumerate(shifts):
-        bits |= flat[index + shift].astype(np.int32) << np.int32(position)
-    return bits
+class _Table(NamedTuple):
+    """What an 18-neighborhood tells, by its bits."""
+
+    bare_but_for: NDArray[np.uint8]
+    """Corners of the cube that are bare if the voxel beyond them is object: a byte of bits."""
+    wanted: NDArray[np.int8]
+    """Bare corners that a simple voxel has; -1 if there is not one piece of object."""
 
 
-def _simple(bits: Bits) -> Bool:
-    """Whether the center voxel of each neighborhood is simple."""
-    faces = bits & _N6
-    inside = bits & _N18
-    outside = ~bits & _N26
-    one_piece = (_flood(faces & -faces, inside, faces_only=True) & faces) == faces
-    one_background = _flood(outside & -outside, outside, faces_only=False) == outside
-    return np.asarray((faces != 0) & (outside != 0) & one_piece & one_background)
+@cache
+def _table() -> _Table:
+    bits = np.arange(1 << len(_CLOSE), dtype=np.uint32)
+    corners = np.zeros(len(bits), dtype=np.uint8)
+    for number, corner in enumerate(_CORNERS):
+        corners |= _is_bare(bits, corner).astype(np.uint8) << np.uint8(number)
+    # 8 - bare corners - covered edges + covered faces = 1.
+    wanted = np.full(len(bits), len(_CORNERS) - 1, dtype=np.int8)
+    for edge in _EDGES:
+        wanted -= ~_is_bare(bits, edge)
+    for face in _FACES:
+        wanted += ~_is_bare(bits, face)
+    return _Table(corners, np.where(_is_one_piece(bits), wanted, np.int8(-1)))
 
 
-def _flood(seed: Bits, within: Bits, *, faces_only: bool) -> Bits:
-    """All bits of ``within`` that hang together with ``seed``."""
-    reached = seed
-    while True:
-        spread = reached
-        for axis, step in enumerate(_STEP):
-            source = reached if faces_only else spread
-            spread = (
-                spread
-                | ((source & _UP[axis]) << np.int32(step))
-                | ((source & _DOWN[axis]) >> np.int32(step))
-            )
-        spread = spread & within
-        if np.array_equal(spread, reached):
-            return reached
-        reached = spread
+def _is_bare(bits: Bits, part: NDArray[np.intp]) -> Bool:
+    """Whether all voxels of the 18-neighborhood that touch a part of the cube are object."""
+    touching = ((_CLOSE == 0) | (part == _CLOSE)).all(axis=1)
+    mask = np.uint32(sum(1 << int(k) for k in np.flatnonzero(touching)))
+    return np.asarray(bits & mask == mask)
+
+
+def _is_one_piece(bits: Bits) -> Bool:
+    """Whether the object's faces hang together, by edges, in the 18-neighborhood."""
+    faces = bits & np.uint32((1 << len(_FACES)) - 1)
+    reached = faces & (~faces + np.uint32(1))  # the lowest one
+    before = np.zeros_like(reached)
+    while not np.array_equal(before, reached):
+        before = reached
+        for number, edge in enumerate(_EDGES, start=len(_FACES)):
+            pair = np.uint32(sum(1 << int(k) for k in np.flatnonzero(_FACES @ edge > 0)))
+            linked = (bits >> np.uint32(number) & np.uint32(1)) != 0
+            linked &= reached & pair != 0
+            reached = np.where(linked, reached | (faces & pair), reached)
+    return np.asarray((reached == faces) & (faces != 0))
