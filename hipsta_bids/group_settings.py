@@ -76,8 +76,8 @@ class ClassificationSettings:
     """Groups of equal size in the table of calibration."""
     iterations: int = 100
     """Most steps of a fit."""
-    tolerance: float = 1e-10
-    """Steps end when the log likelihood can gain no more than this."""
+    tolerance: float = 1e-16
+    """Steps end when they promise to raise the log likelihood by less than this."""
 
     def __post_init__(self) -> None:
         _require(0 < self.confidence < 1, "classification.confidence must lie between 0 and 1")

@@ -1,0 +1,227 @@
+"""Logistic models, areas under the curve and separation, against R, statsmodels and simulation."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import optimize, special, stats
+from statsmodels.discrete.discrete_model import Logit
+
+from hipsta_bids.errors import ModelError
+from hipsta_bids.group.classification import calibrate, compare_models, cross_validate
+from hipsta_bids.group.logistic import fit_logistic, is_separated
+from hipsta_bids.group.roc import delong, delong_difference
+from hipsta_bids.group_settings import ClassificationSettings
+
+SETTINGS = ClassificationSettings(repeats=2, folds=5)
+
+MODELS = {
+    "infert": ("case", ["age", "parity"], ["spontaneous"]),
+    "mtcars_am": ("am", ["wt"], ["hp"]),
+}
+
+
+def r_model(r_data, name):
+    outcome, base, added = MODELS[name]
+    data = r_data[name.split("_")[0]]
+    case = data[outcome] == 1
+    columns = [np.ones(len(case)), *(data[column] for column in base)]
+    return np.column_stack(columns).astype(float), data[added[0]][:, None].astype(float), case
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_agrees_with_r(oracle, r_data, name):
+    base, added, case = r_model(r_data, name)
+    expected = oracle[name]
+    found = compare_models(base, added, case, SETTINGS)
+    assert (found.n, found.n_cases, found.df) == (expected["n"], expected["cases"], 1)
+    assert not found.separated
+
+    def check(value, key):
+        np.testing.assert_allclose(value, expected[key], rtol=1e-6)
+
+    check(found.likelihood_ratio, "LR")
+    check(found.p, "p_LR")
+    for number, model in enumerate((found.base, found.full)):
+        np.testing.assert_allclose(
+            model.fit.coefficients, list(expected[f"coef{number}"].values()), rtol=1e-6
+        )
+        check(model.fit.log_likelihood, f"logLik{number}")
+        check(model.auc.area, f"auc{number}")
+        check([model.auc.low, model.auc.high], f"ci{number}")
+    check(found.base.auc.se, "se0")
+    check(found.full.auc.se, "se1auc")
+    np.testing.assert_allclose(found.full.fit.se, list(expected["se1"].values()), rtol=1e-6)
+    difference = delong_difference(found.base.score, found.full.score, case)
+    check(difference.z, "delong_Z")
+    check(difference.p, "delong_p")
+
+
+def test_firth_agrees_with_r(oracle, r_data):
+    base, added, case = r_model(r_data, "infert")
+    fit = fit_logistic(np.hstack([base, added]), case, SETTINGS, firth=True)
+    expected = oracle["firth_infert"]
+    np.testing.assert_allclose(fit.coefficients, list(expected["coef"].values()), rtol=1e-6)
+    np.testing.assert_allclose(fit.se, list(expected["se"].values()), rtol=1e-6)
+
+
+def simulated(seed=0, n=200, effect=1.0):
+    random = np.random.default_rng(seed)
+    base = np.column_stack([np.ones(n), random.normal(70, 8, n)])
+    added = random.standard_normal((n, 2))
+    case = random.random(n) < special.expit(effect * added[:, 0] + 0.05 * (base[:, 1] - 70))
+    return base, added, case
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_maximum_likelihood_agrees_with_statsmodels(seed):
+    base, added, case = simulated(seed)
+    matrix = np.hstack([base, added])
+    fit = fit_logistic(matrix, case, SETTINGS, firth=False)
+    expected = Logit(case.astype(float), matrix).fit(disp=0, tol=1e-12)
+    np.testing.assert_allclose(fit.coefficients, expected.params, rtol=1e-6)
+    np.testing.assert_allclose(fit.se, expected.bse, rtol=1e-6)
+    assert fit.log_likelihood == pytest.approx(expected.llf, rel=1e-10)
+
+
+def test_firth_maximizes_the_penalized_likelihood():
+    base, added, case = simulated(3, n=30)
+    matrix = np.hstack([base[:, :1], added])
+
+    def loss(beta):
+        chance = special.expit(matrix @ beta)
+        information = matrix.T @ (matrix * (chance * (1 - chance))[:, None])
+        margin = np.where(case, 1, -1) * (matrix @ beta)
+        return -special.log_expit(margin).sum() - 0.5 * np.linalg.slogdet(information)[1]
+
+    best = optimize.minimize(loss, np.zeros(3), method="BFGS", options={"gtol": 1e-8})
+    fit = fit_logistic(matrix, case, SETTINGS, firth=True)
+    np.testing.assert_allclose(fit.coefficients, best.x, atol=1e-5)  # numerical gradients
+    assert fit.log_likelihood == pytest.approx(-best.fun, abs=1e-8)
+
+
+def test_firth_of_a_two_by_two_table_adds_half_to_each_cell():
+    """The penalized estimates of a saturated model are the log odds with 1/2 added."""
+    counts = {(0, 0): 7, (0, 1): 3, (1, 0): 4, (1, 1): 0}
+    rows = [(x, y) for (x, y), count in counts.items() for _ in range(count)]
+    x, y = np.array(rows).T
+    matrix = np.column_stack([np.ones(len(x)), x])
+    assert is_separated(matrix, y == 1)
+    fit = fit_logistic(matrix, y == 1, SETTINGS, firth=True)
+    first, second = np.log(3.5 / 7.5), np.log(0.5 / 4.5)
+    np.testing.assert_allclose(fit.coefficients, [first, second - first], rtol=1e-6)
+
+
+def test_separation_is_found_exactly():
+    x = np.arange(10.0)
+    matrix = np.column_stack([np.ones(10), x])
+    assert is_separated(matrix, x > 4)
+    overlapping = x > 4
+    overlapping[[4, 5]] = [True, False]
+    assert not is_separated(matrix, overlapping)
+    touching = np.column_stack([np.ones(10), np.clip(x, 4, 5)])  # quasi-complete
+    mixed = x > 4
+    mixed[0] = True
+    assert is_separated(touching, mixed)
+    tiny = np.column_stack([np.ones(10), 1e-9 * x])
+    assert is_separated(tiny, x > 4)
+    assert not is_separated(tiny, overlapping)
+
+
+def test_separated_groups_get_finite_answers_and_are_told():
+    base, added, _ = simulated(4, n=40)
+    case = added[:, 0] > 0.1
+    found = compare_models(base, added, case, SETTINGS)
+    assert found.separated
+    assert found.full.fit.firth
+    assert np.isfinite(found.full.fit.coefficients).all()
+    assert found.p < 1e-6
+    assert found.full.auc.area == 1.0
+    with pytest.raises(ModelError, match="separated"):
+        fit_logistic(np.hstack([base, added]), case, SETTINGS, firth=False)
+
+
+def test_likelihood_ratio_does_not_depend_on_units_and_keeps_its_size():
+    p = []
+    quick = replace(SETTINGS, folds=2, repeats=1)
+    for seed in range(60):
+        base, added, case = simulated(seed, n=80, effect=0.0)
+        p.append(compare_models(base, added, case, quick).p)
+    assert stats.kstest(p, "uniform").pvalue > 0.01  # one in a hundred by chance; the seed is fixed
+    for separate in (False, True):
+        outcome = added[:, 0] > 0 if separate else case
+        one = compare_models(base, added, outcome, quick)
+        other = compare_models(base * [1, 1e4], added * 1e-3, outcome, quick)
+        assert one.likelihood_ratio == pytest.approx(other.likelihood_ratio, rel=1e-6, abs=1e-8)
+
+
+def test_area_counts_pairs():
+    random = np.random.default_rng(0)
+    score, case = random.integers(0, 6, 40).astype(float), np.arange(40) < 15
+    pairs = np.sign(score[case][:, None] - score[~case][None])
+    found = delong(score, case, 0.95)
+    assert found.area == pytest.approx((pairs + 1).mean() / 2, rel=1e-12)
+    assert found.low < found.area < found.high
+    assert delong(case.astype(float), case, 0.95).high == 1.0
+    assert delong_difference(score, score, case).p == 1.0
+
+
+def test_delong_interval_covers():
+    random = np.random.default_rng(1)
+    case = np.arange(80) < 30
+    truth = stats.norm.cdf(1 / np.sqrt(2))  # binormal, one SD apart
+    inside = 0
+    for _ in range(600):
+        area = delong(random.standard_normal(80) + case, case, 0.95)
+        inside += area.low < truth < area.high
+    # The interval is asymptotic: 1 % is allowed for that, and three binomial SDs of .009.
+    assert inside / 600 == pytest.approx(0.95, abs=0.037)
+
+
+def test_cross_validation_does_not_reward_noise():
+    random = np.random.default_rng(2)
+    case = np.arange(60) % 2 == 0
+    matrix = np.column_stack([np.ones(60), random.standard_normal((60, 8))])
+    validated = cross_validate(matrix, case, replace(SETTINGS, repeats=10))
+    fit = fit_logistic(matrix, case, SETTINGS, firth=False)
+    assert delong(matrix @ fit.coefficients, case, 0.95).area > 0.65  # optimistic
+    assert validated.auc < 0.6
+    repeated = cross_validate(matrix, case, replace(SETTINGS, repeats=10))
+    assert validated.auc == repeated.auc
+
+
+def test_cross_validation_survives_a_level_that_a_fold_lacks():
+    base, added, case = simulated(5, n=60)
+    rare = np.zeros(60)
+    rare[[3, 7]] = 1.0
+    matrix = np.column_stack([base, added, rare])
+    assert np.isfinite(cross_validate(matrix, case, replace(SETTINGS, repeats=5)).auc)
+
+
+def test_calibration_of_right_and_of_exaggerated_chances():
+    random = np.random.default_rng(6)
+    score = random.normal(0, 1.5, 4000)
+    case = random.random(4000) < special.expit(score)
+    right = calibrate(score, case, SETTINGS)
+    # Standard errors of slope and intercept are .04.
+    assert right.slope == pytest.approx(1, abs=0.12)
+    assert right.intercept == pytest.approx(0, abs=0.12)
+    np.testing.assert_allclose(right.predicted, right.observed, atol=0.1)  # 3 SDs of 400
+    extreme = calibrate(2 * score + 1, case, SETTINGS)
+    assert extreme.slope == pytest.approx(right.slope / 2, rel=1e-6)
+    assert extreme.intercept < -0.5
+    assert extreme.brier > right.brier
+
+
+def test_refuses_what_cannot_be_compared():
+    base, added, case = simulated(7, n=40)
+    only = np.arange(40) == 0
+    cases = {
+        "design-missing": (base, np.where(added > 2, np.nan, added), case),
+        "design-rank": (base, base[:, 1:] * 3, case),
+        "group-size": (base, added, only),
+    }
+    for reason, arguments in cases.items():
+        with pytest.raises(ModelError) as caught:
+            compare_models(*arguments, SETTINGS)
+        assert caught.value.reason == reason
