@@ -35,6 +35,33 @@ def _set(
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class EditedMask:
+    """The body as a person corrected it."""
+
+    inside: Bool
+    """(I, J, K) on the grid of the labels."""
+    voxel: float
+    """Edge of a voxel in plane in the mask's own file, mm."""
+
+    def __post_init__(self) -> None:
+        _set(self, "inside", np.bool_, (None, None, None))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BodyMask:
+    """The measured body, on the whole grid of the file with its labels."""
+
+    inside: Bool
+    """(I, J, K)"""
+    affine: Float
+    """(4, 4), voxel index to RAS mm."""
+
+    def __post_init__(self) -> None:
+        _set(self, "inside", np.bool_, (None, None, None))
+        _set(self, "affine", np.float64, (4, 4))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class LabelVolume:
     """A segmentation in the package's own vocabulary."""
 
@@ -45,14 +72,32 @@ class LabelVolume:
     affine: Float
     """(4, 4), voxel index to RAS mm."""
     scheme: Scheme
+    edited_mask: EditedMask | None = None
+    """What takes the place of the labels between the end planes, if anything."""
+    start: tuple[int, int, int] = (0, 0, 0)
+    """Index of the first voxel in the file, from which this was cropped."""
+    file_shape: tuple[int, int, int] | None = None
+    """Shape of the file; None where there is none or nothing was cropped."""
 
     def __post_init__(self) -> None:
         shape = np.shape(self.tissue)
+        if self.edited_mask is not None and self.edited_mask.inside.shape != shape:
+            raise ValueError(f"LabelVolume.edited_mask: shape differs from that of tissue, {shape}")
         _set(self, "tissue", np.uint8, (None, None, None))
         _set(self, "part", np.uint8, shape)
         affine = _set(self, "affine", np.float64, (4, 4))
         if not np.isfinite(affine).all() or not np.linalg.det(affine[:3, :3]):
             raise ValueError("LabelVolume.affine is singular or not finite")
+
+    def in_file(self, inside: Bool) -> BodyMask:
+        """Put a mask (I, J, K) back into the whole grid of the file."""
+        whole = np.zeros(self.file_shape or inside.shape, dtype=np.bool_)
+        whole[tuple(slice(a, a + n) for a, n in zip(self.start, inside.shape, strict=True))] = (
+            inside
+        )
+        affine = self.affine.copy()
+        affine[:3, 3] -= affine[:3, :3] @ np.array(self.start)
+        return BodyMask(inside=whole, affine=affine)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -152,6 +197,10 @@ class HemisphereMaps:
     curvature_exterior: Float
     subfield: NDArray[np.uint8]
     """(Nx, Ny) values of Tissue."""
+    repaired: Bool
+    """(Nx, Ny) columns that a repair of the topology touched."""
+    body_mask: BodyMask
+    """What was measured, on the grid of the labels' file."""
     summary: Mapping[str, float]
     """One number per summary column (see the output table for units)."""
     qc: Mapping[str, Any]
@@ -167,6 +216,7 @@ class HemisphereMaps:
         for name in ("thickness", "curvature_interior", "curvature", "curvature_exterior"):
             _set(self, name, np.float64, shape)
         _set(self, "subfield", np.uint8, shape)
+        _set(self, "repaired", np.bool_, shape)
 
     @property
     def status(self) -> Status:

@@ -123,6 +123,8 @@ def _log(outcome: Outcome) -> None:
     if outcome.skipped:
         _LOGGER.info("%s: unchanged, skipped (%s)", title, outcome.status)
         return
+    for edit in outcome.job.item.edits:
+        _LOGGER.info("%s: edited %s: %s", title, edit.kind, edit.path)
     for stage, seconds in outcome.stages.items():
         _LOGGER.info("%s: %s %.3f s", title, stage, seconds)
     _LOGGER.info("%s: %s %s %s", title, outcome.status, outcome.reason or "", outcome.message or "")
@@ -143,6 +145,7 @@ def _row(outcome: Outcome) -> dict[str, str]:
         "status": str(outcome.status),
         "reason": outcome.reason or files.MISSING,
         "message": outcome.message or files.MISSING,
+        "edited": "+".join(edit.kind for edit in outcome.job.item.edits) or files.MISSING,
         "version": __version__,
         "settings_hash": outcome.job.settings_hash,
         "input_hash": outcome.input_hash or files.MISSING,

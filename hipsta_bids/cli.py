@@ -104,13 +104,14 @@ def _participant(options: "Namespace") -> ExitCode:
     settings = load_settings(options.settings)
     from hipsta_bids.bids.dataset import (  # noqa: PLC0415  (heavy)
         dataset_notes,
-        find_hemispheres,
+        find_inputs,
         selection_table,
     )
 
     request = _request(options)
-    items = find_hemispheres(request)
-    for note in dataset_notes(request, items):
+    found = find_inputs(request)
+    items = found.items
+    for note in (*dataset_notes(request, items), *found.notes):
         say(f"note: {note}")
     if options.dry_run:
         say_table(selection_table(items))
@@ -164,6 +165,7 @@ def _request(options: "Namespace") -> "InputRequest":
         fs_analysis=options.fs_analysis,
         ashs_atlas=options.ashs_atlas,
         scheme=options.scheme,
+        edited_dir=options.edited_dir,
         bids_filter_file=options.bids_filter_file,
         bids_database_dir=options.bids_database_dir,
     )

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from hipsta_bids import __version__
-from hipsta_bids.artifacts import Status
+from hipsta_bids.artifacts import BodyMask, Status
 from hipsta_bids.bids import files, results
 from hipsta_bids.bids.derivative import source_address
 from hipsta_bids.bids.inputs import HemisphereInput
 from hipsta_bids.bids.results import ResultPlace
 from hipsta_bids.cost import CostClock
-from hipsta_bids.errors import HipstaError, OutputError
+from hipsta_bids.errors import GeometryError, HipstaError, OutputError
 from hipsta_bids.settings import Settings
 
 INTERNAL = "internal-error"
@@ -75,18 +75,19 @@ def run_job(job: Job) -> Outcome:
     Returns
     -------
     Outcome
-        ``failed`` hemispheres leave nothing but their quality record.
+        ``failed`` hemispheres leave nothing but their quality record and, if the labels tell, the
+        mask of the body.
     """
     from hipsta_bids.bids.images import read_label_volume  # noqa: PLC0415  (workers only)
-    from hipsta_bids.participant import measure_hemisphere  # noqa: PLC0415
+    from hipsta_bids.participant import find_body, measure_hemisphere  # noqa: PLC0415
 
     clock = CostClock()
     record = base_record(job)
-    hashed = None
+    hashed, volume = None, None
     try:
         with clock("read"):
-            hashed, record["inputs"] = hash_inputs(job)
-            record["input_hash"] = hashed
+            hashed, hashes = hash_inputs(job)
+            record |= {"input_hash": hashed} | hashes
             volume = read_label_volume(job.item)
         maps = measure_hemisphere(volume, job.item.hemi, job.settings, clock)
         with clock("write"):
@@ -96,7 +97,17 @@ def run_job(job: Job) -> Outcome:
     except Exception as error:  # noqa: BLE001  (one hemisphere's bug must not end the others)
         foreseen = foresee(error, job.place.root)
         trace = None if foreseen else traceback.format_exc()
-        return fail(job, foreseen or unforeseen(error), trace=trace, record=record, **clock.spent())
+        body = None
+        if volume is not None and isinstance(error, GeometryError):
+            body = find_body(volume, job.settings)
+        return fail(
+            job,
+            foreseen or unforeseen(error),
+            trace=trace,
+            record=record,
+            body=body,
+            **clock.spent(),
+        )
     status, reason, message = results.verdict(maps)
     return Outcome(
         job=job,
@@ -115,6 +126,7 @@ def fail(
     *,
     trace: str | None = None,
     record: dict[str, Any] | None = None,
+    body: BodyMask | None = None,
     **spent: Any,  # noqa: ANN401  (fields of Outcome)
 ) -> Outcome:
     """Record that a hemisphere failed, and remove what it had.
@@ -129,6 +141,8 @@ def fail(
         Traceback, if it is a bug.
     record : dict, optional
         What is known about its inputs.
+    body : BodyMask, optional
+        What could not be measured, for a person to correct.
     **spent
         Times and memory, as fields of :class:`Outcome`.
 
@@ -139,7 +153,7 @@ def fail(
     """
     record = base_record(job) if record is None else record
     try:
-        results.write_failure(job.place, error, record)
+        results.write_failure(job.place, error, record, body)
     except OutputError as worse:
         if not isinstance(error, OutputError):
             error = worse
@@ -197,6 +211,9 @@ def base_record(job: Job) -> dict[str, Any]:
         "settings_hash": job.settings_hash,
         "input_hash": None,
         "inputs": [{"file": source_address(path, sources)} for path in item.files],
+        "edited": [
+            {"what": edit.kind, "file": source_address(edit.path, sources)} for edit in item.edits
+        ],
         "scheme": item.scheme.name,
         "scheme_title": item.scheme.title,
         "chosen_because": item.why,
@@ -208,7 +225,7 @@ def base_record(job: Job) -> dict[str, Any]:
     }
 
 
-def hash_inputs(job: Job) -> tuple[str, list[dict[str, str]]]:
+def hash_inputs(job: Job) -> tuple[str, dict[str, list[dict[str, str]]]]:
     """Hash the input files and how they are read.
 
     Parameters
@@ -218,9 +235,9 @@ def hash_inputs(job: Job) -> tuple[str, list[dict[str, str]]]:
 
     Returns
     -------
-    tuple of (str, list of dict)
+    tuple of (str, dict)
         One hash of everything that decides what is measured, besides settings and version; and
-        address and hash per file.
+        address and hash per file: ``inputs``, and what a person ``edited`` of them.
 
     Raises
     ------
@@ -231,6 +248,14 @@ def hash_inputs(job: Job) -> tuple[str, list[dict[str, str]]]:
     hashes = [
         {"file": source_address(path, sources), "sha256": files.sha256_of(path)}
         for path in item.files
+    ]
+    edited = [
+        {
+            "what": edit.kind,
+            "file": source_address(edit.path, sources),
+            "sha256": files.sha256_of(edit.path),
+        }
+        for edit in item.edits
     ]
     reading = [
         [entry["sha256"] for entry in hashes],
@@ -246,5 +271,7 @@ def hash_inputs(job: Job) -> tuple[str, list[dict[str, str]]]:
             for group in (item.scheme.sheet, item.scheme.layer, item.scheme.interior)
         ],
         [item.scheme.unlisted, item.bilateral, item.code_offset, item.hemi],
+        sorted([entry["what"], entry["sha256"]] for entry in edited),
     ]
-    return hashlib.sha256(json.dumps(reading).encode()).hexdigest(), hashes
+    digest = hashlib.sha256(json.dumps(reading).encode()).hexdigest()
+    return digest, {"inputs": hashes, "edited": edited}

@@ -164,6 +164,12 @@ def _add_segmentations(parser: Parser) -> None:
         ("FILE.toml", "a protocol of your own for the BIDS dseg files"),
         type=Path,
     )
+    _add(
+        group,
+        ("--edited-dir", "--edited_dir"),
+        ("DIR", "labels (_desc-edited_dseg) and masks (_desc-edited_mask) corrected by hand"),
+        type=Path,
+    )
 
 
 def _add_processing(parser: Parser) -> None:

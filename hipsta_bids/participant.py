@@ -9,6 +9,7 @@ from contextlib import AbstractContextManager
 from dataclasses import replace
 
 from hipsta_bids.artifacts import (
+    BodyMask,
     Coordinates,
     HemisphereMaps,
     LabelVolume,
@@ -27,7 +28,8 @@ from hipsta_bids.geometry.checks import (
     name_subfields,
 )
 from hipsta_bids.geometry.coordinates import solve_coordinates
-from hipsta_bids.geometry.grid import resample_body
+from hipsta_bids.geometry.edited import check_mask
+from hipsta_bids.geometry.grid import in_plane_voxel, resample_body
 from hipsta_bids.geometry.measures import (
     SheetMeasures,
     bending_angle,
@@ -36,6 +38,7 @@ from hipsta_bids.geometry.measures import (
     summarize,
 )
 from hipsta_bids.geometry.quality import Evidence, find_flags, quality_metrics
+from hipsta_bids.geometry.repaired import repaired_columns
 from hipsta_bids.geometry.sheet import folded_fraction, label_sheet, sample_sheet, whole_body
 from hipsta_bids.geometry.surface import extract_surface, signed_volume
 from hipsta_bids.geometry.tetra import tetrahedralize
@@ -111,6 +114,8 @@ def measure_hemisphere(
         thickness = measure_thickness(sheet)
         doubts = check_end_labels(volume, body, settings.checks)
         doubts += check_thickness(thickness, boundaries.sheet_thickness, settings.checks)
+        doubts += check_mask(volume.edited_mask, in_plane_voxel(body.affine), settings.body)
+        repaired = repaired_columns(sheet, solid, settings.measures)
         return HemisphereMaps(
             sheet=sheet,
             thickness=thickness,
@@ -118,6 +123,8 @@ def measure_hemisphere(
             curvature=mean_curvature(sheet, sheet.middle, settings.measures),
             curvature_exterior=mean_curvature(sheet, -1, settings.measures),
             subfield=subfield,
+            repaired=repaired,
+            body_mask=volume.in_file(body.inside),
             summary=summarize(
                 SheetMeasures(sheet=sheet, thickness=thickness, subfield=subfield),
                 SheetMeasures(
@@ -128,12 +135,32 @@ def measure_hemisphere(
                 volume.scheme.sheet,
                 signed_volume(surface.vertices, surface.triangles),
             ),
-            qc=quality_metrics(evidence),
+            qc=quality_metrics(evidence) | {"repaired_fraction": float(repaired.mean())},
             repairs=tuple(map(str, solid.repairs)),
             flags=(*doubts, *find_flags(evidence, settings)),
             mesh=mesh,
             coordinates=coordinates,
         )
+
+
+def find_body(volume: LabelVolume, settings: Settings) -> BodyMask | None:
+    """Find the body of a hemisphere that cannot be measured, for a person to correct.
+
+    Parameters
+    ----------
+    volume : LabelVolume
+    settings : Settings
+
+    Returns
+    -------
+    BodyMask or None
+        None where the labels do not even tell where the body begins and ends.
+    """
+    try:
+        body = extract_body(volume, settings.body)
+    except GeometryError:
+        return None
+    return volume.in_file(body.inside)
 
 
 def _filled(

@@ -121,7 +121,9 @@ def run_participants(
     derivative.check_not_foreign(out_dir)
     files.check_writable(out_dir)
     digest = derivative.settle_settings(out_dir, settings)
-    sources = derivative.source_names((item.source, item.source_path) for item in items)
+    origins = [(item.source, item.source_path) for item in items]
+    origins += [(edit.source, edit.source_path) for item in items for edit in item.edits]
+    sources = derivative.source_names(origins)
     derivative.write_description(out_dir, sources)
     derivative.write_citation(out_dir, settings, _schemes(items))
     write_sidecar(out_dir)

@@ -35,6 +35,8 @@ class BodySettings:
     """Without end labels: the body ends where a slice shows two pieces above this area, mm2."""
     head_growth: float = 1.35
     """Without end labels: ... or twice running an area above this multiple of the median."""
+    max_mask_ratio: float = 1.5
+    """Flag an edited mask whose voxels are more than this many times those of the labels."""
 
     def __post_init__(self) -> None:
         rules = ("nearest-sheet", "nearest-label")
@@ -231,8 +233,13 @@ class MeasureSettings:
     """Grid nodes over which a local polynomial is fitted, odd."""
     curvature_order: int = 3
     """Order of the local polynomials."""
+    repair_reach: float = 0.35
+    """A column is marked as repaired this near to a grid node that a repair changed, mm."""
+    stump_reach: float = 0.7
+    """... and up to this much farther from a cut than what is nearest to it, mm."""
 
     def __post_init__(self) -> None:
+        _require(self.repair_reach > 0, "measures.repair_reach must be positive")
         _require(self.curvature_window % 2 == 1, "measures.curvature_window must be odd")
         _require(
             1 < self.curvature_order < self.curvature_window,

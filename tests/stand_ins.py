@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from hipsta_bids.artifacts import (
+    BodyMask,
     Coordinates,
     Flag,
     HemisphereMaps,
@@ -53,7 +54,7 @@ def make_scheme(name="demo"):
     )
 
 
-def make_maps(*, hemi="L", flags=(), repairs=(), holes=()):
+def make_maps(*, hemi="L", flags=(), repairs=(), holes=(), repaired=()):
     """A flat sheet of constant thickness: x along RAS x (away from the midline), y along y."""
     side = -1.0 if hemi == "L" else 1.0
     x, y, z = np.meshgrid(np.arange(NX), np.arange(NY), np.linspace(-0.5, 0.5, NZ), indexing="ij")
@@ -62,6 +63,9 @@ def make_maps(*, hemi="L", flags=(), repairs=(), holes=()):
     valid = np.ones((NX, NY), bool)
     for i, j in holes:
         points[i, j], thickness[i, j], valid[i, j] = np.nan, np.nan, False
+    touched = np.zeros((NX, NY), bool)
+    for i, j in repaired:
+        touched[i, j] = True
     subfield = np.repeat([[t] for t in np.resize(TISSUES, NX)], NY, axis=1)
     return HemisphereMaps(
         sheet=Sheet(points=points, valid=valid),
@@ -70,6 +74,8 @@ def make_maps(*, hemi="L", flags=(), repairs=(), holes=()):
         curvature=np.full((NX, NY), 0.1),
         curvature_exterior=np.full((NX, NY), -1e-9),
         subfield=subfield,
+        repaired=touched,
+        body_mask=BodyMask(inside=np.eye(3)[None] > 0, affine=np.diag([0.4, 0.5, 2.0, 1.0])),
         summary={
             "thickness_mean": THICKNESS,
             "extent_x": 4.0,
@@ -141,6 +147,7 @@ def replace_measurement():
     images = types.ModuleType("hipsta_bids.bids.images")
     images.read_label_volume = lambda item: item.files[0].read_text()
     participant = types.ModuleType("hipsta_bids.participant")
+    participant.find_body = lambda *_: None
     participant.measure_hemisphere = lambda volume, hemi, _, clock: act_out(volume, hemi, clock)
     sys.modules[images.__name__] = images
     sys.modules[participant.__name__] = participant

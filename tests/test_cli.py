@@ -9,6 +9,7 @@ from stand_ins import make_input, stand_in_job
 
 from hipsta_bids import __version__, cli, runner
 from hipsta_bids.bids import dataset
+from hipsta_bids.bids.dataset import Findings
 from hipsta_bids.bids.inputs import InputRequest
 from hipsta_bids.errors import ExitCode, NothingToDoError
 from hipsta_bids.parser import EPILOG, build_parser
@@ -32,13 +33,13 @@ def seen(monkeypatch, tmp_path):
 
     def find(request):
         record["request"] = request
-        return (make_input(tmp_path / "in"),)
+        return Findings(items=(make_input(tmp_path / "in"),))
 
     def run(items, out, settings, options, report):
         record.update(items=items, out=out, settings=settings, options=options, report=report)
         return runner.RunResult(outcomes=(), n_requested=0, log=out / "log")
 
-    monkeypatch.setattr(dataset, "find_hemispheres", find)
+    monkeypatch.setattr(dataset, "find_inputs", find)
     monkeypatch.setattr(dataset, "dataset_notes", lambda *_: ())
     monkeypatch.setattr(runner, "run_participants", run)
     return record
@@ -83,9 +84,9 @@ def test_everything_reaches_its_place(seen, tmp_path):
     text = (
         "in {0}/out participant --participant-label sub-01 02 --session-label ses-a b --hemi r"
         " -d one=x -d two=y z --freesurfer-dir f --ashs-dir a --hippunfold-dir h --fs-analysis T1"
-        " --ashs-atlas ashsPMC --scheme s.toml --bids-filter-file j --bids-database-dir db"
-        " --skip-bids-validation --settings {0}/s.toml --write-meshes --force --n-procs 3"
-        " --mem 4G --timeout 9 -w {0}/work --stop-on-first-crash -vv"
+        " --ashs-atlas ashsPMC --scheme s.toml --edited-dir e --bids-filter-file j"
+        " --bids-database-dir db --skip-bids-validation --settings {0}/s.toml --write-meshes"
+        " --force --n-procs 3 --mem 4G --timeout 9 -w {0}/work --stop-on-first-crash -vv"
     )
     assert cli.main(text.format(tmp_path).split()) == 0
     assert seen["request"] == InputRequest(
@@ -100,6 +101,7 @@ def test_everything_reaches_its_place(seen, tmp_path):
         fs_analysis="T1",
         ashs_atlas="ashsPMC",
         scheme=Path("s.toml"),
+        edited_dir=Path("e"),
         bids_filter_file=Path("j"),
         bids_database_dir=Path("db"),
     )
@@ -132,6 +134,7 @@ def test_everything_reaches_its_place(seen, tmp_path):
         ("--fs-subjects-dir f", "freesurfer_dir", Path("f")),
         ("--stop_on_first_crash", "stop_on_first_crash", True),
         ("--skip_bids_validation", "skip_bids_validation", True),
+        ("--edited_dir e", "edited_dir", Path("e")),
         ("--bids_filter_file j", "bids_filter_file", Path("j")),
     ],
 )
@@ -199,7 +202,7 @@ def test_nothing_to_do(seen, monkeypatch, tmp_path, capsys):
     def find(_):
         raise NothingToDoError("nothing found in x; look", reason="no-segmentation")
 
-    monkeypatch.setattr(dataset, "find_hemispheres", find)
+    monkeypatch.setattr(dataset, "find_inputs", find)
     assert cli.main(["x", str(tmp_path / "out"), "participant"]) == ExitCode.NOTHING_TO_DO
     assert capsys.readouterr().err == "hipsta-bids: nothing found in x; look\n"
     assert not (tmp_path / "out").exists()
@@ -210,7 +213,7 @@ def test_bugs_show_their_traceback(monkeypatch, tmp_path, capsys):
     def find(_):
         raise ZeroDivisionError("tests divide by zero")
 
-    monkeypatch.setattr(dataset, "find_hemispheres", find)
+    monkeypatch.setattr(dataset, "find_inputs", find)
     assert cli.main(["x", str(tmp_path), "participant"]) == ExitCode.INTERNAL
     said = capsys.readouterr().err
     assert "Traceback" in said
@@ -222,7 +225,7 @@ def stand_in_run(monkeypatch, tmp_path):
     """A whole run with stand-ins for the search and the measurement."""
     acts = {"01": "ok", "02": "bad-shape", "03": "flagged", "04": "bug"}
     items = [make_input(tmp_path / "in", subject, act=act) for subject, act in acts.items()]
-    monkeypatch.setattr(dataset, "find_hemispheres", lambda _: items)
+    monkeypatch.setattr(dataset, "find_inputs", lambda _: Findings(items=tuple(items)))
     monkeypatch.setattr(dataset, "dataset_notes", lambda *_: ("no description",))
     for name in ("hipsta_bids.bids.images", "hipsta_bids.participant"):
         monkeypatch.setitem(sys.modules, name, None)  # put back afterwards

@@ -65,6 +65,21 @@ def test_a_clean_phantom_needs_no_repair(case):
     assert case.maps.qc["side_rule"] == "labels"
 
 
+def test_columns_at_a_filled_hole_are_marked(plain, damage):
+    spec = plain.phantom.spec
+    maps = measure(damage.erase(damage.shaft(0.5, 0.5, 0.5)))
+    assert maps.repairs
+    u, v = np.moveaxis(sheet_coordinates(plain)[..., :2], -1, 0)
+    distance = np.hypot((u - 0.5) * spec.width, (v - 0.5) * spec.length)
+    # A hole 0.5 mm wide, drawn in 0.4 mm voxels, and half of the 1.2 mm to the next column.
+    near = maps.repaired[distance < 0.3]
+    assert near.size
+    assert near.all()
+    assert not maps.repaired[distance > 0.5 + 0.4 + 0.35 + 0.6].any()
+    assert maps.qc["repaired_fraction"] == pytest.approx(maps.repaired.mean())
+    assert not plain.maps.repaired.any()
+
+
 def test_the_sheet_lies_in_the_middle_of_the_wall_from_end_to_end(case):
     u, v, n = np.moveaxis(sheet_coordinates(case), -1, 0)
     # In a wall round a cylinder the harmonic coordinate is logarithmic in the radius, so that its

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from stand_ins import THICKNESS, make_input, stand_in_job, thread_job
 from hipsta_bids import pool, runner
 from hipsta_bids.artifacts import Status
 from hipsta_bids.bids import files
+from hipsta_bids.bids.inputs import Edit
 from hipsta_bids.bids.names import OUTPUTS
 from hipsta_bids.bids.status import COLUMNS, read_status
 from hipsta_bids.errors import ExitCode, InputError, OutputError, SettingsError
@@ -171,6 +173,51 @@ def test_second_run_skips_what_is_unchanged(tmp_path):
     assert result.counts == {"ok": 1, "flagged": 1}
     assert (out / "status.tsv").read_bytes() == before
     assert {path: path.stat().st_mtime_ns for path in times} == times
+
+
+def with_edit(item, folder, text="corrected", kind="mask"):
+    path = folder / "sub-01_hemi-L_desc-edited_mask.nii.gz"
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(text)
+    edit = Edit(kind=kind, path=path, source="edited", source_path=folder)
+    return replace(item, edits=(edit,))
+
+
+def test_edits_that_appear_change_or_vanish_are_seen(tmp_path):
+    out = tmp_path / "out"
+    plain = make_input(tmp_path / "in")
+    place = run([plain], out).outcomes[0].job.place
+
+    def is_skipped(item):
+        return run([item], out).outcomes[0].skipped
+
+    assert is_skipped(plain)
+    assert not is_skipped(with_edit(plain, tmp_path / "e"))
+    assert is_skipped(with_edit(plain, tmp_path / "e"))
+    assert is_skipped(with_edit(plain, tmp_path / "elsewhere"))  # its content counts
+    assert not is_skipped(with_edit(plain, tmp_path / "e", kind="labels"))
+    assert not is_skipped(with_edit(plain, tmp_path / "e", "once more"))
+    record = json.loads(place.path("qc").read_text())
+    (edit,) = record["edited"]
+    assert edit["file"] == "bids:edited:sub-01_hemi-L_desc-edited_mask.nii.gz"
+    assert edit["sha256"] == files.sha256_of(tmp_path / "e" / edit["file"].rsplit(":", 1)[1])
+    assert [row["edited"] for row in read_status(out)] == [edit["what"]] == ["mask"]
+    description = json.loads((out / "dataset_description.json").read_text())
+    assert "edited" in description["DatasetLinks"]
+    assert not is_skipped(plain)
+    assert [row["edited"] for row in read_status(out)] == ["n/a"]
+    assert json.loads(place.path("qc").read_text())["edited"] == []
+
+
+def test_an_edit_that_cannot_be_read_fails_and_is_named(tmp_path):
+    item = with_edit(make_input(tmp_path / "in"), tmp_path / "e")
+    item.edits[0].path.unlink()
+    result = run([item], tmp_path / "out")
+    (row,) = read_status(tmp_path / "out")
+    assert (row["status"], row["edited"]) == ("failed", "mask")
+    assert "desc-edited_mask.nii.gz" in row["message"]
+    record = json.loads(result.outcomes[0].job.place.path("qc").read_text())
+    assert [edit["what"] for edit in record["edited"]] == ["mask"]
 
 
 @pytest.mark.parametrize("change", ["input", "missing", "version", "mesh", "force", "record"])

@@ -7,11 +7,12 @@ told from the labels.
 """
 
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hipsta_bids.bids.ashs import find_ashs, sample_files
 from hipsta_bids.bids.ashs_atlas import AtlasFinder, choose_atlas
+from hipsta_bids.bids.edits import EditedFile, attach_edits, edits_of_visit, list_edits
 from hipsta_bids.bids.filters import Selection, make_selection
 from hipsta_bids.bids.freesurfer import find_freesurfer
 from hipsta_bids.bids.hippunfold import find_hippunfold
@@ -26,10 +27,12 @@ from hipsta_bids.schemes import Scheme
 
 __all__ = [
     "HEMIS",
+    "Findings",
     "HemisphereInput",
     "InputRequest",
     "dataset_notes",
     "find_hemispheres",
+    "find_inputs",
     "selection_table",
 ]
 
@@ -42,8 +45,23 @@ _LOOKED_FOR = (
 _SHOWN = 6
 
 
+@dataclass(frozen=True, kw_only=True)
+class Findings:
+    """What a search found."""
+
+    items: tuple[HemisphereInput, ...]
+    """Sorted by subject, session, hemisphere, protocol. Some may have a ``problem``."""
+    notes: tuple[str, ...] = ()
+    """One line for each edited file that is not used."""
+
+
 def find_hemispheres(request: InputRequest) -> tuple[HemisphereInput, ...]:
-    """Find all segmentations that are asked for.
+    """Find all segmentations that are asked for: the items of :func:`find_inputs`."""
+    return find_inputs(request).items
+
+
+def find_inputs(request: InputRequest) -> Findings:
+    """Find all segmentations that are asked for, and what a person corrected in them.
 
     Different protocols of one hemisphere (say, FreeSurfer's and ASHS's) are separate inputs. Where
     two datasets offer the same protocol, the one that the user named comes first, then the order
@@ -55,8 +73,7 @@ def find_hemispheres(request: InputRequest) -> tuple[HemisphereInput, ...]:
 
     Returns
     -------
-    tuple of HemisphereInput
-        Sorted by subject, session, hemisphere, protocol. Some may have a ``problem``.
+    Findings
 
     Raises
     ------
@@ -74,11 +91,19 @@ def find_hemispheres(request: InputRequest) -> tuple[HemisphereInput, ...]:
     forget_folders()
     forget_tables()
     sources = list_sources(request)
-    found = [item for source in sources for item in _search(source, selection, option)]
+    folder = request.edited_dir
+    edited = list_edits(folder, selection) if folder else []
+    found: list[HemisphereInput] = []
+    for source in sources:
+        beside: list[EditedFile] = []
+        found += _search(source, selection, option, beside)
+        if folder is None or source.path.resolve() != folder.resolve():
+            edited += beside
     if not found:
         raise _nothing(request, sources)
     _check_analysis(found, request)
-    return _without_clashes(found, sources)
+    items, notes = attach_edits(_without_clashes(found, sources), edited, selection)
+    return Findings(items=items, notes=notes)
 
 
 def selection_table(items: Iterable[HemisphereInput]) -> list[dict[str, str]]:
@@ -91,8 +116,8 @@ def selection_table(items: Iterable[HemisphereInput]) -> list[dict[str, str]]:
     Returns
     -------
     list of dict
-        Keys ``subject``, ``session``, ``hemisphere``, ``file``, ``scheme``, ``why`` and
-        ``passed over``; ``n/a`` where there is nothing to say.
+        Keys ``subject``, ``session``, ``hemisphere``, ``file``, ``scheme``, ``why``, ``edited``
+        and ``passed over``; ``n/a`` where there is nothing to say.
     """
     return [
         {
@@ -103,6 +128,8 @@ def selection_table(items: Iterable[HemisphereInput]) -> list[dict[str, str]]:
             "scheme": item.scheme.name,
             "why": "; ".join((f"{item.source}: {item.why}", *item.notes))
             + (f"; NOT USABLE: {item.problem}" if item.problem else ""),
+            "edited": " + ".join(_relative(edit.path, edit.source_path) for edit in item.edits)
+            or "n/a",
             "passed over": "; ".join(f"{name}: {why}" for name, why in item.passed_over) or "n/a",
         }
         for item in items
@@ -140,11 +167,13 @@ def _search(
     source: Source,
     selection: Selection,
     option: Scheme | None,
+    beside: list[EditedFile],
 ) -> Iterator[HemisphereInput]:
-    """Search one dataset for all kinds of segmentations."""
+    """Search one dataset for all kinds of segmentations, and add the edited files beside them."""
     folders = [folder for folder in subject_folders(source.path) if selection.wants_folder(folder)]
     atlases = AtlasFinder(source.path, option, sample_files(source))
     for visit in filter(selection.wants_visit, list_visits(folders)):
+        beside += edits_of_visit(visit, source.path, source.name, beside=True)
         yield from _search_visit(visit, source, selection, atlases)
 
 

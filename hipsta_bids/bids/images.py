@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from hipsta_bids.artifacts import LabelVolume
 from hipsta_bids.bids.inputs import HemisphereInput
+from hipsta_bids.bids.masks import sample_mask, sample_nearest, within
 from hipsta_bids.errors import InputError, SchemeError
 from hipsta_bids.schemes import Part, Scheme, Tissue, load_scheme, scheme_names, translate
 from hipsta_bids.schemes.scheme import OUTSIDE
@@ -26,6 +27,9 @@ VOXEL_SIZES = (0.05, 5.0)
 
 #: How far the affines of files that are combined may differ [mm, and 1 per voxel].
 SAME_GRID = 1e-3
+
+#: Least share of edited labels that has to lie where the original labels are.
+SAME_PLACE = 0.5
 
 #: All that nibabel and its decompressors raise on damaged files.
 _READ_ERRORS = (
@@ -49,7 +53,7 @@ def read_label_volume(item: HemisphereInput) -> LabelVolume:
     The volume is cropped to the hippocampal labels (not the cortical ones) plus 5 mm on each side,
     as far as the image goes. The affine is the image's own, moved by the crop: scanner RAS
     for MGZ, sform before qform for NIfTI. A NIfTI without either has no known left and right, and
-    is refused.
+    is refused. Labels and mask that a person edited come from their own files, on any grid.
 
     Parameters
     ----------
@@ -65,13 +69,15 @@ def read_label_volume(item: HemisphereInput) -> LabelVolume:
         ``item.problem``, if there is one.
     InputError
         ``unreadable-image``, ``not-3d``, ``bad-affine``, ``bad-voxel-size``,
-        ``non-integer-labels``, ``empty-labels`` or ``grid-mismatch``.
+        ``non-integer-labels``, ``empty-labels``, ``grid-mismatch``, or, of edited files,
+        ``edited-elsewhere`` or what :func:`~hipsta_bids.bids.masks.sample_mask` raises.
     SchemeError
         ``unknown-labels`` or ``wrong-scheme``.
     """
     if item.problem is not None:
         raise item.problem
-    path, *others = item.files
+    labels, mask = item.edit("labels"), item.edit("mask")
+    path = labels.path if labels else item.files[0]
     data, affine = _open(path)
     # A first crop in the type on disk saves memory; it is wide enough for the final one.
     box = _bounding_box(data != 0, affine, path)
@@ -79,25 +85,65 @@ def read_label_volume(item: HemisphereInput) -> LabelVolume:
     shape = data.shape
     del data
     tissue, part = _translate(codes, item.scheme, path)
-    for other in others:
-        more, other_affine = _open(other)
-        if more.shape != shape or not np.allclose(other_affine, affine, rtol=0, atol=SAME_GRID):
-            raise InputError(
-                f"{other}: its grid differs from that of {path.name}, with which it is combined; "
-                "use files of the same run",
-                reason="grid-mismatch",
-            )
+    for other in item.files[1:]:
+        more = _beside(other, path, shape, affine, edited=labels is not None)
         _, parts = _translate(_integers(more[box], other), item.parts_scheme or item.scheme, other)
         part = np.where(parts == Part.UNKNOWN, part, parts)
     part = np.where(tissue == Tissue.BACKGROUND, np.uint8(Part.UNKNOWN), part)
-    inner = _bounding_box(~np.isin(tissue, tuple(OUTSIDE)), affine, path)
+    hippocampal = ~np.isin(tissue, tuple(OUTSIDE))
+    inner = _bounding_box(hippocampal, affine, path)
     start = np.array([a.start + b.start for a, b in zip(box, inner, strict=True)])
+    cropped = _shift(affine, start)
+    if labels:
+        _check_same_place(hippocampal[inner], cropped, item, path)
     return LabelVolume(
         tissue=tissue[inner],
         part=part[inner],
-        affine=_shift(affine, start),
+        affine=cropped,
         scheme=item.scheme,
+        edited_mask=(
+            sample_mask(*_open(mask.path), cropped, tissue[inner].shape, mask.path)
+            if mask
+            else None
+        ),
+        start=(int(start[0]), int(start[1]), int(start[2])),
+        file_shape=(int(shape[0]), int(shape[1]), int(shape[2])),
     )
+
+
+def _beside(
+    other: Path, path: Path, shape: tuple[int, ...], affine: NDArray[np.float64], *, edited: bool
+) -> NDArray[Any]:
+    """Read a second file on the grid of the first, which may be another's only if edited."""
+    data, own = _open(other)
+    if data.shape == shape and np.allclose(own, affine, rtol=0, atol=SAME_GRID):
+        return data
+    if edited:
+        return sample_nearest(_integers(data, other), own, affine, shape)
+    raise InputError(
+        f"{other}: its grid differs from that of {path.name}, with which it is combined; "
+        "use files of the same run",
+        reason="grid-mismatch",
+    )
+
+
+def _check_same_place(
+    hippocampal: NDArray[np.bool_], affine: NDArray[np.float64], item: HemisphereInput, path: Path
+) -> None:
+    """Refuse edited labels that lie elsewhere than those which they correct."""
+    original = item.files[0]
+    try:
+        data, own = _open(original)
+        box = _bounding_box(data != 0, own, original)
+    except InputError:  # that may be why a person made others
+        return
+    share = within(hippocampal, affine, box, own)
+    if share < SAME_PLACE:
+        raise InputError(
+            f"{path}: {1 - share:.0%} of the edited labels lie elsewhere than those of "
+            f"{original.name}; keep the orientation and position of the image that was edited",
+            reason="edited-elsewhere",
+        )
 
 
 def label_values(path: Path) -> frozenset[int]:

@@ -33,8 +33,22 @@ class InputRequest:
     scheme: Path | None = None
     """The user's protocol file, for labels that no bundled protocol describes (for ASHS's, see
     ``ashs_atlas``)."""
+    edited_dir: Path | None = None
+    """Labels and masks that a person corrected."""
     bids_filter_file: Path | None = None
     bids_database_dir: Path | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Edit:
+    """A file that a person corrected."""
+
+    kind: str
+    """``labels`` (it replaces the label image) or ``mask`` (of the body)."""
+    path: Path
+    source: str
+    """Name of the dataset that it is in."""
+    source_path: Path
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,6 +82,12 @@ class HemisphereInput:
     """Found, but not usable: this hemisphere fails, the others go on."""
     notes: tuple[str, ...] = ()
     """What a reader should know about this choice."""
+    edits: tuple[Edit, ...] = ()
+    """Corrections by a person that take the place of what the files say."""
+
+    def edit(self, kind: str) -> Edit | None:
+        """Return the edit of one kind, if there is one."""
+        return next((edit for edit in self.edits if edit.kind == kind), None)
 
     @property
     def key(self) -> tuple[str, str, str, str]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
+from hipsta_bids.bids.edits import is_edited
 from hipsta_bids.bids.filters import Selection
 from hipsta_bids.bids.hippunfold import is_hippunfold
 from hipsta_bids.bids.inputs import HemisphereInput
@@ -95,7 +96,7 @@ def _choose(files: list[_File], visit: Visit, hemi: str, source: Source) -> Hemi
 def _files(visit: Visit, hemi: str, source: Source, selection: Selection) -> Iterator[_File]:
     for folder in visit.folders:
         for name in folder.names:
-            if f"_hemi-{hemi}_" not in name or "dseg." not in name:
+            if f"_hemi-{hemi}_" not in name or "dseg." not in name or is_edited(name):
                 continue
             pairs = entities(name)
             path = folder.path / name

@@ -122,6 +122,13 @@ OUTPUTS: tuple[Output, ...] = (
         in_standard=True,
     ),
     Output(
+        key="body_mask",
+        desc="body",
+        suffix="mask",
+        extension=".nii.gz",
+        description="the measured body on the grid of the labels; edit a copy to correct it",
+    ),
+    Output(
         key="mesh",
         desc="tet",
         suffix="mesh",

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from hipsta_bids.artifacts import Bool, Float, HemisphereMaps, Status
-from hipsta_bids.bids import files, gifti, tables
+from hipsta_bids.artifacts import BodyMask, Bool, Float, HemisphereMaps, Status
+from hipsta_bids.bids import files, gifti, masks, tables
 from hipsta_bids.bids.names import OUTPUTS, HemisphereName, output_path
 from hipsta_bids.errors import HipstaError
 from hipsta_bids.schemes import Scheme
@@ -84,6 +84,7 @@ def write_results(
     tables.write_summary(place.path("summary"), place.path("summary_sidecar"), maps.summary)
     for key, content in gifti_files(maps, scheme, place.name.hemi):
         files.write_bytes(place.path(key), content)
+    files.write_bytes(place.path("body_mask"), masks.mask_bytes(maps.body_mask))
     if write_meshes:
         from hipsta_bids.bids.meshes import mesh_bytes  # noqa: PLC0415  (meshio is slow to load)
 
@@ -105,8 +106,13 @@ def write_results(
     )
 
 
-def write_failure(place: ResultPlace, error: HipstaError, record: Mapping[str, Any]) -> None:
-    """Leave nothing of a failed hemisphere but its quality record, which says why.
+def write_failure(
+    place: ResultPlace,
+    error: HipstaError,
+    record: Mapping[str, Any],
+    body: BodyMask | None = None,
+) -> None:
+    """Leave nothing of a failed hemisphere but its quality record, and its body to be corrected.
 
     Parameters
     ----------
@@ -116,6 +122,8 @@ def write_failure(place: ResultPlace, error: HipstaError, record: Mapping[str, A
         Why it failed.
     record : mapping
         Inputs, hashes, version, as far as known.
+    body : BodyMask, optional
+        What could not be measured, if known.
 
     Raises
     ------
@@ -123,6 +131,8 @@ def write_failure(place: ResultPlace, error: HipstaError, record: Mapping[str, A
         If it cannot be written.
     """
     remove_results(place)
+    if body is not None:
+        files.write_bytes(place.path("body_mask"), masks.mask_bytes(body))
     verdict = {"status": Status.FAILED, "reason": error.reason, "message": str(error)}
     files.write_json(place.path("qc"), verdict | dict(record))
 

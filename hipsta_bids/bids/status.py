@@ -24,6 +24,7 @@ COLUMNS: dict[str, str] = {
     " failed: there are no maps",
     "reason": "machine-readable reasons, joined by +",
     "message": "what happened and what to try",
+    "edited": "what a person corrected: labels, mask, joined by +",
     "version": "version of hipsta_bids",
     "settings_hash": "SHA-256 of the resolved settings",
     "input_hash": "SHA-256 of the input files and of how they are read",

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hipsta_bids.artifacts import Float, HemisphereMaps
+from hipsta_bids.artifacts import Bool, Float, HemisphereMaps
 from hipsta_bids.bids import files
 from hipsta_bids.schemes import Label, Part, Scheme, Tissue
 
@@ -22,6 +22,7 @@ SHEET_COLUMNS: dict[str, tuple[str, str | None]] = {
     "curvature_exterior": ("mean curvature of the exterior surface, sign as above", "1/mm"),
     "subfield": ("subfield at the mid-surface", None),
     "valid": ("true where measured directly, false where filled or missing", None),
+    "repaired": ("true where a repair of the labels' topology touched the column", None),
 }
 
 #: Columns of the summary table that every hemisphere has.
@@ -124,7 +125,8 @@ def write_sheet(table: Path, sidecar: Path, maps: HemisphereMaps, scheme: Scheme
             for name in ("curvature", "curvature_interior", "curvature_exterior")
         },
         "subfield": [short.get(code, files.MISSING) for code in maps.subfield.ravel().tolist()],
-        "valid": ["true" if v else "false" for v in maps.sheet.valid.ravel().tolist()],
+        "valid": _truths(maps.sheet.valid),
+        "repaired": _truths(maps.repaired),
     }
     # One order of columns, stated once.
     files.write_tsv(
@@ -162,6 +164,10 @@ def write_summary(table: Path, sidecar: Path, summary: Mapping[str, float]) -> N
     ]
     files.write_tsv(table, list(definitions), [[cell[0] for cell in cells]])
     files.write_json(sidecar, definitions)
+
+
+def _truths(values: Bool) -> list[str]:
+    return ["true" if value else "false" for value in values.ravel().tolist()]
 
 
 def _definition(description: str, unit: str | None) -> dict[str, object]:

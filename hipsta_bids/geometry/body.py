@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 
 from hipsta_bids.artifacts import Bool, Float, LabelVolume
 from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry.edited import apply_mask
 from hipsta_bids.geometry.ends import EndPlanes, find_end_planes
 from hipsta_bids.schemes import Tissue
 from hipsta_bids.settings import BodySettings
@@ -72,6 +73,10 @@ def extract_body(volume: LabelVolume, settings: BodySettings) -> Body:
             reason="no-sheet-labels",
         )
     ends = find_end_planes(volume, tissue, settings)
+    if volume.edited_mask is not None:
+        volume, tissue = apply_mask(volume, tissue, volume.edited_mask, ends)
+        # What the mask took away may have turned the long axis.
+        ends = find_end_planes(volume, tissue, settings)
     index = np.argwhere(tissue > 0)
     points = index @ volume.affine[:3, :3].T + volume.affine[:3, 3]
     between = (ends.height(points, "posterior") > 0) & (ends.height(points, "anterior") < 0)

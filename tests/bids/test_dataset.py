@@ -351,6 +351,7 @@ def test_the_table_for_a_dry_run(tmp_path):
         ),
         "scheme": "freesurferCA",
         "why": "fs: subfields from .CA, head/body/tail from .HBT, analysis unnamed",
+        "edited": "n/a",
         "passed over": (
             "lh.hippoAmygLabels.CA.FSvoxelSpace.mgz: resampled to 1 mm; a finer file exists"
         ),

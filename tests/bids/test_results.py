@@ -69,6 +69,13 @@ def test_sheet_table(written):
     assert table.index[table.thickness.isna()].tolist() == [ROW]
 
 
+def test_repaired_columns_are_marked(tmp_path):
+    place, _ = write(tmp_path, repaired=[HOLE])
+    table = pd.read_csv(place.path("sheet"), sep="\t")
+    assert table.repaired.dtype == bool
+    assert table.index[table.repaired].tolist() == [ROW]
+
+
 def test_missing_is_spelled_and_zero_has_no_sign(written):
     place, _ = written
     text = place.path("sheet").read_text()
@@ -229,6 +236,17 @@ def test_failure_leaves_only_its_record(tmp_path):
         "version": "x",
     }
     assert all(path.exists() for path in other.paths(optional=True))
+
+
+def test_failure_leaves_the_body_to_be_corrected(tmp_path):
+    place, maps = write(tmp_path)
+    write_failure(place, GeometryError("holes", reason="topology"), {}, maps.body_mask)
+    left = {path for path in place.paths(optional=True) if path.exists()}
+    assert left == {place.path("qc"), place.path("body_mask")}
+    image = nib.load(place.path("body_mask"))
+    np.testing.assert_array_equal(np.asarray(image.dataobj) > 0, maps.body_mask.inside)
+    remove_results(place)
+    assert not place.path("body_mask").exists()
 
 
 def test_removal_of_nothing_is_fine(tmp_path):
