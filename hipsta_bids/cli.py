@@ -166,6 +166,7 @@ def _request(options: "Namespace") -> "InputRequest":
         ashs_atlas=options.ashs_atlas,
         scheme=options.scheme,
         edited_dir=options.edited_dir,
+        output_dir=options.output_dir,
         bids_filter_file=options.bids_filter_file,
         bids_database_dir=options.bids_database_dir,
     )

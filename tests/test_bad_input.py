@@ -140,7 +140,9 @@ def test_bad_hemispheres_fail_alone(good, tmp_path, capsys):
     assert {subject: found[f"sub-{subject}", "L"]["reason"] for subject in expected} == expected
     for subject in expected:
         assert found[f"sub-{subject}", "L"]["status"] == "failed"
-        assert outputs(out, subject, "L") == {"qc"}
+        # Where the labels tell, the body is left for a person to look at.
+        body = {"body_mask"} if subject == "swapped" else set()
+        assert outputs(out, subject, "L") == {"qc"} | body
     for hemi in ("L", "R"):
         assert found["sub-good", hemi]["status"] != "failed"
         assert outputs(out, "good", hemi) == COMPLETE

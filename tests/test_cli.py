@@ -71,7 +71,7 @@ def test_installed_command_runs():
 
 def test_defaults(seen, tmp_path):
     assert cli.main(["in", str(tmp_path), "participant"]) == 0
-    assert seen["request"] == InputRequest(bids_dir=Path("in"))
+    assert seen["request"] == InputRequest(bids_dir=Path("in"), output_dir=tmp_path)
     assert seen["settings"] == Settings()
     n_procs = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     assert seen["options"] == RunOptions(n_procs=n_procs)
@@ -102,6 +102,7 @@ def test_everything_reaches_its_place(seen, tmp_path):
         ashs_atlas="ashsPMC",
         scheme=Path("s.toml"),
         edited_dir=Path("e"),
+        output_dir=tmp_path / "out",
         bids_filter_file=Path("j"),
         bids_database_dir=Path("db"),
     )

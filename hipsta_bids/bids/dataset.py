@@ -12,7 +12,13 @@ from pathlib import Path
 
 from hipsta_bids.bids.ashs import find_ashs, sample_files
 from hipsta_bids.bids.ashs_atlas import AtlasFinder, choose_atlas
-from hipsta_bids.bids.edits import EditedFile, attach_edits, edits_of_visit, list_edits
+from hipsta_bids.bids.edits import (
+    EditedFile,
+    attach_edits,
+    each_once,
+    edits_of_visit,
+    list_edits,
+)
 from hipsta_bids.bids.filters import Selection, make_selection
 from hipsta_bids.bids.freesurfer import find_freesurfer
 from hipsta_bids.bids.hippunfold import find_hippunfold
@@ -91,18 +97,14 @@ def find_inputs(request: InputRequest) -> Findings:
     forget_folders()
     forget_tables()
     sources = list_sources(request)
-    folder = request.edited_dir
-    edited = list_edits(folder, selection) if folder else []
+    edited = list_edits(request, selection)
     found: list[HemisphereInput] = []
     for source in sources:
-        beside: list[EditedFile] = []
-        found += _search(source, selection, option, beside)
-        if folder is None or source.path.resolve() != folder.resolve():
-            edited += beside
+        found += _search(source, selection, option, edited)
     if not found:
         raise _nothing(request, sources)
     _check_analysis(found, request)
-    items, notes = attach_edits(_without_clashes(found, sources), edited, selection)
+    items, notes = attach_edits(_without_clashes(found, sources), each_once(edited), selection)
     return Findings(items=items, notes=notes)
 
 
@@ -167,13 +169,13 @@ def _search(
     source: Source,
     selection: Selection,
     option: Scheme | None,
-    beside: list[EditedFile],
+    edited: list[EditedFile],
 ) -> Iterator[HemisphereInput]:
     """Search one dataset for all kinds of segmentations, and add the edited files beside them."""
     folders = [folder for folder in subject_folders(source.path) if selection.wants_folder(folder)]
     atlases = AtlasFinder(source.path, option, sample_files(source))
     for visit in filter(selection.wants_visit, list_visits(folders)):
-        beside += edits_of_visit(visit, source.path, source.name, beside=True)
+        edited += edits_of_visit(visit, source.path, source.name, beside=True)
         yield from _search_visit(visit, source, selection, atlases)
 
 

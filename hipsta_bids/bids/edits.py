@@ -1,22 +1,24 @@
 """Labels and masks that a person corrected: ``*_desc-edited_dseg`` and ``*_desc-edited_mask``.
 
-They lie beside the labels that they correct, or in a folder of their own (``--edited-dir``), laid
-out like a BIDS derivative: ``sub-X[/ses-Y]/anat/sub-X[_ses-Y]_hemi-H[_seg-P]_desc-edited_dseg``.
+They lie beside the labels that they correct, in the output dataset, or in a folder of their own
+(``--edited-dir``), laid out like a BIDS derivative:
+``sub-X[/ses-Y]/anat/sub-X[_ses-Y]_hemi-H[_seg-P]_desc-edited_dseg``.
 """
 
+import contextlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hipsta_bids.bids.filters import Selection
-from hipsta_bids.bids.inputs import Edit, HemisphereInput
+from hipsta_bids.bids.inputs import Edit, HemisphereInput, InputRequest
 from hipsta_bids.bids.label_tables import entities, read_table
 from hipsta_bids.bids.scan import Visit, list_visits, subject_folders
 from hipsta_bids.errors import HipstaError, InputError
 from hipsta_bids.schemes import scheme_from_names
 
-#: Name under which ``--edited-dir`` appears in addresses.
-EDITED = "edited"
+#: Names under which ``--edited-dir`` and the output dataset appear in addresses.
+_EDITED, _OUTPUT = "edited", "output"
 
 #: What an edited file replaces, by its suffix.
 _KINDS = {"dseg": "labels", "mask": "mask"}
@@ -76,13 +78,14 @@ def edits_of_visit(visit: Visit, root: Path, source: str, *, beside: bool) -> It
             yield EditedFile(edit=edit, subject=visit.subject, session=visit.session, beside=beside)
 
 
-def list_edits(edited_dir: Path, selection: Selection) -> list[EditedFile]:
-    """List the files in a folder of edits, of the subjects and sessions that are wanted.
+def list_edits(request: InputRequest, selection: Selection) -> list[EditedFile]:
+    """List the edited files of ``--edited-dir`` and of the output dataset.
 
     Parameters
     ----------
-    edited_dir : Path
+    request : InputRequest
     selection : Selection
+        Subjects and sessions that are not wanted are left out.
 
     Returns
     -------
@@ -91,14 +94,30 @@ def list_edits(edited_dir: Path, selection: Selection) -> list[EditedFile]:
     Raises
     ------
     InputError
-        If the folder is missing or cannot be listed.
+        If the folder that the user gave is missing or cannot be listed.
     """
-    folders = [folder for folder in subject_folders(edited_dir) if selection.wants_folder(folder)]
+    found = []
+    if request.edited_dir is not None:
+        found += _edits_of_dataset(request.edited_dir, _EDITED, selection)
+    # Whether it can be read is for those to say who write there.
+    with contextlib.suppress(InputError):
+        if request.output_dir is not None:
+            found += _edits_of_dataset(request.output_dir, _OUTPUT, selection)
+    return each_once(found)
+
+
+def _edits_of_dataset(root: Path, name: str, selection: Selection) -> list[EditedFile]:
+    folders = [folder for folder in subject_folders(root) if selection.wants_folder(folder)]
     return [
         file
         for visit in filter(selection.wants_visit, list_visits(folders))
-        for file in edits_of_visit(visit, edited_dir, EDITED, beside=False)
+        for file in edits_of_visit(visit, root, name, beside=False)
     ]
+
+
+def each_once(edited: Iterable[EditedFile]) -> list[EditedFile]:
+    """Keep the first of entries for the same file: folders may be given twice."""
+    return list({file.edit.path.resolve(): file for file in reversed(list(edited))}.values())[::-1]
 
 
 def attach_edits(
@@ -219,6 +238,14 @@ def _described(item: HemisphereInput) -> HemisphereInput:
         scheme = scheme_from_names(read_table(table), name=item.scheme.name, origin=table.name)
     except HipstaError as error:
         return replace(item, problem=item.problem or error)
+    # The citation is that of the protocol; a table has none.
+    scheme = replace(scheme, title=item.scheme.title, citation=item.scheme.citation)
     return replace(
-        item, scheme=scheme, parts_scheme=None, files=item.files[:1], bilateral=False, code_offset=0
+        item,
+        scheme=scheme,
+        parts_scheme=None,
+        files=item.files[:1],
+        bilateral=False,
+        code_offset=0,
+        notes=(*item.notes, f"edited labels are named by {table.name}"),
     )

@@ -35,6 +35,8 @@ class InputRequest:
     ``ashs_atlas``)."""
     edited_dir: Path | None = None
     """Labels and masks that a person corrected."""
+    output_dir: Path | None = None
+    """Where results go, and where a person may have corrected them."""
     bids_filter_file: Path | None = None
     bids_database_dir: Path | None = None
 

@@ -172,6 +172,18 @@ def test_the_folder_of_edits_may_be_a_dataset_that_is_searched(data):
     assert notes == ()
 
 
+def test_edits_in_the_output_folder_are_found(data, tmp_path):
+    out = tmp_path / "out"
+    assert search(data, output_dir=out)[1] == ()  # not there yet
+    name = "sub-01_hemi-L_seg-freesurfer_desc-edited_mask.nii.gz"
+    touch(out / "sub-01" / "anat", name, name.replace("edited", "body"))
+    for options in ({}, {"edited_dir": out}):  # naming it twice is no ambiguity
+        items, notes = search(data, output_dir=out, **options)
+        assert names(items[LEFT]) == [("mask", name)]
+        assert items[LEFT].problem is None
+        assert notes == ()
+
+
 def test_a_missing_folder_is_an_error(data, tmp_path):
     with pytest.raises(InputError, match="no such folder"):
         search(data, edited_dir=tmp_path / "none")
@@ -185,6 +197,8 @@ def test_a_table_beside_edited_labels_says_what_they_are(data):
     items, _ = search(data)
     scheme = items[LEFT].scheme
     assert scheme.name == "freesurfer"
+    assert "Iglesias" in scheme.citation
+    assert any(table.name in note for note in items[LEFT].notes)
     assert {label.code: label.tissue for label in scheme.labels} == {
         1: Tissue.SUBICULUM,
         2: Tissue.CA1,
