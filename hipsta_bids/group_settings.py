@@ -12,6 +12,70 @@ def _require(condition: bool, message: str) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
+class RegistrationSettings:
+    """Registration of curvature profiles along x.
+
+    The first numbers are those of the paper (Diers et al. 2023, appendix B) and of R's
+    ``registr``; those that start with ``penalized`` belong to the other method.
+    """
+
+    align: str = "registr"
+    """``registr`` (Wrobel et al. 2018), ``penalized`` (finer warps, held back by a penalty that is
+    estimated) or ``none``."""
+    template_splines: int = 8
+    """Cubic B-splines of the template (Kt)."""
+    warp_splines: int = 4
+    """Cubic B-splines of a warp (Kh); 4 leave two numbers free."""
+    components: int = 1
+    """Principal components by which a profile may differ from the mean one (npc)."""
+    penalized_template_splines: int = 12
+    """As above."""
+    penalized_warp_splines: int = 6
+    """As above."""
+    penalized_components: int = 2
+    """As above."""
+    penalized_start_sd: float = 0.3
+    """Standard deviation of the logarithms of a warp's local stretch, to start with."""
+    center: bool = True
+    """Keep the mean warp at identity in each iteration; else all maps drift together."""
+    iterations: int = 10
+    """Most turns of template and warps."""
+    tolerance: float = 1e-4
+    """Turns end when warps change by less than this, mean square, sheet = 1."""
+    penalized_iterations: int = 20
+    """As above."""
+    penalized_tolerance: float = 1e-7
+    """As above."""
+    em_iterations: int = 50
+    """Most steps of expectation and maximization for the components."""
+    em_tolerance: float = 1e-4
+    """They end when squared coefficients, of profiles over their SD, change by less than this."""
+    warp_steps: int = 60
+    """Most steps of a warp's fit."""
+    warp_tolerance: float = 1e-10
+    """A warp's fit ends when its loss falls by less than this fraction."""
+    least_stretch: float = 0.02
+    """No increment of a warp's coefficients starts below this; sheet = 1."""
+    min_subjects: int = 10
+    """Fewer profiles than this give no template."""
+    max_gap: float = 0.2
+    """Profiles are filled along x if at most this fraction of them is missing."""
+    extreme: float = 4.0
+    """Flag warps whose mean displacement is so many robust SDs above the median."""
+
+    def __post_init__(self) -> None:
+        ways = ("registr", "penalized", "none")
+        _require(self.align in ways, f"registration.align must be one of {', '.join(ways)}")
+        for name in ("template", "warp", "penalized_template", "penalized_warp"):
+            splines = getattr(self, f"{name}_splines")
+            _require(splines >= 4, f"registration.{name}_splines must be at least 4")  # noqa: PLR2004 -- said there
+        _require(self.components > 0, "registration.components must be at least 1")
+        _require(
+            self.penalized_components > 0, "registration.penalized_components must be at least 1"
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
 class GlmSettings:
     """The linear model at each point."""
 
@@ -90,6 +154,7 @@ class ClassificationSettings:
 class GroupSettings:
     """All settings of the group level."""
 
+    registration: RegistrationSettings = field(default_factory=RegistrationSettings)
     glm: GlmSettings = field(default_factory=GlmSettings)
     multiplicity: MultiplicitySettings = field(default_factory=MultiplicitySettings)
     classification: ClassificationSettings = field(default_factory=ClassificationSettings)

@@ -1,0 +1,314 @@
+"""Registration of curvature profiles, so that the same grid node means the same place."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from hipsta_bids.errors import ModelError
+from hipsta_bids.group.splines import inner_knots, make_basis
+from hipsta_bids.group.template import Template, fit_template, subject_curves
+from hipsta_bids.group.warps import WarpBasis, fit_warps, warp_values
+from hipsta_bids.group_settings import RegistrationSettings
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Registration:
+    """Warps of all subjects, and what they did."""
+
+    warps: FloatArray
+    """(subjects, nodes) registered coordinate of each node, 0..1."""
+    template: Template | None
+    """None without registration."""
+    iterations: int
+    converged: bool
+    explained_before: float
+    """Share of the variance of all profile values that the mean profile explains."""
+    explained_after: float
+    displacement: FloatArray
+    """(subjects,) root mean square of warp minus identity, in grid nodes."""
+    extreme: BoolArray
+    """(subjects,) whose displacement is out of line."""
+
+
+@dataclass(frozen=True)
+class GroupShift:
+    """By how much a group was displaced."""
+
+    mean: FloatArray
+    """(nodes,) registered minus original position, in grid nodes; positive is lateral."""
+    se: FloatArray
+    """(nodes,)"""
+    n: int
+
+
+@dataclass(frozen=True)
+class _Method:
+    """The numbers of one of the two methods."""
+
+    template_splines: int
+    warp_splines: int
+    components: int
+    iterations: int
+    tolerance: float
+    variance: float
+
+    @classmethod
+    def choose(cls, settings: RegistrationSettings) -> "_Method":
+        if settings.align == "penalized":
+            return cls(
+                settings.penalized_template_splines,
+                settings.penalized_warp_splines,
+                settings.penalized_components,
+                settings.penalized_iterations,
+                settings.penalized_tolerance,
+                settings.penalized_start_sd**2,
+            )
+        return cls(
+            settings.template_splines,
+            settings.warp_splines,
+            settings.components,
+            settings.iterations,
+            settings.tolerance,
+            np.inf,
+        )
+
+
+def mean_profiles(maps: FloatArray, settings: RegistrationSettings) -> FloatArray:
+    """Profiles along x: means over y, with gaps filled linearly.
+
+    Parameters
+    ----------
+    maps : ndarray, shape (subjects, x, y)
+        Curvature, NaN where missing.
+    settings : RegistrationSettings
+        How much may be missing.
+
+    Raises
+    ------
+    ModelError
+        If too much of a profile is missing; names the rows.
+    """
+    present = np.isfinite(maps)
+    counts = present.sum(axis=2)
+    sums = np.where(present, maps, 0.0).sum(axis=2)
+    profiles = sums / np.maximum(counts, 1)
+    empty = counts == 0
+    bad = np.flatnonzero(empty.mean(axis=1) > settings.max_gap)
+    if len(bad):
+        raise ModelError(
+            f"registration: rows {', '.join(map(str, bad[:10]))} of the maps lack more than"
+            f" {settings.max_gap:.0%} of the profile; leave them out",
+            reason="profile-missing",
+        )
+    nodes = np.arange(maps.shape[1])
+    for row in np.flatnonzero(empty.any(axis=1)):  # few
+        gaps = empty[row]
+        profiles[row, gaps] = np.interp(nodes[gaps], nodes[~gaps], profiles[row, ~gaps])
+    return np.asarray(profiles, dtype=np.float64)
+
+
+def register(profiles: FloatArray, settings: RegistrationSettings) -> Registration:
+    """Register profiles to a template that is made from them.
+
+    ``registr`` takes turns: each profile is warped onto its own approximation by the mean and
+    the principal components; these are estimated again from the warped profiles (Wrobel et al.
+    2018, as in version 2.1.1 of the R package of that name). Profiles are divided by their
+    standard deviation, since the algorithm is not free of scale. Unlike R, the mean warp is
+    kept at identity (setting ``center``). ``penalized`` has finer warps with a normal prior on
+    the logarithms of local stretch, whose variance is estimated along with the rest.
+
+    Parameters
+    ----------
+    profiles : ndarray, shape (subjects, nodes)
+        Curvature along x, without missing values.
+    settings : RegistrationSettings
+        Method and its numbers.
+
+    Raises
+    ------
+    ModelError
+        If there are too few profiles, or values are missing or all the same.
+    """
+    if settings.align == "none":
+        return _finish(profiles, _identity(profiles), None, settings, 0, converged=True)
+    scale = _check(profiles, settings)
+    method = _Method.choose(settings)
+    scaled = profiles / scale
+    basis = WarpBasis.make(profiles.shape[1], method.warp_splines)
+    warps = _identity(profiles)
+    knots = inner_knots(warps, method.template_splines)
+    mean = np.linalg.lstsq(make_basis(knots)(warps[0]), scaled.mean(axis=0), rcond=None)[0]
+    curves = np.tile(mean, (len(profiles), 1))
+    parameters = np.zeros((len(profiles), len(basis.identity)))
+    variance, noise = method.variance, 1.0
+    turn = 0
+    while True:
+        fit = fit_warps(
+            scaled, knots, curves, basis, parameters, penalty=noise / variance, settings=settings
+        )
+        parameters = fit.parameters
+        if np.isfinite(variance):
+            variance = float(np.mean(parameters**2) + noise * fit.uncertainty.mean())
+        before, warps = warps, fit.warps
+        if settings.center:
+            warps = _after_inverse(warps, warps.mean(axis=0))
+        template, curves = fit_template(
+            scaled, warps, method.template_splines, method.components, settings
+        )
+        knots, noise = template.knots, template.noise
+        change = float(np.mean((warps - before) ** 2))
+        # The first warps are to the mean of profiles that were not registered.
+        if turn == method.iterations or (turn and change <= method.tolerance):
+            break
+        turn += 1
+    template = replace(
+        template, scale=scale, align=settings.align, warp_variance=variance, turns=turn
+    )
+    if settings.center:
+        center = _fit_to(scaled, template, settings).mean(axis=0)
+        template = replace(template, center=center)
+    return _finish(profiles, warps, template, settings, turn, converged=change <= method.tolerance)
+
+
+def register_to(
+    profiles: FloatArray, template: Template, settings: RegistrationSettings
+) -> Registration:
+    """Register profiles to a template that does not change; each subject is on its own.
+
+    Parameters
+    ----------
+    profiles : ndarray, shape (subjects, nodes)
+        In the unit of those that made the template.
+    template : Template
+        From :func:`register`.
+    settings : RegistrationSettings
+        Those with which the template was made.
+
+    Raises
+    ------
+    ModelError
+        If the template was made in another way, or values are missing.
+    """
+    if template.align != settings.align:
+        raise ModelError(
+            f"registration: the template was made with align {template.align}, not"
+            f" {settings.align}; use the same",
+            reason="template-mismatch",
+        )
+    _check_finite(profiles)
+    fitted = _fit_to(profiles / template.scale, template, settings)
+    warps = _after_inverse(fitted, template.center)
+    return _finish(profiles, warps, template, settings, template.turns, converged=True)
+
+
+def _fit_to(scaled: FloatArray, template: Template, settings: RegistrationSettings) -> FloatArray:
+    """Warps to a template that does not change, by as many turns as it was made with."""
+    basis = WarpBasis.make(scaled.shape[1], _Method.choose(settings).warp_splines)
+    curves = np.tile(template.mean, (len(scaled), 1))
+    parameters = np.zeros((len(scaled), len(basis.identity)))
+    penalty = template.noise / template.warp_variance
+    for turn in range(template.turns + 1):
+        fit = fit_warps(
+            scaled, template.knots, curves, basis, parameters, penalty=penalty, settings=settings
+        )
+        parameters = fit.parameters
+        if turn < template.turns:
+            curves = subject_curves(template, scaled, fit.warps)
+    return fit.warps
+
+
+def shift_by_group(
+    registration: Registration, groups: Sequence[str] | NDArray[np.str_]
+) -> Mapping[str, GroupShift]:
+    """Mean displacement of each group along x (figure A5 of the paper).
+
+    Parameters
+    ----------
+    registration : Registration
+        Of all subjects.
+    groups : sequence of str, length (subjects,)
+        Group of each.
+    """
+    names = np.asarray(groups)
+    nodes = registration.warps.shape[1]
+    shift = (registration.warps - np.linspace(0, 1, nodes)) * (nodes - 1)
+    result = {}
+    for name in np.unique(names):
+        part = shift[names == name]
+        spread = part.std(axis=0, ddof=1) if len(part) > 1 else np.full(nodes, np.nan)
+        result[str(name)] = GroupShift(part.mean(axis=0), spread / np.sqrt(len(part)), len(part))
+    return result
+
+
+def _identity(profiles: FloatArray) -> FloatArray:
+    return np.tile(np.linspace(0.0, 1.0, profiles.shape[1]), (len(profiles), 1))
+
+
+def _after_inverse(warps: FloatArray, common: FloatArray) -> FloatArray:
+    """Follow all warps by the inverse of one; by their mean's, it becomes the identity."""
+    grid = np.linspace(0.0, 1.0, warps.shape[1])
+    back = np.interp(warps.ravel(), common, grid)
+    return np.asarray(back.reshape(warps.shape), dtype=np.float64)
+
+
+def _check_finite(profiles: FloatArray) -> None:
+    rows = np.flatnonzero(~np.isfinite(profiles).all(axis=1))
+    if len(rows):
+        raise ModelError(
+            f"registration: profiles {', '.join(map(str, rows[:10]))} have missing values",
+            reason="profile-missing",
+        )
+
+
+def _check(profiles: FloatArray, settings: RegistrationSettings) -> float:
+    """Refuse what gives no template; the profiles' standard deviation otherwise."""
+    _check_finite(profiles)
+    if len(profiles) < settings.min_subjects:
+        raise ModelError(
+            f"registration: {len(profiles)} profiles are too few for a template (least"
+            f" {settings.min_subjects}); use align none, or a template from others",
+            reason="group-size",
+        )
+    scale = float(profiles.std())
+    if scale <= np.finfo(np.float64).eps * float(np.abs(profiles).max()):
+        raise ModelError(
+            "registration: all profiles are the same constant; use align none",
+            reason="profile-constant",
+        )
+    return scale
+
+
+def _finish(
+    profiles: FloatArray,
+    warps: FloatArray,
+    template: Template | None,
+    settings: RegistrationSettings,
+    iterations: int,
+    *,
+    converged: bool,
+) -> Registration:
+    nodes = profiles.shape[1]
+    displacement = np.sqrt(np.mean((warps - np.linspace(0, 1, nodes)) ** 2, axis=1)) * (nodes - 1)
+    spread = float(stats.median_abs_deviation(displacement, scale="normal"))
+    limit = float(np.median(displacement)) + settings.extreme * spread
+    return Registration(
+        warps=warps,
+        template=template,
+        iterations=iterations,
+        converged=converged,
+        explained_before=_explained(profiles),
+        explained_after=_explained(warp_values(profiles[:, :, None], warps)[:, :, 0]),
+        displacement=displacement,
+        extreme=(displacement > limit) & (spread > 0),
+    )
+
+
+def _explained(profiles: FloatArray) -> float:
+    """Share of the variance that the mean profile explains."""
+    return 1 - float(np.mean(profiles.var(axis=0))) / max(float(profiles.var()), 1e-300)

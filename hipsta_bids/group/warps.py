@@ -1,0 +1,208 @@
+"""Monotone warps of the sheet along x: their fit to curves, and their use on maps."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hipsta_bids.group.splines import inner_knots, make_basis
+from hipsta_bids.group_settings import RegistrationSettings
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+#: Damping of the first step, its factor when a step fails or succeeds, and its limits.
+_DAMPING, _FACTOR, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 5.0, 1e-9, 1e9
+
+
+@dataclass(frozen=True)
+class WarpBasis:
+    """Monotone functions of 0..1 onto itself.
+
+    A warp is a sum of B-splines whose coefficients start at 0, end at 1 and rise by the softmax
+    of as many parameters as there are steps: monotone for any parameters.
+    """
+
+    at_nodes: FloatArray
+    """(nodes, splines)"""
+    identity: FloatArray
+    """(steps,) logarithms of the increments of the identity."""
+
+    @classmethod
+    def make(cls, nodes: int, splines: int) -> "WarpBasis":
+        """Splines with knots at quantiles of the grid."""
+        grid = np.linspace(0.0, 1.0, nodes)
+        at_nodes = np.asarray(make_basis(inner_knots(grid, splines))(grid), dtype=np.float64)
+        coefficients = np.linalg.lstsq(at_nodes, grid, rcond=None)[0]
+        return cls(at_nodes, np.log(np.diff(coefficients)))
+
+    def evaluate(self, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Warps (subjects, nodes) and their derivatives (subjects, nodes, steps)."""
+        logs = self.identity + parameters
+        steps = np.exp(logs - logs.max(axis=1, keepdims=True))
+        steps /= steps.sum(axis=1, keepdims=True)
+        sums = np.cumsum(steps, axis=1)
+        warps = np.clip(sums @ self.at_nodes[:, 1:].T, 0.0, 1.0)
+        lower = np.tril(np.ones((steps.shape[1], steps.shape[1])))
+        slopes = lower * steps[:, None, :] - sums[:, :, None] * steps[:, None, :]
+        return warps, self.at_nodes[:, 1:] @ slopes
+
+    def lifted(self, parameters: FloatArray, least: float) -> FloatArray:
+        """Parameters whose increments are all at least ``least``.
+
+        An increment of nearly zero has no slope, and could never grow again.
+        """
+        logs = self.identity + parameters
+        steps = np.exp(logs - logs.max(axis=1, keepdims=True))
+        steps /= steps.sum(axis=1, keepdims=True)
+        steps = np.maximum(steps, least)
+        lifted = np.log(steps) - self.identity
+        lifted -= lifted.mean(axis=1, keepdims=True)
+        return np.where((steps > least).all(axis=1)[:, None], parameters, lifted)
+
+
+@dataclass(frozen=True)
+class WarpFit:
+    """Warps of all subjects."""
+
+    parameters: FloatArray
+    """(subjects, steps)"""
+    warps: FloatArray
+    """(subjects, nodes) registered coordinate of each node, 0..1."""
+    uncertainty: FloatArray
+    """(subjects,) mean posterior variance of the parameters, over the noise variance."""
+
+
+@dataclass(frozen=True)
+class _State:
+    parameters: FloatArray
+    warps: FloatArray
+    slopes: FloatArray
+    residuals: FloatArray
+    loss: FloatArray
+
+
+def fit_warps(
+    profiles: FloatArray,
+    knots: FloatArray,
+    coefficients: FloatArray,
+    basis: WarpBasis,
+    parameters: FloatArray,
+    *,
+    penalty: float,
+    settings: RegistrationSettings,
+) -> WarpFit:
+    """Warp each profile onto its own curve, by damped Gauss-Newton steps for all at once.
+
+    Minimizes half the sum of squared differences, plus half the penalty times the squared
+    parameters (the logarithms of local stretch, in the mean).
+
+    Parameters
+    ----------
+    profiles : ndarray, shape (subjects, nodes)
+        In the unit of the curves.
+    knots : ndarray
+        Inner knots of the curves.
+    coefficients : ndarray, shape (subjects, splines)
+        Each subject's curve.
+    basis : WarpBasis
+        Warps that are possible.
+    parameters : ndarray, shape (subjects, steps)
+        Where to start.
+    penalty : float
+        Variance of the noise over that of the parameters; 0 for none.
+    settings : RegistrationSettings
+        When to stop.
+    """
+    curve = make_basis(knots)
+    slope = curve.derivative()
+
+    def state(parameters: FloatArray, chosen: IntArray) -> _State:
+        warps, slopes = basis.evaluate(parameters)
+        residuals = profiles[chosen] - np.einsum("sdk,sk->sd", curve(warps), coefficients[chosen])
+        loss = 0.5 * np.sum(residuals**2, axis=1) + 0.5 * penalty * np.sum(parameters**2, axis=1)
+        return _State(parameters, warps, slopes, residuals, loss)
+
+    def normal(now: _State, chosen: IntArray) -> tuple[FloatArray, FloatArray]:
+        along = np.einsum("sdk,sk->sd", slope(now.warps), coefficients[chosen])
+        jacobian = along[:, :, None] * now.slopes
+        matrix = np.swapaxes(jacobian, 1, 2) @ jacobian + penalty * np.eye(parameters.shape[1])
+        right = np.einsum("sdi,sd->si", jacobian, now.residuals) - penalty * now.parameters
+        return matrix, right
+
+    best = basis.lifted(parameters, settings.least_stretch)
+    # Adding a constant to all parameters changes nothing: keep their sum.
+    level = np.full((parameters.shape[1], parameters.shape[1]), 1 / parameters.shape[1])
+    active = np.arange(len(profiles))
+    damping = np.full(len(profiles), _DAMPING)
+    for _ in range(settings.warp_steps):
+        now = state(best[active], active)
+        matrix, right = normal(now, active)
+        size = np.maximum(np.trace(matrix, axis1=1, axis2=2), _LEAST_DAMPING)
+        ridge = size[:, None, None] * (level + damping[active, None, None] * np.eye(len(level)))
+        step = np.linalg.solve(matrix + ridge, right[:, :, None])[:, :, 0]
+        trial = state(now.parameters + step, active)
+        gained = now.loss - trial.loss
+        better = gained > 0
+        best[active[better]] = trial.parameters[better]
+        eased = np.maximum(damping[active] / _FACTOR, _LEAST_DAMPING)
+        damping[active] = np.where(better, eased, damping[active] * _FACTOR)
+        done = better & (gained < settings.warp_tolerance * now.loss)
+        active = active[~done & (damping[active] < _MOST_DAMPING)]
+        if not len(active):
+            break
+    everyone = np.arange(len(profiles))
+    last = state(best, everyone)
+    matrix, _ = normal(last, everyone)
+    spread = np.linalg.pinv(matrix, hermitian=True)
+    uncertainty = np.trace(spread, axis1=1, axis2=2) / matrix.shape[1]
+    return WarpFit(best, last.warps, np.asarray(uncertainty, dtype=np.float64))
+
+
+def warp_values(maps: FloatArray, warps: FloatArray) -> FloatArray:
+    """Carry maps of values to registered coordinates, linearly.
+
+    Parameters
+    ----------
+    maps : ndarray, shape (subjects, x, y)
+        NaN is missing, and makes missing what would need it.
+    warps : ndarray, shape (subjects, x)
+        Registered coordinate of each node, 0..1, rising.
+
+    Returns
+    -------
+    ndarray, shape (subjects, x, y)
+    """
+    left, weight = _sources(warps)
+    rows = np.arange(len(maps))[:, None]
+    share = weight[:, :, None]
+    low, high = maps[rows, left], maps[rows, left + 1]
+    mixed = (1 - share) * low + share * high
+    return np.where(share == 0, low, np.where(share == 1, high, mixed))
+
+
+def warp_labels(labels: IntArray, warps: FloatArray) -> IntArray:
+    """Carry maps of labels to registered coordinates, from the nearest node.
+
+    Parameters
+    ----------
+    labels : ndarray of int, shape (subjects, x, y)
+        Any integers.
+    warps : ndarray, shape (subjects, x)
+        As in :func:`warp_values`.
+    """
+    left, weight = _sources(warps)
+    rows = np.arange(len(labels))[:, None]
+    return np.asarray(labels[rows, left + (weight >= 0.5)])  # noqa: PLR2004 -- nearest
+
+
+def _sources(warps: FloatArray) -> tuple[IntArray, FloatArray]:
+    """For each registered node the original node before it, and the way to the next, 0..1."""
+    nodes = warps.shape[1]
+    grid = np.linspace(0.0, 1.0, nodes)
+    below = (warps[:, None, :] <= grid[None, :, None]).sum(axis=2)
+    left = np.clip(below - 1, 0, nodes - 2)
+    start = np.take_along_axis(warps, left, axis=1)
+    gap = np.take_along_axis(warps, left + 1, axis=1) - start
+    weight = np.where(gap > 0, (grid - start) / np.where(gap > 0, gap, 1.0), 0.0)
+    return left, np.clip(weight, 0.0, 1.0)
