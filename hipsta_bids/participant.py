@@ -6,11 +6,12 @@ tetrahedra, boundaries, coordinates, sheet, measures.
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 from hipsta_bids.artifacts import (
     BodyMask,
     Coordinates,
+    Flag,
     HemisphereMaps,
     LabelVolume,
     Sheet,
@@ -18,7 +19,7 @@ from hipsta_bids.artifacts import (
     TetMesh,
 )
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry.body import check_side, extract_body
+from hipsta_bids.geometry.body import Body, check_side, extract_body
 from hipsta_bids.geometry.boundaries import Boundaries, find_boundaries
 from hipsta_bids.geometry.checks import (
     check_end_labels,
@@ -114,7 +115,7 @@ def measure_hemisphere(
         thickness = measure_thickness(sheet)
         doubts = check_end_labels(volume, body, settings.checks)
         doubts += check_thickness(thickness, boundaries.sheet_thickness, settings.checks)
-        doubts += check_mask(volume.edited_mask, in_plane_voxel(body.affine), settings.body)
+        doubts += _mask_doubts(volume, body, settings)
         repaired = repaired_columns(sheet, solid, settings.measures)
         return HemisphereMaps(
             sheet=sheet,
@@ -135,7 +136,9 @@ def measure_hemisphere(
                 volume.scheme.sheet,
                 signed_volume(surface.vertices, surface.triangles),
             ),
-            qc=quality_metrics(evidence) | {"repaired_fraction": float(repaired.mean())},
+            qc=quality_metrics(evidence)
+            | {"repaired_fraction": float(repaired.mean())}
+            | ({"mask_change": asdict(body.mask_change)} if body.mask_change else {}),
             repairs=tuple(map(str, solid.repairs)),
             flags=(*doubts, *find_flags(evidence, settings)),
             mesh=mesh,
@@ -161,6 +164,13 @@ def find_body(volume: LabelVolume, settings: Settings) -> BodyMask | None:
     except GeometryError:
         return None
     return volume.in_file(body.inside)
+
+
+def _mask_doubts(volume: LabelVolume, body: Body, settings: Settings) -> list[Flag]:
+    if volume.edited_mask is None or body.mask_change is None:
+        return []
+    voxel = in_plane_voxel(body.affine)
+    return check_mask(volume.edited_mask, body.mask_change, voxel, settings.body)
 
 
 def _filled(

@@ -36,7 +36,9 @@ class BodySettings:
     head_growth: float = 1.35
     """Without end labels: ... or twice running an area above this multiple of the median."""
     max_mask_ratio: float = 1.5
-    """Flag an edited mask whose voxels are more than this many times those of the labels."""
+    """Flag an edited mask whose voxels are more than this many times those of the labels ..."""
+    max_mask_change: float = 0.5
+    """... or that adds and removes more than this share of the body."""
 
     def __post_init__(self) -> None:
         rules = ("nearest-sheet", "nearest-label")

@@ -111,6 +111,10 @@ def test_an_edit_heals_the_map_and_its_removal_brings_the_damage_back(data, tmp_
     record = results(out, "03", "L", SEG).metrics
     address = f"bids:edited:sub-03/anat/{mask.name}"
     assert record["edited"] == [{"what": "mask", "file": address, "sha256": files.sha256_of(mask)}]
+    change = record["metrics"]["mask_change"]
+    assert change["added"] == 0
+    assert change["removed"] > 100  # the bar
+    assert "mask_change" not in results(out, "02", "L", SEG).metrics["metrics"]
     assert "sub-02_hemi-L_seg-freesurfer: edited labels: " in "".join(
         path.read_text() for path in (out / "logs").glob("*.log")
     )

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from hipsta_bids.artifacts import Bool, Float, LabelVolume
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry.edited import apply_mask
+from hipsta_bids.geometry.edited import MaskChange, apply_mask
 from hipsta_bids.geometry.ends import EndPlanes, find_end_planes
 from hipsta_bids.schemes import Tissue
 from hipsta_bids.settings import BodySettings
@@ -29,6 +29,8 @@ class Body:
     """Voxels of the molecular layer that went to a sheet subfield."""
     inside: Bool
     """(I, J, K) sheet voxels between the end planes."""
+    mask_change: MaskChange | None = None
+    """What an edited mask changed; None if there is none."""
 
     def inside_points(self) -> tuple[NDArray[np.intp], Float]:
         """Voxel indices (N, 3) and RAS mm (N, 3) of the sheet between the end planes."""
@@ -73,8 +75,9 @@ def extract_body(volume: LabelVolume, settings: BodySettings) -> Body:
             reason="no-sheet-labels",
         )
     ends = find_end_planes(volume, tissue, settings)
+    change = None
     if volume.edited_mask is not None:
-        volume, tissue = apply_mask(volume, tissue, volume.edited_mask, ends)
+        volume, tissue, change = apply_mask(volume, tissue, volume.edited_mask, ends)
         # What the mask took away may have turned the long axis.
         ends = find_end_planes(volume, tissue, settings)
     index = np.argwhere(tissue > 0)
@@ -96,6 +99,7 @@ def extract_body(volume: LabelVolume, settings: BodySettings) -> Body:
         ends=ends,
         layer_voxels=layer_voxels,
         inside=inside,
+        mask_change=change,
     )
 
 

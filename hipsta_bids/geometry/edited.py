@@ -1,6 +1,6 @@
 """A body mask that a person corrected takes the place of the labels' own."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +12,24 @@ from hipsta_bids.geometry.ends import EndPlanes
 from hipsta_bids.settings import BodySettings
 
 
+@dataclass(frozen=True, kw_only=True)
+class MaskChange:
+    """What an edited mask changed of the body, in voxels."""
+
+    before: int
+    """Voxels of the body as labeled."""
+    added: int
+    removed: int
+
+    @property
+    def share(self) -> float:
+        """Changed voxels over those of the body as labeled."""
+        return (self.added + self.removed) / max(self.before, 1)
+
+
 def apply_mask(
     volume: LabelVolume, tissue: NDArray[np.uint8], mask: EditedMask, ends: EndPlanes
-) -> tuple[LabelVolume, NDArray[np.uint8]]:
+) -> tuple[LabelVolume, NDArray[np.uint8], MaskChange]:
     """Make the body between its end planes what an edited mask says it is.
 
     Voxels outside of the mask lose their label, and voxels of the mask without a sheet label get
@@ -35,6 +50,7 @@ def apply_mask(
         What the labels would be, had they been corrected themselves.
     tissue : (I, J, K) uint8
         Its sheet tissue.
+    change : MaskChange
 
     Raises
     ------
@@ -62,15 +78,23 @@ def apply_mask(
     edited = tissue.copy()
     edited[tuple(index.T)] = new
     labels = np.where(edited == tissue, volume.tissue, edited)
-    return replace(volume, tissue=labels), edited
+    change = MaskChange(
+        before=int(np.count_nonzero(old)),
+        added=int(np.count_nonzero(bare)),
+        removed=int(np.count_nonzero((old > 0) & ~inside)),
+    )
+    return replace(volume, tissue=labels), edited, change
 
 
-def check_mask(mask: EditedMask | None, voxel: float, settings: BodySettings) -> list[Flag]:
-    """Flag an edited mask that is coarser than the labels.
+def check_mask(
+    mask: EditedMask, change: MaskChange, voxel: float, settings: BodySettings
+) -> list[Flag]:
+    """Flag an edited mask that is coarser than the labels, or differs very much from them.
 
     Parameters
     ----------
-    mask : EditedMask or None
+    mask : EditedMask
+    change : MaskChange
     voxel : float
         Edge of the labels' voxels in plane, mm.
     settings : BodySettings
@@ -78,12 +102,19 @@ def check_mask(mask: EditedMask | None, voxel: float, settings: BodySettings) ->
     Returns
     -------
     list of Flag
-        Empty if there is no mask, or it is fine enough.
+        Empty if the mask is as it should be.
     """
-    if mask is None or mask.voxel <= settings.max_mask_ratio * voxel:
-        return []
-    message = (
-        f"the edited mask has voxels of {mask.voxel:.2f} mm, the labels of {voxel:.2f} mm: draw it "
-        "on the grid of the labels"
-    )
-    return [Flag(reason="edited-mask-coarse", message=message)]
+    flags = []
+    if mask.voxel > settings.max_mask_ratio * voxel:
+        coarse = (
+            f"the edited mask has voxels of {mask.voxel:.2f} mm, the labels of {voxel:.2f} mm: "
+            "draw it on the grid of the labels"
+        )
+        flags.append(Flag(reason="edited-mask-coarse", message=coarse))
+    if change.share > settings.max_mask_change:
+        different = (
+            f"the edited mask adds {change.added} voxels to the body and removes {change.removed} "
+            f"of {change.before}: check that it is in the space of the labels"
+        )
+        flags.append(Flag(reason="edited-mask-different", message=different))
+    return flags

@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from geometry_cases import short_phantom
+from scipy import ndimage
 
 from hipsta_bids.artifacts import EditedMask
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import extract_body
-from hipsta_bids.geometry.edited import check_mask
+from hipsta_bids.geometry.edited import MaskChange, check_mask
 from hipsta_bids.participant import find_body
 from hipsta_bids.schemes import Tissue, load_scheme
 from hipsta_bids.settings import BodySettings, Settings
@@ -104,9 +105,33 @@ def test_a_mask_elsewhere_is_refused(volume, body):
 @pytest.mark.parametrize(("voxel", "wanted"), [(0.4, []), (0.59, []), (0.61, ["coarse"])])
 def test_a_coarse_mask_is_flagged(body, voxel, wanted):
     mask = EditedMask(inside=body.inside, voxel=voxel)
-    flags = check_mask(mask, 0.4, SETTINGS)
+    flags = check_mask(mask, MaskChange(before=9, added=0, removed=0), 0.4, SETTINGS)
     assert [flag.reason.removeprefix("edited-mask-") for flag in flags] == wanted
-    assert check_mask(None, 0.4, SETTINGS) == []
+
+
+@pytest.mark.parametrize(("removed", "wanted"), [(40, []), (41, ["different"])])
+def test_a_mask_that_changes_half_of_the_body_is_flagged(body, removed, wanted):
+    mask = EditedMask(inside=body.inside, voxel=0.4)
+    change = MaskChange(before=100, added=10, removed=removed)
+    flags = check_mask(mask, change, 0.4, SETTINGS)
+    assert [flag.reason.removeprefix("edited-mask-") for flag in flags] == wanted
+
+
+def test_changes_are_counted(volume, body):
+    index = np.argwhere(body.inside)
+    gone, new = np.zeros_like(body.inside), np.zeros_like(body.inside)
+    gone[tuple(index[::50].T)] = True
+    # Beside the body, away from its ends.
+    rim = ndimage.binary_dilation(body.inside) & (body.tissue == 0)
+    points = np.argwhere(rim) @ volume.affine[:3, :3].T + volume.affine[:3, 3]
+    deep = (body.ends.height(points, "posterior") > 0) & (body.ends.height(points, "anterior") < 0)
+    new[tuple(np.argwhere(rim)[deep][::40].T)] = True
+    change = corrected(volume, (body.inside & ~gone) | new).mask_change
+    assert (change.before, change.added, change.removed) == tuple(
+        int(np.count_nonzero(mask)) for mask in (body.inside, new, gone)
+    )
+    assert change.share == (change.added + change.removed) / change.before
+    assert body.mask_change is None
 
 
 def test_the_body_is_found_where_it_can_be(volume, body):
