@@ -145,7 +145,7 @@ def _row(outcome: Outcome) -> dict[str, str]:
         "status": str(outcome.status),
         "reason": outcome.reason or files.MISSING,
         "message": outcome.message or files.MISSING,
-        "edited": "+".join(edit.kind for edit in outcome.job.item.edits) or files.MISSING,
+        "edited": "+".join(outcome.job.item.edited) or files.MISSING,
         "version": __version__,
         "settings_hash": outcome.job.settings_hash,
         "input_hash": outcome.input_hash or files.MISSING,

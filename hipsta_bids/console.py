@@ -68,8 +68,8 @@ def summary_line(outcome: "Outcome") -> str:
         parts.append(f"mean thickness {outcome.thickness:.3f} mm")
     if outcome.seconds is not None:
         parts.append(f"{outcome.seconds:.1f} s")
-    if outcome.job.item.edits:
-        parts.append(f"edited {' and '.join(edit.kind for edit in outcome.job.item.edits)}")
+    if outcome.job.item.edited:
+        parts.append(f"edited {' and '.join(outcome.job.item.edited)}")
     if outcome.skipped:
         parts.append("unchanged, skipped")
     if outcome.status == "repaired" and outcome.message:

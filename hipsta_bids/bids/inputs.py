@@ -92,6 +92,11 @@ class HemisphereInput:
         return next((edit for edit in self.edits if edit.kind == kind), None)
 
     @property
+    def edited(self) -> tuple[str, ...]:
+        """Kinds of edits, each once."""
+        return tuple(dict.fromkeys(edit.kind for edit in self.edits))
+
+    @property
     def key(self) -> tuple[str, str, str, str]:
         """What the names of the outputs consist of: two inputs may not share it."""
         return self.subject, self.session or "", self.hemi, self.scheme.name

@@ -130,6 +130,7 @@ def test_two_for_one_hemisphere_fail_it_alone(data, tmp_path):
     assert items[LEFT].problem.reason == "edit-ambiguous"
     assert "keep one" in str(items[LEFT].problem)
     assert str(edits) in str(items[LEFT].problem)
+    assert items[LEFT].edited == ("labels",)
     assert items[RIGHT].problem is None
     assert notes == ()
 
