@@ -5,6 +5,9 @@ import numpy as np
 from hipsta_bids.artifacts import Coordinates, TetMesh
 from hipsta_bids.geometry.boundaries import Boundaries
 from hipsta_bids.geometry.laplace import solve_dirichlet, stiffness
+from hipsta_bids.geometry.two_level import compact_groups
+
+_MANY = 4000  # vertices from which on iterating is faster than factorizing
 
 
 def solve_coordinates(mesh: TetMesh, boundaries: Boundaries) -> Coordinates:
@@ -28,10 +31,12 @@ def solve_coordinates(mesh: TetMesh, boundaries: Boundaries) -> Coordinates:
         ``laplace`` if a problem has no finite solution.
     """
     matrix = stiffness(mesh.vertices, mesh.tetrahedra)
+    groups = compact_groups(mesh.vertices) if len(mesh.vertices) > _MANY else None
     pairs = (
-        (boundaries.medial, boundaries.lateral),
-        (boundaries.posterior, boundaries.anterior),
-        (boundaries.interior, boundaries.exterior),
+        (boundaries.medial, boundaries.lateral, groups),
+        (boundaries.posterior, boundaries.anterior, groups),
+        # Few vertices lie between the two walls.
+        (boundaries.interior, boundaries.exterior, None),
     )
     values = np.column_stack(
         [
@@ -39,8 +44,9 @@ def solve_coordinates(mesh: TetMesh, boundaries: Boundaries) -> Coordinates:
                 matrix,
                 np.concatenate([first, second]),
                 np.repeat([-1.0, 1.0], [len(first), len(second)]),
+                levels,
             )
-            for first, second in pairs
+            for first, second, levels in pairs
         ]
     )
     return Coordinates(values=values)

@@ -86,8 +86,9 @@ def mean_wall_thickness(surface: Surface) -> float:
 def unique_edges(cells: Int) -> Int:
     """(E, 2) edges of triangles (F, 3) or tetrahedra (T, 4), each once, lower vertex first."""
     first, second = np.triu_indices(cells.shape[1], k=1)
-    pairs = np.sort(np.stack([cells[:, first].ravel(), cells[:, second].ravel()], axis=1))
-    code = np.unique(pairs[:, 0].astype(np.int64) << 32 | pairs[:, 1])
+    a, b = cells[:, first].ravel(), cells[:, second].ravel()
+    code = np.sort(np.minimum(a, b).astype(np.int64) << 32 | np.maximum(a, b))
+    code = code[np.diff(code, prepend=-1) > 0]
     return np.column_stack([code >> 32, code & 0xFFFFFFFF]).astype(np.int32)
 
 

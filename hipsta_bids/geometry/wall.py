@@ -1,13 +1,13 @@
 """The wall of the body: its surface without the caps."""
 
 import numpy as np
-from lapy import TriaMesh
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial import cKDTree
 
 from hipsta_bids.artifacts import Bool, Float, Int, Surface
 from hipsta_bids.geometry.body import Body
+from hipsta_bids.geometry.curvature import least_curvature
 from hipsta_bids.geometry.laplace import triangle_stiffness
 from hipsta_bids.geometry.surface import lateral_triangles, triangle_areas, unique_edges
 from hipsta_bids.settings import BoundarySettings
@@ -18,7 +18,8 @@ class Wall:
 
     def __init__(self, surface: Surface, body: Body, settings: BoundarySettings) -> None:
         triangles = surface.triangles[lateral_triangles(surface)]
-        self.index = np.unique(triangles).astype(np.int32)
+        used = np.bincount(triangles.ravel(), minlength=len(surface.vertices)) > 0
+        self.index = np.flatnonzero(used).astype(np.int32)
         number = np.full(len(surface.vertices), -1, dtype=np.int32)
         number[self.index] = np.arange(len(self.index))
         self.vertices = surface.vertices[self.index]
@@ -31,6 +32,7 @@ class Wall:
         self.edges = unique_edges(self.triangles)
         self.lengths = np.linalg.norm(np.diff(self.vertices[self.edges], axis=1)[:, 0], axis=1)
 
+        self._tree = cKDTree(self.vertices)
         self.bend_aware, self.evenly_aware = self._stiffness(settings)
         areas = triangle_areas(self.vertices, self.triangles)
         count = len(self.vertices)
@@ -47,8 +49,9 @@ class Wall:
         divided by that and a factor (see the settings). On outward triangles it is negative where
         the surface is convex.
         """
-        mesh = TriaMesh(self.vertices.copy(), self.triangles.copy())
-        direction, _, least, _ = mesh.curvature_tria(smoothit=settings.curvature_smoothing)
+        direction, least = least_curvature(
+            self.vertices, self.triangles, settings.curvature_smoothing
+        )
         bend = -least / (settings.lapy_curvature * float(self.lengths.mean()))
         excess = np.maximum(bend - settings.sharp_bend, 0)
         slowed = np.exp(-settings.anisotropy * excess)
@@ -60,14 +63,22 @@ class Wall:
 
     def near(self, curve: Float, reach: float) -> Bool:
         """Vertices within ``reach`` mm of a curve and connected to it along the wall."""
-        gap, _ = cKDTree(curve).query(self.vertices, distance_upper_bound=reach)
-        close = np.isfinite(gap)
-        closest = int(cKDTree(self.vertices).query(curve[len(curve) // 2])[1])
+        close = np.zeros(len(self.vertices), dtype=bool)
+        close[np.concatenate(self._tree.query_ball_point(curve, reach)).astype(np.intp)] = True
+        closest = int(self._tree.query(curve[len(curve) // 2])[1])
         close[closest] = True
-        inside = close[self.edges].all(axis=1)
-        links = edge_graph(self.edges[inside], np.ones(np.count_nonzero(inside)), len(close))
-        _, piece = sparse.csgraph.connected_components(links, directed=False)
+        piece = self._pieces(close)
         return np.asarray(close & (piece == piece[closest]))
+
+    def _pieces(self, where: Bool) -> NDArray[np.int32]:
+        """Piece number of each vertex if only edges between vertices of a set connect."""
+        inside = self.edges[where[self.edges[:, 0]] & where[self.edges[:, 1]]]
+        # The edges are in order, as the rows of a matrix have to be.
+        rows = np.searchsorted(inside[:, 0], np.arange(len(where) + 1))
+        links = sparse.csr_array(
+            (np.ones(len(inside)), inside[:, 1], rows), shape=(len(where),) * 2
+        )
+        return np.asarray(sparse.csgraph.connected_components(links, directed=False)[1])
 
     def with_rim(self, side: Bool, strips: tuple[Bool, Bool]) -> Bool:
         """Add to a side the strips' vertices next to it, so that they share an edge.
@@ -83,9 +94,7 @@ class Wall:
 
     def sides(self, strips: Bool) -> tuple[Bool, Bool] | None:
         """Find the two large pieces of the wall without the strips; crumbs belong to neither."""
-        both = self.edges[~strips[self.edges].any(axis=1)]
-        links = edge_graph(both, np.ones(len(both)), len(strips))
-        _, piece = sparse.csgraph.connected_components(links, directed=False)
+        piece = self._pieces(~strips)
         size = np.bincount(piece, weights=~strips)
         first, second = np.argsort(size)[::-1][:2]
         # Each side makes up most of a half; a leak leaves one piece and crumbs.
