@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import savgol_filter
 
 from hipsta_bids.artifacts import Float, Sheet
+from hipsta_bids.geometry.local_polynomials import differentiate
 from hipsta_bids.schemes import Tissue
 from hipsta_bids.settings import MeasureSettings
 
@@ -161,5 +161,5 @@ def _derivative(points: Float, settings: MeasureSettings, order: tuple[int, int]
     for axis, times in enumerate(order):
         window = min(settings.curvature_window, points.shape[axis] - 1 + points.shape[axis] % 2)
         degree = min(settings.curvature_order, window - 1)
-        points = savgol_filter(points, window, polyorder=degree, deriv=times, axis=axis)
+        points = differentiate(points, window, degree, times, axis)
     return points
