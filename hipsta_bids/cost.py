@@ -1,7 +1,6 @@
 """What one hemisphere costs: time per stage, processor time, memory."""
 
 import contextlib
-import os
 import resource
 import sys
 import time
@@ -18,8 +17,8 @@ class CostClock:
     def __init__(self) -> None:
         self._stages: dict[str, float] = {}
         self._start = time.perf_counter()
-        self._cpu = _cpu_seconds()
-        _reset_peak_memory()
+        self._cpu = cpu_seconds()
+        reset_peak_memory()
 
     @contextlib.contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
@@ -36,25 +35,20 @@ class CostClock:
         return {
             "stages": dict(self._stages),
             "seconds": time.perf_counter() - self._start,
-            "cpu_seconds": _cpu_seconds() - self._cpu,
-            "peak_memory_mb": _peak_memory() / _MEGABYTE,
+            "cpu_seconds": cpu_seconds() - self._cpu,
+            "peak_memory_mb": peak_memory() / _MEGABYTE,
         }
 
 
-def _cpu_seconds() -> float:
+def cpu_seconds() -> float:
     """Processor time of this process and its helpers, running or ended, in s."""
-    own = os.times()
-    total = own.user + own.system + own.children_user + own.children_system
-    tick = os.sysconf("SC_CLK_TCK")
-    for child in _children():
-        # Fields 14 and 15 of proc(5) stat; counted after the name, which may contain blanks.
-        with contextlib.suppress(OSError, IndexError):
-            stat = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()
-            total += (int(stat[11]) + int(stat[12])) / tick
-    return total
+    ended = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return (
+        time.process_time() + ended.ru_utime + ended.ru_stime + sum(map(_cpu_of_helper, helpers()))
+    )
 
 
-def _children() -> list[str]:
+def helpers() -> list[str]:
     """List the process numbers of running children, where the system tells."""
     with contextlib.suppress(OSError):
         lists = [path.read_text() for path in Path("/proc/self/task").glob("*/children")]
@@ -62,16 +56,27 @@ def _children() -> list[str]:
     return []
 
 
-def _reset_peak_memory() -> None:
-    """Forget the peak of the earlier hemispheres of this process, where Linux allows it."""
+def reset_peak_memory(process: str = "self") -> None:
+    """Forget how much memory a process needed so far, where Linux allows it."""
     with contextlib.suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")
+        Path(f"/proc/{process}/clear_refs").write_text("5")
 
 
-def _peak_memory() -> float:
-    """Largest resident memory of this process since the last reset, in bytes."""
+def peak_memory(process: str = "self") -> float:
+    """Largest resident memory of a process since the last reset, in bytes.
+
+    Where there is no ``/proc``: of this process since it began, whichever was asked for.
+    """
     with contextlib.suppress(OSError, StopIteration, ValueError):
-        lines = Path("/proc/self/status").read_text().splitlines()
+        lines = Path(f"/proc/{process}/status").read_text().splitlines()
         return 1024.0 * int(next(line for line in lines if line.startswith("VmHWM")).split()[1])
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return float(peak if sys.platform == "darwin" else 1024 * peak)  # getrusage(2): bytes, or KiB
+
+
+def _cpu_of_helper(process: str) -> float:
+    """Processor time of a running process in s, 0 if it is gone."""
+    # Its main thread's alone, but in ns; TetGen has no other.
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        return int(Path(f"/proc/{process}/schedstat").read_text().split()[0]) * 1e-9
+    return 0.0
