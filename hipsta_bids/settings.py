@@ -112,17 +112,23 @@ class TopologySettings:
     """Membranes cheaper than this are applied together; dearer ones one a round."""
     plug_reach: int = 8
     """A filled hole becomes as thick as the wall within this distance of it, grid nodes."""
-    oriented_nodes: int = 6
+    oriented_nodes: int = 4
     """Membranes of fewer nodes have no direction."""
-    cut_across: float = 0.36
+    cut_across: float = 0.3
     """A cut severs the ribbon rather than a bridge if this share of it lies across the axis
-    (projected areas, squared)."""
+    (projected areas, squared) ..."""
+    sever_reach: int = 2
+    """... and the body goes on for so many grid nodes before and behind it ..."""
+    sever_share: float = 0.4
+    """... at more than this share of its nodes."""
+    sever_factor: float = 1000.0
+    """Such cuts cost this much more: where one is the only way, the hemisphere is flagged."""
     fill_across: float = 0.5
     """A fill spans the inside of a bend rather than a hole if this share lies across the axis."""
     lid_nodes: float = 6.0
     """... unless it lies within this distance of an end plane, grid nodes."""
     across_factor: float = 40.0
-    """Such membranes cost this much more."""
+    """Such fills cost this much more."""
     flag_cut_cost: float = 2.0
     """Flag a cut that overrules more evidence than this (sum of the field)."""
     flag_fill_cost: float = 50.0
@@ -273,12 +279,40 @@ class CheckSettings:
     """Head or tail labels farther inside the body than this are out of place, mm."""
     end_label_share: float = 0.005
     """Flag them if they are more than this share of the body's voxels."""
+    beyond_reach: float = 3.0
+    """Labels are counted within this distance on both sides of an end plane, mm."""
+    beyond_share: float = 0.7
+    """Flag an end with fewer beyond it than this share of those before it (0.92 at least in twelve
+    real bodies)."""
     notch_reach: tuple[float, ...] = (1.0, 2.0, 3.0)
     """A cross-section is compared with those at these distances on both sides, mm."""
     notch_share: tuple[float, ...] = (0.12, 0.3, 0.35)
     """Flag if more than this share of what both sides have is missing, one per distance."""
+    notch_contrast: float = 5.5
+    """... or more than this many times what is missing in the body's other cross-sections."""
+    bump_contrast: float = 3.5
+    """Flag a cross-section that has more than this many times of what its neighbors lack than the
+    body's other cross-sections (2.3 at most in twelve real bodies)."""
+    section_noise: float = 0.02
+    """Share of the area that is added to the usual before such comparisons."""
     flag_row_jump: float = 0.15
     """Flag if the sheet's width changes by more than this from one row to the next."""
+    flag_row_dip: float = 0.15
+    """Flag rows narrower than the widest on both sides by more than this (0.13 at most in twelve
+    real bodies)."""
+    row_dip_reach: float = 6.0
+    """... within this distance along the axis, mm."""
+    flag_pinholes: float = 0.01
+    """Flag labels in which single voxels without a label are more than this share of the sheet's
+    voxels (0.0015 at most in twelve real bodies)."""
+    gap_directions: int = 4
+    """A voxel lies in a gap if it has the sheet on both sides in so many of 13 directions."""
+    flag_gap: float = 0.0115
+    """Flag a gap whose voxels are more than this share of the sheet's (0.009 at most in twelve
+    real bodies)."""
+    flag_loose_part: float = 0.15
+    """Flag a second piece of voxels, connected by faces, above this share of the sheet (0.04 at
+    most in twelve real bodies)."""
     flag_rim_distance: float = 1.25
     """Flag if the rim paths and the boundary curves differ by more than this, multiples of the
     sheet's thickness (along a flat rim a path may follow either edge)."""

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from hipsta_bids.artifacts import Coordinates, Flag, Float, LabelVolume, Sheet, Surface, TetMesh
+from hipsta_bids.artifacts import Coordinates, Flag, Float, LabelVolume, Surface, TetMesh
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
-from hipsta_bids.geometry.grid import Field, in_plane_voxel
+from hipsta_bids.geometry.grid import in_plane_voxel
 from hipsta_bids.geometry.surface import mean_wall_thickness
 from hipsta_bids.schemes import Part, Tissue
 from hipsta_bids.settings import CheckSettings
@@ -139,6 +139,12 @@ def name_subfields(body: Body) -> Callable[[Float], str]:
     return names
 
 
+def name_place(points: Float, body: Body) -> str:
+    """Spell the middle of (N, 3) points, RAS mm, and the subfields there."""
+    middle = " ".join(f"{value:.1f}" for value in points.mean(axis=0))
+    return f"RAS {middle} mm ({name_subfields(body)(points)})"
+
+
 def check_image(body: Body, settings: CheckSettings) -> list[Flag]:
     """Flag images whose voxels or borders do not suit the body.
 
@@ -188,85 +194,45 @@ def _voxel_across(body: Body, settings: CheckSettings) -> float:
 
 
 def check_end_labels(volume: LabelVolume, body: Body, settings: CheckSettings) -> list[Flag]:
-    """Flag head or tail labels in the middle of the body.
+    """Flag head or tail labels in the middle of the body, and ends beyond which nothing is labeled.
 
     Returns
     -------
     list of Flag
-        ``end-labels-inside``.
+        ``end-labels-inside``, ``labels-end``.
     """
     labeled = np.isin(volume.part, (Part.HEAD, Part.TAIL)) & (volume.tissue > 0)
     points = np.argwhere(labeled) @ volume.affine[:3, :3].T + volume.affine[:3, 3]
     depth = np.minimum(body.ends.height(points, "posterior"), -body.ends.height(points, "anterior"))
     inside = points[depth > settings.end_label_depth]
-    if len(inside) <= settings.end_label_share * max(len(body.inside_points()[0]), 1):
-        return []
-    place = " ".join(f"{value:.1f}" for value in inside.mean(axis=0))
-    return [
-        Flag(
-            reason="end-labels-inside",
-            message=f"{len(inside)} head or tail voxels lie inside the body, near RAS {place} mm: "
-            "correct these labels",
+    flags = []
+    if len(inside) > settings.end_label_share * max(len(body.inside_points()[0]), 1):
+        flags.append(
+            Flag(
+                reason="end-labels-inside",
+                message=f"{len(inside)} head or tail voxels lie inside the body, near "
+                f"{name_place(inside, body)}: correct these labels",
+            )
         )
-    ]
+    return flags + _check_beyond(volume, body, settings)
 
 
-def check_cross_sections(field: Field, body: Body, settings: CheckSettings) -> list[Flag]:
-    """Flag a body of which a part is missing between cross-sections that have it.
-
-    Returns
-    -------
-    list of Flag
-        ``section-notch``.
-    """
-    solid = field.values > 0
-    length = body.ends.length(body.inside_points()[1])
-    step = length / (field.grid.shape[2] - 1)
-    worst, lost = 0.0, None
-    for reach, limit in zip(settings.notch_reach, settings.notch_share, strict=True):
-        k = max(round(reach / step), 1)
-        if 2 * k >= solid.shape[2]:
-            continue
-        before, here, after = solid[:, :, : -2 * k], solid[:, :, k:-k], solid[:, :, 2 * k :]
-        missing = before & after & ~here
-        share = missing.sum(axis=(0, 1)) / np.maximum(here.sum(axis=(0, 1)), 1)
-        at = int(share.argmax())
-        if share[at] > limit and share[at] / limit > worst:
-            worst = float(share[at] / limit)
-            nodes = np.argwhere(missing[:, :, at]).astype(float)
-            lost = np.column_stack([nodes, np.full(len(nodes), at + k)]), float(share[at])
-    if lost is None:
-        return []
-    points = field.grid.to_ras(lost[0])
-    place = " ".join(f"{value:.1f}" for value in points.mean(axis=0))
-    return [
-        Flag(
-            reason="section-notch",
-            message=f"a cross-section lacks what its neighbors have, {lost[1]:.0%} of its area, at "
-            f"RAS {place} mm ({name_subfields(body)(points)}): complete the labels there",
-        )
-    ]
-
-
-def check_rows(sheet: Sheet, settings: CheckSettings) -> list[Flag]:
-    """Flag a sheet whose medial-to-lateral length jumps from row to row.
-
-    Returns
-    -------
-    list of Flag
-        ``extent-jump``.
-    """
-    middle = sheet.points[:, :, sheet.middle]
-    lengths = np.linalg.norm(np.diff(middle, axis=0), axis=-1).sum(axis=0)
-    jumps = np.abs(np.diff(lengths)) / np.minimum(lengths[1:], lengths[:-1])
-    row = int(np.nanargmax(jumps))
-    if not jumps[row] > settings.flag_row_jump:
-        return []
-    place = " ".join(f"{value:.1f}" for value in np.nanmean(middle[:, row], axis=0))
-    return [
-        Flag(
-            reason="extent-jump",
-            message=f"the sheet's width changes by {jumps[row]:.0%} from one row to the next, near "
-            f"RAS {place} mm: look for missing or added parts in the labels",
-        )
-    ]
+def _check_beyond(volume: LabelVolume, body: Body, settings: CheckSettings) -> list[Flag]:
+    """Flag ends at which the labels themselves end."""
+    labeled = (volume.tissue > 0) & (volume.tissue <= Tissue.HIPPOCAMPUS)
+    points = np.argwhere(labeled) @ volume.affine[:3, :3].T + volume.affine[:3, 3]
+    flags = []
+    for end, sign in (("posterior", 1), ("anterior", -1)):
+        height = sign * body.ends.height(points, "posterior" if sign > 0 else "anterior")
+        near = points[(height > 0) & (height < settings.beyond_reach)]
+        beyond = np.count_nonzero((height < 0) & (height > -settings.beyond_reach))
+        if beyond < settings.beyond_share * len(near):
+            flags.append(
+                Flag(
+                    reason="labels-end",
+                    message=f"the labels end where the body does, at its {end} end near "
+                    f"{name_place(near, body)}: it may be cut short there; label the whole "
+                    "hippocampus",
+                )
+            )
+    return flags

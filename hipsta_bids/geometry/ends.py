@@ -1,18 +1,16 @@
 """Where the hippocampal body begins and ends along its long axis."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from hipsta_bids.artifacts import Bool, Float, LabelVolume
+from hipsta_bids.artifacts import Float, LabelVolume
 from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry.end_rule import End, automatic_range
 from hipsta_bids.schemes import Part, Tissue
 from hipsta_bids.settings import BodySettings
-
-End = Literal["posterior", "anterior"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -81,12 +79,12 @@ def find_end_planes(
     )
     index = np.argwhere(hippocampal)
     points = index @ volume.affine[:3, :3].T + volume.affine[:3, 3]
-    parts = volume.part[hippocampal]
+    parts = _largest_ends(np.where(hippocampal, volume.part, Part.UNKNOWN))[hippocampal]
     axis = _long_axis(points, parts)
     half_slice = 0.5 * float(np.abs(axis @ volume.affine[:3, :3]).sum())
 
     is_head, is_tail = parts == Part.HEAD, parts == Part.TAIL
-    is_body = ~is_head & ~is_tail
+    is_body = np.isin(volume.part[hippocampal], (Part.BODY, Part.UNKNOWN))
     enough = settings.min_end_voxels
     planes: dict[End, tuple[Float, Float, str]] = {}
     if is_tail.sum() >= enough and is_body.sum() >= enough:
@@ -102,10 +100,22 @@ def find_end_planes(
     if len(planes) < 2:  # noqa: PLR2004 -- two ends
         # Where one end is labeled, the other is cut parallel to it.
         across = next((normal for _, normal, _ in planes.values()), axis)
-        found = _automatic_range(volume, sheet, across, planes, settings)
+        found = automatic_range(volume, sheet, across, planes, settings)
         for end, (level, rule) in found.items():
             planes.setdefault(end, (level * across, across, rule))
     return _checked(planes, axis, half_slice)
+
+
+def _largest_ends(part: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Keep the largest piece each of head and tail: stray voxels must not move the end planes."""
+    kept = part.copy()
+    for end in (Part.HEAD, Part.TAIL):
+        pieces, count = ndimage.label(part == end, structure=np.ones((3, 3, 3)))
+        if count > 1:
+            sizes = np.bincount(pieces.ravel())
+            sizes[0] = 0
+            kept[(pieces > 0) & (pieces != sizes.argmax())] = Part.UNKNOWN
+    return kept
 
 
 def _checked(
@@ -113,18 +123,28 @@ def _checked(
 ) -> EndPlanes:
     middle = planes["posterior"][1] + planes["anterior"][1]
     middle = middle / np.linalg.norm(middle)
-    for end, (_, normal, _) in planes.items():
+    for end, (point, normal, _) in planes.items():
+        place = "RAS " + " ".join(f"{value:.1f}" for value in point) + " mm"
         tilt = np.degrees(np.arccos(np.clip(normal @ axis, -1, 1)))
         if tilt > 90:  # noqa: PLR2004 -- turned round
             name = "tail" if end == "posterior" else "head"
             raise GeometryError(
-                f"labels of the {name} lie on both sides of the body or inside it: correct them",
+                f"labels of the {name} lie on both sides of the body or inside it, near {place}: "
+                "correct them",
                 reason="end-labels-inside",
             )
         if tilt > 50:  # noqa: PLR2004 -- beyond this the labels do not end across the long axis
+            lacking = [name for name, (_, _, rule) in planes.items() if rule != "labels"]
+            if lacking:
+                raise GeometryError(
+                    f"what is labeled does not run from the {end} end near {place} to the "
+                    f"{lacking[0]} one, which has no label: the body may be cut short there; label "
+                    "the whole hippocampus",
+                    reason="labels-end",
+                )
             raise GeometryError(
-                f"the {end} end plane is tilted by {tilt:.0f} degrees against the long axis: "
-                "check the head and tail labels",
+                f"the {end} end plane near {place} is tilted by {tilt:.0f} degrees against the "
+                "long axis: check the head and tail labels there",
                 reason="end-plane-tilted",
             )
     return EndPlanes(
@@ -143,7 +163,8 @@ def _long_axis(points: Float, parts: NDArray[np.uint8]) -> Float:
     """Find the unit vector from tail to head.
 
     Between the centers of the labeled head and tail; otherwise the first principal axis, turned
-    towards whichever end is labeled, or to the front (+y in RAS).
+    to the front (+y in RAS). Where one end is labeled and lies in quite another direction from the
+    rest, that direction: what is cut short may be wider than long.
     """
     head, tail = points[parts == Part.HEAD], points[parts == Part.TAIL]
     if len(head) and len(tail):
@@ -151,14 +172,21 @@ def _long_axis(points: Float, parts: NDArray[np.uint8]) -> Float:
         return np.asarray(between / np.linalg.norm(between))
     centered = points - points.mean(axis=0)
     _, vectors = np.linalg.eigh(centered.T @ centered)
-    axis: Float = vectors[:, -1]
-    if len(head):
-        forward = float(head.mean(axis=0) @ axis - points.mean(axis=0) @ axis)
-    elif len(tail):
-        forward = float(points.mean(axis=0) @ axis - tail.mean(axis=0) @ axis)
-    else:
-        forward = float(axis[1])
-    return axis if forward >= 0 else -axis
+    if not len(head) and not len(tail):
+        axis: Float = vectors[:, -1]
+        return axis if axis[1] >= 0 else -axis
+    rest = points[(parts != Part.HEAD) & (parts != Part.TAIL)]
+    rest = rest if len(rest) else points
+    way = (
+        head.mean(axis=0) - rest.mean(axis=0)
+        if len(head)
+        else rest.mean(axis=0) - tail.mean(axis=0)
+    )
+    way = way / np.linalg.norm(way)
+    along = float(vectors[:, -1] @ way)
+    if abs(along) < 0.8:  # noqa: PLR2004 -- 37 degrees
+        return np.asarray(way)
+    return np.asarray(vectors[:, -1] if along > 0 else -vectors[:, -1])
 
 
 def _separating_plane(below: Float, above: Float, axis: Float, reach: float) -> tuple[Float, Float]:
@@ -212,118 +240,3 @@ def _logistic_plane(below: Float, above: Float, axis: Float) -> tuple[Float, Flo
     normal = beta[:3] / length
     point = centre - beta[3] / length * scale * normal
     return point, normal
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Slices:
-    """Cross-sections at equal steps along an axis."""
-
-    axis: Float
-    first: float
-    """Level of the first slice along the axis, mm."""
-    step: float
-
-    def level(self, number: float) -> float:
-        return float(self.first + self.step * number)
-
-
-def _automatic_range(
-    volume: LabelVolume,
-    sheet: NDArray[np.uint8],
-    axis: Float,
-    known: dict[End, tuple[Float, Float, str]],
-    settings: BodySettings,
-) -> dict[End, tuple[float, str]]:
-    """Levels along the axis, mm, and rules of the ends that have no labels."""
-    index = np.argwhere(sheet > 0)
-    along = (index @ volume.affine[:3, :3].T + volume.affine[:3, 3]) @ axis
-    step = float(np.abs(axis @ volume.affine[:3, :3]).max())
-    slices = _Slices(axis=axis, first=float(along.min()), step=step)
-    number = np.floor((along - slices.first) / step + 0.5).astype(int)
-    values = sheet[sheet > 0]
-    count = int(number.max()) + 1
-    ca1 = np.bincount(number[values == Tissue.CA1], minlength=count) > 0
-    lateral = np.isin(values, (Tissue.CA2, Tissue.CA2_3, Tissue.CA3))
-    ca23 = np.bincount(number[lateral], minlength=count) > 0
-    levels = slices.first + step * np.arange(count)
-    if "posterior" in known:
-        ca23 &= levels > known["posterior"][0] @ axis
-    if "anterior" in known:
-        ca23 &= levels < known["anterior"][0] @ axis
-    both = np.flatnonzero(ca1 & ca23)
-    if not len(both):
-        raise GeometryError(
-            "no slice across the long axis has both CA1 and CA2/CA3, and there are no head and "
-            "tail labels: cannot tell where the body lies",
-            reason="no-body",
-        )
-    low, high = int(both[0]), int(np.flatnonzero(ca23)[-1])
-    first, last = _body_like(sheet > 0, volume.affine, slices, (low, high), settings)
-    # Each kept slice reaches half a step to both sides.
-    return {
-        "posterior": (
-            slices.level(first - 0.5) + settings.end_margin,
-            "cross-section" if first > low else "subfields",
-        ),
-        "anterior": (
-            slices.level(last + 0.5) - settings.end_margin,
-            "cross-section" if last < high else "subfields",
-        ),
-    }
-
-
-def _body_like(
-    mask: Bool, affine: Float, slices: _Slices, bounds: tuple[int, int], settings: BodySettings
-) -> tuple[int, int]:
-    """First and last slice, counted from the middle, that look like the body.
-
-    Where CA2/CA3 is labeled in the head or in the tail's bend, the rule of the paper runs deep
-    into them. The body ends where the cross-section falls into two large pieces, or twice running
-    exceeds the usual area.
-    """
-    section, pixel = _sections(mask, affine, slices, bounds)
-    area = section.sum(axis=(1, 2)) * pixel**2
-    count = len(area)
-    usual = float(np.median(area[count // 4 : count - count // 4]))
-    in_slice = np.zeros((3, 3, 3), dtype=bool)
-    in_slice[1] = True  # pieces are sought within each slice
-    pieces, total = ndimage.label(section, structure=in_slice)
-    sizes = np.bincount(pieces.ravel(), minlength=total + 1)[1:] * pixel**2
-    owner = np.zeros(total, dtype=int)
-    number = np.broadcast_to(np.arange(count)[:, None, None], section.shape)
-    owner[pieces[section] - 1] = number[section]
-    split = np.bincount(owner[sizes > settings.head_piece], minlength=count) > 1
-    wide = area > settings.head_growth * usual
-    twice = np.zeros(count, dtype=bool)
-    twice[:-1] |= wide[:-1] & wide[1:]
-    twice[1:] |= wide[1:] & wide[:-1]
-    odd = np.flatnonzero(split | twice)
-    before, after = odd[odd < count // 2], odd[odd > count // 2]
-    first = int(before[-1]) + 1 if len(before) else 0
-    last = int(after[0]) - 1 if len(after) else count - 1
-    return bounds[0] + first, bounds[0] + last
-
-
-def _sections(
-    mask: Bool, affine: Float, slices: _Slices, bounds: tuple[int, int]
-) -> tuple[Bool, float]:
-    """Sample the mask in the slices between bounds, (N, A, B); also the pixel edge, mm."""
-    axis = slices.axis
-    side = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    side = side / np.linalg.norm(side)
-    up = np.cross(axis, side)
-    pixel = float(np.linalg.norm(affine[:3, :3], axis=0).min())
-    points = np.argwhere(mask) @ affine[:3, :3].T + affine[:3, 3]
-    a, b = (
-        np.arange(reach.min() - 1, reach.max() + 1, pixel) for reach in (points @ side, points @ up)
-    )
-    levels = slices.first + slices.step * np.arange(bounds[0], bounds[1] + 1)
-    where = (
-        a[None, :, None, None] * side
-        + b[None, None, :, None] * up
-        + levels[:, None, None, None] * axis
-    )
-    inverse = np.linalg.inv(affine)
-    voxels = np.moveaxis(where @ inverse[:3, :3].T + inverse[:3, 3], -1, 0)
-    field = ndimage.map_coordinates(mask.astype(np.float32), voxels, order=1, output=np.float32)
-    return field > 0.5, pixel  # noqa: PLR2004 -- halfway between outside and inside

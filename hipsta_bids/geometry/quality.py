@@ -8,7 +8,9 @@ import numpy as np
 from hipsta_bids.artifacts import Flag, Float, Sheet, Surface, TetMesh
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.boundaries import Boundaries
-from hipsta_bids.geometry.checks import check_cross_sections, check_image, check_rows
+from hipsta_bids.geometry.checks import check_image
+from hipsta_bids.geometry.label_checks import check_labels
+from hipsta_bids.geometry.sections import check_cross_sections, check_rows
 from hipsta_bids.geometry.tetra import tetra_quality
 from hipsta_bids.geometry.topology import SolidField
 from hipsta_bids.schemes import Tissue
@@ -94,6 +96,7 @@ def find_flags(evidence: Evidence, settings: Settings) -> list[Flag]:
     return [
         *found,
         *check_image(evidence.body, checks),
+        *check_labels(evidence.body, checks),
         *check_cross_sections(solid.field, evidence.body, checks),
         *check_rows(evidence.sheet, checks),
     ]

@@ -6,6 +6,7 @@ from geometry_cases import degrees_between, rigid, rotation, short_phantom
 
 from hipsta_bids.artifacts import LabelVolume
 from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry import ends as ends_mod
 from hipsta_bids.geometry.body import extract_body
 from hipsta_bids.geometry.ends import find_end_planes
 from hipsta_bids.schemes import Part, Tissue, load_scheme
@@ -227,6 +228,61 @@ def test_no_slice_with_ca1_and_ca2_is_refused():
 
 def test_an_interface_along_the_body_is_refused():
     steep = rotation(0, 70) @ [0.0, 1.0, 0.0]
-    with pytest.raises(GeometryError, match=r"end plane is tilted by \d\d degrees") as caught:
+    with pytest.raises(
+        GeometryError, match=r"end plane near RAS .* is tilted by \d\d degrees"
+    ) as caught:
         ends_of(rod([0.0, 1.0, 0.0], steep, half_body=5.0))
     assert caught.value.reason == "end-plane-tilted"
+
+
+def test_stray_end_labels_do_not_move_the_planes():
+    """Tail labels on voxels in the middle of the body: the tail itself decides."""
+    plain = rod([0.0, 1.0, 0.0], [0.0, 1.0, 0.0])
+    part = plain.part.copy()
+    part[:, 41:46] = Part.TAIL
+    stray = LabelVolume(tissue=plain.tissue, part=part, affine=plain.affine, scheme=plain.scheme)
+    before, after = ends_of(plain), ends_of(stray)
+    np.testing.assert_allclose(after.posterior_normal, before.posterior_normal, atol=1e-6)
+    np.testing.assert_allclose(after.posterior_point, before.posterior_point, atol=1e-6)
+    np.testing.assert_allclose(after.axis, before.axis, atol=1e-6)
+
+
+def test_a_body_cut_short_keeps_its_axis():
+    """18 mm wide and 12 mm long: the principal axis lies across."""
+    whole = rod([0.0, 1.0, 0.0], [0.0, 1.0, 0.0])
+    kept = slice(0, 30)  # 12 mm of 34, the first 9 of them tail
+    short = LabelVolume(
+        tissue=whole.tissue[:, kept],
+        part=whole.part[:, kept],
+        affine=whole.affine,
+        scheme=HIPPUNFOLD,
+    )
+    assert ends_mod._long_axis(*labeled(short))[1] > 0.99  # the axis itself, but for rounding
+
+
+def labeled(volume):
+    index = np.argwhere(volume.tissue > 0)
+    return index @ volume.affine[:3, :3].T + volume.affine[:3, 3], volume.part[volume.tissue > 0]
+
+
+def test_labels_that_do_not_lead_away_from_their_end_are_refused():
+    """The interface of the tail lies along what is left of the body."""
+    turned = ends_mod._checked(
+        {
+            "posterior": (np.zeros(3), np.array([0.0, 1.0, 0.0]), "labels"),
+            "anterior": (np.ones(3), np.array([0.0, 1.0, 0.0]), "subfields"),
+        },
+        np.array([0.0, 1.0, 0.0]),
+        0.2,
+    )
+    assert turned.axis[1] == pytest.approx(1.0)
+    with pytest.raises(GeometryError, match="may be cut short there") as caught:
+        ends_mod._checked(
+            {
+                "posterior": (np.zeros(3), np.array([0.5, 0.866, 0.0]), "labels"),
+                "anterior": (np.ones(3), np.array([0.5, 0.866, 0.0]), "subfields"),
+            },
+            np.array([0.94, -0.34, 0.0]),  # 80 degrees from the normals
+            0.2,
+        )
+    assert caught.value.reason == "labels-end"

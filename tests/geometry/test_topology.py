@@ -126,6 +126,32 @@ def test_a_filled_hole_is_thick():
     assert np.count_nonzero(column) >= 3  # of 5 nodes; a bare membrane has one
 
 
+def with_hole_at_the_rim():
+    """A hole that leaves a strip of three nodes at one rim of the ribbon, 50 degrees round."""
+    mask = ribbon_mask()
+    a, b, w = np.indices(mask.shape)
+    angle = np.degrees(np.arctan2(b - MIDDLE, a - MIDDLE))
+    mask[(angle > 64) & (angle < 95) & (w >= 11) & (w < 18)] = False
+    return mask
+
+
+def test_a_strip_beside_a_hole_is_not_severed():
+    """The strip costs less than the hole; but a cut would leave a notch in the ribbon."""
+    mask = with_hole_at_the_rim()
+    repair = only_repair(repaired(mask), "fill")
+    at = np.radians(79.5)
+    assert distance(repair, (MIDDLE + 12 * np.cos(at), MIDDLE + 12 * np.sin(at), 14)) < 2.5
+    careless = repaired(mask, sever_factor=1.0)
+    assert only_repair(careless, "cut").cost < repair.cost
+
+
+def test_a_cut_that_severs_the_ribbon_is_large_where_nothing_else_helps():
+    only_cuts = {"sever_share": -1.0, "cut_across": -1.0, "sever_factor": 1.001}
+    mask, *_ = with_bridge()
+    assert only_repair(repaired(mask, flag_cut_cost=1e9, **only_cuts), "cut").large
+    assert not only_repair(repaired(mask, flag_cut_cost=1e9), "cut").large
+
+
 def test_a_cap_in_two_pieces_becomes_one():
     """A notch that divides the end's cross-section is a tunnel once the end is closed."""
     mask = ribbon_mask()

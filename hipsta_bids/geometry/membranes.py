@@ -1,0 +1,219 @@
+"""Membranes that cut or fill the tunnels of a voxel body.
+
+Arrays here are padded: along the axis by a layer for a plate and one of free space, across it by
+one of free space.
+"""
+
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from hipsta_bids.artifacts import Bool
+from hipsta_bids.geometry.simple_points import euler_number, grow, shrink
+from hipsta_bids.settings import TopologySettings
+
+Kind = Literal["cut", "fill", "island", "cavity"]
+FACES = ndimage.generate_binary_structure(3, 1)
+ALL = np.ones((3, 3, 3), dtype=bool)
+PAD = ((1, 1), (1, 1), (2, 2))  # along the axis: a plate, then free space
+INNER = (slice(1, -1), slice(1, -1), slice(2, -2))
+CORNER = np.array([1, 1, 2])
+_LEVELS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4)
+_SLOPE = 0.4  # of a smoothed step per node, at the body's surface
+
+
+class Edit(NamedTuple):
+    """One change of a padded body."""
+
+    kind: Kind
+    where: NDArray[np.intp]
+    """(N, 3) nodes."""
+    doubtful: bool = False
+    """It contradicts the run of the ribbon along the axis."""
+
+
+def with_plates(state: NDArray[Any], value: float) -> NDArray[Any]:
+    """Return a copy with solid plates beyond both ends."""
+    solid = state.copy()
+    solid[1:-1, 1:-1, 1] = value
+    solid[1:-1, 1:-1, -2] = value
+    return solid
+
+
+def euler(state: Bool, *, plates: bool = False) -> int:
+    """Find the Euler number of a padded body, with or without plates on both ends."""
+    return euler_number(with_plates(state, True) if plates else state)
+
+
+def apply_membranes(
+    state: Bool,
+    values: NDArray[np.float32],
+    lifted: NDArray[np.float32],
+    settings: TopologySettings,
+    *,
+    plates: bool,
+) -> list[Edit]:
+    """Apply the cheapest membranes (in place): all small ones, or one large one.
+
+    Without plates, tunnels of the body itself are found; with plates, pieces of an end's
+    cross-section that hang together only further inside. ``lifted`` gets the values of filled
+    holes.
+    """
+    weight = np.abs(values)
+    if plates:
+        solid, ranked = with_plates(state, True), with_plates(values, 1.0)
+    else:
+        solid, ranked = state, values
+    grown = grow(_inner_ball(solid, ranked), solid, ranked, settings.levels)
+    shrunk = shrink(_outer_ball(solid, ranked), solid, ranked, settings.levels)
+    candidates: list[tuple[float, Edit]] = []
+    membranes: tuple[tuple[Kind, Bool], ...] = (("cut", solid & ~grown), ("fill", shrunk & ~solid))
+    for kind, membrane in membranes:
+        pieces, _ = ndimage.label(membrane, structure=ALL)
+        for number, around in enumerate(ndimage.find_objects(pieces), start=1):
+            where = np.argwhere(pieces[around] == number) + [s.start for s in around]
+            gain = _gain(solid, where, kind)
+            if gain > 0:
+                factor = _implausibility(kind, where, solid, settings)
+                cost = factor * float(weight[tuple(where.T)].sum()) / gain
+                candidates.append((cost, Edit(kind, where, factor > 1)))
+    candidates.sort(key=lambda c: c[0])
+    edits: list[Edit] = []
+    for cost, edit in candidates:
+        kind, where, doubtful = edit
+        if edits and cost > settings.small_cost:
+            break
+        if edits and _gain(solid, where, kind) <= 0:
+            continue  # another membrane already dealt with this tunnel
+        solid[tuple(where.T)] = kind == "fill"
+        state[tuple(where.T)] = kind == "fill"
+        if kind == "fill":
+            where = _thicken(state, lifted, where, settings)
+        edits.append(Edit(kind, where, doubtful))
+        if cost > settings.small_cost:
+            break
+    return edits
+
+
+def _inner_ball(solid: Bool, values: NDArray[np.float32]) -> Bool:
+    """Find a ball to grow from: the largest level set that is one, or a single voxel."""
+    for level in _LEVELS:
+        pieces, count = ndimage.label(solid & (values > level), structure=FACES)
+        if not count:
+            break
+        part = pieces == np.argmax(np.bincount(pieces[pieces > 0]))
+        if _is_ball(part):
+            return np.asarray(part)
+    seed = np.zeros_like(solid)
+    seed[np.unravel_index(np.argmax(np.where(solid, values, -np.inf)), solid.shape)] = True
+    return seed
+
+
+def _outer_ball(solid: Bool, values: NDArray[np.float32]) -> Bool:
+    """Find a ball to shrink from: the smallest level set that is one, or the full box."""
+    box = np.zeros_like(solid)
+    box[1:-1, 1:-1, 1:-1] = True
+    for level in _LEVELS:
+        part = (solid | (values > -level)) & box
+        pieces, _ = ndimage.label(part, structure=FACES)
+        part = pieces == pieces[tuple(np.argwhere(solid)[0])]
+        if _is_ball(part):
+            return np.asarray(part)
+    return box
+
+
+def _is_ball(mask: Bool) -> bool:
+    """Whether one 6-connected piece has neither tunnels nor cavities."""
+    return euler_number(mask) == 1 and ndimage.label(~mask, structure=ALL)[1] == 1
+
+
+def _gain(state: Bool, where: NDArray[np.intp], kind: Kind) -> int:
+    """Change of the Euler number if these voxels change sides."""
+    low, high = where.min(axis=0) - 1, where.max(axis=0) + 2
+    around = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+    block = state[around].copy()
+    before = euler_number(block)
+    block[tuple((where - low).T)] = kind == "fill"
+    return euler_number(block) - before
+
+
+def _implausibility(
+    kind: Kind, where: NDArray[np.intp], solid: Bool, settings: TopologySettings
+) -> float:
+    """Factor for membranes that lie across the long axis.
+
+    The ribbon runs along the axis, so what fills a hole in it lies along the axis too, and so does
+    what cuts a bridge between two of its turns. A cut across the axis, with ribbon before and
+    behind it, severs a strip of the ribbon beside a hole; a fill across the axis spans the inside
+    of a bend, unless it is the lid of a tunnel that opens at an end plane.
+    """
+    if len(where) < settings.oriented_nodes:
+        return 1.0
+    areas = np.array(
+        [len(np.unique(np.delete(where, axis, axis=1), axis=0)) for axis in range(3)], dtype=float
+    )
+    across = areas[2] ** 2 / float(areas @ areas)
+    if kind == "cut":
+        severs = across > settings.cut_across and _goes_on(where, solid, settings)
+        return settings.sever_factor if severs else 1.0
+    level = float(where[:, 2].mean()) - CORNER[2]
+    last = solid.shape[2] - 2 * CORNER[2] - 1
+    lid = min(level, last - level) < settings.lid_nodes
+    return settings.across_factor if across > settings.fill_across and not lid else 1.0
+
+
+def _goes_on(where: NDArray[np.intp], solid: Bool, settings: TopologySettings) -> bool:
+    """Whether the body goes on along the axis on both sides of most of a membrane's nodes.
+
+    It may step aside by a node; beyond an end plane it counts as going on.
+    """
+    wide = ndimage.maximum_filter(solid, size=(3, 3, 1))
+    both = np.ones(len(where), dtype=bool)
+    a, b, w = where.T
+    for step in range(1, settings.sever_reach + 1):
+        for level in (w - step, w + step):
+            beyond = (level < CORNER[2]) | (level >= solid.shape[2] - CORNER[2])
+            both &= beyond | wide[a, b, np.clip(level, 0, solid.shape[2] - 1)]
+    return bool(both.mean() > settings.sever_share)
+
+
+def _thicken(
+    state: Bool,
+    lifted: NDArray[np.float32],
+    where: NDArray[np.intp],
+    settings: TopologySettings,
+) -> NDArray[np.intp]:
+    """Make a filled membrane as thick as the wall around it (in place), if the topology allows.
+
+    Half the wall's thickness is the median of the distance from its surface along its middle,
+    within ``plug_reach`` nodes of the membrane.
+    """
+    reach = settings.plug_reach
+    low = np.maximum(where.min(axis=0) - reach, CORNER)
+    high = np.minimum(where.max(axis=0) + reach + 1, np.array(state.shape) - CORNER)
+    around = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+    block = state[around]
+    membrane = np.zeros_like(block)
+    membrane[tuple((where - low).T)] = True
+    off = ndimage.distance_transform_edt(~membrane)
+    half = _half_thickness(block & (off > 0), off <= reach)
+    plug = np.clip(_SLOPE * (half - off), -0.5, 0.5).astype(np.float32)
+    added = (plug > 0) & ~block
+    trial = state.copy()
+    trial[around] |= added
+    if euler_number(trial) != euler_number(state):
+        return where
+    state[around] |= added
+    lifted[around] = np.maximum(lifted[around], np.where(off < half + 1, plug, -1))
+    return np.vstack([where, np.argwhere(added) + low])
+
+
+def _half_thickness(wall: Bool, near: Bool) -> float:
+    """Half the thickness of a wall, in nodes: the median depth of its middle."""
+    padded = np.pad(wall, 1, mode="edge")  # what goes on beyond the block has no surface there
+    depth = ndimage.distance_transform_edt(padded)[1:-1, 1:-1, 1:-1]
+    ridge = wall & near & (depth >= ndimage.maximum_filter(depth, 3)) & (depth > 1)
+    # A node's depth is the distance from the next node outside, half a step beyond the surface.
+    return float(np.median(depth[ridge])) - 0.5 if ridge.any() else 1.0

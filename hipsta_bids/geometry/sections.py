@@ -1,0 +1,116 @@
+"""Cross-sections and rows of the sheet that do not go with their neighbors."""
+
+import numpy as np
+
+from hipsta_bids.artifacts import Bool, Flag, Float, Sheet
+from hipsta_bids.geometry.body import Body
+from hipsta_bids.geometry.checks import name_place
+from hipsta_bids.geometry.grid import Field
+from hipsta_bids.settings import CheckSettings
+
+
+def check_cross_sections(field: Field, body: Body, settings: CheckSettings) -> list[Flag]:
+    """Flag a body of which a part is missing between cross-sections that have it, or added.
+
+    Each cross-section is compared with those at a distance on both sides. What both lack is
+    judged by how far it stands out from the same body's other cross-sections: a bent ribbon moves
+    sideways everywhere, a leak is in one place.
+
+    Returns
+    -------
+    list of Flag
+        ``section-notch``, ``section-bump``.
+    """
+    solid = field.values > 0
+    length = body.ends.length(body.inside_points()[1])
+    step = length / (field.grid.shape[2] - 1)
+    area = float(np.median(solid.sum(axis=(0, 1))))
+    notch, bump = _Oddest(), _Oddest()
+    for reach, limit in zip(settings.notch_reach, settings.notch_share, strict=True):
+        k = max(round(reach / step), 1)
+        if 2 * k >= solid.shape[2]:
+            continue
+        before, here, after = solid[:, :, : -2 * k], solid[:, :, k:-k], solid[:, :, 2 * k :]
+        missing, added = before & after & ~here, here & ~before & ~after
+        notch.look(missing, missing.sum(axis=(0, 1)) / here.sum(axis=(0, 1)), limit, k)
+        for oddest, part, contrast in (
+            (notch, missing, settings.notch_contrast),
+            (bump, added, settings.bump_contrast),
+        ):
+            share = part.sum(axis=(0, 1)) / area
+            usual = contrast * (float(np.median(share)) + settings.section_noise)
+            oddest.look(part, share, usual, k)
+    texts = {
+        "section-notch": (notch, "lacks what its neighbors have", "complete the labels there"),
+        "section-bump": (bump, "has what its neighbors lack", "look for leaks and bridges there"),
+    }
+    return [
+        Flag(
+            reason=reason,
+            message=f"a cross-section {what}, {oddest.share:.0%} of its area, at "
+            f"{name_place(field.grid.to_ras(oddest.nodes), body)}: {remedy}",
+        )
+        for reason, (oddest, what, remedy) in texts.items()
+        if oddest.excess > 1
+    ]
+
+
+class _Oddest:
+    """The cross-section that departs most from its neighbors."""
+
+    excess = 1.0
+    """Times the limit."""
+    share = 0.0
+    """Of its area that departs."""
+    nodes: Float = np.zeros((0, 3))
+    """Grid nodes that depart."""
+
+    def look(self, part: Bool, share: Float, limit: float, first: int) -> None:
+        """Take note if a cross-section is odder than those seen before."""
+        at = int(share.argmax())
+        if share[at] > limit * self.excess:
+            self.excess = float(share[at] / limit)
+            self.share = float(share[at])
+            nodes = np.argwhere(part[:, :, at]).astype(float)
+            self.nodes = np.column_stack([nodes, np.full(len(nodes), at + first)])
+
+
+def check_rows(sheet: Sheet, settings: CheckSettings) -> list[Flag]:
+    """Flag a sheet whose medial-to-lateral length jumps from row to row, or dips.
+
+    Returns
+    -------
+    list of Flag
+        ``extent-jump``, or ``extent-dip`` where rows are narrower than some on both sides.
+    """
+    middle = sheet.points[:, :, sheet.middle]
+    lengths = np.linalg.norm(np.diff(middle, axis=0), axis=-1).sum(axis=0)
+    jumps = np.abs(np.diff(lengths)) / np.minimum(lengths[1:], lengths[:-1])
+    dips = 1 - lengths / _wider(lengths, middle, settings.row_dip_reach)
+    found = []
+    for reason, change, limit, what in (
+        ("extent-jump", jumps, settings.flag_row_jump, "changes by {} from one row to the next"),
+        ("extent-dip", dips, settings.flag_row_dip, "dips by {}"),
+    ):
+        row = int(np.nanargmax(change))
+        if change[row] > limit:
+            place = " ".join(f"{value:.1f}" for value in np.nanmean(middle[:, row], axis=0))
+            found.append(
+                Flag(
+                    reason=reason,
+                    message=f"the sheet's width {what.format(f'{change[row]:.0%}')}, near RAS "
+                    f"{place} mm: look for missing or added parts in the labels",
+                )
+            )
+    return found
+
+
+def _wider(lengths: Float, middle: Float, reach: float) -> Float:
+    """Width (Ny,) that rows within a distance (mm) reach on both sides of each row."""
+    step = float(np.nanmedian(np.linalg.norm(np.diff(middle, axis=1), axis=-1)))
+    rows = np.arange(len(lengths))
+    offset = rows[None, :] - rows[:, None]
+    near = np.abs(offset) <= max(round(reach / step), 1)
+    before = np.where(near & (offset <= 0), lengths, -np.inf).max(axis=1)
+    after = np.where(near & (offset >= 0), lengths, -np.inf).max(axis=1)
+    return np.asarray(np.minimum(before, after))

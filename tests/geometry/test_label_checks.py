@@ -1,0 +1,68 @@
+"""Noise and thin gaps in labels: flagged with their place, and sound labels left alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hipsta_bids.geometry.label_checks import check_labels
+from hipsta_bids.settings import CheckSettings
+
+CHECKS = CheckSettings()
+
+
+def damaged(body, where):
+    """Return the body without the voxels of a mask."""
+    return replace(
+        body,
+        tissue=np.where(where, 0, body.tissue).astype(np.uint8),
+        inside=body.inside & ~where,
+    )
+
+
+def reasons(body, settings=CHECKS):
+    return {flag.reason for flag in check_labels(body, settings)}
+
+
+def test_sound_labels_have_no_flags(case):
+    assert check_labels(case.body, CHECKS) == []
+
+
+@pytest.mark.parametrize(("share", "wanted"), [(0.002, set()), (0.05, {"noisy-labels"})])
+def test_single_voxels_without_a_label_are_noise(arc, share, wanted):
+    flips = np.random.default_rng(3).random(arc.body.tissue.shape) < share
+    assert reasons(damaged(arc.body, flips)) & {"noisy-labels"} == wanted
+
+
+def voxels_near_plane(body, normal, width):
+    """Voxels within half a width (mm) of a plane through the middle of the body."""
+    points = np.indices(body.tissue.shape).reshape(3, -1).T @ body.affine[:3, :3].T
+    points = (points + body.affine[:3, 3]).reshape(*body.tissue.shape, 3)
+    middle = body.inside_points()[1].mean(axis=0)
+    return np.abs((points - middle) @ normal) < width / 2, middle
+
+
+def test_a_missing_slice_is_a_gap_and_leaves_a_loose_part(arc):
+    where, middle = voxels_near_plane(arc.body, arc.body.ends.axis, 0.45)
+    flags = {flag.reason: flag.message for flag in check_labels(damaged(arc.body, where), CHECKS)}
+    assert set(flags) == {"thin-gap", "loose-part"}
+    place = np.array(flags["thin-gap"].split("RAS ")[1].split(" mm")[0].split(), dtype=float)
+    assert abs((place - middle) @ arc.body.ends.axis) < 0.4  # mm, a voxel
+
+
+def test_a_gap_of_two_voxels_is_loose_but_not_thin(arc):
+    """Nothing lies between two labeled voxels there; the later steps see such a gap."""
+    where, _ = voxels_near_plane(arc.body, arc.body.ends.axis, 1.3)
+    assert reasons(damaged(arc.body, where)) == {"loose-part"}
+
+
+def test_gaps_filled_by_other_labels_are_none(arc):
+    where, _ = voxels_near_plane(arc.body, arc.body.ends.axis, 0.45)
+    body = replace(damaged(arc.body, where), interior=arc.body.interior | where)
+    assert reasons(body) == {"loose-part"}
+
+
+@pytest.mark.parametrize("name", ["flag_gap", "flag_loose_part"])
+def test_limits_are_the_settings(arc, name):
+    where, _ = voxels_near_plane(arc.body, arc.body.ends.axis, 0.45)
+    assert len(reasons(damaged(arc.body, where), CheckSettings(**{name: 0.9}))) == 1

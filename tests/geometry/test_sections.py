@@ -1,0 +1,120 @@
+"""Cross-sections and rows that do not go with their neighbors, at the place where they are."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from geometry_cases import resampled, short_phantom
+
+from hipsta_bids.artifacts import Sheet
+from hipsta_bids.geometry.body import Body, extract_body
+from hipsta_bids.geometry.grid import Field
+from hipsta_bids.geometry.sections import check_cross_sections, check_rows
+from hipsta_bids.phantom import Phantom
+from hipsta_bids.schemes import load_scheme
+from hipsta_bids.settings import BodySettings, CheckSettings
+
+CHECKS = CheckSettings()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ribbon:
+    """A phantom with its body and field."""
+
+    phantom: Phantom
+    body: Body
+    field: Field
+
+
+@pytest.fixture(scope="module")
+def ribbon():
+    """An arc, 16 mm long: a defect of some millimetres is an exception on it."""
+    phantom = short_phantom(length=16.0)
+    body = extract_body(phantom.label_volume(load_scheme("freesurfer")), BodySettings())
+    return Ribbon(phantom=phantom, body=body, field=resampled(body))
+
+
+def place_of(flag):
+    return np.array(flag.message.split("RAS ")[1].split(" mm")[0].split(), dtype=float)
+
+
+def ball(field, middle, radius):
+    """Nodes within a radius (mm) of a point."""
+    points = field.grid.node_points(clamp=0.0)
+    return np.linalg.norm(points - middle, axis=-1) < radius
+
+
+def changed(field, where, value):
+    return Field(grid=field.grid, values=np.where(where, np.float32(value), field.values))
+
+
+def wall(case, u, n):
+    """Point at the middle of the body, ``n`` mm from the mid-surface."""
+    return case.phantom.body.place(np.array([u]), 0.5, n)[0]
+
+
+def test_sound_bodies_have_no_flags(ribbon):
+    assert check_cross_sections(ribbon.field, ribbon.body, CHECKS) == []
+
+
+def test_a_leak_is_flagged_where_it_is(ribbon):
+    middle = wall(ribbon, 0.5, 1.5)
+    (flag,) = check_cross_sections(
+        changed(ribbon.field, ball(ribbon.field, middle, 1.4), 0.5), ribbon.body, CHECKS
+    )
+    assert flag.reason == "section-bump"
+    assert np.linalg.norm(place_of(flag) - middle) < 1.0  # mm, the ball's part outside the wall
+
+
+def test_a_notch_is_flagged_where_it_is(ribbon):
+    middle = wall(ribbon, 0.95, 0.0)
+    (flag,) = check_cross_sections(
+        changed(ribbon.field, ball(ribbon.field, middle, 1.4), -0.5), ribbon.body, CHECKS
+    )
+    assert flag.reason == "section-notch"
+    assert np.linalg.norm(place_of(flag) - middle) < 1.0  # mm, the ball's part inside the wall
+
+
+def test_what_is_odd_depends_on_the_body_s_other_cross_sections(ribbon):
+    """A leak that is flagged on a smooth body is none on one that is rough everywhere."""
+    leak = changed(ribbon.field, ball(ribbon.field, wall(ribbon, 0.5, 1.5), 1.0), 0.5)
+    rough = np.random.default_rng(2).random(leak.values.shape) < 0.1
+    shell = np.abs(ribbon.field.values) < 0.45  # noise near the surface only
+    noisy = Field(grid=leak.grid, values=np.where(rough & shell, -leak.values, leak.values))
+    assert [f.reason for f in check_cross_sections(leak, ribbon.body, CHECKS)] == ["section-bump"]
+    assert check_cross_sections(noisy, ribbon.body, CHECKS) == []
+
+
+def rows(widths, spacing=0.8):
+    """A flat sheet whose rows have these widths, mm."""
+    x = np.linspace(-0.5, 0.5, 11)
+    y = spacing * np.arange(len(widths))
+    z = np.linspace(0, 2, 3)
+    points = np.zeros((len(x), len(y), len(z), 3))
+    points[..., 0] = x[:, None, None] * np.asarray(widths)[None, :, None]
+    points[..., 1] = y[None, :, None]
+    points[..., 2] = z
+    return Sheet(points=points, valid=np.ones(points.shape[:2], dtype=bool))
+
+
+@pytest.mark.parametrize(
+    ("widths", "wanted"),
+    [
+        ([20.0] * 21, []),
+        (np.linspace(24, 16, 21), []),  # tapers
+        ([20.0] * 10 + [16.0] * 11, ["extent-jump"]),
+        (20 - 4 * np.exp(-(((np.arange(21) - 10) / 3.0) ** 2)), ["extent-dip"]),
+        (20 - 2 * np.exp(-(((np.arange(21) - 10) / 3.0) ** 2)), []),
+        (20 - 4 * np.cos(np.linspace(-1, 1, 21) * np.pi / 4), []),  # narrow all along
+    ],
+)
+def test_rows_that_jump_or_dip(widths, wanted):
+    flags = check_rows(rows(widths), CHECKS)
+    assert [flag.reason for flag in flags] == wanted
+    for flag in flags:
+        assert place_of(flag)[1] == pytest.approx(0.8 * 10, abs=0.8)  # mm, one row
+
+
+def test_dips_are_sought_within_a_reach():
+    widths = 20 - 4 * np.exp(-(((np.arange(21) - 10) / 3.0) ** 2))
+    assert check_rows(rows(widths), replace(CHECKS, row_dip_reach=2.0)) == []
