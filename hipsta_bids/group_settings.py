@@ -76,6 +76,25 @@ class RegistrationSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class DesignSettings:
+    """When a model is refused before it is fitted."""
+
+    min_level: int = 3
+    """Fewer subjects in a level of a factor are too few."""
+    min_residual_df: int = 3
+    """Fewer subjects beyond the columns are too few."""
+    dependence: float = 1e-9
+    """A column is a combination of others if less than this fraction of its length is its own."""
+    numeric_share: float = 0.5
+    """A column with text is taken for a damaged number if more of it than this is numbers."""
+
+    def __post_init__(self) -> None:
+        _require(self.min_level >= 1, "design.min_level must be at least 1")
+        _require(self.min_residual_df >= 1, "design.min_residual_df must be at least 1")
+        _require(0 < self.dependence < 1, "design.dependence must lie between 0 and 1")
+
+
+@dataclass(frozen=True, kw_only=True)
 class GlmSettings:
     """The linear model at each point."""
 
@@ -155,6 +174,7 @@ class GroupSettings:
     """All settings of the group level."""
 
     registration: RegistrationSettings = field(default_factory=RegistrationSettings)
+    design: DesignSettings = field(default_factory=DesignSettings)
     glm: GlmSettings = field(default_factory=GlmSettings)
     multiplicity: MultiplicitySettings = field(default_factory=MultiplicitySettings)
     classification: ClassificationSettings = field(default_factory=ClassificationSettings)
