@@ -5,7 +5,8 @@ import pytest
 from measured_phantoms import LENGTH, measured, spiral
 
 from hipsta_bids.errors import SettingsError
-from hipsta_bids.phantom.defects import DEFECTS, Site, make_defect
+from hipsta_bids.phantom.defects import DEFECTS, make_defect
+from hipsta_bids.phantom.site import Site
 from hipsta_bids.schemes import Part, Tissue
 
 #: One size at which every kind changes something.

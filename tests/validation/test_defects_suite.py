@@ -21,7 +21,7 @@ def trial(kind, size, place=(0.5, 0.5)):
 def test_holes_are_filled_to_the_walls_thickness(place):
     found = measure_trial(trial("hole", 0.8, place))
     assert found.status == "repaired"
-    assert found.shift < 0.2  # mm, roughness of a new mesh: elsewhere the labels are the same
+    assert found.shift < 0.15  # mm, the rule; the grid's nodes are the same, the mesh is not
     # Of about 100 columns near it; a plug of the wall's own thickness leaves few.
     assert found.near_wrong <= 6
 
@@ -31,7 +31,7 @@ def test_a_hole_beside_a_rim_is_not_cut_open():
     assert found.status == "flagged"
     assert found.reasons[0] == "large-repair"
     assert found.near_wrong + found.far_wrong <= 6  # 42 columns moved when it was cut open
-    assert found.shift < 0.2  # mm, roughness of a new mesh
+    assert found.shift < 0.15  # mm, as above
 
 
 def test_a_notch_is_flagged_with_its_place():
@@ -43,7 +43,7 @@ def test_a_notch_is_flagged_with_its_place():
     ("kind", "size", "reason"),
     [
         ("gap", 0.8, "body-split"),
-        ("tail-inside", 2.0, "end-labels-inside"),
+        ("tail-inside", 2.0, "body-interrupted"),
         ("missing-slices", 1.0, "body-interrupted"),
         ("wrong-voxels", 4.0, "sheet-too-thin"),
     ],
@@ -52,13 +52,23 @@ def test_refusals_name_the_defect(kind, size, reason):
     with pytest.raises(GeometryError, match=r"check|correct|fill|use") as caught:
         measure_trial(trial(kind, size))
     assert caught.value.reason == reason
+    assert "RAS" in str(caught.value) or reason in defects.PLACELESS
 
 
 @pytest.mark.parametrize(
     ("kind", "size", "reason"),
-    [("at-border", 1.0, "image-border"), ("wrong-voxels", 2.0, "slices-along-axis")],
+    [
+        ("at-border", 1.0, "image-border"),
+        ("wrong-voxels", 2.0, "slices-along-axis"),
+        ("bridge-ca1-ca1", 0.8, "section-bump"),
+        ("leak", 3.0, "section-bump"),
+        ("salt", 0.08, "noisy-labels"),
+        ("gap", 0.4, "thin-gap"),
+        ("cut-short", 8.0, "labels-end"),
+        ("ends-flush", 1.0, "labels-end"),
+    ],
 )
-def test_doubtful_images_are_flagged(kind, size, reason):
+def test_what_cannot_be_repaired_is_flagged(kind, size, reason):
     assert reason in measure_trial(trial(kind, size)).reasons
 
 
@@ -72,14 +82,26 @@ def test_columns_are_counted_near_and_far():
     assert (found.near_wrong, found.far_wrong) == (1, 0)
     assert found.shift == pytest.approx(0.2)
     assert found.mean == pytest.approx(0.3 / shifted.size)
-    assert not found.sound
-    assert replace(found, shift=0.1).sound
-    assert replace(found, status="flagged").sound
+    assert found.missed == ("moved",)
+    assert replace(found, shift=0.1).missed == ()
+    assert replace(found, status="flagged").missed == ()
 
 
-def test_many_wrong_columns_are_not_sound():
-    assert Damage(status="ok", reasons=(), near_wrong=2, columns=100).sound
-    assert not Damage(status="ok", reasons=(), near_wrong=3, columns=100).sound
+@pytest.mark.parametrize(
+    ("damage", "missed"),
+    [
+        (Damage(status="ok", reasons=(), near_wrong=2, columns=100), ()),
+        (Damage(status="ok", reasons=(), near_wrong=2, far_wrong=1, columns=100), ("wrong",)),
+        (Damage(status="flagged", reasons=("folded",), near_wrong=9, columns=100), ()),
+        (Damage(status="repaired", reasons=(), changed=0.06), ("big",)),
+        (Damage(status="failed", reasons=("topology",), message="near RAS 1 2 3 mm"), ()),
+        (Damage(status="failed", reasons=("topology",), message="somewhere"), ("placeless",)),
+        (Damage(status="failed", reasons=("sheet-too-thin",), message="all of it"), ()),
+        (Damage(status="crash", reasons=("timeout",)), ("crash",)),
+    ],
+)
+def test_rules(damage, missed):
+    assert damage.missed == missed
 
 
 def test_the_tables_show_every_case_and_miss_crashes(monkeypatch):
@@ -96,7 +118,9 @@ def test_the_tables_show_every_case_and_miss_crashes(monkeypatch):
     cases, totals = suite.tables
     assert len(cases.rows) == len(defects.PLAN[::3])
     assert len(defects.run(True).tables[0].rows) == 2 * len(defects.PLAN)
-    assert cases.rows[1][4:7] == ("failed", "topology", None)
-    assert cases.missed == 1
+    assert cases.rows[0][4:6] == ("unnoticed", "-")
+    assert cases.rows[1][4:7] == ("refused", "topology", None)
+    assert [row[-2] for row in cases.rows[:3]] == ["-", "placeless", "crash"]
+    assert cases.missed == 2
     assert {row[0]: row[1] for row in totals.rows}["crash"] == 1
     assert np.sum([row[1] for row in totals.rows]) == len(cases.rows)
