@@ -64,7 +64,7 @@ class PointwiseFit:
 
 
 @dataclass(frozen=True)
-class _Block:
+class PointBlock:
     """The fit at some points, in coordinates in which the complete design is orthonormal."""
 
     scores: FloatArray
@@ -72,7 +72,9 @@ class _Block:
     covariance: FloatArray
     """(points, columns, columns)"""
     sigma: FloatArray
+    """(points,) NaN where the model cannot be fitted."""
     n: IntArray
+    """(points,) subjects with a value."""
 
 
 def fit_points(
@@ -104,10 +106,10 @@ def fit_points(
     basis, triangle = np.linalg.qr(matrix)
     back = np.linalg.inv(triangle)
     blocks = [
-        _fit_block(np.asarray(maps[:, part], dtype=np.float64), basis, settings)
-        for part in _parts(maps.shape, matrix.shape[1])
+        fit_block(np.asarray(maps[:, part], dtype=np.float64), basis, settings)
+        for part in chunks(maps.shape, matrix.shape[1])
     ]
-    fit = _Block(
+    fit = PointBlock(
         scores=np.concatenate([block.scores for block in blocks]),
         covariance=np.concatenate([block.covariance for block in blocks]),
         sigma=np.concatenate([block.sigma for block in blocks]),
@@ -147,17 +149,26 @@ def _check(maps: FloatArray, matrix: FloatArray, contrasts: Sequence[Contrast]) 
             )
 
 
-def _parts(shape: tuple[int, ...], columns: int) -> Iterator[slice]:
-    """Ranges of points that fit into memory together."""
+def chunks(shape: tuple[int, ...], columns: int) -> Iterator[slice]:
+    """Split points into ranges that fit into memory together."""
     step = max(1, _CHUNK // (shape[0] * columns))
     return (slice(start, start + step) for start in range(0, max(shape[1], 1), step))
 
 
-def _fit_block(maps: FloatArray, basis: FloatArray, settings: GlmSettings) -> _Block:
-    """Least squares at some points, from normal equations in orthonormal coordinates.
+def fit_block(maps: FloatArray, basis: FloatArray, settings: GlmSettings) -> PointBlock:
+    """Solve least squares at some points, by normal equations in orthonormal coordinates.
 
     There the equations of a complete point are the identity, and those of others stay well
     conditioned unless the missing subjects really carried a column.
+
+    Parameters
+    ----------
+    maps : ndarray, shape (subjects, points)
+        NaN is missing.
+    basis : ndarray, shape (subjects, columns)
+        Orthonormal columns.
+    settings : GlmSettings
+        Covariance, and when a point is left out.
     """
     present = np.isfinite(maps)
     values = np.where(present, maps, 0.0)
@@ -184,7 +195,7 @@ def _fit_block(maps: FloatArray, basis: FloatArray, settings: GlmSettings) -> _B
         covariance = _hc3(residuals, basis, inverse)
     else:
         covariance = inverse * (sigma**2)[:, None, None]
-    return _Block(
+    return PointBlock(
         scores=np.where(usable[:, None], scores, np.nan),
         covariance=np.where(usable[:, None, None], covariance, np.nan),
         sigma=sigma,
@@ -207,7 +218,7 @@ def _hc3(residuals: FloatArray, basis: FloatArray, inverse: FloatArray) -> Float
 
 
 def _test(
-    contrast: Contrast, rotated: FloatArray, fit: _Block, df: FloatArray, settings: GlmSettings
+    contrast: Contrast, rotated: FloatArray, fit: PointBlock, df: FloatArray, settings: GlmSettings
 ) -> PointTest:
     """Wald test of a contrast at each point."""
     estimate = fit.scores @ rotated.T
