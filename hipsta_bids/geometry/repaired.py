@@ -10,7 +10,6 @@ from hipsta_bids.geometry.topology import SolidField
 from hipsta_bids.settings import MeasureSettings
 
 _ALL = np.ones((3, 3, 3), dtype=bool)
-_Columns = tuple[NDArray[np.intp], NDArray[np.intp]]
 
 
 def repaired_columns(sheet: Sheet, solid: SolidField, settings: MeasureSettings) -> Bool:
@@ -35,55 +34,93 @@ def repaired_columns(sheet: Sheet, solid: SolidField, settings: MeasureSettings)
     marked = np.zeros(sheet.valid.shape, dtype=bool)
     if not solid.touched.any():
         return marked
-    points, columns = _dense_points(sheet, settings.repair_reach)
-    if not len(points):
+    known = np.isfinite(sheet.points).all(axis=(2, 3))
+    if not known.any():
         return marked
-    tree = cKDTree(points)
-    nodes, radii = _changed_nodes(solid, tree, settings)
-    hits = tree.query_ball_point(nodes, radii)
+    nodes, radii = _changed_nodes(solid, sheet.points[known].reshape(-1, 3), settings)
+    gaps = np.stack([_gaps(sheet.points, axis) for axis in (0, 1)], axis=-1)
+    # Most columns are far from all repairs: looking closely at the others only saves much time.
+    near = np.asarray(cKDTree(nodes).query(sheet.points[known])[0])
+    candidates = np.argwhere(known)[near.min(axis=1) <= radii.max() + gaps[known].mean(axis=-1)]
+    if not len(candidates):
+        return marked
+    widest = gaps[tuple(candidates.T)].max(axis=0)
+    parts = np.maximum(np.ceil(widest / settings.repair_reach), 1).astype(int)
+    dense = _cells(sheet.points, candidates, parts)
+    defined = np.isfinite(dense).all(axis=-1)
+    hits = cKDTree(dense[defined]).query_ball_point(nodes, radii)
     hit = np.unique(np.concatenate([np.asarray(found, dtype=np.intp) for found in hits]))
-    marked[columns[0][hit], columns[1][hit]] = True
-    return marked & np.isfinite(sheet.points).all(axis=(2, 3))
+    owner = candidates[np.nonzero(defined)[0][hit]]
+    marked[tuple(owner.T)] = True
+    return marked
+
+
+def _gaps(points: Float, axis: int) -> Float:
+    """Distance (Nx, Ny) of each column to the farther of its neighbors along an axis, mm."""
+    gap = np.nan_to_num(np.linalg.norm(np.diff(points, axis=axis), axis=-1)).max(axis=-1)
+    ends = [(int(k == axis), int(k == axis)) for k in range(2)]
+    padded = np.pad(gap, ends)
+    count = points.shape[axis]
+    before, after = (padded.take(range(k, count + k), axis=axis) for k in (0, 1))
+    return np.asarray(np.maximum(before, after))
 
 
 def _changed_nodes(
-    solid: SolidField, tree: "cKDTree[None, None]", settings: MeasureSettings
+    solid: SolidField, points: Float, settings: MeasureSettings
 ) -> tuple[Float, Float]:
     """Points (N, 3), RAS mm, of changed nodes and faces of cuts, and how far each of them marks."""
-    inside = solid.field.values > 0
-    faces = ndimage.binary_dilation(solid.touched & ~inside, structure=_ALL) & inside
-    places, _ = ndimage.label(faces & ~solid.touched)
-    to_ras = solid.field.grid.to_ras
-    changed = to_ras(np.argwhere(solid.touched).astype(np.float64))
+    box = _surrounding(solid.touched)
+    inside, touched = solid.field.values[box] > 0, solid.touched[box]
+    faces = ndimage.binary_dilation(touched & ~inside, structure=_ALL) & inside
+    places, _ = ndimage.label(faces & ~touched)
+    low = np.array([side.start for side in box])
+    changed = solid.field.grid.to_ras((np.argwhere(touched) + low).astype(np.float64))
     radius = np.full(len(changed), settings.repair_reach)
     where = np.argwhere(places)
-    face = to_ras(where.astype(np.float64))
-    if not len(face):
+    if not len(where):
         return changed, radius
+    face = solid.field.grid.to_ras((where + low).astype(np.float64))
     number = places[tuple(where.T)]
-    distance, _ = tree.query(face)
+    distance, _ = cKDTree(points).query(face)
     nearest = np.asarray(ndimage.minimum(distance, number, np.arange(number.max() + 1)))
     stumps = nearest[number] + settings.stump_reach
     return np.vstack([changed, face]), np.concatenate([radius, stumps])
 
 
-def _dense_points(sheet: Sheet, reach: float) -> tuple[Float, _Columns]:
-    """Points (N, 3) of the sheet no farther apart than the reach, and the column of each."""
-    dense, columns = sheet.points, [np.arange(n) for n in sheet.valid.shape]
-    for axis in (0, 1):
-        gap = np.linalg.norm(np.diff(sheet.points, axis=axis), axis=-1)
-        widest = float(np.max(gap, initial=reach, where=np.isfinite(gap)))
-        dense, columns[axis] = _subdivided(dense, axis, int(np.ceil(widest / reach)))
-    known = np.isfinite(dense).all(axis=-1)
-    x, y, _ = np.nonzero(known)
-    return dense[known], (columns[0][x], columns[1][y])
+def _surrounding(mask: Bool) -> tuple[slice, slice, slice]:
+    """Box round all true nodes and their neighbors."""
+    index = np.argwhere(mask)
+    low = np.maximum(index.min(axis=0) - 1, 0)
+    first, second, third = (
+        slice(int(a), int(b)) for a, b in zip(low, index.max(axis=0) + 2, strict=True)
+    )
+    return first, second, third
 
 
-def _subdivided(points: Float, axis: int, parts: int) -> tuple[Float, NDArray[np.intp]]:
-    """Interpolate linearly, ``parts`` steps from node to node; and say which node is nearest."""
-    last = points.shape[axis] - 1
-    place = np.arange(last * parts + 1) / parts
+def _cells(points: Float, columns: NDArray[np.intp], parts: NDArray[np.intp]) -> Float:
+    """Interpolate round columns, up to halfway to their neighbors.
+
+    Parameters
+    ----------
+    points : (Nx, Ny, Nz, 3) float64
+    columns : (C, 2) int
+        Numbers along x and y.
+    parts : (2,) int
+        Steps from half before to half behind a column, along x and y.
+
+    Returns
+    -------
+    (C, steps, Nz, 3) float64
+        NaN where a neighbor is undefined.
+    """
+    steps = [np.linspace(-0.5, 0.5, int(n) + 1) for n in parts]
+    offsets = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 2)
+    last = np.array(points.shape[:2]) - 1
+    place = np.clip(columns[:, None] + offsets, 0, last)
     low, high = np.floor(place).astype(np.intp), np.ceil(place).astype(np.intp)
-    share = np.expand_dims(place - low, tuple(k for k in range(points.ndim) if k != axis))
-    before, after = np.take(points, low, axis), np.take(points, high, axis)
-    return (1 - share) * before + share * after, np.rint(place).astype(np.intp)
+    share = (place - low)[..., None, None]
+    x, y = share[:, :, 0], share[:, :, 1]
+    (a, b), (c, d) = np.moveaxis(low, -1, 0), np.moveaxis(high, -1, 0)
+    before = (1 - y) * points[a, b] + y * points[a, d]
+    after = (1 - y) * points[c, b] + y * points[c, d]
+    return np.asarray((1 - x) * before + x * after)
