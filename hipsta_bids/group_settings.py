@@ -118,6 +118,29 @@ class GlmSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class LongitudinalSettings:
+    """Repeated sessions of the same participants."""
+
+    confidence: float = 0.95
+    """Coverage of two-sided confidence limits, fraction."""
+    max_correlation: float = 0.999
+    """Largest correlation between a participant's sessions that is looked for."""
+    grid: int = 40
+    """Correlations at which the likelihood is looked at first."""
+    halvings: int = 50
+    """Halvings of the interval that holds the best one."""
+    min_information: float = 1e-8
+    """As ``glm.min_information``."""
+
+    def __post_init__(self) -> None:
+        _require(0 < self.confidence < 1, "longitudinal.confidence must lie between 0 and 1")
+        _require(
+            0 < self.max_correlation < 1, "longitudinal.max_correlation must lie between 0 and 1"
+        )
+        _require(self.grid > 2, "longitudinal.grid must be at least 3")  # noqa: PLR2004 -- said there
+
+
+@dataclass(frozen=True, kw_only=True)
 class MultiplicitySettings:
     """How many tests are allowed for."""
 
@@ -176,5 +199,6 @@ class GroupSettings:
     registration: RegistrationSettings = field(default_factory=RegistrationSettings)
     design: DesignSettings = field(default_factory=DesignSettings)
     glm: GlmSettings = field(default_factory=GlmSettings)
+    longitudinal: LongitudinalSettings = field(default_factory=LongitudinalSettings)
     multiplicity: MultiplicitySettings = field(default_factory=MultiplicitySettings)
     classification: ClassificationSettings = field(default_factory=ClassificationSettings)

@@ -1,0 +1,196 @@
+"""Random-intercept models: exact answers of balanced designs, statsmodels, and error rates."""
+
+import warnings
+
+import numpy as np
+import pytest
+from scipy import stats
+from statsmodels.regression.mixed_linear_model import MixedLM
+
+from hipsta_bids.errors import ModelError
+from hipsta_bids.group.contrasts import Contrast
+from hipsta_bids.group.glm import fit_points
+from hipsta_bids.group.longitudinal import asymmetry, fit_mixed, paired_difference
+from hipsta_bids.group_settings import GlmSettings, LongitudinalSettings
+
+SETTINGS = LongitudinalSettings()
+
+
+def case(seed=0, people=24, sessions=3, points=5, *, between=0.3, balanced=True):
+    """Group differs between participants, time within them."""
+    random = np.random.default_rng(seed)
+    who = np.repeat(np.arange(people), sessions)
+    time = np.tile(np.arange(sessions), people).astype(float)
+    group = (who % 2).astype(float)
+    own = between * random.standard_normal((people, points))
+    maps = 2.0 - 0.05 * time[:, None] + own[who] + 0.1 * random.standard_normal((len(who), points))
+    matrix = np.column_stack([np.ones(len(who)), group, time])
+    if not balanced:
+        kept = random.random(len(who)) < 0.7
+        who, maps, matrix = who[kept], maps[kept], matrix[kept]
+    return np.array([f"sub-{i:02d}" for i in who]), matrix, maps
+
+
+def single(columns):
+    return [Contrast(f"b{i}", np.eye(columns)[i]) for i in range(columns)]
+
+
+def test_balanced_design_gives_exact_tests():
+    """Between participants: the t test of their means. Within: the one with participants fixed."""
+    who, matrix, maps = case()
+    fit = fit_mixed(maps, matrix, who, single(3), SETTINGS)
+    means = maps.reshape(24, 3, -1).mean(axis=1)
+    group = np.arange(24) % 2 == 1
+    between = stats.ttest_ind(means[group], means[~group])
+    # The search stops at 2^-50 of an interval; sums of squares lose some digits on the way.
+    np.testing.assert_allclose(fit.tests[1].t, between.statistic, rtol=1e-6)
+    np.testing.assert_allclose(fit.tests[1].df, 22, rtol=1e-4)
+    np.testing.assert_allclose(fit.tests[1].p, between.pvalue, rtol=1e-4)
+    fixed = np.column_stack([np.arange(72)[:, None] // 3 == np.arange(24), matrix[:, 2]])
+    (within,) = fit_points(
+        maps, fixed.astype(float), [Contrast("t", np.eye(25)[24])], GlmSettings()
+    ).tests
+    np.testing.assert_allclose(fit.tests[2].t, within.statistic, rtol=1e-6)
+    np.testing.assert_allclose(fit.tests[2].df, 47, rtol=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_unbalanced_design_agrees_with_statsmodels(seed):
+    who, matrix, maps = case(seed, balanced=False)
+    fit = fit_mixed(maps, matrix, who, single(3), SETTINGS)
+    for point in range(maps.shape[1]):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            other = MixedLM(maps[:, point], matrix, who).fit(reml=True, method="lbfgs", gtol=1e-9)
+        # The accuracy of that optimizer, about 1e-6 of the ratio of variances.
+        np.testing.assert_allclose(fit.coefficients[:, point], other.fe_params, rtol=1e-4)
+        np.testing.assert_allclose(fit.residual_variance[point], other.scale, rtol=1e-4)
+        np.testing.assert_allclose(fit.participant_variance[point], other.cov_re[0, 0], rtol=1e-3)
+        # statsmodels takes errors from the joint Hessian; lme4, and this, from X' V^-1 X.
+        same = (who[:, None] == who).astype(float)
+        v = other.scale * np.eye(len(who)) + other.cov_re[0, 0] * same
+        errors = np.sqrt(np.diag(np.linalg.inv(matrix.T @ np.linalg.inv(v) @ matrix)))
+        np.testing.assert_allclose([test.se[point] for test in fit.tests], errors, rtol=1e-3)
+
+
+def test_degrees_of_freedom_are_those_of_numerical_derivatives():
+    """Satterthwaite's definition with the restricted likelihood written out."""
+    who, matrix, maps = case(4, people=12, balanced=False, points=1)
+    y = maps[:, 0]
+    same = (who[:, None] == who).astype(float)
+
+    def parts(theta):
+        residual, between = np.exp(theta)
+        v = residual * np.eye(len(y)) + between * same
+        inverse = np.linalg.inv(v)
+        information = matrix.T @ inverse @ matrix
+        beta = np.linalg.solve(information, matrix.T @ inverse @ y)
+        left = y - matrix @ beta
+        loss = np.linalg.slogdet(v)[1] + np.linalg.slogdet(information)[1] + left @ inverse @ left
+        return loss, np.linalg.inv(information)
+
+    fit = fit_mixed(maps, matrix, who, single(3), SETTINGS)
+    best = np.log([fit.residual_variance[0], fit.participant_variance[0]])
+    step = 1e-3
+    shift = step * np.eye(2)
+    gradient = [(parts(best + d)[0] - parts(best - d)[0]) / (2 * step) for d in shift]
+    np.testing.assert_allclose(gradient, 0, atol=1e-4)  # it is the optimum
+    hessian = np.array(
+        [
+            [
+                parts(best + a + b)[0]
+                - parts(best + a - b)[0]
+                - parts(best - a + b)[0]
+                + parts(best - a - b)[0]
+                for a in shift
+            ]
+            for b in shift
+        ]
+    ) / (4 * step**2)
+    covariance = 2 * np.linalg.inv(hessian)
+    for i, test in enumerate(fit.tests):
+        value = parts(best)[1][i, i]
+        slope = np.array(
+            [(parts(best + d)[1][i, i] - parts(best - d)[1][i, i]) / (2 * step) for d in shift]
+        )
+        expected = 2 * value**2 / (slope @ covariance @ slope)
+        assert test.se[0] == pytest.approx(np.sqrt(value), rel=1e-6)
+        assert test.df[0] == pytest.approx(expected, rel=1e-3)  # steps of .001
+
+
+def test_no_variance_between_participants_gives_the_linear_model():
+    who, matrix, maps = case(5, between=0.0, points=40)
+    fit = fit_mixed(maps, matrix, who, single(3), SETTINGS)
+    zero = fit.participant_variance == 0
+    assert 0.3 < zero.mean() < 0.8  # about half the time the estimate is at the bound
+    plain = fit_points(maps, matrix, single(3), GlmSettings())
+    for mixed, linear in zip(fit.tests, plain.tests, strict=True):
+        np.testing.assert_allclose(mixed.t[zero], linear.statistic[zero], rtol=1e-8)  # rounding
+        np.testing.assert_array_equal(mixed.df[zero], 69)
+
+
+def test_missing_values_give_the_fit_of_those_present():
+    who, matrix, maps = case(6, points=12)
+    random = np.random.default_rng(6)
+    maps[random.random(maps.shape) < 0.15] = np.nan
+    maps[:, 0] = np.nan
+    maps[matrix[:, 2] > 0, 1] = np.nan  # nobody has two sessions
+    fit = fit_mixed(maps, matrix, who, single(3), SETTINGS)
+    assert np.isnan(fit.tests[1].p[:2]).all()
+    for point in range(2, 12):
+        present = np.isfinite(maps[:, point])
+        alone = fit_mixed(
+            maps[present, point, None], matrix[present], who[present], single(3), SETTINGS
+        )
+        assert fit.n[point] == present.sum()
+        for test, one in zip(fit.tests, alone.tests, strict=True):
+            # Orthonormal coordinates differ, and with them the rounding of the search.
+            assert test.t[point] == pytest.approx(one.t[0], rel=1e-6)
+            assert test.df[point] == pytest.approx(one.df[0], rel=1e-5)
+
+
+def test_error_rates_are_kept_in_small_samples():
+    """Taking sessions for participants would reject a group effect far too often."""
+    who, matrix, maps = case(7, people=10, points=4000)
+    mixed = fit_mixed(maps, matrix, who, single(3), SETTINGS)
+    linear = fit_points(maps, matrix, single(3), GlmSettings())
+    # Binomial SD .0034; three of them.
+    assert (mixed.tests[1].p < 0.05).mean() == pytest.approx(0.05, abs=0.0105)
+    assert (linear.tests[1].p < 0.05).mean() > 0.15
+    inside = (mixed.tests[2].limits[0] < -0.05) & (mixed.tests[2].limits[1] > -0.05)
+    assert inside.mean() == pytest.approx(0.95, abs=0.0105)
+
+
+def test_two_sessions_give_the_paired_t_test():
+    who, matrix, maps = case(8, sessions=2)
+    fit = fit_mixed(maps, matrix, who, single(3), SETTINGS)
+    change = paired_difference(maps[::2], maps[1::2])
+    expected = stats.ttest_1samp(change, 0)
+    np.testing.assert_allclose(fit.tests[2].t, expected.statistic, rtol=1e-6)
+    np.testing.assert_allclose(fit.tests[2].p, expected.pvalue, rtol=1e-4)
+    years = np.full(24, 2.0)
+    np.testing.assert_allclose(paired_difference(maps[::2], maps[1::2], years), change / 2)
+    years[3] = 0.0
+    with pytest.raises(ModelError, match="rows 3 have"):
+        paired_difference(maps[::2], maps[1::2], years)
+
+
+def test_asymmetry():
+    left, right = np.array([2.0, 1.0, np.nan, 0.0]), np.array([1.0, 1.0, 1.0, 0.0])
+    np.testing.assert_allclose(asymmetry(left, right, relative=False), [1, 0, np.nan, 0])
+    np.testing.assert_allclose(asymmetry(left, right, relative=True), [2 / 3, 0, np.nan, np.nan])
+
+
+def test_refusals():
+    who, matrix, maps = case(9)
+    both = [Contrast("both", np.eye(3)[1:])]
+    cases = {
+        "one-session": (maps[::3], matrix[::3, :2], who[::3], single(2)),
+        "design-shape": (maps, matrix[1:], who, single(3)),
+        "design-rank": (maps, matrix[:, [0, 1, 1]], who, single(3)),
+        "contrast-shape": (maps, matrix, who, both),
+    }
+    for reason, arguments in cases.items():
+        with pytest.raises(ModelError) as caught:
+            fit_mixed(*arguments, SETTINGS)
+        assert caught.value.reason == reason
