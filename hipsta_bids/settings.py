@@ -157,6 +157,9 @@ class TetraSettings:
 
     radius_edge_ratio: float = 2.0
     """Worst ratio of circumradius to shortest edge (TetGen's q)."""
+    smoothing_steps: int = 0
+    """Passes in which TetGen moves its own vertices to better places; they cost time and gain
+    nothing (TetGen's own default is 7)."""
     timeout: float = 60.0
     """Give up after this time, s."""
 
@@ -178,6 +181,8 @@ class BoundarySettings:
     """LaPy's curvature over curvature x mean edge length (measured on cylinders)."""
     label_neighbors: int = 30
     """Voxels around a vertex whose labels tell how lateral it is."""
+    label_stride: int = 2
+    """Every so many-th vertex is asked."""
     lateral_share: float = 0.1
     """Share of the vertices that count as most lateral."""
     axial_stretch: float = 4.0

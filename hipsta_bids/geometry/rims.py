@@ -95,9 +95,10 @@ def _most_lateral(mesh: TetMesh, body: Body, settings: BoundarySettings) -> NDAr
     index, points = body.inside_points()
     rank = body.tissue[tuple(index.T)].astype(float)
     count = min(settings.label_neighbors, len(points))
-    _, nearest = cKDTree(points).query(mesh.vertices, k=count)
+    asked = np.arange(0, len(mesh.vertices), settings.label_stride)
+    _, nearest = cKDTree(points).query(mesh.vertices[asked], k=count)
     mean = rank[nearest].mean(axis=1)
-    return np.flatnonzero(mean >= np.quantile(mean, 1 - settings.lateral_share))
+    return asked[mean >= np.quantile(mean, 1 - settings.lateral_share)]
 
 
 def _rim_path(depth: Float, wall: Wall, settings: BoundarySettings) -> NDArray[np.intp]:

@@ -37,6 +37,7 @@ def tetrahedralize(surface: Surface, settings: TetraSettings) -> TetMesh:
         "plc": True,
         "quality": True,
         "minratio": settings.radius_edge_ratio,
+        "smooth_maxiter": settings.smoothing_steps,
         "nobisect": True,
         "quiet": True,
     }
