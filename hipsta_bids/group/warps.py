@@ -14,6 +14,9 @@ IntArray = NDArray[np.int64]
 #: Damping of the first step, its factor when a step fails or succeeds, and its limits.
 _DAMPING, _FACTOR, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 5.0, 1e-9, 1e9
 
+#: Subjects in memory at once; does not change a result.
+_BLOCK = 2000
+
 
 @dataclass(frozen=True)
 class WarpBasis:
@@ -82,6 +85,67 @@ class _State:
     loss: FloatArray
 
 
+@dataclass(frozen=True)
+class _Problem:
+    """Fits of warps, whatever the subjects."""
+
+    knots: FloatArray
+    basis: WarpBasis
+    penalty: float
+    settings: RegistrationSettings
+
+    def solve(
+        self, profiles: FloatArray, coefficients: FloatArray, parameters: FloatArray
+    ) -> WarpFit:
+        """Damped Gauss-Newton steps; subjects that are done drop out."""
+        best = self.basis.lifted(parameters, self.settings.least_stretch)
+        # Adding a constant to all parameters changes nothing: keep their sum.
+        level = np.full((parameters.shape[1], parameters.shape[1]), 1 / parameters.shape[1])
+        active = np.arange(len(profiles))
+        damping = np.full(len(profiles), _DAMPING)
+        for _ in range(self.settings.warp_steps):
+            curves = coefficients[active]
+            now = self._state(best[active], profiles[active], curves)
+            matrix, right = self._normal(now, curves)
+            size = np.maximum(np.trace(matrix, axis1=1, axis2=2), _LEAST_DAMPING)
+            ridge = size[:, None, None] * (level + damping[active, None, None] * np.eye(len(level)))
+            step = np.linalg.solve(matrix + ridge, right[:, :, None])[:, :, 0]
+            trial = self._state(now.parameters + step, profiles[active], curves)
+            gained = now.loss - trial.loss
+            better = gained > 0
+            best[active[better]] = trial.parameters[better]
+            eased = np.maximum(damping[active] / _FACTOR, _LEAST_DAMPING)
+            damping[active] = np.where(better, eased, damping[active] * _FACTOR)
+            done = better & (gained < self.settings.warp_tolerance * now.loss)
+            active = active[~done & (damping[active] < _MOST_DAMPING)]
+            if not len(active):
+                break
+        last = self._state(best, profiles, coefficients)
+        matrix, _ = self._normal(last, coefficients)
+        spread = np.linalg.pinv(matrix, hermitian=True)
+        uncertainty = np.trace(spread, axis1=1, axis2=2) / matrix.shape[1]
+        return WarpFit(best, last.warps, np.asarray(uncertainty, dtype=np.float64))
+
+    def _state(
+        self, parameters: FloatArray, profiles: FloatArray, coefficients: FloatArray
+    ) -> _State:
+        warps, slopes = self.basis.evaluate(parameters)
+        expected = np.einsum("sdk,sk->sd", make_basis(self.knots)(warps), coefficients)
+        residuals = profiles - expected
+        loss = 0.5 * np.sum(residuals**2, axis=1)
+        loss += 0.5 * self.penalty * np.sum(parameters**2, axis=1)
+        return _State(parameters, warps, slopes, residuals, loss)
+
+    def _normal(self, now: _State, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Matrix and right-hand side of a Gauss-Newton step."""
+        slope = make_basis(self.knots).derivative()
+        along = np.einsum("sdk,sk->sd", slope(now.warps), coefficients)
+        jacobian = along[:, :, None] * now.slopes
+        matrix = np.swapaxes(jacobian, 1, 2) @ jacobian
+        right = np.einsum("sdi,sd->si", jacobian, now.residuals) - self.penalty * now.parameters
+        return matrix + self.penalty * np.eye(matrix.shape[1]), right
+
+
 def fit_warps(
     profiles: FloatArray,
     knots: FloatArray,
@@ -114,49 +178,16 @@ def fit_warps(
     settings : RegistrationSettings
         When to stop.
     """
-    curve = make_basis(knots)
-    slope = curve.derivative()
-
-    def state(parameters: FloatArray, chosen: IntArray) -> _State:
-        warps, slopes = basis.evaluate(parameters)
-        residuals = profiles[chosen] - np.einsum("sdk,sk->sd", curve(warps), coefficients[chosen])
-        loss = 0.5 * np.sum(residuals**2, axis=1) + 0.5 * penalty * np.sum(parameters**2, axis=1)
-        return _State(parameters, warps, slopes, residuals, loss)
-
-    def normal(now: _State, chosen: IntArray) -> tuple[FloatArray, FloatArray]:
-        along = np.einsum("sdk,sk->sd", slope(now.warps), coefficients[chosen])
-        jacobian = along[:, :, None] * now.slopes
-        matrix = np.swapaxes(jacobian, 1, 2) @ jacobian + penalty * np.eye(parameters.shape[1])
-        right = np.einsum("sdi,sd->si", jacobian, now.residuals) - penalty * now.parameters
-        return matrix, right
-
-    best = basis.lifted(parameters, settings.least_stretch)
-    # Adding a constant to all parameters changes nothing: keep their sum.
-    level = np.full((parameters.shape[1], parameters.shape[1]), 1 / parameters.shape[1])
-    active = np.arange(len(profiles))
-    damping = np.full(len(profiles), _DAMPING)
-    for _ in range(settings.warp_steps):
-        now = state(best[active], active)
-        matrix, right = normal(now, active)
-        size = np.maximum(np.trace(matrix, axis1=1, axis2=2), _LEAST_DAMPING)
-        ridge = size[:, None, None] * (level + damping[active, None, None] * np.eye(len(level)))
-        step = np.linalg.solve(matrix + ridge, right[:, :, None])[:, :, 0]
-        trial = state(now.parameters + step, active)
-        gained = now.loss - trial.loss
-        better = gained > 0
-        best[active[better]] = trial.parameters[better]
-        eased = np.maximum(damping[active] / _FACTOR, _LEAST_DAMPING)
-        damping[active] = np.where(better, eased, damping[active] * _FACTOR)
-        done = better & (gained < settings.warp_tolerance * now.loss)
-        active = active[~done & (damping[active] < _MOST_DAMPING)]
-        if not len(active):
-            break
-    everyone = np.arange(len(profiles))
-    last = state(best, everyone)
-    matrix, _ = normal(last, everyone)
-    spread = np.linalg.pinv(matrix, hermitian=True)
-    uncertainty = np.trace(spread, axis1=1, axis2=2) / matrix.shape[1]
-    return WarpFit(best, last.warps, np.asarray(uncertainty, dtype=np.float64))
+    problem = _Problem(knots, basis, penalty, settings)
+    fits = [
+        problem.solve(profiles[block], coefficients[block], parameters[block])
+        for block in _blocks(len(profiles))
+    ]
+    return WarpFit(
+        parameters=np.concatenate([fit.parameters for fit in fits]),
+        warps=np.concatenate([fit.warps for fit in fits]),
+        uncertainty=np.concatenate([fit.uncertainty for fit in fits]),
+    )
 
 
 def warp_values(maps: FloatArray, warps: FloatArray) -> FloatArray:
@@ -173,12 +204,16 @@ def warp_values(maps: FloatArray, warps: FloatArray) -> FloatArray:
     -------
     ndarray, shape (subjects, x, y)
     """
-    left, weight = _sources(warps)
-    rows = np.arange(len(maps))[:, None]
-    share = weight[:, :, None]
-    low, high = maps[rows, left], maps[rows, left + 1]
-    mixed = (1 - share) * low + share * high
-    return np.where(share == 0, low, np.where(share == 1, high, mixed))
+    carried = np.empty(maps.shape)
+    for block in _blocks(len(maps)):
+        left, weight = _sources(warps[block])
+        rows = np.arange(len(left))[:, None]
+        share = weight[:, :, None]
+        own = maps[block]
+        low, high = own[rows, left], own[rows, left + 1]
+        mixed = (1 - share) * low + share * high
+        carried[block] = np.where(share == 0, low, np.where(share == 1, high, mixed))
+    return carried
 
 
 def warp_labels(labels: IntArray, warps: FloatArray) -> IntArray:
@@ -206,3 +241,8 @@ def _sources(warps: FloatArray) -> tuple[IntArray, FloatArray]:
     gap = np.take_along_axis(warps, left + 1, axis=1) - start
     weight = np.where(gap > 0, (grid - start) / np.where(gap > 0, gap, 1.0), 0.0)
     return left, np.clip(weight, 0.0, 1.0)
+
+
+def _blocks(subjects: int) -> list[slice]:
+    """Subjects that are worked on together, to bound memory."""
+    return [slice(start, start + _BLOCK) for start in range(0, max(subjects, 1), _BLOCK)]
