@@ -144,6 +144,12 @@ class LongitudinalSettings:
 class MultiplicitySettings:
     """How many tests are allowed for."""
 
+    method: str = "two-stage"
+    """``two-stage`` (Benjamini, Krieger and Yekutieli 2006; the paper's FDR2) or
+    ``benjamini-hochberg`` (1995)."""
+    scope: str = "map"
+    """What is one family: each ``map`` (measure, contrast and hemisphere), or both ``hemispheres``
+    together."""
     alpha: float = 0.05
     """False discovery rate, or family-wise error rate of permutation tests."""
     permutations: int = 5000
@@ -160,6 +166,9 @@ class MultiplicitySettings:
     """Neighbors of a point on the sheet, 4 or 8."""
 
     def __post_init__(self) -> None:
+        methods, scopes = ("two-stage", "benjamini-hochberg"), ("map", "hemispheres")
+        _require(self.method in methods, f"multiplicity.method must be {' or '.join(methods)}")
+        _require(self.scope in scopes, f"multiplicity.scope must be {' or '.join(scopes)}")
         _require(0 < self.alpha < 1, "multiplicity.alpha must lie between 0 and 1")
         _require(self.permutations > 1, "multiplicity.permutations must be at least 2")
         _require(self.tfce_step > 0, "multiplicity.tfce_step must be positive")

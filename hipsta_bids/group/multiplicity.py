@@ -1,10 +1,13 @@
 """False discovery rates over the points of a map."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from statsmodels.stats.multitest import multipletests
+
+from hipsta_bids.group_settings import MultiplicitySettings
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -58,6 +61,51 @@ def fdr_two_stage(p: FloatArray, alpha: float) -> Discoveries:
 def fdr_benjamini_hochberg(p: FloatArray, alpha: float) -> Discoveries:
     """Step-up procedure of Benjamini and Hochberg (1995); see :func:`fdr_two_stage`."""
     return _discoveries(p, alpha, "fdr_bh")
+
+
+@dataclass(frozen=True, order=True)
+class MapKey:
+    """Which map of statistics."""
+
+    measure: str
+    contrast: str
+    hemi: str
+
+
+def discover(
+    maps: Mapping[MapKey, FloatArray], settings: MultiplicitySettings
+) -> dict[MapKey, Discoveries]:
+    """Control the false discovery rate of several maps, in families.
+
+    Parameters
+    ----------
+    maps : mapping of MapKey to ndarray
+        p-values of any shape; NaN is no test.
+    settings : MultiplicitySettings
+        Method, level, and what is one family.
+
+    Returns
+    -------
+    dict
+        In pooled families cut-off and counts are those of the family.
+    """
+    method = fdr_two_stage if settings.method == "two-stage" else fdr_benjamini_hochberg
+    families: dict[tuple[str, ...], list[MapKey]] = {}
+    for key in maps:
+        pooled = settings.scope == "hemispheres"
+        family = (key.measure, key.contrast, *(() if pooled else (key.hemi,)))
+        families.setdefault(family, []).append(key)
+    found = {}
+    for keys in families.values():
+        together = method(np.concatenate([maps[key].ravel() for key in keys]), settings.alpha)
+        ends = np.cumsum([maps[key].size for key in keys])[:-1]
+        adjusted, rejected = np.split(together.adjusted, ends), np.split(together.rejected, ends)
+        for key, values, flags in zip(keys, adjusted, rejected, strict=True):
+            shape = maps[key].shape
+            found[key] = replace(
+                together, adjusted=values.reshape(shape), rejected=flags.reshape(shape)
+            )
+    return {key: found[key] for key in maps}
 
 
 def _discoveries(p: FloatArray, alpha: float, method: str) -> Discoveries:

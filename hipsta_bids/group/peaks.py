@@ -1,0 +1,91 @@
+"""Peak tables, as in the paper: where a contrast is largest, and what lies around."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from hipsta_bids.group.glm import PointTest
+from hipsta_bids.group.multiplicity import Discoveries
+from hipsta_bids.group.sheet_graph import Cluster, find_clusters
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SheetFrame:
+    """Where the points of a map lie."""
+
+    x: FloatArray
+    """(x,) coordinates, medial to lateral, -1..1."""
+    y: FloatArray
+    """(y,) coordinates, posterior to anterior, -1..1."""
+    subfield: NDArray[np.str_]
+    """(x, y) names."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Nodes along x and y."""
+        return len(self.x), len(self.y)
+
+
+def peak_table(
+    test: PointTest, found: Discoveries, frame: SheetFrame, neighbors: int
+) -> pd.DataFrame:
+    """List the peak of each significant cluster; of the whole map if there is none.
+
+    Parameters
+    ----------
+    test : PointTest
+        One contrast; points in the order of the sheet, x slower than y.
+    found : Discoveries
+        Which points survive.
+    frame : SheetFrame
+        Where they lie.
+    neighbors : int
+        4 or 8, for clusters.
+
+    Returns
+    -------
+    DataFrame
+        One row per cluster, largest extent first: contrast, kind of statistic, place, subfield,
+        statistic, df, p, adjusted p, effect size (Cohen's d for t, else partial eta squared) with
+        limits, extent in points and the share of each subfield. Empty if nothing was tested.
+    """
+    statistic = test.statistic.reshape(frame.shape)
+    rejected = found.rejected.reshape(frame.shape)
+    clusters = find_clusters(rejected, statistic, frame.subfield, neighbors)
+    if not clusters and np.isfinite(statistic).any():
+        place = np.unravel_index(int(np.nanargmax(np.abs(statistic))), frame.shape)
+        here = (int(place[0]), int(place[1]))
+        clusters = [Cluster(0, here, np.zeros(frame.shape, dtype=bool), {})]
+    adjusted = found.adjusted.reshape(-1)
+    return pd.DataFrame([_row(test, adjusted, frame, cluster) for cluster in clusters])
+
+
+def _row(
+    test: PointTest, adjusted: FloatArray, frame: SheetFrame, cluster: Cluster
+) -> dict[str, object]:
+    x, y = cluster.peak
+    point = x * len(frame.y) + y
+    is_t = test.kind == "t"
+    size = test.cohen_d if is_t else test.eta_squared
+    limits = test.cohen_d_limits if is_t else test.eta_squared_limits
+    return {
+        "contrast": test.contrast.name,
+        "test": test.kind,
+        "x": frame.x[x],
+        "y": frame.y[y],
+        "subfield": frame.subfield[x, y],
+        "statistic": test.statistic[point],
+        "df": test.df[point],
+        "p": test.p[point],
+        "p_adjusted": adjusted[point],
+        "effect": "cohen_d" if is_t else "partial_eta_squared",
+        "effect_size": size[point],
+        "effect_low": limits[0, point],
+        "effect_high": limits[1, point],
+        "extent": cluster.extent,
+        "shares": "; ".join(f"{name} {share:.0%}" for name, share in cluster.shares.items()),
+    }
