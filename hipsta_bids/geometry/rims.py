@@ -98,7 +98,7 @@ def _most_lateral(mesh: TetMesh, body: Body, settings: BoundarySettings) -> NDAr
     asked = np.arange(0, len(mesh.vertices), settings.label_stride)
     _, nearest = cKDTree(points).query(mesh.vertices[asked], k=count)
     mean = rank[nearest].mean(axis=1)
-    return asked[mean >= np.quantile(mean, 1 - settings.lateral_share)]
+    return np.asarray(asked[mean >= np.quantile(mean, 1 - settings.lateral_share)])
 
 
 def _rim_path(depth: Float, wall: Wall, settings: BoundarySettings) -> NDArray[np.intp]:
