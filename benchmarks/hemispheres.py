@@ -107,19 +107,21 @@ def benchmark(items: Sequence[HemisphereInput], spacings: Sequence[float], repea
     """Measure all hemispheres at all spacings and print tables."""
     from hipsta_bids.bids.images import read_label_volume  # noqa: PLC0415  (part of start-up)
 
-    volumes = []
+    measure(read_label_volume(items[0]), items[0].hemi, Settings(), 1)  # starts TetGen's process
+    reading: list[float] = []
+    costs: dict[float, dict[str, Cost | None]] = {spacing: {} for spacing in spacings}
     for item in items:
         start = cpu_seconds()
-        volumes.append((name(item), item.hemi, read_label_volume(item), cpu_seconds() - start))
-    measure(volumes[0][2], volumes[0][1], Settings(), 1)  # starts TetGen's process, fills caches
-    reading = float(np.median([volume[3] for volume in volumes]))
-    print(f"\nreading: median {reading:.3f} CPU s")
-    found: dict[str, Any] = {"reading": reading, "spacings": {}}
-    for spacing in spacings:
-        settings = Settings(grid=GridSettings(spacing=spacing))
-        costs = {title: measure(v, hemi, settings, repeats) for title, hemi, v, _ in volumes}
-        found["spacings"][spacing] = report(spacing, costs)
-    return found
+        volume = read_label_volume(item)
+        reading.append(cpu_seconds() - start)
+        for spacing, found in costs.items():
+            settings = Settings(grid=GridSettings(spacing=spacing))
+            found[name(item)] = measure(volume, item.hemi, settings, repeats)
+    print(f"\nreading: median {np.median(reading):.3f} CPU s")
+    return {
+        "reading": float(np.median(reading)),
+        "spacings": {spacing: report(spacing, found) for spacing, found in costs.items()},
+    }
 
 
 def name(item: HemisphereInput) -> str:
