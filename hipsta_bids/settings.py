@@ -111,7 +111,9 @@ class TopologySettings:
     small_cost: float = 5.0
     """Membranes cheaper than this are applied together; dearer ones one a round."""
     plug_reach: int = 8
-    """A filled hole becomes as thick as the wall within this distance of it, grid nodes."""
+    """A filled hole becomes as thick as the wall within this distance of it, grid nodes ..."""
+    plug_neighbors: int = 12
+    """... at each place as thick as at so many nodes of the wall's middle closest to it."""
     oriented_nodes: int = 4
     """Membranes of fewer nodes have no direction."""
     cut_across: float = 0.3
@@ -131,8 +133,9 @@ class TopologySettings:
     """Such fills cost this much more."""
     flag_cut_cost: float = 2.0
     """Flag a cut that overrules more evidence than this (sum of the field)."""
-    flag_fill_cost: float = 50.0
-    """Flag a filled hole that overrules more evidence than this (sum of the field)."""
+    flag_fill_cost: float = 12.0
+    """Flag a filled hole whose membrane overrules more evidence than this (sum of the field; holes
+    of 1 mm radius cost 6 to 11)."""
     flag_fraction: float = 0.05
     """Flag a repair, or all together, beyond this fraction of the body."""
 
@@ -305,16 +308,15 @@ class CheckSettings:
     flag_row_dip: float = 0.15
     """Flag rows narrower than the widest on both sides by more than this (0.13 at most in twelve
     real bodies)."""
-    row_dip_reach: float = 6.0
+    row_dip_reach: float = 8.0
     """... within this distance along the axis, mm."""
     flag_pinholes: float = 0.01
     """Flag labels in which single voxels without a label are more than this share of the sheet's
     voxels (0.0015 at most in twelve real bodies)."""
     gap_directions: int = 4
     """A voxel lies in a gap if it has the sheet on both sides in so many of 13 directions."""
-    flag_gap: float = 0.0115
-    """Flag a gap whose voxels are more than this share of the sheet's (0.009 at most in twelve
-    real bodies)."""
+    flag_gap: int = 60
+    """Flag a gap of more voxels than this (38 at most in twelve real bodies, coarse or fine)."""
     flag_loose_part: float = 0.15
     """Flag a second piece of voxels, connected by faces, above this share of the sheet (0.04 at
     most in twelve real bodies)."""

@@ -26,7 +26,7 @@ def check_labels(body: Body, settings: CheckSettings) -> list[Flag]:
         where a layer of voxels without a label lies between labeled ones, ``loose-part`` where a
         large part of the sheet touches the rest by edges of voxels at most.
     """
-    index, points = body.inside_points()
+    index, _ = body.inside_points()
     low = np.maximum(index.min(axis=0) - 1, 0)
     around = tuple(slice(a, b) for a, b in zip(low, index.max(axis=0) + 2, strict=True))
     sheet = np.pad(body.tissue[around] > 0, 1)
@@ -36,7 +36,7 @@ def check_labels(body: Body, settings: CheckSettings) -> list[Flag]:
     free = ~sheet & ndimage.binary_dilation(within, structure=_ALL)
     rows = [
         _noise(free, within, settings),
-        _thin_gap(free & ~known, sheet, len(points), settings),
+        _thin_gap(free & ~known, sheet, settings),
         _loose_part(within, settings),
     ]
     flags = []
@@ -66,7 +66,7 @@ def _noise(free: Bool, within: Bool, settings: CheckSettings) -> Finding:
     return "noisy-labels", text, "smooth or correct the labels", pinholes
 
 
-def _thin_gap(free: Bool, sheet: Bool, size: int, settings: CheckSettings) -> Finding:
+def _thin_gap(free: Bool, sheet: Bool, settings: CheckSettings) -> Finding:
     """Find the largest layer of voxels that have the sheet on opposite sides."""
     opposite = np.zeros(free.shape, dtype=np.int8)
     for step in _DIRECTIONS:
@@ -77,7 +77,7 @@ def _thin_gap(free: Bool, sheet: Bool, size: int, settings: CheckSettings) -> Fi
         return None
     sizes = np.bincount(pieces.ravel())
     sizes[0] = 0
-    if sizes.max() <= settings.flag_gap * size:
+    if sizes.max() <= settings.flag_gap:
         return None
     text = f"a thin gap of {sizes.max()} voxels without a label parts the sheet"
     return "thin-gap", text, "fill it in the labels", pieces == sizes.argmax()

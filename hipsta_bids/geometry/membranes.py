@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from hipsta_bids.artifacts import Bool
 from hipsta_bids.geometry.simple_points import euler_number, grow, shrink
@@ -30,8 +31,10 @@ class Edit(NamedTuple):
     kind: Kind
     where: NDArray[np.intp]
     """(N, 3) nodes."""
+    cost: float = 0.0
+    """Evidence overruled by a membrane, before it was thickened: sum of the field."""
     doubtful: bool = False
-    """It contradicts the run of the ribbon along the axis."""
+    """A cut that contradicts the run of the ribbon along the axis."""
 
 
 def with_plates(state: NDArray[Any], value: float) -> NDArray[Any]:
@@ -77,12 +80,13 @@ def apply_membranes(
             gain = _gain(solid, where, kind)
             if gain > 0:
                 factor = _implausibility(kind, where, solid, settings)
-                cost = factor * float(weight[tuple(where.T)].sum()) / gain
-                candidates.append((cost, Edit(kind, where, factor > 1)))
+                cost = float(weight[tuple(where.T)].sum())
+                severs = kind == "cut" and factor > 1
+                candidates.append((factor * cost / gain, Edit(kind, where, cost, severs)))
     candidates.sort(key=lambda c: c[0])
     edits: list[Edit] = []
     for cost, edit in candidates:
-        kind, where, doubtful = edit
+        kind, where = edit.kind, edit.where
         if edits and cost > settings.small_cost:
             break
         if edits and _gain(solid, where, kind) <= 0:
@@ -91,7 +95,7 @@ def apply_membranes(
         state[tuple(where.T)] = kind == "fill"
         if kind == "fill":
             where = _thicken(state, lifted, where, settings)
-        edits.append(Edit(kind, where, doubtful))
+        edits.append(edit._replace(where=where))
         if cost > settings.small_cost:
             break
     return edits
@@ -187,8 +191,8 @@ def _thicken(
 ) -> NDArray[np.intp]:
     """Make a filled membrane as thick as the wall around it (in place), if the topology allows.
 
-    Half the wall's thickness is the median of the distance from its surface along its middle,
-    within ``plug_reach`` nodes of the membrane.
+    Half the wall's thickness at a node of the membrane is the mean depth of the nearest nodes along
+    the wall's middle, which are sought within ``plug_reach`` nodes.
     """
     reach = settings.plug_reach
     low = np.maximum(where.min(axis=0) - reach, CORNER)
@@ -197,8 +201,11 @@ def _thicken(
     block = state[around]
     membrane = np.zeros_like(block)
     membrane[tuple((where - low).T)] = True
-    off = ndimage.distance_transform_edt(~membrane)
-    half = _half_thickness(block & (off > 0), off <= reach)
+    off, nearest = ndimage.distance_transform_edt(~membrane, return_indices=True)
+    at = _half_thickness(block & ~membrane, where - low, settings)
+    thickness = np.zeros(block.shape)
+    thickness[tuple((where - low).T)] = at
+    half = thickness[tuple(nearest)]
     plug = np.clip(_SLOPE * (half - off), -0.5, 0.5).astype(np.float32)
     added = (plug > 0) & ~block
     trial = state.copy()
@@ -210,10 +217,18 @@ def _thicken(
     return np.vstack([where, np.argwhere(added) + low])
 
 
-def _half_thickness(wall: Bool, near: Bool) -> float:
-    """Half the thickness of a wall, in nodes: the median depth of its middle."""
+def _half_thickness(
+    wall: Bool, places: NDArray[np.intp], settings: TopologySettings
+) -> NDArray[np.float64]:
+    """Half the thickness of a wall, in nodes, (N,): the depth of its middle near (N, 3) nodes."""
     padded = np.pad(wall, 1, mode="edge")  # what goes on beyond the block has no surface there
     depth = ndimage.distance_transform_edt(padded)[1:-1, 1:-1, 1:-1]
-    ridge = wall & near & (depth >= ndimage.maximum_filter(depth, 3)) & (depth > 1)
+    ridge = wall & (depth >= ndimage.maximum_filter(depth, 3))
+    middle = np.argwhere(ridge)
+    if not len(middle):
+        return np.ones(len(places))
+    count = min(settings.plug_neighbors, len(middle))
+    _, nearest = cKDTree(middle).query(places, k=count)
     # A node's depth is the distance from the next node outside, half a step beyond the surface.
-    return float(np.median(depth[ridge])) - 0.5 if ridge.any() else 1.0
+    found = depth[tuple(middle.T)][nearest.reshape(len(places), count)]
+    return np.asarray(found.mean(axis=1) - 0.5)

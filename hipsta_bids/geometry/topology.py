@@ -39,7 +39,8 @@ class Repair:
     voxels: int
     """Changed nodes of the working grid."""
     cost: float
-    """How much evidence was overruled: sum of the field's distance from its level."""
+    """How much evidence was overruled: sum of the field's distance from its level. For a filled
+    hole, of the membrane alone, without what made it as thick as the wall."""
     position: tuple[float, float, float]
     """Center, RAS mm."""
     subfield: str = ""
@@ -247,11 +248,11 @@ def _fill_cavities(state: Bool, *, plates: bool = False) -> list[Edit]:
 def _describe(
     edit: Edit, field: Field, size: int, settings: TopologySettings, locate: Locate | None
 ) -> Repair:
-    kind, where, doubtful = edit
+    kind, where = edit.kind, edit.where
     nodes: Float = where - CORNER
     centre = field.grid.to_ras(nodes.mean(axis=0, keepdims=True))[0]
     inside = np.clip(where - CORNER, 0, np.array(field.grid.shape) - 1)
-    cost = float(np.abs(field.values[tuple(inside.T)]).sum())
+    cost = edit.cost or float(np.abs(field.values[tuple(inside.T)]).sum())
     limit = {
         "cut": settings.flag_cut_cost,
         "fill": settings.flag_fill_cost,
@@ -262,5 +263,5 @@ def _describe(
         cost=cost,
         position=(float(centre[0]), float(centre[1]), float(centre[2])),
         subfield=locate(centre[None]) if locate else "",
-        large=bool(doubtful or cost > limit or len(where) > settings.flag_fraction * size),
+        large=bool(edit.doubtful or cost > limit or len(where) > settings.flag_fraction * size),
     )

@@ -62,7 +62,7 @@ def test_gaps_filled_by_other_labels_are_none(arc):
     assert reasons(body) == {"loose-part"}
 
 
-@pytest.mark.parametrize("name", ["flag_gap", "flag_loose_part"])
-def test_limits_are_the_settings(arc, name):
+@pytest.mark.parametrize("limit", [{"flag_gap": 999}, {"flag_loose_part": 0.9}])
+def test_limits_are_the_settings(arc, limit):
     where, _ = voxels_near_plane(arc.body, arc.body.ends.axis, 0.45)
-    assert len(reasons(damaged(arc.body, where), CheckSettings(**{name: 0.9}))) == 1
+    assert len(reasons(damaged(arc.body, where), CheckSettings(**limit))) == 1
