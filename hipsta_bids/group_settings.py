@@ -129,6 +129,10 @@ class LongitudinalSettings:
     """Correlations at which the likelihood is looked at first."""
     halvings: int = 50
     """Halvings of the interval that holds the best one."""
+    slope_steps: int = 60
+    """Most steps of the fit with random slopes."""
+    slope_tolerance: float = 1e-8
+    """They end when minus twice the likelihood falls by less than this."""
     min_information: float = 1e-8
     """As ``glm.min_information``."""
 

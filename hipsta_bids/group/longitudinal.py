@@ -1,4 +1,4 @@
-"""Repeated sessions: a random intercept per participant at each point; differences; sides."""
+"""Repeated sessions: mixed models at each point; differences; sides."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,11 +10,19 @@ from scipy import special
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.contrasts import Contrast
 from hipsta_bids.group.random_intercept import best_ratio, collect_sums, curvature
+from hipsta_bids.group.random_slope import (
+    best_triangles,
+    collect_slope_sums,
+    slope_freedom,
+    solve_slopes,
+)
 from hipsta_bids.group_settings import LongitudinalSettings
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+#: Sessions of one participant that tell a slope from noise.
+_SLOPE_SESSIONS = 3
 #: Values in memory at once; bounds the temporaries, and does not change a result.
 _CHUNK = 4_000_000
 
@@ -47,7 +55,9 @@ class MixedFit:
     residual_variance: FloatArray
     """(points,) within participants."""
     participant_variance: FloatArray
-    """(points,) between them, given the columns."""
+    """(points,) between them, given the columns; with random slopes, at the mean time."""
+    slope_variance: FloatArray
+    """(points,) of slopes between them, per squared unit of time; NaN without random slopes."""
     n: IntArray
     """(points,) sessions with a value."""
     tests: tuple[MixedTest, ...]
@@ -59,8 +69,12 @@ def fit_mixed(
     participants: Sequence[str] | NDArray[np.str_],
     contrasts: Sequence[Contrast],
     settings: LongitudinalSettings,
+    *,
+    times: FloatArray | None = None,
 ) -> MixedFit:
     """Fit ``value = matrix @ coefficients + participant + residual`` at each point.
+
+    With times, participants also have a slope of their own, correlated with the intercept.
 
     By restricted maximum likelihood, which for one random intercept depends on one number: the
     ratio of the two variances. It is found for all points at once. Degrees of freedom are
@@ -80,6 +94,8 @@ def fit_mixed(
         Of one row each.
     settings : LongitudinalSettings
         Search and limits.
+    times : ndarray, shape (sessions,), optional
+        For random slopes, in any unit; the fixed slope is the business of the design.
 
     Raises
     ------
@@ -87,17 +103,27 @@ def fit_mixed(
         If shapes differ, a contrast has several rows, or nobody has two sessions.
     """
     numbers = _check(maps, matrix, participants, contrasts)
+    if times is not None and np.bincount(numbers).max() < _SLOPE_SESSIONS:
+        raise ModelError(
+            "longitudinal model: nobody has three sessions, so that slopes cannot be told from"
+            " noise; use random intercepts",
+            reason="few-sessions",
+        )
     basis, triangle = np.linalg.qr(matrix)
     back = np.linalg.inv(triangle)
     step = max(1, _CHUNK // (matrix.shape[0] * matrix.shape[1]))
     rotated = np.array([contrast.weights[0] @ back for contrast in contrasts])
-    parts = [
-        _fit(np.asarray(maps[:, i : i + step], dtype=np.float64), basis, numbers, rotated, settings)
-        for i in range(0, max(maps.shape[1], 1), step)
-    ]
+    parts = []
+    for start in range(0, max(maps.shape[1], 1), step):
+        values = np.asarray(maps[:, start : start + step], dtype=np.float64)
+        if times is None:
+            parts.append(_fit(values, basis, numbers, rotated, settings))
+        else:
+            data = _SlopeData(values, basis, numbers, times)
+            parts.append(_fit_slopes(data, rotated, settings))
     stacked = {
         name: np.concatenate([getattr(part, name) for part in parts], axis=-1)
-        for name in ("scores", "residual", "between", "n", "estimate", "se", "df")
+        for name in ("scores", "residual", "between", "slopes", "n", "estimate", "se", "df")
     }
     tests = tuple(
         _test(contrast, stacked["estimate"][i], stacked["se"][i], stacked["df"][i], settings)
@@ -107,6 +133,7 @@ def fit_mixed(
         coefficients=back @ stacked["scores"],
         residual_variance=stacked["residual"],
         participant_variance=stacked["between"],
+        slope_variance=stacked["slopes"],
         n=stacked["n"],
         tests=tests,
     )
@@ -119,6 +146,7 @@ class _Part:
     scores: FloatArray
     residual: FloatArray
     between: FloatArray
+    slopes: FloatArray
     n: IntArray
     estimate: FloatArray
     se: FloatArray
@@ -185,10 +213,49 @@ def _fit(
         scores=state.scores.T * blank,
         residual=variance * blank,
         between=variance * ratio * blank,
+        slopes=np.full(len(blank), np.nan),
         n=sums.n,
         estimate=estimate * blank,
         se=np.sqrt(form * variance) * blank,
         df=df * blank,
+    )
+
+
+@dataclass(frozen=True)
+class _SlopeData:
+    maps: FloatArray
+    basis: FloatArray
+    participants: IntArray
+    times: FloatArray
+
+
+def _fit_slopes(data: _SlopeData, rotated: FloatArray, settings: LongitudinalSettings) -> _Part:
+    unit = float(data.times.std())
+    standard = (data.times - data.times.mean()) / unit
+    sums = collect_slope_sums(data.maps, data.basis, data.participants, standard)
+    usable = np.linalg.eigvalsh(sums.squares)[:, 0] > settings.min_information
+    usable &= sums.moments[0].max(axis=1) >= _SLOPE_SESSIONS
+    usable &= sums.n > data.basis.shape[1] + _SLOPE_SESSIONS
+    kept = sums.take(np.flatnonzero(usable))
+    triangles = best_triangles(kept, settings)
+    state = solve_slopes(kept, triangles)
+    variance = state.residual / (kept.n - data.basis.shape[1])
+    form = np.einsum("ci,pij,cj->cp", rotated, state.inverse, rotated)
+
+    def spread(values: FloatArray) -> FloatArray:
+        full = np.full((*values.shape[:-1], len(usable)), np.nan)
+        full[..., usable] = values
+        return full
+
+    return _Part(
+        scores=spread(state.scores.T),
+        residual=spread(variance),
+        between=spread(variance * triangles[:, 0] ** 2),
+        slopes=spread(variance * np.sum(triangles[:, 1:] ** 2, axis=1) / unit**2),
+        n=sums.n,
+        estimate=spread(np.einsum("cj,pj->cp", rotated, state.scores)),
+        se=spread(np.sqrt(form * variance)),
+        df=spread(slope_freedom(kept, triangles, rotated)),
     )
 
 

@@ -194,3 +194,73 @@ def test_refusals():
         with pytest.raises(ModelError) as caught:
             fit_mixed(*arguments, SETTINGS)
         assert caught.value.reason == reason
+
+
+def slope_case(seed=0, people=30, slope_sd=0.1, points=4, missing=0.0):
+    """Participants differ in intercept and slope; groups in neither."""
+    random = np.random.default_rng(seed)
+    who, time = np.repeat(np.arange(people), 4), np.tile([0.0, 1.0, 2.0, 3.5], people)
+    group = (who % 2).astype(float)
+    own = 0.3 * random.standard_normal((people, points))
+    slopes = slope_sd * random.standard_normal((people, points))
+    maps = 2.0 + own[who] + slopes[who] * time[:, None]
+    maps += 0.1 * random.standard_normal(maps.shape)
+    maps[random.random(maps.shape) < missing] = np.nan
+    matrix = np.column_stack([np.ones(len(who)), group, time, group * time])
+    return np.array([f"sub-{i:02d}" for i in who]), time, matrix, maps
+
+
+def test_random_slopes_of_a_balanced_design_give_the_t_test_of_slopes():
+    who, time, matrix, maps = slope_case()
+    fit = fit_mixed(maps, matrix, who, single(4), SETTINGS, times=time)
+    slopes = np.polyfit(time[:4], maps.reshape(30, 4, -1).swapaxes(0, 1).reshape(4, -1), 1)[0]
+    slopes = slopes.reshape(30, -1)
+    expected = stats.ttest_ind(slopes[1::2], slopes[::2])
+    np.testing.assert_allclose(fit.tests[3].t, expected.statistic, rtol=1e-5)  # of the search
+    np.testing.assert_allclose(fit.tests[3].df, 28, rtol=1e-4)  # numerical derivatives
+    other = fit_mixed(maps, matrix, who, single(4), SETTINGS, times=10 * time + 3)
+    np.testing.assert_allclose(fit.tests[3].p, other.tests[3].p, rtol=1e-4)
+    np.testing.assert_allclose(fit.slope_variance, 100 * other.slope_variance, rtol=1e-4)
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.25])
+def test_random_slopes_agree_with_statsmodels(missing):
+    who, time, matrix, maps = slope_case(1, missing=missing)
+    fit = fit_mixed(maps, matrix, who, single(4), SETTINGS, times=time)
+    for point in range(maps.shape[1]):
+        here = np.isfinite(maps[:, point])
+        random = np.column_stack([np.ones(len(time)), time])[here]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            other = MixedLM(maps[here, point], matrix[here], who[here], exog_re=random).fit(
+                reml=True, method="lbfgs", gtol=1e-9
+            )
+        # The accuracy of that optimizer, as above.
+        np.testing.assert_allclose(
+            fit.coefficients[:, point], other.fe_params, rtol=1e-3, atol=1e-5
+        )
+        np.testing.assert_allclose(fit.residual_variance[point], other.scale, rtol=1e-3)
+        np.testing.assert_allclose(fit.slope_variance[point], other.cov_re[1, 1], rtol=1e-3)
+
+
+def test_slopes_that_differ_are_not_taken_for_a_change_of_all():
+    """With random intercepts only, the error of the mean slope is too small."""
+    who, time, matrix, maps = slope_case(2, people=16, points=300)
+    slopes = fit_mixed(maps, matrix, who, single(4), SETTINGS, times=time).tests[3]
+    intercepts = fit_mixed(maps, matrix, who, single(4), SETTINGS).tests[3]
+    # Binomial SD .0126; three of them.
+    assert (slopes.p < 0.05).mean() == pytest.approx(0.05, abs=0.038)
+    assert (intercepts.p < 0.05).mean() > 0.15
+
+
+def test_slopes_without_enough_sessions():
+    who, time, matrix, maps = slope_case(3)
+    two = time < 1.5
+    with pytest.raises(ModelError, match="three sessions"):
+        fit_mixed(maps[two], matrix[two], who[two], single(4), SETTINGS, times=time[two])
+    maps[:, 1] = np.nan
+    maps[~two, 2] = np.nan
+    found = fit_mixed(maps, matrix, who, single(4), SETTINGS, times=time).tests[3]
+    np.testing.assert_array_equal(np.isnan(found.p), [False, True, True, False])
+    none = np.full_like(maps, np.nan)
+    assert np.isnan(fit_mixed(none, matrix, who, single(4), SETTINGS, times=time).tests[0].p).all()
