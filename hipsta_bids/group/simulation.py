@@ -14,7 +14,8 @@ from scipy import ndimage
 from hipsta_bids.group.contrasts import Contrast
 from hipsta_bids.group.glm import PointTest, fit_points
 from hipsta_bids.group.multiplicity import fdr_two_stage
-from hipsta_bids.group.registration import mean_profiles, register
+from hipsta_bids.group.profiles import mean_profiles
+from hipsta_bids.group.registration import register
 from hipsta_bids.group.warps import warp_values
 from hipsta_bids.group_settings import GroupSettings
 

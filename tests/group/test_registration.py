@@ -7,12 +7,8 @@ import numpy as np
 import pytest
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.registration import (
-    mean_profiles,
-    register,
-    register_to,
-    shift_by_group,
-)
+from hipsta_bids.group.profiles import mean_profiles, shift_by_group
+from hipsta_bids.group.registration import register, register_to
 from hipsta_bids.group.warps import warp_labels, warp_values
 from hipsta_bids.group_settings import RegistrationSettings
 
