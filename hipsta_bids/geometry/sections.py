@@ -12,47 +12,64 @@ from hipsta_bids.settings import CheckSettings
 def check_cross_sections(field: Field, body: Body, settings: CheckSettings) -> list[Flag]:
     """Flag a body of which a part is missing between cross-sections that have it, or added.
 
-    Each cross-section is compared with those at a distance on both sides. What both lack is
-    judged by how far it stands out from the same body's other cross-sections: a bent ribbon moves
-    sideways everywhere, a leak is in one place.
+    Each cross-section is compared with those at a distance on both sides. What both lack, or have
+    of the interior labels instead, is judged by how far it stands out from the same body's other
+    cross-sections: a bent ribbon moves sideways everywhere, a leak is in one place.
 
     Returns
     -------
     list of Flag
-        ``section-notch``, ``section-bump``.
+        ``section-notch``, ``section-bump``, ``section-intrusion``.
     """
-    solid = field.values > 0
+    solid, interior = field.values > 0, _interior_nodes(field, body)
     length = body.ends.length(body.inside_points()[1])
     step = length / (field.grid.shape[2] - 1)
     area = float(np.median(solid.sum(axis=(0, 1))))
-    notch, bump = _Oddest(), _Oddest()
+    notch, bump, intrusion = _Oddest(), _Oddest(), _Oddest()
     for reach, limit in zip(settings.notch_reach, settings.notch_share, strict=True):
         k = max(round(reach / step), 1)
         if 2 * k >= solid.shape[2]:
             continue
         before, here, after = solid[:, :, : -2 * k], solid[:, :, k:-k], solid[:, :, 2 * k :]
-        missing, added = before & after & ~here, here & ~before & ~after
+        missing = before & after & ~here
         notch.look(missing, missing.sum(axis=(0, 1)) / here.sum(axis=(0, 1)), limit, k)
+        enclosed = here & interior[:, :, : -2 * k] & interior[:, :, 2 * k :]
         for oddest, part, contrast in (
             (notch, missing, settings.notch_contrast),
-            (bump, added, settings.bump_contrast),
+            (bump, here & ~before & ~after, settings.bump_contrast),
+            (intrusion, enclosed, settings.bump_contrast),
         ):
             share = part.sum(axis=(0, 1)) / area
             usual = contrast * (float(np.median(share)) + settings.section_noise)
             oddest.look(part, share, usual, k)
-    texts = {
-        "section-notch": (notch, "lacks what its neighbors have", "complete the labels there"),
-        "section-bump": (bump, "has what its neighbors lack", "look for leaks and bridges there"),
-    }
+    rows = (
+        ("section-notch", notch, "lacks what its neighbors have", "complete the labels there"),
+        ("section-bump", bump, "has what its neighbors lack", "look for leaks and bridges there"),
+        (
+            "section-intrusion",
+            intrusion,
+            "has the sheet between interior labels of its neighbors",
+            "look for bridges there",
+        ),
+    )
     return [
         Flag(
             reason=reason,
             message=f"a cross-section {what}, {oddest.share:.0%} of its area, at "
             f"{name_place(field.grid.to_ras(oddest.nodes), body)}: {remedy}",
         )
-        for reason, (oddest, what, remedy) in texts.items()
+        for reason, oddest, what, remedy in rows
         if oddest.excess > 1
     ]
+
+
+def _interior_nodes(field: Field, body: Body) -> Bool:
+    """Nodes whose nearest voxel has an interior label and is not of the sheet."""
+    inverse = np.linalg.inv(body.affine)
+    points = field.grid.node_points(clamp=0.0)
+    voxels = np.rint(points @ inverse[:3, :3].T + inverse[:3, 3]).astype(np.intp)
+    voxels = np.clip(voxels, 0, np.array(body.interior.shape) - 1)
+    return np.asarray((body.interior & (body.tissue == 0))[tuple(np.moveaxis(voxels, -1, 0))])
 
 
 class _Oddest:

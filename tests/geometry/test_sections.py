@@ -75,6 +75,16 @@ def test_a_notch_is_flagged_where_it_is(ribbon):
     assert np.linalg.norm(place_of(flag) - middle) < 1.0  # mm, the ball's part inside the wall
 
 
+def test_a_bar_through_the_interior_is_flagged_where_it_is(ribbon):
+    """Behind the interior wall lies the dentate gyrus, before and after the bar."""
+    middle = wall(ribbon, 0.75, -1.6)
+    bar = changed(ribbon.field, ball(ribbon.field, middle, 1.1), 0.5)
+    flags = {f.reason: f for f in check_cross_sections(bar, ribbon.body, CHECKS)}
+    assert np.linalg.norm(place_of(flags["section-intrusion"]) - middle) < 1.0  # mm, its radius
+    bare = replace(ribbon.body, interior=np.zeros_like(ribbon.body.interior))
+    assert "section-intrusion" not in {f.reason for f in check_cross_sections(bar, bare, CHECKS)}
+
+
 def test_what_is_odd_depends_on_the_body_s_other_cross_sections(ribbon):
     """A leak that is flagged on a smooth body is none on one that is rough everywhere."""
     leak = changed(ribbon.field, ball(ribbon.field, wall(ribbon, 0.5, 1.5), 1.0), 0.5)
