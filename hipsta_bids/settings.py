@@ -53,6 +53,9 @@ class GridSettings:
     """Distance of grid nodes and so the edge length of the meshes, mm."""
     smoothing: float = 0.85
     """Standard deviation of the Gaussian, in in-plane voxels of the segmentation."""
+    min_smoothing: float = 0.34
+    """... but at least this, mm, so that finer voxels do not leave other maps: what smoothing
+    takes from thin rims and narrow bends changes the mean thickness."""
     margin: float = 1.5
     """Free space around the body, mm."""
 
@@ -70,15 +73,11 @@ class SliceSettings:
     """Slices thicker than this many pixels are interpolated by shape."""
     upsampling: int = 2
     """Fine pixels per pixel."""
-    spacing: float = 0.35
-    """Largest distance of interpolated slices, mm."""
-    smoothing: float = 0.9
+    smoothing: float = 0.7
     """Standard deviation of the Gaussian in a slice, pixels."""
-    tail: float = 0.3
-    """Thin parts keep at least this half width, mm."""
     reach: float = 2.0
     """Distances from the outline are kept up to this, mm."""
-    edge: float = 0.3
+    edge: float = 0.2
     """Half width of the ramp across the outline, mm."""
     max_fragments: int = 8
     """Most fragments that are joined in a slice."""
@@ -92,11 +91,25 @@ class SliceSettings:
     """Fragments farther away are dropped if they are smaller than this, mm2."""
     hole_area: float = 3.0
     """Smaller holes in a slice are filled, mm2."""
-    flow_window: float = 2.0
-    """Window of the registration, mm."""
-    flow_iterations: int = 10
+    flow_window: float = 1.0
+    """Standard deviation of the window of the registration of slices, mm."""
+    flow_ridge: float = 0.02
+    """Added to the mean squared slope in a window, which is 1 where outlines fill it: keeps
+    displacements small where the outlines do not tell them."""
+    flow_smoothing: float = 0.5
+    """Standard deviation of the Gaussian on displacements after each iteration, mm."""
+    flow_iterations: int = 5
     """Iterations of the registration per level."""
-    final_smoothing: float = 0.25
+    touch: float = 0.6
+    """The subiculum and CA2 or CA3 are kept apart where both are nearer than this, mm ..."""
+    slit: float = 0.3
+    """... by a slit of this half width, mm."""
+    hidden_depth: float = 0.1
+    """What lies less deep than this inside an end plane is taken from inside, where the sheet's
+    labels end at the plane, mm."""
+    extrapolation: float = 0.5
+    """There, and beyond the last slice, shapes go on changing at this fraction of their pace."""
+    final_smoothing: float = 0.32
     """Standard deviation of the Gaussian after interpolation, mm."""
 
 

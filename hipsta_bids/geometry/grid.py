@@ -3,12 +3,13 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from hipsta_bids.artifacts import Float
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
-from hipsta_bids.geometry.slices import FineVolume, has_thick_slices, interpolate_slices
+from hipsta_bids.geometry.slices import has_thick_slices, sample_slices
 from hipsta_bids.settings import GridSettings, SliceSettings
 
 
@@ -102,16 +103,12 @@ def resample_body(body: Body, settings: GridSettings, slices: SliceSettings) -> 
     """
     grid = _fit_grid(body, settings)
     if has_thick_slices(body.affine, slices):
-        source, sigma = interpolate_slices(body, slices), slices.final_smoothing
+        points = grid.node_points(clamp=0.0).reshape(-1, 3)
+        values, sigma = sample_slices(body, points, slices), slices.final_smoothing
     else:
-        source = FineVolume(values=(body.tissue > 0).astype(np.float32), affine=body.affine)
-        sigma = settings.smoothing * in_plane_voxel(body.affine)
-    points = grid.node_points(clamp=body.ends.half_slice)
-    inverse = np.linalg.inv(source.affine)
-    voxels = points.reshape(-1, 3) @ inverse[:3, :3].T + inverse[:3, 3]
-    values = ndimage.map_coordinates(
-        source.values, voxels.T, order=1, output=np.float32, mode="nearest"
-    )
+        points = grid.node_points(clamp=body.ends.half_slice).reshape(-1, 3)
+        values = _sample_mask(body, points)
+        sigma = max(settings.smoothing * in_plane_voxel(body.affine), settings.min_smoothing)
     smooth = ndimage.gaussian_filter(
         values.reshape(grid.shape),
         sigma / settings.spacing,
@@ -119,6 +116,16 @@ def resample_body(body: Body, settings: GridSettings, slices: SliceSettings) -> 
         truncate=3.0,
     )
     return Field(grid=grid, values=smooth - np.float32(0.5))
+
+
+def _sample_mask(body: Body, points: Float) -> NDArray[np.float32]:
+    """Linear interpolation of the body's mask at (N, 3) points, RAS mm."""
+    inverse = np.linalg.inv(body.affine)
+    voxels = points @ inverse[:3, :3].T + inverse[:3, 3]
+    mask = (body.tissue > 0).astype(np.float32)
+    return np.asarray(
+        ndimage.map_coordinates(mask, voxels.T, order=1, output=np.float32, mode="nearest")
+    )
 
 
 def in_plane_voxel(affine: Float) -> float:

@@ -1,34 +1,83 @@
-"""Between thick slices: repair each slice, and move its shape into the next one.
+"""Between thick slices: outline each slice, and move its shape into the next one.
 
 Where slices are much thicker than their pixels, the ribbon moves sideways by its own thickness from
 one slice to the next, and blending slices in place would tear it. Each slice becomes a signed
-distance from its outline with thin tails kept and fragments joined; neighboring slices are
-registered, and the shapes between them are blends of both, moved along the registration.
+distance from its outline; neighboring slices are registered, and the shapes between them are blends
+of both, moved along the registration. Where head or tail labels hide how the sheet goes on, its
+shapes are continued from inside. Where the two ends of the ribbon touch, they are kept apart.
 """
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from skimage.morphology import skeletonize
-from skimage.registration import optical_flow_ilk
 
 from hipsta_bids.artifacts import Bool, Float
 from hipsta_bids.geometry.body import Body
+from hipsta_bids.geometry.outlines import outline_slice, part_distance
+from hipsta_bids.geometry.registration import register_slices
+from hipsta_bids.schemes import Tissue
 from hipsta_bids.settings import SliceSettings
 
-Image = NDArray[np.float32]
+Stack = NDArray[np.float32]
+Box = tuple[slice, slice, slice]
+
+#: Subfields of the medial and the lateral end of the ribbon. CA1 lies between them.
+_ENDS = ((Tissue.PRESUBICULUM, Tissue.SUBICULUM), (Tissue.CA2, Tissue.CA2_3, Tissue.CA3))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class FineVolume:
-    """A volume that can be sampled by linear interpolation."""
+class SliceStack:
+    """Outlines of slices and the way from each to the next."""
 
-    values: NDArray[np.float32]
-    """(I, J, K), 0 outside to 1 inside."""
-    affine: Float
+    outlines: Stack
+    """(N, I, J) signed distances at fine pixels, mm, positive inside; at least two slices."""
+    ends: Stack
+    """(2, N, I, J) the same of the medial and of the lateral subfields alone."""
+    flows: Stack
+    """(2, N - 1, I', J') fine pixels from each slice to the next, halfway between them, at the
+    pixels of the segmentation."""
+    settings: SliceSettings
+
+    def blend(self, level: Stack, where: Stack) -> Stack:
+        """Find the signed distance from the outline of the shape at any level.
+
+        Parameters
+        ----------
+        level : (N,) array of float32
+            Slice numbers, not necessarily whole.
+        where : (2, N) array of float32
+            Fine pixels.
+
+        Returns
+        -------
+        (N,) array of float32
+            mm, within the plane of the slices, positive inside.
+        """
+        last = len(self.outlines) - 1
+        level = level + (self.settings.extrapolation - 1) * (level - np.clip(level, 0, last))
+        below = np.clip(np.floor(level), 0, last - 1)
+        share = level - below
+        coarse = self.flows.shape[2] / self.outlines.shape[1]
+        step = np.zeros_like(where)
+        # The flow is known halfway between the slices: find the place there that moves to here.
+        for _ in range(3):
+            middle = (where - (share - 0.5) * step + 0.5) * coarse - 0.5
+            step = np.stack([_sample(part, below, middle) for part in self.flows])
+        middle = where - (share - 0.5) * step
+        distance, medial, lateral = (
+            (1 - share) * _sample(images, below, middle - 0.5 * step)
+            + share * _sample(images, below + 1, middle + 0.5 * step)
+            for images in (self.outlines, *self.ends)
+        )
+        return np.asarray(np.minimum(distance, self._slit(medial, lateral)), dtype=np.float32)
+
+    def _slit(self, medial: Stack, lateral: Stack) -> Stack:
+        """Distance from a slit midway between the two ends of the ribbon, where both are near."""
+        apart = 0.5 * np.abs(medial - lateral) - self.settings.slit
+        far = -np.minimum(medial, lateral) - self.settings.touch
+        return np.asarray(np.maximum(apart, far))
 
 
 def has_thick_slices(affine: Float, settings: SliceSettings) -> bool:
@@ -37,180 +86,119 @@ def has_thick_slices(affine: Float, settings: SliceSettings) -> bool:
     return bool(edges[2] > settings.min_ratio * edges[1])
 
 
-def interpolate_slices(body: Body, settings: SliceSettings) -> FineVolume:
-    """Fill the gaps between thick slices with shapes in between.
+def sample_slices(body: Body, points: Float, settings: SliceSettings) -> Stack:
+    """Sample the body's mask between and beyond its thick slices.
 
     Parameters
     ----------
     body : Body
         Its image has one axis with long voxel edges.
+    points : (N, 3) array
+        RAS mm.
     settings : SliceSettings
 
     Returns
     -------
-    FineVolume
-        Pixels of half the size, slices ``spacing`` mm apart at the most.
+    (N,) array of float32
+        From 0 outside to 1 inside, with a ramp of ``edge`` on each side of the outline.
     """
     edges = np.linalg.norm(body.affine[:3, :3], axis=0)
     through = int(np.argmax(edges))
-    pixel = float(np.delete(edges, through).mean()) / settings.upsampling
-    tissue = np.moveaxis(body.tissue, through, 0)
-    box = _bounds(
-        np.moveaxis(body.inside, through, 0), settings.reach / (pixel * settings.upsampling)
+    pixel = float(np.delete(edges, through).mean())
+    labeled = _labeled_ends(body, through)
+    box = _bounds(np.moveaxis(body.inside, through, 0), settings.reach / pixel, labeled)
+    tissue = np.moveaxis(body.tissue, through, 0)[box].copy()
+    for turn, depth, known in zip((1, -1), _depths(body, through, box), labeled, strict=True):
+        if not known:
+            _continue(tissue[::turn], (depth < settings.hidden_depth)[::turn], pixel, settings)
+    stack = _stacked(tissue, pixel, settings)
+    order = np.array([through, *np.delete(np.arange(3), through)])
+    inverse = np.linalg.inv(body.affine)[order]
+    voxels = points @ inverse[:, :3].T + inverse[:, 3] - [part.start for part in box]
+    where = ((voxels[:, 1:] + 0.5) * settings.upsampling - 0.5).astype(np.float32).T
+    distance = stack.blend(voxels[:, 0].astype(np.float32), where)
+    return np.asarray(np.clip(distance / (2 * settings.edge) + 0.5, 0, 1), dtype=np.float32)
+
+
+def _stacked(tissue: NDArray[np.uint8], pixel: float, settings: SliceSettings) -> SliceStack:
+    if len(tissue) == 1:
+        tissue = np.concatenate([tissue, tissue])
+    outlines = np.stack([outline_slice(image, pixel, settings) for image in tissue])
+    ends = np.array(
+        [[part_distance(image, end, pixel, settings) for image in tissue] for end in _ENDS]
     )
-    outlines = [_outline(image, pixel, settings) for image in tissue[box]]
-    steps = max(int(np.ceil(edges[through] / settings.spacing)), 1)
-    planes = [outlines[0]]
-    for below, above in pairwise(outlines):
-        planes += _between(below, above, steps, pixel, settings)
-    ramp = np.clip(np.stack(planes) / (2 * settings.edge) + 0.5, 0, 1).astype(np.float32)
-    return FineVolume(
-        values=np.moveaxis(ramp, 0, through),
-        affine=_finer(body.affine, through, box, steps, settings.upsampling),
+    return SliceStack(
+        outlines=outlines,
+        ends=ends,
+        flows=register_slices(outlines, pixel, settings),
+        settings=settings,
     )
 
 
-def _bounds(inside: Bool, margin: float) -> tuple[slice, slice, slice]:
-    """Slices that hold the body, and a box in the slices with a margin in pixels."""
+def _sample(images: Stack, number: Stack, where: Stack) -> Stack:
+    return np.asarray(
+        ndimage.map_coordinates(
+            images, np.stack([number, *where]), order=1, mode="nearest", output=np.float32
+        )
+    )
+
+
+def _labeled_ends(body: Body, through: int) -> tuple[bool, bool]:
+    """Whether the sheet's labels go on beyond the first and beyond the last slice of the body."""
+    index = np.argwhere(body.tissue > 0)
+    points = index @ body.affine[:3, :3].T + body.affine[:3, 3]
+    thickness = float(np.linalg.norm(body.affine[:3, through]))
+    known = []
+    for depth in (body.ends.height(points, "posterior"), -body.ends.height(points, "anterior")):
+        inner = np.count_nonzero((depth > 0) & (depth < thickness))
+        outer = np.count_nonzero((depth < 0) & (depth > -thickness))
+        known.append(bool(outer > 0.5 * inner))  # a label that is only blurred at the plane is less
+    return (known[0], known[1]) if _goes_forward(body, through) else (known[1], known[0])
+
+
+def _goes_forward(body: Body, through: int) -> bool:
+    """Whether the numbers of the slices rise from posterior to anterior."""
+    return bool(body.ends.axis @ body.affine[:3, through] > 0)
+
+
+def _bounds(inside: Bool, margin: float, labeled: tuple[bool, bool]) -> Box:
+    """Slices that hold the body, one more where labels go on, and a box in them with a margin."""
     index = np.argwhere(inside)
-    low, high = index.min(axis=0), index.max(axis=0) + 1
-    room = np.array([0, np.ceil(margin), np.ceil(margin)], dtype=int)
-    low, high = np.maximum(low - room, 0), np.minimum(high + room, inside.shape)
+    room = np.ceil([0, margin, margin]).astype(int)
+    low, high = index.min(axis=0) - room, index.max(axis=0) + 1 + room
+    low[0] -= labeled[0]
+    high[0] += labeled[1]
+    low, high = np.maximum(low, 0), np.minimum(high, inside.shape)
     return slice(low[0], high[0]), slice(low[1], high[1]), slice(low[2], high[2])
 
 
-def _finer(
-    affine: Float, through: int, box: tuple[slice, slice, slice], steps: int, upsampling: int
-) -> Float:
-    """Affine of the fine volume: pixels of the box split, ``steps`` planes a slice."""
-    scale = np.insert(np.full(2, 1 / upsampling), through, 1 / steps)
-    split = 0.5 / upsampling - 0.5  # fine pixel centers lie inside the pixel
-    shift = np.array([box[1].start + split, box[2].start + split])
-    fine = affine.copy()
-    fine[:3, :3] = affine[:3, :3] * scale
-    fine[:3, 3] += affine[:3, :3] @ np.insert(shift, through, box[0].start)
-    return fine
+def _depths(body: Body, through: int, box: Box) -> tuple[Float, Float]:
+    """Depths of the box's voxels inside the planes at its first and last slices, mm."""
+    order = [through, *(axis for axis in range(3) if axis != through)]
+    index = np.meshgrid(*(np.arange(part.start, part.stop) for part in box), indexing="ij")
+    points = np.stack(index, axis=-1) @ body.affine[:3, order].T + body.affine[:3, 3]
+    posterior = body.ends.height(points, "posterior")
+    anterior = -body.ends.height(points, "anterior")
+    return (posterior, anterior) if _goes_forward(body, through) else (anterior, posterior)
 
 
-def _outline(tissue: NDArray[np.uint8], pixel: float, settings: SliceSettings) -> Image:
-    """Signed distance from a slice's outline, mm, positive inside, at the fine pixels."""
-    mask = tissue > 0
-    fine = np.kron(mask, np.ones((settings.upsampling,) * 2)).astype(np.float32)
-    ranks = np.kron(tissue, np.ones((settings.upsampling,) * 2, np.uint8))
-    smooth = ndimage.gaussian_filter(fine, settings.smoothing * settings.upsampling)
-    distance = _signed_distance(smooth > 0.5, pixel, settings)  # noqa: PLR2004 -- the outline
-    if mask.any():
-        skeleton = skeletonize(fine > 0)  # type: ignore[no-untyped-call]
-        spine = ndimage.distance_transform_edt(~skeleton) * pixel
-        distance = np.maximum(distance, settings.tail - spine)
-        distance = _join(distance, ranks, pixel, settings)
-    return np.asarray(np.clip(distance, -settings.reach, settings.reach), dtype=np.float32)
+def _continue(
+    tissue: NDArray[np.uint8], hidden: Bool, pixel: float, settings: SliceSettings
+) -> None:
+    """Fill in, in place, what end labels hide of oblique first slices, as the next ones suggest.
 
-
-def _signed_distance(mask: Bool, pixel: float, settings: SliceSettings) -> Float:
-    """Distance from the border between pixels, mm, positive inside."""
-    if not mask.any():
-        return np.full(mask.shape, -settings.reach)
-    inside = ndimage.distance_transform_edt(mask)
-    outside = ndimage.distance_transform_edt(~mask)
-    return np.asarray((np.maximum(inside - 0.5, 0) - np.maximum(outside - 0.5, 0)) * pixel)
-
-
-def _join(
-    distance: Float, ranks: NDArray[np.uint8], pixel: float, settings: SliceSettings
-) -> Float:
-    """Bridge near fragments of a slice to the largest, drop crumbs, fill holes.
-
-    A large piece farther away is left alone: whether it belongs to the ribbon (it may turn into
-    the uncus) is seen in three dimensions only.
+    Left empty, the hidden part would thin the sheet up to a slice's thickness inside the plane.
     """
-    for _ in range(settings.max_fragments):
-        pieces, count = ndimage.label(distance > 0)
-        if count < 2:  # noqa: PLR2004 -- one piece is the aim
-            break
-        sizes = np.bincount(pieces.ravel()) * pixel**2
-        sizes[0] = 0
-        main = pieces == sizes.argmax()
-        gap, nearest = ndimage.distance_transform_edt(~main, return_indices=True)
-        gap *= pixel
-        # The sheet is one ribbon: a fragment belongs to a neighbor in medial-to-lateral order,
-        # not to the part that happens to lie across the sulcus.
-        jump = np.abs(ranks.astype(int) - ranks[tuple(nearest)]) > settings.max_rank_jump
-        cost = gap + np.where(jump & (ranks > 0), settings.reach, 0)
-        crumbs = (sizes < settings.crumb_area)[pieces]
-        cost[(pieces == 0) | main | ((cost > settings.max_gap) & ~crumbs)] = np.inf
-        end = np.array(np.unravel_index(np.argmin(cost), cost.shape))
-        nearest_cost = cost[tuple(end)]
-        if not np.isfinite(nearest_cost):
-            break
-        if nearest_cost > settings.max_gap:
-            distance = np.where(pieces == pieces[tuple(end)], -0.5 * pixel, distance)
-        else:
-            start = np.array([axis[tuple(end)] for axis in nearest])
-            bridge = _segment_distance(distance.shape, start, end) * pixel
-            distance = np.maximum(distance, settings.bridge - bridge)
-    holes, _ = ndimage.label(distance <= 0)
-    area = np.bincount(holes.ravel()) * pixel**2
-    small = (area < settings.hole_area)[holes] & (distance <= 0)
-    return np.where(small, 0.5 * pixel, distance)
-
-
-def _segment_distance(
-    shape: tuple[int, ...], start: NDArray[np.intp], end: NDArray[np.intp]
-) -> Float:
-    """Distance of each pixel from a segment, in pixels."""
-    grid = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1)
-    along = end - start
-    share = ((grid - start) @ along) / max(float(along @ along), 1e-9)
-    foot = start + np.clip(share, 0, 1)[..., None] * along
-    return np.asarray(np.linalg.norm(grid - foot, axis=-1))
-
-
-def _between(
-    below: Image, above: Image, steps: int, pixel: float, settings: SliceSettings
-) -> list[Image]:
-    """Shapes at 1/steps, 2/steps, ... 1 of the way from one slice to the next."""
-    forward = _flow(below, above, pixel, settings)
-    backward = _flow(above, below, pixel, settings)
-    planes = []
-    for step in range(1, steps):
-        share = step / steps
-        one = _blend(below, above, forward, share)
-        other = _blend(above, below, backward, 1 - share)
-        planes.append(0.5 * (one + other))
-    return [*planes, above]
-
-
-def _flow(fixed: Image, moving: Image, pixel: float, settings: SliceSettings) -> Image:
-    """Displacement (2, I, J) in pixels with moving(x + flow) = fixed(x).
-
-    Iterative Lucas-Kanade (Le Besnerais & Champagnat 2005, ICIP:I-137), as in scikit-image.
-    """
-    # At the pixels of the segmentation: the fine ones would cost much and tell no more.
-    coarse = settings.upsampling
-    small = [
-        ndimage.zoom(image, 1 / coarse, order=1, grid_mode=True, mode="nearest")
-        for image in (fixed, moving)
-    ]
-    radius = max(round(settings.flow_window / (pixel * coarse)), 1)
-    flow = optical_flow_ilk(  # type: ignore[no-untyped-call]
-        small[0], small[1], radius=radius, num_warp=settings.flow_iterations, gaussian=True
-    )
-    fine = [ndimage.zoom(part, coarse, order=1, grid_mode=True, mode="nearest") for part in flow]
-    return np.asarray(np.stack(fine) * coarse, dtype=np.float32)
-
-
-def _blend(first: Image, second: Image, flow: Image, share: float) -> Image:
-    """Shape at a share of the way, both slices moved along the flow."""
-    grid = np.indices(first.shape, dtype=np.float32)
-    here = flow
-    for _ in range(3):  # the flow is known at the first slice: find it at the place in between
-        here = np.stack([_sample(part, grid - share * here) for part in flow])
-    moved = _sample(first, grid - share * here), _sample(second, grid + (1 - share) * here)
-    return np.asarray((1 - share) * moved[0] + share * moved[1], dtype=np.float32)
-
-
-def _sample(image: Image, where: Image) -> Image:
-    return np.asarray(
-        ndimage.map_coordinates(image, where, order=1, mode="nearest", output=np.float32)
-    )
+    parted = np.flatnonzero((hidden[:-2] & (tissue[1:-1] > 0)).any(axis=(1, 2)))
+    up = settings.upsampling
+    where = np.indices(tissue.shape[1:], dtype=np.float32).reshape(2, -1) * up + 0.5 * (up - 1)
+    level = np.full(where.shape[1], -1.0, dtype=np.float32)
+    for number in range(int(parted.max(initial=-1)), -1, -1):
+        stack = _stacked(tissue[number + 1 : number + 3], pixel, settings)
+        expected = stack.blend(level, where).reshape(tissue.shape[1:]) > 0
+        inner = tissue[number + 1]
+        nearest = ndimage.distance_transform_edt(
+            inner == 0, return_distances=False, return_indices=True
+        )
+        filled = np.where(expected, inner[tuple(nearest)], 0)
+        tissue[number] = np.where(hidden[number], filled, tissue[number])
