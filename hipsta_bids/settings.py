@@ -149,6 +149,8 @@ class TopologySettings:
     flag_fill_cost: float = 8.0
     """Flag a filled hole whose membrane overrules more evidence than this (sum of the field; holes
     of 0.8 mm radius cost 2 to 6, of 1 mm 6 to 11)."""
+    doubtful_fill_cost: float = 2.0
+    """... and a fill across the axis that overrules more than this."""
     flag_fraction: float = 0.05
     """Flag a repair, or all together, beyond this fraction of the body."""
 

@@ -34,7 +34,7 @@ class Edit(NamedTuple):
     cost: float = 0.0
     """Evidence overruled by a membrane, before it was thickened: sum of the field."""
     doubtful: bool = False
-    """A cut that contradicts the run of the ribbon along the axis."""
+    """It contradicts the run of the ribbon along the axis."""
 
 
 def with_plates(state: NDArray[Any], value: float) -> NDArray[Any]:
@@ -81,8 +81,8 @@ def apply_membranes(
             if gain > 0:
                 factor = _implausibility(kind, where, solid, settings)
                 cost = float(weight[tuple(where.T)].sum())
-                severs = kind == "cut" and factor > 1
-                candidates.append((factor * cost / gain, Edit(kind, where, cost, severs)))
+                doubtful = factor > 1 and (kind == "cut" or cost > settings.doubtful_fill_cost)
+                candidates.append((factor * cost / gain, Edit(kind, where, cost, doubtful)))
     candidates.sort(key=lambda c: c[0])
     edits: list[Edit] = []
     for cost, edit in candidates:
