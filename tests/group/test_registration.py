@@ -5,11 +5,13 @@ from time import process_time
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.profiles import mean_profiles, shift_by_group
 from hipsta_bids.group.registration import register, register_to
-from hipsta_bids.group.warps import warp_labels, warp_values
+from hipsta_bids.group.splines import inner_knots, make_basis
+from hipsta_bids.group.warps import WarpBasis, fit_warps, warp_labels, warp_values
 from hipsta_bids.group_settings import RegistrationSettings
 
 NODES = 41
@@ -74,6 +76,31 @@ def test_known_warps_are_recovered(settings):
     np.testing.assert_array_equal(found.warps[:, 0], 0.0)
     np.testing.assert_allclose(found.warps[:, -1], 1.0, rtol=1e-12)
     np.testing.assert_allclose(found.warps.mean(axis=0), GRID, atol=2e-3)  # a tenth of a node
+
+
+@pytest.mark.parametrize("penalty", [0.0, 1.0])
+def test_warps_are_the_optimum_of_their_loss(penalty):
+    """A general optimizer, one subject at a time, finds nothing better and the same warp."""
+    profiles, _, _ = simulated(6)
+    basis = WarpBasis.make(NODES, 5)
+    knots = inner_knots(GRID, 12)
+    curve = make_basis(knots)
+    mean = np.linalg.lstsq(curve(GRID), shape(GRID), rcond=None)[0]
+
+    def loss(parameters, profile):
+        warps, _ = basis.evaluate(parameters[None])
+        difference = profile - curve(warps[0]) @ mean
+        return 0.5 * (difference @ difference + penalty * parameters @ parameters)
+
+    start = np.zeros((6, 4))
+    curves = np.tile(mean, (6, 1))
+    found = fit_warps(profiles, knots, curves, basis, start, penalty=penalty, settings=SETTINGS)
+    for i, profile in enumerate(profiles):
+        best = minimize(loss, start[i], args=(profile,), method="BFGS", options={"gtol": 1e-9})
+        own = loss(found.parameters[i], profile)
+        assert own == pytest.approx(best.fun, rel=1e-6)  # numerical gradients
+        warps, _ = basis.evaluate(best.x[None])
+        np.testing.assert_allclose(found.warps[i], warps[0], atol=1e-3)  # a flat optimum
 
 
 @pytest.mark.parametrize("settings", [SETTINGS, PENALIZED], ids=["registr", "penalized"])
@@ -157,6 +184,7 @@ def test_missing_values_stay_missing_and_do_not_spread():
     warps = np.stack([GRID, GRID**1.2])
     maps = np.ones((2, NODES, 3))
     maps[:, 10:13, 1] = np.nan
+    maps[0, -2, 1] = np.nan
     carried = warp_values(maps, warps)
     np.testing.assert_array_equal(np.isnan(carried[0]), np.isnan(maps[0]))
     assert np.isnan(carried[1, :, 1]).sum() in range(2, 6)
