@@ -11,6 +11,9 @@ FloatArray = NDArray[np.float64]
 
 #: SciPy's inverse is exact to some 1e-5 only; the root is looked for this far around it.
 _BRACKET = 0.01
+#: SciPy's inverse for F goes no farther than 10000; beyond it the root is looked for between a
+#: tenth of this and so many times the numerator's sum.
+_FARTHEST, _WIDEST = 9990.0, 20.0
 
 
 def t_limits(t: FloatArray, df: FloatArray, confidence: float) -> tuple[FloatArray, FloatArray]:
@@ -72,6 +75,11 @@ def f_limits(
         inside = np.where(reachable, f, np.nan)
         start = _floats(special.ncfdtrinc(first, df2, probability, inside))
         root = np.maximum(_root(excess, start, inside, df2), 0.0)
+        far = start >= _FARTHEST
+        if far.any():
+            wide = (np.full(far.sum(), _FARTHEST / 10), _WIDEST * first * inside[far])
+            found = elementwise.find_root(excess, wide, args=(inside[far], df2[far]))
+            root[far] = np.where(found.success, found.x, np.nan)
         return np.where(reachable | np.isnan(f), root, 0.0)
 
     return limit(1 - tail), limit(tail)

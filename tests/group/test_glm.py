@@ -181,6 +181,11 @@ def test_limits_are_roots_of_the_distributions():
     assert high[0] == 0.0
     assert np.isnan(low[-1])
     assert np.isnan(high[-1])
+    large, df = np.array([9e3, 9e4]), np.array([40.0, 1500.0])  # beyond SciPy's inverse
+    low, high = f_limits(large, 2, df, 0.9)
+    np.testing.assert_allclose(stats.ncf.cdf(large, 2, df, low), 0.95, atol=1e-8)
+    np.testing.assert_allclose(stats.ncf.cdf(large, 2, df, high), 0.05, atol=1e-8)
+    assert (low > 1e4).all()
 
 
 def test_refuses_what_cannot_be_fitted():
