@@ -159,7 +159,7 @@ class TopologySettings:
 class SurfaceSettings:
     """The closed surface of the body."""
 
-    taubin_iterations: int = 8
+    taubin_iterations: int = 16
     """Pairs of shrinking and inflating steps."""
     taubin_shrink: float = 0.5
     """Step towards the mean of the neighbors, fraction."""
@@ -215,8 +215,23 @@ class BoundarySettings:
     """The zones hold at least all within this distance of the rim path, in the same unit."""
     max_distance: float = 1.0
     """The two rules may differ by this much, mm; beyond it the rims are taken."""
-    strip_width: float = 1.1
-    """Width of the boundary strips, multiples of 2 volume / wall area."""
+    strip_facing: float = 0.62
+    """The boundary strips face away from the sheet: least cosine of the angle between the wall's
+    normal and the direction in which the sheet would go on."""
+    first_strip: float = 0.55
+    """At first they hold all within this distance of the curves, multiples of 2 volume / wall
+    area."""
+    least_strip: float = 0.25
+    """They hold at least all within this distance of their middle lines, in the same unit."""
+    strip_step: float = 0.5
+    """The direction of the sheet is found after one, two and three steps of this length from the
+    rim, in the same unit."""
+    strip_neighbors: int = 160
+    """... as the mean over so many tetrahedra,"""
+    rim_neighbors: int = 15
+    """... and then over so many points of the rim."""
+    strip_rounds: int = 2
+    """How often the strips are found, each time from the middle lines of the last ones."""
     probe_distances: tuple[float, ...] = (0.4, 0.8, 1.2)
     """Distances at which interior labels are looked for, mm outside the wall."""
     min_probe_share: float = 0.02
@@ -236,7 +251,7 @@ class SheetSettings:
     """Nodes from posterior to anterior."""
     z_nodes: int = 9
     """Nodes from interior to exterior, odd so that the middle one is the mid-surface."""
-    x_extent: float = 0.95
+    x_extent: float = 0.9
     """The grid spans plus and minus this along x."""
     y_extent: float = 1.0
     """The grid spans plus and minus this along y."""

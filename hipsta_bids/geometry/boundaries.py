@@ -10,10 +10,10 @@ from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.laplace import smallest_eigenfunctions
 from hipsta_bids.geometry.rims import center_curves, guided_curves, rim_paths
+from hipsta_bids.geometry.strips import facing_strips
 from hipsta_bids.geometry.surface import (
     mean_wall_thickness,
     signed_volume,
-    triangle_areas,
 )
 from hipsta_bids.geometry.wall import Wall, end_to_end, vertex_normals
 from hipsta_bids.settings import BoundarySettings
@@ -44,7 +44,7 @@ class Boundaries:
     side_margin: float
     """Difference of the shares of outward probes that hit interior labels; NaN without labels."""
     strip_width: float
-    """Full width of the boundary strips, mm."""
+    """Mean width of the boundary strips, mm."""
     sheet_thickness: float
     """2 volume / area of the two sides, strips left out on either, mm."""
 
@@ -84,17 +84,17 @@ def find_boundaries(
     distance = float("nan")
     if curves is not None and guided is not None:
         distance = _curve_distance(curves, guided)
-    width = settings.strip_width * thickness
     attempts = [
         (rule, pair and center_curves(wall, pair, thickness, settings))
         for rule, pair in (("eigenfunction", curves), ("rims", guided))
     ]
     if not distance <= settings.max_distance:
         attempts.reverse()
-    rule, pair, strips, sides = _separating(wall, attempts, width)
+    rule, pair, strips, sides = _separating(wall, mesh, attempts, thickness, settings)
     if _rank(pair[0], body) > _rank(pair[1], body):
         pair, strips = (pair[1], pair[0]), (strips[1], strips[0])
     sides, side_rule, margin = _interior_first(sides, wall, body, settings)
+    area = _strip_area(wall, strips[0] | strips[1])
     return Boundaries(
         medial=wall.index[strips[0]],
         lateral=wall.index[strips[1]],
@@ -109,22 +109,29 @@ def find_boundaries(
         rim_distance=_curve_distance(pair, rims),
         side_rule=side_rule,
         side_margin=margin,
-        strip_width=width,
-        sheet_thickness=_sheet_thickness(surface, wall, strips[0] | strips[1]),
+        strip_width=area / (2 * body.ends.length(wall.vertices)),
+        # The strips are end faces of the sheet.
+        sheet_thickness=2
+        * signed_volume(surface.vertices, surface.triangles)
+        / (float(wall.areas.sum()) - area),
     )
 
 
 def _separating(
-    wall: Wall, attempts: list[tuple[str, tuple[Float, Float] | None]], width: float
+    wall: Wall,
+    mesh: TetMesh,
+    attempts: list[tuple[str, tuple[Float, Float] | None]],
+    thickness: float,
+    settings: BoundarySettings,
 ) -> tuple[str, tuple[Float, Float], tuple[Bool, Bool], tuple[Bool, Bool]]:
     """Take the first pair of curves whose strips separate the wall into two sides."""
     for rule, pair in attempts:
         if pair is None:
             continue
-        strips = (wall.near(pair[0], 0.5 * width), wall.near(pair[1], 0.5 * width))
+        strips, middle = facing_strips(wall, mesh, pair, thickness, settings)
         sides = wall.sides(strips[0] | strips[1])
         if sides is not None and not (strips[0] & strips[1]).any():
-            return rule, pair, strips, sides
+            return rule, middle, strips, sides
     raise GeometryError(
         "the medial and lateral boundary do not separate the interior from the exterior side: "
         "check the labels for folds that touch each other",
@@ -176,8 +183,6 @@ def _interior_first(
     return (sides if share[0] > share[1] else (sides[1], sides[0])), "labels", margin
 
 
-def _sheet_thickness(surface: Surface, wall: Wall, strips: Bool) -> float:
-    """2 volume / area of the wall, the strips' own area counted as end faces."""
-    areas = triangle_areas(wall.vertices, wall.triangles)
-    ends = strips[wall.triangles].all(axis=1)
-    return 2 * signed_volume(surface.vertices, surface.triangles) / float(areas[~ends].sum())
+def _strip_area(wall: Wall, strips: Bool) -> float:
+    """Area of the triangles within the strips, mm2."""
+    return float(wall.areas[strips[wall.triangles].all(axis=1)].sum())

@@ -4,10 +4,7 @@ import numpy as np
 
 from hipsta_bids.artifacts import Coordinates, TetMesh
 from hipsta_bids.geometry.boundaries import Boundaries
-from hipsta_bids.geometry.laplace import solve_dirichlet, stiffness
-from hipsta_bids.geometry.two_level import compact_groups
-
-_MANY = 4000  # vertices from which on iterating is faster than factorizing
+from hipsta_bids.geometry.laplace import HarmonicSolver
 
 
 def solve_coordinates(mesh: TetMesh, boundaries: Boundaries) -> Coordinates:
@@ -30,23 +27,10 @@ def solve_coordinates(mesh: TetMesh, boundaries: Boundaries) -> Coordinates:
     GeometryError
         ``laplace`` if a problem has no finite solution.
     """
-    matrix = stiffness(mesh.vertices, mesh.tetrahedra)
-    groups = compact_groups(mesh.vertices) if len(mesh.vertices) > _MANY else None
-    pairs = (
-        (boundaries.medial, boundaries.lateral, groups),
-        (boundaries.posterior, boundaries.anterior, groups),
-        # Few vertices lie between the two walls.
-        (boundaries.interior, boundaries.exterior, None),
+    solver = HarmonicSolver(mesh)
+    values = (
+        solver.between(boundaries.medial, boundaries.lateral),
+        solver.between(boundaries.posterior, boundaries.anterior),
+        solver.between(boundaries.interior, boundaries.exterior, few=True),
     )
-    values = np.column_stack(
-        [
-            solve_dirichlet(
-                matrix,
-                np.concatenate([first, second]),
-                np.repeat([-1.0, 1.0], [len(first), len(second)]),
-                levels,
-            )
-            for first, second, levels in pairs
-        ]
-    )
-    return Coordinates(values=values)
+    return Coordinates(values=np.column_stack(values))

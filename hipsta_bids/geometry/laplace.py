@@ -5,10 +5,10 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse import linalg
 
-from hipsta_bids.artifacts import Float, Int
+from hipsta_bids.artifacts import Float, Int, TetMesh
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.tetra import cross, tetra_volumes
-from hipsta_bids.geometry.two_level import solve_two_level
+from hipsta_bids.geometry.two_level import compact_groups, solve_two_level
 
 
 def stiffness(vertices: Float, tetrahedra: Int, tensor: Float | None = None) -> sparse.csc_array:
@@ -76,6 +76,14 @@ def triangle_stiffness(
     return _assemble(local * (double / 2)[:, None, None], triangles, len(vertices))
 
 
+def gradients(vertices: Float, tetrahedra: Int, values: Float) -> Float:
+    """Gradient (T, 3) of a piecewise linear function (V,), per mm."""
+    steps = vertices[tetrahedra[:, 1:]] - vertices[tetrahedra[:, :1]]
+    rise = values[tetrahedra[:, 1:]] - values[tetrahedra[:, :1]]
+    gradient: Float = np.linalg.solve(steps, rise[..., None])[..., 0].astype(np.float64)
+    return gradient
+
+
 def lumped_mass(vertices: Float, tetrahedra: Int) -> Float:
     """Diagonal of the lumped mass matrix, (V,), mm3."""
     share = np.repeat(tetra_volumes(vertices, tetrahedra) / 4, 4)
@@ -124,6 +132,42 @@ def solve_dirichlet(
             "a Laplace problem has no finite solution: the mesh is broken", reason="laplace"
         )
     return result
+
+
+class HarmonicSolver:
+    """Harmonic functions on a mesh, from -1 to 1; the matrix is assembled once."""
+
+    _MANY = 4000  # vertices from which on iterating is faster than factorizing
+
+    def __init__(self, mesh: TetMesh) -> None:
+        self._matrix = stiffness(mesh.vertices, mesh.tetrahedra)
+        self._groups = compact_groups(mesh.vertices) if len(mesh.vertices) > self._MANY else None
+
+    def between(self, first: Int, second: Int, *, few: bool = False) -> Float:
+        """Solve Laplace's equation between two sets of vertices, without flux elsewhere.
+
+        Parameters
+        ----------
+        first, second : arrays of int
+            Vertices where the function is -1 and 1.
+        few : bool
+            Few vertices are left between them, so that a factorization is faster.
+
+        Returns
+        -------
+        (V,) array
+
+        Raises
+        ------
+        GeometryError
+            ``laplace`` if there is no finite solution.
+        """
+        return solve_dirichlet(
+            self._matrix,
+            np.concatenate([first, second]),
+            np.repeat([-1.0, 1.0], [len(first), len(second)]),
+            None if few else self._groups,
+        )
 
 
 def smallest_eigenfunctions(

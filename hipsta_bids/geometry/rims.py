@@ -1,5 +1,7 @@
 """The rims of the sheet, found by distances inside the body."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, sparse
@@ -64,7 +66,7 @@ def guided_curves(
         | wall.near(wall.vertices[path], settings.rim_reach * thickness)
         for path, depth in zip(paths, depths, strict=True)
     ]
-    return _middle_lines(wall, zones)
+    return middle_lines(wall, zones)
 
 
 def center_curves(
@@ -77,11 +79,12 @@ def center_curves(
     """
     for width in settings.rim_bands:
         bands = [wall.near(curve, width * thickness) for curve in curves]
-        curves = _middle_lines(wall, bands) or curves
+        curves = middle_lines(wall, bands) or curves
     return curves
 
 
-def _middle_lines(wall: Wall, zones: list[Bool]) -> tuple[Float, Float] | None:
+def middle_lines(wall: Wall, zones: Sequence[Bool]) -> tuple[Float, Float] | None:
+    """Zero lines, within zones at the rims, of the harmonic function between the two sides."""
     sides = wall.sides(zones[0] | zones[1])
     if sides is None:
         return None

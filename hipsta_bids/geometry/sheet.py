@@ -45,7 +45,7 @@ def sample_sheet(mesh: TetMesh, coordinates: Coordinates, settings: SheetSetting
             "check the labels near the end planes",
             reason="sheet-incomplete",
         )
-    return Sheet(points=_filled(points), valid=~missing)
+    return Sheet(points=_evenly(_filled(points)), valid=~missing)
 
 
 def sheet_levels(settings: SheetSettings) -> tuple[Float, Float, Float]:
@@ -86,6 +86,25 @@ def label_sheet(sheet: Sheet, body: Body) -> NDArray[np.uint8]:
     kinds = np.unique(labels)
     votes = np.stack([(labels == kind).sum(axis=2) for kind in kinds], axis=-1)
     return np.asarray(kinds[votes.argmax(axis=-1)], dtype=np.uint8)
+
+
+def _evenly(points: Float) -> Float:
+    """Space the points of each column evenly between its ends.
+
+    Where the sheet bends, z = 0 lies towards the interior of the middle: half way between two
+    cylinders, a harmonic function is zero at the geometric mean of their radii.
+    """
+    count = points.shape[2]
+    steps = np.linalg.norm(np.diff(points, axis=2), axis=3)
+    depth = np.concatenate([np.zeros((*steps.shape[:2], 1)), steps.cumsum(axis=2)], axis=2)
+    wanted = depth[..., -1:] * np.linspace(0, 1, count)
+    below = (depth[..., None, :-1] <= wanted[..., 1:-1, None]).sum(axis=-1) - 1
+    first = np.take_along_axis(depth, below, axis=2)
+    share = (wanted[..., 1:-1] - first) / np.take_along_axis(steps, below, axis=2)
+    start = np.take_along_axis(points, below[..., None], axis=2)
+    end = np.take_along_axis(points, below[..., None] + 1, axis=2)
+    inner = start + share[..., None] * (end - start)
+    return np.concatenate([points[:, :, :1], inner, points[:, :, -1:]], axis=2)
 
 
 def _invert(mesh: TetMesh, values: Float, axes: tuple[Float, Float, Float]) -> Float:

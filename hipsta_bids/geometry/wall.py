@@ -34,9 +34,9 @@ class Wall:
 
         self._tree = cKDTree(self.vertices)
         self.bend_aware, self.evenly_aware = self._stiffness(settings)
-        areas = triangle_areas(self.vertices, self.triangles)
+        self.areas = triangle_areas(self.vertices, self.triangles)
         count = len(self.vertices)
-        share = np.repeat(areas / 3, 3)
+        share = np.repeat(self.areas / 3, 3)
         self.mass: Float = np.bincount(self.triangles.ravel(), share, count).astype(np.float64)
 
     def _stiffness(self, settings: BoundarySettings) -> tuple[sparse.csc_array, sparse.csc_array]:
@@ -67,8 +67,14 @@ class Wall:
         close[np.concatenate(self._tree.query_ball_point(curve, reach)).astype(np.intp)] = True
         closest = int(self._tree.query(curve[len(curve) // 2])[1])
         close[closest] = True
-        piece = self._pieces(close)
-        return np.asarray(close & (piece == piece[closest]))
+        seed = np.zeros(len(close), dtype=bool)
+        seed[closest] = True
+        return self.connected(close, seed)
+
+    def connected(self, part: Bool, seed: Bool) -> Bool:
+        """Vertices of a part of the wall that are connected within it to one of the seeds."""
+        piece = self._pieces(part)
+        return np.asarray(part & np.isin(piece, piece[seed]))
 
     def _pieces(self, where: Bool) -> NDArray[np.int32]:
         """Piece number of each vertex if only edges between vertices of a set connect."""

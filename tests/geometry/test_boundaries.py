@@ -13,7 +13,7 @@ from hipsta_bids.geometry.boundaries import find_boundaries
 from hipsta_bids.geometry.coordinates import solve_coordinates
 from hipsta_bids.geometry.measures import bending_angle
 from hipsta_bids.geometry.sheet import sample_sheet
-from hipsta_bids.geometry.surface import lateral_triangles, mean_wall_thickness
+from hipsta_bids.geometry.surface import lateral_triangles
 from hipsta_bids.settings import BoundarySettings, MeasureSettings, SheetSettings
 
 SETTINGS = BoundarySettings()
@@ -56,9 +56,21 @@ def test_rim_paths_lie_near_the_curves(case):
 def test_strips_hold_the_rims(case):
     for u, strip in ((0, case.boundaries.medial), (1, case.boundaries.lateral)):
         gap, _ = cKDTree(rim(case, u)).query(case.surface.vertices[strip])
-        assert gap.max() < 0.75 * case.boundaries.strip_width
-    width = SETTINGS.strip_width * mean_wall_thickness(case.surface)
-    assert case.boundaries.strip_width == pytest.approx(width)
+        assert gap.max() < 0.6  # mm; edges of the mesh, 0.35 mm long, and rounded corners
+    # Triangles that lie in the strips as a whole: half an edge is missing on either side.
+    assert case.boundaries.strip_width == pytest.approx(2.0 - 0.35, rel=0.1)
+
+
+def test_strips_reach_from_edge_to_edge(case):
+    for u, strip in ((0, case.boundaries.medial), (1, case.boundaries.lateral)):
+        places = case.surface.vertices[strip]
+        reached = []
+        for n in (-0.5, 0.5):  # mm from the middle of a rim that reaches 1 mm to both sides
+            line = case.phantom.body.place(u, np.linspace(0.1, 0.9, 41), n, hemi=hemi_of(case))
+            gap, _ = cKDTree(places).query(line)
+            reached.append(gap.mean())
+        # Vertices of a mesh of 0.35 mm lie within 0.2 mm of any point; smoothing takes 0.1 mm.
+        assert max(reached) < 0.3
 
 
 def test_sides_lie_on_their_sides(case):
@@ -155,7 +167,7 @@ def test_the_eigenfunction_is_overruled_where_the_rules_disagree(arc):
 
 def test_strips_that_swallow_the_sides_are_refused(arc):
     with pytest.raises(GeometryError, match="do not separate the interior") as caught:
-        find_boundaries(arc.surface, arc.mesh, arc.body, replace(SETTINGS, strip_width=12.0))
+        find_boundaries(arc.surface, arc.mesh, arc.body, replace(SETTINGS, least_strip=6.0))
     assert caught.value.reason == "boundaries"
 
 

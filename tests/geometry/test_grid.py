@@ -98,7 +98,7 @@ def test_damage_moves_no_node_elsewhere():
     )
     mine = before.values[tuple(np.moveaxis(index, -1, 0))]
     other = after.values[tuple(np.moveaxis(index + offset, -1, 0))]
-    ends = w[(w < 5) | (w > w.max() - 5)] - w[0]  # 3 mm from the damage
+    ends = w[(w < 2) | (w > w.max() - 2)] - w[0]  # two passes of smoothing reach 2.5 mm
     np.testing.assert_array_equal(mine[..., ends] > 0, other[..., ends] > 0)
     np.testing.assert_allclose(mine[..., ends], other[..., ends], atol=1e-6)  # single precision
     assert np.abs(mine - other).max() > 0.3
@@ -116,8 +116,9 @@ def test_field_is_positive_inside_and_negative_outside(case):
     assert far.sum() > 1000
     assert (values[deep] > 0).all()
     assert (values[far] < 0).all()
-    assert values.min() >= -0.5
-    assert values.max() <= 0.5 + 1e-6  # float32
+    # Across a plane wall, 2 G - G * G goes beyond its ends by 0.037; the two walls add up.
+    assert -0.58 < values.min() <= -0.5
+    assert 0.5 <= values.max() < 0.58
 
 
 def test_field_reaches_both_ends_at_full_strength():
