@@ -276,7 +276,9 @@ def _validate(arguments: list[str]) -> ExitCode:
     options = validate_parser().parse_args(arguments)
     from hipsta_bids.validation.report import PAGE, validate  # noqa: PLC0415  (heavy)
 
-    missed = validate(options.out, full=options.full, names=options.suite, report=say)
+    missed = validate(
+        options.out, full=options.full, names=options.suite, labels=options.labels, report=say
+    )
     say(f"targets missed: {missed}; report: {options.out / PAGE}")
     return ExitCode.OK
 

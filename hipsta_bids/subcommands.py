@@ -102,4 +102,10 @@ def validate_parser() -> Parser:
         help="folder for validation.md and images/ (default: docs)",
     )
     add("--suite", nargs="+", default=[], metavar="NAME", help="only these suites")
+    add(
+        "--labels",
+        type=Path,
+        metavar="BIDS_DIR",
+        help="a dataset with fine segmentations, to be measured in thick slices as well",
+    )
     return parser

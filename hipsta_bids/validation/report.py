@@ -28,6 +28,7 @@ def validate(
     *,
     full: bool,
     names: Sequence[str] = (),
+    labels: Path | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> int:
     """Run suites and write their report.
@@ -40,6 +41,8 @@ def validate(
         All cases instead of a quick selection.
     names : sequence of str
         Suites to run; all if empty.
+    labels : Path, optional
+        A BIDS dataset with real segmentations, for the suites that can use them.
     report : callable
         Receives one line per suite as it ends.
 
@@ -65,21 +68,26 @@ def validate(
     files.check_writable(out)
     suites = []
     for name in names or SUITES:
-        suite = run_suite(name, full=full)
+        suite = run_suite(name, full=full, labels=labels)
         suites.append(suite)
         report(f"{suite.title}: {_score(suite)}")
     for suite in suites:
         for picture in suite.pictures:
             files.write_bytes(out / IMAGES / file_name(picture), render(picture))
-    files.write_text(out / PAGE, page(suites, full=full))
+    files.write_text(out / PAGE, page(suites, full=full, labels=labels is not None))
     return sum(table.missed for suite in suites for table in suite.tables)
 
 
-def page(suites: Sequence[Suite], *, full: bool) -> str:
+def page(suites: Sequence[Suite], *, full: bool, labels: bool = False) -> str:
     """Write the page in Markdown."""
     names = [suite.name for suite in suites]
     some = "" if names == list(SUITES) else " --suite " + " ".join(names)
-    command = "hipsta-bids validate" + (" --full" if full else "") + some
+    command = (
+        "hipsta-bids validate"
+        + (" --full" if full else "")
+        + some
+        + (" --labels BIDS_DIR" if labels else "")
+    )
     python = f"Python {platform.python_version()}"
     libraries = ", ".join([python, *(f"{name} {version(name)}" for name in _LIBRARIES)])
     intro = (

@@ -6,6 +6,7 @@ A suite is a module of this package with ``run(full: bool) -> Suite``, named in 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -20,11 +21,16 @@ SUITES: Mapping[str, str] = MappingProxyType(
     {
         "accuracy": "hipsta_bids.validation.accuracy",
         "limits": "hipsta_bids.validation.limits",
+        "slices": "hipsta_bids.validation.slices",
         "convergence": "hipsta_bids.validation.convergence",
         "invariance": "hipsta_bids.validation.invariance",
         "defects": "hipsta_bids.validation.defects",
     }
 )
+
+
+#: Suites that measure real segmentations too, where there are any.
+WITH_LABELS = frozenset({"slices"})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +88,7 @@ class Suite:
     pictures: tuple[Picture, ...] = ()
 
 
-def run_suite(name: str, *, full: bool) -> Suite:
+def run_suite(name: str, *, full: bool, labels: Path | None = None) -> Suite:
     """Run one suite.
 
     Parameters
@@ -91,11 +97,13 @@ def run_suite(name: str, *, full: bool) -> Suite:
         One of ``SUITES``.
     full : bool
         All cases instead of a quick selection.
+    labels : Path, optional
+        A BIDS dataset with real segmentations, for the suites that can use them.
 
     Returns
     -------
     Suite
     """
     module: Any = import_module(SUITES[name])
-    suite: Suite = module.run(full)
+    suite: Suite = module.run(full, labels) if name in WITH_LABELS else module.run(full)
     return suite

@@ -1,0 +1,129 @@
+"""The suite of thick slices: how labels are resliced, and what its table says."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from hipsta_bids.artifacts import LabelVolume
+from hipsta_bids.schemes import load_scheme
+from hipsta_bids.validation import slices
+from hipsta_bids.validation.reslice import reslice
+from hipsta_bids.validation.slices import Outcome, Trial
+from hipsta_bids.validation.workers import Refusal
+
+AXIS = np.array([0.0, 1.0, 0.0])
+
+
+def numbered(shape=(20, 30, 16), voxel=0.3):
+    """A volume whose tissue says how far it lies along each axis, in steps of three voxels."""
+    i, j, k = np.indices(shape) // 3
+    affine = np.diag([voxel, voxel, voxel, 1.0])
+    affine[:3, 3] = [5.0, -3.0, 2.0]
+    return LabelVolume(
+        tissue=(1 + i + j + k).astype(np.uint8),
+        part=(j % 4).astype(np.uint8),
+        affine=affine,
+        scheme=load_scheme("freesurfer"),
+    )
+
+
+@pytest.mark.parametrize(("offset", "tilt"), [(0.0, 0.0), (0.3, 0.0), (0.7, 10.0)])
+def test_each_voxel_has_the_label_at_its_center(offset, tilt):
+    volume = numbered()
+    found = reslice(volume, AXIS, (0.4, 0.4, 1.5), offset=offset, tilt=tilt)
+    index = np.argwhere(np.ones(found.tissue.shape, dtype=bool))
+    points = index @ found.affine[:3, :3].T + found.affine[:3, 3]
+    nearest = np.rint((points - volume.affine[:3, 3]) / 0.3).astype(int)
+    inside = ((nearest >= 0) & (nearest < volume.tissue.shape)).all(axis=1)
+    assert inside.sum() > 500
+    assert (found.tissue.ravel()[inside] == volume.tissue[tuple(nearest[inside].T)]).all()
+    assert (found.part.ravel()[inside] == volume.part[tuple(nearest[inside].T)]).all()
+    assert not found.tissue.ravel()[~inside].any()
+
+
+@pytest.mark.parametrize("tilt", [0.0, 10.0])
+def test_slices_lie_across_the_axis_but_for_the_tilt(tilt):
+    found = reslice(numbered(), AXIS, (0.4, 0.4, 2.0), tilt=tilt)
+    edges = np.linalg.norm(found.affine[:3, :3], axis=0)
+    np.testing.assert_allclose(edges, [0.4, 0.4, 2.0])
+    assert np.degrees(np.arccos(found.affine[:3, 2] @ AXIS / 2.0)) == pytest.approx(tilt, abs=1e-5)
+
+
+def test_an_offset_moves_slices_by_its_share_of_their_distance():
+    plain, moved = (reslice(numbered(), AXIS, (0.4, 0.4, 2.0), offset=o) for o in (0.0, 0.25))
+    np.testing.assert_allclose((moved.affine - plain.affine)[:3, 3], 0.25 * 2.0 * AXIS, atol=1e-12)
+
+
+def maps(thickness, length=20.0):
+    return SimpleNamespace(thickness=thickness, qc={"body_length_mm": length}, status="ok")
+
+
+def test_maps_are_compared_node_by_node():
+    reference = np.random.default_rng(1).uniform(1, 2, (41, 21))
+    found = slices.compare(maps(2 * reference - 1.2), maps(reference), 2.0)
+    assert found.correlation == pytest.approx(1.0)
+    assert found.change == pytest.approx(reference.mean() - 1.2)
+
+
+def test_sampling_loses_nothing_of_a_map_without_change_along_the_axis():
+    thickness = np.repeat(np.linspace(1, 2, 41)[:, None], 21, axis=1)
+    for change, correlation in slices.compare(maps(thickness), maps(thickness), 2.0).sampled:
+        assert change == pytest.approx(0.0, abs=1e-12)
+        assert correlation == pytest.approx(1.0)
+
+
+def test_sampling_a_spike_between_slices_loses_all_of_it():
+    thickness = np.repeat(np.linspace(1, 2, 41)[:, None], 21, axis=1)
+    thickness[:, 10] += 1.0  # at 10 mm; rows are 1 mm apart
+    lost = [change for change, _ in slices.compare(maps(thickness), maps(thickness), 4.0).sampled]
+    # Slices at 4 (n + 1/6), 4 (n + 1/2) and 4 (n + 5/6) mm. That at 10 mm makes a tent 8 mm wide,
+    # 4 rows in sum; those at 8.67 and 12.67, and at 7.33 and 11.33 mm miss the spike.
+    np.testing.assert_allclose(lost, np.array([-1, 3, -1]) / 21, atol=1e-12)
+
+
+def outcome(change, correlation=0.9, status="ok"):
+    sampled = ((0.01, 0.95), (-0.03, 0.93), (0.02, 0.97))
+    return Outcome(status=status, change=change, correlation=correlation, sampled=sampled)
+
+
+def row_of(results, step=2.0):
+    trials = [
+        Trial(body=slices.PHANTOMS[0], step=step, offset=0.0, tilt=0.0) for _ in range(len(results))
+    ]
+    table = slices._table(trials, results)
+    assert len(table.rows) == 1
+    return dict(zip(table.columns[:9], table.rows[0], strict=False)), table.rows[0][-1], table
+
+
+@pytest.mark.parametrize(
+    ("results", "met"),
+    [
+        ([outcome(0.02), outcome(-0.03)], True),
+        ([outcome(0.02), outcome(-0.09)], False),  # worst
+        ([outcome(0.04), outcome(-0.04)], False),  # mean
+        ([outcome(0.02, 0.61), outcome(0.02)], False),  # one correlation
+    ],
+)
+def test_targets_are_judged(results, met):
+    assert row_of(results)[1] is met
+
+
+def test_no_accepted_map_may_be_far_off_whatever_the_distance():
+    assert row_of([outcome(0.16)], step=slices.PIXEL)[1] is False
+    assert row_of([outcome(0.16, status="flagged")], step=slices.PIXEL)[1] is True
+
+
+def test_refusals_are_counted_and_explained():
+    row, met, table = row_of([outcome(0.01), Refusal(reason="topology", message="a knot")])
+    assert (row["number"], row["refused"], row["flagged"]) == (2, 1, 0)
+    assert met is True
+    assert "phantoms, 2 mm, straight: topology: a knot" in table.notes
+    assert row_of([Refusal(reason="topology", message="a knot")])[1] is False
+
+
+def test_a_phantom_in_thick_slices_meets_the_targets():
+    trial = Trial(body=slices.PHANTOMS[0], step=2.0, offset=1 / 3, tilt=10.0)
+    found = slices.measure_trial(trial)
+    assert abs(found.change) <= slices.TARGETS[2.0][1]
+    assert found.correlation >= slices.TARGETS[2.0][3]
