@@ -105,11 +105,11 @@ def resample_body(body: Body, settings: GridSettings, slices: SliceSettings) -> 
     grid = _fit_grid(body, settings)
     if has_thick_slices(body.affine, slices):
         points = grid.node_points(clamp=0.0).reshape(-1, 3)
-        values, sigma = sample_slices(body, points, slices), slices.final_smoothing
+        values = sample_slices(body, points, slices)
     else:
         points = grid.node_points(clamp=body.ends.half_slice).reshape(-1, 3)
         values = _sample_mask(body, points)
-        sigma = max(settings.smoothing * in_plane_voxel(body.affine), settings.min_smoothing)
+    sigma = max(settings.smoothing * in_plane_voxel(body.affine), settings.min_smoothing)
     smooth = _smooth(values.reshape(grid.shape), sigma / settings.spacing)
     return Field(grid=grid, values=smooth - np.float32(0.5))
 
