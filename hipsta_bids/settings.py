@@ -109,8 +109,6 @@ class SliceSettings:
     labels end at the plane, mm."""
     extrapolation: float = 0.5
     """There, and beyond the last slice, shapes go on changing at this fraction of their pace."""
-    final_smoothing: float = 0.32
-    """Standard deviation of the Gaussian after interpolation, mm."""
 
 
 @dataclass(frozen=True, kw_only=True)
