@@ -119,6 +119,8 @@ class TopologySettings:
     """Steps in which field values are ordered while growing and shrinking."""
     rounds: int = 12
     """Most rounds of repair."""
+    depth_rank: float = 0.05
+    """... and depth, in grid nodes, adds this much of the field to the order."""
     small_cost: float = 5.0
     """Membranes cheaper than this are applied together; dearer ones one a round."""
     plug_reach: int = 8
@@ -318,19 +320,20 @@ class CheckSettings:
     beyond_reach: float = 3.0
     """Labels are counted within this distance on both sides of an end plane, mm."""
     beyond_share: float = 0.7
-    """Flag an end with fewer beyond it than this share of those before it (0.92 at least in twelve
-    real bodies)."""
+    """Flag an end without a label of its own if fewer lie beyond it than this share of those before
+    it (0.92 at least in twelve real bodies)."""
     notch_reach: tuple[float, ...] = (1.0, 2.0, 3.0)
     """A cross-section is compared with those at these distances on both sides, mm."""
     notch_share: tuple[float, ...] = (0.12, 0.3, 0.35)
     """Flag if more than this share of what both sides have is missing, one per distance."""
-    notch_contrast: float = 5.5
-    """... or more than this many times what is missing in the body's other cross-sections."""
     bump_contrast: float = 3.5
     """Flag a cross-section that has more than this many times of what its neighbors lack, or label
     interior, than the body's other cross-sections (2.7 at most in twelve real bodies)."""
+    stub_nodes: float = 6.0
+    """... but for what lies within this distance of a bridge that was cut, grid nodes."""
     section_noise: float = 0.02
-    """Share of the area that is added to the usual before such comparisons."""
+    """Share of the area that is added to the usual before such comparisons, per mm of distance
+    (interior: in all), since thickness may change along the body."""
     flag_row_jump: float = 0.15
     """Flag if the sheet's width changes by more than this from one row to the next."""
     flag_row_dip: float = 0.15

@@ -218,12 +218,17 @@ def check_end_labels(volume: LabelVolume, body: Body, settings: CheckSettings) -
 
 
 def _check_beyond(volume: LabelVolume, body: Body, settings: CheckSettings) -> list[Flag]:
-    """Flag ends at which the labels themselves end."""
+    """Flag ends without head or tail labels at which all labels end."""
     labeled = (volume.tissue > 0) & (volume.tissue <= Tissue.HIPPOCAMPUS)
     points = np.argwhere(labeled) @ volume.affine[:3, :3].T + volume.affine[:3, 3]
     flags = []
-    for end, sign in (("posterior", 1), ("anterior", -1)):
-        height = sign * body.ends.height(points, "posterior" if sign > 0 else "anterior")
+    ends = body.ends
+    for end, rule, height in (
+        ("posterior", ends.posterior_rule, ends.height(points, "posterior")),
+        ("anterior", ends.anterior_rule, -ends.height(points, "anterior")),
+    ):
+        if rule == "labels":
+            continue
         near = points[(height > 0) & (height < settings.beyond_reach)]
         beyond = np.count_nonzero((height < 0) & (height > -settings.beyond_reach))
         if beyond < settings.beyond_share * len(near):

@@ -64,25 +64,20 @@ def apply_membranes(
     cross-section that hang together only further inside. ``lifted`` gets the values of filled
     holes.
     """
-    weight = np.abs(values)
+    ranked = _ranked(values, settings)
+    solid = with_plates(state, True) if plates else state
     if plates:
-        solid, ranked = with_plates(state, True), with_plates(values, 1.0)
-    else:
-        solid, ranked = state, values
+        ranked = with_plates(ranked, float(ranked.max()) + 1.0)
     grown = grow(_inner_ball(solid, ranked), solid, ranked, settings.levels)
     shrunk = shrink(_outer_ball(solid, ranked), solid, ranked, settings.levels)
-    candidates: list[tuple[float, Edit]] = []
-    membranes: tuple[tuple[Kind, Bool], ...] = (("cut", solid & ~grown), ("fill", shrunk & ~solid))
-    for kind, membrane in membranes:
-        pieces, _ = ndimage.label(membrane, structure=ALL)
-        for number, around in enumerate(ndimage.find_objects(pieces), start=1):
-            where = np.argwhere(pieces[around] == number) + [s.start for s in around]
-            gain = _gain(solid, where, kind)
-            if gain > 0:
-                factor = _implausibility(kind, where, solid, settings)
-                cost = float(weight[tuple(where.T)].sum())
-                doubtful = factor > 1 and (kind == "cut" or cost > settings.doubtful_fill_cost)
-                candidates.append((factor * cost / gain, Edit(kind, where, cost, doubtful)))
+    both: tuple[tuple[Kind, Bool], ...] = (("cut", solid & ~grown), ("fill", shrunk & ~solid))
+    found = [
+        Edit(kind, where)
+        for kind, membrane in both
+        for where in _pieces(membrane)
+        if not (plates and _in_plates(where, solid))
+    ]
+    candidates = _priced(found, solid, values, settings)
     candidates.sort(key=lambda c: c[0])
     edits: list[Edit] = []
     for cost, edit in candidates:
@@ -99,6 +94,53 @@ def apply_membranes(
         if cost > settings.small_cost:
             break
     return edits
+
+
+def _pieces(membrane: Bool) -> list[NDArray[np.intp]]:
+    """Nodes (N, 3) of each connected piece."""
+    pieces, _ = ndimage.label(membrane, structure=ALL)
+    return [
+        np.argwhere(pieces[around] == number) + [s.start for s in around]
+        for number, around in enumerate(ndimage.find_objects(pieces), start=1)
+    ]
+
+
+def _priced(
+    found: list[Edit], solid: Bool, values: NDArray[np.float32], settings: TopologySettings
+) -> list[tuple[float, Edit]]:
+    """Price per tunnel of the membranes that deal with one.
+
+    A cut that leads from a hole to an end plane deals with none once the ends are closed.
+    """
+    closed = with_plates(solid, True)
+    open_hole = euler_number(closed) != 1
+    candidates = []
+    for kind, where, *_ in found:
+        gain = _gain(solid, where, kind)
+        if gain <= 0:
+            continue
+        cost = float(np.abs(values[tuple(where.T)]).sum())
+        factor = _implausibility(kind, where, solid, settings)
+        if kind == "cut" and open_hole and _gain(closed, where, kind) <= 0:
+            factor *= settings.across_factor
+        doubtful = factor > 1 and (kind == "cut" or cost > settings.doubtful_fill_cost)
+        candidates.append((factor * cost / gain, Edit(kind, where, cost, doubtful)))
+    return candidates
+
+
+def _ranked(values: NDArray[np.float32], settings: TopologySettings) -> NDArray[np.float32]:
+    """Order in which nodes are added or removed: by value, and by depth where values saturate.
+
+    So membranes come to lie midway across a wide hole, where the field is flat.
+    """
+    inside = values > 0
+    depth = ndimage.distance_transform_edt(inside) - ndimage.distance_transform_edt(~inside)
+    return np.asarray(values + settings.depth_rank * depth, dtype=np.float32)
+
+
+def _in_plates(where: NDArray[np.intp], solid: Bool) -> bool:
+    """Whether a membrane lies in one of the plates, where nothing can be changed."""
+    return bool(((where[:, 2] == 1) | (where[:, 2] == solid.shape[2] - 2)).any())
 
 
 def _inner_ball(solid: Bool, values: NDArray[np.float32]) -> Bool:
@@ -156,7 +198,8 @@ def _implausibility(
     if len(where) < settings.oriented_nodes:
         return 1.0
     areas = np.array(
-        [len(np.unique(np.delete(where, axis, axis=1), axis=0)) for axis in range(3)], dtype=float
+        [len(np.unique(np.delete(where, axis, axis=1), axis=0)) for axis in range(3)],
+        dtype=float,
     )
     across = areas[2] ** 2 / float(areas @ areas)
     if kind == "cut":

@@ -97,7 +97,9 @@ def find_flags(evidence: Evidence, settings: Settings) -> list[Flag]:
         *found,
         *check_image(evidence.body, checks),
         *check_labels(evidence.body, checks),
-        *check_cross_sections(solid.field, evidence.body, checks),
+        *check_cross_sections(
+            solid.field, evidence.body, checks, solid.touched & (solid.field.values < 0)
+        ),
         *check_rows(evidence.sheet, checks),
     ]
 

@@ -1,6 +1,7 @@
 """Cross-sections and rows of the sheet that do not go with their neighbors."""
 
 import numpy as np
+from scipy import ndimage
 
 from hipsta_bids.artifacts import Bool, Flag, Float, Sheet
 from hipsta_bids.geometry.body import Body
@@ -9,12 +10,23 @@ from hipsta_bids.geometry.grid import Field
 from hipsta_bids.settings import CheckSettings
 
 
-def check_cross_sections(field: Field, body: Body, settings: CheckSettings) -> list[Flag]:
+def check_cross_sections(
+    field: Field, body: Body, settings: CheckSettings, cuts: Bool | None = None
+) -> list[Flag]:
     """Flag a body of which a part is missing between cross-sections that have it, or added.
 
     Each cross-section is compared with those at a distance on both sides. What both lack, or have
     of the interior labels instead, is judged by how far it stands out from the same body's other
     cross-sections: a bent ribbon moves sideways everywhere, a leak is in one place.
+
+    Parameters
+    ----------
+    field : Field
+        After the repair of its topology.
+    body : Body
+    settings : CheckSettings
+    cuts : (A, B, W) array of bool, optional
+        Nodes at which bridges were cut: their stubs are known, and nothing that is added.
 
     Returns
     -------
@@ -22,6 +34,9 @@ def check_cross_sections(field: Field, body: Body, settings: CheckSettings) -> l
         ``section-notch``, ``section-bump``, ``section-intrusion``.
     """
     solid, interior = field.values > 0, _interior_nodes(field, body)
+    strange = np.ones_like(solid)
+    if cuts is not None and cuts.any():
+        strange = ndimage.distance_transform_edt(~cuts) > settings.stub_nodes
     length = body.ends.length(body.inside_points()[1])
     step = length / (field.grid.shape[2] - 1)
     area = float(np.median(solid.sum(axis=(0, 1))))
@@ -33,14 +48,13 @@ def check_cross_sections(field: Field, body: Body, settings: CheckSettings) -> l
         before, here, after = solid[:, :, : -2 * k], solid[:, :, k:-k], solid[:, :, 2 * k :]
         missing = before & after & ~here
         notch.look(missing, missing.sum(axis=(0, 1)) / here.sum(axis=(0, 1)), limit, k)
-        enclosed = here & interior[:, :, : -2 * k] & interior[:, :, 2 * k :]
-        for oddest, part, contrast in (
-            (notch, missing, settings.notch_contrast),
-            (bump, here & ~before & ~after, settings.bump_contrast),
-            (intrusion, enclosed, settings.bump_contrast),
-        ):
+        unknown = here & strange[:, :, k:-k]
+        enclosed = unknown & interior[:, :, : -2 * k] & interior[:, :, 2 * k :]
+        added = unknown & ~before & ~after
+        noise = settings.section_noise
+        for oddest, part, least in ((bump, added, noise * reach), (intrusion, enclosed, noise)):
             share = part.sum(axis=(0, 1)) / area
-            usual = contrast * (float(np.median(share)) + settings.section_noise)
+            usual = settings.bump_contrast * (float(np.median(share)) + least)
             oddest.look(part, share, usual, k)
     rows = (
         ("section-notch", notch, "lacks what its neighbors have", "complete the labels there"),

@@ -1,5 +1,7 @@
 """Each refusal with a case that must trigger it and one that must not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from geometry_cases import box_mesh, plain_body, resampled, short_phantom, straight_ends
@@ -12,6 +14,7 @@ from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import extract_body
 from hipsta_bids.geometry.checks import (
     _rank_correlation,
+    check_end_labels,
     check_label_order,
     check_thickness,
     check_voxels_across,
@@ -19,7 +22,7 @@ from hipsta_bids.geometry.checks import (
 from hipsta_bids.geometry.measures import measure_thickness
 from hipsta_bids.geometry.surface import extract_surface
 from hipsta_bids.geometry.topology import repair_topology
-from hipsta_bids.schemes import Tissue, load_scheme
+from hipsta_bids.schemes import Part, Tissue, load_scheme
 from hipsta_bids.settings import CheckSettings, Settings
 
 CHECKS, ALL = CheckSettings(), Settings()
@@ -159,3 +162,21 @@ def test_a_wrong_map_is_refused(mean):
     with pytest.raises(GeometryError, match="the map would be wrong") as caught:
         check_thickness(values, 2.0, CHECKS)
     assert caught.value.reason == "thickness-implausible"
+
+
+@pytest.mark.parametrize("part", [Part.HEAD, Part.TAIL])
+def test_an_end_at_which_all_labels_end_is_flagged(arc, part):
+    """The head or the tail is not drawn, as in a body that is cut short."""
+    lost = arc.volume.part == part
+    volume = replace(
+        arc.volume,
+        tissue=np.where(lost, 0, arc.volume.tissue),
+        part=np.where(lost, Part.UNKNOWN, arc.volume.part),
+    )
+    flags = check_end_labels(volume, extract_body(volume, ALL.body), CHECKS)
+    assert [flag.reason for flag in flags] == ["labels-end"]
+    assert ("anterior" if part is Part.HEAD else "posterior") in flags[0].message
+
+
+def test_short_head_and_tail_labels_are_enough(arc):
+    assert check_end_labels(arc.volume, arc.body, CHECKS) == []

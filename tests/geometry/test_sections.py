@@ -67,9 +67,9 @@ def test_a_leak_is_flagged_where_it_is(ribbon):
 
 
 def test_a_notch_is_flagged_where_it_is(ribbon):
-    middle = wall(ribbon, 0.95, 0.0)
+    middle = wall(ribbon, 0.85, 0.0)
     (flag,) = check_cross_sections(
-        changed(ribbon.field, ball(ribbon.field, middle, 1.4), -0.5), ribbon.body, CHECKS
+        changed(ribbon.field, ball(ribbon.field, middle, 2.0), -0.5), ribbon.body, CHECKS
     )
     assert flag.reason == "section-notch"
     assert np.linalg.norm(place_of(flag) - middle) < 1.0  # mm, the ball's part inside the wall
@@ -83,6 +83,15 @@ def test_a_bar_through_the_interior_is_flagged_where_it_is(ribbon):
     assert np.linalg.norm(place_of(flags["section-intrusion"]) - middle) < 1.0  # mm, its radius
     bare = replace(ribbon.body, interior=np.zeros_like(ribbon.body.interior))
     assert "section-intrusion" not in {f.reason for f in check_cross_sections(bar, bare, CHECKS)}
+
+
+def test_stubs_of_a_cut_bridge_are_known(ribbon):
+    middle = wall(ribbon, 0.75, -1.6)
+    where = ball(ribbon.field, middle, 1.1)
+    cuts = ball(ribbon.field, middle, 0.4)
+    stubs = changed(changed(ribbon.field, where, 0.5), cuts, -0.1)
+    assert check_cross_sections(stubs, ribbon.body, CHECKS, cuts) == []
+    assert check_cross_sections(stubs, ribbon.body, CHECKS) != []
 
 
 def test_what_is_odd_depends_on_the_body_s_other_cross_sections(ribbon):
