@@ -62,10 +62,9 @@ def test_refusals_name_the_defect(kind, size, reason):
         ("wrong-voxels", 2.0, "slices-along-axis"),
         ("bridge-ca1-ca1", 0.8, "section-bump"),
         ("leak", 3.0, "section-bump"),
-        ("salt", 0.08, "noisy-labels"),
+        ("salt", 0.03, "noisy-labels"),
         ("gap", 0.4, "thin-gap"),
         ("cut-short", 8.0, "labels-end"),
-        ("ends-flush", 1.0, "labels-end"),
     ],
 )
 def test_what_cannot_be_repaired_is_flagged(kind, size, reason):
