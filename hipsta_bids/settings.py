@@ -230,8 +230,9 @@ class BoundarySettings:
     """... as the mean over so many tetrahedra,"""
     rim_neighbors: int = 15
     """... and then over so many points of the rim."""
-    strip_rounds: int = 2
-    """How often the strips are found, each time from the middle lines of the last ones."""
+    strip_reach: tuple[float, ...] = (0.9, 0.75)
+    """They hold nothing farther than this from the curves, in the same unit; one value per round.
+    Later rounds start from the middle lines of the strips of the round before."""
     probe_distances: tuple[float, ...] = (0.4, 0.8, 1.2)
     """Distances at which interior labels are looked for, mm outside the wall."""
     min_probe_share: float = 0.02

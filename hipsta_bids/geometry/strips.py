@@ -44,13 +44,14 @@ def facing_strips(
     finder = _Finder(wall, mesh, thickness, settings)
     starts = curves
     strips = _near(wall, curves, settings.first_strip * thickness)
-    for _ in range(settings.strip_rounds):
+    for reach in settings.strip_reach:
         lines = _near(wall, curves, settings.least_strip * thickness)
+        limits = _near(wall, curves, reach * thickness)
         function = solver.between(wall.index[strips[0]], wall.index[strips[1]])
         flow = gradients(mesh.vertices, mesh.tetrahedra, function)
         strips = (
-            finder.strip(starts[0], flow, lines[0]),
-            finder.strip(starts[1], -flow, lines[1]),
+            finder.strip(starts[0], flow, lines[0], limits[0]),
+            finder.strip(starts[1], -flow, lines[1], limits[1]),
         )
         starts = (wall.vertices[strips[0]], wall.vertices[strips[1]])
         curves = middle_lines(wall, strips) or curves
@@ -69,18 +70,28 @@ class _Finder:
     ) -> None:
         self._wall, self._settings = wall, settings
         self._step = settings.strip_step * thickness
-        self._reach = settings.rim_bands[0] * thickness
         links = edge_graph(wall.edges, np.ones(len(wall.edges)), len(wall.vertices))
         self._normals = _unit((links + sparse.eye_array(len(wall.vertices))) @ vertex_normals(wall))
         self._centers = cKDTree(mesh.vertices[mesh.tetrahedra].mean(axis=1))
 
-    def strip(self, starts: Float, inward: Float, line: Bool) -> Bool:
-        """Vertices (V,) near points (N, 3) of a rim that face away from the sheet, with a line.
+    def strip(self, starts: Float, inward: Float, line: Bool, limit: Bool) -> Bool:
+        """Vertices (V,) within a limit that face away from the sheet, with a line among them.
 
-        ``inward`` (T, 3) points from this rim into the sheet, in each tetrahedron.
+        Parameters
+        ----------
+        starts : (N, 3) array
+            Points of the rim.
+        inward : (T, 3) array
+            From this rim into the sheet, in each tetrahedron.
+        line, limit : (V,) arrays of bool
+            Vertices that belong to the strip, and those that may.
+
+        Returns
+        -------
+        (V,) array of bool
         """
         away = -self._direction_at_rim(starts, inward)
-        close = np.flatnonzero(self._wall.near(starts, self._reach))
+        close = np.flatnonzero(limit)
         count = min(self._settings.rim_neighbors, len(starts))
         _, nearest = cKDTree(starts).query(self._wall.vertices[close], k=count)
         towards = _unit(away[nearest].mean(axis=1))
