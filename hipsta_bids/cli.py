@@ -107,11 +107,13 @@ def _participant(options: "Namespace") -> ExitCode:
         find_inputs,
         selection_table,
     )
+    from hipsta_bids.bids.maps import attach, map_requests  # noqa: PLC0415  (heavy)
 
     request = _request(options)
+    wishes = map_requests(options.map, options.map_sampling, options.map_interpolation)
     found = find_inputs(request)
-    items = found.items
-    for note in (*dataset_notes(request, items), *found.notes):
+    items, map_notes = attach(found.items, wishes, options.roi, options.bids_dir)
+    for note in (*dataset_notes(request, items), *found.notes, *map_notes):
         say(f"note: {note}")
     if options.dry_run:
         say_table(selection_table(items))

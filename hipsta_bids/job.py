@@ -15,6 +15,7 @@ from hipsta_bids.bids.inputs import HemisphereInput
 from hipsta_bids.bids.results import ResultPlace
 from hipsta_bids.cost import CostClock
 from hipsta_bids.errors import GeometryError, HipstaError, OutputError
+from hipsta_bids.mapping import Mapped, add_signals, signal_hash, write_signals
 from hipsta_bids.settings import Settings
 
 INTERNAL = "internal-error"
@@ -90,9 +91,19 @@ def run_job(job: Job) -> Outcome:
             record |= {"input_hash": hashed} | hashes
             volume = read_label_volume(job.item)
         maps = measure_hemisphere(volume, job.item.hemi, job.settings, clock)
+        mapped = Mapped()
+        if job.item.maps or job.item.regions:
+            with clock("maps"):
+                maps, mapped = add_signals(job.item, maps, job.settings.maps, dict(job.sources))
+                record |= mapped.record or {}
         with clock("write"):
             results.write_results(
-                job.place, maps, job.item.scheme, record, write_meshes=job.write_meshes
+                job.place,
+                maps,
+                job.item.scheme,
+                record,
+                write_meshes=job.write_meshes,
+                write_more=lambda: write_signals(job.place, maps, mapped),
             )
     except Exception as error:  # noqa: BLE001  (one hemisphere's bug must not end the others)
         foreseen = foresee(error, job.place.root)
@@ -272,6 +283,7 @@ def hash_inputs(job: Job) -> tuple[str, dict[str, list[dict[str, str]]]]:
         ],
         [item.scheme.unlisted, item.bilateral, item.code_offset, item.hemi],
         sorted([entry["what"], entry["sha256"]] for entry in edited),
+        *signal_hash(item),
     ]
     digest = hashlib.sha256(json.dumps(reading).encode()).hexdigest()
     return digest, {"inputs": hashes, "edited": edited}

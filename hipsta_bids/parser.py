@@ -65,6 +65,7 @@ def build_parser() -> Parser:
     parser.add_argument("--version", action="version", version=f"hipsta_bids {__version__}")
     _add_selection(parser)
     _add_segmentations(parser)
+    _add_signals(parser)
     _add_processing(parser)
     return parser
 
@@ -172,6 +173,46 @@ def _add_segmentations(parser: Parser) -> None:
     )
 
 
+def _add_signals(parser: Parser) -> None:
+    group = parser.add_argument_group("what else to bring to the sheet")
+    _add(
+        group,
+        ("--map",),
+        (
+            "NAME=PATTERN",
+            "volumes in the space of the labels: path (also in BIDS_DIR) with {subject}, {hemi}, *",
+        ),
+        nargs="+",
+        action="extend",
+        type=_named_pattern,
+        default=[],
+    )
+    _add(
+        group,
+        ("--map-sampling", "--map_sampling"),
+        ("[NAME=]depth|mid", "mean from wall to wall (default), or on the mid-surface"),
+        nargs="+",
+        action="extend",
+        type=_choice("depth", "mid"),
+        default=[],
+    )
+    _add(
+        group,
+        ("--map-interpolation", "--map_interpolation"),
+        ("[NAME=]linear|nearest", "between voxels (default: linear); nearest for labels"),
+        nargs="+",
+        action="extend",
+        type=_choice("linear", "nearest"),
+        default=[],
+    )
+    _add(
+        group,
+        ("--roi",),
+        ("FILE.tsv", "regions drawn on the sheet: columns x, y, region; their means go to a table"),
+        type=Path,
+    )
+
+
 def _add_processing(parser: Parser) -> None:
     group = parser.add_argument_group("how to process")
     _add(
@@ -268,6 +309,27 @@ def _named_path(text: str) -> tuple[str, Path]:
     if equals or not folder.name:
         raise argparse.ArgumentTypeError(f"{text!r} is not of the form NAME=PATH")
     return folder.name, folder
+
+
+def _named_pattern(text: str) -> tuple[str, str]:
+    name, equals, pattern = text.partition("=")
+    if not (equals and name and pattern):
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form NAME=PATTERN")
+    return name, pattern
+
+
+def _choice(*values: str) -> Any:  # noqa: ANN401  (a converter for argparse)
+    """Take one of some words, for all maps or (NAME=) for one."""
+
+    def convert(text: str) -> tuple[str | None, str]:
+        name, equals, value = text.rpartition("=")
+        if value not in values or (equals and not name):
+            raise argparse.ArgumentTypeError(
+                f"{text!r} is not {' or '.join(values)}, alone or after NAME="
+            )
+        return name or None, value
+
+    return convert
 
 
 def _positive_int(text: str) -> int:

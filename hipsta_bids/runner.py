@@ -18,6 +18,7 @@ from hipsta_bids.bids.status import write_sidecar
 from hipsta_bids.bookkeeping import Books, log_file, open_books
 from hipsta_bids.errors import ExitCode, HipstaError, InputError, OutputError, SchemeError
 from hipsta_bids.job import INTERNAL, Job, Outcome, fail, hash_inputs, run_job, warm_up
+from hipsta_bids.mapping import is_complete
 from hipsta_bids.pool import WorkerLost, WorkerPlan, run_jobs
 from hipsta_bids.schemes import Scheme
 from hipsta_bids.settings import Settings
@@ -208,6 +209,7 @@ def finished(job: Job) -> Outcome | None:
         and record.get("version") == __version__
         and record.get("settings_hash") == job.settings_hash
         and all(path.exists() for path in job.place.paths(optional=job.write_meshes))
+        and is_complete(job.place, record)
     )
     if not same:
         return None

@@ -358,6 +358,49 @@ class CheckSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class MapSettings:
+    """Other volumes on the sheet (``--map``)."""
+
+    min_known: float = 0.5
+    """A value is missing if less than this share of the voxels, or of the depth, that it is made
+    of is known."""
+    flag_outside: float = 0.05
+    """Flag if a larger share of the points lies outside the volume's field of view."""
+
+    def __post_init__(self) -> None:
+        _require(0 <= self.min_known <= 1, "maps.min_known must lie between 0 and 1")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurrogateSettings:
+    """Thickness from the medial axis of single slices (``hipsta-bids surrogate``)."""
+
+    positions: tuple[float, ...] = (0.5,)
+    """Where the slices are, fractions of the body's length from its posterior end."""
+    pixel: float = 0.1
+    """Edge of the pixels on which the slices are drawn, mm."""
+    smoothing: float = 0.4
+    """Standard deviation of the Gaussian that rounds the voxels' corners, in-plane voxels."""
+    samples: int = 41
+    """Points on the medial axis, evenly from rim to rim."""
+    step: float = 0.5
+    """Distance of points in the other sampling, mm."""
+    axis_smoothing: float = 0.5
+    """Standard deviation of the Gaussian that straightens the steps of the medial axis, mm."""
+
+    def __post_init__(self) -> None:
+        _require(
+            bool(self.positions) and all(0 < p < 1 for p in self.positions),
+            "surrogate.positions must lie between 0 and 1",
+        )
+        _require(0.02 <= self.pixel <= 1, "surrogate.pixel must lie between 0.02 and 1 mm")  # noqa: PLR2004 -- said there
+        _require(self.samples > 1, "surrogate.samples must be at least 2")
+        _require(self.step > 0, "surrogate.step must be positive")
+        _require(self.smoothing >= 0, "surrogate.smoothing must not be negative")
+        _require(self.axis_smoothing >= 0, "surrogate.axis_smoothing must not be negative")
+
+
+@dataclass(frozen=True, kw_only=True)
 class Settings:
     """All settings of the participant level."""
 
@@ -371,3 +414,5 @@ class Settings:
     sheet: SheetSettings = field(default_factory=SheetSettings)
     measures: MeasureSettings = field(default_factory=MeasureSettings)
     checks: CheckSettings = field(default_factory=CheckSettings)
+    maps: MapSettings = field(default_factory=MapSettings)
+    surrogate: SurrogateSettings = field(default_factory=SurrogateSettings)

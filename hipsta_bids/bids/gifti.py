@@ -140,6 +140,36 @@ def shape_bytes(values: Float, *, hemi: str, name: str, unit: str) -> bytes:
     return _encode([array], hemi)
 
 
+def maps_bytes(values: Float, *, hemi: str, names: Sequence[str]) -> bytes:
+    """Encode one or several numbers per vertex, of unknown unit.
+
+    Parameters
+    ----------
+    values : (V, T) float64
+        NaN where missing.
+    hemi : str
+        ``L`` or ``R``.
+    names : sequence of str
+        What the T maps are called in viewers.
+
+    Returns
+    -------
+    bytes
+        A ``.shape.gii`` file if T is 1, else a ``.func.gii`` file.
+    """
+    kind = "NIFTI_INTENT_SHAPE" if len(names) == 1 else "NIFTI_INTENT_TIME_SERIES"
+    arrays = [
+        GiftiDataArray(
+            column.astype(np.float32),
+            intent=kind,
+            datatype="NIFTI_TYPE_FLOAT32",
+            meta=GiftiMetaData({"Name": name}),
+        )
+        for name, column in zip(names, values.T, strict=True)
+    ]
+    return _encode(arrays, hemi)
+
+
 def label_bytes(
     keys: NDArray[np.uint8], *, hemi: str, name: str, table: Mapping[int, tuple[str, str]]
 ) -> bytes:

@@ -1,20 +1,15 @@
-"""The only place where images are opened for reading."""
+"""Segmentations as label volumes."""
 
-import zlib
 from pathlib import Path
 from typing import Any
 
-import nibabel as nib
 import numpy as np
-from nibabel.filebasedimages import ImageFileError
-from nibabel.openers import ImageOpener
-from nibabel.spatialimages import HeaderDataError
-from nibabel.wrapstruct import WrapStructError
 from numpy.typing import NDArray
 
 from hipsta_bids.artifacts import LabelVolume
 from hipsta_bids.bids.inputs import HemisphereInput
 from hipsta_bids.bids.masks import sample_mask, sample_nearest, within
+from hipsta_bids.bids.volumes import read_voxels
 from hipsta_bids.errors import InputError, SchemeError
 from hipsta_bids.schemes import Part, Scheme, Tissue, load_scheme, scheme_names, translate
 from hipsta_bids.schemes.scheme import OUTSIDE
@@ -22,27 +17,11 @@ from hipsta_bids.schemes.scheme import OUTSIDE
 #: Kept around the hippocampal labels [mm], where the image extends that far.
 MARGIN = 5.0
 
-#: Voxel edges [mm] outside of this range are taken for a wrong header.
-VOXEL_SIZES = (0.05, 5.0)
-
 #: How far the affines of files that are combined may differ [mm, and 1 per voxel].
 SAME_GRID = 1e-3
 
 #: Least share of edited labels that has to lie where the original labels are.
 SAME_PLACE = 0.5
-
-#: All that nibabel and its decompressors raise on damaged files.
-_READ_ERRORS = (
-    OSError,
-    EOFError,
-    ValueError,
-    KeyError,
-    OverflowError,
-    zlib.error,
-    ImageFileError,
-    HeaderDataError,
-    WrapStructError,
-)
 
 _Box = tuple[slice, slice, slice]
 
@@ -78,7 +57,7 @@ def read_label_volume(item: HemisphereInput) -> LabelVolume:
         raise item.problem
     labels, mask = item.edit("labels"), item.edit("mask")
     path = labels.path if labels else item.files[0]
-    data, affine = _open(path)
+    data, affine = read_voxels(path)
     # A first crop in the type on disk saves memory; it is wide enough for the final one.
     box = _bounding_box(data != 0, affine, path)
     codes = _one_hemisphere(_integers(data[box], path), item, path)
@@ -102,7 +81,7 @@ def read_label_volume(item: HemisphereInput) -> LabelVolume:
         affine=cropped,
         scheme=item.scheme,
         edited_mask=(
-            sample_mask(*_open(mask.path), cropped, tissue[inner].shape, mask.path)
+            sample_mask(*read_voxels(mask.path), cropped, tissue[inner].shape, mask.path)
             if mask
             else None
         ),
@@ -115,7 +94,7 @@ def _beside(
     other: Path, path: Path, shape: tuple[int, ...], affine: NDArray[np.float64], *, edited: bool
 ) -> NDArray[Any]:
     """Read a second file on the grid of the first, which may be another's only if edited."""
-    data, own = _open(other)
+    data, own = read_voxels(other)
     if data.shape == shape and np.allclose(own, affine, rtol=0, atol=SAME_GRID):
         return data
     if edited:
@@ -133,7 +112,7 @@ def _check_same_place(
     """Refuse edited labels that lie elsewhere than those which they correct."""
     original = item.files[0]
     try:
-        data, own = _open(original)
+        data, own = read_voxels(original)
         box = _bounding_box(data != 0, own, original)
     except InputError:  # that may be why a person made others
         return
@@ -162,48 +141,11 @@ def label_values(path: Path) -> frozenset[int]:
     InputError
         As :func:`read_label_volume`.
     """
-    data, _ = _open(path)
+    data, _ = read_voxels(path)
     values = np.unique(_integers(data[data != 0], path))
     if not values.size:
         raise _empty(path)
     return frozenset(values.tolist())
-
-
-def _open(path: Path) -> tuple[NDArray[Any], NDArray[np.float64]]:
-    """Load an image's voxels, in the type on disk, and its affine; check both."""
-    try:
-        # nibabel leaves files open on some of its paths; reading the bytes here does not.
-        with ImageOpener(str(path)) as stream:
-            contents = stream.read()
-        image = _format(path, contents).from_bytes(contents)
-        data = np.asanyarray(image.dataobj)
-        affine = np.asarray(image.affine, dtype=np.float64)
-    except _READ_ERRORS as error:
-        message = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(
-            f"{path}: cannot be read as an image ({message}); copy or make the file again",
-            reason="unreadable-image",
-        ) from error
-    while data.ndim > 3 and data.shape[-1] == 1:  # noqa: PLR2004 (space has three dimensions)
-        data = data[..., 0]
-    if data.ndim != 3:  # noqa: PLR2004
-        raise InputError(
-            f"{path}: has shape {' x '.join(map(str, data.shape))}, but labels are one 3-D volume; "
-            "extract the volume",
-            reason="not-3d",
-        )
-    _check_affine(image, affine, path)
-    return data, affine
-
-
-def _format(path: Path, contents: bytes) -> type[Any]:
-    """Tell the format by the file's name and, between the versions of NIfTI, its first bytes."""
-    if path.suffix in {".mgz", ".mgh"}:
-        return nib.MGHImage
-    # NIfTI begins with the size of its header, which tells the versions apart.
-    sizes = {int.from_bytes(contents[:4], order) for order in ("little", "big")}
-    newer = nib.Nifti2Header.template_dtype.itemsize in sizes
-    return nib.Nifti2Image if newer else nib.Nifti1Image
 
 
 def _empty(path: Path) -> InputError:
@@ -211,38 +153,6 @@ def _empty(path: Path) -> InputError:
         f"{path}: all labels are zero; check that the segmentation finished",
         reason="empty-labels",
     )
-
-
-def _check_affine(image: Any, affine: NDArray[np.float64], path: Path) -> None:  # noqa: ANN401 (nibabel's classes are untyped)
-    linear = affine[:3, :3]
-    no_orientation = isinstance(image, nib.Nifti1Pair) and not (
-        int(image.header["sform_code"]) or int(image.header["qform_code"])
-    )
-    if no_orientation:
-        raise InputError(
-            f"{path}: the header has neither an sform nor a qform, so left and right are unknown; "
-            "copy the orientation from the image that was segmented",
-            reason="bad-affine",
-        )
-    if not np.isfinite(affine).all():
-        raise InputError(
-            f"{path}: the affine contains NaN or infinity; repair the header",
-            reason="bad-affine",
-        )
-    sizes = np.linalg.norm(linear, axis=0)
-    volume = abs(np.linalg.det(linear))
-    # Relative, so that small voxels are not mistaken for flat ones.
-    if volume <= 1e-6 * np.prod(sizes):
-        raise InputError(
-            f"{path}: the affine is singular (its axes lie in one plane); repair the header",
-            reason="bad-affine",
-        )
-    if sizes.min() < VOXEL_SIZES[0] or sizes.max() > VOXEL_SIZES[1]:
-        raise InputError(
-            f"{path}: voxels of {' x '.join(f'{size:.3g}' for size in sizes)} mm are outside of "
-            f"{VOXEL_SIZES[0]} to {VOXEL_SIZES[1]} mm; check the header's units",
-            reason="bad-voxel-size",
-        )
 
 
 def _bounding_box(inside: NDArray[np.bool_], affine: NDArray[np.float64], path: Path) -> _Box:

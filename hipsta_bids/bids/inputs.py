@@ -54,6 +54,22 @@ class Edit:
 
 
 @dataclass(frozen=True, kw_only=True)
+class MapSource:
+    """Another volume of the same person, to be sampled on the sheet."""
+
+    name: str
+    """What its outputs are called."""
+    sampling: str
+    """``depth`` or ``mid``, see :func:`~hipsta_bids.geometry.sampling.sample_on_sheet`."""
+    interpolation: str
+    """``linear`` or ``nearest``."""
+    path: Path | None
+    """None where there is no file, or more than one that it could be."""
+    missing: str | None = None
+    """Why there is no path, in one phrase."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class HemisphereInput:
     """One hemisphere's segmentation: which files, which protocol, and why these."""
 
@@ -86,6 +102,10 @@ class HemisphereInput:
     """What a reader should know about this choice."""
     edits: tuple[Edit, ...] = ()
     """Corrections by a person that take the place of what the files say."""
+    maps: tuple[MapSource, ...] = ()
+    """Other volumes to be sampled on the sheet."""
+    regions: Path | None = None
+    """Table of regions drawn on the sheet."""
 
     def edit(self, kind: str) -> Edit | None:
         """Return the edit of one kind, if there is one."""

@@ -146,6 +146,68 @@ OUTPUTS: tuple[Output, ...] = (
     ),
 )
 
+#: Files of one hemisphere that come with an option or another command. A ``*`` stands for the name
+#: that the user gave.
+EXTRA_OUTPUTS: tuple[Output, ...] = (
+    Output(
+        key="map_table",
+        desc="*",
+        suffix="map",
+        extension=".tsv",
+        description="another volume at each sheet point, one column per volume (`--map`)",
+    ),
+    Output(
+        key="map_sidecar",
+        desc="*",
+        suffix="map",
+        extension=".json",
+        description="its source, how it was sampled, and how much of it is missing",
+    ),
+    Output(
+        key="map_shape",
+        desc="*",
+        suffix="map",
+        extension=".shape.gii",
+        description="the same per surface vertex",
+    ),
+    Output(
+        key="map_series",
+        desc="*",
+        suffix="map",
+        extension=".func.gii",
+        description="the same per surface vertex, where there are several volumes",
+    ),
+    Output(
+        key="roi",
+        desc="roi",
+        suffix="morph",
+        extension=".tsv",
+        description="one row per region drawn on the sheet: points, area, mean and SD of the maps"
+        " (`--roi`)",
+    ),
+    Output(
+        key="roi_sidecar",
+        desc="roi",
+        suffix="morph",
+        extension=".json",
+        description="columns, units and definitions of the region table",
+    ),
+    Output(
+        key="surrogate",
+        desc="surrogate",
+        suffix="morph",
+        extension=".tsv",
+        description="thickness from the medial axis of single slices (`hipsta-bids surrogate`)",
+    ),
+    Output(
+        key="surrogate_sidecar",
+        desc="surrogate",
+        suffix="morph",
+        extension=".json",
+        description="columns, units and definitions of that table",
+    ),
+)
+
 #: Files of the whole dataset, by the name of what they hold.
 DATASET_FILES: dict[str, str] = {
     "description": "dataset_description.json",
@@ -157,10 +219,10 @@ DATASET_FILES: dict[str, str] = {
     "logs": "logs",
 }
 
-_BY_KEY = {output.key: output for output in OUTPUTS}
+_BY_KEY = {output.key: output for output in (*OUTPUTS, *EXTRA_OUTPUTS)}
 
 
-def output_name(name: HemisphereName, key: str) -> str:
+def output_name(name: HemisphereName, key: str, desc: str | None = None) -> str:
     """Spell the file name of one output.
 
     Parameters
@@ -168,7 +230,9 @@ def output_name(name: HemisphereName, key: str) -> str:
     name : HemisphereName
         Whose result it is.
     key : str
-        A key of :data:`OUTPUTS`.
+        A key of :data:`OUTPUTS` or :data:`EXTRA_OUTPUTS`.
+    desc : str, optional
+        What takes the place of the table's ``desc``: the user's name for a map.
 
     Returns
     -------
@@ -180,13 +244,13 @@ def output_name(name: HemisphereName, key: str) -> str:
         name.stem,
         f"space-{output.space}" if output.space else None,
         f"seg-{name.seg}",
-        f"desc-{output.desc}" if output.desc else None,
+        f"desc-{desc or output.desc}" if output.desc else None,
         output.suffix,
     ]
     return "_".join(part for part in entities if part) + output.extension
 
 
-def output_path(name: HemisphereName, key: str) -> PurePosixPath:
+def output_path(name: HemisphereName, key: str, desc: str | None = None) -> PurePosixPath:
     """Spell the path of one output, relative to the output dataset.
 
     Parameters
@@ -194,14 +258,16 @@ def output_path(name: HemisphereName, key: str) -> PurePosixPath:
     name : HemisphereName
         Whose result it is.
     key : str
-        A key of :data:`OUTPUTS`.
+        A key of :data:`OUTPUTS` or :data:`EXTRA_OUTPUTS`.
+    desc : str, optional
+        See :func:`output_name`.
 
     Returns
     -------
     PurePosixPath
         ``sub-X[/ses-Y]/anat/sub-X[_ses-Y]_hemi-H[_space-S]_seg-P[_desc-D]_<suffix><extension>``.
     """
-    return name.folder / output_name(name, key)
+    return name.folder / output_name(name, key, desc)
 
 
 def ignore_patterns() -> tuple[str, ...]:
@@ -214,6 +280,8 @@ def ignore_patterns() -> tuple[str, ...]:
     """
     dataset = [DATASET_FILES[key] for key in ("settings", "citation", "status", "status_sidecar")]
     patterns = dict.fromkeys(
-        f"*_{output.suffix}{output.extension}" for output in OUTPUTS if not output.in_standard
+        f"*_{output.suffix}{output.extension}"
+        for output in (*OUTPUTS, *EXTRA_OUTPUTS)
+        if not output.in_standard
     )
     return (*dataset, f"{DATASET_FILES['logs']}/", *patterns)

@@ -3,7 +3,7 @@
 The quality record goes last and is removed first, so that it stands for a complete set.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,13 @@ import numpy as np
 
 from hipsta_bids.artifacts import BodyMask, Bool, Float, HemisphereMaps, Status
 from hipsta_bids.bids import files, gifti, masks, tables
-from hipsta_bids.bids.names import OUTPUTS, HemisphereName, output_path
+from hipsta_bids.bids.names import (
+    EXTRA_OUTPUTS,
+    OUTPUTS,
+    HemisphereName,
+    output_name,
+    output_path,
+)
 from hipsta_bids.errors import HipstaError
 from hipsta_bids.schemes import Scheme
 
@@ -28,13 +34,19 @@ class ResultPlace:
     """The output dataset."""
     name: HemisphereName
 
-    def path(self, key: str) -> Path:
-        """Path of one output, by its key in the output table."""
-        return self.root / output_path(self.name, key)
+    def path(self, key: str, desc: str | None = None) -> Path:
+        """Path of one output, by its key in the output table and, for maps, the user's name."""
+        return self.root / output_path(self.name, key, desc)
 
     def paths(self, *, optional: bool) -> list[Path]:
         """Paths of all outputs, with the optional ones or without."""
         return [self.path(row.key) for row in OUTPUTS if optional or not row.optional]
+
+    def extra_paths(self) -> list[Path]:
+        """Existing files that came with an option or another command."""
+        folder = self.root / self.name.folder
+        names = [output_name(self.name, row.key) for row in EXTRA_OUTPUTS]
+        return [path for name in names for path in sorted(folder.glob(name))]
 
 
 def remove_results(place: ResultPlace) -> None:
@@ -45,7 +57,7 @@ def remove_results(place: ResultPlace) -> None:
     OutputError
         If one cannot be removed.
     """
-    files.remove(reversed(place.paths(optional=True)))
+    files.remove([*reversed(place.paths(optional=True)), *place.extra_paths()])
     folder = place.path("qc").parent
     if folder.is_dir():
         files.remove_leftovers(folder, f"{place.name.stem}_*seg-{place.name.seg}_*")
@@ -58,6 +70,7 @@ def write_results(
     record: Mapping[str, Any],
     *,
     write_meshes: bool,
+    write_more: Callable[[], None] = lambda: None,
 ) -> None:
     """Write all files of one hemisphere; earlier ones are removed first.
 
@@ -73,6 +86,8 @@ def write_results(
         What the quality record says besides the measures (inputs, hashes, version, ...).
     write_meshes : bool
         Whether to add the tetrahedral mesh.
+    write_more : callable, optional
+        Writes what else there is to write, before the record.
 
     Raises
     ------
@@ -89,6 +104,7 @@ def write_results(
         from hipsta_bids.bids.meshes import mesh_bytes  # noqa: PLC0415  (meshio is slow to load)
 
         files.write_bytes(place.path("mesh"), mesh_bytes(maps.mesh, maps.coordinates))
+    write_more()
     undefined = int(np.isnan(maps.sheet.points[:, :, [0, -1]]).any(axis=(2, 3)).sum())
     status, reason, message = verdict(maps)
     files.write_json(

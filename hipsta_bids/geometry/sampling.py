@@ -1,0 +1,160 @@
+"""Other volumes on the sheet: their values at its points, or averaged over its depth."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hipsta_bids.artifacts import Bool, Float, Sheet
+from hipsta_bids.settings import MapSettings
+
+#: Where a volume is read, and how between its voxels.
+SAMPLINGS = ("depth", "mid")
+INTERPOLATIONS = ("linear", "nearest")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScalarVolume:
+    """One or more numbers per voxel, cropped to what is needed."""
+
+    values: Float
+    """(I, J, K, T); not finite where missing."""
+    affine: Float
+    """(4, 4), index into ``values`` to RAS mm."""
+    start: tuple[int, int, int]
+    """Index of the first voxel in the whole image."""
+    shape: tuple[int, int, int]
+    """Of the whole image."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SampledMap:
+    """A volume on the sheet."""
+
+    values: Float
+    """(Nx, Ny, T), NaN where missing."""
+    outside: float
+    """Share of the points asked for that lie outside the field of view."""
+    unknown: float
+    """Share of the points inside it that have no known value."""
+
+    @property
+    def missing(self) -> float:
+        """Share of the values that are missing."""
+        return float(np.isnan(self.values).mean())
+
+
+def sample_on_sheet(
+    volume: ScalarVolume,
+    sheet: Sheet,
+    settings: MapSettings,
+    *,
+    sampling: str,
+    interpolation: str,
+) -> SampledMap:
+    """Read a volume on the mid-surface or averaged over the depth of the sheet.
+
+    Parameters
+    ----------
+    volume : ScalarVolume
+    sheet : Sheet
+    settings : MapSettings
+    sampling : {"depth", "mid"}
+        ``depth`` gives the mean over each column from wall to wall (trapezoidal rule), or, with
+        ``nearest``, the value that most of the column has, so that labels remain labels.
+    interpolation : {"linear", "nearest"}
+        Trilinear between the centers of voxels, or the value of the voxel that holds the point.
+
+    Returns
+    -------
+    SampledMap
+        A value is missing where less than ``min_known`` of what it is made of is known.
+
+    Notes
+    -----
+    The field of view ends at the outer faces of the outermost voxels; from their centers outward
+    the value is that of the voxel.
+    """
+    level = sheet.middle
+    points = sheet.points if sampling == "depth" else sheet.points[:, :, level : level + 1]
+    index, inside = _locate(volume, points.reshape(-1, 3))
+    read = _linear if interpolation == "linear" else _nearest
+    values = read(volume.values, index, settings.min_known)
+    values[~inside] = np.nan
+    # Columns without a position are missing, and no sign of a wrong field of view.
+    asked = np.isfinite(points.reshape(-1, 3)).all(axis=1)
+    known = ~np.isnan(values[inside])
+    columns = values.reshape(*points.shape[:3], -1)
+    merge = _mean if interpolation == "linear" else _most_frequent
+    return SampledMap(
+        values=merge(columns, settings.min_known),
+        outside=float((~inside)[asked].mean()) if asked.any() else 0.0,
+        unknown=float(1 - known.mean()) if known.size else 0.0,
+    )
+
+
+def _locate(volume: ScalarVolume, points: Float) -> tuple[Float, Bool]:
+    """Index (N, 3) into the values, clamped to centers of voxels; and which are inside."""
+    to_index = np.linalg.inv(volume.affine)
+    index = points @ to_index[:3, :3].T + to_index[:3, 3]
+    whole = index + volume.start
+    shape = np.array(volume.shape)
+    slack = 0.5 + 1e-6  # rounding of affines must not decide about points on the outer face
+    with np.errstate(invalid="ignore"):
+        inside = ((whole >= -slack) & (whole <= shape - 1 + slack)).all(axis=1)
+    index = np.where(inside[:, None], index, 0.0)
+    return np.clip(index, 0, np.array(volume.values.shape[:3]) - 1), inside
+
+
+def _linear(values: Float, index: Float, min_known: float) -> Float:
+    """Interpolate (N, T) between eight voxels, by those of them that are known."""
+    low = np.floor(index).astype(np.intp)
+    share = index - low
+    last = np.array(values.shape[:3]) - 1
+    total = np.zeros((len(index), values.shape[3]))
+    weight = np.zeros_like(total)
+    for corner in np.ndindex(2, 2, 2):
+        here = np.minimum(low + corner, last)
+        part = np.prod(np.where(corner, share, 1 - share), axis=1)[:, None]
+        found = values[tuple(here.T)]
+        known = np.isfinite(found)
+        total += part * np.where(known, found, 0.0)
+        weight += part * known
+    return _quotient(total, weight, min_known)
+
+
+def _nearest(values: Float, index: Float, _: float) -> Float:
+    found = values[tuple(np.rint(index).astype(np.intp).T)]
+    return np.asarray(np.where(np.isfinite(found), found, np.nan))
+
+
+def _depth_weights(count: int) -> Float:
+    """Weights of evenly spaced points of a column, (1, 1, count, 1), with sum 1."""
+    weights = np.ones(count)
+    if count > 1:
+        weights[[0, -1]] = 0.5
+    return np.asarray(weights / weights.sum())[None, None, :, None]
+
+
+def _mean(columns: Float, min_known: float) -> Float:
+    known = np.isfinite(columns)
+    weights = _depth_weights(columns.shape[2])
+    total = (weights * np.where(known, columns, 0.0)).sum(axis=2)
+    return _quotient(total, (weights * known).sum(axis=2), min_known)
+
+
+def _most_frequent(columns: Float, min_known: float) -> Float:
+    """Take the value with most weight along each column; of equals, that nearest the middle."""
+    count = columns.shape[2]
+    order = np.argsort(np.abs(np.arange(count) - count // 2), kind="stable")
+    columns, weights = columns[:, :, order], _depth_weights(count)[:, :, order]
+    same = columns[:, :, :, None] == columns[:, :, None]
+    votes = (same * weights[:, :, None]).sum(axis=3)
+    best = np.take_along_axis(columns, votes.argmax(axis=2)[:, :, None], axis=2)[:, :, 0]
+    known = (np.isfinite(columns) * weights).sum(axis=2)
+    return np.where(known >= min_known, best, np.nan)
+
+
+def _quotient(total: Float, weight: Float, least: float) -> Float:
+    """Divide where the weight suffices; NaN elsewhere."""
+    enough = (weight >= least) & (weight > 0)
+    return np.where(enough, total / np.where(enough, weight, 1.0), np.nan)
