@@ -219,7 +219,7 @@ def rigid_motion(degrees: tuple[float, float, float], shift: tuple[float, float,
 
 
 def _truth_row(item: Hemisphere, phantom: Phantom) -> dict[str, str]:
-    values = phantom.truth(0.5, 0.5).summary
+    values = phantom.region_summary("body")
     row = {"subject": f"sub-{item.subject}", "hemi": item.hemi, "kind": item.spec.kind}
     return row | {name: f"{value:.4f}" for name, value in values.items()}
 

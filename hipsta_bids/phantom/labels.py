@@ -10,6 +10,7 @@ from hipsta_bids.artifacts import Bool, Float, Int, LabelVolume
 from hipsta_bids.errors import SchemeError, SettingsError
 from hipsta_bids.phantom.body import Body
 from hipsta_bids.phantom.grid import Grid
+from hipsta_bids.phantom.spec import PhantomSpec
 from hipsta_bids.schemes import Label, Part, Scheme, Tissue
 
 #: Subfields of the sheet and the u at which each begins. The share of CA2 is small, as in life.
@@ -21,6 +22,11 @@ SUBFIELD_STARTS: tuple[tuple[Tissue, float], ...] = (
     (Tissue.CA3, 0.82),
 )
 
+#: Neighboring cortex. BA35 takes the far part of it; nearer to the subiculum lies entorhinal cortex
+#: in the anterior half and parahippocampal cortex in the posterior one.
+CORTEX: tuple[Tissue, ...] = (Tissue.ENTORHINAL, Tissue.BA35, Tissue.PARAHIPPOCAMPAL)
+_BA35_SHARE = 0.4
+
 #: What to draw where a protocol lacks a tissue, first choice first.
 _STAND_INS: Mapping[Tissue, tuple[Tissue, ...]] = MappingProxyType(
     {
@@ -29,6 +35,9 @@ _STAND_INS: Mapping[Tissue, tuple[Tissue, ...]] = MappingProxyType(
         Tissue.CA3: (Tissue.CA2_3,),
         Tissue.CA4: (Tissue.DENTATE_GYRUS,),
         Tissue.DENTATE_GYRUS: (Tissue.CA4,),
+        Tissue.BA35: (Tissue.ENTORHINAL, Tissue.PARAHIPPOCAMPAL),
+        Tissue.PARAHIPPOCAMPAL: (Tissue.ENTORHINAL,),
+        Tissue.ENTORHINAL: (Tissue.PARAHIPPOCAMPAL,),
     }
 )
 
@@ -111,6 +120,26 @@ def subfield_at(u: Float) -> NDArray[np.uint8]:
     return np.asarray(tissues[np.searchsorted(starts[1:], u, side="right")])
 
 
+def tissue_at(spec: PhantomSpec, u: Float, v: Float) -> NDArray[np.uint8]:
+    """Tissue of the whole wall, cortex included, at positions ``u`` and ``v``."""
+    place, cortex = _along(spec, u - spec.offset)
+    return np.asarray(np.where(place < 0.0, cortex_at(cortex, v), subfield_at(place)))
+
+
+def cortex_at(place: Float, v: Float) -> NDArray[np.uint8]:
+    """Kind of cortex at a share of its extent, from far to near, and at ``v``."""
+    near = np.where(v < 0.5, Tissue.PARAHIPPOCAMPAL, Tissue.ENTORHINAL)  # noqa: PLR2004 -- half
+    return np.where(place < _BA35_SHARE, Tissue.BA35, near).astype(np.uint8)
+
+
+def _along(spec: PhantomSpec, u: Float) -> tuple[Float, Float]:
+    """Share of the hippocampal subfields' extent, below 0 in cortex; and of the cortex's."""
+    share = spec.cortex_share
+    if share == 0.0:
+        return np.maximum(u, 0.0), np.full(np.shape(u), np.inf)
+    return (u - share) / (1.0 - share), u / share
+
+
 def label_for(scheme: Scheme, tissue: Tissue, part: Part) -> Label | None:
     """Label that a protocol gives a tissue of a part; None if it leaves it out.
 
@@ -119,7 +148,9 @@ def label_for(scheme: Scheme, tissue: Tissue, part: Part) -> Label | None:
     """
     by_meaning = {(label.tissue, label.part): label for label in reversed(scheme.labels)}
     tissues = (tissue, *_STAND_INS.get(tissue, ()))
-    wanted = [(choice, part) for choice in tissues] + [(Tissue.HIPPOCAMPUS, part)]
+    wanted = [(choice, part) for choice in tissues]
+    if tissue not in CORTEX:
+        wanted += [(Tissue.HIPPOCAMPUS, part)]
     if part is Part.BODY or tissue not in _BODY_ONLY:
         wanted += [(choice, Part.UNKNOWN) for choice in tissues]
     return next((by_meaning[key] for key in wanted if key in by_meaning), None)
@@ -149,10 +180,10 @@ def encode(volume: LabelVolume) -> NDArray[np.int32]:
 
 
 # Regions are numbered part by part: for each part, the sheet's subfields, the same again for the
-# molecular layer beneath each, then dentate gyrus and CA4. Region 0 is outside.
+# molecular layer beneath each, then dentate gyrus and CA4, then cortex. Region 0 is outside.
 _PARTS = (Part.TAIL, Part.BODY, Part.HEAD)
 _SHEET = len(SUBFIELD_STARTS)
-_PER_PART = 2 * _SHEET + 2
+_PER_PART = 2 * _SHEET + 2 + len(CORTEX)
 
 
 def _label_table(scheme: Scheme) -> NDArray[np.intp]:
@@ -169,8 +200,11 @@ def _label_table(scheme: Scheme) -> NDArray[np.intp]:
                 "choose another scheme",
                 reason="phantom-scheme",
             )
+        cortex = [label_for(scheme, tissue, part) for tissue in CORTEX]
         layers = [None if own is None else layer or own for own in sheet]
-        table += [position[id(x)] if x is not None else 0 for x in (*sheet, *layers, *inner)]
+        table += [
+            position[id(x)] if x is not None else 0 for x in (*sheet, *layers, *inner, *cortex)
+        ]
     return np.array(table, dtype=np.intp)
 
 
@@ -188,11 +222,14 @@ def _regions(
     u, v, n = u[near], v[near], n[near]
     half = body.thickness(u, v) / 2.0
     starts = [start for _, start in SUBFIELD_STARTS[1:]]
-    band = 1 + np.searchsorted(starts, u - spec.offset, side="right")
+    place, share = _along(spec, u - spec.offset)
+    band = 1 + np.searchsorted(starts, place, side="right")
     layer = n < -half + spec.layer_thickness
-    wall = band + _SHEET * layer
+    cortex = 2 * _SHEET + 3 + np.searchsorted(CORTEX, cortex_at(share, v))
+    wall = np.where(place < 0.0, cortex, band + _SHEET * layer)
     depth = -half - n
-    inner = (depth > 0.0) & (depth <= spec.interior_depth) & (u >= spec.interior_start)
+    lined = _along(spec, u)[0] >= spec.interior_start
+    inner = (depth > 0.0) & (depth <= spec.interior_depth) & lined
     local = np.where(np.abs(n) <= half, wall, 0)
     local[inner] = np.where(depth[inner] <= _GYRUS_DEPTH, 2 * _SHEET + 1, 2 * _SHEET + 2)
     part = (v >= 0.0).astype(int) + (v > 1.0)

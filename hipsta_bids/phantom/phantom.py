@@ -6,9 +6,16 @@ from numpy.typing import ArrayLike
 from hipsta_bids.artifacts import Float, LabelVolume
 from hipsta_bids.phantom.body import Body
 from hipsta_bids.phantom.grid import make_grid
-from hipsta_bids.phantom.labels import draw, subfield_at
+from hipsta_bids.phantom.labels import draw, tissue_at
 from hipsta_bids.phantom.spec import PhantomSpec
-from hipsta_bids.phantom.truth import SURFACES, PhantomTruth, mean_curvature, summarize
+from hipsta_bids.phantom.truth import (
+    SURFACES,
+    PhantomTruth,
+    gaussian_curvature,
+    line_lengths,
+    mean_curvature,
+    summarize,
+)
 from hipsta_bids.schemes import Scheme
 
 
@@ -106,15 +113,41 @@ class Phantom:
         """
         x, y = np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64))
         bent = {name: mean_curvature(self.body, x, y, at=at) for name, at in SURFACES.items()}
+        domed = {name: gaussian_curvature(self.body, x, y, at=at) for name, at in SURFACES.items()}
+        extent_x, extent_y = line_lengths(self.body, x, y)
         return PhantomTruth(
             thickness=self.body.thickness(x, y),
             points=self.body.place(x, y, 0.0, hemi=hemi, pose=pose),
             curvature_interior=bent["interior"],
             curvature=bent["mid"],
             curvature_exterior=bent["exterior"],
-            subfield=subfield_at(x - self.spec.offset),
+            gaussian_curvature=domed["mid"],
+            gaussian_curvature_interior=domed["interior"],
+            gaussian_curvature_exterior=domed["exterior"],
+            extent_x=extent_x,
+            extent_y=extent_y,
+            subfield=tissue_at(self.spec, x, y),
             summary=summarize(self.body),
         )
+
+    def region_summary(self, region: str) -> dict[str, float]:
+        """Tell what a perfect method would measure in a region as a whole.
+
+        Parameters
+        ----------
+        region : str
+            ``body`` (the hippocampal subfields), ``extended`` (with the cortex, which is the whole
+            wall) or ``entorhinal`` (the cortex alone).
+
+        Returns
+        -------
+        dict
+            See :func:`~hipsta_bids.phantom.truth.summarize`.
+        """
+        border = self.spec.cortex_share
+        border += self.spec.offset if border else 0.0
+        spans = {"body": (border, 1.0), "extended": (0.0, 1.0), "entorhinal": (0.0, border)}
+        return summarize(self.body, span=spans[region])
 
     def _outline(self, hemi: str, pose: Float | None) -> Float:
         """Points (N, 3), RAS mm, that span head, body and tail with all they enclose."""

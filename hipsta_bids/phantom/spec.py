@@ -79,7 +79,11 @@ class PhantomSpec:
     interior_depth: float = 1.5
     """mm, depth of the dentate gyrus and CA4 beneath the interior side."""
     interior_start: float = 0.45
-    """Position u from which on dentate gyrus and CA4 line the interior side."""
+    """Share of the hippocampal part of the mid-curve from which on dentate gyrus and CA4 line the
+    interior side."""
+    cortex: float = 0.0
+    """mm of the mid-curve, from its medial end, that are neighboring cortex; the hippocampal
+    subfields share the rest. Drawn where the protocol has labels for it."""
     thinnings: tuple[Thinning, ...] = ()
     """Regions in which the wall is thinner. Where they overlap, depths add up."""
     offset: float = 0.0
@@ -108,12 +112,23 @@ class PhantomSpec:
                 "thin it less",
                 reason="phantom-setting",
             )
+        if self.cortex > 0.8 * self.width:
+            raise SettingsError(
+                f"phantom: cortex of {self.cortex:g} mm leaves less than a fifth of the sheet's "
+                f"{self.width:g} mm to the hippocampus; make it shorter",
+                reason="phantom-setting",
+            )
         if self.layer_thickness >= thinnest:
             raise SettingsError(
                 f"phantom: layer_thickness {self.layer_thickness:g} mm fills the wall, which is "
                 f"{thinnest:g} mm at its thinnest; make the layer thinner",
                 reason="phantom-layer",
             )
+
+    @property
+    def cortex_share(self) -> float:
+        """Share of the mid-curve that is cortex."""
+        return self.cortex / self.width
 
     @property
     def section_bend(self) -> Bend:
@@ -136,6 +151,7 @@ _LIMITS: Mapping[str, tuple[float, float]] = MappingProxyType(
         "bend": (-0.1, 0.1),
         "end_length": (0.0, 50.0),
         "layer_thickness": (0.0, 10.0),
+        "cortex": (0.0, 80.0),
         "interior_depth": (0.0, 10.0),
         "interior_start": (0.0, 1.0),
         "offset": (-0.15, 0.15),

@@ -1,4 +1,4 @@
-"""Exact thickness, curvature, areas and volume of a phantom.
+"""Exact thickness, curvatures, lengths, areas, cross-sections and volume of a phantom.
 
 The three surfaces are ``mid(s, w) + n(s, w) * normal(s, w)`` with n = -T/2, 0 and T/2. Their
 derivatives are written out in the frame that moves with the sweep, so curvature is a formula and
@@ -36,10 +36,18 @@ class PhantomTruth:
     curvature: Float
     """Of the mid-surface."""
     curvature_exterior: Float
+    gaussian_curvature: Float
+    """Gaussian curvature of the mid-surface, 1/mm2. Likewise below."""
+    gaussian_curvature_interior: Float
+    gaussian_curvature_exterior: Float
+    extent_x: Float
+    """Length of the line u from 0 to 1 through each position, on the mid-surface, mm."""
+    extent_y: Float
+    """Length of the line v from 0 to 1, mm."""
     subfield: NDArray[np.uint8]
     """Values of :class:`~hipsta_bids.schemes.Tissue`, in the finest division."""
     summary: Mapping[str, float]
-    """The whole body, see :func:`summarize`."""
+    """The whole wall, see :func:`summarize`."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -64,15 +72,56 @@ def mean_curvature(body: Body, u: Float, v: Float, *, at: float) -> Float:
     H = (e G - 2 f F + g E) / (2 (E G - F^2)) (do Carmo, Differential Geometry of Curves and
     Surfaces, section 3-3), here for the normal that points to the interior.
     """
-    jet = _surface_jet(body, u, v, at)
-    normal = np.cross(jet.s, jet.w)
-    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    normal *= -np.sign(normal[..., 1:2])  # to the interior: the section's normal points away
-    first_ss, first_sw, first_ww = _dot(jet.s, jet.s), _dot(jet.s, jet.w), _dot(jet.w, jet.w)
-    second_ss, second_sw, second_ww = (_dot(x, normal) for x in (jet.ss, jet.sw, jet.ww))
+    (first_ss, first_sw, first_ww), (ss, sw, ww) = _fundamental_forms(body, u, v, at)
     twice_det = 2.0 * (first_ss * first_ww - first_sw**2)
-    trace = second_ss * first_ww - 2.0 * second_sw * first_sw + second_ww * first_ss
-    return np.asarray(trace / twice_det)
+    return np.asarray((ss * first_ww - 2.0 * sw * first_sw + ww * first_ss) / twice_det)
+
+
+def gaussian_curvature(body: Body, u: Float, v: Float, *, at: float) -> Float:
+    """Gaussian curvature at positions (u, v) of a surface of the wall, 1/mm2.
+
+    K = (e g - f^2) / (E G - F^2), in the terms of :func:`mean_curvature`.
+    """
+    (first_ss, first_sw, first_ww), (ss, sw, ww) = _fundamental_forms(body, u, v, at)
+    return np.asarray((ss * ww - sw**2) / (first_ss * first_ww - first_sw**2))
+
+
+def cut_sections(body: Body, v: Float) -> dict[str, Float]:
+    """Measure the cross-sections at positions v along the axis.
+
+    Parameters
+    ----------
+    body : Body
+        The shape.
+    v : (N,) array
+        From 0 to 1.
+
+    Returns
+    -------
+    dict of (N,) arrays
+        As in the output's table of cross-sections, mm and mm2. Lines are those of constant v.
+    """
+    u, weights = gauss_panels(0.0, 1.0, _PANELS_U)
+    u, v = u[:, None], np.asarray(v, np.float64)[None, :]
+    cell = weights[:, None] * body.spec.width
+    lengths = {
+        f"length_{name}": (cell * np.linalg.norm(_surface_jet(body, u, v, at).s, axis=-1)).sum(0)
+        for name, at in SURFACES.items()
+    }
+    thickness = body.thickness(u, v)
+    # The integral of 1 + n k over n from -T/2 to T/2 is T.
+    area = (cell * thickness).sum(axis=0)
+    circumference = lengths["length_interior"] + lengths["length_exterior"]
+    stretch = _axis_stretch(body, u)[0].ravel() @ weights
+    return {
+        "position": stretch * v.ravel() * body.spec.length,
+        "thickness": area / body.spec.width,
+        **lengths,
+        "circumference": circumference,
+        "interior_exterior_ratio": lengths["length_interior"] / lengths["length_exterior"],
+        "section_area": area,
+        "shape_index": circumference / area,
+    }
 
 
 def summarize(body: Body, *, span: tuple[float, float] = (0.0, 1.0)) -> dict[str, float]:
@@ -90,7 +139,8 @@ def summarize(body: Body, *, span: tuple[float, float] = (0.0, 1.0)) -> dict[str
     dict
         ``thickness_mean`` (mm, over uniform u and v), ``extent_x``, ``extent_y``, ``extent_z``
         (mm: arc length of the mid-curve, length along v averaged over u, mean thickness),
-        ``volume`` (mm3), ``area_interior``, ``area_mid`` and ``area_exterior`` (mm2).
+        ``volume`` (mm3), ``area_interior``, ``area_mid`` and ``area_exterior`` (mm2), and for the
+        whole body what :func:`summarize_ratios` adds.
     """
     u, weights_u = gauss_panels(*span, _PANELS_U)
     v, weights_v = gauss_panels(0.0, 1.0, _PANELS_V)
@@ -108,7 +158,7 @@ def summarize(body: Body, *, span: tuple[float, float] = (0.0, 1.0)) -> dict[str
         f"area_{name}": float((cell * _area_element(body, u, v, at)).sum())
         for name, at in SURFACES.items()
     }
-    return {
+    summary = {
         "thickness_mean": mean,
         "extent_x": spec.width * (span[1] - span[0]),
         "extent_y": float((uniform * stretch).sum()) * spec.length,
@@ -116,6 +166,62 @@ def summarize(body: Body, *, span: tuple[float, float] = (0.0, 1.0)) -> dict[str
         "volume": float((cell * column).sum()),
         **areas,
     }
+    return summary if span != (0.0, 1.0) else summary | summarize_ratios(body, summary)
+
+
+def summarize_ratios(body: Body, summary: Mapping[str, float]) -> dict[str, float]:
+    """Average cross-sections and curvatures over the whole body, and relate its sizes.
+
+    Parameters
+    ----------
+    body : Body
+        The shape.
+    summary : mapping
+        Its areas (mm2) and volume (mm3).
+
+    Returns
+    -------
+    dict
+        ``area_ratio``, ``surface_volume_ratio`` (1/mm), means of what :func:`cut_sections`
+        gives over the body's length, and medians of the curvatures over uniform u and v.
+    """
+    v, weights_v = gauss_panels(0.0, 1.0, _PANELS_V)
+    even_u, even_v = np.linspace(0.0, 1.0, 201)[:, None], np.linspace(0.0, 1.0, 101)[None, :]
+    sections = cut_sections(body, v)
+    walls = summary["area_interior"] + summary["area_exterior"]
+    ratios = {
+        "area_ratio": summary["area_interior"] / summary["area_exterior"],
+        "surface_volume_ratio": walls / summary["volume"],
+    }
+    for name in ("circumference", "interior_exterior_ratio", "section_area", "shape_index"):
+        ratios[f"{name}_mean"] = float(sections[name] @ weights_v)
+    kinds = {"curvature": mean_curvature, "gaussian_curvature": gaussian_curvature}
+    for kind, curvature in kinds.items():
+        for surface, at in SURFACES.items():
+            name = kind if surface == "mid" else f"{kind}_{surface}"
+            values = curvature(body, even_u, even_v, at=at)
+            ratios[f"{name}_median"] = float(np.median(values))
+    return ratios
+
+
+def line_lengths(body: Body, u: Float, v: Float) -> tuple[Float, Float]:
+    """Lengths of the mid-surface's lines along u and along v through positions (u, v), mm."""
+    u, v = np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64))
+    along = _axis_stretch(body, u)[0] * body.spec.length
+    return np.full(v.shape, body.spec.width), np.broadcast_to(along, u.shape).copy()
+
+
+_Form = tuple[Float, Float, Float]
+
+
+def _fundamental_forms(body: Body, u: Float, v: Float, at: float) -> tuple[_Form, _Form]:
+    """First and second fundamental form, for the normal that points to the interior."""
+    jet = _surface_jet(body, u, v, at)
+    normal = np.cross(jet.s, jet.w)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    normal *= -np.sign(normal[..., 1:2])  # to the interior: the section's normal points away
+    first = (_dot(jet.s, jet.s), _dot(jet.s, jet.w), _dot(jet.w, jet.w))
+    return first, (_dot(jet.ss, normal), _dot(jet.sw, normal), _dot(jet.ww, normal))
 
 
 def _surface_jet(body: Body, u: Float, v: Float, at: float) -> _Jet:

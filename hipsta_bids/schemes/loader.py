@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 from hipsta_bids.errors import SchemeError
 from hipsta_bids.schemes.scheme import Label, Scheme
-from hipsta_bids.schemes.tissues import MEDIAL_TO_LATERAL, Part, Tissue
+from hipsta_bids.schemes.tissues import FAR_TO_NEAR, MEDIAL_TO_LATERAL, Part, Tissue
 
 _Member = TypeVar("_Member", Tissue, Part)
 
@@ -24,7 +24,7 @@ _KEYS = {
     "interior": list,
     "labels": list,
 }
-_OPTIONAL_KEYS = {"tool": str, "unlisted": str, "right_offset": int}
+_OPTIONAL_KEYS = {"tool": str, "unlisted": str, "right_offset": int, "neighbors": list}
 _LABEL_KEYS = {"code": int, "tissue": str, "name": str, "abbreviation": str, "color": str}
 _OPTIONAL_LABEL_KEYS = {"part": str}
 
@@ -71,8 +71,9 @@ def scheme_table() -> list[dict[str, str]]:
     Returns
     -------
     list of dict
-        Keys ``name``, ``tool``, ``title``, ``sheet`` (tissues from medial to lateral), ``labels``
-        (how many), ``parts`` (of head, body, tail: those that have labels) and ``citation``.
+        Keys ``name``, ``tool``, ``title``, ``sheet`` (tissues from medial to lateral),
+        ``neighbors`` (cortex beyond the medial end), ``labels`` (how many), ``parts`` (of head,
+        body, tail: those that have labels) and ``citation``.
     """
     rows = []
     for name in scheme_names():
@@ -84,6 +85,7 @@ def scheme_table() -> list[dict[str, str]]:
                 "tool": scheme.tool,
                 "title": scheme.title,
                 "sheet": ", ".join(tissue.name for tissue in scheme.sheet),
+                "neighbors": ", ".join(tissue.name for tissue in scheme.neighbors) or "none",
                 "labels": str(len(scheme.labels)),
                 "parts": ", ".join(part.name.lower() for part in parts),
                 "citation": scheme.citation,
@@ -149,6 +151,7 @@ def parse_scheme(table: Mapping[str, Any], *, origin: str) -> Scheme:
         tool=table.get("tool", ""),
         unlisted=table.get("unlisted", "error"),
         right_offset=table.get("right_offset", 0),
+        neighbors=_tissues(table, "neighbors", origin) if "neighbors" in table else (),
     )
     check_scheme(scheme, origin=origin)
     return scheme
@@ -171,9 +174,10 @@ def check_scheme(scheme: Scheme, *, origin: str) -> None:
     codes = [label.code for label in scheme.labels]
     twice = sorted({code for code in codes if codes.count(code) > 1})
     used = {label.tissue for label in scheme.labels}
-    named = (*scheme.sheet, *scheme.layer, *scheme.interior)
+    named = (*scheme.sheet, *scheme.layer, *scheme.interior, *scheme.neighbors)
     absent = [tissue.name for tissue in dict.fromkeys(named) if tissue not in used]
     order = tuple(tissue for tissue in MEDIAL_TO_LATERAL if tissue in scheme.sheet)
+    beside = tuple(tissue for tissue in FAR_TO_NEAR if tissue in scheme.neighbors)
     problems = {
         f"name {scheme.name!r} has to consist of letters and digits": not re.fullmatch(
             "[A-Za-z0-9]+", scheme.name
@@ -187,9 +191,11 @@ def check_scheme(scheme: Scheme, *, origin: str) -> None:
         f"no label has tissue {', '.join(absent)}": bool(absent),
         "sheet has to list each tissue once, medial to lateral, out of "
         + ", ".join(t.name for t in MEDIAL_TO_LATERAL): scheme.sheet != order,
+        "neighbors has to list each tissue once, far to near, out of "
+        + ", ".join(t.name for t in FAR_TO_NEAR): scheme.neighbors != beside,
         "a tissue is in both sheet and layer": not set(scheme.sheet).isdisjoint(scheme.layer),
         "a tissue is in both sheet and interior": not set(scheme.sheet).isdisjoint(scheme.interior),
-        "layer or interior is given without a sheet": not scheme.sheet and bool(named),
+        "layer, interior or neighbors is given without a sheet": not scheme.sheet and bool(named),
         "there is neither a sheet nor a label with a part": not scheme.sheet
         and all(label.part is Part.UNKNOWN for label in scheme.labels),
     }

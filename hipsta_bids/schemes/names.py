@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from hipsta_bids.errors import SchemeError
 from hipsta_bids.schemes.loader import check_scheme
 from hipsta_bids.schemes.scheme import Label, Scheme
-from hipsta_bids.schemes.tissues import MEDIAL_TO_LATERAL, Part, Tissue
+from hipsta_bids.schemes.tissues import FAR_TO_NEAR, MEDIAL_TO_LATERAL, Part, Tissue
 
 #: What laboratories call the tissues, after :func:`identify_tissue` has reduced a name.
 _NAMES = {
@@ -48,6 +48,8 @@ _FILLERS = {
     *("hippocampus", "hippocampal", "hipp", "hp", "cortex", "label", "region"),
     *("and", "with", "including", "of", "the", "proper"),
 }
+#: Cortex that continues the sheet where a table names it, as in the bundled protocols.
+_NEIGHBORS = {Tissue.BA35, Tissue.ENTORHINAL, Tissue.PARAHIPPOCAMPAL}
 _WHOLE = {"hippocampus", "hippocampal", "hipp", "hp"}
 
 #: Colors of tissues in tables that give none (ColorBrewer's qualitative sets, recycled).
@@ -129,6 +131,7 @@ def scheme_from_names(rows: Iterable[NamedCode], *, name: str, origin: str) -> S
         layer=tuple(tissue for tissue in (Tissue.MOLECULAR_LAYER,) if tissue in tissues),
         interior=tuple(tissue for tissue in inside if tissue in tissues),
         labels=labels,
+        neighbors=tuple(t for t in FAR_TO_NEAR if t in tissues and t in _NEIGHBORS),
     )
     check_scheme(scheme, origin=origin)
     return scheme

@@ -58,6 +58,8 @@ class Scheme:
     """The software that writes these codes (``freesurfer``, ``ashs``, ``hippunfold``), if any."""
     unlisted: str = "error"
     """What a code that is not listed means: ``error``, or ``other`` (outside the hippocampus)."""
+    neighbors: tuple[Tissue, ...] = ()
+    """Cortex beyond the medial end of the sheet, from far to near, for the regions with cortex."""
     right_offset: int = 0
     """Added to right-hand codes in files that carry both hemispheres; 0 if there are none."""
 

@@ -2,6 +2,9 @@
 
 from enum import IntEnum
 
+import numpy as np
+from numpy.typing import NDArray
+
 
 class Tissue(IntEnum):
     """What a voxel is. Values are internal; files of other tools never use them."""
@@ -47,3 +50,35 @@ MEDIAL_TO_LATERAL: tuple[Tissue, ...] = (
     Tissue.CA2_3,
     Tissue.CA3,
 )
+
+#: Cortex that the sheet goes on into beyond its medial end, from far to near. The entorhinal cortex
+#: lies before the parahippocampal cortex rather than beside it.
+FAR_TO_NEAR: tuple[Tissue, ...] = (
+    Tissue.BA36,
+    Tissue.BA35,
+    Tissue.ENTORHINAL,
+    Tissue.PARAHIPPOCAMPAL,
+    Tissue.PARASUBICULUM,
+)
+
+#: Rank along the sheet by tissue: that of the subfields is their value, which rises from medial to
+#: lateral; cortex has 0 and less, the same where it lies side by side.
+_RANKS = np.arange(max(Tissue) + 1, dtype=np.int8)
+_RANKS[list(FAR_TO_NEAR)] = (-3, -2, -1, -1, 0)
+_RANKS.flags.writeable = False
+
+
+def lateral_rank(tissue: NDArray[np.uint8]) -> NDArray[np.int8]:
+    """Rank from medial to lateral of the tissues of a sheet and of the cortex beside it.
+
+    Parameters
+    ----------
+    tissue : array of uint8, any shape
+        Values of :class:`Tissue`.
+
+    Returns
+    -------
+    array of int8, same shape
+        0 for the background.
+    """
+    return np.asarray(_RANKS[tissue])
