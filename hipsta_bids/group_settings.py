@@ -95,6 +95,22 @@ class DesignSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class DefaultModelSettings:
+    """What is fitted when no model is given."""
+
+    group_columns: tuple[str, ...] = ("group", "diagnosis", "dx", "diagnostic_group")
+    """The first of these columns, in any case of letters, tells the groups."""
+    reference_levels: tuple[str, ...] = ("CN", "CU", "HC", "NC", "CTRL", "control", "healthy")
+    """The first of these, in any case and singular or plural, is the reference level of the
+    groups; else the most frequent one is."""
+    covariates: tuple[str, ...] = ("age", "sex", "site")
+    """Further columns of the model, where the table has them and they vary."""
+    icv_columns: tuple[str, ...] = ("icv", "etiv", "tiv", "intracranial_volume")
+    """The first of these columns is the covariate of volumes; else what FreeSurfer or ASHS
+    estimated."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class GlmSettings:
     """The linear model at each point."""
 
@@ -183,6 +199,17 @@ class MultiplicitySettings:
 class ClassificationSettings:
     """Logistic models and how well they tell groups apart."""
 
+    base: tuple[str, ...] = ("volume",)
+    """Summary measures and covariates of the base model."""
+    added: tuple[str, ...] = (
+        "thickness_mean",
+        "extent_x",
+        "extent_y",
+        "area_interior",
+        "area_mid",
+        "area_exterior",
+    )
+    """Summary measures that are added to it, each by itself, where they were measured."""
     confidence: float = 0.95
     """Coverage of two-sided confidence limits, fraction."""
     folds: int = 10
@@ -210,6 +237,7 @@ class GroupSettings:
     """All settings of the group level."""
 
     registration: RegistrationSettings = field(default_factory=RegistrationSettings)
+    model: DefaultModelSettings = field(default_factory=DefaultModelSettings)
     design: DesignSettings = field(default_factory=DesignSettings)
     glm: GlmSettings = field(default_factory=GlmSettings)
     longitudinal: LongitudinalSettings = field(default_factory=LongitudinalSettings)

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from hipsta_bids.errors import SettingsError
+from hipsta_bids.group_settings import GroupSettings
 from hipsta_bids.settings import Settings
 
 T = TypeVar("T")
@@ -43,8 +44,17 @@ def load_settings(path: Path | None) -> Settings:
     SettingsError
         If the file cannot be read, or a key or a value in it is wrong.
     """
+    return _load(path, Settings)
+
+
+def load_group_settings(path: Path | None) -> GroupSettings:
+    """Read settings of the group level; see :func:`load_settings`."""
+    return _load(path, GroupSettings)
+
+
+def _load(path: Path | None, kind: type[T]) -> T:
     if path is None:
-        return Settings()
+        return kind()
     try:
         with path.open("rb") as file:
             values = tomllib.load(file)
@@ -58,7 +68,7 @@ def load_settings(path: Path | None) -> Settings:
             f"{path}: not a TOML file ({error}); start from `hipsta-bids settings`",
             reason="settings-not-toml",
         ) from error
-    return settings_from(values, Settings, where=str(path))
+    return settings_from(values, kind, where=str(path))
 
 
 def settings_from(values: Mapping[str, Any], kind: type[T], *, where: str, prefix: str = "") -> T:

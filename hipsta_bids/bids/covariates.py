@@ -1,0 +1,164 @@
+"""Covariates of participants and sessions, from the tables of a BIDS dataset and from others."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+import pandas as pd
+
+from hipsta_bids.bids import files
+from hipsta_bids.errors import InputError
+from hipsta_bids.group_data import PARTICIPANT, SESSION
+
+_NAMED = 6
+
+
+def read_covariates(visits: pd.DataFrame, bids_dir: Path, extra: Sequence[Path]) -> pd.DataFrame:
+    """Join covariates to visits; cells stay text.
+
+    In this order: ``participants.tsv``, ``sessions.tsv`` of the participants, ``phenotype/*.tsv``,
+    and the user's own tables. A later table fills or replaces columns of the same name.
+
+    Parameters
+    ----------
+    visits : DataFrame
+        Participant and session, one row per visit.
+    bids_dir : Path
+        The BIDS dataset.
+    extra : sequence of Path
+        Tables with ``participant_id`` and perhaps ``session_id``.
+
+    Returns
+    -------
+    DataFrame
+        The visits with all covariates; ``None`` where there is none.
+
+    Raises
+    ------
+    InputError
+        If a table cannot be read, has no ``participant_id``, or names somebody twice.
+    """
+    joined = visits.copy()
+    main = bids_dir / "participants.tsv"
+    tables = [main] if main.is_file() else []
+    for path in (*tables, *sorted((bids_dir / "phenotype").glob("*.tsv")), *extra):
+        joined = _join(joined, _read(path), path)
+        if path == main:
+            joined = _join_sessions(joined, bids_dir)
+    return joined
+
+
+def _read(path: Path) -> pd.DataFrame:
+    rows = files.read_tsv(path)
+    table = pd.DataFrame(rows, dtype=object)
+    if PARTICIPANT not in table.columns:
+        raise InputError(f"{path}: has no column participant_id", reason="bad-table")
+    table[PARTICIPANT] = [_prefixed(cell, "sub-") for cell in table[PARTICIPANT]]
+    if SESSION in table.columns:
+        table[SESSION] = [_prefixed(cell, "ses-") for cell in table[SESSION]]
+    return table.where(table != files.MISSING, None)
+
+
+def _prefixed(cell: str, prefix: str) -> str:
+    return cell if cell == files.MISSING or cell.startswith(prefix) else prefix + cell
+
+
+def _join_sessions(joined: pd.DataFrame, bids_dir: Path) -> pd.DataFrame:
+    parts = []
+    for participant in joined.loc[joined[SESSION].notna(), PARTICIPANT].unique():
+        path = bids_dir / participant / f"{participant}_sessions.tsv"
+        if path.is_file():
+            part = pd.DataFrame(files.read_tsv(path), dtype=object)
+            if SESSION not in part.columns:
+                raise InputError(f"{path}: has no column session_id", reason="bad-table")
+            part[SESSION] = [_prefixed(cell, "ses-") for cell in part[SESSION]]
+            part = part.where(part != files.MISSING, None)
+            parts.append(part.assign(**{PARTICIPANT: participant}))
+    if not parts:
+        return joined
+    return _join(joined, pd.concat(parts, ignore_index=True), bids_dir / "sub-*_sessions.tsv")
+
+
+def _join(joined: pd.DataFrame, table: pd.DataFrame, path: Path) -> pd.DataFrame:
+    """Add the columns of one table, by participant, and by session where it tells sessions."""
+    by_session = SESSION in table.columns and bool(table[SESSION].notna().any())
+    keys = [PARTICIPANT, SESSION] if by_session else [PARTICIPANT]
+    table = table.drop(columns=[SESSION]) if SESSION in table and not by_session else table
+    table = table[table[PARTICIPANT].isin(joined[PARTICIPANT])]
+    twice = table.loc[table.duplicated(keys), keys].astype(str).agg(" ".join, axis=1)
+    if len(twice):
+        names = sorted(set(twice))
+        more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+        raise InputError(
+            f"{path}: {', '.join(names[:_NAMED])}{more} stand more than once; keep one row each",
+            reason="duplicate-rows",
+        )
+    indexed = table.set_index(keys)
+    wanted = pd.MultiIndex.from_frame(joined[keys]) if by_session else joined[PARTICIPANT]
+    aligned = indexed.reindex(wanted)
+    result = joined.copy()
+    for column in indexed.columns:
+        values = pd.Series(aligned[column].to_numpy(), index=joined.index, dtype=object)
+        values = values.where(values.notna(), None)
+        if column in result.columns:
+            values = values.where(values.notna(), result[column])
+        result[column] = values
+    return result
+
+
+def read_icv(sources: Sequence[str], roots: Sequence[Path]) -> list[float | None]:
+    """Find the intracranial volume that the segmentation's own program estimated.
+
+    FreeSurfer's ``stats/aseg.stats`` (EstimatedTotalIntraCranialVol) beside the ``mri`` folder, or
+    ASHS's ``*_icv.txt`` beside or above the segmentation.
+
+    Parameters
+    ----------
+    sources : sequence of str
+        Address of a segmentation of each visit, ``bids:<dataset>:<path>``.
+    roots : sequence of Path
+        Dataset whose description knows that name, per visit.
+
+    Returns
+    -------
+    list of float or None
+        mm^3.
+    """
+    links: dict[Path, Mapping[str, str]] = {}
+    result: list[float | None] = []
+    for source, root in zip(sources, roots, strict=True):
+        if root not in links:
+            links[root] = files.read_json(root / "dataset_description.json").get("DatasetLinks", {})
+        path = _resolve(source, links[root])
+        result.append(None if path is None else _icv_beside(path))
+    return result
+
+
+def _resolve(source: str, links: Mapping[str, str]) -> Path | None:
+    if not source.startswith("bids:"):
+        return Path(source) if source else None
+    _, dataset, inside = source.split(":", 2)
+    link = links.get(dataset, "")
+    return Path(unquote(urlsplit(link).path)) / inside if link.startswith("file:") else None
+
+
+def _icv_beside(path: Path) -> float | None:
+    stats = path.parent.parent / "stats" / "aseg.stats"
+    if stats.is_file():
+        for line in stats.read_text(encoding="utf-8", errors="replace").splitlines():
+            if line.startswith("# Measure EstimatedTotalIntraCranialVol,"):
+                return _number(line.split(",")[-2])
+    for folder in (path.parent, path.parent.parent, path.parent.parent / "final"):
+        for found in sorted(folder.glob("*icv.txt")):
+            words = found.read_text(encoding="utf-8", errors="replace").split()
+            if words:  # subject and volume, or the volume alone
+                return _number(words[-1])
+    return None
+
+
+def _number(text: str) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if value > 0 else None

@@ -1,0 +1,302 @@
+"""Which hemispheres of the participant level enter the group level, and who is left out, why."""
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from hipsta_bids.artifacts import Status
+from hipsta_bids.bids import files
+from hipsta_bids.bids.names import DATASET_FILES, HemisphereName
+from hipsta_bids.bids.quality_filter import QualityCondition
+from hipsta_bids.bids.results import ResultPlace
+from hipsta_bids.bids.status import read_status
+from hipsta_bids.errors import InputError, NothingToDoError
+
+_RECORD = re.compile(
+    r"sub-(?P<subject>[^_]+)(?:_ses-(?P<session>[^_]+))?_hemi-(?P<hemi>[LR])_seg-(?P<seg>[^_]+)"
+    r"_desc-qc_metrics\.json"
+)
+#: How many names an error message lists.
+_SHOWN = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class GroupRequest:
+    """What the user asked for."""
+
+    roots: tuple[Path, ...]
+    """Output datasets of the participant level."""
+    seg: str | None = None
+    """Segmentation protocol; ``None`` if there is but one."""
+    subjects: tuple[str, ...] = ()
+    """Labels without ``sub-``; empty is all."""
+    sessions: tuple[str, ...] = ()
+    """Labels without ``ses-``; empty is all."""
+    exclude_flagged: bool = False
+    exclude_quality: QualityCondition | None = None
+    exclude_table: Path | None = None
+    """Participants, or single sessions and hemispheres, to leave out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SheetRecord:
+    """One complete hemisphere."""
+
+    place: ResultPlace
+    settings_hash: str
+    version: str
+    source: str
+    """Address of the segmentation."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Exclusion:
+    """One hemisphere, or visit, that is left out."""
+
+    participant: str
+    session: str | None
+    hemi: str
+    reason: str
+    message: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Collection:
+    """What was found."""
+
+    records: tuple[SheetRecord, ...]
+    """Sorted by subject, session, hemisphere."""
+    exclusions: tuple[Exclusion, ...]
+    settings: Mapping[str, Any]
+    """Those of the participant level, resolved."""
+    settings_hash: str
+    versions: tuple[str, ...]
+
+
+def collect_sheets(request: GroupRequest) -> Collection:
+    """Find all complete hemispheres of one protocol, made with the same settings.
+
+    Parameters
+    ----------
+    request : GroupRequest
+
+    Raises
+    ------
+    InputError
+        Several protocols or settings, an unfinished run, a hemisphere in two datasets, or a file
+        that cannot be read.
+    NothingToDoError
+        Nothing, or nothing of what is asked for, is there.
+    UsageError
+        The quality condition cannot be evaluated.
+    """
+    found = [entry for root in request.roots for entry in _quality_files(root, request)]
+    seg = _one_protocol(found, request)
+    found = [place for place in found if place.name.seg == seg]
+    _refuse_twice(found)
+    unwanted = _listed_exclusions(request.exclude_table)
+    kept: list[SheetRecord] = []
+    left_out: list[Exclusion] = []
+    for place in sorted(found, key=_order):
+        entry = _judge(place, request, unwanted)
+        if isinstance(entry, Exclusion):
+            left_out.append(entry)
+        else:
+            kept.append(entry)
+    _refuse_unfinished(request, seg, unwanted)
+    if not kept:
+        reasons = ", ".join(f"{n} {why}" for why, n in Counter(e.reason for e in left_out).items())
+        raise NothingToDoError(
+            f"{request.roots[0]}: no hemisphere is left for the group level ({reasons})",
+            reason="no-hemisphere",
+        )
+    digest = _one_settings(kept)
+    return Collection(
+        records=tuple(kept),
+        exclusions=tuple(left_out),
+        settings=_settings_of(kept[0].place.root),
+        settings_hash=digest,
+        versions=tuple(sorted({record.version for record in kept})),
+    )
+
+
+def _quality_files(root: Path, request: GroupRequest) -> Iterator[ResultPlace]:
+    if not root.is_dir():
+        raise InputError(
+            f"{root}: no such folder; run the participant level first", reason="no-derivatives"
+        )
+    for pattern in ("sub-*/anat", "sub-*/ses-*/anat"):
+        for path in root.glob(f"{pattern}/*_desc-qc_metrics.json"):
+            match = _RECORD.fullmatch(path.name)
+            if match is None:
+                continue
+            name = HemisphereName(**match.groupdict())
+            if request.subjects and name.subject not in request.subjects:
+                continue
+            if request.sessions and name.session not in request.sessions:
+                continue
+            yield ResultPlace(root=root, name=name)
+
+
+def _order(place: ResultPlace) -> tuple[str, str, str]:
+    return place.name.subject, place.name.session or "", place.name.hemi
+
+
+def _one_protocol(found: Sequence[ResultPlace], request: GroupRequest) -> str:
+    counts = Counter(place.name.seg for place in found)
+    if request.seg is not None and request.seg not in counts:
+        known = ", ".join(sorted(counts)) or "nothing"
+        raise NothingToDoError(
+            f"{request.roots[0]}: no hemisphere with --seg {request.seg}; there is {known}",
+            reason="no-hemisphere",
+        )
+    if not counts:
+        raise NothingToDoError(
+            f"{request.roots[0]}: no hemisphere as asked for; run the participant level first",
+            reason="no-hemisphere",
+        )
+    if request.seg is None and len(counts) > 1:
+        names = ", ".join(f"{name} ({n})" for name, n in sorted(counts.items()))
+        raise InputError(
+            f"{request.roots[0]}: hemispheres of several protocols, {names}; choose one by --seg",
+            reason="several-protocols",
+        )
+    return request.seg or next(iter(counts))
+
+
+def _refuse_twice(found: Sequence[ResultPlace]) -> None:
+    first: dict[tuple[str, str, str], Path] = {}
+    for place in found:
+        other = first.setdefault(_order(place), place.root)
+        if other != place.root:
+            raise InputError(
+                f"{place.name.stem} is in {other} and in {place.root}; participants of different"
+                " sites need different labels",
+                reason="duplicate-rows",
+            )
+
+
+def _judge(
+    place: ResultPlace, request: GroupRequest, unwanted: Sequence[Mapping[str, str]]
+) -> SheetRecord | Exclusion:
+    record = files.read_json(place.path("qc"))
+    status = record.get("status")
+    reason, message = record.get("reason") or str(status), record.get("message") or ""
+    listed = next((row for row in unwanted if _is_listed(place.name, row)), None)
+    if listed is not None:
+        reason, message = "listed", listed.get("reason", "in the table of --exclude")
+    elif status == Status.FAILED:
+        reason = f"failed: {reason}"
+    elif request.exclude_flagged and status == Status.FLAGGED:
+        reason = f"flagged: {reason}"
+    elif request.exclude_quality is not None and request.exclude_quality.holds(_metrics(record)):
+        reason, message = "quality", request.exclude_quality.text
+    else:
+        inputs = record.get("inputs") or [{}]
+        return SheetRecord(
+            place=place,
+            settings_hash=str(record.get("settings_hash")),
+            version=str(record.get("version")),
+            source=str(inputs[0].get("file", "")),
+        )
+    name = place.name
+    return Exclusion(
+        participant=f"sub-{name.subject}",
+        session=f"ses-{name.session}" if name.session else None,
+        hemi=name.hemi,
+        reason=reason,
+        message=message,
+    )
+
+
+def _metrics(record: Mapping[str, Any]) -> dict[str, Any]:
+    """List what conditions can name: numbers and words of the record and of its metrics."""
+    metrics = record.get("metrics") or {}
+    both = {**metrics, **{name: record.get(name) for name in ("status", "undefined_columns")}}
+    return {k: v for k, v in both.items() if not isinstance(v, (list, dict))}
+
+
+def _listed_exclusions(path: Path | None) -> list[dict[str, str]]:
+    if path is None:
+        return []
+    rows = files.read_tsv(path)
+    if rows and "participant_id" not in rows[0]:
+        raise InputError(
+            f"{path}: no column participant_id; it may have session_id, hemi and reason besides",
+            reason="bad-table",
+        )
+    return rows
+
+
+def _is_listed(name: HemisphereName, row: Mapping[str, str]) -> bool:
+    """Whether a row of the user's table means this hemisphere; empty cells mean any."""
+    own = {"participant_id": name.subject, "session_id": name.session or "", "hemi": name.hemi}
+    for key, value in own.items():
+        cell = row.get(key, files.MISSING).removeprefix("sub-").removeprefix("ses-")
+        if cell not in {files.MISSING, "", value}:
+            return False
+    return True
+
+
+def _refuse_unfinished(
+    request: GroupRequest, seg: str, unwanted: Sequence[Mapping[str, str]]
+) -> None:
+    """Refuse a run of the participant level that was interrupted: the rest might differ."""
+    pending = []
+    for root in request.roots:
+        for row in read_status(root):
+            session = row["session"].removeprefix("ses-")
+            name = HemisphereName(
+                subject=row["subject"].removeprefix("sub-"),
+                session=None if session == files.MISSING else session,
+                hemi=row["hemi"],
+                seg=row["seg"],
+            )
+            asked = (not request.subjects or name.subject in request.subjects) and (
+                not request.sessions or name.session in request.sessions
+            )
+            listed = any(_is_listed(name, one) for one in unwanted)
+            if row.get("reason") == "not-finished" and name.seg == seg and asked and not listed:
+                pending.append(name.stem)
+    if pending:
+        shown = ", ".join(pending[:_SHOWN]) + (" ..." if len(pending) > _SHOWN else "")
+        raise InputError(
+            f"{request.roots[0]}: the participant level has not finished {len(pending)} hemispheres"
+            f" ({shown}); complete it by the same command, or list them in --exclude",
+            reason="not-finished",
+        )
+
+
+def _one_settings(kept: Sequence[SheetRecord]) -> str:
+    counts = Counter(record.settings_hash for record in kept)
+    if len(counts) > 1:
+        examples = {record.settings_hash: record.place for record in reversed(kept)}
+        parts = [
+            f"{n} with {digest[:8]} (as {examples[digest].name.stem} in {examples[digest].root})"
+            for digest, n in counts.most_common()
+        ]
+        raise InputError(
+            f"hemispheres were measured with different settings: {'; '.join(parts)}; measure all"
+            " with the same",
+            reason="other-settings",
+        )
+    return next(iter(counts))
+
+
+def _settings_of(root: Path) -> Mapping[str, Any]:
+    settings = files.read_json(root / DATASET_FILES["settings"]).get("settings")
+    if not isinstance(settings, Mapping):
+        raise InputError(
+            f"{root / DATASET_FILES['settings']}: holds no settings; run the participant level"
+            " again",
+            reason="bad-json",
+        )
+    return settings
+
+
+def with_exclusions(collection: Collection, more: Sequence[Exclusion]) -> Collection:
+    """Add to those left out."""
+    return replace(collection, exclusions=(*collection.exclusions, *more))

@@ -1,0 +1,171 @@
+"""Reads the participant level's tables of many hemispheres into arrays."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+from pyarrow import csv
+
+from hipsta_bids.bids import files
+from hipsta_bids.bids.group_inputs import SheetRecord
+from hipsta_bids.errors import InputError
+from hipsta_bids.group_data import PARTICIPANT, SESSION, Float, SideMaps
+
+#: Columns of the sheet table that are analyzed.
+MAPS = ("thickness", "curvature")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measured:
+    """Sheets and summaries, before covariates are known."""
+
+    visits: pd.DataFrame
+    """Participant and session, one row per visit; the index names it."""
+    sides: Mapping[str, SideMaps]
+    x: Float
+    y: Float
+    units: Mapping[str, str]
+    sources: Sequence[str]
+    """Address of one segmentation per visit."""
+    roots: Sequence[Path]
+    """Dataset of each visit."""
+
+
+def read_sheets(records: Sequence[SheetRecord], settings: Mapping[str, Any]) -> Measured:
+    """Read all sheets and summaries.
+
+    Parameters
+    ----------
+    records : sequence of SheetRecord
+        Sorted by subject and session.
+    settings : mapping
+        Resolved settings of the participant level: number of nodes, extent of the grid.
+
+    Raises
+    ------
+    InputError
+        If a table is missing, cannot be read, or has another grid than the settings say.
+    """
+    grid = settings["sheet"]
+    shape = (int(grid["x_nodes"]), int(grid["y_nodes"]))
+    keys = [(r.place.name.subject, r.place.name.session) for r in records]
+    visits = list(dict.fromkeys(keys))
+    row_of = {visit: row for row, visit in enumerate(visits)}
+    first = dict(zip(reversed(keys), reversed(records), strict=True))
+    sides = {}
+    for hemi in "LR":
+        own = [record for record in records if record.place.name.hemi == hemi]
+        rows = [row_of[r.place.name.subject, r.place.name.session] for r in own]
+        if own:
+            sides[hemi] = _read_side(own, np.array(rows, dtype=np.int64), shape)
+    return Measured(
+        visits=_visit_table(visits),
+        sides=sides,
+        x=_coordinates(grid["x_extent"], shape[0]),
+        y=_coordinates(grid["y_extent"], shape[1]),
+        units=_units(records[0]),
+        sources=[first[visit].source for visit in visits],
+        roots=[first[visit].place.root for visit in visits],
+    )
+
+
+def _coordinates(extent: float, nodes: int) -> Float:
+    """Coordinates of the nodes, without the rounding errors that would show in tables."""
+    return np.asarray(np.linspace(-extent, extent, nodes).round(10) + 0.0, dtype=np.float64)
+
+
+def _visit_table(visits: Sequence[tuple[str, str | None]]) -> pd.DataFrame:
+    names = [f"sub-{subject}" for subject, _ in visits]
+    sessions = [None if session is None else f"ses-{session}" for _, session in visits]
+    index = [f"{a}_{b}" if b else a for a, b in zip(names, sessions, strict=True)]
+    return pd.DataFrame(
+        {PARTICIPANT: names, SESSION: pd.array(sessions, dtype=object)}, index=index
+    )
+
+
+def _read_side(
+    records: Sequence[SheetRecord], rows: np.ndarray[Any, Any], shape: tuple[int, int]
+) -> SideMaps:
+    maps = {name: np.empty((len(records), *shape)) for name in MAPS}
+    subfield = np.empty((len(records), *shape), dtype=np.int8)
+    codes: dict[str, int] = {}
+    summaries = []
+    for i, record in enumerate(records):
+        table = _read_columns(record.place.path("sheet"), shape)
+        for name in MAPS:
+            maps[name][i] = table.column(name).to_numpy().reshape(shape)
+        subfield[i] = _encode(table.column("subfield"), codes).reshape(shape)
+        summaries.append(_read_summary(record.place.path("summary")))
+    summary = pd.DataFrame(summaries).astype(np.float64)
+    return SideMaps(rows=rows, maps=maps, subfield=subfield, names=tuple(codes), summary=summary)
+
+
+def _read_columns(path: Path, shape: tuple[int, int]) -> pa.Table:
+    try:
+        table = csv.read_csv(
+            path,
+            read_options=csv.ReadOptions(use_threads=False),
+            parse_options=csv.ParseOptions(delimiter="\t"),
+            convert_options=csv.ConvertOptions(
+                include_columns=["x", "y", *MAPS, "subfield"],
+                column_types={**dict.fromkeys(MAPS, pa.float64()), "subfield": pa.string()},
+                null_values=[files.MISSING],
+                strings_can_be_null=True,
+            ),
+        )
+    except (OSError, pa.ArrowInvalid, pa.ArrowKeyError, KeyError) as error:
+        first = str(error).partition("\n")[0]
+        raise InputError(
+            f"{path}: not readable as a sheet ({first}); run the participant level again with"
+            " --force",
+            reason="unreadable-table",
+        ) from error
+    x, y = (table.column(name).to_numpy() for name in "xy")
+    expected = np.divmod(np.arange(shape[0] * shape[1]), shape[1])
+    if len(x) != len(expected[0]) or any(
+        (given != wanted + 1).any() for given, wanted in zip((x, y), expected, strict=True)
+    ):
+        raise InputError(
+            f"{path}: not a sheet of {shape[0]} x {shape[1]} nodes, as the settings say; run the"
+            " participant level again with --force",
+            reason="mixed-grids",
+        )
+    return table
+
+
+def _encode(column: pa.ChunkedArray, codes: dict[str, int]) -> np.ndarray[Any, Any]:
+    """Numbers instead of names, new names at the end; -1 where missing."""
+    encoded = column.combine_chunks().dictionary_encode()
+    names = encoded.dictionary.to_pylist()
+    numbers = np.array([codes.setdefault(name, len(codes)) for name in names] + [-1])
+    places = encoded.indices.fill_null(len(names)).to_numpy()
+    return np.asarray(numbers[places], dtype=np.int8)
+
+
+def _read_summary(path: Path) -> dict[str, float]:
+    rows = files.read_tsv(path)
+    try:
+        (row,) = rows
+        return {
+            name: float("nan") if cell == files.MISSING else float(cell)
+            for name, cell in row.items()
+        }
+    except ValueError as error:
+        raise InputError(
+            f"{path}: not one row of numbers; run the participant level again with --force",
+            reason="bad-table",
+        ) from error
+
+
+def _units(record: SheetRecord) -> dict[str, str]:
+    """Units of maps and summary columns, from the sidecars."""
+    units = {}
+    for key in ("sheet_sidecar", "summary_sidecar"):
+        for name, entry in files.read_json(record.place.path(key)).items():
+            if isinstance(entry, Mapping) and "Units" in entry:
+                units[name] = str(entry["Units"])
+    return units

@@ -1,0 +1,202 @@
+"""Summary measures in the models of the maps, and as classifiers, as in the paper's tables."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+
+from hipsta_bids.errors import ModelError
+from hipsta_bids.group.default_model import Groups
+from hipsta_bids.group.design import Design, build_design
+from hipsta_bids.group.glm import PointwiseFit, fit_points
+from hipsta_bids.group.model_spec import ModelSpec
+from hipsta_bids.group.pairs import PairComparison, compare_pairs
+from hipsta_bids.group.variables import check_names, typed
+from hipsta_bids.group_data import Cohort, Float
+from hipsta_bids.group_settings import GroupSettings
+
+#: Both hemispheres together: the mean of the two.
+BOTH = "LR"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MeasureFit:
+    """One model of summary measures; the points of the fit are measures."""
+
+    hemi: str
+    """``L``, ``R``, or ``LR`` for the mean of both."""
+    measures: tuple[str, ...]
+    formula: str
+    fit: PointwiseFit
+
+
+def summary_values(cohort: Cohort, hemi: str) -> pd.DataFrame:
+    """Summary measures by visit.
+
+    Parameters
+    ----------
+    cohort : Cohort
+        Sheets and summaries.
+    hemi : str
+        ``L``, ``R``, or ``LR`` for the mean of both, where both are there.
+
+    Returns
+    -------
+    DataFrame
+        One row per visit of the cohort's table, NaN where missing.
+    """
+    if hemi == BOTH:
+        left, right = (summary_values(cohort, side) for side in BOTH)
+        return (left + right) / 2
+    side = cohort.sides[hemi]
+    table = side.summary.set_axis(cohort.table.index[side.rows])
+    return table.reindex(cohort.table.index)
+
+
+def hemispheres(cohort: Cohort) -> list[str]:
+    """Hemispheres that are there, and both together if both are."""
+    own = list(cohort.sides)
+    return [*own, BOTH] if len(own) == len(BOTH) else own
+
+
+def fit_summaries(
+    cohort: Cohort,
+    model: ModelSpec,
+    design: Design,
+    settings: GroupSettings,
+    *,
+    references: Mapping[str, str],
+    icv: str | None,
+) -> tuple[list[MeasureFit], list[str]]:
+    """Fit the model of the maps to all summary measures; to volumes with intracranial volume too.
+
+    Parameters
+    ----------
+    cohort : Cohort
+        Summaries and covariates.
+    model : ModelSpec
+        That of the maps.
+    design : Design
+        Its design.
+    settings : GroupSettings
+        When a fit is refused.
+    references : mapping of str to str
+        Reference levels.
+    icv : str or None
+        Column of intracranial volume.
+
+    Returns
+    -------
+    list of MeasureFit, list of str
+        And what could not be fitted, one line each.
+    """
+    fits, notes = [], []
+    for hemi in hemispheres(cohort):
+        values = summary_values(cohort, hemi)
+        fits += _fit(values, hemi, model.formula, design, settings)
+    if icv is None:
+        notes.append("volumes are not adjusted: no intracranial volume is known")
+        return fits, notes
+    if icv in model.formula:
+        return fits, notes
+    try:
+        adjusted = replace(model, formula=f"{model.formula} + {icv}")
+        larger = build_design(cohort.table, adjusted, settings.design, references)
+    except ModelError as error:
+        notes.append(f"volumes are not adjusted for {icv}: {error}")
+        return fits, notes
+    for hemi in hemispheres(cohort):
+        values = summary_values(cohort, hemi)
+        volumes = [name for name in values.columns if name.startswith("volume")]
+        fits += _fit(values[volumes], hemi, adjusted.formula, larger, settings)
+    return fits, notes
+
+
+def _fit(
+    values: pd.DataFrame,
+    hemi: str,
+    formula: str,
+    design: Design,
+    settings: GroupSettings,
+) -> list[MeasureFit]:
+    own = values.iloc[design.rows]
+    varying = tuple(own.columns[(own.max() > own.min()).to_numpy()])
+    present = own[list(varying)].notna().any(axis=1).to_numpy()
+    if not varying:
+        return []
+    matrix = design.matrix[present]
+    maps: Float = own.loc[present, list(varying)].to_numpy(dtype=np.float64)
+    fit = fit_points(maps, matrix, design.contrasts, settings.glm)
+    return [MeasureFit(hemi=hemi, measures=varying, formula=formula, fit=fit)]
+
+
+def classify_groups(
+    cohort: Cohort, groups: Groups, settings: GroupSettings
+) -> tuple[list[tuple[str, str, PairComparison]], list[str]]:
+    """Compare each pair of groups by base measures, and by each further measure on top.
+
+    Parameters
+    ----------
+    cohort : Cohort
+        Summaries and covariates.
+    groups : Groups
+        Column and order.
+    settings : GroupSettings
+        Base, added measures, limits and folds.
+
+    Returns
+    -------
+    list of (str, str, PairComparison), list of str
+        Hemisphere, added measure and result; and what could not be compared, one line each.
+
+    Raises
+    ------
+    ModelError
+        If a base measure or covariate is unknown.
+    """
+    names = cohort.table[groups.column].astype(object)
+    labels = names.where(names.notna(), "").astype(str).to_numpy(dtype=np.str_)
+    results: list[tuple[str, str, PairComparison]] = []
+    notes: list[str] = []
+    for hemi in hemispheres(cohort):
+        values = summary_values(cohort, hemi)
+        base = _base(cohort, values, settings)
+        added = [name for name in settings.classification.added if name in values.columns]
+        for measure in added:
+            if measure in settings.classification.base:
+                continue
+            try:
+                pairs = compare_pairs(
+                    labels,
+                    base,
+                    values[[measure]].to_numpy(dtype=np.float64),
+                    settings.classification,
+                    order=groups.levels,
+                )
+            except ModelError as error:
+                notes.append(f"classification by {measure}, hemisphere {hemi}: {error}")
+                continue
+            results += [(hemi, measure, pair) for pair in pairs]
+    return results, notes
+
+
+def _base(cohort: Cohort, values: pd.DataFrame, settings: GroupSettings) -> Float:
+    """Columns of the base model, from the summaries or the covariates."""
+    names = settings.classification.base
+    check_names(names, values.columns.union(cohort.table.columns, sort=False))
+    columns = []
+    for name in names:
+        if name in values.columns:
+            columns.append(values[name].to_numpy(dtype=np.float64))
+            continue
+        column = typed(cohort.table[name], settings.design)
+        if pd.api.types.is_numeric_dtype(column):
+            columns.append(column.to_numpy(dtype=np.float64))
+        else:
+            levels = sorted(column.dropna().unique())
+            columns += [
+                np.where(column.notna(), (column == level).to_numpy(dtype=np.float64), np.nan)
+                for level in levels[1:]
+            ]
+    return np.column_stack(columns)

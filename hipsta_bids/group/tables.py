@@ -1,0 +1,357 @@
+"""Results as tables, and the meaning of their columns."""
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+import pandas as pd
+
+from hipsta_bids.group.analysis import Analysis, SideResult
+from hipsta_bids.group.classification import ClassifierResult
+from hipsta_bids.group.glm import PointTest
+from hipsta_bids.group.multiplicity import Discoveries, MapKey
+from hipsta_bids.group.peaks import SheetFrame, peak_table
+from hipsta_bids.group.summaries import hemispheres, summary_values
+from hipsta_bids.group_data import Cohort, ResultTable
+from hipsta_bids.group_settings import GroupSettings
+
+#: Meaning of every column; the unit is that of the measure unless said.
+COLUMNS: Mapping[str, str] = {
+    "hemi": "hemisphere, L or R; LR is the mean of both",
+    "measure": "map or summary measure",
+    "unit": "unit of the measure",
+    "contrast": "name of the contrast; A-B is positive where A has more",
+    "model": "right-hand side of the model",
+    "test": "t, or F for contrasts of several rows",
+    "x": "sheet coordinate, -1 medial to 1 lateral",
+    "y": "sheet coordinate, -1 posterior to 1 anterior",
+    "node_x": "node along x, 1 is most medial; coordinates are registered",
+    "node_y": "node along y, 1 is most posterior",
+    "subfield": "subfield, most frequent after registration",
+    "n": "participants with a value",
+    "n_cases": "of these, in the second group",
+    "n_incomplete": "participants of the two groups that lack a value",
+    "estimate": "contrast of the model's coefficients, unit of the measure; n/a for F",
+    "se": "standard error of the estimate, unit of the measure; n/a for F",
+    "statistic": "t or F",
+    "df": "degrees of freedom; of F, the denominator's",
+    "p": "two-sided p-value, not corrected",
+    "p_adjusted": "p-value adjusted for the false discovery rate; compare with its level",
+    "significant": "true where the adjusted p-value is at most the level",
+    "effect": "kind of effect size",
+    "effect_size": "Cohen's d (estimate over residual SD), or partial eta squared",
+    "effect_low": "lower confidence limit of the effect size",
+    "effect_high": "upper confidence limit of the effect size",
+    "cohen_d": "estimate over residual SD; n/a for F",
+    "cohen_d_low": "lower confidence limit",
+    "cohen_d_high": "upper confidence limit",
+    "eta_squared": "partial eta squared",
+    "eta_squared_low": "lower confidence limit",
+    "eta_squared_high": "upper confidence limit",
+    "extent": "points of the cluster; 0 for the largest statistic of a map without findings",
+    "shares": "share of the cluster in each subfield",
+    "n_tests": "points tested in the family",
+    "n_significant": "points of the map that survive",
+    "p_cutoff": "largest p-value that survives; below all p-values if none does",
+    "lenient": "true where p-values above the level survive, as they may with widespread effects",
+    "group": "group",
+    "mean": "mean, unit of the measure",
+    "sd": "standard deviation, unit of the measure",
+    "shift": "registered minus original position, in grid nodes; positive is lateral",
+    "shift_se": "standard error of the shift, grid nodes",
+    "explained_before": "share of the variance of curvature profiles that their mean explains",
+    "explained_after": "the same after registration",
+    "iterations": "turns of template and warps",
+    "converged": "whether warps had settled",
+    "displacement": "root mean square of warp minus identity, grid nodes",
+    "extreme": "true where the displacement is out of line with the others",
+    "control": "first group of the pair",
+    "case": "second group of the pair",
+    "base": "measures of the base model",
+    "added": "measure that is added to it",
+    "auc_base": "area under the curve of the base model, on the participants fitted",
+    "auc_base_low": "lower confidence limit (DeLong)",
+    "auc_base_high": "upper confidence limit (DeLong)",
+    "auc_full": "area under the curve with the measure added, on the participants fitted",
+    "auc_full_low": "lower confidence limit (DeLong)",
+    "auc_full_high": "upper confidence limit (DeLong)",
+    "auc_base_cv": "cross-validated area of the base model",
+    "auc_full_cv": "cross-validated area with the measure added",
+    "auc_base_cv_sd": "standard deviation over repeats",
+    "auc_full_cv_sd": "standard deviation over repeats",
+    "calibration_slope": "of the full model, cross-validated; below 1 if it is too sure",
+    "brier": "mean squared error of the chance, full model, cross-validated",
+    "likelihood_ratio": "chi squared of the likelihood-ratio test, base against full model",
+    "lr_df": "its degrees of freedom",
+    "separated": "true where groups were separated, and both models are Firth's",
+    "participant_id": "participant",
+    "session_id": "session",
+    "reason": "why",
+    "message": "what was said about it",
+}
+
+
+def result_tables(
+    cohort: Cohort, analysis: Analysis, settings: GroupSettings
+) -> Iterator[ResultTable]:
+    """Give all tables of one model.
+
+    Parameters
+    ----------
+    cohort : Cohort
+        What was analyzed.
+    analysis : Analysis
+        Results.
+    settings : GroupSettings
+        Level of the false discovery rate, neighbors, base model.
+
+    Yields
+    ------
+    ResultTable
+    """
+    yield ResultTable(name="peaks", rows=_peaks(cohort, analysis, settings))
+    yield ResultTable(name="maps", rows=_overview(analysis))
+    yield ResultTable(name="measures", rows=_measures(cohort, analysis))
+    yield ResultTable(name="registration", rows=_registration(analysis))
+    yield ResultTable(name="warps", rows=_warps(cohort, analysis))
+    if analysis.groups is not None:
+        yield ResultTable(name="descriptives", rows=_descriptives(cohort, analysis))
+        yield ResultTable(name="shifts", rows=_shifts(analysis))
+    if analysis.pairs:
+        yield ResultTable(name="classification", rows=_classification(analysis, settings))
+    for hemi, side in analysis.sides.items():
+        for measure, fit in side.fits.items():
+            for test in fit.tests:
+                found = analysis.found[MapKey(measure, test.contrast.name, hemi)]
+                rows = _map(frame_of(cohort, side), fit.n, test, found)
+                yield ResultTable(name=map_name(hemi, measure, test), rows=rows)
+
+
+def map_name(hemi: str, measure: str, test: PointTest) -> str:
+    """Name of the files of one map of statistics, without suffix and extension."""
+    contrast = "".join(c if c.isalnum() else " " for c in test.contrast.name).split()
+    joined = "".join(word[:1].upper() + word[1:] for word in contrast) or "contrast"
+    return f"hemi-{hemi}_contrast-{joined}_desc-{measure}_statmap"
+
+
+def frame_of(cohort: Cohort, side: SideResult) -> SheetFrame:
+    """Where the points lie, and in which subfield most participants have them."""
+    names = np.array([*side.registered.names, "n/a"])
+    return SheetFrame(cohort.x, cohort.y, names[side.subfield])
+
+
+def _map(
+    frame: SheetFrame,
+    n: np.ndarray,
+    test: PointTest,
+    found: Discoveries,
+) -> pd.DataFrame:
+    nx, ny = frame.shape
+    x, y = np.divmod(np.arange(nx * ny), ny)
+    single = test.kind == "t"
+    blank = np.full(nx * ny, np.nan)
+    return pd.DataFrame(
+        {
+            "node_x": x + 1,
+            "node_y": y + 1,
+            "x": frame.x[x],
+            "y": frame.y[y],
+            "subfield": frame.subfield.ravel(),
+            "n": n,
+            "estimate": test.estimate[0] if single else blank,
+            "se": test.se[0] if single else blank,
+            "statistic": test.statistic,
+            "df": test.df,
+            "p": test.p,
+            "p_adjusted": found.adjusted,
+            "significant": found.rejected,
+            "cohen_d": test.cohen_d,
+            "cohen_d_low": test.cohen_d_limits[0],
+            "cohen_d_high": test.cohen_d_limits[1],
+            "eta_squared": test.eta_squared,
+            "eta_squared_low": test.eta_squared_limits[0],
+            "eta_squared_high": test.eta_squared_limits[1],
+        }
+    )
+
+
+def _peaks(cohort: Cohort, analysis: Analysis, settings: GroupSettings) -> pd.DataFrame:
+    parts = []
+    for hemi, side in analysis.sides.items():
+        frame = frame_of(cohort, side)
+        for measure, fit in side.fits.items():
+            for test in fit.tests:
+                found = analysis.found[MapKey(measure, test.contrast.name, hemi)]
+                part = peak_table(test, found, frame, settings.multiplicity.neighbors)
+                part.insert(0, "hemi", hemi)
+                part.insert(0, "measure", measure)
+                parts.append(part)
+    return pd.concat(parts, ignore_index=True)
+
+
+def _overview(analysis: Analysis) -> pd.DataFrame:
+    """One row per map: how many points survive, and at which p."""
+    return pd.DataFrame(
+        [
+            {
+                "measure": key.measure,
+                "contrast": key.contrast,
+                "hemi": key.hemi,
+                "n_tests": found.n_tests,
+                "n_significant": int(found.rejected.sum()),
+                "p_cutoff": found.cutoff,
+                "lenient": found.lenient,
+            }
+            for key, found in analysis.found.items()
+        ]
+    )
+
+
+def _measures(cohort: Cohort, analysis: Analysis) -> pd.DataFrame:
+    parts = []
+    for one in analysis.measures:
+        for test in one.fit.tests:
+            single = test.kind == "t"
+            limits = test.cohen_d_limits if single else test.eta_squared_limits
+            blank = np.full(len(one.measures), np.nan)
+            parts.append(
+                pd.DataFrame(
+                    {
+                        "hemi": one.hemi,
+                        "measure": one.measures,
+                        "unit": [cohort.units.get(name, "1") for name in one.measures],
+                        "model": one.formula,
+                        "contrast": test.contrast.name,
+                        "test": test.kind,
+                        "n": one.fit.n,
+                        "estimate": test.estimate[0] if single else blank,
+                        "se": test.se[0] if single else blank,
+                        "statistic": test.statistic,
+                        "df": test.df,
+                        "p": test.p,
+                        "effect": "cohen_d" if single else "partial_eta_squared",
+                        "effect_size": test.cohen_d if single else test.eta_squared,
+                        "effect_low": limits[0],
+                        "effect_high": limits[1],
+                    }
+                )
+            )
+    return pd.concat(parts, ignore_index=True)
+
+
+def _descriptives(cohort: Cohort, analysis: Analysis) -> pd.DataFrame:
+    groups = analysis.groups
+    if groups is None:
+        return pd.DataFrame()
+    members = cohort.table[groups.column].iloc[analysis.design.rows]
+    parts = []
+    for hemi in hemispheres(cohort):
+        values = summary_values(cohort, hemi).iloc[analysis.design.rows]
+        for level in groups.levels:
+            own = values[(members == level).to_numpy()]
+            parts.append(
+                pd.DataFrame(
+                    {
+                        "hemi": hemi,
+                        "group": level,
+                        "measure": own.columns,
+                        "unit": [cohort.units.get(str(name), "1") for name in own.columns],
+                        "n": own.notna().sum().to_numpy(),
+                        "mean": own.mean().to_numpy(),
+                        "sd": own.std().to_numpy(),
+                    }
+                )
+            )
+    return pd.concat(parts, ignore_index=True)
+
+
+def _registration(analysis: Analysis) -> pd.DataFrame:
+    return pd.DataFrame(
+        [
+            {
+                "hemi": hemi,
+                "n": len(side.registration.warps),
+                "explained_before": side.registration.explained_before,
+                "explained_after": side.registration.explained_after,
+                "iterations": side.registration.iterations,
+                "converged": side.registration.converged,
+            }
+            for hemi, side in analysis.sides.items()
+        ]
+    )
+
+
+def _warps(cohort: Cohort, analysis: Analysis) -> pd.DataFrame:
+    parts = []
+    for hemi, side in analysis.sides.items():
+        visits = cohort.table.iloc[side.registered.rows]
+        nodes = side.registration.warps.shape[1]
+        parts.append(
+            pd.DataFrame(
+                {
+                    "participant_id": visits["participant_id"].to_numpy(),
+                    "session_id": visits["session_id"].to_numpy(),
+                    "hemi": hemi,
+                    "displacement": side.registration.displacement,
+                    "extreme": side.registration.extreme,
+                    **{f"node_{i + 1}": side.registration.warps[:, i] for i in range(nodes)},
+                }
+            )
+        )
+    return pd.concat(parts, ignore_index=True)
+
+
+def _shifts(analysis: Analysis) -> pd.DataFrame:
+    return pd.concat(
+        [
+            pd.DataFrame(
+                {
+                    "hemi": hemi,
+                    "group": group,
+                    "node_x": np.arange(len(shift.mean)) + 1,
+                    "n": shift.n,
+                    "shift": shift.mean,
+                    "shift_se": shift.se,
+                }
+            )
+            for hemi, side in analysis.sides.items()
+            for group, shift in side.shifts.items()
+        ],
+        ignore_index=True,
+    )
+
+
+def _classification(analysis: Analysis, settings: GroupSettings) -> pd.DataFrame:
+    rows: list[dict[str, object]] = []
+    for hemi, measure, pair in analysis.pairs:
+        found = pair.comparison
+        rows.append(
+            {
+                "hemi": hemi,
+                "control": pair.control,
+                "case": pair.case,
+                "base": " + ".join(settings.classification.base),
+                "added": measure,
+                "n": found.n,
+                "n_cases": found.n_cases,
+                "n_incomplete": pair.n_incomplete,
+                **_areas("base", found.base),
+                **_areas("full", found.full),
+                "calibration_slope": found.full.calibration.slope,
+                "brier": found.full.calibration.brier,
+                "likelihood_ratio": found.likelihood_ratio,
+                "lr_df": found.df,
+                "p": found.p,
+                "separated": found.separated,
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def _areas(which: str, result: ClassifierResult) -> dict[str, float]:
+    return {
+        f"auc_{which}": result.auc.area,
+        f"auc_{which}_low": result.auc.low,
+        f"auc_{which}_high": result.auc.high,
+        f"auc_{which}_cv": result.cross_validation.auc,
+        f"auc_{which}_cv_sd": result.cross_validation.auc_sd,
+    }
