@@ -119,7 +119,7 @@ class Books:
 
 def _log(outcome: Outcome) -> None:
     name = outcome.job.place.name
-    title = f"{name.stem}_seg-{name.seg}"
+    title = f"{name.stem}_{name.protocol}"
     if outcome.skipped:
         _LOGGER.info("%s: unchanged, skipped (%s)", title, outcome.status)
         return

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from hipsta_bids.bids.inputs import HemisphereInput, InputRequest
     from hipsta_bids.runner import RunOptions
+    from hipsta_bids.settings import Settings
 
 _SIGNALED = 128  # shells report death by signal n as 128 + n
 
@@ -101,7 +102,7 @@ def _participant(options: "Namespace") -> ExitCode:
     from hipsta_bids.settings_file import load_settings  # noqa: PLC0415  (start-up time)
 
     _check_folders(options)
-    settings = load_settings(options.settings)
+    settings = _with_region(load_settings(options.settings), options.region)
     from hipsta_bids.bids.dataset import (  # noqa: PLC0415  (heavy)
         dataset_notes,
         find_inputs,
@@ -130,6 +131,14 @@ def _participant(options: "Namespace") -> ExitCode:
         progress.close()
     say_result(result, options.output_dir)
     return result.exit_code
+
+
+def _with_region(settings: "Settings", region: str | None) -> "Settings":
+    from dataclasses import replace  # noqa: PLC0415  (start-up time)
+
+    if region is None:
+        return settings
+    return replace(settings, body=replace(settings.body, region=region))
 
 
 def _check_folders(options: "Namespace") -> None:

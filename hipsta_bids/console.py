@@ -63,7 +63,7 @@ class Progress:
 def summary_line(outcome: "Outcome") -> str:
     """Sum up one hemisphere: whose, status, mean thickness, time, and what to know."""
     name = outcome.job.place.name
-    parts = [f"{name.stem}_seg-{name.seg}", str(outcome.status)]
+    parts = [f"{name.stem}_{name.protocol}", str(outcome.status)]
     if outcome.thickness is not None:
         parts.append(f"mean thickness {outcome.thickness:.3f} mm")
     if outcome.seconds is not None:

@@ -16,6 +16,7 @@ from hipsta_bids.bids.results import ResultPlace
 from hipsta_bids.cost import CostClock
 from hipsta_bids.errors import GeometryError, HipstaError, OutputError
 from hipsta_bids.mapping import Mapped, add_signals, signal_hash, write_signals
+from hipsta_bids.schemes import for_region
 from hipsta_bids.settings import Settings
 
 INTERNAL = "internal-error"
@@ -89,7 +90,7 @@ def run_job(job: Job) -> Outcome:
         with clock("read"):
             hashed, hashes = hash_inputs(job)
             record |= {"input_hash": hashed} | hashes
-            volume = read_label_volume(job.item)
+            volume = read_label_volume(job.item, job.settings.body.region)
         maps = measure_hemisphere(volume, job.item.hemi, job.settings, clock)
         mapped = Mapped()
         if job.item.maps or job.item.regions:
@@ -100,7 +101,7 @@ def run_job(job: Job) -> Outcome:
             results.write_results(
                 job.place,
                 maps,
-                job.item.scheme,
+                for_region(job.item.scheme, job.settings.body.region),
                 record,
                 write_meshes=job.write_meshes,
                 write_more=lambda: write_signals(job.place, maps, mapped),
@@ -226,6 +227,7 @@ def base_record(job: Job) -> dict[str, Any]:
             {"what": edit.kind, "file": source_address(edit.path, sources)} for edit in item.edits
         ],
         "scheme": item.scheme.name,
+        "region": job.settings.body.region,
         "scheme_title": item.scheme.title,
         "chosen_because": item.why,
         "passed_over": [
@@ -254,8 +256,11 @@ def hash_inputs(job: Job) -> tuple[str, dict[str, list[dict[str, str]]]]:
     ------
     InputError
         If a file cannot be read.
+    SchemeError
+        If the protocol has no labels of the region.
     """
     item, sources = job.item, dict(job.sources)
+    region = for_region(item.scheme, job.settings.body.region)
     hashes = [
         {"file": source_address(path, sources), "sha256": files.sha256_of(path)}
         for path in item.files
@@ -279,7 +284,7 @@ def hash_inputs(job: Job) -> tuple[str, dict[str, list[dict[str, str]]]]:
         ],
         [
             [int(tissue) for tissue in group]
-            for group in (item.scheme.sheet, item.scheme.layer, item.scheme.interior)
+            for group in (region.sheet, item.scheme.layer, item.scheme.interior)
         ],
         [item.scheme.unlisted, item.bilateral, item.code_offset, item.hemi],
         sorted([entry["what"], entry["sha256"]] for entry in edited),

@@ -11,6 +11,7 @@ from hipsta_bids import __version__
 from hipsta_bids.errors import UsageError
 
 LEVELS = ("participant",)
+REGIONS = ("body", "extended", "entorhinal")
 
 EPILOG = """\
 other commands:
@@ -220,6 +221,12 @@ def _add_processing(parser: Parser) -> None:
         ("--settings",),
         ("FILE.toml", "settings that change results (see `hipsta-bids settings`)"),
         type=Path,
+    )
+    _add(
+        group,
+        ("--region",),
+        ("NAME", "body (default), extended (with neighboring cortex), entorhinal (that alone)"),
+        choices=REGIONS,
     )
     _add(
         group,

@@ -38,12 +38,14 @@ from hipsta_bids.geometry.measures import (
     measure_thickness,
     summarize,
 )
+from hipsta_bids.geometry.neighbors import check_turned, is_turned
 from hipsta_bids.geometry.quality import Evidence, find_flags, quality_metrics
 from hipsta_bids.geometry.repaired import repaired_columns
 from hipsta_bids.geometry.sheet import folded_fraction, label_sheet, sample_sheet, whole_body
 from hipsta_bids.geometry.surface import extract_surface, signed_volume
 from hipsta_bids.geometry.tetra import tetrahedralize
 from hipsta_bids.geometry.topology import SolidField, repair_topology
+from hipsta_bids.schemes import for_region
 from hipsta_bids.settings import Settings
 
 Clock = Callable[[str], AbstractContextManager[None]]
@@ -92,7 +94,10 @@ def measure_hemisphere(
     with clock("sheet"):
         sheet = sample_sheet(mesh, coordinates, settings.sheet)
         bending = bending_angle(sheet, settings.measures)
-        if boundaries.side_rule == "bending" and bending < 0:
+        if body.region != "body" and boundaries.side_rule == "bending":
+            boundaries = replace(boundaries, side_rule="continuity")
+        wrong = {"bending": bending < 0, "continuity": is_turned(sheet, hemi), "labels": False}
+        if wrong[boundaries.side_rule]:
             sheet, coordinates, boundaries = _turned(sheet, coordinates, boundaries)
             bending = -bending
         whole = sample_sheet(mesh, coordinates, whole_body(settings.sheet))
@@ -115,6 +120,7 @@ def measure_hemisphere(
         thickness = measure_thickness(sheet)
         doubts = check_end_labels(volume, body, settings.checks)
         doubts += check_thickness(thickness, boundaries.sheet_thickness, settings.checks)
+        doubts += check_turned(sheet, hemi) if body.region == "extended" else []
         doubts += _mask_doubts(volume, body, settings)
         repaired = repaired_columns(sheet, solid, settings.measures)
         return HemisphereMaps(
@@ -133,7 +139,7 @@ def measure_hemisphere(
                     thickness=measure_thickness(whole),
                     subfield=label_sheet(whole, body),
                 ),
-                volume.scheme.sheet,
+                for_region(volume.scheme, body.region).sheet,
                 signed_volume(surface.vertices, surface.triangles),
             ),
             qc=quality_metrics(evidence)

@@ -131,7 +131,7 @@ def run_participants(
     jobs = [
         Job(
             item=item,
-            place=ResultPlace(root=out_dir, name=hemisphere_name(item)),
+            place=ResultPlace(root=out_dir, name=hemisphere_name(item, settings)),
             settings=settings,
             settings_hash=digest,
             sources=tuple(sources.items()),
@@ -172,10 +172,14 @@ def _run(
     return kept
 
 
-def hemisphere_name(item: HemisphereInput) -> HemisphereName:
+def hemisphere_name(item: HemisphereInput, settings: Settings) -> HemisphereName:
     """Name the results of one input."""
     return HemisphereName(
-        subject=item.subject, session=item.session, hemi=item.hemi, seg=item.scheme.name
+        subject=item.subject,
+        session=item.session,
+        hemi=item.hemi,
+        seg=item.scheme.name,
+        region=settings.body.region,
     )
 
 
@@ -215,7 +219,7 @@ def finished(job: Job) -> Outcome | None:
         return None
     try:
         digest, _ = hash_inputs(job)
-    except InputError:
+    except (InputError, SchemeError):
         return None
     if record.get("input_hash") != digest:
         return None

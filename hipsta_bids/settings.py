@@ -20,6 +20,13 @@ def _require(condition: bool, message: str) -> None:
 class BodySettings:
     """From labels to the body's mask and end planes."""
 
+    region: str = "body"
+    """What is measured between the end planes: ``body`` (the hippocampal subfields), ``extended``
+    (with the neighboring cortex) or ``entorhinal`` (that cortex alone); the command line's
+    ``--region`` goes first."""
+    min_cortex_reach: float = 0.9
+    """Refuse regions with cortex if its labels fill less than this share of the distance between
+    the end planes: the sheet would not go from end to end."""
     layer_rule: str = "nearest-sheet"
     """Who gets the molecular layer: ``nearest-sheet`` (the nearest sheet subfield; Diers et al.
     2023) or ``nearest-label`` (the nearest label; voxels nearest to DG or CA4 are left out)."""
@@ -42,6 +49,9 @@ class BodySettings:
 
     def __post_init__(self) -> None:
         rules = ("nearest-sheet", "nearest-label")
+        regions = ("body", "extended", "entorhinal")
+        _require(self.region in regions, f"body.region must be one of {', '.join(regions)}")
+        _require(0 < self.min_cortex_reach <= 1, "body.min_cortex_reach must lie in (0, 1]")
         _require(self.layer_rule in rules, f"body.layer_rule must be {' or '.join(rules)}")
 
 

@@ -145,7 +145,7 @@ def act_out(act, hemi, clock):
 def replace_measurement():
     """Put stand-ins in the place of reading and measuring, in this process."""
     images = types.ModuleType("hipsta_bids.bids.images")
-    images.read_label_volume = lambda item: item.files[0].read_text()
+    images.read_label_volume = lambda item, _region: item.files[0].read_text()
     participant = types.ModuleType("hipsta_bids.participant")
     participant.find_body = lambda *_: None
     participant.measure_hemisphere = lambda volume, hemi, _, clock: act_out(volume, hemi, clock)

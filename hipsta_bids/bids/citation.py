@@ -12,6 +12,15 @@ _LAYER_RULES = {
     "nearest-label": "was given to the nearest label, the dentate gyrus and CA4 included",
 }
 
+_REGIONS = {
+    "body": "",
+    "extended": " For files with label-extended, the sheet goes on beyond the subiculum into the"
+    " neighboring cortex, between the same end planes.",
+    "entorhinal": " For files with label-entorhinal, the neighboring cortex alone was taken,"
+    " between the same end planes; its interior side is the one that continues the hippocampal"
+    " sheet's.",
+}
+
 #: Key and entry of each work that the methods rest on.
 REFERENCES: dict[str, str] = {
     "method": "Diers K, Baumeister H, Jessen F, Düzel E, Berron D, Reuter M. An automated,"
@@ -62,6 +71,7 @@ def citation_text(settings: Settings, schemes: Sequence[Scheme]) -> str:
             " The subfields of the hippocampal body from presubiculum to CA3 were merged into one"
             " sheet; the molecular layer, where labeled,"
             f" {_LAYER_RULES.get(settings.body.layer_rule, settings.body.layer_rule)}."
+            f"{_REGIONS[settings.body.region]}"
             " The sheet was meshed as a closed surface of checked topology and filled with"
             f" tetrahedra by TetGen {cite['tetgen']}. Its medial and lateral ends were located with"
             " an eigenfunction of the anisotropic Laplace-Beltrami operator, computed with LaPy"

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ from hipsta_bids.bids import files
 from hipsta_bids.bids.names import DATASET_FILES, ignore_patterns
 from hipsta_bids.errors import InputError, SettingsError, UsageError
 from hipsta_bids.schemes import Scheme
-from hipsta_bids.settings import Settings
+from hipsta_bids.settings import BodySettings, Settings
 from hipsta_bids.settings_file import flatten, resolve, settings_hash
 
 NAME = "hipsta_bids"
@@ -89,13 +90,13 @@ def settle_settings(root: Path, settings: Settings) -> str:
         If an earlier file cannot be read.
     """
     path = root / DATASET_FILES["settings"]
-    digest = settings_hash(settings)
+    digest, resolved = shared_settings(settings)
     if path.exists():
         earlier = files.read_json(path)
         if earlier.get("hash") == digest:
             return digest
         theirs = flatten(earlier.get("settings", {}))
-        ours = flatten(resolve(settings))
+        ours = flatten(resolved)
         changes = [
             f"{key} was {theirs.get(key, 'not there')}, now {ours.get(key, 'not there')}"
             for key in dict.fromkeys((*theirs, *ours))
@@ -106,9 +107,20 @@ def settle_settings(root: Path, settings: Settings) -> str:
             " use a new output folder, or delete this one to redo all of it",
             reason="other-settings",
         )
-    content = {"hash": digest, "version": __version__, "settings": resolve(settings)}
+    content = {"hash": digest, "version": __version__, "settings": resolved}
     files.write_json(path, content)
     return digest
+
+
+def shared_settings(settings: Settings) -> tuple[str, dict[str, Any]]:
+    """Hash and resolve what all results of a folder share: everything but the region.
+
+    The region is in the names of the files, so that one folder may hold several.
+    """
+    anywhere = replace(settings, body=replace(settings.body, region=BodySettings().region))
+    resolved = resolve(anywhere)
+    del resolved["body"]["region"]
+    return settings_hash(anywhere), resolved
 
 
 def write_description(root: Path, sources: Mapping[str, Path]) -> None:

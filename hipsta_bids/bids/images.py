@@ -11,7 +11,15 @@ from hipsta_bids.bids.inputs import HemisphereInput
 from hipsta_bids.bids.masks import sample_mask, sample_nearest, within
 from hipsta_bids.bids.volumes import read_voxels
 from hipsta_bids.errors import InputError, SchemeError
-from hipsta_bids.schemes import Part, Scheme, Tissue, load_scheme, scheme_names, translate
+from hipsta_bids.schemes import (
+    Part,
+    Scheme,
+    Tissue,
+    for_region,
+    load_scheme,
+    scheme_names,
+    translate,
+)
 from hipsta_bids.schemes.scheme import OUTSIDE
 
 #: Kept around the hippocampal labels [mm], where the image extends that far.
@@ -26,17 +34,20 @@ SAME_PLACE = 0.5
 _Box = tuple[slice, slice, slice]
 
 
-def read_label_volume(item: HemisphereInput) -> LabelVolume:
+def read_label_volume(item: HemisphereInput, region: str = "body") -> LabelVolume:
     """Read one hemisphere's segmentation.
 
-    The volume is cropped to the hippocampal labels (not the cortical ones) plus 5 mm on each side,
-    as far as the image goes. The affine is the image's own, moved by the crop: scanner RAS
-    for MGZ, sform before qform for NIfTI. A NIfTI without either has no known left and right, and
-    is refused. Labels and mask that a person edited come from their own files, on any grid.
+    The volume is cropped to the hippocampal labels, and the cortical ones of the region, plus 5 mm
+    on each side, as far as the image goes. The affine is the image's own, moved by the crop:
+    scanner RAS for MGZ, sform before qform for NIfTI. A NIfTI without either has no known left and
+    right, and is refused. Labels and mask that a person edited come from their own files, on any
+    grid.
 
     Parameters
     ----------
     item : HemisphereInput
+    region : str
+        What is going to be measured (``body.region`` of the settings).
 
     Returns
     -------
@@ -51,10 +62,11 @@ def read_label_volume(item: HemisphereInput) -> LabelVolume:
         ``non-integer-labels``, ``empty-labels``, ``grid-mismatch``, or, of edited files,
         ``edited-elsewhere`` or what :func:`~hipsta_bids.bids.masks.sample_mask` raises.
     SchemeError
-        ``unknown-labels`` or ``wrong-scheme``.
+        ``unknown-labels`` or ``wrong-scheme``; ``no-cortex-labels`` if the protocol has none.
     """
     if item.problem is not None:
         raise item.problem
+    sheet = for_region(item.scheme, region).sheet
     labels, mask = item.edit("labels"), item.edit("mask")
     path = labels.path if labels else item.files[0]
     data, affine = read_voxels(path)
@@ -69,7 +81,7 @@ def read_label_volume(item: HemisphereInput) -> LabelVolume:
         _, parts = _translate(_integers(more[box], other), item.parts_scheme or item.scheme, other)
         part = np.where(parts == Part.UNKNOWN, part, parts)
     part = np.where(tissue == Tissue.BACKGROUND, np.uint8(Part.UNKNOWN), part)
-    hippocampal = ~np.isin(tissue, tuple(OUTSIDE))
+    hippocampal = ~np.isin(tissue, tuple(OUTSIDE.difference(sheet)))
     inner = _bounding_box(hippocampal, affine, path)
     start = np.array([a.start + b.start for a, b in zip(box, inner, strict=True)])
     cropped = _shift(affine, start)

@@ -1,7 +1,7 @@
 """The one table of outputs, and the one function that spells their paths.
 
-Entities follow the order of BIDS 1.11 (``sub ses hemi space seg desc``). What the standard has
-no rule for is listed in ``.bidsignore`` from the same table.
+Entities follow the order of BIDS 1.11 (``sub ses hemi space seg label desc``). What the standard
+has no rule for is listed in ``.bidsignore`` from the same table.
 """
 
 from dataclasses import dataclass
@@ -20,6 +20,20 @@ class HemisphereName:
     """``L`` or ``R``."""
     seg: str
     """Name of the segmentation protocol."""
+    region: str = "body"
+    """What was measured; other regions than the body are in the names, as ``label-``."""
+
+    @property
+    def protocol(self) -> str:
+        """Entities that tell results of one hemisphere apart: protocol and region."""
+        label = "" if self.region == "body" else f"_label-{self.region}"
+        return f"seg-{self.seg}{label}"
+
+    @property
+    def pattern(self) -> str:
+        """Glob pattern of its file names, in which no other region has a part."""
+        # No suffix of the table begins as the entity label does.
+        return f"{self.stem}_*{self.protocol}_{'[!l]*' if self.region == 'body' else '*'}"
 
     @property
     def stem(self) -> str:
@@ -243,7 +257,7 @@ def output_name(name: HemisphereName, key: str, desc: str | None = None) -> str:
     entities = [
         name.stem,
         f"space-{output.space}" if output.space else None,
-        f"seg-{name.seg}",
+        name.protocol,
         f"desc-{desc or output.desc}" if output.desc else None,
         output.suffix,
     ]
@@ -265,7 +279,7 @@ def output_path(name: HemisphereName, key: str, desc: str | None = None) -> Pure
     Returns
     -------
     PurePosixPath
-        ``sub-X[/ses-Y]/anat/sub-X[_ses-Y]_hemi-H[_space-S]_seg-P[_desc-D]_<suffix><extension>``.
+        ``sub-X[/ses-Y]/anat/sub-X[_ses-Y]_hemi-H[_space-S]_seg-P[_label-R][_desc-D]_<suffix><extension>``.
     """
     return name.folder / output_name(name, key, desc)
 
@@ -284,4 +298,7 @@ def ignore_patterns() -> tuple[str, ...]:
         for output in (*OUTPUTS, *EXTRA_OUTPUTS)
         if not output.in_standard
     )
-    return (*dataset, f"{DATASET_FILES['logs']}/", *patterns)
+    regions = [
+        f"*_label-*_{output.suffix}{output.extension}" for output in OUTPUTS if output.in_standard
+    ]
+    return (*dataset, f"{DATASET_FILES['logs']}/", *patterns, *regions)

@@ -60,7 +60,7 @@ def remove_results(place: ResultPlace) -> None:
     files.remove([*reversed(place.paths(optional=True)), *place.extra_paths()])
     folder = place.path("qc").parent
     if folder.is_dir():
-        files.remove_leftovers(folder, f"{place.name.stem}_*seg-{place.name.seg}_*")
+        files.remove_leftovers(folder, place.name.pattern)
 
 
 def write_results(

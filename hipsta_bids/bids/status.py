@@ -20,6 +20,7 @@ COLUMNS: dict[str, str] = {
     "session": "session, with its ses- prefix",
     "hemi": "L or R",
     "seg": "segmentation protocol",
+    "region": "what was measured: body, extended (and neighboring cortex), entorhinal (that alone)",
     "status": "ok; repaired: small defects were mended; flagged: look before use;"
     " failed: there are no maps",
     "reason": "machine-readable reasons, joined by +",
@@ -43,12 +44,15 @@ def identity(name: HemisphereName) -> dict[str, str]:
         "session": f"ses-{name.session}" if name.session else files.MISSING,
         "hemi": name.hemi,
         "seg": name.seg,
+        "region": name.region,
     }
 
 
 def row_key(row: Row) -> tuple[str, ...]:
     """Cells that tell rows apart."""
-    return tuple(row[key] for key in _KEY)
+    region = row.get("region", files.MISSING)
+    # Rows of a table without that column are about the body.
+    return *(row[key] for key in _KEY), "body" if region == files.MISSING else region
 
 
 def read_status(root: Path) -> list[dict[str, str]]:

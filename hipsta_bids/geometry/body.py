@@ -11,7 +11,8 @@ from hipsta_bids.artifacts import Bool, Float, LabelVolume
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.edited import MaskChange, apply_mask
 from hipsta_bids.geometry.ends import EndPlanes, find_end_planes
-from hipsta_bids.schemes import Tissue
+from hipsta_bids.geometry.neighbors import check_reach, join_cortex
+from hipsta_bids.schemes import Tissue, lateral_rank
 from hipsta_bids.settings import BodySettings
 
 
@@ -20,7 +21,11 @@ class Body:
     """The merged ribbon, on the grid of the label image."""
 
     tissue: NDArray[np.uint8]
-    """(I, J, K) sheet tissue after the layer was given away; 0 elsewhere."""
+    """(I, J, K) tissue of the region's sheet after the layer was given away; 0 elsewhere."""
+    hippocampal: NDArray[np.uint8]
+    """(I, J, K) the same of the hippocampal sheet, whatever the region."""
+    region: str
+    """``body``, ``extended`` or ``entorhinal``."""
     interior: Bool
     """(I, J, K) labels known to lie on the interior side (DG, CA4, molecular layer)."""
     affine: Float
@@ -31,6 +36,19 @@ class Body:
     """(I, J, K) sheet voxels between the end planes."""
     mask_change: MaskChange | None = None
     """What an edited mask changed; None if there is none."""
+
+    @cached_property
+    def lateral(self) -> Float:
+        """How lateral each voxel between the end planes lies, (N,), larger is more lateral.
+
+        The rank of its label; in the cortex alone, which may have one label only, minus its
+        distance from the medial subfields of the hippocampus, mm.
+        """
+        if self.region != "entorhinal":
+            return lateral_rank(self.tissue[self.inside]).astype(np.float64)
+        medial = np.isin(self.hippocampal, (Tissue.PRESUBICULUM, Tissue.SUBICULUM))
+        near = cKDTree(_millimetres(medial, self.affine))
+        return np.asarray(-near.query(self.inside_points()[1])[0])
 
     def inside_points(self) -> tuple[NDArray[np.intp], Float]:
         """Voxel indices (N, 3) and RAS mm (N, 3) of the sheet between the end planes."""
@@ -80,20 +98,23 @@ def extract_body(volume: LabelVolume, settings: BodySettings) -> Body:
         volume, tissue, change = apply_mask(volume, tissue, volume.edited_mask, ends)
         # What the mask took away may have turned the long axis.
         ends = find_end_planes(volume, tissue, settings)
-    index = np.argwhere(tissue > 0)
-    points = index @ volume.affine[:3, :3].T + volume.affine[:3, 3]
-    between = (ends.height(points, "posterior") > 0) & (ends.height(points, "anterior") < 0)
-    inside = np.zeros(tissue.shape, dtype=bool)
-    inside[tuple(index[between].T)] = True
-    length = ends.length(points[between]) if between.any() else 0.0
+    hippocampal, region = tissue, settings.region
+    if region != "body":
+        tissue = join_cortex(volume, hippocampal, region)
+    inside, points = _between(tissue > 0, volume.affine, ends)
+    length = ends.length(points) if len(points) else 0.0
     if length < settings.min_length:
         raise GeometryError(
             f"the body is {length:.1f} mm long, {settings.min_length:g} mm are needed: "
             "check the head and tail labels",
             reason="body-too-short",
         )
+    if region != "body":
+        check_reach(points, tissue[inside], ends, settings)
     return Body(
         tissue=tissue,
+        hippocampal=hippocampal,
+        region=region,
         interior=np.isin(volume.tissue, volume.scheme.interior),
         affine=volume.affine,
         ends=ends,
@@ -125,8 +146,10 @@ def check_side(body: Body, hemi: str) -> float:
         ``left-right-swapped`` if they lie on the far side by more than 1 mm, and the body is not
         of the handedness that the file claims.
     """
-    values = body.tissue[body.inside]
-    _, points = body.inside_points()
+    inside, points = body.inside, body.inside_points()[1]
+    if body.region != "body":
+        inside, points = _between(body.hippocampal > 0, body.affine, body.ends)
+    values = body.hippocampal[inside]
     medial = np.isin(values, (Tissue.PRESUBICULUM, Tissue.SUBICULUM))
     lateral = values == Tissue.CA1
     if not (medial.any() and lateral.any()):
@@ -153,10 +176,7 @@ def _has_handedness(body: Body, subiculum: Float, ca1: Float, hemi: str) -> bool
     Seen along the long axis, the way from the subiculum over CA1 to the interior labels turns one
     way on the left and the other way on the right.
     """
-    points = _millimetres(body.interior & (body.tissue == 0), body.affine)
-    points = points[
-        (body.ends.height(points, "posterior") > 0) & (body.ends.height(points, "anterior") < 0)
-    ]
+    _, points = _between(body.interior & (body.tissue == 0), body.affine, body.ends)
     if not len(points):
         return False
     first, second = ca1 - subiculum, points.mean(axis=0) - subiculum
@@ -196,6 +216,16 @@ def _touching(mask: Bool) -> Bool:
         & mask[1:-1, 1:-1, 2:]
     )
     return mask & ~deep
+
+
+def _between(mask: Bool, affine: Float, ends: EndPlanes) -> tuple[Bool, Float]:
+    """Part of a mask between the end planes, (I, J, K), and its voxels in RAS mm, (N, 3)."""
+    index = np.argwhere(mask)
+    points = index @ affine[:3, :3].T + affine[:3, 3]
+    between = (ends.height(points, "posterior") > 0) & (ends.height(points, "anterior") < 0)
+    inside = np.zeros(mask.shape, dtype=bool)
+    inside[tuple(index[between].T)] = True
+    return inside, points[between]
 
 
 def _millimetres(mask: Bool, affine: Float) -> Float:

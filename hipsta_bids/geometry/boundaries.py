@@ -40,7 +40,8 @@ class Boundaries:
     rim_distance: float
     """Mean distance of the curves from the rim paths, the worse of the two, mm."""
     side_rule: str
-    """What told interior from exterior: ``labels``, or ``bending`` (decided on the sheet)."""
+    """What told interior from exterior: ``labels``, or, decided on the sheet, ``bending``; where
+    cortex is measured, ``continuity`` with the hippocampus takes the place of bending."""
     side_margin: float
     """Difference of the shares of outward probes that hit interior labels; NaN without labels."""
     strip_width: float
@@ -158,16 +159,18 @@ def _gap(points: Float, curve: Float) -> float:
 
 
 def _rank(curve: Float, body: Body) -> float:
-    """Mean medial-to-lateral rank of the sheet labels nearest to a curve (Tissue is in order)."""
-    index, points = body.inside_points()
+    """How lateral the voxels nearest to a curve lie, on average."""
+    _, points = body.inside_points()
     _, nearest = cKDTree(points).query(curve)
-    return float(body.tissue[tuple(index[nearest].T)].mean())
+    return float(body.lateral[nearest].mean())
 
 
 def _interior_first(
     sides: tuple[Bool, Bool], wall: Wall, body: Body, settings: BoundarySettings
 ) -> tuple[tuple[Bool, Bool], str, float]:
     """Order the sides by how often probes outward from them hit labels of the interior side."""
+    if body.region == "entorhinal":  # no such label touches it
+        return sides, "bending", float("nan")
     normals = vertex_normals(wall)
     target = body.interior & (body.tissue == 0)
     inverse = np.linalg.inv(body.affine)

@@ -12,7 +12,7 @@ from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.grid import in_plane_voxel
 from hipsta_bids.geometry.surface import mean_wall_thickness
-from hipsta_bids.schemes import Part, Tissue
+from hipsta_bids.schemes import Part, Tissue, lateral_rank
 from hipsta_bids.settings import CheckSettings
 
 
@@ -64,7 +64,7 @@ def check_label_order(
     """
     index, points = body.inside_points()
     thin = slice(None, None, max(len(points) // 5000, 1))  # some thousand voxels are plenty
-    rank = body.tissue[tuple(index[thin].T)]
+    rank = lateral_rank(body.tissue[tuple(index[thin].T)])
     kinds = np.unique(rank)
     if len(kinds) == 1:
         return float("nan")
@@ -81,13 +81,13 @@ def check_label_order(
     return order
 
 
-def _swapped(medians: list[float], rank: NDArray[np.uint8], kinds: NDArray[np.uint8]) -> bool:
+def _swapped(medians: list[float], rank: NDArray[np.int8], kinds: NDArray[np.int8]) -> bool:
     """Whether subfields of a fair size lie in another order than their names say."""
     fair = [m for m, kind in zip(medians, kinds, strict=True) if (rank == kind).mean() > 0.03]  # noqa: PLR2004
     return any(b < a for a, b in pairwise(fair))
 
 
-def _rank_correlation(x: Float, y: NDArray[np.uint8]) -> float:
+def _rank_correlation(x: Float, y: NDArray[np.int8]) -> float:
     """Spearman's rank correlation, ties at their mean rank (scipy.stats takes 1.6 s to import)."""
     ranks = []
     for values in (x, y):

@@ -210,7 +210,7 @@ def _directions_across(body: Body, flat: Float) -> Float:
     edges = edges / np.linalg.norm(edges, axis=1, keepdims=True)
     projected = edges - np.outer(edges @ axis, axis)
     length = np.linalg.norm(projected, axis=1)
-    rank = body.tissue[body.inside].astype(np.float64)
+    rank = body.lateral
     lateral = (flat - flat.mean(axis=0)).T @ (rank - rank.mean())
     along = projected @ lateral
     usable = length > 0.5  # noqa: PLR2004 -- not the edge along the axis

@@ -8,7 +8,7 @@ from scipy import ndimage
 from scipy.special import ndtri
 
 from hipsta_bids.artifacts import Bool, Float
-from hipsta_bids.schemes import Tissue
+from hipsta_bids.schemes import Tissue, lateral_rank
 from hipsta_bids.settings import SliceSettings
 
 Image = NDArray[np.float32]
@@ -37,16 +37,16 @@ def outline_slice(tissue: NDArray[np.uint8], pixel: float, settings: SliceSettin
     up to half of one, which the smoothing of the working grid cannot undo along the slice.
     """
     block = np.ones((settings.upsampling,) * 2, dtype=np.uint8)
-    ranks = np.kron(tissue, block)
-    if not ranks.any():
-        return np.full(ranks.shape, -settings.reach, dtype=np.float32)
+    labels = np.kron(tissue, block)
+    if not labels.any():
+        return np.full(labels.shape, -settings.reach, dtype=np.float32)
     fine = pixel / settings.upsampling
     sigma = settings.smoothing * settings.upsampling
-    smooth = ndimage.gaussian_filter((ranks > 0).astype(np.float64), sigma)
+    smooth = ndimage.gaussian_filter((labels > 0).astype(np.float64), sigma)
     distance = _signed_distance(smooth > 0.5, fine)  # noqa: PLR2004 -- the outline
     exact = sigma * fine * ndtri(np.clip(smooth, 1e-6, 1 - 1e-6))
     distance = np.where(np.abs(distance) < sigma * fine, exact, distance)
-    distance = _join(distance, ranks, fine, settings)
+    distance = _join(distance, lateral_rank(labels).astype(int), labels > 0, fine, settings)
     return np.asarray(np.clip(distance, -settings.reach, settings.reach), dtype=np.float32)
 
 
@@ -83,7 +83,7 @@ def _signed_distance(mask: Bool, pixel: float) -> Float:
 
 
 def _join(
-    distance: Float, ranks: NDArray[np.uint8], pixel: float, settings: SliceSettings
+    distance: Float, ranks: NDArray[np.intp], labeled: Bool, pixel: float, settings: SliceSettings
 ) -> Float:
     """Bridge near fragments of a slice to the largest, drop crumbs, fill holes.
 
@@ -101,8 +101,8 @@ def _join(
         gap *= pixel
         # The sheet is one ribbon: a fragment belongs to a neighbor in medial-to-lateral order,
         # not to the part that happens to lie across the sulcus.
-        jump = np.abs(ranks.astype(int) - ranks[tuple(nearest)]) > settings.max_rank_jump
-        cost = gap + np.where(jump & (ranks > 0), settings.reach, 0)
+        jump = np.abs(ranks - ranks[tuple(nearest)]) > settings.max_rank_jump
+        cost = gap + np.where(jump & labeled, settings.reach, 0)
         crumbs = (sizes < settings.crumb_area)[pieces]
         cost[(pieces == 0) | main | ((cost > settings.max_gap) & ~crumbs)] = np.inf
         end = np.array(np.unravel_index(np.argmin(cost), cost.shape))

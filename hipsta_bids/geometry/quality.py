@@ -64,6 +64,7 @@ def find_flags(evidence: Evidence, settings: Settings) -> list[Flag]:
             f"the body has no {name}: the sheet ends there; look at the labels",
         )
         for name, tissues in _PARTS.items()
+        if evidence.body.region != "entorhinal"
     ]
     rows += [
         (
@@ -77,7 +78,10 @@ def find_flags(evidence: Evidence, settings: Settings) -> list[Flag]:
             f"the medial or lateral boundary is uncertain by {boundaries.rim_distance:.1f} mm",
         ),
         (
-            boundaries.side_rule == "labels" and evidence.bending < -checks.flag_bending,
+            # The cortex beside the body bends the other way.
+            evidence.body.region == "body"
+            and boundaries.side_rule == "labels"
+            and evidence.bending < -checks.flag_bending,
             "side-doubtful",
             f"dentate gyrus labels lie on the outer side of the bend ({evidence.bending:.1f} rad)",
         ),
@@ -111,6 +115,7 @@ def quality_metrics(evidence: Evidence) -> dict[str, Any]:
     quality = tetra_quality(evidence.mesh)
     valid = evidence.sheet.valid
     return {
+        "region": body.region,
         "voxel_size_mm": np.linalg.norm(body.affine[:3, :3], axis=0).round(4).tolist(),
         "body_voxels": int(np.count_nonzero(body.inside)),
         "layer_voxels": body.layer_voxels,

@@ -95,12 +95,11 @@ def middle_lines(wall: Wall, zones: Sequence[Bool]) -> tuple[Float, Float] | Non
 
 def _most_lateral(mesh: TetMesh, body: Body, settings: BoundarySettings) -> NDArray[np.intp]:
     """Vertices whose surroundings carry the most lateral labels."""
-    index, points = body.inside_points()
-    rank = body.tissue[tuple(index.T)].astype(float)
+    _, points = body.inside_points()
     count = min(settings.label_neighbors, len(points))
     asked = np.arange(0, len(mesh.vertices), settings.label_stride)
     _, nearest = cKDTree(points).query(mesh.vertices[asked], k=count)
-    mean = rank[nearest].mean(axis=1)
+    mean = body.lateral[nearest].mean(axis=1)
     return np.asarray(asked[mean >= np.quantile(mean, 1 - settings.lateral_share)])
 
 

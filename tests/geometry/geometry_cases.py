@@ -176,6 +176,8 @@ def plain_body(tissue, affine, ends):
     """A body straight from an array of sheet tissue, all of it between the end planes."""
     return Body(
         tissue=tissue.astype(np.uint8),
+        hippocampal=tissue.astype(np.uint8),
+        region="body",
         interior=np.zeros(tissue.shape, dtype=bool),
         affine=affine,
         ends=ends,
