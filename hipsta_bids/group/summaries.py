@@ -162,9 +162,9 @@ def classify_groups(
     for hemi in hemispheres(cohort):
         values = summary_values(cohort, hemi)
         base = _base(cohort, values, settings)
-        added = [name for name in settings.classification.added if name in values.columns]
-        for measure in added:
-            if measure in settings.classification.base:
+        measured = values.columns[values.notna().any().to_numpy()]
+        for measure in settings.classification.added:
+            if measure not in measured or measure in settings.classification.base:
                 continue
             try:
                 pairs = compare_pairs(
