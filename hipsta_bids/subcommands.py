@@ -1,9 +1,9 @@
-"""What ``hipsta-bids phantom`` and ``hipsta-bids validate`` look like. Loads nothing heavy."""
+"""What ``hipsta-bids phantom``, ``surrogate`` and ``validate`` look like. Loads nothing heavy."""
 
 import argparse
 from pathlib import Path
 
-from hipsta_bids.parser import Parser
+from hipsta_bids.parser import Parser, add_segmentations, add_selection
 
 PHANTOM_EPILOG = """\
 regions: presubiculum, subiculum, CA1, CA2-3 or all, alone or with -anterior or -posterior
@@ -75,6 +75,34 @@ def phantom_parser() -> Parser:
         help="left-right, superior-inferior, anterior-posterior (default: 0.4 0.4 0.4)",
     )
     add("--seed", type=int, default=0, help="the same seed gives the same files (default: 0)")
+    return parser
+
+
+def surrogate_parser() -> Parser:
+    """Describe ``hipsta-bids surrogate``.
+
+    Returns
+    -------
+    Parser
+        Raises :class:`UsageError` on wrong use.
+    """
+    parser = Parser(
+        prog="hipsta-bids surrogate",
+        description="measure thickness in single slices, without a mesh, and compare it with the"
+        " sheet if OUT_DIR has one",
+        epilog="Exit codes are those of the participant level. The setting surrogate.positions says"
+        " which slices are taken (default: the middle of the body).",
+        allow_abbrev=False,
+    )
+    parser.add_argument("bids_dir", type=Path, metavar="BIDS_DIR", help="a BIDS dataset")
+    parser.add_argument(
+        "output_dir", type=Path, metavar="OUT_DIR", help="the output dataset, new or with results"
+    )
+    add_selection(parser)
+    add_segmentations(parser)
+    parser.add_argument(
+        "--settings", type=Path, metavar="FILE.toml", help="those of the results in OUT_DIR"
+    )
     return parser
 
 

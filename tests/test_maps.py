@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import nibabel as nib
 import numpy as np
@@ -9,7 +10,7 @@ import pandas as pd
 import pytest
 
 from hipsta_bids import cli
-from hipsta_bids.bids.names import HemisphereName, output_path
+from hipsta_bids.bids.names import EXTRA_OUTPUTS, HemisphereName, output_name, output_path
 from hipsta_bids.bids.rois import read_regions
 from hipsta_bids.bids.status import read_status
 from hipsta_bids.errors import ExitCode, InputError
@@ -364,3 +365,11 @@ def test_sessions_are_filled_in(bids_dir, tmp_path, capsys):
     command = [str(data), str(tmp_path / "out"), "participant", "--dry-run"]
     assert cli.main([*command, "--map", f"T1w={pattern('T1w')}"]) == ExitCode.OK
     assert "map T1w: 2 of 2 hemispheres\n" in capsys.readouterr().out
+
+
+def test_the_readme_lists_the_extra_outputs():
+    name = HemisphereName(subject="X", session=None, hemi="L", seg="P")
+    readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+    for row in EXTRA_OUTPUTS:
+        spelled = output_name(name, row.key, "NAME" if row.desc == "*" else None)
+        assert f"`{spelled.removeprefix(name.stem)}`" in readme

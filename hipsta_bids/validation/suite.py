@@ -25,12 +25,13 @@ SUITES: Mapping[str, str] = MappingProxyType(
         "convergence": "hipsta_bids.validation.convergence",
         "invariance": "hipsta_bids.validation.invariance",
         "defects": "hipsta_bids.validation.defects",
+        "surrogate": "hipsta_bids.validation.surrogate",
     }
 )
 
 
 #: Suites that measure real segmentations too, where there are any.
-WITH_LABELS = frozenset({"slices"})
+WITH_LABELS = frozenset({"slices", "surrogate"})
 
 
 @dataclass(frozen=True, kw_only=True)

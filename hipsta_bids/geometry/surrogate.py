@@ -1,0 +1,271 @@
+"""Thickness from single slices without a mesh: a cross-check of unexpected findings.
+
+As the image-based check of Diers et al. 2023: the medial axis of the merged labels in a slice, the
+closest points of the contour on both sides, at places proportional or equidistant along the axis.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, sparse
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
+from skimage.measure import find_contours
+from skimage.morphology import skeletonize
+
+from hipsta_bids.artifacts import Bool, Float
+from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry.body import Body
+from hipsta_bids.geometry.grid import in_plane_voxel
+from hipsta_bids.settings import SheetSettings, SurrogateSettings
+
+#: How points are spread along the medial axis.
+PROPORTIONAL, EQUIDISTANT = "proportional", "equidistant"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SurrogateProfile:
+    """Thickness along the medial axis of one slice, from medial to lateral; all arrays (N,)."""
+
+    position: float
+    """Of the slice: fraction of the body's length from its posterior end."""
+    sampling: str
+    """``proportional`` or ``equidistant``."""
+    fraction: Float
+    """Of the axis, 0 at the medial and 1 at the lateral rim."""
+    distance: Float
+    """From the medial rim along the axis, mm."""
+    points: Float
+    """(N, 3) RAS mm."""
+    thickness: Float
+    """Distances to the closest points of the contour on both sides, added, mm."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Slice:
+    """A slice of the merged labels, drawn on fine pixels."""
+
+    values: Float
+    """(A, B) share of the pixel that is inside; the contour is where it is a half."""
+    inside: Bool
+    """(A, B) one piece without small holes."""
+    origin: Float
+    """(3,) RAS mm of the first pixel."""
+    directions: Float
+    """(2, 3) RAS mm per pixel along both axes."""
+
+    def to_ras(self, index: Float) -> Float:
+        """(N, 3) RAS mm of (N, 2) indices."""
+        return np.asarray(self.origin + index @ self.directions)
+
+
+def surrogate_profiles(
+    body: Body, position: float, sheet: SheetSettings, settings: SurrogateSettings
+) -> tuple[SurrogateProfile, SurrogateProfile]:
+    """Measure thickness along the medial axis of one slice.
+
+    Parameters
+    ----------
+    body : Body
+    position : float
+        Fraction of the body's length from its posterior end, as the sheet's y.
+    sheet : SheetSettings
+        The proportional points lie where the sheet's nodes along x are.
+    settings : SurrogateSettings
+
+    Returns
+    -------
+    proportional, equidistant : SurrogateProfile
+
+    Raises
+    ------
+    GeometryError
+        ``surrogate-empty`` where the slice has no labels, ``surrogate-loop`` where the ribbon
+        closes on itself, ``surrogate-short`` where the medial axis is no line.
+    """
+    cut = draw_slice(body, position, settings)
+    axis = _from_medial(body, cut, _medial_axis(cut, position, settings))
+    sides = _sides(cut, axis)
+    steps = np.linalg.norm(np.diff(axis, axis=0), axis=1) * settings.pixel
+    along = np.concatenate([[0.0], steps.cumsum()])
+    nodes = np.linspace(-sheet.x_extent, sheet.x_extent, sheet.x_nodes)
+    places = {
+        PROPORTIONAL: along[-1] * (nodes + 1) / 2,
+        EQUIDISTANT: np.arange(settings.step, along[-1], settings.step),
+    }
+    index = {
+        sampling: np.stack([np.interp(at, along, axis[:, k]) for k in (0, 1)], axis=1)
+        for sampling, at in places.items()
+    }
+    first, second = (
+        SurrogateProfile(
+            position=position,
+            sampling=sampling,
+            fraction=at / along[-1],
+            distance=at,
+            points=cut.to_ras(index[sampling]),
+            thickness=_wall(index[sampling], sides) * settings.pixel,
+        )
+        for sampling, at in places.items()
+    )
+    return first, second
+
+
+def draw_slice(body: Body, position: float, settings: SurrogateSettings) -> Slice:
+    """Draw the merged labels where a plane between the end planes cuts them.
+
+    The plane turns from the posterior to the anterior end plane as it moves along the body.
+
+    Parameters
+    ----------
+    body : Body
+    position : float
+        As in :func:`surrogate_profiles`.
+    settings : SurrogateSettings
+
+    Returns
+    -------
+    Slice
+
+    Raises
+    ------
+    GeometryError
+        ``surrogate-empty`` or ``surrogate-loop``.
+    """
+    ends, (_, points) = body.ends, body.inside_points()
+    normal = (1 - position) * ends.posterior_normal + position * ends.anterior_normal
+    height = (1 - position) * ends.height(points, "posterior")
+    height = height + position * ends.height(points, "anterior")
+    normal, height = normal / np.linalg.norm(normal), height / np.linalg.norm(normal)
+    near = np.abs(height) < 2 * ends.half_slice
+    if not near.any():
+        raise GeometryError(
+            f"no labels at {position:.0%} of the body's length: choose another slice",
+            reason="surrogate-empty",
+        )
+    flat = points[near] - height[near, None] * normal
+    across = np.eye(3)[np.abs(normal).argmin()]
+    first = np.cross(normal, across)
+    first /= np.linalg.norm(first)
+    directions = np.stack([first, np.cross(normal, first)])
+    margin = 2.0  # mm, so that smoothing and contours end inside
+    reach = flat @ directions.T
+    low, high = reach.min(axis=0) - margin, reach.max(axis=0) + margin
+    shape = np.ceil((high - low) / settings.pixel).astype(int)
+    origin = low @ directions + (flat[0] @ normal) * normal
+    steps = directions * settings.pixel
+    to_voxel = np.linalg.inv(body.affine)
+    values = ndimage.affine_transform(
+        (body.tissue > 0).astype(np.float64),
+        np.column_stack([to_voxel[:3, :3] @ steps.T, np.zeros(3)]),
+        to_voxel[:3, :3] @ origin + to_voxel[:3, 3],
+        output_shape=(*shape.tolist(), 1),
+        order=1,
+    )[..., 0]
+    sigma = settings.smoothing * in_plane_voxel(body.affine) / settings.pixel
+    values = ndimage.gaussian_filter(values, sigma)
+    return Slice(
+        values=values,
+        inside=_one_piece(values > 0.5, position, settings),  # noqa: PLR2004 -- half inside
+        origin=origin,
+        directions=steps,
+    )
+
+
+def _one_piece(inside: Bool, position: float, settings: SurrogateSettings) -> Bool:
+    """Take the largest piece, fill its small holes, and refuse others."""
+    pieces, _ = ndimage.label(inside)
+    if not inside.any():
+        raise GeometryError(
+            f"no labels at {position:.0%} of the body's length: choose another slice",
+            reason="surrogate-empty",
+        )
+    largest = pieces == np.bincount(pieces.ravel())[1:].argmax() + 1
+    # Pixels that touch by corners only separate inside, and connect outside.
+    outside, count = ndimage.label(~largest, structure=np.ones((3, 3)))
+    small = np.bincount(outside.ravel(), minlength=count + 1) * settings.pixel**2
+    hole = small < settings.hole_area
+    hole[0] = False
+    if count - hole.sum() > 1:
+        raise GeometryError(
+            f"the ribbon closes on itself at {position:.0%} of the body's length: choose another"
+            " slice, or look for a bridge there",
+            reason="surrogate-loop",
+        )
+    return np.asarray(largest | hole[outside])
+
+
+def _medial_axis(cut: Slice, position: float, settings: SurrogateSettings) -> Float:
+    """Longest path through the skeleton, smooth, and straight on to the rims: (N, 2) indices."""
+    skeleton = skeletonize(cut.inside)  # type: ignore[no-untyped-call]
+    pixels = np.argwhere(skeleton)
+    path = pixels[_longest_path(pixels)].astype(np.float64)
+    depth = ndimage.distance_transform_edt(cut.inside)
+    half = depth[tuple(path.astype(int).T)]
+    along = np.concatenate([[0.0], np.linalg.norm(np.diff(path, axis=0), axis=1).cumsum()])
+    middle = (along > 0.2 * along[-1]) & (along < 0.8 * along[-1])  # without forks
+    width = float(np.median(half[middle])) if middle.any() else 0.0
+    trim = settings.fork * width
+    kept = (along >= trim) & (along <= along[-1] - trim)
+    if along[-1] < 4 * trim or not width:
+        raise GeometryError(
+            f"the medial axis is no line at {position:.0%} of the body's length: choose another"
+            " slice, or look at its labels",
+            reason="surrogate-short",
+        )
+    sigma = settings.axis_smoothing / settings.pixel
+    smooth = ndimage.gaussian_filter1d(path, sigma, axis=0, mode="nearest")[kept]
+    back = min(max(int(2 * width), 2), len(smooth) - 1)
+    ends = (
+        _to_the_rim(cut, smooth[0], smooth[0] - smooth[back])[::-1],
+        _to_the_rim(cut, smooth[-1], smooth[-1] - smooth[-1 - back]),
+    )
+    return np.concatenate([ends[0], smooth, ends[1]])
+
+
+def _longest_path(pixels: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Order the pixels (N, 2) of the longest shortest path through a skeleton."""
+    pairs = cKDTree(pixels).query_pairs(1.5, output_type="ndarray")
+    length = np.linalg.norm(pixels[pairs[:, 0]] - pixels[pairs[:, 1]], axis=1)
+    graph = sparse.csr_matrix((length, pairs.T), shape=(len(pixels), len(pixels)))
+    # In a tree, what is farthest from anywhere is an end of the longest path.
+    start = int(dijkstra(graph, directed=False, indices=np.array([0]))[0].argmax())
+    from_start = dijkstra(graph, directed=False, indices=np.array([start]))[0]
+    from_end = dijkstra(graph, directed=False, indices=np.array([from_start.argmax()]))[0]
+    on_path = np.flatnonzero(from_start + from_end < from_start.max() + 1e-6)
+    return np.asarray(on_path[np.argsort(from_start[on_path], kind="stable")])
+
+
+def _to_the_rim(cut: Slice, start: Float, direction: Float) -> Float:
+    """Points (M, 2) straight on from an end of the axis until the slice ends."""
+    steps = np.arange(1, sum(cut.inside.shape))[:, None]
+    ray = start + steps * direction / np.linalg.norm(direction)
+    within = ndimage.map_coordinates(cut.inside.astype(np.uint8), ray.T, order=0) > 0
+    return np.asarray(ray[: int(np.argmin(within))])
+
+
+def _from_medial(body: Body, cut: Slice, axis: Float) -> Float:
+    """Turn the axis so that it runs from medial to lateral, by the labels along it."""
+    inverse = np.linalg.inv(body.affine)
+    index = cut.to_ras(axis) @ inverse[:3, :3].T + inverse[:3, 3]
+    labels = ndimage.map_coordinates(body.tissue, index.T, order=0)
+    known = np.flatnonzero(labels)
+    trend = float(((known - known.mean()) * labels[known]).sum()) if known.size else 0.0
+    return axis if trend >= 0 else axis[::-1]
+
+
+def _sides(cut: Slice, axis: Float) -> tuple[Float, Float]:
+    """Cut the contour at both rims: two lines of points, (M, 2) each."""
+    held = np.where(cut.inside, np.maximum(cut.values, 0.5 + 1e-6), np.minimum(cut.values, 0.5))
+    lines = find_contours(held, 0.5 + 5e-7)  # type: ignore[no-untyped-call]
+    contour = max(lines, key=len)[:-1]
+    first, second = (int(cKDTree(contour).query(end)[1]) for end in (axis[0], axis[-1]))
+    turned = np.roll(contour, -first, axis=0)
+    middle = (second - first) % len(contour)
+    return turned[: middle + 1], np.concatenate([turned[middle:], turned[:1]])
+
+
+def _wall(index: Float, sides: tuple[Float, Float]) -> Float:
+    """Add the distances (N,) from points to the closest points of both sides, pixels."""
+    return np.asarray(sum(cKDTree(side).query(index)[0] for side in sides))
