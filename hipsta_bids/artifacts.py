@@ -188,13 +188,14 @@ class HemisphereMaps:
     """All that the participant level measures in one hemisphere."""
 
     sheet: Sheet
-    thickness: Float
-    """(Nx, Ny) mm, wall to wall; NaN where undefined (as in the other maps)."""
-    curvature_interior: Float
-    """(Nx, Ny) mean curvature, 1/mm; positive where the sheet curls round its interior."""
-    curvature: Float
-    """(Nx, Ny) of the mid-surface."""
-    curvature_exterior: Float
+    layers: Sheet
+    """The columns of the sheet cut into layers; the same points unless depths are by volume."""
+    maps: Mapping[str, Float]
+    """(Nx, Ny) each, by name in the catalog of measures; NaN where undefined."""
+    profiles: Mapping[str, Mapping[str, Float]]
+    """The maps averaged: ``x`` over y, (Nx,) each, and ``y`` over x, (Ny,) each."""
+    sections: Mapping[str, Float]
+    """(Ny,) each, by name: one number per cross-section."""
     subfield: NDArray[np.uint8]
     """(Nx, Ny) values of Tissue."""
     repaired: Bool
@@ -213,10 +214,31 @@ class HemisphereMaps:
 
     def __post_init__(self) -> None:
         shape = self.sheet.points.shape[:2]
-        for name in ("thickness", "curvature_interior", "curvature", "curvature_exterior"):
-            _set(self, name, np.float64, shape)
+        wrong = [name for name, values in self.maps.items() if values.shape != shape]
+        if wrong:
+            raise ValueError(f"HemisphereMaps.maps: {wrong[0]} has not the sheet's shape {shape}")
         _set(self, "subfield", np.uint8, shape)
         _set(self, "repaired", np.bool_, shape)
+
+    @property
+    def thickness(self) -> Float:
+        """(Nx, Ny) mm, wall to wall."""
+        return self.maps["thickness"]
+
+    @property
+    def curvature(self) -> Float:
+        """(Nx, Ny) mean curvature of the mid-surface, 1/mm; positive round the interior."""
+        return self.maps["curvature"]
+
+    @property
+    def curvature_interior(self) -> Float:
+        """(Nx, Ny) the same of the interior surface."""
+        return self.maps["curvature_interior"]
+
+    @property
+    def curvature_exterior(self) -> Float:
+        """(Nx, Ny) the same of the exterior surface."""
+        return self.maps["curvature_exterior"]
 
     @property
     def status(self) -> Status:

@@ -21,6 +21,7 @@ from hipsta_bids.artifacts import (
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body, check_side, extract_body
 from hipsta_bids.geometry.boundaries import Boundaries, find_boundaries
+from hipsta_bids.geometry.catalog import measure_maps, measure_sections
 from hipsta_bids.geometry.checks import (
     check_end_labels,
     check_label_order,
@@ -31,17 +32,14 @@ from hipsta_bids.geometry.checks import (
 from hipsta_bids.geometry.coordinates import solve_coordinates
 from hipsta_bids.geometry.edited import check_mask
 from hipsta_bids.geometry.grid import in_plane_voxel, resample_body
-from hipsta_bids.geometry.measures import (
-    SheetMeasures,
-    bending_angle,
-    mean_curvature,
-    measure_thickness,
-    summarize,
-)
+from hipsta_bids.geometry.layers import check_layers, equal_volume_layers
+from hipsta_bids.geometry.measured import Measured, average_profiles
+from hipsta_bids.geometry.measures import bending_angle
 from hipsta_bids.geometry.neighbors import check_turned, is_turned
 from hipsta_bids.geometry.quality import Evidence, find_flags, quality_metrics
 from hipsta_bids.geometry.repaired import repaired_columns
 from hipsta_bids.geometry.sheet import folded_fraction, label_sheet, sample_sheet, whole_body
+from hipsta_bids.geometry.summary import summarize
 from hipsta_bids.geometry.surface import extract_surface, signed_volume
 from hipsta_bids.geometry.tetra import tetrahedralize
 from hipsta_bids.geometry.topology import SolidField, repair_topology
@@ -117,36 +115,36 @@ def measure_hemisphere(
         folded=folded_fraction(mesh, coordinates),
     )
     with clock("measures"):
-        thickness = measure_thickness(sheet)
+        measured = Measured(
+            sheet=sheet,
+            subfield=subfield,
+            whole=whole,
+            whole_subfield=label_sheet(whole, body),
+            volume=signed_volume(surface.vertices, surface.triangles),
+            settings=settings,
+        )
         doubts = check_end_labels(volume, body, settings.checks)
-        doubts += check_thickness(thickness, boundaries.sheet_thickness, settings.checks)
+        doubts += check_thickness(measured.thickness, boundaries.sheet_thickness, settings.checks)
         doubts += check_turned(sheet, hemi) if body.region == "extended" else []
         doubts += _mask_doubts(volume, body, settings)
         repaired = repaired_columns(sheet, solid, settings.measures)
+        layers, folds = _layers(sheet, settings)
+        maps = measure_maps(measured)
         return HemisphereMaps(
             sheet=sheet,
-            thickness=thickness,
-            curvature_interior=mean_curvature(sheet, 0, settings.measures),
-            curvature=mean_curvature(sheet, sheet.middle, settings.measures),
-            curvature_exterior=mean_curvature(sheet, -1, settings.measures),
+            layers=layers,
+            maps=maps,
+            profiles=average_profiles(maps, sheet),
+            sections=measure_sections(measured),
             subfield=subfield,
             repaired=repaired,
             body_mask=volume.in_file(body.inside),
-            summary=summarize(
-                SheetMeasures(sheet=sheet, thickness=thickness, subfield=subfield),
-                SheetMeasures(
-                    sheet=whole,
-                    thickness=measure_thickness(whole),
-                    subfield=label_sheet(whole, body),
-                ),
-                for_region(volume.scheme, body.region).sheet,
-                signed_volume(surface.vertices, surface.triangles),
-            ),
+            summary=summarize(measured, for_region(volume.scheme, body.region).sheet),
             qc=quality_metrics(evidence)
             | {"repaired_fraction": float(repaired.mean())}
             | ({"mask_change": asdict(body.mask_change)} if body.mask_change else {}),
             repairs=tuple(map(str, solid.repairs)),
-            flags=(*doubts, *find_flags(evidence, settings)),
+            flags=(*doubts, *find_flags(evidence, settings), *folds),
             mesh=mesh,
             coordinates=coordinates,
         )
@@ -192,6 +190,14 @@ def _filled(
                 solid.field, replace(settings.surface, taubin_iterations=steps)
             )
     return surface, tetrahedralize(surface, settings.tetra), settings.surface.untangle_tries
+
+
+def _layers(sheet: Sheet, settings: Settings) -> tuple[Sheet, list[Flag]]:
+    """Space layers as the settings say, and flag where that cannot be."""
+    if settings.sheet.depths == "distance":
+        return sheet, []
+    layers, folded = equal_volume_layers(sheet)
+    return layers, check_layers(folded)
 
 
 def _turned(

@@ -21,6 +21,8 @@ from hipsta_bids.artifacts import (
 from hipsta_bids.bids.inputs import HemisphereInput
 from hipsta_bids.bids.names import HemisphereName
 from hipsta_bids.errors import GeometryError, InputError
+from hipsta_bids.geometry.catalog import MAPS, SECTIONS
+from hipsta_bids.geometry.measured import average_profiles
 from hipsta_bids.job import run_job
 from hipsta_bids.schemes import Label, Part, Scheme, Tissue
 
@@ -67,12 +69,20 @@ def make_maps(*, hemi="L", flags=(), repairs=(), holes=(), repaired=()):
     for i, j in repaired:
         touched[i, j] = True
     subfield = np.repeat([[t] for t in np.resize(TISSUES, NX)], NY, axis=1)
+    sheet = Sheet(points=points, valid=valid)
+    maps = {row.name: np.full((NX, NY), 0.1 * k) for k, row in enumerate(MAPS)}
+    maps |= {
+        "thickness": thickness,
+        "curvature_interior": np.full((NX, NY), 0.2),
+        "curvature": np.full((NX, NY), 0.1),
+        "curvature_exterior": np.full((NX, NY), -1e-9),
+    }
     return HemisphereMaps(
-        sheet=Sheet(points=points, valid=valid),
-        thickness=thickness,
-        curvature_interior=np.full((NX, NY), 0.2),
-        curvature=np.full((NX, NY), 0.1),
-        curvature_exterior=np.full((NX, NY), -1e-9),
+        sheet=sheet,
+        layers=sheet,
+        maps=maps,
+        profiles=average_profiles(maps, sheet),
+        sections={row.name: np.arange(NY) + k for k, row in enumerate(SECTIONS)},
         subfield=subfield,
         repaired=touched,
         body_mask=BodyMask(inside=np.eye(3)[None] > 0, affine=np.diag([0.4, 0.5, 2.0, 1.0])),

@@ -7,6 +7,8 @@ has no rule for is listed in ``.bidsignore`` from the same table.
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 
+from hipsta_bids.geometry.catalog import MAPS
+
 
 @dataclass(frozen=True, kw_only=True)
 class HemisphereName:
@@ -74,7 +76,7 @@ OUTPUTS: tuple[Output, ...] = (
         desc="sheet",
         suffix="morph",
         extension=".tsv",
-        description="one row per sheet point: position, thickness, curvatures, subfield",
+        description="one row per sheet point: position, thickness, curvatures, extents, subfield",
     ),
     Output(
         key="sheet_sidecar",
@@ -88,7 +90,8 @@ OUTPUTS: tuple[Output, ...] = (
         desc="summary",
         suffix="morph",
         extension=".tsv",
-        description="one row: mean thickness, extents, volume, areas, and the same per subfield",
+        description="one row: means of thickness, curvatures and cross-sections, extents, volume,"
+        " areas and their ratios; some per subfield",
     ),
     Output(
         key="summary_sidecar",
@@ -96,6 +99,25 @@ OUTPUTS: tuple[Output, ...] = (
         suffix="morph",
         extension=".json",
         description="columns, units and definitions of the summary table",
+    ),
+    *(
+        row
+        for table, description in (
+            ("profile", "means along the sheet: one row per x (over y), then one per y (over x)"),
+            ("sections", "one row per cross-section: lengths, area, ratio, shape index"),
+        )
+        for row in (
+            Output(
+                key=table, desc=table, suffix="morph", extension=".tsv", description=description
+            ),
+            Output(
+                key=f"{table}_sidecar",
+                desc=table,
+                suffix="morph",
+                extension=".json",
+                description=f"columns, units and definitions of the {table} table",
+            ),
+        )
     ),
     *(
         Output(
@@ -116,17 +138,15 @@ OUTPUTS: tuple[Output, ...] = (
         )
         for name in _SURFACES
     ),
-    Output(
-        key="thickness",
-        suffix="thickness",
-        extension=".shape.gii",
-        description="thickness per surface vertex, mm",
-    ),
-    Output(
-        key="curvature",
-        suffix="curv",
-        extension=".shape.gii",
-        description="mean curvature of the mid-surface per vertex, 1/mm",
+    *(
+        Output(
+            key=row.name,
+            desc=row.desc,
+            suffix=row.suffix,
+            extension=".shape.gii",
+            description=f"{row.definition}; per surface vertex, {row.unit}",
+        )
+        for row in MAPS
     ),
     Output(
         key="subfields",
@@ -141,6 +161,23 @@ OUTPUTS: tuple[Output, ...] = (
         suffix="mask",
         extension=".nii.gz",
         description="the measured body on the grid of the labels; edit a copy to correct it",
+    ),
+    Output(
+        key="layers",
+        desc="layers",
+        suffix="morph",
+        extension=".tsv",
+        description="one row per point of the three-dimensional grid: layer, depth, position"
+        " (`--write-meshes`)",
+        optional=True,
+    ),
+    Output(
+        key="layers_sidecar",
+        desc="layers",
+        suffix="morph",
+        extension=".json",
+        description="columns, units and definitions of the layers table (`--write-meshes`)",
+        optional=True,
     ),
     Output(
         key="mesh",

@@ -20,6 +20,7 @@ from hipsta_bids.bids.names import (
     output_path,
 )
 from hipsta_bids.errors import HipstaError
+from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.schemes import Scheme
 
 #: Workbench's word for a surface, where it has one that fits.
@@ -97,10 +98,13 @@ def write_results(
     remove_results(place)
     tables.write_sheet(place.path("sheet"), place.path("sheet_sidecar"), maps, scheme)
     tables.write_summary(place.path("summary"), place.path("summary_sidecar"), maps.summary)
+    tables.write_profile(place.path("profile"), place.path("profile_sidecar"), maps)
+    tables.write_sections(place.path("sections"), place.path("sections_sidecar"), maps.sections)
     for key, content in gifti_files(maps, scheme, place.name.hemi):
         files.write_bytes(place.path(key), content)
     files.write_bytes(place.path("body_mask"), masks.mask_bytes(maps.body_mask))
     if write_meshes:
+        tables.write_layers(place.path("layers"), place.path("layers_sidecar"), maps.layers)
         from hipsta_bids.bids.meshes import mesh_bytes  # noqa: PLC0415  (meshio is slow to load)
 
         files.write_bytes(place.path("mesh"), mesh_bytes(maps.mesh, maps.coordinates))
@@ -221,14 +225,9 @@ def gifti_files(maps: HemisphereMaps, scheme: Scheme, hemi: str) -> Iterator[tup
                 unfolded=True,
             ),
         )
-    yield (
-        "thickness",
-        gifti.shape_bytes(maps.thickness.ravel(), hemi=hemi, name="thickness", unit="mm"),
-    )
-    yield (
-        "curvature",
-        gifti.shape_bytes(maps.curvature.ravel(), hemi=hemi, name="curvature", unit="1/mm"),
-    )
+    for row in MAPS:
+        values = maps.maps[row.name].ravel()
+        yield row.name, gifti.shape_bytes(values, hemi=hemi, name=row.name, unit=row.unit)
     table = {
         int(tissue): (label.name, label.color)
         for tissue, label in tables.sheet_labels(scheme).items()

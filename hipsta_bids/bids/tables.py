@@ -1,51 +1,61 @@
-"""The tables of one hemisphere and their sidecars: columns, units, definitions, formats."""
+"""The tables of one hemisphere and their sidecars: columns, units, definitions, formats.
 
-from collections.abc import Mapping
+Columns of measures come from the catalog of measures; here are those that say where a row is.
+"""
+
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from hipsta_bids.artifacts import Bool, Float, HemisphereMaps
+from hipsta_bids.artifacts import Bool, Float, HemisphereMaps, Sheet
 from hipsta_bids.bids import files
+from hipsta_bids.geometry.catalog import MAPS, SECTIONS, Column
+from hipsta_bids.geometry.layers import layer_depth
+from hipsta_bids.geometry.summary import PER_SUBFIELD, SUMMARY
 from hipsta_bids.schemes import Label, Part, Scheme, Tissue
 
-#: Columns of the sheet table: definition and unit.
-SHEET_COLUMNS: dict[str, tuple[str, str | None]] = {
+_NODES: dict[str, tuple[str, str | None]] = {
     "x": ("node number along x, 1 at the medial end (subiculum)", None),
     "y": ("node number along y, 1 at the posterior end", None),
+}
+
+#: Columns of the sheet table that are no measures: definition and unit.
+_PLACE: dict[str, tuple[str, str | None]] = {
     "r": ("position on the mid-surface, scanner RAS, left to right", "mm"),
     "a": ("position on the mid-surface, scanner RAS, posterior to anterior", "mm"),
     "s": ("position on the mid-surface, scanner RAS, inferior to superior", "mm"),
-    "thickness": ("length of the line from the interior to the exterior wall", "mm"),
-    "curvature": ("mean curvature of the mid-surface, positive round the interior", "1/mm"),
-    "curvature_interior": ("mean curvature of the interior surface, sign as above", "1/mm"),
-    "curvature_exterior": ("mean curvature of the exterior surface, sign as above", "1/mm"),
+}
+_STATE: dict[str, tuple[str, str | None]] = {
     "subfield": ("subfield at the mid-surface", None),
     "valid": ("true where measured directly, false where filled or missing", None),
     "repaired": ("true where a repair of the labels' topology touched the column", None),
 }
 
-#: Columns of the summary table that every hemisphere has.
-SUMMARY_COLUMNS: dict[str, tuple[str, str]] = {
-    "thickness_mean": ("mean thickness over the sheet", "mm"),
-    "extent_x": ("mean extent of the sheet from medial to lateral, along the sheet", "mm"),
-    "extent_y": ("mean extent of the sheet from posterior to anterior, along the sheet", "mm"),
-    "extent_z": ("mean extent of the sheet from interior to exterior", "mm"),
-    "volume": ("volume of the sheet", "mm^3"),
-    "area_interior": ("area of the interior surface", "mm^2"),
-    "area_mid": ("area of the mid-surface", "mm^2"),
-    "area_exterior": ("area of the exterior surface", "mm^2"),
+#: Columns of each table, in order.
+SHEET_COLUMNS = (*_NODES, *_PLACE, *(row.name for row in MAPS), *_STATE)
+SUMMARY_COLUMNS = tuple(row.name for row in SUMMARY)
+PROFILE_COLUMNS = ("axis", "node", *(row.name for row in MAPS))
+SECTION_COLUMNS = ("y", *(row.name for row in SECTIONS))
+
+_LAYERS: dict[str, tuple[str, str | None]] = {
+    **_NODES,
+    "layer": ("number of the layer, 1 on the interior and the last on the exterior wall", None),
+    "depth": ("distance from the interior wall along the column", "mm"),
+    "relative_depth": ("the same over the length of the column", None),
+    **{
+        axis: (definition.replace("on the mid-surface", "of the point"), unit)
+        for axis, (definition, unit) in _PLACE.items()
+    },
 }
 
-#: Columns of the summary table per subfield.
-SUBFIELD_COLUMNS: dict[str, tuple[str, str]] = {
-    "thickness_mean": ("mean thickness over the part of the sheet in {}", "mm"),
-    "area": ("area of the mid-surface in {}", "mm^2"),
-    "volume": ("volume of the sheet in {}", "mm^3"),
-}
+#: What all of these tables are about, whatever the columns.
+MEASURED_REGION = (
+    "the sheet between the two end planes of the hippocampal body; head and tail are not measured"
+    " and not part of any number"
+)
 
 _MILLIMETER_DIGITS = 4
-_CURVATURE_DIGITS = 5
 
 
 def sheet_labels(scheme: Scheme) -> dict[Tissue, Label]:
@@ -119,11 +129,7 @@ def write_sheet(table: Path, sidecar: Path, maps: HemisphereMaps, scheme: Scheme
             axis: format_column(middle[:, k], _MILLIMETER_DIGITS)
             for k, axis in enumerate(("r", "a", "s"))
         },
-        "thickness": format_column(maps.thickness, _MILLIMETER_DIGITS),
-        **{
-            name: format_column(getattr(maps, name), _CURVATURE_DIGITS)
-            for name in ("curvature", "curvature_interior", "curvature_exterior")
-        },
+        **_formatted(MAPS, maps.maps),
         "subfield": [short.get(code, files.MISSING) for code in maps.subfield.ravel().tolist()],
         "valid": _truths(maps.sheet.valid),
         "repaired": _truths(maps.repaired),
@@ -134,11 +140,12 @@ def write_sheet(table: Path, sidecar: Path, maps: HemisphereMaps, scheme: Scheme
         list(SHEET_COLUMNS),
         zip(*(columns[name] for name in SHEET_COLUMNS), strict=True),
     )
-    definitions = {name: _definition(*entry) for name, entry in SHEET_COLUMNS.items()}
+    definitions = _definitions(_NODES) | _definitions(_PLACE)
+    definitions |= {row.name: _measure(row) for row in MAPS} | _definitions(_STATE)
     definitions["subfield"]["Levels"] = {
         label.abbreviation: label.name for label in labels.values()
     }
-    files.write_json(sidecar, definitions)
+    _write_sidecar(sidecar, definitions)
 
 
 def write_summary(table: Path, sidecar: Path, summary: Mapping[str, float]) -> None:
@@ -156,18 +163,119 @@ def write_summary(table: Path, sidecar: Path, summary: Mapping[str, float]) -> N
     OutputError
         If a file cannot be written.
     """
-    definitions = {name: _definition(*entry) for name, entry in SUMMARY_COLUMNS.items()}
+    definitions = {row.name: _measure(row) for row in SUMMARY}
+    digits = {row.name: row.digits for row in SUMMARY}
     definitions |= {name: _subfield_definition(name) for name in summary if name not in definitions}
     cells = [
-        format_column(np.array([summary.get(name, np.nan)], dtype=np.float64), _MILLIMETER_DIGITS)
+        format_column(
+            np.array([summary.get(name, np.nan)], dtype=np.float64),
+            digits.get(name, _MILLIMETER_DIGITS),
+        )
         for name in definitions
     ]
     files.write_tsv(table, list(definitions), [[cell[0] for cell in cells]])
-    files.write_json(sidecar, definitions)
+    _write_sidecar(sidecar, definitions)
+
+
+def write_profile(table: Path, sidecar: Path, maps: HemisphereMaps) -> None:
+    """Write the profile table, first along x and then along y, and its sidecar.
+
+    Parameters
+    ----------
+    table, sidecar : Path
+        The ``.tsv`` and ``.json`` files.
+    maps : HemisphereMaps
+        What was measured.
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written.
+    """
+    rows: list[tuple[str, ...]] = []
+    for axis, profile in maps.profiles.items():
+        columns = _formatted(MAPS, profile)
+        nodes = [str(k + 1) for k in range(len(columns[MAPS[0].name]))]
+        rows += zip([axis] * len(nodes), nodes, *columns.values(), strict=True)
+    files.write_tsv(table, list(PROFILE_COLUMNS), rows)
+    definitions: dict[str, dict[str, object]] = {
+        "axis": {
+            "Description": "axis along which the profile runs; the other one is averaged over",
+            "Levels": {
+                "x": "one row per x from medial to lateral, mean over y",
+                "y": "one row per y from posterior to anterior, mean over x",
+            },
+        },
+        "node": _definition("node number along that axis, from 1", None),
+    }
+    for row in MAPS:
+        definitions[row.name] = _measure(row, "{}; mean over the columns measured directly")
+    _write_sidecar(sidecar, definitions)
+
+
+def write_sections(table: Path, sidecar: Path, sections: Mapping[str, Float]) -> None:
+    """Write the table of cross-sections, from posterior to anterior, and its sidecar.
+
+    Parameters
+    ----------
+    table, sidecar : Path
+        The ``.tsv`` and ``.json`` files.
+    sections : mapping of str to (Ny,) float64
+        What was measured, by the names in the catalog.
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written.
+    """
+    columns = _formatted(SECTIONS, sections)
+    nodes = [str(k + 1) for k in range(len(columns[SECTIONS[0].name]))]
+    files.write_tsv(table, list(SECTION_COLUMNS), zip(nodes, *columns.values(), strict=True))
+    definitions = {
+        "y": _definition("number of the section, from the posterior to the anterior end", None)
+    }
+    _write_sidecar(sidecar, definitions | {row.name: _measure(row) for row in SECTIONS})
+
+
+def write_layers(table: Path, sidecar: Path, layers: Sheet) -> None:
+    """Write all points of the three-dimensional grid, layers fastest, and the table's sidecar.
+
+    Parameters
+    ----------
+    table, sidecar : Path
+        The ``.tsv`` and ``.json`` files.
+    layers : Sheet
+        The points, layer by layer.
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written.
+    """
+    depth = layer_depth(layers)
+    length = np.where(depth[:, :, -1:] > 0, depth[:, :, -1:], np.nan)
+    x, y, layer = (index.ravel() + 1 for index in np.indices(depth.shape))
+    columns = [
+        *([str(k) for k in index.tolist()] for index in (x, y, layer)),
+        format_column(depth, _MILLIMETER_DIGITS),
+        format_column(depth / length, _MILLIMETER_DIGITS),
+        *(format_column(layers.points[..., k], _MILLIMETER_DIGITS) for k in range(3)),
+    ]
+    files.write_tsv(table, list(_LAYERS), zip(*columns, strict=True))
+    _write_sidecar(sidecar, _definitions(_LAYERS))
 
 
 def _truths(values: Bool) -> list[str]:
     return ["true" if value else "false" for value in values.ravel().tolist()]
+
+
+def _formatted(rows: Sequence[Column], values: Mapping[str, Float]) -> dict[str, list[str]]:
+    """Format columns in the catalog's order, each with its own number of decimals."""
+    return {row.name: format_column(values[row.name], row.digits) for row in rows}
+
+
+def _write_sidecar(path: Path, definitions: Mapping[str, object]) -> None:
+    files.write_json(path, {**definitions, "MeasuredRegion": MEASURED_REGION})
 
 
 def _definition(description: str, unit: str | None) -> dict[str, object]:
@@ -175,9 +283,23 @@ def _definition(description: str, unit: str | None) -> dict[str, object]:
     return definition | ({"Units": unit} if unit else {})
 
 
+def _definitions(entries: Mapping[str, tuple[str, str | None]]) -> dict[str, dict[str, object]]:
+    return {name: _definition(*entry) for name, entry in entries.items()}
+
+
+def _measure(row: Column, wording: str = "{}") -> dict[str, object]:
+    """Define the column of a measure, with where its formula comes from."""
+    return {
+        "Description": wording.format(row.definition),
+        "Units": row.unit,
+        "Source": row.source,
+    }
+
+
 def _subfield_definition(column: str) -> dict[str, object]:
     """Define a per-subfield column from its prefix; the rest of its name is the subfield."""
-    for prefix, (description, unit) in SUBFIELD_COLUMNS.items():
-        if column.startswith(f"{prefix}_"):
-            return _definition(description.format(column.removeprefix(f"{prefix}_")), unit)
+    for row in PER_SUBFIELD:
+        if column.startswith(f"{row.name}_"):
+            subfield = column.removeprefix(f"{row.name}_")
+            return _measure(row) | {"Description": row.definition.format(subfield)}
     return _definition(column.replace("_", " "), None)

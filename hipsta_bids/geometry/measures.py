@@ -1,13 +1,9 @@
-"""Thickness, curvature, extents and areas of a sheet."""
-
-from dataclasses import dataclass
+"""Thickness, curvature, areas and volumes of a sheet, point by point."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hipsta_bids.artifacts import Float, Sheet
 from hipsta_bids.geometry.local_polynomials import differentiate
-from hipsta_bids.schemes import Tissue
 from hipsta_bids.settings import MeasureSettings
 
 
@@ -43,19 +39,36 @@ def mean_curvature(sheet: Sheet, level: int, settings: MeasureSettings) -> Float
     Geometry of Curves and Surfaces, section 3.3; smoothing differentiation by Savitzky & Golay
     1964, Anal Chem 36:1627-1639).
     """
-    points = sheet.points[:, :, level]
-    outward = sheet.points[:, :, -1] - sheet.points[:, :, 0]
-    du = _derivative(points, settings, (1, 0))
-    dv = _derivative(points, settings, (0, 1))
-    duu = _derivative(points, settings, (2, 0))
-    dvv = _derivative(points, settings, (0, 2))
-    duv = _derivative(points, settings, (1, 1))
-    normal = np.cross(du, dv)
-    normal *= -np.sign((normal * outward).sum(axis=-1, keepdims=True))  # towards the interior
-    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    e, f, g = ((p * q).sum(axis=-1) for p, q in ((du, du), (du, dv), (dv, dv)))
-    l, m, n = ((p * normal).sum(axis=-1) for p in (duu, duv, dvv))  # noqa: E741 -- textbook names
-    return np.asarray((e * n - 2 * f * m + g * l) / (2 * (e * g - f**2)))
+    windows = (settings.curvature_window, settings.curvature_window)
+    low, high = _principal_curvatures(sheet, level, windows, settings)
+    return (low + high) / 2
+
+
+def gaussian_curvature(sheet: Sheet, level: int, settings: MeasureSettings) -> Float:
+    """Gaussian curvature of one layer of the sheet, (Nx, Ny), 1/mm2.
+
+    Zero where the layer could be laid flat without stretching; positive where it is a bowl or a
+    dome, negative where it is a saddle. It does not depend on which side is interior.
+
+    Parameters
+    ----------
+    sheet : Sheet
+    level : int
+        Number of the layer along z.
+    settings : MeasureSettings
+
+    Returns
+    -------
+    (Nx, Ny) array
+
+    Notes
+    -----
+    As in :func:`mean_curvature`, but with longer windows along y: noise in the small curvature
+    along the axis is multiplied by the large one across it.
+    """
+    windows = (settings.curvature_window, settings.gaussian_window)
+    low, high = _principal_curvatures(sheet, level, windows, settings)
+    return low * high
 
 
 def bending_angle(sheet: Sheet, settings: MeasureSettings) -> float:
@@ -65,8 +78,9 @@ def bending_angle(sheet: Sheet, settings: MeasureSettings) -> float:
     """
     mid = sheet.points[:, :, sheet.middle]
     outward = sheet.points[:, :, -1] - sheet.points[:, :, 0]
-    du = _derivative(mid, settings, (1, 0))
-    duu = _derivative(mid, settings, (2, 0))
+    windows = (settings.curvature_window, settings.curvature_window)
+    du = _derivative(mid, windows, settings.curvature_order, (1, 0))
+    duu = _derivative(mid, windows, settings.curvature_order, (2, 0))
     outward = outward / np.linalg.norm(outward, axis=-1, keepdims=True)
     speed = np.linalg.norm(du, axis=-1)
     bend = -(duu * outward).sum(axis=-1) / speed  # curvature times step length
@@ -98,68 +112,37 @@ def node_shares(cells: Float) -> Float:
     return shares
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class SheetMeasures:
-    """A sheet with what was measured on it."""
+def _principal_curvatures(
+    sheet: Sheet, level: int, windows: tuple[int, int], settings: MeasureSettings
+) -> tuple[Float, Float]:
+    """Both principal curvatures (Nx, Ny), 1/mm, for the normal that points to the interior.
 
-    sheet: Sheet
-    thickness: Float
-    """(Nx, Ny) mm."""
-    subfield: NDArray[np.uint8]
-    """(Nx, Ny) values of Tissue."""
-
-
-def summarize(
-    measured: SheetMeasures, whole: SheetMeasures, tissues: tuple[Tissue, ...], volume: float
-) -> dict[str, float]:
-    """One number per measure for the whole body and per subfield.
-
-    Parameters
-    ----------
-    measured : SheetMeasures
-        Where thickness is measured.
-    whole : SheetMeasures
-        The same body from rim to rim, end to end and wall to wall, for lengths, areas and volumes.
-    tissues : tuple of Tissue
-        The subfields of the protocol; absent ones are NaN.
-    volume : float
-        Of the mesh, mm3.
-
-    Returns
-    -------
-    dict
-        Keys as in the output table: thickness and extents in mm, areas in mm2, volumes in mm3.
+    They are bounded: where lines of the sheet meet or turn back, next to rims and ends, the
+    formulas divide by nearly zero.
     """
-    points, valid = whole.sheet.points, measured.sheet.valid
-    mid = points[:, :, whole.sheet.middle]
-    mid_area = node_shares(layer_area(mid))
-    columns = column_volume(whole.sheet)
-    summary = {
-        "thickness_mean": float(measured.thickness[valid].mean()),
-        "extent_x": float(np.linalg.norm(np.diff(mid, axis=0), axis=-1).sum(axis=0).mean()),
-        "extent_y": float(np.linalg.norm(np.diff(mid, axis=1), axis=-1).sum(axis=1).mean()),
-        "extent_z": float(measured.thickness.mean()),
-        "volume": volume,
-        "area_interior": float(layer_area(points[:, :, 0]).sum()),
-        "area_mid": float(mid_area.sum()),
-        "area_exterior": float(layer_area(points[:, :, -1]).sum()),
-    }
-    parts = (
-        ("thickness_mean", measured.subfield[valid], measured.thickness[valid], np.mean),
-        ("area", whole.subfield, mid_area, np.sum),
-        ("volume", whole.subfield, columns, np.sum),
+    degree, bound = settings.curvature_order, settings.max_curvature
+    points = sheet.points[:, :, level]
+    outward = sheet.points[:, :, -1] - sheet.points[:, :, 0]
+    du, dv, duu, duv, dvv = (
+        _derivative(points, windows, degree, order)
+        for order in ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
     )
-    for name, labels, values, merge in parts:
-        for tissue in tissues:
-            here = values[labels == tissue]
-            summary[f"{name}_{tissue.name}"] = float(merge(here)) if here.size else float("nan")
-    return summary
+    normal = np.cross(du, dv)
+    normal *= -np.sign((normal * outward).sum(axis=-1, keepdims=True))
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    e, f, g = ((p * q).sum(axis=-1) for p, q in ((du, du), (du, dv), (dv, dv)))
+    l, m, n = ((p * normal).sum(axis=-1) for p in (duu, duv, dvv))  # noqa: E741 -- textbook names
+    area = e * g - f**2
+    mean = (e * n - 2 * f * m + g * l) / (2 * area)
+    spread = np.sqrt(np.maximum(mean**2 - (l * n - m**2) / area, 0))
+    return np.clip(mean - spread, -bound, bound), np.clip(mean + spread, -bound, bound)
 
 
-def _derivative(points: Float, settings: MeasureSettings, order: tuple[int, int]) -> Float:
+def _derivative(
+    points: Float, windows: tuple[int, int], degree: int, order: tuple[int, int]
+) -> Float:
     """Smoothed partial derivative with respect to the node numbers."""
     for axis, times in enumerate(order):
-        window = min(settings.curvature_window, points.shape[axis] - 1 + points.shape[axis] % 2)
-        degree = min(settings.curvature_order, window - 1)
-        points = differentiate(points, window, degree, times, axis)
+        window = min(windows[axis], points.shape[axis] - 1 + points.shape[axis] % 2)
+        points = differentiate(points, window, min(degree, window - 1), times, axis)
     return points

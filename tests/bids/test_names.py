@@ -29,6 +29,11 @@ FULL = HemisphereName(subject="01", session="02", hemi="R", seg="freesurfer")
         ),
         ("thickness", "sub-01_ses-02_hemi-R_seg-freesurfer_thickness.shape.gii"),
         ("curvature", "sub-01_ses-02_hemi-R_seg-freesurfer_curv.shape.gii"),
+        (
+            "gaussian_curvature_interior",
+            "sub-01_ses-02_hemi-R_seg-freesurfer_desc-gaussianInterior_curv.shape.gii",
+        ),
+        ("sections", "sub-01_ses-02_hemi-R_seg-freesurfer_desc-sections_morph.tsv"),
         ("subfields", "sub-01_ses-02_hemi-R_seg-freesurfer_dseg.label.gii"),
         ("mesh", "sub-01_ses-02_hemi-R_seg-freesurfer_desc-tet_mesh.vtu"),
     ],

@@ -21,6 +21,7 @@ from hipsta_bids.bids.results import (
 )
 from hipsta_bids.bids.tables import SHEET_COLUMNS, SUMMARY_COLUMNS, format_column
 from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry.catalog import DIERS, MAPS, SECTIONS
 
 HOLE = (2, 1)
 ROW = HOLE[0] * NY + HOLE[1]
@@ -86,17 +87,66 @@ def test_missing_is_spelled_and_zero_has_no_sign(written):
 
 def test_sidecars_define_every_column(written):
     place, _ = written
-    for key in ("sheet", "summary"):
+    for key in ("sheet", "summary", "profile", "sections", "layers"):
         columns = place.path(key).read_text().splitlines()[0].split("\t")
-        definitions = json.loads(place.path(f"{key}_sidecar").read_text())
+        definitions = sidecar(place, key)
+        assert "head and tail are not measured" in definitions.pop("MeasuredRegion")
         assert list(definitions) == columns
         assert all(entry["Description"] for entry in definitions.values())
-    assert definitions["volume"]["Units"] == "mm^3"
-    assert definitions["area_CA1"] == {
+
+
+def test_every_measure_has_a_unit_and_a_source(written):
+    place, _ = written
+    for key, rows in (("sheet", MAPS), ("profile", MAPS), ("sections", SECTIONS)):
+        for row in rows:
+            definition = sidecar(place, key)[row.name]
+            assert definition["Units"] == row.unit
+            assert definition["Source"] == row.source
+    summary = sidecar(place, "summary")
+    assert summary["surface_volume_ratio"]["Units"] == "1/mm"
+    assert summary["area_CA1"] == {
         "Description": "area of the mid-surface in CA1",
         "Units": "mm^2",
+        "Source": DIERS,
     }
-    assert definitions["thickness_mean_CA1"]["Units"] == "mm"
+    assert summary["thickness_mean_CA1"]["Units"] == "mm"
+
+
+def sidecar(place, key):
+    return json.loads(place.path(f"{key}_sidecar").read_text())
+
+
+def test_profile_table(written):
+    place, maps = written
+    table = pd.read_csv(place.path("profile"), sep="\t")
+    assert table.axis.tolist() == ["x"] * NX + ["y"] * NY
+    assert table.node.tolist() == [*range(1, NX + 1), *range(1, NY + 1)]
+    # The mean leaves the hole out; half a unit of the last of four decimals.
+    np.testing.assert_allclose(table.thickness, THICKNESS, atol=5e-5)
+    for row in MAPS:
+        values = [*maps.profiles["x"][row.name], *maps.profiles["y"][row.name]]
+        np.testing.assert_allclose(table[row.name], values, atol=0.51 * 10.0**-row.digits)
+
+
+def test_sections_table(written):
+    place, maps = written
+    table = pd.read_csv(place.path("sections"), sep="\t")
+    assert list(table.columns) == ["y", *(row.name for row in SECTIONS)]
+    assert table.y.tolist() == list(range(1, NY + 1))
+    for row in SECTIONS:
+        np.testing.assert_allclose(table[row.name], maps.sections[row.name], atol=5e-5)
+
+
+def test_layers_table(written):
+    place, maps = written
+    table = pd.read_csv(place.path("layers"), sep="\t")
+    assert len(table) == NX * NY * 3
+    assert table.layer.tolist() == [1, 2, 3] * (NX * NY)
+    points = maps.layers.points.reshape(-1, 3)
+    np.testing.assert_allclose(table[["r", "a", "s"]], points, atol=5e-5)
+    whole = table[(table.x != HOLE[0] + 1) | (table.y != HOLE[1] + 1)]
+    assert sorted(set(whole.depth)) == [0, THICKNESS / 2, THICKNESS]
+    assert sorted(set(whole.relative_depth)) == [0, 0.5, 1]
 
 
 def test_sidecar_says_what_subfields_are(written):
@@ -182,8 +232,10 @@ def test_maps_load_on_the_surface(written):
     thickness = load_surf_data(str(place.path("thickness")))
     np.testing.assert_array_equal(thickness, maps.thickness.ravel().astype(np.float32))
     assert np.isnan(thickness[ROW])
-    curvature = load_surf_data(str(place.path("curvature")))
-    np.testing.assert_array_equal(curvature, maps.curvature.ravel().astype(np.float32))
+    for row in MAPS:
+        values = load_surf_data(str(place.path(row.name)))
+        np.testing.assert_array_equal(values, maps.maps[row.name].ravel().astype(np.float32))
+        assert nib.load(place.path(row.name)).darrays[0].meta["Units"] == row.unit
 
 
 def test_labels_load_with_names_and_colors(written):

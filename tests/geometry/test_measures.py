@@ -1,75 +1,25 @@
-"""Thickness, curvature, areas and volumes of grids whose measures are known."""
+"""Thickness, curvatures, areas and volumes of grids whose measures are known."""
 
 import numpy as np
 import pytest
 from geometry_cases import rigid
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sheet_cases import grid, plates, quadric, saddle, sheet_of, shell, tube
 
-from hipsta_bids.artifacts import Sheet
 from hipsta_bids.geometry.measures import (
-    SheetMeasures,
     bending_angle,
     column_volume,
+    gaussian_curvature,
     layer_area,
     mean_curvature,
     measure_thickness,
     node_shares,
-    summarize,
 )
-from hipsta_bids.schemes import Tissue
 from hipsta_bids.settings import MeasureSettings
 
 MEASURES = MeasureSettings()
 EXACT = 1e-12  # relative rounding
-
-
-def sheet_of(points):
-    return Sheet(points=points, valid=np.ones(points.shape[:2], dtype=bool))
-
-
-def grid(nx=41, ny=21, nz=9):
-    return np.meshgrid(
-        np.linspace(0, 1, nx), np.linspace(0, 1, ny), np.linspace(0, 1, nz), indexing="ij"
-    )
-
-
-def plates(thickness=1.7):
-    """Two parallel plates of 12 x 8 mm."""
-    x, y, z = grid()
-    return sheet_of(np.stack([12 * x, 8 * y, thickness * z], axis=-1))
-
-
-def tube(radius=4.0, thickness=2.0, turn=np.pi):
-    """Part of a pipe, interior side within."""
-    x, y, z = grid()
-    r = radius + thickness * (z - 0.5)
-    return sheet_of(np.stack([r * np.cos(turn * x), r * np.sin(turn * x), 10 * y], axis=-1))
-
-
-def shell(radius=10.0, thickness=2.0):
-    """Part of a sphere, interior side within; away from the poles."""
-    x, y, z = grid()
-    r = radius + thickness * (z - 0.5)
-    polar, azimuth = np.pi * (0.35 + 0.3 * y), 1.2 * x
-    return sheet_of(
-        np.stack(
-            [
-                r * np.sin(polar) * np.cos(azimuth),
-                r * np.sin(polar) * np.sin(azimuth),
-                r * np.cos(polar),
-            ],
-            axis=-1,
-        )
-    )
-
-
-def quadric(first, second, extent=2.0):
-    """Height (first x^2 + second y^2) / 2 over a square; the interior side is above."""
-    x, y, z = grid(nx=41, ny=41)
-    x, y = extent * (x - 0.5), extent * (y - 0.5)
-    height = (first * x**2 + second * y**2) / 2 - 1.5 * (z - 0.5)
-    return sheet_of(np.stack([x, y, height], axis=-1))
 
 
 @given(st.floats(0.2, 5.0))
@@ -103,6 +53,7 @@ def test_rigid_motion_leaves_every_measure(degrees, shift, mirrored):
         measure_thickness,
         column_volume,
         lambda s: mean_curvature(s, s.middle, MEASURES),
+        lambda s: gaussian_curvature(s, s.middle, MEASURES),
         lambda s: bending_angle(s, MEASURES),
     ):
         # Rounding of coordinates of 100 mm, amplified by second differences.
@@ -205,53 +156,39 @@ def test_volumes_of_columns():
     assert column_volume(tube()).sum() == pytest.approx(truth, rel=3e-4)
 
 
-TISSUES = (Tissue.SUBICULUM, Tissue.CA1, Tissue.CA3)
+@pytest.mark.parametrize("level", [0, 4, -1])
+def test_gaussian_curvature_of_a_tube_is_zero(level):
+    np.testing.assert_allclose(gaussian_curvature(tube(), level, MEASURES), 0, atol=1e-9)
 
 
-def measured(sheet, subfield):
-    return SheetMeasures(sheet=sheet, thickness=measure_thickness(sheet), subfield=subfield)
+def test_gaussian_curvature_of_a_sphere_is_one_over_its_radius_squared():
+    for level, radius in ((0, 9.0), (4, 10.0), (-1, 11.0)):
+        curvature = gaussian_curvature(shell(tall=0.15), level, MEASURES)
+        # Cubics over 9 nodes along x, and along y over all of an arc of 27 degrees.
+        np.testing.assert_allclose(curvature[4:-4], 1 / radius**2, rtol=0.025)
 
 
-def test_summary_of_plates():
-    sheet = plates(2.0)
-    subfield = np.full((41, 21), Tissue.SUBICULUM, dtype=np.uint8)
-    subfield[20:] = Tissue.CA1
-    both = measured(sheet, subfield)
-    summary = summarize(both, both, TISSUES, 191.0)
-    wanted = {
-        "thickness_mean": 2.0,
-        "extent_x": 12.0,
-        "extent_y": 8.0,
-        "extent_z": 2.0,
-        "volume": 191.0,
-        "area_interior": 96.0,
-        "area_mid": 96.0,
-        "area_exterior": 96.0,
-        "thickness_mean_SUBICULUM": 2.0,
-        "thickness_mean_CA1": 2.0,
-        # The border's nodes have half of their cells on either side: 19.5 and 20.5 of 40.
-        "area_SUBICULUM": 96.0 * 19.5 / 40,
-        "area_CA1": 96.0 * 20.5 / 40,
-        "volume_SUBICULUM": 192.0 * 19.5 / 40,
-        "volume_CA1": 192.0 * 20.5 / 40,
-    }
-    for name, value in wanted.items():
-        assert summary[name] == pytest.approx(value), name
-    absent = {f"{name}_CA3" for name in ("thickness_mean", "area", "volume")}
-    assert {name for name, value in summary.items() if np.isnan(value)} == absent
-    assert set(summary) == set(wanted) | absent
+def test_gaussian_curvature_inside_a_ring_is_negative():
+    curvature = gaussian_curvature(saddle(), 4, MEASURES)[20]
+    # cos / (r (R + r cos)) where the tube faces the middle of the ring; cubics over 34
+    # degrees.
+    np.testing.assert_allclose(curvature, -1 / (4.0 * (9.0 - 4.0)), rtol=0.04)
 
 
-def test_filled_columns_do_not_count_for_mean_thickness():
-    sheet = plates(2.0)
-    points, valid = sheet.points.copy(), sheet.valid.copy()
-    points[:5, :, :, 2] *= 3
-    valid[:5] = False
-    odd = Sheet(points=points, valid=valid)
-    subfield = np.full(valid.shape, Tissue.CA1, dtype=np.uint8)
-    summary = summarize(measured(odd, subfield), measured(sheet, subfield), TISSUES, 0.0)
-    assert summary["thickness_mean"] == pytest.approx(2.0)
-    assert summary["thickness_mean_CA1"] == pytest.approx(2.0)
+@pytest.mark.parametrize(
+    ("first", "second"), [(0.2, -0.2), (0.3, 0.1), (-0.2, -0.1), (0.0, 0.3), (0.25, -0.05)]
+)
+def test_gaussian_curvature_in_the_middle_of_a_quadric(first, second):
+    curvature = gaussian_curvature(quadric(first, second), 4, MEASURES)
+    # Quadrics are fitted exactly by cubics.
+    assert curvature[20, 20] == pytest.approx(first * second, abs=1e-9)
+
+
+def test_gaussian_curvature_does_not_know_the_sides():
+    still = shell()
+    turned = sheet_of(still.points[:, :, ::-1])
+    one, other = (gaussian_curvature(s, 4, MEASURES) for s in (still, turned))
+    np.testing.assert_allclose(other, one)
 
 
 def test_small_grids_are_measured_with_smaller_windows():

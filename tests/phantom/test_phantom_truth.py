@@ -9,7 +9,13 @@ from hipsta_bids.phantom import KINDS, Phantom, PhantomSpec
 from hipsta_bids.phantom.body import Body
 from hipsta_bids.phantom.curve import START_ANGLE
 from hipsta_bids.phantom.labels import SUBFIELD_STARTS
-from hipsta_bids.phantom.truth import SURFACES, mean_curvature, summarize
+from hipsta_bids.phantom.truth import (
+    SURFACES,
+    cut_sections,
+    gaussian_curvature,
+    mean_curvature,
+    summarize,
+)
 from hipsta_bids.schemes import Tissue, load_scheme
 
 EXACT = 1e-9  # relative: quadrature of smooth functions and rounding
@@ -24,7 +30,17 @@ def test_slab():
     area = {f"area_{name}": 80.0 for name in SURFACES}
     extents = {"extent_x": 10.0, "extent_y": 8.0, "extent_z": 1.5}
     wanted = {"thickness_mean": 1.5, "volume": 120.0} | extents | area
-    assert summary == pytest.approx(wanted, rel=EXACT)
+    wanted |= {
+        "area_ratio": 1.0,
+        "surface_volume_ratio": 2 / 1.5,
+        "circumference_mean": 20.0,
+        "interior_exterior_ratio_mean": 1.0,
+        "section_area_mean": 15.0,
+        "shape_index_mean": 2 / 1.5,
+    }
+    flat = {name: 0.0 for name in summary if name.endswith("_median")}
+    assert len(flat) == 6  # mean and Gaussian curvature, of three surfaces
+    assert summary == pytest.approx(wanted | flat, rel=EXACT, abs=1e-12)
 
 
 def test_straight_arc():
@@ -32,7 +48,12 @@ def test_straight_arc():
     summary = summary_of(kind="arc", width=width, length=10.0)
     for name, radius in [("interior", 3.0), ("mid", 4.0), ("exterior", 5.0)]:
         assert summary[f"area_{name}"] == pytest.approx(1.5 * np.pi * radius * 10.0, rel=EXACT)
+    assert summary["circumference_mean"] == pytest.approx(1.5 * np.pi * 8.0, rel=EXACT)
+    assert summary["interior_exterior_ratio_mean"] == pytest.approx(0.6, rel=EXACT)
+    assert summary["area_ratio"] == pytest.approx(0.6, rel=EXACT)
+    assert summary["shape_index_mean"] == pytest.approx(1.0, rel=EXACT)  # 2 / thickness
     ring = 0.75 * np.pi * (5.0**2 - 3.0**2)
+    assert summary["section_area_mean"] == pytest.approx(ring, rel=EXACT)
     assert summary["volume"] == pytest.approx(ring * 10.0, rel=EXACT)
 
 
@@ -68,13 +89,59 @@ def test_curvature_equals_finite_differences(kind, bend):
     random = np.random.default_rng(5)
     u, v = random.uniform(0.05, 0.95, (2, 60))
     for at in SURFACES.values():
-        measured = _curvature_by_differences(body, u, v, at)
+        mean, gaussian = _curvature_by_differences(body, u, v, at)
         # Truncation is h^2 = 1e-6 times fourth derivatives of up to a few tens.
-        np.testing.assert_allclose(mean_curvature(body, u, v, at=at), measured, atol=5e-5)
+        np.testing.assert_allclose(mean_curvature(body, u, v, at=at), mean, atol=5e-5)
+        np.testing.assert_allclose(gaussian_curvature(body, u, v, at=at), gaussian, atol=5e-5)
+
+
+def test_gaussian_curvature_of_straight_walls_is_zero():
+    truth = Phantom(PhantomSpec(kind="tight")).truth(np.linspace(0, 1, 9)[:, None], [0.2, 0.9])
+    for name in ("", "_interior", "_exterior"):
+        np.testing.assert_allclose(getattr(truth, f"gaussian_curvature{name}"), 0, atol=1e-12)
+
+
+def test_gaussian_curvature_of_a_ring_is_that_of_a_torus():
+    """An arc swept round a bent axis: its curvature times that of its circle of latitude."""
+    spec = PhantomSpec(kind="arc", bend=0.04)
+    body, u = Body(spec), np.linspace(0.0, 1.0, 9)
+    section = body.curve.position(u * spec.width)
+    leaning = -body.curve.normal(u * spec.width)[:, 0]  # medial part, towards the center
+    far = 1.0 / spec.bend + section[:, 0]
+    np.testing.assert_allclose(
+        gaussian_curvature(body, u, np.zeros(9), at=0.0), 0.25 * -leaning / far, rtol=1e-9
+    )
+
+
+@pytest.mark.parametrize("bend", [0.0, 0.03])
+def test_sections_add_up_to_areas_and_lengths(bend):
+    phantom = Phantom(PhantomSpec(kind="spiral", bend=bend, variation=0.3))
+    v = np.linspace(0.0, 1.0, 7)
+    sections = cut_sections(phantom.body, v)
+    fine = np.linspace(0.0, 1.0, 4001)[:, None]
+    for name, at in SURFACES.items():
+        line = phantom.body.place(fine, v, at * phantom.body.thickness(fine, v))
+        length = np.linalg.norm(np.diff(line, axis=0), axis=-1).sum(axis=0)
+        # Chords of 4000 parts: (0.02 / 8000)^2 and less.
+        np.testing.assert_allclose(sections[f"length_{name}"], length, rtol=1e-6)
+    np.testing.assert_allclose(sections["position"][-1], phantom.truth(0, 0).summary["extent_y"])
+    assert sections["thickness"] == pytest.approx(
+        phantom.body.thickness(fine[:-1], v).mean(axis=0),
+        rel=1e-6,  # whole periods
+    )
+
+
+def test_lines_are_as_long_as_their_points_say():
+    phantom = Phantom(PhantomSpec(kind="arc", bend=0.04))
+    u, v = np.linspace(0, 1, 5)[:, None], np.linspace(0, 1, 2001)[None, :]
+    truth = phantom.truth(u, v)
+    along = np.linalg.norm(np.diff(truth.points, axis=1), axis=-1).sum(axis=1)
+    np.testing.assert_allclose(truth.extent_y[:, 0], along, rtol=1e-6)  # chords
+    assert truth.extent_x == pytest.approx(np.full((5, 2001), 20.0))
 
 
 def _curvature_by_differences(body, u, v, at, h=1e-3):
-    """Mean curvature of points alone, signed by the direction to the exterior."""
+    """Mean and Gaussian curvature of points alone, by the direction to the exterior."""
 
     def point(i, j):
         a, b = u + i * h, v + j * h
@@ -91,8 +158,10 @@ def _curvature_by_differences(body, u, v, at, h=1e-3):
     normal /= np.linalg.norm(normal, axis=1)[:, None]
     normal *= -np.sign(dot(normal, body.place(u, v, 0.1) - body.place(u, v, 0.0)))[:, None]
     e, f, g = dot(x_u, x_u), dot(x_u, x_v), dot(x_v, x_v)
-    trace = dot(x_uu, normal) * g - 2 * dot(x_uv, normal) * f + dot(x_vv, normal) * e
-    return trace / (2 * (e * g - f**2))
+    second = [dot(x, normal) for x in (x_uu, x_uv, x_vv)]
+    trace = second[0] * g - 2 * second[1] * f + second[2] * e
+    det = e * g - f**2
+    return trace / (2 * det), (second[0] * second[2] - second[1] ** 2) / det
 
 
 @pytest.mark.parametrize(("kind", "axis"), [("tight", "xy"), ("spiral", "x"), ("s-shape", "y")])
