@@ -259,6 +259,7 @@ def _refuse_unfinished(
                 not request.sessions or name.session in request.sessions
             )
             listed = any(_is_listed(name, one) for one in unwanted)
+            listed = listed or row.get("region", "body") != "body"  # the body alone is read here
             if row.get("reason") == "not-finished" and name.seg == seg and asked and not listed:
                 pending.append(name.stem)
     if pending:
