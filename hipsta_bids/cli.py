@@ -90,6 +90,7 @@ def _dispatch(arguments: list[str]) -> ExitCode:
         "demo-data": _demo_data,
         "demo": _demo,
         "phantom": _phantom,
+        "surrogate": _surrogate,
         "validate": _validate,
     }
     is_app = any(level in arguments[1:] for level in (*LEVELS, "group"))
@@ -278,6 +279,36 @@ def _phantom(arguments: list[str]) -> ExitCode:
     write_cohort(options.out, plan, layout=options.layout, voxel_size=tuple(options.voxel_size))
     say(f"synthetic dataset of {plan.n_subjects} subjects: {options.out}")
     return ExitCode.OK
+
+
+def _surrogate(arguments: list[str]) -> ExitCode:
+    """Measure thickness in single slices."""
+    from hipsta_bids.subcommands import surrogate_parser  # noqa: PLC0415  (start-up time)
+
+    given = surrogate_parser().parse_args(arguments)
+    # What is not asked here is as if it had not been asked for.
+    defaults = build_parser().parse_args([str(given.bids_dir), str(given.output_dir), LEVELS[0]])
+    options = type(given)(**{**vars(defaults), **vars(given)})
+    _check_folders(options)
+    from hipsta_bids.settings_file import load_settings  # noqa: PLC0415  (start-up time)
+
+    settings = load_settings(options.settings)
+    from hipsta_bids.bids.dataset import (  # noqa: PLC0415  (heavy)
+        dataset_notes,
+        find_inputs,
+        selection_table,
+    )
+    from hipsta_bids.crosscheck import crosscheck  # noqa: PLC0415  (heavy)
+
+    request = _request(options)
+    found = find_inputs(request)
+    for note in (*dataset_notes(request, found.items), *found.notes):
+        say(f"note: {note}")
+    if options.dry_run:
+        say_table(selection_table(found.items))
+        return ExitCode.OK
+    _check_output_is_no_input(options.output_dir, found.items)
+    return crosscheck(found.items, options.output_dir, settings, say, complain)
 
 
 def _validate(arguments: list[str]) -> ExitCode:

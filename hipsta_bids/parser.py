@@ -20,6 +20,7 @@ other commands:
   hipsta-bids demo-data DIR    write a synthetic dataset with known thickness
   hipsta-bids demo DIR         write it, run on it, and compare with the truth
   hipsta-bids phantom DIR      write a synthetic cohort with a known effect (see its --help)
+  hipsta-bids surrogate IN OUT measure thickness in single slices to cross-check maps
   hipsta-bids validate         measure accuracy on phantoms, write a report (see its --help)
 
 exit codes:
@@ -64,14 +65,15 @@ def build_parser() -> Parser:
     parser.add_argument("output_dir", type=Path, help="where the output dataset goes")
     parser.add_argument("analysis_level", type=_level, help="participant")
     parser.add_argument("--version", action="version", version=f"hipsta_bids {__version__}")
-    _add_selection(parser)
-    _add_segmentations(parser)
+    add_selection(parser)
+    add_segmentations(parser)
     _add_signals(parser)
     _add_processing(parser)
     return parser
 
 
-def _add_selection(parser: Parser) -> None:
+def add_selection(parser: Parser) -> None:
+    """Add the options that choose subjects, sessions and hemispheres."""
     group = parser.add_argument_group("what to process")
     _add(
         group,
@@ -123,7 +125,8 @@ def _add_selection(parser: Parser) -> None:
     )
 
 
-def _add_segmentations(parser: Parser) -> None:
+def add_segmentations(parser: Parser) -> None:
+    """Add the options that say where segmentations are."""
     group = parser.add_argument_group("where the segmentations are")
     _add(
         group,
