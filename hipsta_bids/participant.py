@@ -27,6 +27,7 @@ from hipsta_bids.geometry.checks import (
     check_label_order,
     check_thickness,
     check_voxels_across,
+    find_contacts,
     name_subfields,
 )
 from hipsta_bids.geometry.coordinates import solve_coordinates
@@ -79,6 +80,7 @@ def measure_hemisphere(
             resample_body(body, settings.grid, settings.slices),
             settings.topology,
             name_subfields(body),
+            find_contacts(body, settings.topology),
         )
         surface = extract_surface(solid.field, settings.surface)
         across = check_voxels_across(surface, body, settings.checks)

@@ -148,6 +148,8 @@ class TopologySettings:
     """... at more than this share of its nodes."""
     sever_factor: float = 1000.0
     """Such cuts cost this much more: where one is the only way, the hemisphere is flagged."""
+    contact_reach: float = 1.2
+    """... unless both the subiculum and CA2 or CA3 lie within this distance of its middle, mm."""
     fill_across: float = 0.5
     """A fill spans the inside of a bend rather than a hole if this share lies across the axis."""
     lid_nodes: float = 6.0

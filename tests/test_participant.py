@@ -328,7 +328,8 @@ def test_subfields_in_the_wrong_order_are_refused(damage):
         affine=volume.affine,
         scheme=volume.scheme,
     )
-    refused(volume, "label-order", "check that the scheme fits")
+    # The subiculum borders on CA2/3 as where two turns touch, so that the sheet is parted there.
+    refused(volume, "body-split", "check that the scheme fits")
 
 
 def test_too_few_voxels_across_are_refused(plain):

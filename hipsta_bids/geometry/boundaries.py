@@ -129,10 +129,12 @@ def _separating(
     for rule, pair in attempts:
         if pair is None:
             continue
-        strips, middle = facing_strips(wall, mesh, pair, thickness, settings)
-        sides = wall.sides(strips[0] | strips[1])
-        if sides is not None and not (strips[0] & strips[1]).any():
-            return rule, middle, strips, sides
+        reach = settings.first_strip * thickness
+        plain = (wall.near(pair[0], reach), wall.near(pair[1], reach))
+        for strips, middle in (facing_strips(wall, mesh, pair, thickness, settings), (plain, pair)):
+            sides = wall.sides(strips[0] | strips[1])
+            if sides is not None and not (strips[0] & strips[1]).any():
+                return rule, middle, strips, sides
     raise GeometryError(
         "the medial and lateral boundary do not separate the interior from the exterior side: "
         "check the labels for folds that touch each other",

@@ -11,9 +11,10 @@ from hipsta_bids.artifacts import Coordinates, Flag, Float, LabelVolume, Surface
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.grid import in_plane_voxel
+from hipsta_bids.geometry.slices import ENDS
 from hipsta_bids.geometry.surface import mean_wall_thickness
 from hipsta_bids.schemes import Part, Tissue, lateral_rank
-from hipsta_bids.settings import CheckSettings
+from hipsta_bids.settings import CheckSettings, TopologySettings
 
 
 def check_voxels_across(surface: Surface, body: Body, settings: CheckSettings) -> float:
@@ -137,6 +138,23 @@ def name_subfields(body: Body) -> Callable[[Float], str]:
         return ", ".join(Tissue(int(kind)).name for kind in found)
 
     return names
+
+
+def find_contacts(body: Body, settings: TopologySettings) -> Callable[[Float], bool]:
+    """Make a function that says whether the two ends of the sheet touch at (N, 3) points, RAS mm.
+
+    The subiculum and CA2 or CA3 are no neighbors on the sheet: where both are near, two of its
+    turns touch.
+    """
+    index, points = body.inside_points()
+    tissue = body.tissue[tuple(index.T)]
+    trees = [cKDTree(points[np.isin(tissue, kinds)]) for kinds in ENDS]
+
+    def touch(at: Float) -> bool:
+        middle = at.mean(axis=0)
+        return all(tree.n and tree.query(middle)[0] < settings.contact_reach for tree in trees)
+
+    return touch
 
 
 def name_place(points: Float, body: Body) -> str:

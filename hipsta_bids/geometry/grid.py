@@ -6,11 +6,12 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
-from hipsta_bids.artifacts import Float
+from hipsta_bids.artifacts import Bool, Float
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
-from hipsta_bids.geometry.slices import has_thick_slices, sample_slices
+from hipsta_bids.geometry.slices import ENDS, has_thick_slices, sample_slices
 from hipsta_bids.settings import GridSettings, SliceSettings
 
 
@@ -109,6 +110,7 @@ def resample_body(body: Body, settings: GridSettings, slices: SliceSettings) -> 
     else:
         points = grid.node_points(clamp=body.ends.half_slice).reshape(-1, 3)
         values = _sample_mask(body, points)
+        values[_between_turns(body, points, slices)] = 0
     sigma = max(settings.smoothing * in_plane_voxel(body.affine), settings.min_smoothing)
     smooth = _smooth(values.reshape(grid.shape), sigma / settings.spacing)
     return Field(grid=grid, values=smooth - np.float32(0.5))
@@ -122,6 +124,31 @@ def _sample_mask(body: Body, points: Float) -> NDArray[np.float32]:
     return np.asarray(
         ndimage.map_coordinates(mask, voxels.T, order=1, output=np.float32, mode="nearest")
     )
+
+
+def _between_turns(body: Body, points: Float, settings: SliceSettings) -> Bool:
+    """Which of (N, 3) points, RAS mm, part the two ends of the sheet where they touch."""
+    index, places = body.inside_points()
+    tissue = body.tissue[tuple(index.T)]
+    medial, lateral = (places[np.isin(tissue, kinds)] for kinds in ENDS)
+    parts = np.zeros(len(points), dtype=bool)
+    if not (len(medial) and len(lateral)):
+        return parts
+    trees = cKDTree(medial), cKDTree(lateral)
+    reach = settings.touch + 0.5 * in_plane_voxel(body.affine)  # labels end beyond their centers
+    gap = np.asarray(trees[1].query(medial, distance_upper_bound=reach)[0])
+    touching = medial[np.isfinite(gap)]
+    if not len(touching):
+        return parts
+    low, high = touching.min(axis=0) - reach, touching.max(axis=0) + reach
+    close = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
+    first, second = (
+        np.asarray(tree.query(points[close], distance_upper_bound=reach)[0]) for tree in trees
+    )
+    between = np.isfinite(first) & np.isfinite(second)
+    first, second = first[between], second[between]
+    parts[close[between]] = np.abs(first - second) < 2 * settings.slit
+    return parts
 
 
 def _smooth(values: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:

@@ -4,6 +4,7 @@ Arrays here are padded: along the axis by a layer for a plate and one of free sp
 one of free space.
 """
 
+from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -16,6 +17,7 @@ from hipsta_bids.geometry.simple_points import euler_number, grow, shrink
 from hipsta_bids.settings import TopologySettings
 
 Kind = Literal["cut", "fill", "island", "cavity"]
+Contact = Callable[[NDArray[np.intp]], bool]
 FACES = ndimage.generate_binary_structure(3, 1)
 ALL = np.ones((3, 3, 3), dtype=bool)
 PAD = ((1, 1), (1, 1), (2, 2))  # along the axis: a plate, then free space
@@ -57,12 +59,13 @@ def apply_membranes(
     settings: TopologySettings,
     *,
     plates: bool,
+    contact: Contact,
 ) -> list[Edit]:
     """Apply the cheapest membranes (in place): all small ones, or one large one.
 
     Without plates, tunnels of the body itself are found; with plates, pieces of an end's
     cross-section that hang together only further inside. ``lifted`` gets the values of filled
-    holes.
+    holes. ``contact`` tells of nodes (N, 3) whether two turns of the sheet touch there.
     """
     ranked = _ranked(values, settings)
     solid = with_plates(state, True) if plates else state
@@ -77,7 +80,7 @@ def apply_membranes(
         for where in _pieces(membrane)
         if not (plates and _in_plates(where, solid))
     ]
-    candidates = _priced(found, solid, values, settings)
+    candidates = _priced(found, solid, values, settings, contact)
     candidates.sort(key=lambda c: c[0])
     edits: list[Edit] = []
     for cost, edit in candidates:
@@ -106,7 +109,11 @@ def _pieces(membrane: Bool) -> list[NDArray[np.intp]]:
 
 
 def _priced(
-    found: list[Edit], solid: Bool, values: NDArray[np.float32], settings: TopologySettings
+    found: list[Edit],
+    solid: Bool,
+    values: NDArray[np.float32],
+    settings: TopologySettings,
+    contact: Contact,
 ) -> list[tuple[float, Edit]]:
     """Price per tunnel of the membranes that deal with one.
 
@@ -121,6 +128,8 @@ def _priced(
             continue
         cost = float(np.abs(values[tuple(where.T)]).sum())
         factor = _implausibility(kind, where, solid, settings)
+        if kind == "cut" and factor > 1 and contact(where):
+            factor = 1.0
         if kind == "cut" and open_hole and _gain(closed, where, kind) <= 0:
             factor *= settings.across_factor
         doubtful = factor > 1 and (kind == "cut" or cost > settings.doubtful_fill_cost)

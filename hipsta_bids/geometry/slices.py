@@ -24,7 +24,7 @@ Stack = NDArray[np.float32]
 Box = tuple[slice, slice, slice]
 
 #: Subfields of the medial and the lateral end of the ribbon. CA1 lies between them.
-_ENDS = ((Tissue.PRESUBICULUM, Tissue.SUBICULUM), (Tissue.CA2, Tissue.CA2_3, Tissue.CA3))
+ENDS = ((Tissue.PRESUBICULUM, Tissue.SUBICULUM), (Tissue.CA2, Tissue.CA2_3, Tissue.CA3))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -125,7 +125,7 @@ def _stacked(tissue: NDArray[np.uint8], pixel: float, settings: SliceSettings) -
         tissue = np.concatenate([tissue, tissue])
     outlines = np.stack([outline_slice(image, pixel, settings) for image in tissue])
     ends = np.array(
-        [[part_distance(image, end, pixel, settings) for image in tissue] for end in _ENDS]
+        [[part_distance(image, end, pixel, settings) for image in tissue] for end in ENDS]
     )
     return SliceStack(
         outlines=outlines,

@@ -28,6 +28,8 @@ from hipsta_bids.settings import TopologySettings
 
 Locate = Callable[[Float], str]
 """Names the subfields at (N, 3) points, RAS mm."""
+Contact = Callable[[Float], bool]
+"""Whether two turns of the sheet touch at (N, 3) points, RAS mm, by their labels."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +76,10 @@ class SolidField:
 
 
 def repair_topology(
-    field: Field, settings: TopologySettings, locate: Locate | None = None
+    field: Field,
+    settings: TopologySettings,
+    locate: Locate | None = None,
+    contact: Contact | None = None,
 ) -> SolidField:
     """Make the positive part of a field one solid piece without tunnels.
 
@@ -89,6 +94,8 @@ def repair_topology(
     settings : TopologySettings
     locate : callable, optional
         Names the subfields at points, for messages.
+    contact : callable, optional
+        Whether two turns of the sheet touch at points, by their labels: a cut there is welcome.
 
     Returns
     -------
@@ -112,6 +119,10 @@ def repair_topology(
     padded = np.pad(values, PAD, constant_values=-1.0)
     lifted = padded.copy()
     _refuse_strips(state, field, settings, locate)
+
+    def touching(where: NDArray[np.intp]) -> bool:
+        return contact is not None and contact(field.grid.to_ras((where - CORNER).astype(float)))
+
     edits = _remove_islands(state, field, locate) + _fill_cavities(state)
     for _ in range(settings.rounds):
         wrong = [plates for plates in (False, True) if euler(state, plates=plates) != 1]
@@ -119,7 +130,9 @@ def repair_topology(
             break
         # Only once the body itself is sound: the inside of a closed tube is no pit.
         pits = _fill_cavities(state, plates=True) if wrong[0] else []
-        found = pits or apply_membranes(state, padded, lifted, settings, plates=wrong[0])
+        found = pits or apply_membranes(
+            state, padded, lifted, settings, plates=wrong[0], contact=touching
+        )
         edits += found
         if not found or _has_strips(state, settings):
             raise _unrepaired(edits, state, field, locate)
@@ -174,7 +187,7 @@ def _refuse_strips(
     place = _place(field.grid.to_ras(center[None])[0], names)
     raise GeometryError(
         f"a gap parts the sheet into {len(through)} strips from end to end, at {place}: "
-        "fill it in the labels",
+        "fill it in the labels, or check that the scheme fits them",
         reason="body-split",
     )
 

@@ -166,8 +166,9 @@ def test_the_eigenfunction_is_overruled_where_the_rules_disagree(arc):
 
 
 def test_strips_that_swallow_the_sides_are_refused(arc):
+    wide = replace(SETTINGS, first_strip=6.0, least_strip=6.0)
     with pytest.raises(GeometryError, match="do not separate the interior") as caught:
-        find_boundaries(arc.surface, arc.mesh, arc.body, replace(SETTINGS, least_strip=6.0))
+        find_boundaries(arc.surface, arc.mesh, arc.body, wide)
     assert caught.value.reason == "boundaries"
 
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.ends import EndPlanes
 from hipsta_bids.geometry.grid import in_plane_voxel
+from hipsta_bids.schemes import Tissue
 
 EXACT = 1e-9  # rounding of coordinates of some ten mm
 
@@ -172,3 +173,23 @@ def test_planes_that_meet_beside_the_body_are_refused():
     with pytest.raises(GeometryError, match="the end planes meet beside the body") as caught:
         resampled(crossed)
     assert caught.value.reason == "ends-crossed"
+
+
+def test_turns_that_touch_are_parted():
+    """Subiculum and CA3 side by side, in a block without a gap: the field is negative between."""
+    body = box_body()
+    half = body.tissue.shape[1] // 2
+    inside = body.tissue > 0
+    tissue = np.zeros_like(body.tissue)
+    tissue[:, :half] = Tissue.SUBICULUM
+    tissue[:, half:] = Tissue.CA3
+    field = resampled(replace(body, tissue=np.where(inside, tissue, 0).astype(np.uint8)))
+    values = field.values.ravel()
+    nodes = np.argwhere(np.ones(field.grid.shape, dtype=bool)).astype(float)
+    border = (half - 0.5) * 0.4 - 1.0  # mm along y, between two voxels
+    offset = np.abs(field.grid.to_ras(nodes) - [3.0, border, 4.0])
+    block = (offset[:, [0, 2]] < [2.0, 3.0]).all(axis=1)  # away from the block's faces
+    assert (values[block & (offset[:, 1] < 0.1)] < 0).all()
+    # The slit's half width of 0.3 mm and what smoothing adds.
+    assert (values[block & (offset[:, 1] > 0.7) & (offset[:, 1] < 0.8)] > 0).all()
+    assert (block & (offset[:, 1] > 0.7) & (offset[:, 1] < 0.8)).any()
