@@ -16,17 +16,13 @@ from hipsta_bids.bids.maps import column_names, write_map
 from hipsta_bids.bids.results import ResultPlace
 from hipsta_bids.bids.rois import read_regions, write_regions
 from hipsta_bids.errors import InputError
+from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.geometry.regions import Regions, summarize_regions
 from hipsta_bids.geometry.sampling import SampledMap, sample_on_sheet
 from hipsta_bids.settings import MapSettings
 
 #: Maps of every hemisphere that are summed up in regions, and their units.
-SHAPE_MAPS = {
-    "thickness": "mm",
-    "curvature": "1/mm",
-    "curvature_interior": "1/mm",
-    "curvature_exterior": "1/mm",
-}
+SHAPE_MAPS = {row.name: row.unit for row in MAPS}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -124,7 +120,7 @@ def write_signals(place: ResultPlace, maps: HemisphereMaps, mapped: Mapped) -> N
     OutputError
         If a file cannot be written.
     """
-    numbers: dict[str, Float] = {name: getattr(maps, name) for name in SHAPE_MAPS}
+    numbers: dict[str, Float] = {name: maps.maps[name] for name in SHAPE_MAPS}
     labels: dict[str, Float] = {}
     entries = {entry["name"]: entry for entry in (mapped.record or {}).get("maps", ())}
     for source, sampled in mapped.maps:

@@ -124,6 +124,7 @@ def run_participants(
     digest = derivative.settle_settings(out_dir, settings)
     origins = [(item.source, item.source_path) for item in items]
     origins += [(edit.source, edit.source_path) for item in items for edit in item.edits]
+    origins += [("bids", m.source_path) for item in items for m in item.maps if m.source_path]
     sources = derivative.source_names(origins)
     derivative.write_description(out_dir, sources)
     derivative.write_citation(out_dir, settings, _schemes(items))

@@ -241,7 +241,9 @@ def test_a_missing_file_is_a_note_and_harms_nobody(done):
 
 def test_the_sidecar_says_where_values_come_from(done):
     sidecar = json.loads(path_of(done[0], "map_sidecar", "quadratic").read_text())
-    assert sidecar["Source"].endswith("sub-01/anat/sub-01_quadratic.nii.gz")
+    assert sidecar["Source"] == "bids:bids:sub-01/anat/sub-01_quadratic.nii.gz"
+    description = json.loads((done[0] / "dataset_description.json").read_text())
+    assert description["DatasetLinks"]["bids"].endswith("/bids")
     assert (sidecar["Sampling"], sidecar["Interpolation"]) == ("mid", "linear")
     assert (sidecar["Outside"], sidecar["Missing"], sidecar["Volumes"]) == (0, 0, 1)
     assert set(sidecar) >= set(table(done[0], "map_table", "quadratic").columns)
@@ -255,7 +257,7 @@ def test_regions_are_summed_up(done, sheet):
         row, here = found.loc[region], sheet["x"].between(low, high) & sheet["y"].between(5, 14)
         assert row["n_points"] == 60
         valid = here & sheet["valid"]
-        for name in ("thickness", "curvature"):
+        for name in ("thickness", "curvature", "gaussian_curvature"):
             # Four decimals of the sheet table, five of curvature.
             assert row[f"{name}_mean"] == pytest.approx(sheet[name][valid].mean(), abs=1e-4)
             assert row[f"{name}_sd"] == pytest.approx(sheet[name][valid].std(), abs=1e-4)
@@ -329,6 +331,7 @@ def test_bad_regions_harm_nothing_else(bids_dir, tmp_path):
         (["--map", "T1w"], "not of the form NAME=PATTERN"),
         (["--map", "a_b=x"], "not a name of letters and digits"),
         (["--map", "sheet=x"], "belongs to other outputs"),
+        (["--map", "thickness=x"], "belongs to other outputs"),
         (["--map", "a=x", "a=y"], "occurs twice"),
         (["--map", "a=sub-{sub}.nii"], "'sub' is not understood"),
         (["--map", "a=sub-{.nii"], "is not understood"),

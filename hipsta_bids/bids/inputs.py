@@ -67,6 +67,8 @@ class MapSource:
     """None where there is no file, or more than one that it could be."""
     missing: str | None = None
     """Why there is no path, in one phrase."""
+    source_path: Path | None = None
+    """The dataset that it is in, if it is in the one that was given."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,6 +15,7 @@ from hipsta_bids.bids.inputs import HemisphereInput, MapSource
 from hipsta_bids.bids.names import EXTRA_OUTPUTS, OUTPUTS
 from hipsta_bids.bids.results import ResultPlace
 from hipsta_bids.errors import UsageError
+from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.geometry.sampling import SampledMap
 
 #: What a pattern may contain.
@@ -60,7 +61,7 @@ def map_requests(
         is for a map that does not exist.
     """
     names = [name for name, _ in patterns]
-    taken = {row.desc for row in (*OUTPUTS, *EXTRA_OUTPUTS)}
+    taken = {row.desc for row in (*OUTPUTS, *EXTRA_OUTPUTS)} | {"x", "y", *(m.name for m in MAPS)}
     for name, pattern in patterns:
         if not name.isalnum() or not name.isascii():
             raise UsageError(f"--map: {name!r} is not a name of letters and digits", reason="usage")
@@ -147,7 +148,7 @@ def _source(item: HemisphereInput, wish: MapRequest, bids_dir: Path) -> MapSourc
     pattern = wish.pattern if item.session else _SESSION.sub("", wish.pattern)
     name = pattern.format(subject=item.subject, session=item.session, hemi=item.hemi)
     matches = sorted(glob.glob(name, root_dir=bids_dir, recursive=True))  # noqa: PTH207 (root_dir)
-    missing = None
+    missing, inside = None, not Path(pattern).is_absolute()
     if not matches:
         missing = f"no file {name}"
     elif len(matches) > 1:
@@ -158,6 +159,7 @@ def _source(item: HemisphereInput, wish: MapRequest, bids_dir: Path) -> MapSourc
         interpolation=wish.interpolation,
         path=None if missing else bids_dir / matches[0],
         missing=missing,
+        source_path=bids_dir if inside else None,
     )
 
 

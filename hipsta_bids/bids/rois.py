@@ -14,7 +14,7 @@ from hipsta_bids.geometry.regions import Regions, RegionStatistics
 #: Columns of a region file: node numbers as in the sheet table, and the region's name.
 COLUMNS = ("x", "y", "region")
 
-_DIGITS = 5
+_DIGITS = 6
 
 
 def read_regions(path: Path, shape: tuple[int, int]) -> Regions:
