@@ -150,7 +150,9 @@ def _table(
         is_phantom = isinstance(body, PhantomSpec)
         target = f"r ≥ {LEAST_CORRELATION}" if is_phantom else "n/a"
         if isinstance(result, Refusal):
-            rows.append((_name(body), result.reason, *[None] * 6, target, not is_phantom or None))
+            rows.append(
+                (_name(body), result.reason, *[None] * 6, target, False if is_phantom else None)
+            )
             continue
         pair = agreement(result.surrogate.ravel(), result.mesh.ravel())
         true = agreement(result.surrogate.ravel(), result.truth.ravel())
