@@ -36,10 +36,16 @@ from hipsta_bids.geometry.grid import in_plane_voxel, resample_body
 from hipsta_bids.geometry.layers import check_layers, equal_volume_layers
 from hipsta_bids.geometry.measured import Measured, average_profiles
 from hipsta_bids.geometry.measures import bending_angle
-from hipsta_bids.geometry.neighbors import check_turned, is_turned
 from hipsta_bids.geometry.quality import Evidence, find_flags, quality_metrics
 from hipsta_bids.geometry.repaired import repaired_columns
-from hipsta_bids.geometry.sheet import folded_fraction, label_sheet, sample_sheet, whole_body
+from hipsta_bids.geometry.sheet import (
+    check_turned,
+    folded_fraction,
+    is_turned,
+    label_sheet,
+    sample_sheet,
+    whole_body,
+)
 from hipsta_bids.geometry.summary import summarize
 from hipsta_bids.geometry.surface import extract_surface, signed_volume
 from hipsta_bids.geometry.tetra import tetrahedralize

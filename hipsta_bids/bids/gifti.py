@@ -45,29 +45,6 @@ def sheet_triangles(nx: int, ny: int, *, flip: bool = False) -> Int:
     return np.ascontiguousarray(triangles[:, ::-1] if flip else triangles)
 
 
-def is_left_handed(points: Float) -> bool:
-    """Say whether x cross y points from exterior to interior on most of a sheet.
-
-    The two hemispheres are mirror images, so that one of them always is.
-
-    Parameters
-    ----------
-    points : (Nx, Ny, Nz, 3) float64
-        Sheet points in mm, NaN where undefined.
-
-    Returns
-    -------
-    bool
-        Whether triangles have to be flipped for their normals to point to the exterior.
-    """
-    middle = points[:, :, points.shape[2] // 2]
-    along_x = middle[1:, :-1] - middle[:-1, :-1]
-    along_y = middle[:-1, 1:] - middle[:-1, :-1]
-    outward = (points[:, :, -1] - points[:, :, 0])[:-1, :-1]
-    volume = np.einsum("ijk,ijk->ij", np.cross(along_x, along_y), outward)
-    return bool(np.nansum(volume) < 0)
-
-
 def surface_bytes(
     points: Float, triangles: Int, *, hemi: str, secondary: str | None, unfolded: bool
 ) -> bytes:

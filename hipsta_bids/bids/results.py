@@ -21,6 +21,7 @@ from hipsta_bids.bids.names import (
 )
 from hipsta_bids.errors import HipstaError
 from hipsta_bids.geometry.catalog import MAPS
+from hipsta_bids.geometry.sheet import is_left_handed
 from hipsta_bids.schemes import Scheme
 
 #: Workbench's word for a surface, where it has one that fits.
@@ -202,7 +203,7 @@ def gifti_files(maps: HemisphereMaps, scheme: Scheme, hemi: str) -> Iterator[tup
     points = maps.sheet.points
     nx, ny = points.shape[:2]
     levels = {"interior": 0, "midthickness": points.shape[2] // 2, "exterior": -1}
-    triangles = gifti.sheet_triangles(nx, ny, flip=gifti.is_left_handed(points))
+    triangles = gifti.sheet_triangles(nx, ny, flip=is_left_handed(points))
     flat_triangles = gifti.sheet_triangles(nx, ny)
     for surface, level in levels.items():
         yield (

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from hipsta_bids.artifacts import Flag, Float, LabelVolume, Sheet
+from hipsta_bids.artifacts import Float, LabelVolume
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.ends import EndPlanes
 from hipsta_bids.schemes import Tissue, for_region
@@ -86,40 +86,6 @@ def check_reach(
             "all of it",
             reason="cortex-incomplete",
         )
-
-
-def is_turned(sheet: Sheet, hemi: str) -> bool:
-    """Say whether interior and exterior of a sheet are exchanged for its hemisphere.
-
-    The interior side of the cortex is the one that continues the interior side of the hippocampus:
-    its outer (pial) surface. Bending does not tell, since the cortex bends round its white matter
-    and the hippocampus round the dentate gyrus. But medial to lateral, posterior to anterior and
-    interior to exterior are a right-handed system on the left and a left-handed one on the right,
-    all along the sheet and however it bends.
-
-    Parameters
-    ----------
-    sheet : Sheet
-    hemi : {"L", "R"}
-
-    Returns
-    -------
-    bool
-    """
-    middle = sheet.points[:, :, sheet.middle]
-    along_x = middle[1:, :-1] - middle[:-1, :-1]
-    along_y = middle[:-1, 1:] - middle[:-1, :-1]
-    outward = (sheet.points[:, :, -1] - sheet.points[:, :, 0])[:-1, :-1]
-    volume = float(np.nansum(np.cross(along_x, along_y) * outward))
-    return (volume < 0) if hemi == "L" else (volume > 0)
-
-
-def check_turned(sheet: Sheet, hemi: str) -> list[Flag]:
-    """Flag a sheet whose interior side, told by labels, is not that of its hemisphere."""
-    if not is_turned(sheet, hemi):
-        return []
-    text = "the labels of the dentate gyrus lie on the exterior side of the sheet: look at the map"
-    return [Flag(reason="side-doubtful", message=text)]
 
 
 def _names(kinds: list[Tissue]) -> str:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from hipsta_bids.artifacts import Bool, Coordinates, Float, Sheet, TetMesh
+from hipsta_bids.artifacts import Bool, Coordinates, Flag, Float, Sheet, TetMesh
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.settings import SheetSettings
@@ -76,6 +76,58 @@ def folded_fraction(mesh: TetMesh, coordinates: Coordinates) -> float:
     inner = np.linalg.det(turned[:, 1:] - turned[:, :1])
     sign = np.sign((volume * inner).sum())
     return float(volume[inner * sign < 0].sum() / volume.sum())
+
+
+def is_left_handed(points: Float) -> bool:
+    """Say whether x cross y points from exterior to interior on most of a sheet.
+
+    The two hemispheres are mirror images, so that one of them always is.
+
+    Parameters
+    ----------
+    points : (Nx, Ny, Nz, 3) float64
+        Sheet points in mm, NaN where undefined.
+
+    Returns
+    -------
+    bool
+        Whether triangles have to be flipped for their normals to point to the exterior.
+    """
+    middle = points[:, :, points.shape[2] // 2]
+    along_x = middle[1:, :-1] - middle[:-1, :-1]
+    along_y = middle[:-1, 1:] - middle[:-1, :-1]
+    outward = (points[:, :, -1] - points[:, :, 0])[:-1, :-1]
+    volume = np.einsum("ijk,ijk->ij", np.cross(along_x, along_y), outward)
+    return bool(np.nansum(volume) < 0)
+
+
+def is_turned(sheet: Sheet, hemi: str) -> bool:
+    """Say whether interior and exterior of a sheet are exchanged for its hemisphere.
+
+    The interior side of the cortex is the one that continues the interior side of the hippocampus:
+    its outer (pial) surface. Bending does not tell, since the cortex bends round its white matter
+    and the hippocampus round the dentate gyrus. But medial to lateral, posterior to anterior and
+    interior to exterior are a right-handed system on the left and a left-handed one on the right,
+    all along the sheet and however it bends.
+
+    Parameters
+    ----------
+    sheet : Sheet
+    hemi : {"L", "R"}
+
+    Returns
+    -------
+    bool
+    """
+    return is_left_handed(sheet.points) == (hemi == "L")
+
+
+def check_turned(sheet: Sheet, hemi: str) -> list[Flag]:
+    """Flag a sheet whose interior side, told by labels, is not that of its hemisphere."""
+    if not is_turned(sheet, hemi):
+        return []
+    text = "the labels of the dentate gyrus lie on the exterior side of the sheet: look at the map"
+    return [Flag(reason="side-doubtful", message=text)]
 
 
 def label_sheet(sheet: Sheet, body: Body) -> NDArray[np.uint8]:

@@ -8,7 +8,8 @@ from hipsta_bids.artifacts import LabelVolume, Sheet
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body, extract_body
 from hipsta_bids.geometry.ends import EndPlanes
-from hipsta_bids.geometry.neighbors import check_reach, check_turned, is_turned, join_cortex
+from hipsta_bids.geometry.neighbors import check_reach, join_cortex
+from hipsta_bids.geometry.sheet import check_turned, is_turned
 from hipsta_bids.schemes import Tissue, load_scheme
 from hipsta_bids.settings import BodySettings
 
