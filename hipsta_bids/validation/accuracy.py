@@ -1,15 +1,16 @@
 """Thickness, curvature, volume, areas and extents of phantoms against the truth."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hipsta_bids.artifacts import Float
-from hipsta_bids.phantom import PhantomSpec
+from hipsta_bids.validation.accuracy_rows import ROWS, Row
 from hipsta_bids.validation.cases import (
+    CURVATURES,
     EDGE,
+    GAUSSIAN_CURVATURES,
     Case,
     Measured,
     along_slices,
@@ -25,69 +26,21 @@ if TYPE_CHECKING:
 
 SEED = 20230
 POSES_QUICK, POSES_FULL = 4, 12
-TILT = 10.0
-"""Degrees by which tilted slices miss the perpendicular to the long axis."""
-
 MAX_SIZE_ERROR = 2.0
 """Percent, of volume, areas and extents."""
 MAX_CURVATURE_ERROR = 5.0
 """Percent, of mean curvature in the middle of an arc."""
+MAX_GAUSSIAN_ERROR = 0.005
+"""1/mm2, root mean square over the middle of the sheet, on straight extrusions."""
 SIZES = ("volume", "area_interior", "area_mid", "area_exterior", "extent_x", "extent_y")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Row:
-    """One row of the accuracy table."""
-
-    spec: PhantomSpec
-    voxel_size: tuple[float, float, float]
-    bias: float
-    """mm, target."""
-    sd: float
-    """mm, target."""
-    tilt: float | None = None
-    """Degrees; None for isotropic voxels, which are turned at random."""
-
-    @property
-    def name(self) -> str:
-        """For people."""
-        spec = self.spec
-        varied = f", ±{spec.variation:.0%}" if spec.variation else ""
-        tilted = f", tilted by {self.tilt:g}°" if self.tilt else ""
-        return f"{spec.kind} {spec.thickness:.1f} mm{varied}{tilted}"
-
-    @property
-    def voxels(self) -> str:
-        """Voxel size for people."""
-        x, y, z = self.voxel_size
-        return f"{x:g} iso" if x == y == z else f"{x:g} x {y:g} x {z:g}"
-
-
-def _rows() -> tuple[Row, ...]:
-    iso = (0.4, 0.4, 0.4)
-    thin = PhantomSpec(kind="spiral", thickness=1.2)
-    fine = [
-        *(
-            Row(spec=PhantomSpec(kind=kind, thickness=2.0), voxel_size=iso, bias=0.015, sd=0.04)
-            for kind in ("arc", "spiral", "tight")
-        ),
-        Row(spec=thin, voxel_size=iso, bias=0.02, sd=0.05),
-    ]
-    varied = PhantomSpec(kind="spiral", thickness=2.0, variation=0.3)
-    tight = PhantomSpec(kind="tight", thickness=1.6)
-    thick = [
-        row
-        for tilt in (0.0, TILT)
-        for row in (
-            Row(spec=varied, voxel_size=(0.4, 0.4, 2.0), bias=0.015, sd=0.065, tilt=tilt),
-            Row(spec=thin, voxel_size=(0.4, 0.4, 2.0), bias=0.02, sd=0.05, tilt=tilt),
-            Row(spec=tight, voxel_size=(0.5, 0.5, 1.5), bias=0.03, sd=0.09, tilt=tilt),
-        )
-    ]
-    return (*fine, *thick)
-
-
-ROWS = _rows()
+SECTION_SIZES = (
+    "circumference_mean",
+    "interior_exterior_ratio_mean",
+    "section_area_mean",
+    "shape_index_mean",
+    "area_ratio",
+    "surface_volume_ratio",
+)
 
 
 def run(full: bool) -> Suite:
@@ -114,7 +67,9 @@ def run(full: bool) -> Suite:
         tables=(
             _thickness_table(groups),
             _curvature_table(measured),
-            _size_table(measured),
+            _gaussian_table(measured),
+            _size_table(measured, "Volume, areas and extents, error in percent", SIZES),
+            _size_table(measured, "Cross-sections and ratios, error in percent", SECTION_SIZES),
         ),
         pictures=(_error_picture(measured),),
     )
@@ -204,7 +159,7 @@ def _curvature_table(measured: Sequence[Sequence[Measured]]) -> Table:
     for row, group in zip(ROWS, measured, strict=True):
         if not group or row.tilt is not None:
             continue
-        for name in group[0].curvature:
+        for name in CURVATURES:
             pairs = [(_middle(m.curvature[name]), _middle(m.true_curvature[name])) for m in group]
             found, true = (np.array(values) for values in zip(*pairs, strict=True))
             percent = 100.0 * (np.nanmean(found) / np.nanmean(true) - 1.0)
@@ -237,14 +192,53 @@ def _curvature_table(measured: Sequence[Sequence[Measured]]) -> Table:
     )
 
 
-def _size_table(measured: Sequence[Sequence[Measured]]) -> Table:
+def _gaussian_table(measured: Sequence[Sequence[Measured]]) -> Table:
+    """Middle half of each row's sheet, over all surfaces and poses."""
+    rows: list[tuple[Cell, ...]] = []
+    for row, group in zip(ROWS, measured, strict=True):
+        if not group or row.tilt is not None:
+            continue
+        for name in GAUSSIAN_CURVATURES:
+            found = np.array([_middle(m.curvature[name]) for m in group])
+            true = np.array([_middle(m.true_curvature[name]) for m in group])
+            error = float(np.sqrt(np.nanmean((found - true) ** 2)))
+            surface = name.removeprefix("gaussian_curvature").removeprefix("_") or "mid"
+            rows.append(
+                (
+                    row.name,
+                    surface,
+                    f"{np.nanmean(true):.4f}",
+                    f"{np.nanmean(found):.4f}",
+                    f"{error:.4f}",
+                    f"≤ {MAX_GAUSSIAN_ERROR:g}",
+                    bool(error <= MAX_GAUSSIAN_ERROR),
+                )
+            )
+    return Table(
+        title="Gaussian curvature in the middle half of the sheet, 1/mm²",
+        columns=(
+            "phantom, 0.4 mm voxels",
+            "surface",
+            "true mean",
+            "measured mean",
+            "RMS error of points",
+            "target",
+            "met",
+        ),
+        rows=tuple(rows),
+    )
+
+
+def _size_table(
+    measured: Sequence[Sequence[Measured]], title: str, names: tuple[str, ...]
+) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for row, group in zip(ROWS, measured, strict=True):
         if not group:
             continue
         errors = {
             name: 100.0 * np.mean([m.summary[name] / m.true_summary[name] - 1.0 for m in group])
-            for name in SIZES
+            for name in names
         }
         worst = max(map(abs, errors.values()))
         rows.append(
@@ -256,12 +250,13 @@ def _size_table(measured: Sequence[Sequence[Measured]]) -> Table:
                 bool(worst <= MAX_SIZE_ERROR),
             )
         )
-    headings = tuple(name.replace("_", ", ", 1) for name in SIZES)
+    headings = tuple(name.removesuffix("_mean").replace("_", " ") for name in names)
     return Table(
-        title="Volume, areas and extents, error in percent",
+        title=title,
         columns=("phantom", "voxels, mm", *headings, "target", "met"),
         rows=tuple(rows),
-        notes="Mean over the poses. Extents are arc lengths of the mid-surface.",
+        notes="Mean over the poses. Extents are arc lengths of the mid-surface; cross-sections are"
+        " averaged over the length of the body.",
     )
 
 

@@ -16,6 +16,7 @@ from hipsta_bids.settings import GridSettings, Settings
 
 #: Maps of curvature that are compared with the truth, interior to exterior.
 CURVATURES = ("curvature_interior", "curvature", "curvature_exterior")
+GAUSSIAN_CURVATURES = tuple(f"gaussian_{name}" for name in CURVATURES)
 
 #: Nodes at each border of the grid that are its edge: rims and end planes.
 EDGE = 2
@@ -51,7 +52,7 @@ class Measured:
     true_thickness: Float
     """mm, where the mid-surface of the sheet was found."""
     curvature: Mapping[str, Float]
-    """1/mm, by name in ``CURVATURES``."""
+    """By name in ``CURVATURES``, 1/mm, and in ``GAUSSIAN_CURVATURES``, 1/mm2."""
     true_curvature: Mapping[str, Float]
     summary: Mapping[str, float]
     true_summary: Mapping[str, float]
@@ -114,9 +115,10 @@ def compare(phantom: Phantom, case: Case, maps: HemisphereMaps) -> Measured:
     return Measured(
         thickness=maps.thickness,
         true_thickness=np.where(inside, truth.thickness, np.nan),
-        curvature={name: getattr(maps, name) for name in CURVATURES},
+        curvature={name: maps.maps[name] for name in (*CURVATURES, *GAUSSIAN_CURVATURES)},
         true_curvature={
-            name: np.where(inside, getattr(truth, name), np.nan) for name in CURVATURES
+            name: np.where(inside, getattr(truth, name), np.nan)
+            for name in (*CURVATURES, *GAUSSIAN_CURVATURES)
         },
         summary=dict(maps.summary),
         true_summary=dict(truth.summary),

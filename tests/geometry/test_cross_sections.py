@@ -11,7 +11,7 @@ from hipsta_bids.geometry.measures import measure_thickness
 from hipsta_bids.settings import MeasureSettings
 
 MEASURES = MeasureSettings()
-CHORDS = 3e-3  # areas of chords of pi / 40 instead of arcs: off by (pi / 40)^2 / 6 on either wall
+CHORDS = 3e-4  # chords of pi / 40 instead of arcs: lengths are short by (pi / 40)^2 / 24
 
 
 def cut(sheet):

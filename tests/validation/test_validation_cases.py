@@ -9,9 +9,11 @@ import pytest
 from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.phantom.body import PITCH
 from hipsta_bids.schemes import load_scheme
-from hipsta_bids.validation.accuracy import ROWS, Row, _poses, _thickness_table
+from hipsta_bids.validation.accuracy import _poses, _thickness_table
+from hipsta_bids.validation.accuracy_rows import ROWS, Row
 from hipsta_bids.validation.cases import (
     CURVATURES,
+    GAUSSIAN_CURVATURES,
     Case,
     Measured,
     along_slices,
@@ -47,7 +49,7 @@ def perfect(case, *, error=0.0):
         summary=dict(truth.summary),
         status="ok",
         flags=(SimpleNamespace(reason="thin"),),
-        **{name: getattr(truth, name) for name in CURVATURES},
+        maps={name: getattr(truth, name) for name in (*CURVATURES, *GAUSSIAN_CURVATURES)},
     )
 
 
@@ -58,7 +60,7 @@ def test_truth_is_looked_up_at_the_places_of_the_sheet(hemi, mirrored):
     phantom, maps = perfect(case, error=0.1)
     measured = compare(phantom, case, maps)
     np.testing.assert_allclose(measured.error, 0.1, atol=1e-9)  # projection is exact
-    for name in CURVATURES:
+    for name in (*CURVATURES, *GAUSSIAN_CURVATURES):
         np.testing.assert_allclose(
             measured.curvature[name], measured.true_curvature[name], atol=1e-9
         )
