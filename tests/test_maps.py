@@ -350,11 +350,12 @@ def test_wrong_options_get_one_line(bids_dir, tmp_path, options, what, capsys):
 
 def test_a_dry_run_says_which_maps_there_are(bids_dir, tmp_path, capsys):
     options = ["--map", f"half={pattern('half_hemi-{hemi}')}", "all=sub-*/anat/*_T1w.nii.gz"]
-    options += ["many=sub-*/anat/*.nii.gz"]
+    options += ["many=sub-*/anat/*.nii.gz", "fs=derivatives/*/sub-{subject}/mri/{side}.*.mgz"]
     assert run(bids_dir, tmp_path / "out", "--dry-run", *options, hemi="LR") == ExitCode.OK
     said = capsys.readouterr().out
     assert "map half: 1 of 2 hemispheres have a file; not sub-01 hemi-R (no file sub-01" in said
     assert "map all: 2 of 2 hemispheres\n" in said
+    assert "map fs: 2 of 2 hemispheres\n" in said
     assert "map many: 0 of 2 hemispheres have a file; not sub-01 hemi-L (11 files match" in said
 
 

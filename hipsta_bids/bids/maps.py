@@ -18,8 +18,10 @@ from hipsta_bids.errors import UsageError
 from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.geometry.sampling import SampledMap
 
-#: What a pattern may contain.
-PLACEHOLDERS = ("subject", "session", "hemi")
+#: What a pattern may contain; the side is the hemisphere as FreeSurfer spells it.
+PLACEHOLDERS = ("subject", "session", "hemi", "side")
+
+_SIDES = {"L": "lh", "R": "rh"}
 
 #: A session's part of a path, which goes where there are no sessions.
 _SESSION = re.compile(r"(?:^|(?<=/))ses-\{session\}/|_ses-\{session\}|\{session\}")
@@ -146,7 +148,9 @@ def attach(
 
 def _source(item: HemisphereInput, wish: MapRequest, bids_dir: Path) -> MapSource:
     pattern = wish.pattern if item.session else _SESSION.sub("", wish.pattern)
-    name = pattern.format(subject=item.subject, session=item.session, hemi=item.hemi)
+    name = pattern.format(
+        subject=item.subject, session=item.session, hemi=item.hemi, side=_SIDES[item.hemi]
+    )
     matches = sorted(glob.glob(name, root_dir=bids_dir, recursive=True))  # noqa: PTH207 (root_dir)
     missing, inside = None, not Path(pattern).is_absolute()
     if not matches:
