@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from hipsta_bids.console import Progress, complain, say, say_result, say_table
 from hipsta_bids.errors import ExitCode, HipstaError, UsageError
+from hipsta_bids.group_command import is_group_level, run_group_level
 from hipsta_bids.parser import LEVELS, build_parser
 
 if TYPE_CHECKING:
@@ -93,7 +94,9 @@ def _dispatch(arguments: list[str]) -> ExitCode:
         "surrogate": _surrogate,
         "validate": _validate,
     }
-    is_app = any(level in arguments[1:] for level in (*LEVELS, "group"))
+    if is_group_level(arguments):
+        return run_group_level(arguments)
+    is_app = any(level in arguments[1:] for level in LEVELS)
     if arguments and arguments[0] in commands and not is_app:
         return commands[arguments[0]](arguments[1:])
     return _participant(build_parser().parse_args(arguments))
@@ -228,11 +231,13 @@ def _schemes(arguments: list[str]) -> ExitCode:
 
 
 def _settings(arguments: list[str]) -> ExitCode:
-    _no_arguments(arguments, "settings")
+    group = arguments == ["group"]
+    _no_arguments([] if group else arguments, "settings")
+    from hipsta_bids.group_settings import GroupSettings  # noqa: PLC0415  (start-up time)
     from hipsta_bids.settings import Settings  # noqa: PLC0415  (start-up time)
     from hipsta_bids.settings_file import settings_toml  # noqa: PLC0415  (start-up time)
 
-    say(settings_toml(Settings()).rstrip())
+    say(settings_toml(GroupSettings() if group else Settings()).rstrip())
     return ExitCode.OK
 
 

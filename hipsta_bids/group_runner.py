@@ -21,6 +21,7 @@ from hipsta_bids.group.report import methods_text
 from hipsta_bids.group.tables import COLUMNS, map_name, result_tables
 from hipsta_bids.group.template_json import templates_from_json, templates_to_json
 from hipsta_bids.group_data import PARTICIPANT, SESSION, Cohort, ResultTable
+from hipsta_bids.group_figures import draw_figures
 from hipsta_bids.group_settings import GroupSettings
 from hipsta_bids.settings_file import resolve
 
@@ -113,6 +114,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
     with group_outputs.model_folder(options.out_dir, name) as folder:
         _write(folder, cohort, analysis, settings, exclusions)
         files.write_json(folder / "model.json", document)
+        notes += _draw(folder, cohort, analysis)
         record = _record(options, found, settings, analysis, notes)
         files.write_json(folder / "analysis.json", record)
     return GroupResult(
@@ -294,6 +296,17 @@ def _write(
     _write_gifti(folder, cohort, analysis)
     text = methods_text(cohort, analysis, settings, len(exclusions))
     files.write_text(folder / "methods.md", text)
+
+
+def _draw(folder: Path, cohort: Cohort, analysis: Analysis) -> list[str]:
+    """Draw the figures, if the library for it is there; notes otherwise."""
+    try:
+        for drawing in draw_figures(cohort, analysis):
+            files.write_bytes(folder / "figures" / f"{drawing.name}.png", drawing.png)
+            files.write_bytes(folder / "figures" / f"{drawing.name}.svg", drawing.svg)
+    except ImportError:
+        return ["no figures, as matplotlib is missing: pip install 'hipsta_bids[figures]'"]
+    return []
 
 
 def _write_gifti(folder: Path, cohort: Cohort, analysis: Analysis) -> None:

@@ -222,6 +222,8 @@ class ClassificationSettings:
     """Groups of equal size in the table of calibration."""
     iterations: int = 100
     """Most steps of a fit."""
+    firth_iterations: int = 2000
+    """Most steps of a fit by Firth's method, which takes hundreds where groups are far apart."""
     tolerance: float = 1e-16
     """Steps end when they promise to raise the log likelihood by less than this."""
 

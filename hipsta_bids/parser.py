@@ -63,7 +63,9 @@ def build_parser() -> Parser:
     )
     parser.add_argument("bids_dir", type=Path, help="a BIDS dataset")
     parser.add_argument("output_dir", type=Path, help="where the output dataset goes")
-    parser.add_argument("analysis_level", type=_level, help="participant")
+    parser.add_argument(
+        "analysis_level", type=_level, help="participant, or group (which has a --help of its own)"
+    )
     parser.add_argument("--version", action="version", version=f"hipsta_bids {__version__}")
     add_selection(parser)
     add_segmentations(parser)
@@ -289,7 +291,7 @@ def _add(
 def _level(text: str) -> str:
     if text not in LEVELS:
         raise argparse.ArgumentTypeError(
-            f"{text!r} does not exist; this version has the participant level only"
+            f"{text!r} does not exist; there are participant and group"
         )
     return text
 

@@ -131,6 +131,13 @@ def validate_parser() -> Parser:
     )
     add("--suite", nargs="+", default=[], metavar="NAME", help="only these suites")
     add(
+        "--group",
+        action="append_const",
+        dest="suite",
+        const="group",
+        help="only the group level: simulated cohorts",
+    )
+    add(
         "--labels",
         type=Path,
         metavar="BIDS_DIR",

@@ -260,7 +260,8 @@ def _refuse_unfinished(
             )
             listed = any(_is_listed(name, one) for one in unwanted)
             listed = listed or row.get("region", "body") != "body"  # the body alone is read here
-            if row.get("reason") == "not-finished" and name.seg == seg and asked and not listed:
+            same = name.seg == seg and row.get("region", "body") == "body"
+            if row.get("reason") == "not-finished" and same and asked and not listed:
                 pending.append(name.stem)
     if pending:
         shown = ", ".join(pending[:_SHOWN]) + (" ..." if len(pending) > _SHOWN else "")

@@ -12,10 +12,11 @@ import pyarrow as pa
 from pyarrow import parquet
 
 from hipsta_bids.bids import files, gifti
+from hipsta_bids.bids.names import DATASET_FILES
 from hipsta_bids.group_data import PARTICIPANT, SESSION, Cohort, Float, ResultTable, SideMaps
 
 #: Folder of all models, in the output dataset.
-GROUP_FOLDER = "group"
+GROUP_FOLDER = DATASET_FILES["group"]
 
 #: Sheets per row group of the Parquet file; bounds the memory.
 _BLOCK = 500

@@ -268,6 +268,7 @@ DATASET_FILES: dict[str, str] = {
     "status": "status.tsv",
     "status_sidecar": "status.json",
     "logs": "logs",
+    "group": "group",
 }
 
 _BY_KEY = {output.key: output for output in (*OUTPUTS, *EXTRA_OUTPUTS)}
@@ -338,4 +339,4 @@ def ignore_patterns() -> tuple[str, ...]:
     regions = [
         f"*_label-*_{output.suffix}{output.extension}" for output in OUTPUTS if output.in_standard
     ]
-    return (*dataset, f"{DATASET_FILES['logs']}/", *patterns, *regions)
+    return (*dataset, *(f"{DATASET_FILES[key]}/" for key in ("logs", "group")), *patterns, *regions)

@@ -95,7 +95,8 @@ def fit_logistic(
     kept = np.ones(matrix.shape[1], dtype=bool) if free is None else free
     beta = np.zeros(matrix.shape[1])
     value = _log_likelihood(scaled, case, beta, firth=firth)
-    for _ in range(settings.iterations):
+    limit = settings.firth_iterations if firth else settings.iterations
+    for _ in range(limit):
         step, promised = _newton_step(scaled, case, beta, kept, firth=firth)
         for halving in range(_HALVINGS):
             new = _log_likelihood(scaled, case, beta + step, firth=firth)
@@ -108,7 +109,7 @@ def fit_logistic(
             break
     else:
         raise ModelError(
-            f"logistic model: no convergence in {settings.iterations} steps; the groups may be"
+            f"logistic model: no convergence in {limit} steps; the groups may be"
             " separated, or columns nearly the same",
             reason="logistic-convergence",
         )

@@ -21,6 +21,8 @@ class PairComparison:
     control: str
     case: str
     comparison: ModelComparison
+    is_case: NDArray[np.bool_]
+    """(subjects,) in the order of the models' scores."""
     n_incomplete: int
     """Subjects of the two groups left out of both models, as they lack a value."""
 
@@ -69,5 +71,13 @@ def compare_pairs(
             found = compare_models(matrix, added[used], groups[used] == case, settings)
         except ModelError as error:
             raise ModelError(f"{control} against {case}: {error}", reason=error.reason) from error
-        results.append(PairComparison(control, case, found, int((both & ~complete).sum())))
+        results.append(
+            PairComparison(
+                control=control,
+                case=case,
+                comparison=found,
+                is_case=groups[used] == case,
+                n_incomplete=int((both & ~complete).sum()),
+            )
+        )
     return results

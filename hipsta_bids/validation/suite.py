@@ -25,6 +25,7 @@ SUITES: Mapping[str, str] = MappingProxyType(
         "convergence": "hipsta_bids.validation.convergence",
         "invariance": "hipsta_bids.validation.invariance",
         "defects": "hipsta_bids.validation.defects",
+        "group": "hipsta_bids.validation.group",
         "surrogate": "hipsta_bids.validation.surrogate",
     }
 )

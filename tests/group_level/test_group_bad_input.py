@@ -16,7 +16,7 @@ from small_cohorts import (
 )
 
 from hipsta_bids.bids import files
-from hipsta_bids.bids.status import update_status
+from hipsta_bids.bids.status import identity, update_status
 from hipsta_bids.cli import main
 
 
@@ -86,7 +86,7 @@ def no_sheet(study):
 
 
 def unfinished(study):
-    row = {"subject": "sub-99", "session": "n/a", "hemi": "L", "seg": "demo"}
+    row = identity(place_of(study.out, "99", "L").name)
     update_status(study.out, [row | {"status": "failed", "reason": "not-finished"}])
 
 

@@ -9,6 +9,7 @@ import pytest
 from pyarrow import parquet
 from small_cohorts import GROUPS, NODES, PLAN, place_of, write_dataset
 
+from hipsta_bids import group_runner
 from hipsta_bids.bids import files
 from hipsta_bids.cli import main
 from hipsta_bids.group.contrasts import Contrast
@@ -37,6 +38,18 @@ def results(dataset, quick):
     data, out = dataset
     assert main([str(data), str(out), "group", *quick]) == 0
     return out / "group" / MODEL
+
+
+@pytest.fixture
+def with_figures():
+    """Marks tests that look at figures."""
+
+
+@pytest.fixture(autouse=True)
+def _quick_figures(request, monkeypatch):
+    """Figures take longer than all else; the module's own run draws them."""
+    if "with_figures" not in request.fixturenames:
+        monkeypatch.setattr(group_runner, "draw_figures", lambda *_: iter(()))
 
 
 def table(path):
@@ -217,6 +230,34 @@ def test_left_out_hemispheres_are_listed_with_the_reason(tmp_path, quick):
     }
     n = table(folder / "hemi-L_contrast-CNAD_desc-thickness_statmap.tsv").n
     assert set(n) == {sum(PLAN.sizes) - 4}  # without 01, 03, 05, 06
+
+
+def test_figures_are_drawn_as_pictures_and_drawings(results):
+    names = {path.stem for path in (results / "figures").glob("*.png")}
+    assert names == {
+        *(
+            f"{measure}_{what}"
+            for measure in ("thickness", "curvature")
+            for what in ("means", "contrasts")
+        ),
+        *("profiles", "warps", "roc"),
+    }
+    for name in names:
+        drawing = (results / "figures" / f"{name}.svg").read_text()
+        # Words stay words, so that they can be searched and edited.
+        assert ">medial<" in drawing or name == "roc"
+    contrasts = (results / "figures" / "thickness_contrasts.svg").read_text()
+    assert "CN-AD" in contrasts
+    assert ">CA1<" in contrasts
+
+
+@pytest.mark.usefixtures("with_figures")
+def test_same_run_gives_the_same_files(results, dataset, quick):
+    data, out = dataset
+    before = {path.name: path.read_bytes() for path in results.rglob("*") if path.is_file()}
+    assert main([str(data), str(out), "group", *quick]) == 0
+    after = {path.name: path.read_bytes() for path in results.rglob("*") if path.is_file()}
+    assert before == after
 
 
 def test_first_of_several_sessions_is_analyzed(tmp_path, quick):
