@@ -154,7 +154,7 @@ def _sample(
     volume = read_scalars(path, maps.sheet.points.reshape(-1, 3))
     return sample_on_sheet(
         volume,
-        maps.sheet,
+        maps.layers if source.sampling == "depth" else maps.sheet,
         settings,
         sampling=source.sampling,
         interpolation=source.interpolation,
