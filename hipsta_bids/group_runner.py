@@ -238,6 +238,10 @@ def _incomplete(cohort: Cohort, analysis: Analysis) -> list[Exclusion]:
 
 def _notes(found: Collection, analysis: Analysis) -> list[str]:
     notes = list(analysis.skipped)
+    if flagged := sum(record.flagged for record in found.records):
+        notes.append(
+            f"{flagged} flagged hemispheres are in it; look at them, or use --exclude-flagged"
+        )
     if len(found.versions) > 1:
         notes.append(f"hemispheres were measured by several versions, {', '.join(found.versions)}")
     for key, discoveries in analysis.found.items():

@@ -205,9 +205,13 @@ class ClassificationSettings:
         "thickness_mean",
         "extent_x",
         "extent_y",
+        "circumference_mean",
+        "interior_exterior_ratio_mean",
         "area_interior",
         "area_mid",
         "area_exterior",
+        "shape_index_mean",
+        "curvature_median",
     )
     """Summary measures that are added to it, each by itself, where they were measured."""
     confidence: float = 0.95

@@ -3,7 +3,7 @@
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +50,8 @@ class SheetRecord:
     version: str
     source: str
     """Address of the segmentation."""
+    flagged: bool = False
+    """Whether the participant level asks to look before use."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,6 +203,7 @@ def _judge(
             settings_hash=str(record.get("settings_hash")),
             version=str(record.get("version")),
             source=str(inputs[0].get("file", "")),
+            flagged=status == Status.FLAGGED,
         )
     name = place.name
     return Exclusion(
@@ -297,8 +300,3 @@ def _settings_of(root: Path) -> Mapping[str, Any]:
             reason="bad-json",
         )
     return settings
-
-
-def with_exclusions(collection: Collection, more: Sequence[Exclusion]) -> Collection:
-    """Add to those left out."""
-    return replace(collection, exclusions=(*collection.exclusions, *more))

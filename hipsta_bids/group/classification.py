@@ -5,12 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize, special, stats
-from sklearn.metrics import roc_auc_score
 from sklearn.model_selection import RepeatedStratifiedKFold
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.logistic import LogisticFit, fit_logistic, is_separated
-from hipsta_bids.group.roc import Area, delong
+from hipsta_bids.group.roc import Area, area_under, delong
 from hipsta_bids.group_settings import ClassificationSettings
 
 FloatArray = NDArray[np.float64]
@@ -184,7 +183,7 @@ def cross_validate(
     for train, test in splits.split(matrix, case):
         score = _predict(matrix[train], case[train], matrix[test], settings)
         total[test] += score
-        areas.append(roc_auc_score(case[test], score))
+        areas.append(area_under(score, case[test]))
     means = np.reshape(areas, (settings.repeats, folds)).mean(axis=1)
     spread = float(means.std(ddof=1)) if settings.repeats > 1 else float("nan")
     return CrossValidation(float(means.mean()), spread, total / settings.repeats, folds)

@@ -52,6 +52,13 @@ def delong(score: FloatArray, case: BoolArray, confidence: float) -> Area:
     return Area(area, se, max(area - reach, 0.0), min(area + reach, 1.0))
 
 
+def area_under(score: FloatArray, case: BoolArray) -> float:
+    """Chance that a case scores higher than a control, ties counted half (Mann and Whitney)."""
+    cases = int(case.sum())
+    ranks = float(stats.rankdata(score)[case].sum())
+    return (ranks - cases * (cases + 1) / 2) / (cases * (len(case) - cases))
+
+
 def delong_difference(first: FloatArray, second: FloatArray, case: BoolArray) -> AreaDifference:
     """Compare two areas of the same subjects (DeLong, DeLong and Clarke-Pearson 1988).
 

@@ -10,7 +10,7 @@ from statsmodels.discrete.discrete_model import Logit
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.classification import calibrate, compare_models, cross_validate
 from hipsta_bids.group.logistic import fit_logistic, is_separated
-from hipsta_bids.group.roc import delong, delong_difference
+from hipsta_bids.group.roc import area_under, delong, delong_difference
 from hipsta_bids.group_settings import ClassificationSettings
 
 SETTINGS = ClassificationSettings(repeats=2, folds=5)
@@ -225,3 +225,10 @@ def test_refuses_what_cannot_be_compared():
         with pytest.raises(ModelError) as caught:
             compare_models(*arguments, SETTINGS)
         assert caught.value.reason == reason
+
+
+def test_area_by_ranks_counts_pairs_and_half_of_ties():
+    score = np.array([1.0, 2.0, 2.0, 3.0, 0.0])
+    case = np.array([False, True, False, True, True])
+    # Six pairs: 2 > 1, 2 = 2, 3 > 1, 3 > 2, 0 < 1, 0 < 2.
+    assert area_under(score, case) == 3.5 / 6

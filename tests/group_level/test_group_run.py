@@ -192,6 +192,16 @@ def test_formula_contrast_reference_and_options(dataset, quick):
     assert set(first.contrast) == set(second.contrast)
 
 
+def test_flagged_hemispheres_are_told(dataset, quick, capsys):
+    data, out = dataset
+    path = place_of(out, "02", "R").path("qc")
+    before = path.read_bytes()
+    files.write_json(path, json.loads(before) | {"status": "flagged"})
+    assert main([str(data), str(out), "group", *quick, "--name", "flagged"]) == 0
+    assert "note: 1 flagged hemispheres are in it" in capsys.readouterr().out
+    path.write_bytes(before)
+
+
 def test_left_out_hemispheres_are_listed_with_the_reason(tmp_path, quick):
     data, out = write_dataset(tmp_path)
     record = place_of(out, "01", "L").path("qc")
