@@ -9,7 +9,7 @@ from hipsta_bids.artifacts import Sheet
 from hipsta_bids.geometry.catalog import MAPS, SECTIONS
 from hipsta_bids.geometry.sheet import sample_sheet
 from hipsta_bids.geometry.summary import SUMMARY
-from hipsta_bids.phantom import PhantomSpec
+from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.phantom.truth import cut_sections
 from hipsta_bids.settings import Settings, SheetSettings
 
@@ -162,3 +162,9 @@ def with_fold(*arguments):
     points = sheet.points.copy()
     points[[19, 21], 10, 0] = points[[21, 19], 10, 0]
     return Sheet(points=points, valid=sheet.valid)
+
+
+def test_every_map_has_an_analytic_value():
+    truth = Phantom(SHAPES[0]).truth(np.linspace(0, 1, 3), 0.5)
+    missing = [row.name for row in MAPS if np.shape(getattr(truth, row.name, None)) != (3,)]
+    assert missing == []
