@@ -105,7 +105,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         cohort, model, groups, settings, references=references, icv=icv, templates=templates
     )
     exclusions = [*found.exclusions, *later, *_incomplete(cohort, analysis)]
-    name = options.model.name or _slug(model.formula)
+    name = options.model.name or folder_name(model.formula)
     notes = _notes(found, analysis)
     files.make_folder(options.out_dir)
     if not (options.out_dir / "dataset_description.json").exists():
@@ -191,7 +191,7 @@ def _document(
         contrasts = list(request.contrasts)
         if not contrasts and groups is not None and groups.column in formula:
             contrasts = groups.contrasts()
-        return model_from_shortcut(formula, contrasts, request.name or _slug(formula))
+        return model_from_shortcut(formula, contrasts, request.name or folder_name(formula))
     if groups is None:
         raise ModelError(
             "participants.tsv has no column that tells groups"
@@ -201,12 +201,13 @@ def _document(
         )
     formula = default_formula(table, groups, settings)
     contrasts = list(request.contrasts) or groups.contrasts()
-    return model_from_shortcut(formula, contrasts, request.name or _slug(formula))
+    return model_from_shortcut(formula, contrasts, request.name or folder_name(formula))
 
 
-def _slug(formula: str) -> str:
-    """Spell a formula as the name of a folder."""
-    right = formula.rpartition("~")[2]
+def folder_name(formula: str) -> str:
+    """Spell a formula as the name of a folder; products must not look like sums."""
+    right = formula.rpartition("~")[2].replace("*", " x ").replace(":", " by ")
+    right = right.replace(" - ", " without ")
     words = "".join(c if c.isalnum() else " " for c in right).split()
     return "-".join(words) or "model"
 

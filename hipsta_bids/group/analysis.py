@@ -154,7 +154,10 @@ def _analyze_side(
     try:
         fits = {
             name: fit_points(
-                maps[used].reshape(len(used), -1), matrix, design.contrasts, settings.glm
+                (maps if len(used) == len(maps) else maps[used]).reshape(len(used), -1),
+                matrix,
+                design.contrasts,
+                settings.glm,
             )
             for name, maps in registered.maps.items()
         }

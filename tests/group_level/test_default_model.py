@@ -5,6 +5,7 @@ import pytest
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.default_model import default_formula, find_groups
+from hipsta_bids.group_runner import folder_name
 from hipsta_bids.group_settings import GroupSettings
 
 SETTINGS = GroupSettings()
@@ -49,3 +50,15 @@ def test_one_level_is_no_group_and_numbers_are_no_names():
     with pytest.raises(ModelError) as caught:
         find_groups(pd.DataFrame({"group": ["0", "1"]}), SETTINGS)
     assert caught.value.reason == "group-numeric"
+
+
+def test_different_models_have_different_folders():
+    formulas = (
+        "group + age",
+        "group * age",
+        "group:age",
+        "group + age - 1",
+        "~ group + np.log(age)",
+    )
+    assert len({folder_name(formula) for formula in formulas}) == len(formulas)
+    assert folder_name("thickness ~ group + age") == "group-age"
