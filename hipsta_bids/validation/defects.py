@@ -1,19 +1,23 @@
 """What becomes of damaged labels: repaired, flagged or refused, and how far the maps move."""
 
-from contextlib import nullcontext
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from hipsta_bids.artifacts import Float, HemisphereMaps, LabelVolume, Status
-from hipsta_bids.participant import measure_hemisphere
-from hipsta_bids.phantom import Phantom, PhantomSpec
+from hipsta_bids.artifacts import Float, HemisphereMaps, Status
+from hipsta_bids.phantom import PhantomSpec
 from hipsta_bids.phantom.defects import make_defect
 from hipsta_bids.phantom.site import Place, Site
-from hipsta_bids.schemes import load_scheme
-from hipsta_bids.settings import Settings
+from hipsta_bids.validation.bodies import (
+    ValidationBody,
+    fine_segmentations,
+    load_body,
+    measure_body,
+    name_body,
+)
 from hipsta_bids.validation.suite import Cell, Suite, Table
 from hipsta_bids.validation.workers import Refusal, run_cases
 
@@ -42,10 +46,12 @@ OUTCOMES = {
     CRASH: "crash",
 }
 
-SPECS = {
-    "spiral": PhantomSpec(kind="spiral", thickness=2.0, length=12.0),
-    "tight": PhantomSpec(kind="tight", thickness=1.6, length=12.0),
-}
+SPECS = (
+    PhantomSpec(kind="spiral", thickness=2.0, length=12.0),
+    PhantomSpec(kind="tight", thickness=1.6, length=12.0),
+)
+VOXEL = 0.4
+"""mm, of the phantoms and at most of labels."""
 
 MIDDLE: Place = (0.5, 0.5)
 HOLES: tuple[Place, ...] = (MIDDLE, (0.2, 0.35), (0.82, 0.6))
@@ -77,10 +83,9 @@ PLAN: tuple[tuple[str, float, Place], ...] = (
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """One phantom with one defect."""
+    """One body with one defect."""
 
-    phantom: str
-    """One of :data:`SPECS`."""
+    body: ValidationBody
     kind: str
     size: float
     place: Place
@@ -124,21 +129,25 @@ class Damage:
         return tuple(rule for rule, broken in rules if broken)
 
 
-def run(full: bool) -> Suite:
-    """Damage phantoms in many ways and measure them.
+def run(full: bool, labels: Path | None = None) -> Suite:
+    """Damage bodies in many ways and measure them.
 
     Parameters
     ----------
     full : bool
         Every case on both phantoms instead of every third on one.
+    labels : Path, optional
+        A BIDS dataset with segmentations in fine voxels, of which every second is damaged too.
 
     Returns
     -------
     Suite
     """
-    names = tuple(SPECS) if full else tuple(SPECS)[:1]
+    bodies: list[ValidationBody] = list(SPECS if full else SPECS[:1])
+    if labels is not None:
+        bodies += fine_segmentations(labels, VOXEL)[::2]
     plan = PLAN if full else PLAN[::3]
-    trials = [Trial(phantom=name, kind=k, size=s, place=p) for name in names for k, s, p in plan]
+    trials = [Trial(body=body, kind=k, size=s, place=p) for body in bodies for k, s, p in plan]
     results = [
         _refused(result) if isinstance(result, Refusal) else result
         for result in run_cases(measure_trial, trials, timeout=TIMEOUT)
@@ -146,7 +155,7 @@ def run(full: bool) -> Suite:
     return Suite(
         name="defects",
         title="Damaged labels",
-        text="Each defect is put into a phantom, and the map compared with that of the undamaged "
+        text="Each defect is put into a body, and the map compared with that of the undamaged "
         "one, column by column. A map that is handed out as sound, the defect unnoticed or "
         "repaired, has to be right; flagged ones say where to look, and refused ones why.",
         tables=(_cases(trials, results), _totals(results)),
@@ -161,9 +170,9 @@ def measure_trial(trial: Trial) -> Damage:
     GeometryError
         If the package refuses the damaged labels.
     """
-    _, reference = _undamaged(trial.phantom)
-    defect = make_defect(_site(trial.phantom), trial.kind, trial.size, trial.place)
-    return compare(_measure(defect.volume), reference, defect.changed)
+    site, hemi, reference = _undamaged(trial.body)
+    defect = make_defect(site, trial.kind, trial.size, trial.place)
+    return compare(measure_body(defect.volume, hemi), reference, defect.changed)
 
 
 def compare(maps: HemisphereMaps, reference: HemisphereMaps, changed: Float) -> Damage:
@@ -196,20 +205,12 @@ def compare(maps: HemisphereMaps, reference: HemisphereMaps, changed: Float) -> 
     )
 
 
-@cache
-def _undamaged(name: str) -> tuple[LabelVolume, HemisphereMaps]:
-    volume = Phantom(SPECS[name]).label_volume(load_scheme("freesurfer"))
-    return volume, _measure(volume)
-
-
-@cache
-def _site(name: str) -> Site:
-    volume, maps = _undamaged(name)
-    return Site(volume, maps.sheet)
-
-
-def _measure(volume: LabelVolume) -> HemisphereMaps:
-    return measure_hemisphere(volume, "L", Settings(), lambda _: nullcontext())
+@lru_cache(maxsize=2)
+def _undamaged(body: ValidationBody) -> tuple[Site, str, HemisphereMaps]:
+    """Where a body can be damaged, its hemisphere and its maps; the cases of one are together."""
+    volume, hemi = load_body(body, VOXEL)
+    maps = measure_body(volume, hemi)
+    return Site(volume, maps.sheet), hemi, maps
 
 
 def _refused(refusal: Refusal) -> Damage:
@@ -225,7 +226,7 @@ def _cases(trials: list[Trial], results: list[Damage]) -> Table:
             numbers = (result.near_wrong, result.far_wrong, result.shift, result.mean)
         rows.append(
             (
-                trial.phantom,
+                name_body(trial.body),
                 trial.kind,
                 f"{trial.size:g}",
                 f"{trial.place[0]:g}, {trial.place[1]:g}",
@@ -239,7 +240,7 @@ def _cases(trials: list[Trial], results: list[Damage]) -> Table:
     return Table(
         title="Defects",
         columns=(
-            "phantom",
+            "body",
             "defect",
             "size",
             "place (u, v)",

@@ -1,7 +1,6 @@
 """Thick slices: maps of resliced bodies against those of the same bodies at full resolution."""
 
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -9,13 +8,15 @@ from pathlib import Path
 import numpy as np
 
 from hipsta_bids.artifacts import HemisphereMaps, LabelVolume, Status
-from hipsta_bids.bids.dataset import HemisphereInput, InputRequest, find_hemispheres
-from hipsta_bids.bids.images import read_label_volume
 from hipsta_bids.geometry.body import extract_body
-from hipsta_bids.participant import measure_hemisphere
-from hipsta_bids.phantom import Phantom, PhantomSpec
-from hipsta_bids.schemes import load_scheme
+from hipsta_bids.phantom import PhantomSpec
 from hipsta_bids.settings import Settings
+from hipsta_bids.validation.bodies import (
+    ValidationBody,
+    fine_segmentations,
+    load_body,
+    measure_body,
+)
 from hipsta_bids.validation.reslice import reslice
 from hipsta_bids.validation.suite import Cell, Suite, Table
 from hipsta_bids.validation.workers import Refusal, run_cases
@@ -50,7 +51,7 @@ PHANTOMS = (
 class Trial:
     """One hemisphere in slices."""
 
-    body: PhantomSpec | HemisphereInput
+    body: ValidationBody
     step: float
     """Distance of slices, mm."""
     offset: float
@@ -91,9 +92,9 @@ def run(full: bool, labels: Path | None = None) -> Suite:
     """
     steps = tuple(TARGETS) if full else (2.0,)
     ways = [(offset, 0.0) for offset in (OFFSETS if full else OFFSETS[:1])] + [(OFFSETS[1], TILT)]
-    bodies: list[PhantomSpec | HemisphereInput] = list(PHANTOMS if full else PHANTOMS[:1])
+    bodies: list[ValidationBody] = list(PHANTOMS if full else PHANTOMS[:1])
     if labels is not None:
-        bodies += _fine_segmentations(labels)
+        bodies += fine_segmentations(labels, PIXEL)
     trials = [
         Trial(body=body, step=step, offset=offset, tilt=tilt)
         for body in bodies
@@ -121,7 +122,7 @@ def measure_trial(trial: Trial) -> Outcome:
     axis = extract_body(volume, Settings().body).ends.axis
     size = (PIXEL, PIXEL, trial.step)
     thick = reslice(volume, axis, size, offset=trial.offset, tilt=trial.tilt)
-    return compare(_measure(thick, hemi), reference, trial.step)
+    return compare(measure_body(thick, hemi), reference, trial.step)
 
 
 def compare(maps: HemisphereMaps, reference: HemisphereMaps, step: float) -> Outcome:
@@ -166,30 +167,11 @@ def _sampled(reference: HemisphereMaps, step: float) -> tuple[tuple[float, float
     return tuple(found)
 
 
-def _fine_segmentations(labels: Path) -> list[HemisphereInput]:
-    """Usable segmentations of a dataset whose voxels are no coarser than the pixels of slices."""
-    items = find_hemispheres(InputRequest(bids_dir=labels))
-    return [
-        item
-        for item in items
-        if item.problem is None
-        and np.linalg.norm(read_label_volume(item).affine[:3, :3], axis=0).max() <= PIXEL
-    ]
-
-
 @lru_cache(maxsize=2)
-def _full(body: PhantomSpec | HemisphereInput) -> tuple[LabelVolume, str, HemisphereMaps]:
+def _full(body: ValidationBody) -> tuple[LabelVolume, str, HemisphereMaps]:
     """Labels at full resolution, the hemisphere and its maps; the cases of a body are together."""
-    if isinstance(body, PhantomSpec):
-        scheme, size = load_scheme("freesurfer"), (FULL_VOXEL,) * 3
-        volume, hemi = Phantom(body).label_volume(scheme, voxel_size=size), "L"
-    else:
-        volume, hemi = read_label_volume(body), body.hemi
-    return volume, hemi, _measure(volume, hemi)
-
-
-def _measure(volume: LabelVolume, hemi: str) -> HemisphereMaps:
-    return measure_hemisphere(volume, hemi, Settings(), lambda _: nullcontext())
+    volume, hemi = load_body(body, FULL_VOXEL)
+    return volume, hemi, measure_body(volume, hemi)
 
 
 def _table(trials: Sequence[Trial], results: Sequence[Outcome | Refusal]) -> Table:

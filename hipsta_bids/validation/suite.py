@@ -32,7 +32,7 @@ SUITES: Mapping[str, str] = MappingProxyType(
 
 
 #: Suites that measure real segmentations too, where there are any.
-WITH_LABELS = frozenset({"slices", "surrogate"})
+WITH_LABELS = frozenset({"defects", "slices", "surrogate"})
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,11 +10,11 @@ from hipsta_bids.validation import defects
 from hipsta_bids.validation.defects import Damage, Trial, compare, measure_trial
 from hipsta_bids.validation.workers import Refusal
 
-SPIRAL = defects.SPECS["spiral"]
+SPIRAL = defects.SPECS[0]
 
 
 def trial(kind, size, place=(0.5, 0.5)):
-    return Trial(phantom="spiral", kind=kind, size=size, place=place)
+    return Trial(body=SPIRAL, kind=kind, size=size, place=place)
 
 
 @pytest.mark.parametrize("place", [(0.5, 0.5), (0.2, 0.35), (0.82, 0.6)])
@@ -65,6 +65,7 @@ def test_refusals_name_the_defect(kind, size, reason):
         ("salt", 0.03, "noisy-labels"),
         ("gap", 0.4, "thin-gap"),
         ("cut-short", 8.0, "labels-end"),
+        ("ends-flush", 1.0, "labels-end"),
     ],
 )
 def test_what_cannot_be_repaired_is_flagged(kind, size, reason):
@@ -72,11 +73,11 @@ def test_what_cannot_be_repaired_is_flagged(kind, size, reason):
 
 
 def test_columns_are_counted_near_and_far():
-    _, reference = defects._undamaged("spiral")
+    _, _, reference = defects._undamaged(SPIRAL)
     shifted = reference.thickness.copy()
     shifted[0, 0] += 0.5
     shifted[-1, -1] -= 0.2
-    damaged = replace(reference, thickness=shifted)
+    damaged = replace(reference, maps={**reference.maps, "thickness": shifted})
     found = compare(damaged, reference, reference.sheet.points[0, 0])
     assert (found.near_wrong, found.far_wrong) == (1, 0)
     assert found.shift == pytest.approx(0.2)
