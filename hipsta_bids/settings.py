@@ -163,6 +163,8 @@ class TopologySettings:
     of 0.8 mm radius cost 2 to 6, of 1 mm 6 to 11)."""
     doubtful_fill_cost: float = 2.0
     """... and a fill across the axis that overrules more than this."""
+    flag_part: float = 0.01
+    """Flag the parting of turns that touch beyond this fraction of the body."""
     flag_fraction: float = 0.05
     """Flag a repair, or all together, beyond this fraction of the body."""
 

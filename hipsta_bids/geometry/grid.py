@@ -82,6 +82,8 @@ class Field:
     grid: WedgeGrid
     values: np.ndarray[tuple[int, ...], np.dtype[np.float32]]
     """(A, B, W), -0.5 far outside and 0.5 deep inside; a little beyond near the wall."""
+    parted: Bool | None = None
+    """(A, B, W) nodes of the body that were taken out between turns that touch, if any."""
 
 
 def resample_body(body: Body, settings: GridSettings, slices: SliceSettings) -> Field:
@@ -104,16 +106,19 @@ def resample_body(body: Body, settings: GridSettings, slices: SliceSettings) -> 
         ``ends-crossed`` where the end planes meet inside the body.
     """
     grid = _fit_grid(body, settings)
+    parted = None
     if has_thick_slices(body.affine, slices):
         points = grid.node_points(clamp=0.0).reshape(-1, 3)
         values = sample_slices(body, points, slices)
     else:
         points = grid.node_points(clamp=body.ends.half_slice).reshape(-1, 3)
         values = _sample_mask(body, points)
-        values[_between_turns(body, points, slices)] = 0
+        between = _between_turns(body, points, slices)
+        parted = (between & (values > 0.5)).reshape(grid.shape)  # noqa: PLR2004 -- in the mask
+        values[between] = 0
     sigma = max(settings.smoothing * in_plane_voxel(body.affine), settings.min_smoothing)
     smooth = _smooth(values.reshape(grid.shape), sigma / settings.spacing)
-    return Field(grid=grid, values=smooth - np.float32(0.5))
+    return Field(grid=grid, values=smooth - np.float32(0.5), parted=parted)
 
 
 def _sample_mask(body: Body, points: Float) -> NDArray[np.float32]:

@@ -16,7 +16,7 @@ from hipsta_bids.artifacts import Bool
 from hipsta_bids.geometry.simple_points import euler_number, grow, shrink
 from hipsta_bids.settings import TopologySettings
 
-Kind = Literal["cut", "fill", "island", "cavity"]
+Kind = Literal["part", "cut", "fill", "island", "cavity"]
 Contact = Callable[[NDArray[np.intp]], bool]
 FACES = ndimage.generate_binary_structure(3, 1)
 ALL = np.ones((3, 3, 3), dtype=bool)

@@ -37,7 +37,8 @@ class Repair:
     """One change of the body's shape."""
 
     kind: Kind
-    """``cut`` a bridge, ``fill`` a hole, remove an ``island``, fill a ``cavity``."""
+    """``part`` turns that touch, ``cut`` a bridge, ``fill`` a hole, remove an ``island``, fill a
+    ``cavity``."""
     voxels: int
     """Changed nodes of the working grid."""
     cost: float
@@ -52,6 +53,7 @@ class Repair:
 
     def __str__(self) -> str:
         what = {
+            "part": "parted two turns that touch, by a slit",
             "cut": "cut a bridge",
             "fill": "filled a hole",
             "island": "removed a separate piece",
@@ -123,7 +125,8 @@ def repair_topology(
     def touching(where: NDArray[np.intp]) -> bool:
         return contact is not None and contact(field.grid.to_ras((where - CORNER).astype(float)))
 
-    edits = _remove_islands(state, field, locate) + _fill_cavities(state)
+    edits = _parted(field)
+    edits += _remove_islands(state, field, locate) + _fill_cavities(state)
     for _ in range(settings.rounds):
         wrong = [plates for plates in (False, True) if euler(state, plates=plates) != 1]
         if not wrong:
@@ -145,11 +148,18 @@ def repair_topology(
     return SolidField(
         field=Field(grid=field.grid, values=consistent_values(lifted[INNER], after)),
         repairs=repairs,
-        touched=after != before,
+        touched=after != before if field.parted is None else (after != before) | field.parted,
         euler_before=euler_before,
         euler_after=euler(state),
         changed_fraction=float(np.count_nonzero(after != before) / size),
     )
+
+
+def _parted(field: Field) -> list[Edit]:
+    """List what was taken out between turns that touch, before smoothing."""
+    if field.parted is None or not field.parted.any():
+        return []
+    return [Edit("part", np.argwhere(field.parted) + CORNER)]
 
 
 def _through_pieces(state: Bool) -> tuple[NDArray[Any], int, NDArray[Any]]:
@@ -266,6 +276,7 @@ def _describe(
     centre = field.grid.to_ras(nodes.mean(axis=0, keepdims=True))[0]
     inside = np.clip(where - CORNER, 0, np.array(field.grid.shape) - 1)
     cost = edit.cost or float(np.abs(field.values[tuple(inside.T)]).sum())
+    share = settings.flag_part if kind == "part" else settings.flag_fraction
     limit = {
         "cut": settings.flag_cut_cost,
         "fill": settings.flag_fill_cost,
@@ -276,5 +287,5 @@ def _describe(
         cost=cost,
         position=(float(centre[0]), float(centre[1]), float(centre[2])),
         subfield=locate(centre[None]) if locate else "",
-        large=bool(edit.doubtful or cost > limit or len(where) > settings.flag_fraction * size),
+        large=bool(edit.doubtful or cost > limit or len(where) > share * size),
     )

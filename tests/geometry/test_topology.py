@@ -1,5 +1,7 @@
 """Holes, bridges, islands, cavities and torn caps put into a ribbon, and taken out again."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from geometry_cases import field_of, ribbon_mask
@@ -297,3 +299,14 @@ def test_ambiguous_cubes_keep_foreground_corners_apart():
     solid = repair_topology(Field(grid=field_of(mask).grid, values=values), TOPOLOGY)
     extract_surface(solid.field, SurfaceSettings())
     assert euler_number(solid.field.values > 0) == 1
+
+
+def test_parted_turns_are_reported(slab):
+    parted = np.zeros(slab.field.grid.shape, dtype=bool)
+    where = np.argwhere(slab.field.values > 0.3)[:5]  # fewer than 1 % of the body
+    parted[tuple(where.T)] = True
+    found = repair_topology(replace(slab.field, parted=parted), TopologySettings())
+    (repair,) = found.repairs
+    assert (repair.kind, repair.voxels, repair.large) == ("part", 5, False)
+    assert str(repair).startswith("parted two turns that touch, by a slit of 5 grid nodes at RAS")
+    assert found.touched[parted].all()
