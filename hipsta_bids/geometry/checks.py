@@ -11,7 +11,7 @@ from hipsta_bids.artifacts import Coordinates, Flag, Float, LabelVolume, Surface
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.grid import in_plane_voxel
-from hipsta_bids.geometry.slices import ENDS
+from hipsta_bids.geometry.slices import points_of_ends
 from hipsta_bids.geometry.surface import mean_wall_thickness
 from hipsta_bids.schemes import Part, Tissue, lateral_rank
 from hipsta_bids.settings import CheckSettings, TopologySettings
@@ -146,9 +146,7 @@ def find_contacts(body: Body, settings: TopologySettings) -> Callable[[Float], b
     The subiculum and CA2 or CA3 are no neighbors on the sheet: where both are near, two of its
     turns touch.
     """
-    index, points = body.inside_points()
-    tissue = body.tissue[tuple(index.T)]
-    trees = [cKDTree(points[np.isin(tissue, kinds)]) for kinds in ENDS]
+    trees = [cKDTree(points) for points in points_of_ends(body)]
 
     def touch(at: Float) -> bool:
         middle = at.mean(axis=0)

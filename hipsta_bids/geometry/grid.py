@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from hipsta_bids.artifacts import Bool, Float
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
-from hipsta_bids.geometry.slices import ENDS, has_thick_slices, sample_slices
+from hipsta_bids.geometry.slices import has_thick_slices, points_of_ends, sample_slices
 from hipsta_bids.settings import GridSettings, SliceSettings
 
 
@@ -133,9 +133,7 @@ def _sample_mask(body: Body, points: Float) -> NDArray[np.float32]:
 
 def _between_turns(body: Body, points: Float, settings: SliceSettings) -> Bool:
     """Which of (N, 3) points, RAS mm, part the two ends of the sheet where they touch."""
-    index, places = body.inside_points()
-    tissue = body.tissue[tuple(index.T)]
-    medial, lateral = (places[np.isin(tissue, kinds)] for kinds in ENDS)
+    medial, lateral = points_of_ends(body)
     parts = np.zeros(len(points), dtype=bool)
     if not (len(medial) and len(lateral)):
         return parts

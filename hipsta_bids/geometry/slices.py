@@ -24,7 +24,7 @@ Stack = NDArray[np.float32]
 Box = tuple[slice, slice, slice]
 
 #: Subfields of the medial and the lateral end of the ribbon. CA1 lies between them.
-ENDS = ((Tissue.PRESUBICULUM, Tissue.SUBICULUM), (Tissue.CA2, Tissue.CA2_3, Tissue.CA3))
+_ENDS = ((Tissue.PRESUBICULUM, Tissue.SUBICULUM), (Tissue.CA2, Tissue.CA2_3, Tissue.CA3))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -80,6 +80,14 @@ class SliceStack:
         return np.asarray(np.maximum(apart, far))
 
 
+def points_of_ends(body: Body) -> tuple[Float, Float]:
+    """Voxels (N, 3) of the medial and of the lateral end of the ribbon, RAS mm."""
+    index, points = body.inside_points()
+    tissue = body.tissue[tuple(index.T)]
+    medial, lateral = (points[np.isin(tissue, kinds)] for kinds in _ENDS)
+    return medial, lateral
+
+
 def has_thick_slices(affine: Float, settings: SliceSettings) -> bool:
     """Whether the longest voxel edge is long enough for interpolation by shape."""
     edges = np.sort(np.linalg.norm(affine[:3, :3], axis=0))
@@ -125,7 +133,7 @@ def _stacked(tissue: NDArray[np.uint8], pixel: float, settings: SliceSettings) -
         tissue = np.concatenate([tissue, tissue])
     outlines = np.stack([outline_slice(image, pixel, settings) for image in tissue])
     ends = np.array(
-        [[part_distance(image, end, pixel, settings) for image in tissue] for end in ENDS]
+        [[part_distance(image, end, pixel, settings) for image in tissue] for end in _ENDS]
     )
     return SliceStack(
         outlines=outlines,
