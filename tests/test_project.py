@@ -54,7 +54,10 @@ def tracked_files() -> list[Path]:
 @pytest.mark.parametrize(
     ("lock", "requirements"),
     [
-        ("requirements.lock", PROJECT["dependencies"]),
+        (
+            "requirements.lock",
+            [*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["figures"]],
+        ),
         (
             "requirements-dev.lock",
             [*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["dev"]],
