@@ -10,7 +10,7 @@ from hipsta_bids.errors import ExitCode, UsageError
 from hipsta_bids.group_parser import LEVEL, group_parser
 
 if TYPE_CHECKING:
-    from hipsta_bids.group_runner import GroupOptions
+    from hipsta_bids.group_record import GroupOptions
     from hipsta_bids.group_settings import GroupSettings
 
 
@@ -76,7 +76,8 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
 def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOptions":
     from hipsta_bids.bids.group_inputs import GroupRequest  # noqa: PLC0415  (heavy)
     from hipsta_bids.bids.quality_filter import QualityCondition  # noqa: PLC0415  (heavy)
-    from hipsta_bids.group_runner import GroupOptions, ModelRequest  # noqa: PLC0415  (heavy)
+    from hipsta_bids.group_model import ModelRequest  # noqa: PLC0415  (heavy)
+    from hipsta_bids.group_record import GroupOptions  # noqa: PLC0415  (heavy)
 
     condition = None if parsed.exclude_qc is None else QualityCondition(parsed.exclude_qc)
     return GroupOptions(

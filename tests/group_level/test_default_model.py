@@ -5,7 +5,7 @@ import pytest
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.default_model import default_formula, find_groups
-from hipsta_bids.group_runner import folder_name
+from hipsta_bids.group_model import folder_name
 from hipsta_bids.group_settings import GroupSettings
 
 SETTINGS = GroupSettings()

@@ -9,7 +9,7 @@ import pytest
 from pyarrow import parquet
 from small_cohorts import GROUPS, NODES, PLAN, place_of, write_dataset
 
-from hipsta_bids import group_runner
+from hipsta_bids import group_writer
 from hipsta_bids.bids import files
 from hipsta_bids.cli import main
 from hipsta_bids.group.contrasts import Contrast
@@ -49,7 +49,7 @@ def with_figures():
 def _quick_figures(request, monkeypatch):
     """Figures take longer than all else; the module's own run draws them."""
     if "with_figures" not in request.fixturenames:
-        monkeypatch.setattr(group_runner, "draw_figures", lambda *_: iter(()))
+        monkeypatch.setattr(group_writer, "draw_figures", lambda *_: iter(()))
 
 
 def table(path):

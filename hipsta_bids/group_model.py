@@ -1,0 +1,96 @@
+"""Which model the group level fits: the user's, or the paper's."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from hipsta_bids.bids import files
+from hipsta_bids.errors import ModelError, UsageError
+from hipsta_bids.group.default_model import Groups, default_formula, find_groups
+from hipsta_bids.group.model_spec import model_from_shortcut
+from hipsta_bids.group_settings import GroupSettings
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelRequest:
+    """Which model; all empty is the default."""
+
+    file: Path | None = None
+    """BIDS Stats Model."""
+    formula: str | None = None
+    contrasts: tuple[str, ...] = ()
+    references: tuple[tuple[str, str], ...] = ()
+    """Reference level by factor."""
+    name: str | None = None
+    """Folder of the results; else made from the formula."""
+
+
+def choose_references(
+    request: ModelRequest, table: pd.DataFrame, settings: GroupSettings
+) -> tuple[dict[str, str], Groups | None]:
+    """Take reference levels that the user gave; that of the groups reorders them.
+
+    Raises
+    ------
+    ModelError
+        If nobody has the reference level of the groups.
+    """
+    references = dict(request.references)
+    groups = find_groups(table, settings)
+    if groups is not None and groups.column in references:
+        groups = find_groups(table, settings, references[groups.column])
+    return references, groups
+
+
+def model_document(
+    request: ModelRequest, table: pd.DataFrame, groups: Groups | None, settings: GroupSettings
+) -> Mapping[str, Any]:
+    """Give the model as a BIDS Stats Model.
+
+    Parameters
+    ----------
+    request : ModelRequest
+    table : DataFrame
+        Covariates.
+    groups : Groups or None
+        From :func:`choose_references`.
+    settings : GroupSettings
+
+    Raises
+    ------
+    UsageError
+        If two models are asked for.
+    ModelError
+        If none is, and the table does not allow for the default one.
+    """
+    if request.file is not None:
+        if request.formula or request.contrasts:
+            raise UsageError("give --model or --formula, not both", reason="usage")
+        return files.read_json(request.file)
+    if request.formula is not None:
+        formula = request.formula
+        contrasts = list(request.contrasts)
+        if not contrasts and groups is not None and groups.column in formula:
+            contrasts = groups.contrasts()
+        return model_from_shortcut(formula, contrasts, request.name or folder_name(formula))
+    if groups is None:
+        raise ModelError(
+            "participants.tsv has no column that tells groups"
+            f" ({', '.join(settings.model.group_columns)}) with two levels; give a model by"
+            ' --formula "age + sex" --contrast age',
+            reason="no-groups",
+        )
+    formula = default_formula(table, groups, settings)
+    contrasts = list(request.contrasts) or groups.contrasts()
+    return model_from_shortcut(formula, contrasts, request.name or folder_name(formula))
+
+
+def folder_name(formula: str) -> str:
+    """Spell a formula as the name of a folder; products must not look like sums."""
+    right = formula.rpartition("~")[2].replace("*", " x ").replace(":", " by ")
+    right = right.replace(" - ", " without ")
+    words = "".join(c if c.isalnum() else " " for c in right).split()
+    return "-".join(words) or "model"

@@ -1,0 +1,102 @@
+"""Writes all results of one model into its folder."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import pandas as pd
+
+from hipsta_bids.bids import files, gifti, group_outputs
+from hipsta_bids.bids.group_inputs import Exclusion
+from hipsta_bids.group.analysis import Analysis
+from hipsta_bids.group.report import methods_text
+from hipsta_bids.group.tables import COLUMNS, map_name, result_tables
+from hipsta_bids.group.template_json import templates_to_json
+from hipsta_bids.group_data import PARTICIPANT, SESSION, Cohort, ResultTable
+from hipsta_bids.group_figures import draw_figures
+from hipsta_bids.group_settings import GroupSettings
+
+
+def write_results(
+    folder: Path,
+    cohort: Cohort,
+    analysis: Analysis,
+    settings: GroupSettings,
+    exclusions: Sequence[Exclusion],
+) -> None:
+    """Write tables, maps and text.
+
+    Parameters
+    ----------
+    folder : Path
+        Where; see :func:`~hipsta_bids.bids.group_outputs.model_folder`.
+    cohort : Cohort
+        What was analyzed.
+    analysis : Analysis
+        Results.
+    settings : GroupSettings
+    exclusions : sequence of Exclusion
+        Who was left out.
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written.
+    """
+    for table in result_tables(cohort, analysis, settings):
+        group_outputs.write_result_table(folder, table, COLUMNS)
+    rows = pd.DataFrame(
+        [
+            {
+                PARTICIPANT: one.participant,
+                SESSION: one.session,
+                "hemi": one.hemi,
+                "reason": one.reason,
+                "message": one.message,
+            }
+            for one in exclusions
+        ],
+        columns=[PARTICIPANT, SESSION, "hemi", "reason", "message"],
+    )
+    excluded = ResultTable(name="excluded", rows=rows)
+    group_outputs.write_result_table(folder, excluded, COLUMNS)
+    group_outputs.write_covariates(
+        folder / "covariates.tsv", cohort.table.iloc[analysis.design.rows]
+    )
+    registered = {hemi: side.registered for hemi, side in analysis.sides.items()}
+    group_outputs.write_maps(folder / "maps.parquet", cohort, registered)
+    templates = {
+        hemi: side.registration.template
+        for hemi, side in analysis.sides.items()
+        if side.registration.template is not None
+    }
+    if templates:
+        files.write_json(folder / "template.json", templates_to_json(templates))
+    _write_gifti(folder, cohort, analysis)
+    text = methods_text(cohort, analysis, settings, len(exclusions))
+    files.write_text(folder / "methods.md", text)
+
+
+def draw(folder: Path, cohort: Cohort, analysis: Analysis) -> list[str]:
+    """Draw the figures, if the library for it is there; notes otherwise."""
+    try:
+        for drawing in draw_figures(cohort, analysis):
+            files.write_bytes(folder / "figures" / f"{drawing.name}.png", drawing.png)
+            files.write_bytes(folder / "figures" / f"{drawing.name}.svg", drawing.svg)
+    except ImportError:
+        return ["no figures, as matplotlib is missing: pip install 'hipsta_bids[figures]'"]
+    return []
+
+
+def _write_gifti(folder: Path, cohort: Cohort, analysis: Analysis) -> None:
+    """Write statistics and effect sizes on the unfolded sheet."""
+    for hemi, side in analysis.sides.items():
+        surface = folder / f"hemi-{hemi}_space-unfold_midthickness.surf.gii"
+        group_outputs.write_sheet_surface(surface, cohort.x, cohort.y, hemi)
+        for measure, fit in side.fits.items():
+            for test in fit.tests:
+                single = test.kind == "t"
+                effect = ("d", test.cohen_d) if single else ("eta2", test.eta_squared)
+                for stat, values in ((test.kind, test.statistic), effect):
+                    stem = map_name(hemi, measure, test).replace("_desc-", f"_stat-{stat}_desc-")
+                    content = gifti.shape_bytes(values, hemi=hemi, name=stem, unit="1")
+                    files.write_bytes(folder / f"{stem}.shape.gii", content)
