@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hipsta_bids.drawing import new_figure
 from hipsta_bids.group.analysis import Analysis, SideResult
 from hipsta_bids.group.glm import PointTest
 from hipsta_bids.group.multiplicity import MapKey
@@ -79,10 +80,8 @@ def _encode(name: str, figure: "Figure") -> Drawing:
 
 def _panels(rows: Sequence[str], n_columns: int, size: tuple[float, float]) -> tuple["Figure", Any]:
     """Return an empty figure with a row per hemisphere."""
-    from matplotlib.figure import Figure  # noqa: PLC0415  (optional, slow to load)
-
     shape = (size[0] * n_columns + 0.8, size[1] * len(rows) + 0.6)
-    figure = Figure(figsize=shape, layout="constrained")
+    figure = new_figure(shape, layout="constrained")
     return figure, figure.subplots(len(rows), n_columns, squeeze=False)
 
 

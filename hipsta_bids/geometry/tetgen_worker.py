@@ -72,8 +72,10 @@ class TetgenClient:
         if self._process is None or self._owner != os.getpid() or self._process.poll() is not None:
             self._stop()
             environment = dict(os.environ, OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
+            # Where this process is shielded from the user's Python settings, so is the other.
+            shield = ["-I"] if sys.flags.isolated else []
             self._process = subprocess.Popen(  # noqa: S603 -- our own module
-                [sys.executable, "-m", __name__],
+                [sys.executable, *shield, "-m", __name__],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,

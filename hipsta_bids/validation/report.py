@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from hipsta_bids import __version__
 from hipsta_bids.bids import files
+from hipsta_bids.drawing import new_figure
 from hipsta_bids.errors import UsageError
 from hipsta_bids.validation.suite import SUITES, Cell, Picture, Suite, Table, run_suite
 
@@ -147,13 +148,12 @@ def file_name(picture: Picture) -> str:
 
 def _new_figure(size: tuple[float, float]) -> "Figure":
     try:
-        from matplotlib.figure import Figure  # noqa: PLC0415  (optional, heavy)
+        return new_figure(size, layout="compressed")
     except ImportError as error:
         raise UsageError(
             "validate: figures need matplotlib; try: pip install 'hipsta_bids[figures]'",
             reason="matplotlib-missing",
         ) from error
-    return Figure(figsize=size, layout="compressed")
 
 
 def _overview(suites: Sequence[Suite]) -> Table:
