@@ -14,6 +14,7 @@ from hipsta_bids.console import Progress, complain, say, say_result, say_table
 from hipsta_bids.errors import ExitCode, HipstaError, UsageError
 from hipsta_bids.group_command import is_group_level, run_group_level
 from hipsta_bids.parser import LEVELS, build_parser
+from hipsta_bids.threads import pin_threads
 
 if TYPE_CHECKING:
     from argparse import Namespace
@@ -103,6 +104,7 @@ def _dispatch(arguments: list[str]) -> ExitCode:
 
 
 def _participant(options: "Namespace") -> ExitCode:
+    pin_threads()
     from hipsta_bids.settings_file import load_settings  # noqa: PLC0415  (start-up time)
 
     _check_folders(options)

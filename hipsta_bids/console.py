@@ -39,6 +39,7 @@ class Progress:
         if sys.stderr.isatty():
             from tqdm import tqdm  # noqa: PLC0415  (not needed elsewhere)
 
+            tqdm.monitor_interval = 0  # its thread would keep workers from being forked
             self._bar = tqdm(total=total, unit="hemisphere", file=sys.stderr, leave=False)
 
     def report(self, outcome: "Outcome") -> None:

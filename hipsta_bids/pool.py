@@ -22,14 +22,8 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
-#: Read by the numerical libraries when they load, so they have to be set before.
-_THREAD_VARIABLES = (
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "VECLIB_MAXIMUM_THREADS",
-    "NUMEXPR_NUM_THREADS",
-)
+from hipsta_bids.threads import THREAD_VARIABLES
+
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _GRACE = 5.0  # s that an idle worker gets to end by itself
 _START_TIME = 300.0  # s that a worker gets to load its libraries, on a slow network disk
@@ -141,11 +135,19 @@ class _Ready:
     """Message of a worker that has loaded everything."""
 
 
+class _Enough:
+    """Message to a worker that there are no more jobs."""
+
+
 def _give(slot: _Slot, job: Any) -> None:  # noqa: ANN401  (jobs are the caller's)
     slot.job, slot.started = job, time.monotonic()
+    _tell(slot, job)
+
+
+def _tell(slot: _Slot, message: Any) -> None:  # noqa: ANN401  (jobs are the caller's)
     # A worker that died idle is noticed when it is polled.
     with contextlib.suppress(BrokenPipeError, ConnectionResetError):
-        slot.connection.send(job)
+        slot.connection.send(message)
 
 
 def _poll(slots: list[_Slot], timeout: float) -> list[tuple[_Slot, Any]]:
@@ -178,7 +180,11 @@ def _lose(slot: _Slot, *, timed_out: bool) -> WorkerLost:
 
 
 def _start(plan: WorkerPlan) -> _Slot:
-    context = multiprocessing.get_context("spawn")
+    context = _context()
+    if plan.warm_up is not None and context.get_start_method() == "fork":
+        # Once for all workers. What is wrong with it shows again in them, and in the log.
+        with contextlib.suppress(Exception):
+            plan.warm_up()
     ours, theirs = context.Pipe()
     # Not daemonic: stages may start helper processes of their own.
     process = context.Process(target=_serve, args=(theirs, plan, os.getpid()), daemon=False)
@@ -188,13 +194,21 @@ def _start(plan: WorkerPlan) -> _Slot:
     return _Slot(process=process, connection=ours)
 
 
+def _context() -> Any:  # noqa: ANN401  (the contexts have no common type that can start processes)
+    """Fork, so that nothing is loaded twice, unless threads or the system make that unsafe."""
+    with contextlib.suppress(OSError):
+        if len(os.listdir("/proc/self/task")) == 1:  # noqa: PTH208  (a count, not paths)
+            return multiprocessing.get_context("fork")
+    return multiprocessing.get_context("spawn")
+
+
 @contextlib.contextmanager
 def _inherited(plan: WorkerPlan) -> Iterator[None]:
     """Set what a new process takes over: one thread each, and no reaction to Ctrl-C.
 
     The terminal sends Ctrl-C to every process; it is this one that stops the workers.
     """
-    wanted = dict.fromkeys(_THREAD_VARIABLES, "1") | dict(plan.environment)
+    wanted = dict.fromkeys(THREAD_VARIABLES, "1") | dict(plan.environment)
     before = {name: os.environ.get(name) for name in wanted}
     in_main = threading.current_thread() is threading.main_thread()
     handler = signal.signal(signal.SIGINT, signal.SIG_IGN) if in_main else None
@@ -227,7 +241,7 @@ def _stop(slots: list[_Slot]) -> None:
     """Let idle workers end by themselves, so that they tidy up; then kill all that is left."""
     idle = [slot for slot in slots if slot.ready and slot.job is None]
     for slot in idle:
-        slot.connection.close()
+        _tell(slot, _Enough())
     for slot in idle:
         wait([slot.process.sentinel], _GRACE)
     for slot in slots:
@@ -236,7 +250,7 @@ def _stop(slots: list[_Slot]) -> None:
 
 
 def _serve(connection: Connection, plan: WorkerPlan, parent: int) -> None:
-    """Run in the worker: answer jobs until the pipe closes."""
+    """Run in the worker: answer jobs until there are no more."""
     _separate(parent)
     _redirect(plan.log)
     from threadpoolctl import threadpool_limits  # noqa: PLC0415  (loads libraries)
@@ -249,6 +263,8 @@ def _serve(connection: Connection, plan: WorkerPlan, parent: int) -> None:
             try:
                 job = connection.recv()
             except EOFError:
+                return
+            if isinstance(job, _Enough):
                 return
             connection.send(plan.work(job))
 
@@ -268,9 +284,9 @@ def _separate(parent: int) -> None:
 def _redirect(log: Path) -> None:
     """Send all output, also that of compiled libraries and crash reports, to the log file."""
     handle = os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
-    sys.stdout.flush()
-    sys.stderr.flush()
     os.dup2(handle, 1)
     os.dup2(handle, 2)
     os.close(handle)
+    # A forked worker has the streams of its parent, whatever those are.
+    sys.stdout = sys.stderr = os.fdopen(2, "w", buffering=1, closefd=False)
     faulthandler.enable()

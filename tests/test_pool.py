@@ -1,5 +1,6 @@
 import json
 import os
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -76,3 +77,36 @@ def test_environment_reaches_workers_and_is_put_back(tmp_path, monkeypatch):
 def test_no_jobs_need_no_workers(tmp_path):
     assert list(run_jobs(plan(tmp_path), [])) == []
     assert not (tmp_path / "log").exists()
+
+
+THREADLESS = """
+import subprocess
+import sys
+sys.path.insert(0, {tests!r})
+from pathlib import Path
+from pool_jobs import work
+from hipsta_bids.pool import WorkerPlan, run_jobs
+from hipsta_bids.threads import pin_threads
+def load():
+    import colorsys
+pin_threads()
+import numpy
+plan = WorkerPlan(work=work, n_workers=2, timeout=30, log=Path({where!r}, "log"), warm_up=load)
+for job, answer in run_jobs(plan, ["kill 9", "square 4", "exit 3", "square 5"]):
+    print(job, getattr(answer, "cause", answer))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="forks on Linux only")
+def test_without_threads_workers_are_forked_and_nothing_is_loaded_twice(tmp_path):
+    script = THREADLESS.format(tests=str(Path(__file__).parent), where=str(tmp_path))
+    # A spawned worker would not find ``load``, which is in no module.
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert sorted(done.stdout.splitlines()) == [
+        "exit 3 exit code 3",
+        "kill 9 SIGKILL",
+        "square 4 16",
+        "square 5 25",
+    ]
