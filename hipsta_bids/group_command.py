@@ -100,6 +100,7 @@ def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOpti
             name=parsed.name,
         ),
         covariates=tuple(parsed.covariates),
+        measures=tuple(dict.fromkeys(parsed.measures)),
         template=parsed.template,
         command=("hipsta-bids", *arguments),
     )

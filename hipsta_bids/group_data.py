@@ -14,6 +14,16 @@ Int = NDArray[np.int64]
 PARTICIPANT, SESSION = "participant_id", "session_id"
 
 
+@dataclass(frozen=True, kw_only=True)
+class Measures:
+    """What the model is fitted to."""
+
+    maps: tuple[str, ...]
+    """Maps of the sheet, by the names of their columns or by those that a user gave."""
+    summaries: tuple[str, ...] | None = None
+    """Summary measures; ``None`` for all."""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SideMaps:
     """Sheets of one hemisphere of all visits that have it."""

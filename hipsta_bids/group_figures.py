@@ -53,12 +53,15 @@ def draw_figures(cohort: Cohort, analysis: Analysis) -> Iterator[Drawing]:
     ImportError
         Without matplotlib.
     """
-    for measure in next(iter(analysis.sides.values())).fits:
+    for measure in analysis.measured.maps if analysis.sides else ():
         yield _encode(f"{measure}_means", _means(cohort, analysis, measure))
         yield _encode(f"{measure}_contrasts", _contrasts(cohort, analysis, measure))
-    yield _encode("profiles", _profiles(cohort, analysis))
-    if analysis.groups is not None and all(
-        side.registration.template is not None for side in analysis.sides.values()
+    if analysis.sides:
+        yield _encode("profiles", _profiles(cohort, analysis))
+    if (
+        analysis.groups is not None
+        and analysis.sides
+        and all(side.registration.template is not None for side in analysis.sides.values())
     ):
         yield _encode("warps", _warps(cohort, analysis))
     if analysis.pairs:
@@ -98,7 +101,7 @@ def _means(cohort: Cohort, analysis: Analysis, measure: str) -> "Figure":
     groups = analysis.groups.levels if analysis.groups else ("all",)
     figure, axes = _panels(list(analysis.sides), len(groups), (2.6, 3.6))
     means = {
-        (hemi, group): np.nanmean(side.registered.maps[measure][side.used][own], axis=0)
+        (hemi, group): mean_of_known(side.registered.maps[measure][side.used][own], 0)
         for hemi, side in analysis.sides.items()
         for group, own in _members(cohort, analysis, side).items()
     }
@@ -219,7 +222,7 @@ def _profiles(cohort: Cohort, analysis: Analysis) -> "Figure":
         for j, measure in enumerate(measures):
             for k, (source, when) in enumerate(((original, "before"), (side.registered, "after"))):
                 axis = axes[i, 2 * j + k]
-                values = np.nanmean(source.maps[measure][side.used], axis=2)
+                values = mean_of_known(source.maps[measure][side.used], 2)
                 for color, (group, own) in zip(
                     _repeat_colors(), _members(cohort, analysis, side).items(), strict=False
                 ):
@@ -232,11 +235,19 @@ def _profiles(cohort: Cohort, analysis: Analysis) -> "Figure":
     return figure
 
 
+def mean_of_known(values: Float, axis: int) -> Float:
+    """Mean of what is not missing; NaN where all is."""
+    known = np.isfinite(values)
+    total = np.where(known, values, 0.0).sum(axis=axis)
+    count = known.sum(axis=axis)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
 def _band(axis: "Axes", x: Float, values: Float, name: str, color: str) -> None:
     """Draw a mean and twice its standard error to both sides."""
     count = np.isfinite(values).sum(axis=0)
-    mean = np.nanmean(values, axis=0)
-    error = np.nanstd(values, axis=0) / np.sqrt(np.maximum(count, 1))
+    mean = mean_of_known(values, 0)
+    error = np.sqrt(mean_of_known((values - mean) ** 2, 0) / np.maximum(count, 1))
     axis.plot(x, mean, color=color, label=f"{name} (n = {len(values)})", linewidth=1.2)
     axis.fill_between(x, mean - 2 * error, mean + 2 * error, color=color, alpha=0.25, linewidth=0)
 

@@ -10,7 +10,7 @@ import pandas as pd
 from hipsta_bids.bids import files
 from hipsta_bids.errors import ModelError, UsageError
 from hipsta_bids.group.default_model import Groups, default_formula, find_groups
-from hipsta_bids.group.model_spec import model_from_shortcut
+from hipsta_bids.group.model_spec import left_side, model_from_shortcut, parse_model
 from hipsta_bids.group_settings import GroupSettings
 
 
@@ -26,6 +26,40 @@ class ModelRequest:
     """Reference level by factor."""
     name: str | None = None
     """Folder of the results; else made from the formula."""
+
+
+def wanted_measures(request: ModelRequest, listed: tuple[str, ...]) -> tuple[str, ...]:
+    """Names of the measures that are asked for, by option or on the left of a formula.
+
+    Parameters
+    ----------
+    request : ModelRequest
+    listed : tuple of str
+        Those of the option.
+
+    Returns
+    -------
+    tuple of str
+        Empty for the default.
+
+    Raises
+    ------
+    UsageError
+        If both ask for different ones.
+    ModelError
+        If the left-hand side cannot be read.
+    """
+    if request.file is not None:
+        left = parse_model(files.read_json(request.file)).measures
+    else:
+        left = left_side(request.formula or "")
+    if listed and left and set(listed) != set(left):
+        raise UsageError(
+            f"--measures {' '.join(listed)} and {' + '.join(left)} ~ in the formula differ; give"
+            " one",
+            reason="usage",
+        )
+    return listed or left
 
 
 def choose_references(
@@ -88,9 +122,9 @@ def model_document(
     return model_from_shortcut(formula, contrasts, request.name or folder_name(formula))
 
 
-def folder_name(formula: str) -> str:
-    """Spell a formula as the name of a folder; products must not look like sums."""
+def folder_name(formula: str, measures: tuple[str, ...] = ()) -> str:
+    """Spell measures and a formula as the name of a folder; products must not look like sums."""
     right = formula.rpartition("~")[2].replace("*", " x ").replace(":", " by ")
     right = right.replace(" - ", " without ")
     words = "".join(c if c.isalnum() else " " for c in right).split()
-    return "-".join(words) or "model"
+    return "_".join(part for part in ("-".join(measures), "-".join(words) or "model") if part)

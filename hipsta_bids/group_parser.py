@@ -118,6 +118,16 @@ def _add_model(parser: Parser) -> None:
         metavar="FACTOR=LEVEL",
         help="reference levels",
     )
+    add(
+        "--measures",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="NAME",
+        help="maps (columns of the sheet table, maps sampled by --map) or summary measures to fit"
+        " the model to, as does the left side of a formula (default: thickness curvature, and all"
+        " summary measures)",
+    )
     add("--name", type=_name, metavar="NAME", help="folder of the results (default: the formula)")
 
 

@@ -22,6 +22,8 @@ class GroupOptions:
     sheets: GroupRequest
     model: ModelRequest
     covariates: tuple[Path, ...] = ()
+    measures: tuple[str, ...] = ()
+    """What to fit the model to; empty for the default or the formula's left-hand side."""
     template: Path | None = None
     command: tuple[str, ...] = ()
     """The command line, for the record."""
@@ -72,6 +74,7 @@ def record_of(
             "covariates": [str(path) for path in options.covariates],
             "template": None if options.template is None else str(options.template),
         },
+        "measures": {"maps": analysis.measured.maps, "summaries": analysis.measured.summaries},
         "formula": analysis.model.formula,
         "columns": analysis.design.columns,
         "references": analysis.design.references,

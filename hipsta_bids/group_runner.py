@@ -11,13 +11,14 @@ import pandas as pd
 from hipsta_bids.bids import derivative, files, group_outputs
 from hipsta_bids.bids.covariates import read_covariates, read_icv
 from hipsta_bids.bids.group_inputs import Exclusion, collect_sheets
+from hipsta_bids.bids.measure_names import choose_measures
 from hipsta_bids.bids.sheets import Measured, read_sheets
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.analysis import Analysis, analyze_cohort
 from hipsta_bids.group.model_spec import parse_model
 from hipsta_bids.group.template_json import templates_from_json
 from hipsta_bids.group_data import PARTICIPANT, SESSION, Cohort
-from hipsta_bids.group_model import choose_references, folder_name, model_document
+from hipsta_bids.group_model import choose_references, folder_name, model_document, wanted_measures
 from hipsta_bids.group_record import GroupOptions, notes_of, record_of
 from hipsta_bids.group_settings import GroupSettings
 from hipsta_bids.group_writer import draw, write_results
@@ -60,7 +61,9 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
     """
     derivative.check_not_foreign(options.out_dir)
     found = collect_sheets(options.sheets)
-    measured = read_sheets(found.records, found.settings)
+    wanted = wanted_measures(options.model, options.measures)
+    measures = choose_measures(wanted, found.records)
+    measured = read_sheets(found.records, found.settings, measures.maps)
     cohort, later = _first_visits(_cohort(measured, options))
     cohort, icv = _with_icv(cohort, measured, settings)
     references, groups = choose_references(options.model, cohort.table, settings)
@@ -71,10 +74,17 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         templates = templates_from_json(files.read_json(options.template), str(options.template))
         _check_templates(templates, cohort, options.template)
     analysis = analyze_cohort(
-        cohort, model, groups, settings, references=references, icv=icv, templates=templates
+        cohort,
+        model,
+        groups,
+        settings,
+        measures=measures,
+        references=references,
+        icv=icv,
+        templates=templates,
     )
     exclusions = [*found.exclusions, *later, *_incomplete(cohort, analysis)]
-    name = options.model.name or folder_name(model.formula)
+    name = options.model.name or folder_name(model.formula, wanted)
     notes = notes_of(found, analysis)
     files.make_folder(options.out_dir)
     if not (options.out_dir / "dataset_description.json").exists():

@@ -63,7 +63,8 @@ def write_results(
         folder / "covariates.tsv", cohort.table.iloc[analysis.design.rows]
     )
     registered = {hemi: side.registered for hemi, side in analysis.sides.items()}
-    group_outputs.write_maps(folder / "maps.parquet", cohort, registered)
+    if registered:
+        group_outputs.write_maps(folder / "maps.parquet", cohort, registered)
     templates = {
         hemi: side.registration.template
         for hemi, side in analysis.sides.items()

@@ -12,11 +12,12 @@ from pyarrow import csv
 
 from hipsta_bids.bids import files
 from hipsta_bids.bids.group_inputs import SheetRecord
+from hipsta_bids.bids.measure_names import CURVATURE, SHEET_MAPS, sampled_desc
 from hipsta_bids.errors import InputError
 from hipsta_bids.group_data import PARTICIPANT, SESSION, Float, SideMaps
 
-#: Columns of the sheet table that are analyzed.
-MAPS = ("thickness", "curvature")
+#: Unit of sampled maps, whose own unit nobody told.
+ARBITRARY = "arbitrary"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +36,9 @@ class Measured:
     """Dataset of each visit."""
 
 
-def read_sheets(records: Sequence[SheetRecord], settings: Mapping[str, Any]) -> Measured:
+def read_sheets(
+    records: Sequence[SheetRecord], settings: Mapping[str, Any], maps: Sequence[str]
+) -> Measured:
     """Read all sheets and summaries.
 
     Parameters
@@ -44,6 +47,8 @@ def read_sheets(records: Sequence[SheetRecord], settings: Mapping[str, Any]) -> 
         Sorted by subject and session.
     settings : mapping
         Resolved settings of the participant level: number of nodes, extent of the grid.
+    maps : sequence of str
+        Columns of the sheet tables, or names of sampled maps. Curvature is read in any case.
 
     Raises
     ------
@@ -55,19 +60,20 @@ def read_sheets(records: Sequence[SheetRecord], settings: Mapping[str, Any]) -> 
     keys = [(r.place.name.subject, r.place.name.session) for r in records]
     visits = list(dict.fromkeys(keys))
     row_of = {visit: row for row, visit in enumerate(visits)}
+    names = tuple(dict.fromkeys((*maps, CURVATURE)))
     first = dict(zip(reversed(keys), reversed(records), strict=True))
     sides = {}
     for hemi in "LR":
         own = [record for record in records if record.place.name.hemi == hemi]
         rows = [row_of[r.place.name.subject, r.place.name.session] for r in own]
         if own:
-            sides[hemi] = _read_side(own, np.array(rows, dtype=np.int64), shape)
+            sides[hemi] = _read_side(own, np.array(rows, dtype=np.int64), shape, names)
     return Measured(
         visits=_visit_table(visits),
         sides=sides,
         x=_coordinates(grid["x_extent"], shape[0]),
         y=_coordinates(grid["y_extent"], shape[1]),
-        units=_units(records[0]),
+        units=_units(records[0]) | {n: ARBITRARY for n in names if n not in SHEET_MAPS},
         sources=[first[visit].source for visit in visits],
         roots=[first[visit].place.root for visit in visits],
     )
@@ -88,31 +94,46 @@ def _visit_table(visits: Sequence[tuple[str, str | None]]) -> pd.DataFrame:
 
 
 def _read_side(
-    records: Sequence[SheetRecord], rows: np.ndarray[Any, Any], shape: tuple[int, int]
+    records: Sequence[SheetRecord],
+    rows: np.ndarray[Any, Any],
+    shape: tuple[int, int],
+    names: Sequence[str],
 ) -> SideMaps:
-    maps = {name: np.empty((len(records), *shape)) for name in MAPS}
+    maps = {name: np.full((len(records), *shape), np.nan) for name in names}
+    measured = [name for name in names if name in SHEET_MAPS]
+    sampled = [name for name in names if name not in SHEET_MAPS]
     subfield = np.empty((len(records), *shape), dtype=np.int8)
     codes: dict[str, int] = {}
     summaries = []
     for i, record in enumerate(records):
-        table = _read_columns(record.place.path("sheet"), shape)
-        for name in MAPS:
+        table = _read_columns(record.place.path("sheet"), shape, measured, ["subfield"])
+        for name in measured:
             maps[name][i] = table.column(name).to_numpy().reshape(shape)
+        for name in sampled:
+            path = record.place.path("map_table", sampled_desc(name))
+            if path.is_file():
+                column = _read_columns(path, shape, [name]).column(name)
+                maps[name][i] = column.to_numpy().reshape(shape)
         subfield[i] = _encode(table.column("subfield"), codes).reshape(shape)
         summaries.append(_read_summary(record.place.path("summary")))
     summary = pd.DataFrame(summaries).astype(np.float64)
     return SideMaps(rows=rows, maps=maps, subfield=subfield, names=tuple(codes), summary=summary)
 
 
-def _read_columns(path: Path, shape: tuple[int, int]) -> pa.Table:
+def _read_columns(
+    path: Path, shape: tuple[int, int], numbers: Sequence[str], words: Sequence[str] = ()
+) -> pa.Table:
     try:
         table = csv.read_csv(
             path,
             read_options=csv.ReadOptions(use_threads=False),
             parse_options=csv.ParseOptions(delimiter="\t"),
             convert_options=csv.ConvertOptions(
-                include_columns=["x", "y", *MAPS, "subfield"],
-                column_types={**dict.fromkeys(MAPS, pa.float64()), "subfield": pa.string()},
+                include_columns=["x", "y", *numbers, *words],
+                column_types={
+                    **dict.fromkeys(numbers, pa.float64()),
+                    **dict.fromkeys(words, pa.string()),
+                },
                 null_values=[files.MISSING],
                 strings_can_be_null=True,
             ),

@@ -18,7 +18,7 @@ from hipsta_bids.group.registration import Registration, register, register_to
 from hipsta_bids.group.summaries import MeasureFit, classify_groups, fit_summaries
 from hipsta_bids.group.template import Template
 from hipsta_bids.group.warps import warp_labels, warp_values
-from hipsta_bids.group_data import Cohort, Float, Int, SideMaps
+from hipsta_bids.group_data import Cohort, Float, Int, Measures, SideMaps
 from hipsta_bids.group_settings import GroupSettings
 
 
@@ -49,6 +49,8 @@ class Analysis:
     groups: Groups | None
     sides: Mapping[str, SideResult]
     """By hemisphere."""
+    measured: Measures
+    """What the model was fitted to."""
     found: Mapping[MapKey, Discoveries]
     measures: Sequence[MeasureFit]
     pairs: Sequence[tuple[str, str, PairComparison]]
@@ -63,6 +65,7 @@ def analyze_cohort(
     groups: Groups | None,
     settings: GroupSettings,
     *,
+    measures: Measures,
     references: Mapping[str, str],
     icv: str | None = None,
     templates: Mapping[str, Template] | None = None,
@@ -79,6 +82,8 @@ def analyze_cohort(
         For classification and for figures by group.
     settings : GroupSettings
         All of the group level.
+    measures : Measures
+        What to fit the model to.
     references : mapping of str to str
         Reference levels of factors.
     icv : str, optional
@@ -95,9 +100,15 @@ def analyze_cohort(
     design = build_design(cohort.table, model, settings.design, references)
     sides = {
         hemi: _analyze_side(
-            cohort, hemi, design, groups=groups, settings=settings, templates=templates
+            cohort,
+            hemi,
+            design,
+            maps=measures.maps,
+            groups=groups,
+            settings=settings,
+            templates=templates,
         )
-        for hemi in cohort.sides
+        for hemi in (cohort.sides if measures.maps else ())
     }
     found = discover(
         {
@@ -108,15 +119,24 @@ def analyze_cohort(
         },
         settings.multiplicity,
     )
-    measures, notes = fit_summaries(cohort, model, design, settings, references=references, icv=icv)
+    summaries, notes = fit_summaries(
+        cohort,
+        model,
+        design,
+        settings,
+        only=measures.summaries,
+        references=references,
+        icv=icv,
+    )
     pairs, more = classify_groups(cohort, groups, settings) if groups else ([], [])
     return Analysis(
         model=model,
         design=design,
         groups=groups,
         sides=sides,
+        measured=measures,
         found=found,
-        measures=measures,
+        measures=summaries,
         pairs=pairs,
         skipped=[*notes, *more],
     )
@@ -138,6 +158,7 @@ def _analyze_side(
     hemi: str,
     design: Design,
     *,
+    maps: Sequence[str],
     groups: Groups | None,
     settings: GroupSettings,
     templates: Mapping[str, Template] | None,
@@ -154,12 +175,12 @@ def _analyze_side(
     try:
         fits = {
             name: fit_points(
-                (maps if len(used) == len(maps) else maps[used]).reshape(len(used), -1),
+                _rows(registered.maps[name], used).reshape(len(used), -1),
                 matrix,
                 design.contrasts,
                 settings.glm,
             )
-            for name, maps in registered.maps.items()
+            for name in maps
         }
     except ModelError as error:
         raise ModelError(f"hemisphere {hemi}: {error}", reason=error.reason) from error
@@ -198,6 +219,11 @@ def _register_maps(side: SideMaps, warps: Float) -> SideMaps:
         names=side.names,
         summary=side.summary,
     )
+
+
+def _rows(maps: Float, used: Int) -> Float:
+    """Take some sheets, without a copy if they are all."""
+    return maps if len(used) == len(maps) else maps[used]
 
 
 def _used(side: SideMaps, design: Design) -> tuple[Int, Int]:

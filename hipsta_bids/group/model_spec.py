@@ -38,6 +38,8 @@ class ModelSpec:
     contrasts: tuple[ContrastSpec, ...]
     dummy: str | None
     """Also test each column by itself, with this test."""
+    measures: tuple[str, ...] = ()
+    """Left-hand side: what the model is fitted to; empty for the default."""
 
 
 def model_from_shortcut(formula: str, contrasts: Sequence[str], name: str) -> dict[str, Any]:
@@ -105,9 +107,40 @@ def parse_model(document: Mapping[str, Any]) -> ModelSpec:
     return ModelSpec(
         name=name,
         formula=_formula(model),
+        measures=left_side(str(model.get("Formula") or "")),
         contrasts=specs,
         dummy=str(dummy.get("Test", "t")) if isinstance(dummy, Mapping) else None,
     )
+
+
+def left_side(formula: str) -> tuple[str, ...]:
+    """Names on the left of the tilde, as in ``thickness + curvature ~ group``.
+
+    Parameters
+    ----------
+    formula : str
+
+    Returns
+    -------
+    tuple of str
+        Empty if there is no left-hand side.
+
+    Raises
+    ------
+    ModelError
+        If it is not a sum of names.
+    """
+    left, tilde, right = formula.partition("~")
+    if not tilde or not left.strip():
+        return ()
+    names = tuple(dict.fromkeys(name.strip() for name in left.split("+")))
+    if "~" in right or not all(name.isidentifier() for name in names):
+        raise ModelError(
+            f"formula {formula!r}: on the left of ~ stand names of measures, joined by +, as"
+            " thickness + curvature",
+            reason="formula",
+        )
+    return names
 
 
 def parse_expression(text: str) -> dict[str, float]:

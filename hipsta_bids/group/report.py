@@ -1,6 +1,7 @@
 """A methods and results paragraph with the numbers of one analysis filled in."""
 
 from collections import Counter
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -56,14 +57,14 @@ def methods_text(cohort: Cohort, analysis: Analysis, settings: GroupSettings, n_
             cited.append(key)
         return f"[{cited.index(key) + 1}]"
 
-    paragraphs = [
-        _sample(cohort, analysis, n_out, cite("method")),
-        _registration(analysis, settings, cite("registr")),
-        _models(analysis, settings, cite(settings.multiplicity.method)),
-    ]
+    paragraphs = [_sample(cohort, analysis, n_out, cite("method"))]
+    if analysis.sides:
+        paragraphs.append(_registration(analysis, settings, cite("registr")))
+    paragraphs.append(_models(analysis, settings, cite(settings.multiplicity.method)))
     if analysis.pairs:
         paragraphs.append(_classification(analysis, settings, cite("delong"), cite("firth")))
-    paragraphs.append(_findings(analysis))
+    if analysis.sides:
+        paragraphs.append(_findings(analysis))
     lines = ["# Methods and findings", "", "This text may be used freely, as it stands or changed."]
     for paragraph in paragraphs:
         lines += ["", paragraph]
@@ -77,18 +78,21 @@ def methods_text(cohort: Cohort, analysis: Analysis, settings: GroupSettings, n_
 def _sample(cohort: Cohort, analysis: Analysis, n_out: int, method: str) -> str:
     rows = analysis.design.rows
     text = (
-        f"Maps of hippocampal thickness and curvature {method} of {len(cohort.table)} participants"
-        f" were analyzed with hipsta_bids {__version__}; {len(rows)} had all variables of the model"
+        f"Measures of the hippocampus {method} ({_words(analysis.measured.maps) or 'summaries'}) of"
+        f" {len(cohort.table)} participants were analyzed with hipsta_bids {__version__};"
+        f" {len(rows)} had all variables of the model"
     )
     if analysis.groups is not None:
         names = cohort.table[analysis.groups.column].iloc[rows]
         counts = Counter(names.dropna().astype(str))
         text += f" ({', '.join(f'{counts[g]} {g}' for g in analysis.groups.levels)})"
-    sheets = ", ".join(f"{len(side.used)} {hemi}" for hemi, side in analysis.sides.items())
-    return (
-        f"{text}, with hemispheres {sheets}. {n_out} hemispheres or visits were left out; the table"
-        " of exclusions says why."
-    )
+    if sheets := ", ".join(f"{len(side.used)} {hemi}" for hemi, side in analysis.sides.items()):
+        text += f", with hemispheres {sheets}"
+    return f"{text}. {n_out} hemispheres or visits were left out; the table of exclusions says why."
+
+
+def _words(names: Sequence[str]) -> str:
+    return ", ".join(f"map of {name.replace('_', ' ')}" for name in names)
 
 
 def _registration(analysis: Analysis, settings: GroupSettings, registr: str) -> str:

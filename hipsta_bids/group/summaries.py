@@ -1,10 +1,11 @@
 """Summary measures in the models of the maps, and as classifiers, as in the paper's tables."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
+from formulaic import Formula
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.default_model import Groups
@@ -31,7 +32,7 @@ class MeasureFit:
     fit: PointwiseFit
 
 
-def summary_values(cohort: Cohort, hemi: str) -> pd.DataFrame:
+def summary_values(cohort: Cohort, hemi: str, only: Sequence[str] | None = None) -> pd.DataFrame:
     """Summary measures by visit.
 
     Parameters
@@ -40,6 +41,8 @@ def summary_values(cohort: Cohort, hemi: str) -> pd.DataFrame:
         Sheets and summaries.
     hemi : str
         ``L``, ``R``, or ``LR`` for the mean of both, where both are there.
+    only : sequence of str, optional
+        Names of measures; else all.
 
     Returns
     -------
@@ -47,11 +50,12 @@ def summary_values(cohort: Cohort, hemi: str) -> pd.DataFrame:
         One row per visit of the cohort's table, NaN where missing.
     """
     if hemi == BOTH:
-        left, right = (summary_values(cohort, side) for side in BOTH)
+        left, right = (summary_values(cohort, side, only) for side in BOTH)
         return (left + right) / 2
     side = cohort.sides[hemi]
     table = side.summary.set_axis(cohort.table.index[side.rows])
-    return table.reindex(cohort.table.index)
+    chosen = table if only is None else table[[name for name in only if name in table.columns]]
+    return chosen.reindex(cohort.table.index)
 
 
 def hemispheres(cohort: Cohort) -> list[str]:
@@ -66,6 +70,7 @@ def fit_summaries(
     design: Design,
     settings: GroupSettings,
     *,
+    only: Sequence[str] | None,
     references: Mapping[str, str],
     icv: str | None,
 ) -> tuple[list[MeasureFit], list[str]]:
@@ -81,6 +86,8 @@ def fit_summaries(
         Its design.
     settings : GroupSettings
         When a fit is refused.
+    only : sequence of str or None
+        Names of measures; ``None`` for all.
     references : mapping of str to str
         Reference levels.
     icv : str or None
@@ -93,12 +100,11 @@ def fit_summaries(
     """
     fits, notes = [], []
     for hemi in hemispheres(cohort):
-        values = summary_values(cohort, hemi)
-        fits += _fit(values, hemi, model.formula, design, settings)
+        fits += _fit(summary_values(cohort, hemi, only), hemi, model.formula, design, settings)
     if icv is None:
         notes.append("volumes are not adjusted: no intracranial volume is known")
         return fits, notes
-    if icv in model.formula:
+    if icv in {str(name) for name in Formula(model.formula).required_variables}:
         return fits, notes
     try:
         adjusted = replace(model, formula=f"{model.formula} + {icv}")
@@ -107,7 +113,7 @@ def fit_summaries(
         notes.append(f"volumes are not adjusted for {icv}: {error}")
         return fits, notes
     for hemi in hemispheres(cohort):
-        values = summary_values(cohort, hemi)
+        values = summary_values(cohort, hemi, only)
         volumes = [name for name in values.columns if name.startswith("volume")]
         fits += _fit(values[volumes], hemi, adjusted.formula, larger, settings)
     return fits, notes

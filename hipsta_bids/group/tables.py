@@ -108,13 +108,16 @@ def result_tables(
     ------
     ResultTable
     """
-    yield ResultTable(name="peaks", rows=_peaks(cohort, analysis, settings))
-    yield ResultTable(name="maps", rows=_overview(analysis))
-    yield ResultTable(name="measures", rows=_measures(cohort, analysis))
-    yield ResultTable(name="registration", rows=_registration(analysis))
-    yield ResultTable(name="warps", rows=_warps(cohort, analysis))
-    if analysis.groups is not None:
+    if analysis.sides:
+        yield ResultTable(name="peaks", rows=_peaks(cohort, analysis, settings))
+        yield ResultTable(name="maps", rows=_overview(analysis))
+        yield ResultTable(name="registration", rows=_registration(analysis))
+        yield ResultTable(name="warps", rows=_warps(cohort, analysis))
+    if analysis.measures:
+        yield ResultTable(name="measures", rows=_measures(cohort, analysis))
+    if analysis.groups is not None and analysis.measures:
         yield ResultTable(name="descriptives", rows=_descriptives(cohort, analysis))
+    if analysis.groups is not None and analysis.sides:
         yield ResultTable(name="shifts", rows=_shifts(analysis))
     if analysis.pairs:
         yield ResultTable(name="classification", rows=_classification(analysis, settings))
@@ -130,7 +133,9 @@ def map_name(hemi: str, measure: str, test: PointTest) -> str:
     """Name of the files of one map of statistics, without suffix and extension."""
     contrast = "".join(c if c.isalnum() else " " for c in test.contrast.name).split()
     joined = "".join(word[:1].upper() + word[1:] for word in contrast) or "contrast"
-    return f"hemi-{hemi}_contrast-{joined}_desc-{measure}_statmap"
+    first, *more = measure.split("_")  # values of entities have no underscores
+    desc = first + "".join(word[:1].upper() + word[1:] for word in more)
+    return f"hemi-{hemi}_contrast-{joined}_desc-{desc}_statmap"
 
 
 def frame_of(cohort: Cohort, side: SideResult) -> SheetFrame:
@@ -245,7 +250,8 @@ def _descriptives(cohort: Cohort, analysis: Analysis) -> pd.DataFrame:
     members = cohort.table[groups.column].iloc[analysis.design.rows]
     parts = []
     for hemi in hemispheres(cohort):
-        values = summary_values(cohort, hemi).iloc[analysis.design.rows]
+        only = analysis.measured.summaries
+        values = summary_values(cohort, hemi, only).iloc[analysis.design.rows]
         for level in groups.levels:
             own = values[(members == level).to_numpy()]
             parts.append(
