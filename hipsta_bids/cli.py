@@ -10,7 +10,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
 
-from hipsta_bids.console import Progress, complain, say, say_result, say_table
+from hipsta_bids.console import Progress, complain, say, say_result, say_start, say_table
 from hipsta_bids.errors import ExitCode, HipstaError, UsageError
 from hipsta_bids.group_command import is_group_level, run_group_level
 from hipsta_bids.parser import LEVELS, build_parser
@@ -109,6 +109,8 @@ def _participant(options: "Namespace") -> ExitCode:
 
     _check_folders(options)
     settings = _with_region(load_settings(options.settings), options.region)
+    request = _request(options)
+    say_start("participant", options.bids_dir)
     from hipsta_bids.bids.dataset import (  # noqa: PLC0415  (heavy)
         dataset_notes,
         find_inputs,
@@ -116,7 +118,6 @@ def _participant(options: "Namespace") -> ExitCode:
     )
     from hipsta_bids.bids.maps import attach, map_requests  # noqa: PLC0415  (heavy)
 
-    request = _request(options)
     wishes = map_requests(options.map, options.map_sampling, options.map_interpolation)
     found = find_inputs(request)
     items, map_notes = attach(found.items, wishes, options.roi, options.bids_dir)

@@ -5,6 +5,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hipsta_bids import __version__
+
 if TYPE_CHECKING:
     from hipsta_bids.job import Outcome
     from hipsta_bids.runner import RunResult
@@ -20,6 +22,11 @@ def complain(text: str) -> None:
     """Print one line about what went wrong."""
     sys.stderr.write(" ".join(text.split()) + "\n")
     sys.stderr.flush()
+
+
+def say_start(level: str, bids_dir: Path) -> None:
+    """Say at once what runs: finding the inputs can take a while."""
+    say(f"hipsta_bids {__version__}, {level} level of {bids_dir}")
 
 
 class Progress:

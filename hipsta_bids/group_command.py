@@ -44,7 +44,9 @@ def run_group_level(arguments: Sequence[str]) -> ExitCode:
     # Thousands of tiny fits: threads of the linear algebra would only get in each other's way.
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
-    from hipsta_bids.console import say  # noqa: PLC0415  (start-up time)
+    from hipsta_bids.console import say, say_start  # noqa: PLC0415  (start-up time)
+
+    say_start(LEVEL, parsed.bids_dir)
     from hipsta_bids.group_runner import run_group  # noqa: PLC0415  (heavy)
 
     settings = _settings(parsed)

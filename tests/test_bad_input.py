@@ -286,7 +286,7 @@ def test_killed_in_the_middle_then_rerun_completes(bids_dir, tmp_path, capsys):
     out = tmp_path / "out"
     command = [*COMMAND, *arguments(bids_dir, out, "--n-procs", "1")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        first = process.stdout.readline()
+        _opening, first = process.stdout.readline(), process.stdout.readline()
         process.send_signal(signal.SIGKILL)
     assert first.startswith("sub-good_hemi-L")
     assert process.returncode == -signal.SIGKILL

@@ -26,6 +26,10 @@ def python(*arguments, **options):
     )
 
 
+def opening(folder):
+    return f"hipsta_bids {__version__}, participant level of {folder}"
+
+
 @pytest.fixture
 def seen(monkeypatch, tmp_path):
     """What the command line hands on; nothing is searched for or measured."""
@@ -172,7 +176,8 @@ def test_spellings_of_other_bids_apps(alias, field, value):
 def test_wrong_use_gets_one_line(arguments, message, capsys):
     assert cli.main(arguments.split()) == ExitCode.USAGE
     said = capsys.readouterr()
-    assert said.out == ""
+    # What needs heavy libraries to be told from right use may come after the opening line.
+    assert said.out in {"", f"{opening('in')}\n"}
     assert said.err.startswith("hipsta-bids: ")
     assert message in said.err
     assert said.err.count("\n") == 1
@@ -239,7 +244,8 @@ def stand_in_run(monkeypatch, tmp_path):
 def test_run_says_what_happened(stand_in_run, tmp_path, capsys):
     assert cli.main(stand_in_run) == ExitCode.INTERNAL
     said = capsys.readouterr()
-    lines = said.out.splitlines()
+    start, *lines = said.out.splitlines()
+    assert start == opening(stand_in_run[0])
     assert lines[0] == "note: no description"
     assert lines[1].startswith("sub-01_hemi-L_seg-demo  ok  mean thickness 1.500 mm  ")
     assert lines[2].startswith("sub-03_hemi-L_seg-demo  flagged  mean thickness 1.500 mm")
@@ -252,6 +258,12 @@ def test_run_says_what_happened(stand_in_run, tmp_path, capsys):
     assert len(errors) == 2
     assert errors[0].endswith("[body-too-short] body is 2 mm long; too short")
     assert "[internal-error] internal error (ZeroDivisionError: tests divide by zero)" in errors[1]
+
+
+def test_opening_line_waits_for_no_library(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "hipsta_bids.bids.dataset", None)  # takes longest to load
+    assert cli.main(["in", "out", "participant"]) == ExitCode.INTERNAL
+    assert capsys.readouterr().out == f"{opening('in')}\n"
 
 
 def test_second_run_says_that_it_skipped(stand_in_run, capsys):
