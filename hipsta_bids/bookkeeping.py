@@ -21,42 +21,6 @@ _CHEAP_WRITE = 0.1  # s; quicker writes are never put off
 _LOGGER = logging.getLogger(__name__)
 
 
-def open_books(root: Path, done: Sequence[Outcome], todo: Sequence[Job]) -> None:
-    """Make the table right for the case that this process ends at any moment from here on.
-
-    Parameters
-    ----------
-    root : Path
-        The output dataset.
-    done : sequence of Outcome
-        What earlier runs did.
-    todo : sequence of Job
-        What this run is going to do: recorded as not finished until it is.
-
-    Raises
-    ------
-    OutputError
-        If the table cannot be written.
-    """
-    known = {row_key(row): row.get("status") for row in read_status(root)}
-    rows = [
-        row
-        for row in map(_row, done)
-        # Rows that are there already also have the times, which the quality record has not.
-        if known.get(row_key(row)) != row["status"]
-    ]
-    for job in todo:
-        error = HipstaError(
-            "the run ended before this hemisphere; run the same command again",
-            reason="not-finished",
-        )
-        pending = Outcome(
-            job=job, status=Status.FAILED, reason=error.reason, message=str(error), error=error
-        )
-        rows.append(_row(pending))
-    update_status(root, rows)
-
-
 class Books:
     """The table and the log, written as hemispheres end.
 
@@ -68,8 +32,40 @@ class Books:
 
     def __init__(self, root: Path) -> None:
         self._root = root
+        self._known = {row_key(row): row.get("status") for row in read_status(root)}
         self._pending: list[dict[str, str]] = []
         self._next_write = 0.0
+
+    def expect(self, jobs: Sequence[Job]) -> None:
+        """Make the table right for the case that this process ends at any moment from here on.
+
+        Parameters
+        ----------
+        jobs : sequence of Job
+            What this run is going to do: recorded as not finished until it is.
+
+        Raises
+        ------
+        OutputError
+            If the table cannot be written.
+        """
+        for job in jobs:
+            error = HipstaError(
+                "the run ended before this hemisphere; run the same command again",
+                reason="not-finished",
+            )
+            row = _row(
+                Outcome(
+                    job=job,
+                    status=Status.FAILED,
+                    reason=error.reason,
+                    message=str(error),
+                    error=error,
+                )
+            )
+            self._pending.append(row)
+            self._known[row_key(row)] = row["status"]
+        self.close()
 
     def enter(self, outcome: Outcome) -> None:
         """Write one outcome to the log and to the table.
@@ -85,9 +81,11 @@ class Books:
             If the table cannot be written.
         """
         _log(outcome)
-        if outcome.skipped:
+        row = _row(outcome)
+        # Rows that are there already also have the times, which the quality record has not.
+        if outcome.skipped and self._known.get(row_key(row)) == row["status"]:
             return
-        self._pending.append(_row(outcome))
+        self._pending.append(row)
         try:
             if time.monotonic() >= self._next_write:
                 self.close()
@@ -118,8 +116,7 @@ class Books:
 
 
 def _log(outcome: Outcome) -> None:
-    name = outcome.job.place.name
-    title = f"{name.stem}_{name.protocol}"
+    title = outcome.job.title
     if outcome.skipped:
         _LOGGER.info("%s: unchanged, skipped (%s)", title, outcome.status)
         return

@@ -12,10 +12,11 @@ from hipsta_bids.artifacts import BodyMask, Status
 from hipsta_bids.bids import files, results
 from hipsta_bids.bids.derivative import source_address
 from hipsta_bids.bids.inputs import HemisphereInput
+from hipsta_bids.bids.locks import locked
 from hipsta_bids.bids.results import ResultPlace
 from hipsta_bids.cost import CostClock
-from hipsta_bids.errors import GeometryError, HipstaError, OutputError
-from hipsta_bids.mapping import Mapped, add_signals, signal_hash, write_signals
+from hipsta_bids.errors import GeometryError, HipstaError, InputError, OutputError, SchemeError
+from hipsta_bids.mapping import Mapped, add_signals, is_complete, signal_hash, write_signals
 from hipsta_bids.schemes import for_region
 from hipsta_bids.settings import Settings
 
@@ -34,6 +35,13 @@ class Job:
     sources: tuple[tuple[str, Path], ...]
     """Input datasets by name."""
     write_meshes: bool
+    force: bool = False
+    """Redo it even if an earlier run has done it just so."""
+
+    @property
+    def title(self) -> str:
+        """What its messages are headed by."""
+        return f"{self.place.name.stem}_{self.place.name.protocol}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,6 +77,8 @@ def warm_up() -> None:
 def run_job(job: Job) -> Outcome:
     """Measure one hemisphere and write its results; never raises a foreseen error.
 
+    Where another run is just doing the same, it is waited for, and its results are taken.
+
     Parameters
     ----------
     job : Job
@@ -80,6 +90,14 @@ def run_job(job: Job) -> Outcome:
         ``failed`` hemispheres leave nothing but their quality record and, if the labels tell, the
         mask of the body.
     """
+    try:
+        with locked(job.place.root, job.title):
+            return finished(job) or _measure(job)
+    except OutputError as error:
+        return fail(job, error)
+
+
+def _measure(job: Job) -> Outcome:
     from hipsta_bids.bids.images import read_label_volume  # noqa: PLC0415  (workers only)
     from hipsta_bids.participant import find_body, measure_hemisphere  # noqa: PLC0415
 
@@ -129,6 +147,52 @@ def run_job(job: Job) -> Outcome:
         input_hash=hashed,
         thickness=maps.summary.get("thickness_mean"),
         **clock.spent(),
+    )
+
+
+def finished(job: Job) -> Outcome | None:
+    """Recognize a hemisphere that an earlier run has done just so.
+
+    Parameters
+    ----------
+    job : Job
+        What would be done.
+
+    Returns
+    -------
+    Outcome or None
+        Its outcome if all files are there and inputs, settings and version are unchanged.
+        Failed hemispheres are always tried again: what stood in the way may be gone.
+    """
+    if job.force:
+        return None
+    try:
+        record = files.read_json(job.place.path("qc"))
+        status = Status(record.get("status", ""))
+    except (InputError, ValueError):
+        return None
+    same = (
+        status != Status.FAILED
+        and record.get("version") == __version__
+        and record.get("settings_hash") == job.settings_hash
+        and all(path.exists() for path in job.place.paths(optional=job.write_meshes))
+        and is_complete(job.place, record)
+    )
+    if not same:
+        return None
+    try:
+        digest, _ = hash_inputs(job)
+    except (InputError, SchemeError):
+        return None
+    if record.get("input_hash") != digest:
+        return None
+    return Outcome(
+        job=job,
+        status=status,
+        reason=record.get("reason"),
+        message=record.get("message"),
+        input_hash=digest,
+        skipped=True,
     )
 
 

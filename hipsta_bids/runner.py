@@ -12,13 +12,13 @@ from hipsta_bids import __version__
 from hipsta_bids.artifacts import Status
 from hipsta_bids.bids import derivative, files, results
 from hipsta_bids.bids.inputs import HemisphereInput
+from hipsta_bids.bids.locks import DATASET, locked
 from hipsta_bids.bids.names import HemisphereName
 from hipsta_bids.bids.results import ResultPlace
 from hipsta_bids.bids.status import write_sidecar
-from hipsta_bids.bookkeeping import Books, log_file, open_books
+from hipsta_bids.bookkeeping import Books, log_file
 from hipsta_bids.errors import ExitCode, HipstaError, InputError, OutputError, SchemeError
-from hipsta_bids.job import INTERNAL, Job, Outcome, fail, hash_inputs, run_job, warm_up
-from hipsta_bids.mapping import is_complete
+from hipsta_bids.job import INTERNAL, Job, Outcome, fail, finished, run_job, warm_up
 from hipsta_bids.pool import WorkerLost, WorkerPlan, run_jobs
 from hipsta_bids.schemes import Scheme
 from hipsta_bids.settings import Settings
@@ -119,16 +119,8 @@ def run_participants(
     UsageError
         If it is a dataset of other software.
     """
-    derivative.check_not_foreign(out_dir)
-    files.check_writable(out_dir)
-    digest = derivative.settle_settings(out_dir, settings)
-    origins = [(item.source, item.source_path) for item in items]
-    origins += [(edit.source, edit.source_path) for item in items for edit in item.edits]
-    origins += [("bids", m.source_path) for item in items for m in item.maps if m.source_path]
-    sources = derivative.source_names(origins)
-    derivative.write_description(out_dir, sources)
-    derivative.write_citation(out_dir, settings, _schemes(items))
-    write_sidecar(out_dir)
+    sources = _source_names(items)
+    digest = _set_up(out_dir, settings, sources, _schemes(items))
     jobs = [
         Job(
             item=item,
@@ -137,6 +129,7 @@ def run_participants(
             settings_hash=digest,
             sources=tuple(sources.items()),
             write_meshes=options.write_meshes,
+            force=options.force,
         )
         for item in items
     ]
@@ -146,12 +139,28 @@ def run_participants(
         # Closed at once, whatever ends the loop, so that no worker outlives it.
         with (
             contextlib.closing(books),
-            contextlib.closing(_outcomes(jobs, out_dir, options, log)) as found,
+            contextlib.closing(_outcomes(jobs, books, options, log)) as found,
         ):
             outcomes = _run(found, books, options, report)
         result = RunResult(outcomes=tuple(outcomes), n_requested=len(jobs), log=log)
         _LOGGER.info("done: %s, exit code %d", dict(result.counts), result.exit_code)
     return result
+
+
+def _set_up(
+    out_dir: Path, settings: Settings, sources: dict[str, Path], schemes: Sequence[Scheme]
+) -> str:
+    """Write what describes the dataset as a whole; give the hash of its settings."""
+    derivative.check_not_foreign(out_dir)
+    files.check_writable(out_dir)
+    with locked(out_dir, DATASET) as alone:
+        if alone:
+            files.remove_leftovers(out_dir, "*")
+        digest = derivative.settle_settings(out_dir, settings)
+        derivative.write_description(out_dir, sources)
+        derivative.write_citation(out_dir, settings, schemes)
+        write_sidecar(out_dir)
+    return digest
 
 
 def _run(
@@ -190,63 +199,18 @@ def n_workers(options: RunOptions, n_jobs: int) -> int:
     return int(max(1, min(options.n_procs, by_memory, n_jobs)))
 
 
-def finished(job: Job) -> Outcome | None:
-    """Recognize a hemisphere that an earlier run has done just so.
-
-    Parameters
-    ----------
-    job : Job
-        What would be done.
-
-    Returns
-    -------
-    Outcome or None
-        Its outcome if all files are there and inputs, settings and version are unchanged.
-        Failed hemispheres are always tried again: what stood in the way may be gone.
-    """
-    try:
-        record = files.read_json(job.place.path("qc"))
-        status = Status(record.get("status", ""))
-    except (InputError, ValueError):
-        return None
-    same = (
-        status != Status.FAILED
-        and record.get("version") == __version__
-        and record.get("settings_hash") == job.settings_hash
-        and all(path.exists() for path in job.place.paths(optional=job.write_meshes))
-        and is_complete(job.place, record)
-    )
-    if not same:
-        return None
-    try:
-        digest, _ = hash_inputs(job)
-    except (InputError, SchemeError):
-        return None
-    if record.get("input_hash") != digest:
-        return None
-    return Outcome(
-        job=job,
-        status=status,
-        reason=record.get("reason"),
-        message=record.get("message"),
-        input_hash=digest,
-        skipped=True,
-    )
-
-
 def _outcomes(
-    jobs: Sequence[Job], root: Path, options: RunOptions, log: Path
+    jobs: Sequence[Job], books: Books, options: RunOptions, log: Path
 ) -> Generator[Outcome]:
     """Give the outcomes of all hemispheres: first what is done already, then the others."""
-    done, todo = [], []
+    todo = []
     for job in jobs:
-        earlier = None if options.force else finished(job)
+        earlier = finished(job)
         if earlier is None:
             todo.append(job)
         else:
-            done.append(earlier)
             yield earlier
-    open_books(root, done, todo)
+    books.expect(todo)
     for job in todo:
         if job.item.problem is not None:
             yield fail(job, job.item.problem)
@@ -258,11 +222,17 @@ def _outcomes(
     except BaseException:
         pool.close()
         for job in able:
-            # What was being written has no quality record yet.
-            if not job.place.path("qc").exists():
-                with contextlib.suppress(OutputError):
-                    results.remove_results(job.place)
+            with contextlib.suppress(OutputError):
+                _remove_unfinished(job)
         raise
+
+
+def _remove_unfinished(job: Job) -> None:
+    """Remove what was being written: it has no quality record yet."""
+    if job.place.path("sheet").exists() and not job.place.path("qc").exists():
+        with locked(job.place.root, job.title):
+            if not job.place.path("qc").exists():  # another run may have been at it
+                results.remove_results(job.place)
 
 
 def _plan(options: RunOptions, n_jobs: int, log: Path) -> WorkerPlan:
@@ -290,7 +260,17 @@ def _lost(job: Job, loss: WorkerLost, options: RunOptions) -> Outcome:
             " it with the log",
             reason="worker-died",
         )
-    return fail(job, error, seconds=loss.seconds)
+    # Another run may have been at it, and for that one it may have gone well.
+    with locked(job.place.root, job.title):
+        return finished(job) or fail(job, error, seconds=loss.seconds)
+
+
+def _source_names(items: Sequence[HemisphereInput]) -> dict[str, Path]:
+    """Name the datasets that inputs come from."""
+    origins = [(item.source, item.source_path) for item in items]
+    origins += [(edit.source, edit.source_path) for item in items for edit in item.edits]
+    origins += [("bids", m.source_path) for item in items for m in item.maps if m.source_path]
+    return derivative.source_names(origins)
 
 
 def _schemes(items: Sequence[HemisphereInput]) -> list[Scheme]:

@@ -12,6 +12,7 @@ import io
 import json
 import math
 import os
+import secrets
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -86,11 +87,11 @@ def check_writable(folder: Path) -> None:
         If not.
     """
     make_folder(folder)
-    probe = folder / f".write-probe.{os.getpid()}{_TEMPORARY}"
+    probe = _aside(folder / "write-probe")
     try:
         # A whole block, since an empty file can still be made on a full disk.
         _write_through(probe, b"\0" * 4096)
-        probe.unlink()
+        probe.unlink(missing_ok=True)  # another run may tidy up
     except OSError as error:
         with contextlib.suppress(OSError):
             probe.unlink()
@@ -113,7 +114,7 @@ def write_bytes(path: Path, content: bytes) -> None:
         If it cannot be written; the earlier file, if any, is then unharmed.
     """
     make_folder(path.parent)
-    aside = path.with_name(f".{path.name}.{os.getpid()}{_TEMPORARY}")
+    aside = _aside(path)
     try:
         try:
             _write_through(aside, content)
@@ -124,6 +125,11 @@ def write_bytes(path: Path, content: bytes) -> None:
             raise
     except OSError as error:
         raise output_error(path, error) from error
+
+
+def _aside(path: Path) -> Path:
+    """Name a file to write into before it is renamed, that no process elsewhere has as well."""
+    return path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}{_TEMPORARY}")
 
 
 def _write_through(path: Path, content: bytes) -> None:

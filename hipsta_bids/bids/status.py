@@ -1,11 +1,10 @@
 """``status.tsv``: one row per hemisphere, kept over all runs into the same folder."""
 
-import contextlib
-import fcntl
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from hipsta_bids.bids import files
+from hipsta_bids.bids.locks import DATASET, locked
 from hipsta_bids.bids.names import DATASET_FILES, HemisphereName
 from hipsta_bids.errors import InputError
 
@@ -92,7 +91,7 @@ def update_status(root: Path, rows: Iterable[Row]) -> None:
     OutputError
         If the table cannot be written; the earlier one is then unharmed.
     """
-    with _locked(root):
+    with locked(root, DATASET):
         merged = {row_key(row): row for row in read_status(root)}
         merged |= {row_key(row): dict(row) for row in rows}
         ordered = [merged[key] for key in sorted(merged)]
@@ -118,20 +117,3 @@ def write_sidecar(root: Path) -> None:
     described = {name: {"Description": text} for name, text in COLUMNS.items()}
     described[f"{STAGE_PREFIX}*"] = {"Description": "elapsed time of one stage, s"}
     files.write_json(root / DATASET_FILES["status_sidecar"], described)
-
-
-@contextlib.contextmanager
-def _locked(root: Path) -> Iterator[None]:
-    """Let one process at a time read, merge and write the table."""
-    folder = root / DATASET_FILES["logs"]
-    files.make_folder(folder)
-    path = folder / ".status.lock"
-    try:
-        handle = path.open("ab")
-    except OSError as error:
-        raise files.output_error(path, error) from error
-    with handle:
-        # Some network file systems have no locks: then single runs still work.
-        with contextlib.suppress(OSError):
-            fcntl.flock(handle, fcntl.LOCK_EX)
-        yield

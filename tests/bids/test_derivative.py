@@ -1,5 +1,5 @@
 import json
-import threading
+import multiprocessing
 from dataclasses import dataclass, field
 
 import pytest
@@ -129,15 +129,19 @@ def test_unreadable_status_is_rebuilt(tmp_path):
     assert len(read_status(tmp_path)) == 1
 
 
+def add_rows(folder, subject):
+    for session in range(20):
+        update_status(folder, [row(subject) | {"session": f"ses-{session}"}])
+
+
 def test_runs_side_by_side_lose_no_row(tmp_path):
-    threads = [
-        threading.Thread(target=update_status, args=(tmp_path, [row(f"sub-{k}")])) for k in range(8)
-    ]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(read_status(tmp_path)) == 8
+    context = multiprocessing.get_context("spawn")
+    runs = [context.Process(target=add_rows, args=(tmp_path, f"sub-{k}")) for k in range(2)]
+    for run in runs:
+        run.start()
+    for run in runs:
+        run.join()
+    assert len(read_status(tmp_path)) == 40
 
 
 def test_status_sidecar_defines_the_columns(tmp_path):
