@@ -25,6 +25,16 @@ class Measures:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class Mesh:
+    """Surface whose vertices are the points of maps, where these lie on no regular grid."""
+
+    points: Float
+    """(points, 3)"""
+    triangles: Int
+    """(triangles, 3)"""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class SideMaps:
     """Sheets of one hemisphere of all visits that have it."""
 

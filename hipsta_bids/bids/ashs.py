@@ -44,6 +44,22 @@ class _File:
         return self.hemi is None, _KINDS.index(self.kind), outside, not self.own_id
 
 
+def volume_table(path: Path) -> Path | None:
+    """Name the table of volumes that was written with a segmentation.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    Path or None
+        In the same folder, there or not; ``None`` if the file is not ASHS's.
+    """
+    match = _NAME.fullmatch(path.name)
+    return None if match is None else path.with_name(f"{match['stem']}_{match['kind']}_volumes.txt")
+
+
 def find_ashs(
     visit: Visit, source: Source, atlases: AtlasFinder, selection: Selection
 ) -> Iterator[HemisphereInput]:

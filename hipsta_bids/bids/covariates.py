@@ -1,12 +1,12 @@
 """Covariates of participants and sessions, from the tables of a BIDS dataset and from others."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from urllib.parse import unquote, urlsplit
 
 import pandas as pd
 
 from hipsta_bids.bids import files
+from hipsta_bids.bids.source_links import locate_sources
 from hipsta_bids.errors import InputError
 from hipsta_bids.group_data import PARTICIPANT, SESSION
 
@@ -124,22 +124,8 @@ def read_icv(sources: Sequence[str], roots: Sequence[Path]) -> list[float | None
     list of float or None
         mm^3.
     """
-    links: dict[Path, Mapping[str, str]] = {}
-    result: list[float | None] = []
-    for source, root in zip(sources, roots, strict=True):
-        if root not in links:
-            links[root] = files.read_json(root / "dataset_description.json").get("DatasetLinks", {})
-        path = _resolve(source, links[root])
-        result.append(None if path is None else _icv_beside(path))
-    return result
-
-
-def _resolve(source: str, links: Mapping[str, str]) -> Path | None:
-    if not source.startswith("bids:"):
-        return Path(source) if source else None
-    _, dataset, inside = source.split(":", 2)
-    link = links.get(dataset, "")
-    return Path(unquote(urlsplit(link).path)) / inside if link.startswith("file:") else None
+    paths = locate_sources(sources, roots)
+    return [None if path is None else _icv_beside(path) for path in paths]
 
 
 def _icv_beside(path: Path) -> float | None:

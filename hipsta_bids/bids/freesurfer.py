@@ -114,6 +114,26 @@ class _Run:
         return next(ways, None)
 
 
+def volume_table(path: Path) -> Path | None:
+    """Name the table of volumes that was written with a segmentation.
+
+    Parameters
+    ----------
+    path : Path
+        A file of any hierarchy.
+
+    Returns
+    -------
+    Path or None
+        Of the same analysis, in the same folder, there or not; ``None`` if the file is not
+        FreeSurfer's.
+    """
+    match = _NAME.fullmatch(path.name)
+    if match is None:
+        return None
+    return path.with_name(f"{match['hemi']}h.hippoSfVolumes{match['analysis']}.txt")
+
+
 def find_freesurfer(
     visit: Visit, source: Source, selection: Selection
 ) -> Iterator[HemisphereInput]:

@@ -1,8 +1,5 @@
 """Other volumes to be sampled on the sheet (``--map``): which files, and what is written."""
 
-import glob
-import re
-import string
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,18 +10,11 @@ from hipsta_bids.artifacts import Float
 from hipsta_bids.bids import files, gifti
 from hipsta_bids.bids.inputs import HemisphereInput, MapSource
 from hipsta_bids.bids.names import EXTRA_OUTPUTS, OUTPUTS
+from hipsta_bids.bids.patterns import check_pattern, fill, find
 from hipsta_bids.bids.results import ResultPlace
 from hipsta_bids.errors import UsageError
 from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.geometry.sampling import SampledMap
-
-#: What a pattern may contain; the side is the hemisphere as FreeSurfer spells it.
-PLACEHOLDERS = ("subject", "session", "hemi", "side")
-
-_SIDES = {"L": "lh", "R": "rh"}
-
-#: A session's part of a path, which goes where there are no sessions.
-_SESSION = re.compile(r"(?:^|(?<=/))ses-\{session\}/|_ses-\{session\}|\{session\}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +60,7 @@ def map_requests(
         if name in taken or names.count(name) > 1:
             why = "belongs to other outputs" if name in taken else "occurs twice"
             raise UsageError(f"--map: the name {name} {why}; choose another one", reason="usage")
-        _check_placeholders(name, pattern)
+        check_pattern("--map", name, pattern)
     for option, choices in (("sampling", samplings), ("interpolation", interpolations)):
         lost = [name for name, _ in choices if name is not None and name not in names]
         if lost:
@@ -86,20 +76,6 @@ def map_requests(
         )
         for name, pattern in patterns
     )
-
-
-def _check_placeholders(name: str, pattern: str) -> None:
-    try:
-        fields = {field for _, field, _, _ in string.Formatter().parse(pattern)} - {None}
-        unknown = fields - set(PLACEHOLDERS)
-    except ValueError:
-        unknown = {pattern}
-    if unknown:
-        known = ", ".join(f"{{{field}}}" for field in PLACEHOLDERS)
-        raise UsageError(
-            f"--map {name}: {min(map(str, unknown))!r} is not understood; placeholders are {known}",
-            reason="usage",
-        )
 
 
 def attach(
@@ -147,12 +123,9 @@ def attach(
 
 
 def _source(item: HemisphereInput, wish: MapRequest, bids_dir: Path) -> MapSource:
-    pattern = wish.pattern if item.session else _SESSION.sub("", wish.pattern)
-    name = pattern.format(
-        subject=item.subject, session=item.session, hemi=item.hemi, side=_SIDES[item.hemi]
-    )
-    matches = sorted(glob.glob(name, root_dir=bids_dir, recursive=True))  # noqa: PTH207 (root_dir)
-    missing, inside = None, not Path(pattern).is_absolute()
+    name = fill(wish.pattern, item.subject, item.session, item.hemi)
+    matches = find(name, bids_dir)
+    missing, inside = None, not Path(wish.pattern).is_absolute()
     if not matches:
         missing = f"no file {name}"
     elif len(matches) > 1:
@@ -161,7 +134,7 @@ def _source(item: HemisphereInput, wish: MapRequest, bids_dir: Path) -> MapSourc
         name=wish.name,
         sampling=wish.sampling,
         interpolation=wish.interpolation,
-        path=None if missing else bids_dir / matches[0],
+        path=None if missing else matches[0],
         missing=missing,
         source_path=bids_dir if inside else None,
     )

@@ -1,0 +1,318 @@
+"""Other programs' maps with corresponding points (``--maps``): which files, whose, on what."""
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hipsta_bids.bids.label_tables import entities
+from hipsta_bids.bids.patterns import Found, check_pattern, fields_of, fill, find, scan
+from hipsta_bids.bids.point_files import PointMap, read_map, read_mesh
+from hipsta_bids.errors import InputError, NothingToDoError, UsageError
+from hipsta_bids.geometry.catalog import MAPS
+from hipsta_bids.group_data import Float, Int, Mesh
+
+Visit = tuple[str, str | None]
+"""Subject and session, without prefixes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapPattern:
+    """A map that every hemisphere may have."""
+
+    name: str
+    pattern: str
+    """Path with placeholders, absolute or relative to the BIDS dataset; may have wildcards."""
+    surface: str | None = None
+    """The same for the surface to draw it on."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ForeignSide:
+    """One map of one hemisphere."""
+
+    visits: tuple[Visit, ...]
+    values: Float
+    """(visits, points)"""
+    unit: str
+    mesh: Mesh | None
+    """``None`` on the regular grid of sheets."""
+    nodes: tuple[int, int]
+    """Nodes along x and y of that grid; (points, 1) on a mesh."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ForeignFiles:
+    """The files of one map."""
+
+    request: MapPattern
+    root: Path
+    """What patterns are relative to."""
+    files: Mapping[str, Mapping[Visit, Path]]
+    """By hemisphere and visit."""
+
+    @property
+    def visits(self) -> set[Visit]:
+        """Visits that have it, in either hemisphere."""
+        return {visit for side in self.files.values() for visit in side}
+
+
+def map_patterns(
+    patterns: Sequence[tuple[str, str]],
+    surfaces: Sequence[tuple[str | None, str]],
+    taken: Sequence[str],
+) -> tuple[MapPattern, ...]:
+    """Combine and check the options about maps.
+
+    Parameters
+    ----------
+    patterns : sequence of (str, str)
+        Names and patterns.
+    surfaces : sequence of (str or None, str)
+        Surfaces for one name, or (None) for all that have none of their own.
+    taken : sequence of str
+        Names that have another meaning.
+
+    Returns
+    -------
+    tuple of MapPattern
+
+    Raises
+    ------
+    UsageError
+        If a name occurs twice or is taken, a placeholder is unknown or lacking, or a surface is
+        for a map that does not exist.
+    """
+    names = [name for name, _ in patterns]
+    for name, pattern in patterns:
+        if not (name.isalnum() and name.isascii() and name[0].isalpha()):
+            raise UsageError(
+                f"--maps: {name!r} is not a name of letters and digits", reason="usage"
+            )
+        if name in taken or names.count(name) > 1:
+            why = "belongs to the sheets" if name in taken else "occurs twice"
+            raise UsageError(
+                f"--maps: the name {name} {why}; choose another one, such as other{name}",
+                reason="usage",
+            )
+        check_pattern("--maps", name, pattern)
+        fields = fields_of(pattern)
+        if "subject" not in fields or not fields & {"hemi", "side"}:
+            raise UsageError(
+                f"--maps {name}: the pattern needs {{subject}}, and {{hemi}} or {{side}}",
+                reason="usage",
+            )
+    if lost := [name for name, _ in surfaces if name is not None and name not in names]:
+        raise UsageError(f"--maps-surface: there is no --maps {lost[0]}=...", reason="usage")
+    for whose, pattern in surfaces:
+        check_pattern("--maps-surface", whose or "", pattern)
+    chosen = dict(surfaces)
+    return tuple(
+        MapPattern(name=name, pattern=pattern, surface=chosen.get(name, chosen.get(None)))
+        for name, pattern in patterns
+    )
+
+
+def taken_names(*, with_sheets: bool) -> tuple[str, ...]:
+    """Names that other programs' maps may not have."""
+    return tuple(row.name for row in MAPS) if with_sheets else ()
+
+
+def find_maps(
+    request: MapPattern,
+    root: Path,
+    known: Iterable[Visit],
+    is_wanted: Callable[[str, str | None, str], bool],
+) -> ForeignFiles:
+    """Look for the files of one map.
+
+    Parameters
+    ----------
+    request : MapPattern
+    root : Path
+        What patterns are relative to.
+    known : iterable of (str, str or None)
+        Visits that there are anyway. A participant of these has no others; a file without
+        session is for all of them.
+    is_wanted : callable
+        Takes subject, session and hemisphere.
+
+    Returns
+    -------
+    ForeignFiles
+
+    Raises
+    ------
+    InputError
+        If several files are for the same hemisphere.
+    NothingToDoError
+        If there are no files.
+    """
+    sessions: dict[str, list[str | None]] = {}
+    for subject, session in known:
+        sessions.setdefault(subject, []).append(session)
+    found: dict[str, dict[Visit, Path]] = {}
+    for one in scan(request.pattern, root):
+        if one.hemi is None:
+            continue
+        for session in _sessions(one, sessions):
+            if not is_wanted(one.subject, session, one.hemi):
+                continue
+            first = found.setdefault(one.hemi, {}).setdefault((one.subject, session), one.path)
+            if first != one.path:
+                raise InputError(
+                    f"--maps {request.name}: {first} and {one.path} are both for sub-{one.subject}"
+                    f" hemi-{one.hemi}; make the pattern match one of them",
+                    reason="several-files",
+                )
+    if not found:
+        raise NothingToDoError(
+            f"--maps {request.name}: no file matches {request.pattern} (in {root})",
+            reason="no-maps",
+        )
+    return ForeignFiles(
+        request=request, root=root, files={hemi: found[hemi] for hemi in "LR" if hemi in found}
+    )
+
+
+def _sessions(one: Found, known: Mapping[str, Sequence[str | None]]) -> Sequence[str | None]:
+    """Sessions that a file is for."""
+    own = known.get(one.subject)
+    if own is None:
+        return [one.session]
+    if one.session is None:
+        return own
+    return [one.session] if one.session in own else []
+
+
+def read_maps(found: ForeignFiles, grid: tuple[int, int]) -> dict[str, ForeignSide]:
+    """Read one map of all hemispheres.
+
+    Parameters
+    ----------
+    found : ForeignFiles
+    grid : (int, int)
+        Nodes along x and y of the sheets.
+
+    Returns
+    -------
+    dict of str to ForeignSide
+        By hemisphere.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be read, maps have different numbers of points, or no surface fits.
+    """
+    return {hemi: _read_side(found, hemi, grid) for hemi in found.files}
+
+
+def _read_side(found: ForeignFiles, hemi: str, grid: tuple[int, int]) -> ForeignSide:
+    paths = found.files[hemi]
+    visits = tuple(sorted(paths, key=lambda visit: (visit[0], visit[1] or "")))
+    maps = [read_map(paths[visit], found.request.name) for visit in visits]
+    _refuse_mixed(found.request.name, hemi, [paths[visit] for visit in visits], maps)
+    first = maps[0]
+    points = len(first.values)
+    mesh = None if first.nodes == grid else _mesh(found, hemi, points)
+    if mesh is None and first.nodes != grid and points != grid[0] * grid[1]:
+        raise InputError(
+            f"--maps {found.request.name}, hemisphere {hemi}: no surface of {points} vertices lies"
+            f" beside {paths[visits[0]]}, and sheets have {grid[0]} x {grid[1]} points; name one by"
+            " --maps-surface",
+            reason="no-surface",
+        )
+    return ForeignSide(
+        visits=visits,
+        values=np.stack([one.values for one in maps]),
+        unit=first.unit,
+        mesh=mesh,
+        nodes=grid if mesh is None else (points, 1),
+    )
+
+
+def _refuse_mixed(name: str, hemi: str, paths: Sequence[Path], maps: Sequence[PointMap]) -> None:
+    counts = Counter(len(one.values) for one in maps)
+    if len(counts) > 1:
+        examples = {len(one.values): path for path, one in zip(paths, maps, strict=True)}
+        parts = [f"{n} with {points} ({examples[points]})" for points, n in counts.most_common()]
+        raise InputError(
+            f"--maps {name}, hemisphere {hemi}: maps have different numbers of points:"
+            f" {'; '.join(parts)}; use one density",
+            reason="mixed-grids",
+        )
+
+
+def _mesh(found: ForeignFiles, hemi: str, points: int) -> Mesh | None:
+    """Read the surface that the user named, or else that beside the first map that has one."""
+    paths = found.files[hemi]
+    if found.request.surface is not None:
+        return _named_surface(found, hemi, points)
+    for path in paths.values():
+        for candidate in _surfaces_beside(path):
+            mesh = read_mesh(candidate)
+            if len(mesh.points) == points:
+                return mesh
+    return None
+
+
+def _named_surface(found: ForeignFiles, hemi: str, points: int) -> Mesh:
+    request = found.request
+    pattern = request.surface or ""
+    names = dict.fromkeys(
+        fill(pattern, subject, session, hemi) for subject, session in found.files[hemi]
+    )
+    for name in names:
+        for path in find(name, found.root) or find(name, Path()):
+            mesh = read_mesh(path)
+            if len(mesh.points) != points:
+                raise InputError(
+                    f"--maps-surface {path}: has {len(mesh.points)} vertices, the maps"
+                    f" {request.name} of hemisphere {hemi} have {points} points",
+                    reason="mixed-grids",
+                )
+            return mesh
+    raise InputError(
+        f"--maps-surface: no file {next(iter(names))}; it serves to draw {request.name}",
+        reason="no-surface",
+    )
+
+
+def _surfaces_beside(path: Path) -> list[Path]:
+    """HippUnfold's unfolded surface: beside the map, or in version 2 in ``surf/``."""
+    own = entities(path.name)
+    folders = [path.parent, path.parent.parent / "surf"]
+    return [
+        candidate
+        for folder in folders
+        for candidate in sorted(folder.glob("*space-unfold*_midthickness.surf.gii"))
+        if _belongs(own, entities(candidate.name))
+    ]
+
+
+def _belongs(own: Mapping[str, str], surface: Mapping[str, str]) -> bool:
+    keys = ("sub", "ses", "hemi", "den", "label")
+    # Sheets of this program have an unfolded surface too, but their maps have their grid.
+    return "seg" not in surface and all(own.get(key) == surface.get(key) for key in keys)
+
+
+def rows_of(visits: Sequence[Visit], keys: Sequence[Visit]) -> tuple[Int, Int]:
+    """Match visits to rows of the covariates.
+
+    Parameters
+    ----------
+    visits : sequence of (str, str or None)
+    keys : sequence of (str, str or None)
+        Visits of the rows.
+
+    Returns
+    -------
+    rows, places : ndarray of int
+        Rows, rising, and the places of their visits.
+    """
+    row_of = {visit: row for row, visit in enumerate(keys)}
+    rows = np.array([row_of[visit] for visit in visits], dtype=np.int64)
+    places = np.argsort(rows)
+    return rows[places], np.asarray(places, dtype=np.int64)
