@@ -95,6 +95,8 @@ def _dispatch(arguments: list[str]) -> ExitCode:
         "surrogate": _surrogate,
         "validate": _validate,
     }
+    if "--bids-exec-spec" in arguments:
+        return _descriptor()
     if is_group_level(arguments):
         return run_group_level(arguments)
     is_app = any(level in arguments[1:] for level in LEVELS)
@@ -212,6 +214,14 @@ def _run_options(options: "Namespace") -> "RunOptions":
         write_meshes=options.write_meshes,
         timeout=options.timeout,
     )
+
+
+def _descriptor() -> ExitCode:
+    """Print what the command line looks like, for platforms."""
+    from hipsta_bids.boutiques import descriptor_text  # noqa: PLC0415  (start-up time)
+
+    say(descriptor_text().rstrip())
+    return ExitCode.OK
 
 
 def _no_arguments(arguments: list[str], command: str) -> None:

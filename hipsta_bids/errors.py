@@ -5,6 +5,7 @@ a :class:`HipstaError` is a bug in this package and shows its traceback.
 """
 
 from enum import IntEnum
+from signal import SIGINT, SIGTERM
 
 
 class ExitCode(IntEnum):
@@ -17,6 +18,20 @@ class ExitCode(IntEnum):
     NOTHING_TO_DO = 66
     INTERNAL = 70
     NOT_WRITABLE = 73
+
+
+#: What exit codes mean, those of signals included: shells report death by signal n as 128 + n.
+EXIT_MEANINGS: dict[int, str] = {
+    ExitCode.OK: "all hemispheres done",
+    ExitCode.SOME_FAILED: "some hemisphere failed, the rest is complete (see status.tsv)",
+    ExitCode.USAGE: "wrong use of the command line, wrong settings",
+    ExitCode.BAD_DATA: "bad data: an unreadable folder, no usable hemisphere, or no possible model",
+    ExitCode.NOTHING_TO_DO: "nothing to process",
+    ExitCode.INTERNAL: "internal error: please report it",
+    ExitCode.NOT_WRITABLE: "the output folder cannot be written, or the disk is full",
+    128 + SIGINT: "stopped by Ctrl-C; run the same command again to complete",
+    128 + SIGTERM: "stopped by SIGTERM; run the same command again to complete",
+}
 
 
 class HipstaError(Exception):

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from hipsta_bids import __version__
-from hipsta_bids.errors import UsageError
+from hipsta_bids.errors import EXIT_MEANINGS, UsageError
 
 LEVELS = ("participant",)
 REGIONS = ("body", "extended", "entorhinal")
@@ -22,17 +22,10 @@ other commands:
   hipsta-bids phantom DIR      write a synthetic cohort with a known effect (see its --help)
   hipsta-bids surrogate IN OUT measure thickness in single slices to cross-check maps
   hipsta-bids validate         measure accuracy on phantoms, write a report (see its --help)
+  hipsta-bids --bids-exec-spec print the Boutiques descriptor of both levels
 
 exit codes:
-  0    all hemispheres done
-  1    some hemisphere failed, the rest is complete (see status.tsv)
-  64   wrong use of the command line, wrong settings
-  65   bad data: an input folder cannot be read, or every hemisphere's input is unusable
-  66   nothing to process
-  70   internal error: please report it
-  73   the output folder cannot be written, or the disk is full
-  130  stopped by Ctrl-C (143: by SIGTERM); run the same command again to complete
-"""
+""" + "".join(f"  {int(code):<4} {meaning}\n" for code, meaning in EXIT_MEANINGS.items())
 
 _MEMORY_UNITS = {"K": 1e-6, "M": 1e-3, "G": 1.0, "T": 1e3}
 
