@@ -20,7 +20,7 @@ from hipsta_bids.boutiques.outputs import (
     participant_outputs,
 )
 from hipsta_bids.errors import EXIT_MEANINGS, ExitCode
-from hipsta_bids.group_command import group_parser
+from hipsta_bids.group_parser import group_parser
 from hipsta_bids.parser import build_parser
 
 #: Name of each descriptor, and the level that it is for; ``None`` is both.

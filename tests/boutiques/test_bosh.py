@@ -18,7 +18,7 @@ from bosh_cases import (
 
 from hipsta_bids.boutiques import DESCRIPTORS
 from hipsta_bids.errors import EXIT_MEANINGS, ExitCode
-from hipsta_bids.group_command import group_parser
+from hipsta_bids.group_parser import group_parser
 from hipsta_bids.parser import build_parser
 from hipsta_bids.phantom import Hemisphere, PhantomSpec, write_dataset
 

@@ -14,7 +14,7 @@ from hipsta_bids.boutiques import DESCRIPTORS, describe, descriptor_text
 from hipsta_bids.boutiques.inputs import groups_of, inputs_of, merge_inputs
 from hipsta_bids.cli import main
 from hipsta_bids.errors import EXIT_MEANINGS, ExitCode
-from hipsta_bids.group_command import group_parser
+from hipsta_bids.group_parser import group_parser
 from hipsta_bids.parser import build_parser
 
 PARSERS = {"participant": build_parser, "group": group_parser}

@@ -47,6 +47,7 @@ def test_group_level_in_place_by_the_descriptor_of_both(folder):
         output_mount="part 1",
         analysis_level="group",
         formula="thickness ~ age",
+        name="age",
     )
     assert "Exit code\n0\n" in done.stdout, done.stdout
     assert outputs_found(done) == {"output_dataset"}
