@@ -66,9 +66,17 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
     if parsed.align is not None:
         align = parsed.align.replace("penalised", "penalized")
         settings = replace(settings, registration=replace(settings.registration, align=align))
-    if parsed.fdr_scope is not None:
-        multiplicity = replace(settings.multiplicity, scope=parsed.fdr_scope)
-        settings = replace(settings, multiplicity=multiplicity)
+    given = {
+        "method": parsed.correction,
+        "scope": parsed.fdr_scope,
+        "permutations": parsed.permutations,
+        "blocks": parsed.blocks,
+    }
+    chosen = {name: value for name, value in given.items() if value is not None}
+    settings = replace(settings, multiplicity=replace(settings.multiplicity, **chosen))
+    if parsed.longitudinal is not None:
+        longitudinal = replace(settings.longitudinal, random=parsed.longitudinal)
+        settings = replace(settings, longitudinal=longitudinal)
     if parsed.base:
         classification = replace(settings.classification, base=tuple(parsed.base))
         settings = replace(settings, classification=classification)
@@ -78,6 +86,7 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
 def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOptions":
     from hipsta_bids.bids.group_inputs import GroupRequest  # noqa: PLC0415  (heavy)
     from hipsta_bids.bids.quality_filter import QualityCondition  # noqa: PLC0415  (heavy)
+    from hipsta_bids.group.comparison import Comparison  # noqa: PLC0415  (heavy)
     from hipsta_bids.group_model import ModelRequest  # noqa: PLC0415  (heavy)
     from hipsta_bids.group_record import GroupOptions  # noqa: PLC0415  (heavy)
 
@@ -104,5 +113,10 @@ def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOpti
         covariates=tuple(parsed.covariates),
         measures=tuple(dict.fromkeys(parsed.measures)),
         template=parsed.template,
+        comparison=Comparison(
+            longitudinal=parsed.longitudinal is not None,
+            pair=None if parsed.paired is None else tuple(parsed.paired),
+            asymmetry=parsed.asymmetry,
+        ),
         command=("hipsta-bids", *arguments),
     )

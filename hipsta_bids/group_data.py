@@ -1,7 +1,7 @@
 """Values that pass between reading, analyzing and writing at the group level."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -53,6 +53,16 @@ class SideMaps:
     def shape(self) -> tuple[int, int]:
         """Nodes along x and y."""
         return self.subfield.shape[1], self.subfield.shape[2]
+
+    def only(self, measures: Sequence[str]) -> "SideMaps":
+        """Keep some maps.
+
+        Parameters
+        ----------
+        measures : sequence of str
+            Which.
+        """
+        return replace(self, maps={name: self.maps[name] for name in measures})
 
     def take(self, keep: NDArray[np.bool_]) -> "SideMaps":
         """Keep some rows of the cohort's table, which are numbered anew.

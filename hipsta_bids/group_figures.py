@@ -6,9 +6,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 
 from hipsta_bids.drawing import new_figure
-from hipsta_bids.group.analysis import Analysis, SideResult
+from hipsta_bids.group.analysis import Analysis
+from hipsta_bids.group.fitted import FittedMaps
 from hipsta_bids.group.glm import PointTest
 from hipsta_bids.group.multiplicity import MapKey
 from hipsta_bids.group_data import Cohort, Float
@@ -53,7 +55,7 @@ def draw_figures(cohort: Cohort, analysis: Analysis) -> Iterator[Drawing]:
     ImportError
         Without matplotlib.
     """
-    for measure in analysis.measured.maps if analysis.sides else ():
+    for measure in dict.fromkeys(m for one in analysis.fitted.values() for m in one.fits):
         yield _encode(f"{measure}_means", _means(cohort, analysis, measure))
         yield _encode(f"{measure}_contrasts", _contrasts(cohort, analysis, measure))
     if analysis.sides:
@@ -88,30 +90,41 @@ def _panels(rows: Sequence[str], n_columns: int, size: tuple[float, float]) -> t
     return figure, figure.subplots(len(rows), n_columns, squeeze=False)
 
 
-def _members(cohort: Cohort, analysis: Analysis, side: SideResult) -> Mapping[str, Any]:
-    """Tell which of the sheets used belong to each group."""
+def _shown(analysis: Analysis, measure: str) -> Mapping[str, FittedMaps]:
+    """Give hemispheres, or their difference, that have maps of a measure."""
+    return {hemi: one for hemi, one in analysis.fitted.items() if measure in one.fits}
+
+
+def _rows(analysis: Analysis, one: FittedMaps) -> pd.DataFrame:
+    """Rows of the model's table that the sheets used belong to."""
+    return analysis.compared.table.iloc[one.maps.rows[one.used]]
+
+
+def _members(analysis: Analysis, table: pd.DataFrame) -> Mapping[str, Any]:
+    """Tell which rows belong to each group."""
     if analysis.groups is None:
-        return {"all": np.ones(len(side.used), dtype=bool)}
-    names = cohort.table[analysis.groups.column].iloc[side.registered.rows[side.used]]
+        return {"all": np.ones(len(table), dtype=bool)}
+    names = table[analysis.groups.column]
     return {level: (names == level).to_numpy() for level in analysis.groups.levels}
 
 
 def _means(cohort: Cohort, analysis: Analysis, measure: str) -> "Figure":
     """Draw the mean map of each group."""
     groups = analysis.groups.levels if analysis.groups else ("all",)
-    figure, axes = _panels(list(analysis.sides), len(groups), (2.6, 3.6))
+    shown = _shown(analysis, measure)
+    figure, axes = _panels(list(shown), len(groups), (2.6, 3.6))
     means = {
-        (hemi, group): mean_of_known(side.registered.maps[measure][side.used][own], 0)
-        for hemi, side in analysis.sides.items()
-        for group, own in _members(cohort, analysis, side).items()
+        (hemi, group): mean_of_known(one.values(measure)[own], 0).reshape(one.maps.shape)
+        for hemi, one in shown.items()
+        for group, own in _members(analysis, _rows(analysis, one)).items()
     }
     low, high = np.nanpercentile(np.stack(list(means.values())), _SHARED)
     images: list[Any] = []
-    for i, (hemi, side) in enumerate(analysis.sides.items()):
+    for i, (hemi, one) in enumerate(shown.items()):
         for j, group in enumerate(groups):
             axis = axes[i, j]
             images.append(_sheet(axis, cohort, means[hemi, group], "viridis", (low, high)))
-            _borders(axis, cohort, side)
+            _borders(axis, cohort, one)
             axis.set_title(f"{group}, {_side(hemi)}", fontsize=9)
     unit = cohort.units.get(measure, "1")
     figure.colorbar(images[0], ax=axes, label=f"mean {measure} [{unit}]", shrink=0.6)
@@ -120,26 +133,27 @@ def _means(cohort: Cohort, analysis: Analysis, measure: str) -> "Figure":
 
 def _contrasts(cohort: Cohort, analysis: Analysis, measure: str) -> "Figure":
     """Draw effect sizes and adjusted p-values of each contrast."""
-    tests = next(iter(analysis.sides.values())).fits[measure].tests
-    figure, axes = _panels(list(analysis.sides), 2 * len(tests), (2.6, 3.6))
-    effects = [_effect(t) for s in analysis.sides.values() for t in s.fits[measure].tests]
+    shown = _shown(analysis, measure)
+    tests = next(iter(shown.values())).fits[measure].tests
+    figure, axes = _panels(list(shown), 2 * len(tests), (2.6, 3.6))
+    effects = [_effect(t) for one in shown.values() for t in one.fits[measure].tests]
     reach = max(float(np.nanmax(np.abs(np.stack(effects)))), 1e-6)
     top = -np.log10(_SMALLEST_P)
     images: list[Any] = []
-    for i, (hemi, side) in enumerate(analysis.sides.items()):
-        for j, test in enumerate(side.fits[measure].tests):
+    for i, (hemi, one) in enumerate(shown.items()):
+        for j, test in enumerate(one.fits[measure].tests):
             found = analysis.found[MapKey(measure, test.contrast.name, hemi)]
             left, right = axes[i, j], axes[i, len(tests) + j]
-            shape = side.registered.shape
+            shape = one.maps.shape
             images.append(
                 _sheet(left, cohort, _effect(test).reshape(shape), "RdBu_r", (-reach, reach))
             )
             sign = np.sign(test.statistic)
             log = -np.log10(np.clip(found.adjusted, _SMALLEST_P, 1)) * sign
-            shown = np.where(found.rejected, log, np.nan).reshape(shape)
-            images.append(_sheet(right, cohort, shown, "PuOr_r", (-top, top)))
+            surviving = np.where(found.rejected, log, np.nan).reshape(shape)
+            images.append(_sheet(right, cohort, surviving, "PuOr_r", (-top, top)))
             for axis, what in ((left, "effect size"), (right, "significance")):
-                _borders(axis, cohort, side)
+                _borders(axis, cohort, one)
                 axis.set_title(f"{test.contrast.name}, {_side(hemi)}\n{what}", fontsize=9)
     figure.colorbar(
         images[0], ax=axes[:, : len(tests)], label="Cohen's d (F: partial eta squared)", shrink=0.6
@@ -158,7 +172,7 @@ def _effect(test: PointTest) -> Float:
 
 
 def _side(hemi: str) -> str:
-    return "left" if hemi == "L" else "right"
+    return {"L": "left", "R": "right"}.get(hemi, "left minus right")
 
 
 def _sheet(
@@ -191,16 +205,16 @@ def _mark_medial(axis: "Axes", cohort: Cohort) -> None:
     right.set_horizontalalignment("right")
 
 
-def _borders(axis: "Axes", cohort: Cohort, side: SideResult) -> None:
+def _borders(axis: "Axes", cohort: Cohort, one: FittedMaps) -> None:
     """Draw where the most frequent subfield changes, and name the subfields."""
-    fields = side.subfield
+    fields = one.subfield
     x, y = cohort.x, cohort.y
     dx, dy = (x[1] - x[0]) / 2, (y[1] - y[0]) / 2
     i, j = np.nonzero(fields[1:] != fields[:-1])
     axis.vlines(x[i] + dx, y[j] - dy, y[j] + dy, colors="black", linewidth=0.8)
     i, j = np.nonzero(fields[:, 1:] != fields[:, :-1])
     axis.hlines(y[j] + dy, x[i] - dx, x[i] + dx, colors="black", linewidth=0.8)
-    for number, name in enumerate(side.registered.names):
+    for number, name in enumerate(one.maps.names):
         places = np.nonzero(fields == number)
         if len(places[0]):
             axis.text(
@@ -215,16 +229,18 @@ def _borders(axis: "Axes", cohort: Cohort, side: SideResult) -> None:
 
 def _profiles(cohort: Cohort, analysis: Analysis) -> "Figure":
     """Draw means over y by group, before and after registration."""
-    measures = list(next(iter(analysis.sides.values())).fits)
+    measures = list(next(iter(cohort.sides.values())).maps)
     figure, axes = _panels(list(analysis.sides), 2 * len(measures), (3.0, 2.4))
     for i, (hemi, side) in enumerate(analysis.sides.items()):
         original = cohort.sides[hemi]
         for j, measure in enumerate(measures):
             for k, (source, when) in enumerate(((original, "before"), (side.registered, "after"))):
                 axis = axes[i, 2 * j + k]
-                values = mean_of_known(source.maps[measure][side.used], 2)
+                values = mean_of_known(source.maps[measure], 2)
                 for color, (group, own) in zip(
-                    _repeat_colors(), _members(cohort, analysis, side).items(), strict=False
+                    _repeat_colors(),
+                    _members(analysis, cohort.table.iloc[source.rows]).items(),
+                    strict=False,
                 ):
                     _band(axis, cohort.x, values[own], group, color)
                 axis.set_title(f"{measure}, {_side(hemi)}, {when}", fontsize=9)
@@ -263,9 +279,9 @@ def _warps(cohort: Cohort, analysis: Analysis) -> "Figure":
     for i, (hemi, side) in enumerate(analysis.sides.items()):
         nodes = side.registration.warps.shape[1]
         moved = (side.registration.warps - np.linspace(0, 1, nodes)) * (nodes - 1)
-        members = _members(cohort, analysis, side)
+        members = _members(analysis, cohort.table.iloc[side.registered.rows])
         for color, (group, own) in zip(_repeat_colors(), members.items(), strict=False):
-            lines = moved[side.used][own]
+            lines = moved[own]
             axes[i, 0].plot(cohort.x, lines.T, color=color, alpha=0.25, linewidth=0.4)
             _band(axes[i, 1], cohort.x, lines, group, color)
         for axis, what in zip(axes[i], ("each participant", "mean, 2 SE"), strict=True):

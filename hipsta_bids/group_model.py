@@ -9,8 +9,15 @@ import pandas as pd
 
 from hipsta_bids.bids import files
 from hipsta_bids.errors import ModelError, UsageError
-from hipsta_bids.group.default_model import Groups, default_formula, find_groups
+from hipsta_bids.group.comparison import Comparison
+from hipsta_bids.group.default_model import (
+    Groups,
+    default_contrasts,
+    default_formula,
+    find_groups,
+)
 from hipsta_bids.group.model_spec import left_side, model_from_shortcut, parse_model
+from hipsta_bids.group.visit_time import VisitTime
 from hipsta_bids.group_settings import GroupSettings
 
 
@@ -80,7 +87,13 @@ def choose_references(
 
 
 def model_document(
-    request: ModelRequest, table: pd.DataFrame, groups: Groups | None, settings: GroupSettings
+    request: ModelRequest,
+    table: pd.DataFrame,
+    groups: Groups | None,
+    settings: GroupSettings,
+    *,
+    comparison: Comparison | None = None,
+    visits: VisitTime | None = None,
 ) -> Mapping[str, Any]:
     """Give the model as a BIDS Stats Model.
 
@@ -92,6 +105,10 @@ def model_document(
     groups : Groups or None
         From :func:`choose_references`.
     settings : GroupSettings
+    comparison : Comparison, optional
+        Changes and asymmetries can be tested without groups.
+    visits : VisitTime, optional
+        Of a longitudinal model: its default has time, and its products with groups.
 
     Raises
     ------
@@ -110,15 +127,25 @@ def model_document(
         if not contrasts and groups is not None and groups.column in formula:
             contrasts = groups.contrasts()
         return model_from_shortcut(formula, contrasts, request.name or folder_name(formula))
-    if groups is None:
+    comparison = comparison or Comparison()
+    within = comparison.longitudinal or comparison.pair or comparison.asymmetry
+    if groups is None and not within:
         raise ModelError(
             "participants.tsv has no column that tells groups"
             f" ({', '.join(settings.model.group_columns)}) with two levels; give a model by"
             ' --formula "age + sex" --contrast age',
             reason="no-groups",
         )
-    formula = default_formula(table, groups, settings)
-    contrasts = list(request.contrasts) or groups.contrasts()
+    time = visits.column if visits else None
+    if comparison.longitudinal and time is None:
+        raise ModelError(
+            "the default longitudinal model needs the time of each session: a column"
+            f" {', '.join(settings.longitudinal.time_columns)}, acq_time or age in sessions.tsv",
+            reason="no-time",
+        )
+    covariates = visits.covariates if visits else settings.model.covariates
+    formula = default_formula(table, groups, settings, covariates=covariates, time=time)
+    contrasts = list(request.contrasts) or default_contrasts(groups, time)
     return model_from_shortcut(formula, contrasts, request.name or folder_name(formula))
 
 

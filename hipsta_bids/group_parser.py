@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from hipsta_bids import __version__
+from hipsta_bids.group_settings import CORRECTIONS
 from hipsta_bids.parser import Parser
 
 LEVEL = "group"
@@ -40,6 +41,7 @@ def group_parser() -> Parser:
     parser.add_argument("--version", action="version", version=f"hipsta_bids {__version__}")
     _add_sheets(parser)
     _add_model(parser)
+    _add_comparison(parser)
     _add_methods(parser)
     return parser
 
@@ -131,6 +133,26 @@ def _add_model(parser: Parser) -> None:
     add("--name", type=_name, metavar="NAME", help="folder of the results (default: the formula)")
 
 
+def _add_comparison(parser: Parser) -> None:
+    add = parser.add_argument_group("sessions and sides (default: first sessions)").add_argument
+    add(
+        "--longitudinal",
+        nargs="?",
+        const="intercept",
+        choices=["intercept", "slope"],
+        help="all sessions, by a mixed model in which participants have an intercept (default) or"
+        " also a slope of their own",
+    )
+    add(
+        "--paired",
+        nargs=2,
+        type=_session,
+        metavar=("SES1", "SES2"),
+        help="the second session minus the first",
+    )
+    add("--asymmetry", action="store_true", help="also maps of left minus right")
+
+
 def _add_methods(parser: Parser) -> None:
     add = parser.add_argument_group("methods").add_argument
     add(
@@ -145,10 +167,18 @@ def _add_methods(parser: Parser) -> None:
         help="register to the template.json of another analysis",
     )
     add(
+        "--correction",
+        choices=CORRECTIONS,
+        help="for the number of points: false discovery rate (fdr2, the default; bh), or"
+        " family-wise error by permutation of residuals (permutation-tfce, permutation-max)",
+    )
+    add("--permutations", type=int, metavar="N", help="the data as they are included; default 5000")
+    add("--blocks", metavar="COLUMN", help="permute inside its levels only, as those of site")
+    add(
         "--fdr-scope",
         "--fdr_scope",
         choices=["map", "hemispheres"],
-        help="what is one family of tests (default: map)",
+        help="what is one family of tests, for permutations too (default: map)",
     )
     add(
         "--base",
@@ -163,6 +193,10 @@ def _add_methods(parser: Parser) -> None:
         metavar="FILE.toml",
         help="settings that change results (see `hipsta-bids settings group`)",
     )
+
+
+def _session(text: str) -> str:
+    return f"ses-{_label(text)}"
 
 
 def _label(text: str) -> str:

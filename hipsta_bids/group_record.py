@@ -1,13 +1,14 @@
 """What the group level is asked for, what comes of it, and the record of both."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from hipsta_bids import __version__
 from hipsta_bids.bids.group_inputs import Collection, GroupRequest
 from hipsta_bids.group.analysis import Analysis
+from hipsta_bids.group.comparison import Comparison
 from hipsta_bids.group_model import ModelRequest
 from hipsta_bids.group_settings import GroupSettings
 from hipsta_bids.settings_file import resolve
@@ -25,13 +26,18 @@ class GroupOptions:
     measures: tuple[str, ...] = ()
     """What to fit the model to; empty for the default or the formula's left-hand side."""
     template: Path | None = None
+    comparison: Comparison = field(default_factory=Comparison)
     command: tuple[str, ...] = ()
     """The command line, for the record."""
 
 
-def notes_of(found: Collection, analysis: Analysis) -> list[str]:
+def notes_of(found: Collection, analysis: Analysis, *, n_other_visits: int) -> list[str]:
     """Say what a reader of the results should know, one line each."""
     notes = list(analysis.skipped)
+    if n_other_visits and analysis.comparison.pair is None:
+        notes.append(
+            f"{n_other_visits} later sessions are not in it; --longitudinal takes all, --paired two"
+        )
     if flagged := sum(record.flagged for record in found.records):
         notes.append(
             f"{flagged} flagged hemispheres are in it; look at them, or use --exclude-flagged"
@@ -79,9 +85,11 @@ def record_of(
         "columns": analysis.design.columns,
         "references": analysis.design.references,
         "contrasts": {c.name: c.weights.tolist() for c in analysis.design.contrasts},
+        "comparison": asdict(analysis.comparison),
         "groups": None if analysis.groups is None else asdict(analysis.groups),
-        "participants": len(analysis.design.rows),
-        "hemispheres": {hemi: len(side.used) for hemi, side in analysis.sides.items()},
+        "participants": analysis.n_participants,
+        "rows": len(analysis.design.rows),
+        "hemispheres": {hemi: len(one.used) for hemi, one in analysis.fitted.items()},
         "notes": notes,
         "settings": resolve(settings),
     }

@@ -15,8 +15,10 @@ from hipsta_bids.bids.measure_names import choose_measures
 from hipsta_bids.bids.sheets import Measured, read_sheets
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.analysis import Analysis, analyze_cohort
+from hipsta_bids.group.comparison import Comparison, choose_visits
 from hipsta_bids.group.model_spec import parse_model
 from hipsta_bids.group.template_json import templates_from_json
+from hipsta_bids.group.visit_time import VisitTime, add_time
 from hipsta_bids.group_data import PARTICIPANT, SESSION, Cohort
 from hipsta_bids.group_model import choose_references, folder_name, model_document, wanted_measures
 from hipsta_bids.group_record import GroupOptions, notes_of, record_of
@@ -64,10 +66,18 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
     wanted = wanted_measures(options.model, options.measures)
     measures = choose_measures(wanted, found.records)
     measured = read_sheets(found.records, found.settings, measures.maps)
-    cohort, later = _first_visits(_cohort(measured, options))
+    cohort, reasons = choose_visits(_cohort(measured, options), options.comparison)
     cohort, icv = _with_icv(cohort, measured, settings)
+    cohort, visits = _with_time(cohort, options.comparison, settings)
     references, groups = choose_references(options.model, cohort.table, settings)
-    document = model_document(options.model, cohort.table, groups, settings)
+    document = model_document(
+        options.model,
+        cohort.table,
+        groups,
+        settings,
+        comparison=options.comparison,
+        visits=visits,
+    )
     model = parse_model(document)
     templates = None
     if options.template is not None:
@@ -80,12 +90,15 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         settings,
         measures=measures,
         references=references,
+        comparison=options.comparison,
+        time=visits.column if visits else None,
         icv=icv,
         templates=templates,
     )
-    exclusions = [*found.exclusions, *later, *_incomplete(cohort, analysis)]
-    name = options.model.name or folder_name(model.formula, wanted)
-    notes = notes_of(found, analysis)
+    later = _other_visits(measured, reasons, options.comparison)
+    exclusions = [*found.exclusions, *later, *_incomplete(analysis)]
+    name = options.model.name or folder_name(model.formula, wanted) + options.comparison.suffix
+    notes = notes_of(found, analysis, n_other_visits=len(later))
     files.make_folder(options.out_dir)
     if not (options.out_dir / "dataset_description.json").exists():
         roots = derivative.source_names((root.name, root) for root in options.sheets.roots)
@@ -98,7 +111,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         files.write_json(folder / "analysis.json", record)
     return GroupResult(
         folder=options.out_dir / group_outputs.GROUP_FOLDER / name,
-        n_participants=len(analysis.design.rows),
+        n_participants=analysis.n_participants,
         n_excluded=len(exclusions),
         notes=tuple(notes),
     )
@@ -114,20 +127,31 @@ def _cohort(measured: Measured, options: GroupOptions) -> Cohort:
     )
 
 
-def _first_visits(cohort: Cohort) -> tuple[Cohort, list[Exclusion]]:
-    """Keep the first session of each participant: models of the maps want independent rows."""
-    later = cohort.table[PARTICIPANT].duplicated().to_numpy()
-    left_out = [
+def _other_visits(
+    measured: Measured, reasons: Mapping[str, str], comparison: Comparison
+) -> list[Exclusion]:
+    """List the sessions that are not compared."""
+    return [
         Exclusion(
             participant=row[PARTICIPANT],
             session=row[SESSION],
             hemi=files.MISSING,
-            reason="later-session",
-            message="the first session of each participant is analyzed",
+            reason="other-session" if comparison.pair else "later-session",
+            message=message,
         )
-        for row in cohort.table[later].to_dict("records")
+        for visit, message in reasons.items()
+        for row in measured.visits.loc[[visit]].to_dict("records")
     ]
-    return cohort.take(~later), left_out
+
+
+def _with_time(
+    cohort: Cohort, comparison: Comparison, settings: GroupSettings
+) -> tuple[Cohort, VisitTime | None]:
+    """Add the time of visits, if it is needed."""
+    if not comparison.longitudinal:
+        return cohort, None
+    visits = add_time(cohort.table, settings)
+    return replace(cohort, table=visits.table), visits
 
 
 def _with_icv(
@@ -154,12 +178,12 @@ def _check_templates(templates: Mapping[str, Any], cohort: Cohort, path: Path) -
         )
 
 
-def _incomplete(cohort: Cohort, analysis: Analysis) -> list[Exclusion]:
+def _incomplete(analysis: Analysis) -> list[Exclusion]:
     """Visits that lack a variable of the model."""
     result = []
     for variable, visits in analysis.design.dropped.items():
         for visit in visits:
-            row = cohort.table.loc[[visit], [PARTICIPANT, SESSION]].to_dict("records")[0]
+            row = analysis.compared.table.loc[[visit], [PARTICIPANT, SESSION]].to_dict("records")[0]
             result.append(
                 Exclusion(
                     participant=row[PARTICIPANT],

@@ -137,6 +137,11 @@ class GlmSettings:
 class LongitudinalSettings:
     """Repeated sessions of the same participants."""
 
+    random: str = "intercept"
+    """What participants have of their own: an ``intercept``, or also a ``slope`` over time."""
+    time_columns: tuple[str, ...] = ("time", "years", "months", "days")
+    """The first of these columns, in any case, that varies between sessions is the time; else it
+    is made, in years since the first session, from ``acq_time`` or age."""
     confidence: float = 0.95
     """Coverage of two-sided confidence limits, fraction."""
     max_correlation: float = 0.999
@@ -154,19 +159,26 @@ class LongitudinalSettings:
 
     def __post_init__(self) -> None:
         _require(0 < self.confidence < 1, "longitudinal.confidence must lie between 0 and 1")
+        kinds = ("intercept", "slope")
+        _require(self.random in kinds, f"longitudinal.random must be {' or '.join(kinds)}")
         _require(
             0 < self.max_correlation < 1, "longitudinal.max_correlation must lie between 0 and 1"
         )
         _require(self.grid > 2, "longitudinal.grid must be at least 3")  # noqa: PLR2004 -- said there
 
 
+#: How to allow for many tests, as the command line spells it.
+CORRECTIONS = ("fdr2", "bh", "permutation-tfce", "permutation-max")
+
+
 @dataclass(frozen=True, kw_only=True)
 class MultiplicitySettings:
     """How many tests are allowed for."""
 
-    method: str = "two-stage"
-    """``two-stage`` (Benjamini, Krieger and Yekutieli 2006; the paper's FDR2) or
-    ``benjamini-hochberg`` (1995)."""
+    method: str = "fdr2"
+    """``fdr2`` (two-stage false discovery rate, Benjamini, Krieger and Yekutieli 2006; the
+    paper's), ``bh`` (Benjamini and Hochberg 1995), or family-wise error by permutation:
+    ``permutation-tfce`` (threshold-free cluster enhancement) or ``permutation-max`` (largest t)."""
     scope: str = "map"
     """What is one family: each ``map`` (measure, contrast and hemisphere), or both ``hemispheres``
     together."""
@@ -176,6 +188,8 @@ class MultiplicitySettings:
     """Permutations, the unpermuted data included."""
     seed: int = 0
     """Of the permutations."""
+    blocks: str = ""
+    """Column whose levels participants are permuted within, as of sites; empty is all."""
     tfce_extent: float = 0.5
     """Exponent of a cluster's extent (Smith and Nichols 2009)."""
     tfce_height: float = 2.0
@@ -186,13 +200,25 @@ class MultiplicitySettings:
     """Neighbors of a point on the sheet, 4 or 8."""
 
     def __post_init__(self) -> None:
-        methods, scopes = ("two-stage", "benjamini-hochberg"), ("map", "hemispheres")
-        _require(self.method in methods, f"multiplicity.method must be {' or '.join(methods)}")
+        scopes = ("map", "hemispheres")
+        _require(
+            self.method in CORRECTIONS,
+            f"multiplicity.method must be one of {', '.join(CORRECTIONS)}",
+        )
         _require(self.scope in scopes, f"multiplicity.scope must be {' or '.join(scopes)}")
         _require(0 < self.alpha < 1, "multiplicity.alpha must lie between 0 and 1")
         _require(self.permutations > 1, "multiplicity.permutations must be at least 2")
         _require(self.tfce_step > 0, "multiplicity.tfce_step must be positive")
         _require(self.neighbors in (4, 8), "multiplicity.neighbors must be 4 or 8")
+
+
+@dataclass(frozen=True, kw_only=True)
+class AsymmetrySettings:
+    """Differences between left and right."""
+
+    relative: tuple[str, ...] = ("thickness",)
+    """Maps, of positive measures, whose difference is taken over the mean of both sides; that of
+    others is in their own unit."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -247,5 +273,6 @@ class GroupSettings:
     design: DesignSettings = field(default_factory=DesignSettings)
     glm: GlmSettings = field(default_factory=GlmSettings)
     longitudinal: LongitudinalSettings = field(default_factory=LongitudinalSettings)
+    asymmetry: AsymmetrySettings = field(default_factory=AsymmetrySettings)
     multiplicity: MultiplicitySettings = field(default_factory=MultiplicitySettings)
     classification: ClassificationSettings = field(default_factory=ClassificationSettings)

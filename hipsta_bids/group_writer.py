@@ -8,6 +8,7 @@ import pandas as pd
 from hipsta_bids.bids import files, gifti, group_outputs
 from hipsta_bids.bids.group_inputs import Exclusion
 from hipsta_bids.group.analysis import Analysis
+from hipsta_bids.group.multiplicity import MapKey
 from hipsta_bids.group.report import methods_text
 from hipsta_bids.group.tables import COLUMNS, map_name, result_tables
 from hipsta_bids.group.template_json import templates_to_json
@@ -59,9 +60,8 @@ def write_results(
     )
     excluded = ResultTable(name="excluded", rows=rows)
     group_outputs.write_result_table(folder, excluded, COLUMNS)
-    group_outputs.write_covariates(
-        folder / "covariates.tsv", cohort.table.iloc[analysis.design.rows]
-    )
+    rows_of_model = analysis.compared.table.iloc[analysis.design.rows]
+    group_outputs.write_covariates(folder / "covariates.tsv", rows_of_model)
     registered = {hemi: side.registered for hemi, side in analysis.sides.items()}
     if registered:
         group_outputs.write_maps(folder / "maps.parquet", cohort, registered)
@@ -89,15 +89,21 @@ def draw(folder: Path, cohort: Cohort, analysis: Analysis) -> list[str]:
 
 
 def _write_gifti(folder: Path, cohort: Cohort, analysis: Analysis) -> None:
-    """Write statistics and effect sizes on the unfolded sheet."""
-    for hemi, side in analysis.sides.items():
-        surface = folder / f"hemi-{hemi}_space-unfold_midthickness.surf.gii"
-        group_outputs.write_sheet_surface(surface, cohort.x, cohort.y, hemi)
-        for measure, fit in side.fits.items():
+    """Write statistics, effect sizes and corrected p-values on the sheet."""
+    for hemi, one in analysis.fitted.items():
+        if hemi in cohort.sides:
+            surface = folder / f"hemi-{hemi}_space-unfold_midthickness.surf.gii"
+            group_outputs.write_sheet_surface(surface, cohort.x, cohort.y, hemi)
+        for measure, fit in one.fits.items():
             for test in fit.tests:
+                found = analysis.found[MapKey(measure, test.contrast.name, hemi)]
                 single = test.kind == "t"
-                effect = ("d", test.cohen_d) if single else ("eta2", test.eta_squared)
-                for stat, values in ((test.kind, test.statistic), effect):
+                for stat, values in (
+                    (test.kind, test.statistic),
+                    ("d", test.cohen_d) if single else ("eta2", test.eta_squared),
+                    ("pcorrected", found.adjusted),
+                ):
                     stem = map_name(hemi, measure, test).replace("_desc-", f"_stat-{stat}_desc-")
-                    content = gifti.shape_bytes(values, hemi=hemi, name=stem, unit="1")
+                    # Of both sides, maps lie on the left sheet: they say left minus right.
+                    content = gifti.shape_bytes(values, hemi=hemi[0], name=stem, unit="1")
                     files.write_bytes(folder / f"{stem}.shape.gii", content)

@@ -4,40 +4,42 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hipsta_bids.errors import ModelError
+from hipsta_bids.group.comparison import (
+    BOTH,
+    Comparison,
+    asymmetry_maps,
+    compare_sessions,
+    modeled_table,
+)
 from hipsta_bids.group.default_model import Groups
 from hipsta_bids.group.design import Design, build_design
-from hipsta_bids.group.glm import PointwiseFit, fit_points
+from hipsta_bids.group.fitted import FittedMaps, fit_maps
+from hipsta_bids.group.inference import check_permutations, correct
 from hipsta_bids.group.model_spec import ModelSpec
-from hipsta_bids.group.multiplicity import Discoveries, MapKey, discover
+from hipsta_bids.group.multiplicity import Discoveries, MapKey
 from hipsta_bids.group.pairs import PairComparison
 from hipsta_bids.group.profiles import GroupShift, mean_profiles, shift_by_group
 from hipsta_bids.group.registration import Registration, register, register_to
+from hipsta_bids.group.row_model import RowModel, longitudinal_model, with_mean
 from hipsta_bids.group.summaries import MeasureFit, classify_groups, fit_summaries
 from hipsta_bids.group.template import Template
 from hipsta_bids.group.warps import warp_labels, warp_values
-from hipsta_bids.group_data import Cohort, Float, Int, Measures, SideMaps
+from hipsta_bids.group_data import PARTICIPANT, Cohort, Float, Measures, SideMaps
 from hipsta_bids.group_settings import GroupSettings
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SideResult:
-    """What was found in one hemisphere."""
+    """Sheets of one hemisphere, registered."""
 
     profiles: Float
     """(sheets, x) curvature before registration, 1/mm."""
     registration: Registration
     registered: SideMaps
-    subfield: Int
-    """(x, y) most frequent subfield after registration, place in ``registered.names``."""
+    """Of all visits that were chosen."""
     shifts: Mapping[str, GroupShift]
     """By group; empty without groups."""
-    used: Int
-    """Sheets that the model is fitted to, as places in ``registered``."""
-    fits: Mapping[str, PointwiseFit]
-    """By measure."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -45,18 +47,28 @@ class Analysis:
     """Results of one model."""
 
     model: ModelSpec
+    comparison: Comparison
     design: Design
     groups: Groups | None
     sides: Mapping[str, SideResult]
     """By hemisphere."""
     measured: Measures
     """What the model was fitted to."""
+    compared: Cohort
+    """Rows of the model's table with registered maps; of two sessions, their differences."""
+    fitted: Mapping[str, FittedMaps]
+    """By hemisphere; ``LR`` is left minus right."""
     found: Mapping[MapKey, Discoveries]
     measures: Sequence[MeasureFit]
     pairs: Sequence[tuple[str, str, PairComparison]]
     """Hemisphere, added measure, and result."""
     skipped: Sequence[str]
     """What was left out, and why; one line each."""
+
+    @property
+    def n_participants(self) -> int:
+        """In the model; some may have several rows."""
+        return int(self.compared.table[PARTICIPANT].iloc[self.design.rows].nunique())
 
 
 def analyze_cohort(
@@ -67,6 +79,8 @@ def analyze_cohort(
     *,
     measures: Measures,
     references: Mapping[str, str],
+    comparison: Comparison | None = None,
+    time: str | None = None,
     icv: str | None = None,
     templates: Mapping[str, Template] | None = None,
 ) -> Analysis:
@@ -75,7 +89,7 @@ def analyze_cohort(
     Parameters
     ----------
     cohort : Cohort
-        One visit per participant.
+        The visits that are compared.
     model : ModelSpec
         Formula and contrasts.
     groups : Groups or None
@@ -86,6 +100,10 @@ def analyze_cohort(
         What to fit the model to.
     references : mapping of str to str
         Reference levels of factors.
+    comparison : Comparison, optional
+        Which sessions and sides; by default one visit per participant.
+    time : str, optional
+        Column of the time of visits, for random slopes.
     icv : str, optional
         Column of intracranial volume, for volumes.
     templates : mapping of str to Template, optional
@@ -96,45 +114,55 @@ def analyze_cohort(
     ModelError
         If the model cannot be fitted to these data.
     """
+    comparison = comparison or Comparison()
     references = _references(model, groups, references)
-    design = build_design(cohort.table, model, settings.design, references)
+    table = modeled_table(cohort.table, comparison)
+    design = build_design(table, model, settings.design, references)
+    if comparison.pair or not design.contrasts:
+        design = replace(design, contrasts=with_mean(design))
+
+    def rows_of(design: Design) -> RowModel:
+        if comparison.longitudinal:
+            return longitudinal_model(design, table, time, settings)
+        return RowModel(design)
+
+    rows = rows_of(design)
+    check_permutations(rows, settings)
     sides = {
-        hemi: _analyze_side(
-            cohort,
-            hemi,
-            design,
-            maps=measures.maps,
-            groups=groups,
-            settings=settings,
-            templates=templates,
-        )
+        hemi: _register_side(cohort, hemi, groups=groups, settings=settings, templates=templates)
         for hemi in (cohort.sides if measures.maps else ())
     }
-    found = discover(
-        {
-            MapKey(measure, test.contrast.name, hemi): test.p
-            for hemi, side in sides.items()
-            for measure, fit in side.fits.items()
-            for test in fit.tests
-        },
-        settings.multiplicity,
-    )
+    registered = {hemi: side.registered for hemi, side in sides.items()} or cohort.sides
+    compared = compare_sessions(replace(cohort, sides=registered), comparison)
+    fitted = {
+        hemi: fit_maps(hemi, compared.sides[hemi].only(measures.maps), rows, settings)
+        for hemi in (compared.sides if measures.maps else ())
+    }
+    if comparison.asymmetry and measures.maps:
+        maps = asymmetry_maps(compared, measures.maps, settings.asymmetry.relative)
+        fitted[BOTH] = fit_maps(BOTH, maps, rows, settings, contrasts=with_mean(design))
+    found = correct(fitted, rows, table, settings)
     summaries, notes = fit_summaries(
-        cohort,
+        compared,
         model,
         design,
         settings,
         only=measures.summaries,
         references=references,
         icv=icv,
+        rows_of=rows_of,
     )
-    pairs, more = classify_groups(cohort, groups, settings) if groups else ([], [])
+    once = compared.take(~table[PARTICIPANT].duplicated().to_numpy())
+    pairs, more = classify_groups(once, groups, settings) if groups else ([], [])
     return Analysis(
         model=model,
+        comparison=comparison,
         design=design,
         groups=groups,
         sides=sides,
         measured=measures,
+        compared=compared,
+        fitted=fitted,
         found=found,
         measures=summaries,
         pairs=pairs,
@@ -153,12 +181,10 @@ def _references(
     return chosen
 
 
-def _analyze_side(
+def _register_side(
     cohort: Cohort,
     hemi: str,
-    design: Design,
     *,
-    maps: Sequence[str],
     groups: Groups | None,
     settings: GroupSettings,
     templates: Mapping[str, Template] | None,
@@ -169,28 +195,6 @@ def _analyze_side(
         registration = register(profiles, settings.registration)
     else:
         registration = register_to(profiles, templates[hemi], settings.registration)
-    registered = _register_maps(side, registration.warps)
-    used, rows = _used(side, design)
-    matrix = design.matrix[rows]
-    try:
-        fits = {
-            name: fit_points(
-                _rows(registered.maps[name], used).reshape(len(used), -1),
-                matrix,
-                design.contrasts,
-                settings.glm,
-            )
-            for name in maps
-        }
-    except ModelError as error:
-        raise ModelError(f"hemisphere {hemi}: {error}", reason=error.reason) from error
-    for name, fit in fits.items():
-        if not np.isfinite(fit.sigma).any():
-            raise ModelError(
-                f"hemisphere {hemi}: no point of the {name} maps has enough values for the model;"
-                " look at the sheets, or use a smaller model",
-                reason="all-points-invalid",
-            )
     shifts: Mapping[str, GroupShift] = {}
     if groups is not None:
         names = cohort.table[groups.column].iloc[side.rows]
@@ -202,11 +206,8 @@ def _analyze_side(
     return SideResult(
         profiles=profiles,
         registration=registration,
-        registered=registered,
-        subfield=most_frequent(registered.subfield[used], len(side.names)),
+        registered=_register_maps(side, registration.warps),
         shifts=shifts,
-        used=used,
-        fits=fits,
     )
 
 
@@ -219,33 +220,3 @@ def _register_maps(side: SideMaps, warps: Float) -> SideMaps:
         names=side.names,
         summary=side.summary,
     )
-
-
-def _rows(maps: Float, used: Int) -> Float:
-    """Take some sheets, without a copy if they are all."""
-    return maps if len(used) == len(maps) else maps[used]
-
-
-def _used(side: SideMaps, design: Design) -> tuple[Int, Int]:
-    """Sheets whose visits are complete, and their rows of the design."""
-    _, used, rows = np.intersect1d(side.rows, design.rows, assume_unique=True, return_indices=True)
-    return np.asarray(used, dtype=np.int64), np.asarray(rows, dtype=np.int64)
-
-
-def most_frequent(labels: NDArray[np.int8], count: int) -> Int:
-    """Most frequent label at each point.
-
-    Parameters
-    ----------
-    labels : ndarray of int, shape (sheets, x, y)
-        -1 is missing.
-    count : int
-        Labels are below this.
-
-    Returns
-    -------
-    ndarray of int, shape (x, y)
-        -1 where there is none.
-    """
-    votes = np.stack([(labels == label).sum(axis=0) for label in range(count)])
-    return np.where(votes.max(axis=0) > 0, votes.argmax(axis=0), -1).astype(np.int64)

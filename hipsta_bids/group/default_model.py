@@ -88,19 +88,55 @@ def _reference(counts: Counter[str], settings: DefaultModelSettings) -> str:
     return min(counts, key=lambda level: (-counts[level], level))
 
 
-def default_formula(table: pd.DataFrame, groups: Groups, settings: GroupSettings) -> str:
+def default_formula(
+    table: pd.DataFrame,
+    groups: Groups | None,
+    settings: GroupSettings,
+    *,
+    covariates: Sequence[str] | None = None,
+    time: str | None = None,
+) -> str:
     """Spell the right-hand side: the groups, and each covariate that varies.
 
     Parameters
     ----------
     table : DataFrame
         Covariates.
-    groups : Groups
+    groups : Groups or None
         From :func:`find_groups`.
     settings : GroupSettings
-        Names of covariates.
+        What is a number.
+    covariates : sequence of str, optional
+        Their names; else those of the settings.
+    time : str, optional
+        Column of the time of visits, which may go by differently in groups.
     """
-    return " + ".join([groups.column, *_varying(table, settings.model.covariates, settings)])
+    first = " * ".join(name for name in (groups.column if groups else None, time) if name)
+    names = settings.model.covariates if covariates is None else covariates
+    return " + ".join([first or "1", *_varying(table, names, settings)])
+
+
+def default_contrasts(groups: Groups | None, time: str | None) -> list[str]:
+    """Contrasts of the default model: groups, changes over time in each, and their differences.
+
+    Parameters
+    ----------
+    groups : Groups or None
+        From :func:`find_groups`.
+    time : str or None
+        Column of the time of visits.
+    """
+    if groups is None:
+        return [time] if time else []
+    found = groups.contrasts()
+    if time is None:
+        return found
+    slopes = {level: f"{groups.column}[T.{level}]:{time}" for level in groups.levels[1:]}
+    found.append(f"{time} in {groups.reference} = {time}")
+    for level, slope in slopes.items():
+        found.append(f"{time} in {level} = {time} + {slope}")
+        found.append(f"{time} in {groups.reference}-{level} = -1*{slope}")
+    return found
 
 
 def _varying(table: pd.DataFrame, names: Sequence[str], settings: GroupSettings) -> list[str]:

@@ -1,6 +1,6 @@
 """False discovery rates over the points of a map."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +13,7 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 #: Share of the smallest p that serves as cut-off when nothing is rejected.
-_BELOW_ALL = 0.1
+BELOW_ALL = 0.1
 
 
 @dataclass(frozen=True)
@@ -21,14 +21,16 @@ class Discoveries:
     """Tests that survive, in the shape of the p-values."""
 
     adjusted: FloatArray
-    """Compare with ``alpha``; holds for this level. NaN where there was no test."""
+    """Compare with ``alpha``; of false discovery rates it holds for this level. NaN where there
+    was no test."""
     rejected: BoolArray
     cutoff: float
     """Largest raw p that is rejected; a tenth of the smallest p if none is (the convention of
-    FreeSurfer's ``lme_mass_FDR``), so that nothing lies at or below it; NaN without tests."""
+    FreeSurfer's ``lme_mass_FDR``), so that nothing lies at or below it; NaN without tests,
+    and where clusters decide."""
     n_tests: int
     n_null: int
-    """Estimated number of true null hypotheses; with Benjamini-Hochberg the number of tests."""
+    """Estimated number of true null hypotheses; but for ``fdr2`` the number of tests."""
     alpha: float
 
     @property
@@ -72,6 +74,23 @@ class MapKey:
     hemi: str
 
 
+def families(maps: Iterable[MapKey], scope: str) -> list[list[MapKey]]:
+    """Group maps whose points are tested together.
+
+    Parameters
+    ----------
+    maps : iterable of MapKey
+        All maps.
+    scope : str
+        ``map`` or ``hemispheres``.
+    """
+    found: dict[tuple[str, ...], list[MapKey]] = {}
+    for key in maps:
+        family = (key.measure, key.contrast, *(() if scope == "hemispheres" else (key.hemi,)))
+        found.setdefault(family, []).append(key)
+    return list(found.values())
+
+
 def discover(
     maps: Mapping[MapKey, FloatArray], settings: MultiplicitySettings
 ) -> dict[MapKey, Discoveries]:
@@ -89,14 +108,9 @@ def discover(
     dict
         In pooled families cut-off and counts are those of the family.
     """
-    method = fdr_two_stage if settings.method == "two-stage" else fdr_benjamini_hochberg
-    families: dict[tuple[str, ...], list[MapKey]] = {}
-    for key in maps:
-        pooled = settings.scope == "hemispheres"
-        family = (key.measure, key.contrast, *(() if pooled else (key.hemi,)))
-        families.setdefault(family, []).append(key)
+    method = fdr_benjamini_hochberg if settings.method == "bh" else fdr_two_stage
     found = {}
-    for keys in families.values():
+    for keys in families(maps, settings.scope):
         together = method(np.concatenate([maps[key].ravel() for key in keys]), settings.alpha)
         ends = np.cumsum([maps[key].size for key in keys])[:-1]
         adjusted, rejected = np.split(together.adjusted, ends), np.split(together.rejected, ends)
@@ -116,7 +130,7 @@ def _discoveries(p: FloatArray, alpha: float, method: str) -> Discoveries:
     cutoff, n_null = np.nan, len(tests)
     if len(tests):
         rejected[valid], adjusted[valid], *_ = multipletests(tests, alpha, method)
-        cutoff = tests[rejected[valid]].max() if rejected.any() else tests.min() * _BELOW_ALL
+        cutoff = tests[rejected[valid]].max() if rejected.any() else tests.min() * BELOW_ALL
         if method == "fdr_tsbky":
             stage = multipletests(tests, alpha / (1 + alpha), "fdr_bh")[0]
             n_null = int(len(tests) - stage.sum())

@@ -50,7 +50,7 @@ def peak_table(
     -------
     DataFrame
         One row per cluster, largest extent first: contrast, kind of statistic, place, subfield,
-        statistic, df, p, adjusted p, effect size (Cohen's d for t, else partial eta squared) with
+        statistic, df, p, corrected p, effect size (Cohen's d for t, else partial eta squared) with
         limits, extent in points and the share of each subfield. Empty if nothing was tested.
     """
     statistic = test.statistic.reshape(frame.shape)
@@ -81,7 +81,7 @@ def _row(
         "statistic": test.statistic[point],
         "df": test.df[point],
         "p": test.p[point],
-        "p_adjusted": adjusted[point],
+        "p_corrected": adjusted[point],
         "effect": "cohen_d" if is_t else "partial_eta_squared",
         "effect_size": size[point],
         "effect_low": limits[0, point],

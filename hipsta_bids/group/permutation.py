@@ -1,5 +1,6 @@
 """Family-wise error rates by permutation of residuals."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,18 +20,20 @@ IntArray = NDArray[np.int64]
 _BATCH = 50
 #: Sums in another order differ by less, relatively.
 _ROUNDING = 1e-9
+#: The method that does without cluster enhancement.
+_MAXIMUM = "permutation-max"
 #: Length left of the constant vector, of length 1, if it is not among the columns.
 _CONSTANT = 1e-6
 
 
 @dataclass(frozen=True)
 class PermutationTest:
-    """Corrected p-values; the family is all points given."""
+    """Corrected p-values; the family is all points of all parts."""
 
     p_max: FloatArray
     """(points,) of the statistic itself (maximum over the sheet)."""
     p_enhanced: FloatArray
-    """(points,) of the cluster-enhanced statistic."""
+    """(points,) of the cluster-enhanced statistic; NaN with ``permutation-max``."""
     p_uncorrected: FloatArray
     """(points,) of each point alone."""
     statistic: FloatArray
@@ -39,15 +42,27 @@ class PermutationTest:
     """(points,) threshold-free cluster enhancement of t, or of the square root of F."""
 
 
+@dataclass(frozen=True, eq=False)
+class PermutationPart:
+    """Maps of one sheet, as of one hemisphere."""
+
+    maps: FloatArray
+    """(subjects, points) in the order of the sheet, ``x`` slower than ``y``; NaN is missing."""
+    matrix: FloatArray
+    """(subjects, columns) design of full column rank."""
+    subjects: IntArray
+    """(subjects,) which ones of the whole sample they are: the same subject is shuffled in the
+    same way in all parts."""
+
+
 def permute(
-    maps: FloatArray,
-    matrix: FloatArray,
+    parts: Sequence[PermutationPart],
     contrast: Contrast,
     shape: tuple[int, int],
     *,
     settings: MultiplicitySettings,
     blocks: IntArray | None = None,
-) -> PermutationTest:
+) -> list[PermutationTest]:
     """Permutation test of one contrast at all points (Freedman and Lane 1983).
 
     What the covariates explain is taken off, the residuals are shuffled between subjects, and
@@ -59,57 +74,139 @@ def permute(
 
     Parameters
     ----------
-    maps : ndarray, shape (subjects, points)
-        Points in the order of the sheet, ``x`` slower than ``y``.
-    matrix : ndarray, shape (subjects, columns)
-        Design of full column rank.
+    parts : sequence of PermutationPart
+        One family.
     contrast : Contrast
         One row is tested two-sidedly.
     shape : (int, int)
         Nodes of the sheet along x and y.
     settings : MultiplicitySettings
         Number and seed of permutations, and cluster enhancement.
-    blocks : ndarray of int, shape (subjects,), optional
-        Subjects are shuffled within a block only (as sites, or sessions of a subject).
+    blocks : ndarray of int, shape (all subjects,), optional
+        Subjects are shuffled within a block only (as sites).
 
     Returns
     -------
-    PermutationTest
+    list of PermutationTest
+        Of each part.
 
     Raises
     ------
     ModelError
-        If the sheet does not have the maps' number of points.
+        If the sheet does not have the maps' number of points, or shuffling changes nothing.
     """
-    if maps.shape[1] != shape[0] * shape[1] or maps.shape[0] != matrix.shape[0]:
-        raise ModelError(
-            f"permutation: maps of shape {maps.shape} do not fit a sheet of {shape[0]} x"
-            f" {shape[1]} points and {matrix.shape[0]} subjects",
-            reason="design-shape",
-        )
-    model = _Model.build(maps, matrix, contrast)
+    runs = [_Part.build(part, contrast, shape, settings, blocks) for part in parts]
     random = np.random.default_rng(settings.seed)
-    observed = model.statistics(model.basis[None])
-    signs_only = model.tests_common_part()
-    height = enhance(observed.reshape(1, *shape), settings).reshape(1, -1)
-    own, highest, enhanced = (np.ones(maps.shape[1]) for _ in range(3))
+    n_subjects = 1 + max(int(part.subjects.max()) for part in parts)
     for start in range(1, settings.permutations, _BATCH):
         count = min(_BATCH, settings.permutations - start)
-        shuffled = [_shuffle(model.basis, blocks, random, flip=signs_only) for _ in range(count)]
-        t = model.statistics(np.stack(shuffled))
-        raised = enhance(t.reshape(count, *shape), settings).reshape(count, -1)
-        own += _at_least(t, observed).sum(axis=0)
-        highest += _at_least(_maximum(t), observed).sum(axis=0)
-        enhanced += _at_least(_maximum(raised), height).sum(axis=0)
-    missing = np.isnan(observed[0])
-    p = np.where(missing, np.nan, np.stack([own, highest, enhanced]) / settings.permutations)
-    return PermutationTest(
-        p_uncorrected=p[0],
-        p_max=p[1],
-        p_enhanced=p[2],
-        statistic=observed[0] if contrast.n_rows == 1 else observed[0] ** 2,
-        enhanced=np.where(missing, np.nan, height[0]),
-    )
+        keys = random.random((count, n_subjects))
+        maps = [run.shuffled(keys) for run in runs]
+        highest = np.max([_maximum(t) for t, _ in maps], axis=0)
+        highest_enhanced = np.max([_maximum(raised) for _, raised in maps], axis=0)
+        for run, (t, _) in zip(runs, maps, strict=True):
+            run.count(t, highest, highest_enhanced)
+    return [run.result(settings) for run in runs]
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """One part under way, with its counts of what reached the observed statistics."""
+
+    model: "_Model"
+    contrast: Contrast
+    shape: tuple[int, int]
+    settings: MultiplicitySettings
+    subjects: IntArray
+    blocks: IntArray | None
+    observed: FloatArray
+    height: FloatArray
+    counts: FloatArray
+    """(3, points) of each point alone, of the maximum, and of the enhanced maximum."""
+
+    @classmethod
+    def build(
+        cls,
+        part: PermutationPart,
+        contrast: Contrast,
+        shape: tuple[int, int],
+        settings: MultiplicitySettings,
+        blocks: IntArray | None,
+    ) -> "_Part":
+        maps, matrix = part.maps, part.matrix
+        if maps.shape[1] != shape[0] * shape[1] or maps.shape[0] != matrix.shape[0]:
+            raise ModelError(
+                f"permutation: maps of shape {maps.shape} do not fit a sheet of {shape[0]} x"
+                f" {shape[1]} points and {matrix.shape[0]} subjects",
+                reason="design-shape",
+            )
+        model = _Model.build(maps, matrix, contrast)
+        own = None if blocks is None else blocks[part.subjects]
+        if own is not None and not model.tests_common_part():
+            _check_blocks(matrix @ np.linalg.pinv(contrast.weights), own, contrast)
+        observed = model.statistics(model.basis[None])
+        return cls(
+            model=model,
+            contrast=contrast,
+            shape=shape,
+            settings=settings,
+            subjects=part.subjects,
+            blocks=own,
+            observed=observed,
+            height=_enhanced(observed, shape, settings),
+            counts=np.ones((3, maps.shape[1])),
+        )
+
+    def shuffled(self, keys: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Statistics, and enhanced ones, of permutations that keys of all subjects say."""
+        flip = self.model.tests_common_part()
+        bases = [
+            _shuffle(self.model.basis, self.blocks, key[self.subjects], flip=flip) for key in keys
+        ]
+        t = self.model.statistics(np.stack(bases))
+        return t, _enhanced(t, self.shape, self.settings)
+
+    def count(self, t: FloatArray, highest: FloatArray, highest_enhanced: FloatArray) -> None:
+        """Count what reaches the observed statistics, alone and anywhere in the family."""
+        self.counts[0] += _at_least(t, self.observed).sum(axis=0)
+        self.counts[1] += _at_least(highest, self.observed).sum(axis=0)
+        self.counts[2] += _at_least(highest_enhanced, self.height).sum(axis=0)
+
+    def result(self, settings: MultiplicitySettings) -> PermutationTest:
+        """Turn counts into p-values."""
+        missing = np.isnan(self.observed[0])
+        p = np.where(missing, np.nan, self.counts / settings.permutations)
+        enhanced = np.where(missing, np.nan, self.height[0])
+        if settings.method == _MAXIMUM:
+            p[2], enhanced = np.nan, np.full(len(missing), np.nan)
+        single = self.contrast.n_rows == 1
+        return PermutationTest(
+            p_uncorrected=p[0],
+            p_max=p[1],
+            p_enhanced=p[2],
+            statistic=self.observed[0] if single else self.observed[0] ** 2,
+            enhanced=enhanced,
+        )
+
+
+def _check_blocks(tested: FloatArray, blocks: IntArray, contrast: Contrast) -> None:
+    """Refuse blocks inside which what is tested does not vary: shuffling would not undo it."""
+    numbers = np.unique(blocks, return_inverse=True)[1]
+    sizes = np.bincount(numbers)
+    means = np.stack([np.bincount(numbers, column) for column in tested.T], axis=1) / sizes[:, None]
+    if np.abs(tested - means[numbers]).max() < _CONSTANT * np.abs(tested).max():
+        raise ModelError(
+            f"permutation: {contrast.name} does not vary inside the blocks, so that shuffling there"
+            " says nothing about it; leave --blocks out, or choose larger blocks",
+            reason="permutation-blocks",
+        )
+
+
+def _enhanced(t: FloatArray, shape: tuple[int, int], settings: MultiplicitySettings) -> FloatArray:
+    """Cluster enhancement, where it is asked for; else nothing."""
+    if settings.method == _MAXIMUM:
+        return np.zeros_like(t)
+    return enhance(t.reshape(len(t), *shape), settings).reshape(t.shape)
 
 
 @dataclass(frozen=True)
@@ -161,13 +258,15 @@ class _Model:
 
 
 def _shuffle(
-    basis: FloatArray, blocks: IntArray | None, random: np.random.Generator, *, flip: bool
+    basis: FloatArray, blocks: IntArray | None, key: FloatArray, *, flip: bool
 ) -> FloatArray:
-    """Shuffle subjects, within blocks; the same as shuffling residuals the other way round."""
+    """Shuffle subjects, within blocks; the same as shuffling residuals the other way round.
+
+    Keys are uniform between 0 and 1: their order is the permutation, their halves are signs.
+    """
     if flip:
-        signs: FloatArray = random.choice([-1.0, 1.0], size=(len(basis), 1))
+        signs: FloatArray = np.where(key < 0.5, -1.0, 1.0)[:, None]  # noqa: PLR2004 -- half of them
         return basis * signs
-    key = random.random(len(basis))
     if blocks is None:
         return basis[np.argsort(key)]
     result = basis.copy()

@@ -1,34 +1,16 @@
 """A methods and results paragraph with the numbers of one analysis filled in."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from hipsta_bids import __version__
 from hipsta_bids.group.analysis import Analysis
-from hipsta_bids.group_data import Cohort
-from hipsta_bids.group_settings import GroupSettings
-
-#: Key and entry of each work that the methods rest on.
-_REFERENCES = {
-    "method": "Diers K, Baumeister H, Jessen F, Düzel E, Berron D, Reuter M. An automated,"
-    " geometry-based method for hippocampal shape and thickness analysis. NeuroImage"
-    " 2023;276:120182. doi:10.1016/j.neuroimage.2023.120182",
-    "registr": "Wrobel J. register: registration for exponential family functional data. Journal"
-    " of Open Source Software 2018;3(22):557. doi:10.21105/joss.00557",
-    "two-stage": "Benjamini Y, Krieger AM, Yekutieli D. Adaptive linear step-up procedures that"
-    " control the false discovery rate. Biometrika 2006;93(3):491-507."
-    " doi:10.1093/biomet/93.3.491",
-    "benjamini-hochberg": "Benjamini Y, Hochberg Y. Controlling the false discovery rate: a"
-    " practical and powerful approach to multiple testing. Journal of the Royal Statistical"
-    " Society B 1995;57(1):289-300.",
-    "delong": "DeLong ER, DeLong DM, Clarke-Pearson DL. Comparing the areas under two or more"
-    " correlated receiver operating characteristic curves: a nonparametric approach. Biometrics"
-    " 1988;44(3):837-845.",
-    "firth": "Heinze G, Schemper M. A solution to the problem of separation in logistic"
-    " regression. Statistics in Medicine 2002;21(16):2409-2419. doi:10.1002/sim.1047",
-}
+from hipsta_bids.group.inference import PERMUTATIONS
+from hipsta_bids.group.references import REFERENCES
+from hipsta_bids.group_data import PARTICIPANT, Cohort
+from hipsta_bids.group_settings import GroupSettings, MultiplicitySettings
 
 
 def methods_text(cohort: Cohort, analysis: Analysis, settings: GroupSettings, n_out: int) -> str:
@@ -60,7 +42,9 @@ def methods_text(cohort: Cohort, analysis: Analysis, settings: GroupSettings, n_
     paragraphs = [_sample(cohort, analysis, n_out, cite("method"))]
     if analysis.sides:
         paragraphs.append(_registration(analysis, settings, cite("registr")))
-    paragraphs.append(_models(analysis, settings, cite(settings.multiplicity.method)))
+    paragraphs.append(_models(analysis, settings, cite))
+    if analysis.comparison.asymmetry:
+        paragraphs.append(_asymmetry(settings, cite("asymmetry")))
     if analysis.pairs:
         paragraphs.append(_classification(analysis, settings, cite("delong"), cite("firth")))
     if analysis.sides:
@@ -71,22 +55,25 @@ def methods_text(cohort: Cohort, analysis: Analysis, settings: GroupSettings, n_
     if analysis.skipped:
         lines += ["", "Left out:", "", *(f"- {note}" for note in analysis.skipped)]
     lines += ["", "# References", ""]
-    lines += [f"{i}. {_REFERENCES[key]}" for i, key in enumerate(cited, start=1)]
+    lines += [f"{i}. {REFERENCES[key]}" for i, key in enumerate(cited, start=1)]
     return "\n".join(lines) + "\n"
 
 
 def _sample(cohort: Cohort, analysis: Analysis, n_out: int, method: str) -> str:
     rows = analysis.design.rows
+    table = analysis.compared.table.iloc[rows]
+    people = cohort.table[PARTICIPANT].nunique()
+    visits = f" ({len(cohort.table)} visits)" if len(cohort.table) > people else ""
     text = (
         f"Measures of the hippocampus {method} ({_words(analysis.measured.maps) or 'summaries'}) of"
-        f" {len(cohort.table)} participants were analyzed with hipsta_bids {__version__};"
-        f" {len(rows)} had all variables of the model"
+        f" {people} participants{visits} were analyzed with hipsta_bids {__version__};"
+        f" {analysis.n_participants} had all variables of the model"
     )
     if analysis.groups is not None:
-        names = cohort.table[analysis.groups.column].iloc[rows]
+        names = table[analysis.groups.column][~table[PARTICIPANT].duplicated()]
         counts = Counter(names.dropna().astype(str))
         text += f" ({', '.join(f'{counts[g]} {g}' for g in analysis.groups.levels)})"
-    if sheets := ", ".join(f"{len(side.used)} {hemi}" for hemi, side in analysis.sides.items()):
+    if sheets := ", ".join(f"{len(one.used)} {hemi}" for hemi, one in analysis.fitted.items()):
         text += f", with hemispheres {sheets}"
     return f"{text}. {n_out} hemispheres or visits were left out; the table of exclusions says why."
 
@@ -116,23 +103,65 @@ def _registration(analysis: Analysis, settings: GroupSettings, registr: str) -> 
     )
 
 
-def _models(analysis: Analysis, settings: GroupSettings, fdr: str) -> str:
+def _models(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], str]) -> str:
     names = ", ".join(contrast.name for contrast in analysis.design.contrasts)
-    kind = (
-        "the two-stage procedure of Benjamini, Krieger and Yekutieli"
-        if settings.multiplicity.method == "two-stage"
-        else "the procedure of Benjamini and Hochberg"
-    )
-    family = "each map" if settings.multiplicity.scope == "map" else "both hemispheres together"
     levels = ", ".join(f"{name} {level}" for name, level in analysis.design.references.items())
     errors = " with HC3 standard errors" if settings.glm.covariance == "hc3" else ""
+    kind, what, d = "linear model", "", "estimate over residual standard deviation"
+    if analysis.comparison.pair:
+        first, second = analysis.comparison.pair
+        what = f" to the change from {first} to {second}, with the covariates of {first}"
+    if analysis.comparison.longitudinal:
+        own = "intercepts and slopes" if settings.longitudinal.random == "slope" else "intercepts"
+        kind = f"linear mixed model with {own} of participants"
+        errors = (
+            " by restricted maximum likelihood, with Satterthwaite's degrees of freedom"
+            f" {cite('mixed')}"
+        )
+        d = "estimate over the standard deviation of single visits"
     return (
-        f"At each point of the sheet a linear model `{analysis.model.formula}` was fitted{errors}"
-        f" (reference levels: {levels or 'none'}); contrasts: {names}. The false discovery rate was"
-        f" held at {settings.multiplicity.alpha:g} by {kind} {fdr}, for {family}. Effect sizes are"
-        " Cohen's d (estimate over residual standard deviation) or partial eta squared, with"
+        f"At each point of the sheet a {kind} `{analysis.model.formula}` was fitted{what}{errors}"
+        f" (reference levels: {levels or 'none'}); contrasts: {names}."
+        f" {_correction(settings.multiplicity, cite)} Effect sizes are"
+        f" Cohen's d ({d}) or partial eta squared, with"
         f" {settings.glm.confidence:.0%} confidence limits from non-central distributions. Summary"
         " measures were tested in the same model, volumes also with intracranial volume."
+    )
+
+
+def _correction(how: MultiplicitySettings, cite: Callable[[str], str]) -> str:
+    family = "each map" if how.scope == "map" else "both hemispheres together"
+    if how.method in PERMUTATIONS:
+        statistic = "the largest absolute statistic"
+        if how.method == "permutation-tfce":
+            statistic = (
+                f"the largest threshold-free cluster enhancement {cite('tfce')} (extent"
+                f" {how.tfce_extent:g}, height {how.tfce_height:g})"
+            )
+        inside = f" within levels of {how.blocks}" if how.blocks else ""
+        return (
+            f"The family-wise error rate was held at {how.alpha:g} by {statistic} in"
+            f" {how.permutations} permutations{inside} of the residuals of the model without the"
+            " contrast (Freedman and Lane's; of signs, where a mean was tested; seed"
+            f" {how.seed}) {cite('permutation')}, for {family}."
+        )
+    kind = (
+        "the procedure of Benjamini and Hochberg"
+        if how.method == "bh"
+        else "the two-stage procedure of Benjamini, Krieger and Yekutieli"
+    )
+    return (
+        f"The false discovery rate was held at {how.alpha:g} by {kind} {cite(how.method)}, for"
+        f" {family}."
+    )
+
+
+def _asymmetry(settings: GroupSettings, source: str) -> str:
+    relative = " and ".join(settings.asymmetry.relative) or "no map"
+    return (
+        "Left minus right was taken at each point of the registered sheets, which are numbered"
+        f" alike on both sides; of {relative} as (L - R) / ((L + R) / 2) {source}, of other maps in"
+        " their own unit. The contrast `mean` tests it over all participants."
     )
 
 

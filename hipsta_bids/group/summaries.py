@@ -1,6 +1,6 @@
 """Summary measures in the models of the maps, and as classifiers, as in the paper's tables."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,17 +8,17 @@ import pandas as pd
 from formulaic import Formula
 
 from hipsta_bids.errors import ModelError
+from hipsta_bids.group.comparison import BOTH
+from hipsta_bids.group.contrasts import Contrast
 from hipsta_bids.group.default_model import Groups
 from hipsta_bids.group.design import Design, build_design
-from hipsta_bids.group.glm import PointwiseFit, fit_points
+from hipsta_bids.group.glm import PointwiseFit
 from hipsta_bids.group.model_spec import ModelSpec
 from hipsta_bids.group.pairs import PairComparison, compare_pairs
+from hipsta_bids.group.row_model import MEAN, RowModel, with_mean
 from hipsta_bids.group.variables import check_names, typed
 from hipsta_bids.group_data import Cohort, Float
 from hipsta_bids.group_settings import GroupSettings
-
-#: Both hemispheres together: the mean of the two.
-BOTH = "LR"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -73,6 +73,7 @@ def fit_summaries(
     only: Sequence[str] | None,
     references: Mapping[str, str],
     icv: str | None,
+    rows_of: Callable[[Design], RowModel] = RowModel,
 ) -> tuple[list[MeasureFit], list[str]]:
     """Fit the model of the maps to all summary measures; to volumes with intracranial volume too.
 
@@ -92,6 +93,8 @@ def fit_summaries(
         Reference levels.
     icv : str or None
         Column of intracranial volume.
+    rows_of : callable
+        Tells of a design whether its rows are independent.
 
     Returns
     -------
@@ -100,7 +103,8 @@ def fit_summaries(
     """
     fits, notes = [], []
     for hemi in hemispheres(cohort):
-        fits += _fit(summary_values(cohort, hemi, only), hemi, model.formula, design, settings)
+        values = summary_values(cohort, hemi, only)
+        fits += _fit(values, hemi, model.formula, rows_of(design), settings)
     if icv is None:
         notes.append("volumes are not adjusted: no intracranial volume is known")
         return fits, notes
@@ -109,13 +113,14 @@ def fit_summaries(
     try:
         adjusted = replace(model, formula=f"{model.formula} + {icv}")
         larger = build_design(cohort.table, adjusted, settings.design, references)
+        larger = replace(larger, contrasts=_same_names(larger, design))
     except ModelError as error:
         notes.append(f"volumes are not adjusted for {icv}: {error}")
         return fits, notes
     for hemi in hemispheres(cohort):
         values = summary_values(cohort, hemi, only)
         volumes = [name for name in values.columns if name.startswith("volume")]
-        fits += _fit(values[volumes], hemi, adjusted.formula, larger, settings)
+        fits += _fit(values[volumes], hemi, adjusted.formula, rows_of(larger), settings)
     return fits, notes
 
 
@@ -123,18 +128,24 @@ def _fit(
     values: pd.DataFrame,
     hemi: str,
     formula: str,
-    design: Design,
+    model: RowModel,
     settings: GroupSettings,
 ) -> list[MeasureFit]:
-    own = values.iloc[design.rows]
+    own = values.iloc[model.design.rows]
     varying = tuple(own.columns[(own.max() > own.min()).to_numpy()])
-    present = own[list(varying)].notna().any(axis=1).to_numpy()
+    present = np.flatnonzero(own[list(varying)].notna().any(axis=1).to_numpy())
     if not varying:
         return []
-    matrix = design.matrix[present]
-    maps: Float = own.loc[present, list(varying)].to_numpy(dtype=np.float64)
-    fit = fit_points(maps, matrix, design.contrasts, settings.glm)
+    maps: Float = own[list(varying)].to_numpy(dtype=np.float64)[present]
+    fit = model.fit(maps, present, model.design.contrasts, settings)
     return [MeasureFit(hemi=hemi, measures=varying, formula=formula, fit=fit)]
+
+
+def _same_names(larger: Design, design: Design) -> tuple[Contrast, ...]:
+    """Contrasts of the larger design; with that of the mean, if the smaller one has it."""
+    names = {contrast.name for contrast in design.contrasts}
+    contrasts = with_mean(larger) if MEAN in names else larger.contrasts
+    return tuple(contrast for contrast in contrasts if contrast.name in names)
 
 
 def classify_groups(

@@ -5,8 +5,9 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 import pandas as pd
 
-from hipsta_bids.group.analysis import Analysis, SideResult
+from hipsta_bids.group.analysis import Analysis
 from hipsta_bids.group.classification import ClassifierResult
+from hipsta_bids.group.fitted import FittedMaps
 from hipsta_bids.group.glm import PointTest
 from hipsta_bids.group.multiplicity import Discoveries, MapKey
 from hipsta_bids.group.peaks import SheetFrame, peak_table
@@ -16,7 +17,7 @@ from hipsta_bids.group_settings import GroupSettings
 
 #: Meaning of every column; the unit is that of the measure unless said.
 COLUMNS: Mapping[str, str] = {
-    "hemi": "hemisphere, L or R; LR is the mean of both",
+    "hemi": "hemisphere, L or R; LR is the mean of both, of asymmetry left minus right",
     "measure": "map or summary measure",
     "unit": "unit of the measure",
     "contrast": "name of the contrast; A-B is positive where A has more",
@@ -35,8 +36,8 @@ COLUMNS: Mapping[str, str] = {
     "statistic": "t or F",
     "df": "degrees of freedom; of F, the denominator's",
     "p": "two-sided p-value, not corrected",
-    "p_adjusted": "p-value adjusted for the false discovery rate; compare with its level",
-    "significant": "true where the adjusted p-value is at most the level",
+    "p_corrected": "p-value corrected for the number of points, by the method of analysis.json",
+    "significant": "true where the corrected p-value is at most the level",
     "effect": "kind of effect size",
     "effect_size": "Cohen's d (estimate over residual SD), or partial eta squared",
     "effect_low": "lower confidence limit of the effect size",
@@ -51,7 +52,7 @@ COLUMNS: Mapping[str, str] = {
     "shares": "share of the cluster in each subfield",
     "n_tests": "points tested in the family",
     "n_significant": "points of the map that survive",
-    "p_cutoff": "largest p-value that survives; below all p-values if none does",
+    "p_cutoff": "largest p-value that survives; below all if none does; n/a if clusters decide",
     "lenient": "true where p-values above the level survive, as they may with widespread effects",
     "group": "group",
     "mean": "mean, unit of the measure",
@@ -116,32 +117,38 @@ def result_tables(
     if analysis.measures:
         yield ResultTable(name="measures", rows=_measures(cohort, analysis))
     if analysis.groups is not None and analysis.measures:
-        yield ResultTable(name="descriptives", rows=_descriptives(cohort, analysis))
+        yield ResultTable(name="descriptives", rows=_descriptives(analysis))
     if analysis.groups is not None and analysis.sides:
         yield ResultTable(name="shifts", rows=_shifts(analysis))
     if analysis.pairs:
         yield ResultTable(name="classification", rows=_classification(analysis, settings))
-    for hemi, side in analysis.sides.items():
-        for measure, fit in side.fits.items():
+    for hemi, one in analysis.fitted.items():
+        for measure, fit in one.fits.items():
             for test in fit.tests:
                 found = analysis.found[MapKey(measure, test.contrast.name, hemi)]
-                rows = _map(frame_of(cohort, side), fit.n, test, found)
+                rows = _map(frame_of(cohort, one), fit.n, test, found)
                 yield ResultTable(name=map_name(hemi, measure, test), rows=rows)
 
 
 def map_name(hemi: str, measure: str, test: PointTest) -> str:
     """Name of the files of one map of statistics, without suffix and extension."""
-    contrast = "".join(c if c.isalnum() else " " for c in test.contrast.name).split()
-    joined = "".join(word[:1].upper() + word[1:] for word in contrast) or "contrast"
-    first, *more = measure.split("_")  # values of entities have no underscores
-    desc = first + "".join(word[:1].upper() + word[1:] for word in more)
-    return f"hemi-{hemi}_contrast-{joined}_desc-{desc}_statmap"
+    contrast = _label(test.contrast.name) or "contrast"
+    # BIDS knows L and R only: what is made of both has no hemisphere in its name.
+    side = f"hemi-{hemi}_" if hemi in {"L", "R"} else ""
+    desc = _label(measure)
+    return f"{side}contrast-{contrast}_desc-{measure[:1] + desc[1:]}_statmap"
 
 
-def frame_of(cohort: Cohort, side: SideResult) -> SheetFrame:
+def _label(text: str) -> str:
+    """Spell a name with letters and digits only, as entities want it."""
+    words = "".join(c if c.isalnum() else " " for c in text).split()
+    return "".join(word[:1].upper() + word[1:] for word in words)
+
+
+def frame_of(cohort: Cohort, one: FittedMaps) -> SheetFrame:
     """Where the points lie, and in which subfield most participants have them."""
-    names = np.array([*side.registered.names, "n/a"])
-    return SheetFrame(cohort.x, cohort.y, names[side.subfield])
+    names = np.array([*one.maps.names, "n/a"])
+    return SheetFrame(cohort.x, cohort.y, names[one.subfield])
 
 
 def _map(
@@ -167,7 +174,7 @@ def _map(
             "statistic": test.statistic,
             "df": test.df,
             "p": test.p,
-            "p_adjusted": found.adjusted,
+            "p_corrected": found.adjusted,
             "significant": found.rejected,
             "cohen_d": test.cohen_d,
             "cohen_d_low": test.cohen_d_limits[0],
@@ -181,9 +188,9 @@ def _map(
 
 def _peaks(cohort: Cohort, analysis: Analysis, settings: GroupSettings) -> pd.DataFrame:
     parts = []
-    for hemi, side in analysis.sides.items():
-        frame = frame_of(cohort, side)
-        for measure, fit in side.fits.items():
+    for hemi, one in analysis.fitted.items():
+        frame = frame_of(cohort, one)
+        for measure, fit in one.fits.items():
             for test in fit.tests:
                 found = analysis.found[MapKey(measure, test.contrast.name, hemi)]
                 part = peak_table(test, found, frame, settings.multiplicity.neighbors)
@@ -243,8 +250,8 @@ def _measures(cohort: Cohort, analysis: Analysis) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True)
 
 
-def _descriptives(cohort: Cohort, analysis: Analysis) -> pd.DataFrame:
-    groups = analysis.groups
+def _descriptives(analysis: Analysis) -> pd.DataFrame:
+    groups, cohort = analysis.groups, analysis.compared
     if groups is None:
         return pd.DataFrame()
     members = cohort.table[groups.column].iloc[analysis.design.rows]

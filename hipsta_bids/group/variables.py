@@ -99,7 +99,7 @@ def set_levels(
     ModelError
         If nothing is left, a column does not vary, a level is unknown or has too few rows.
     """
-    if used.empty:
+    if not len(used):
         raise ModelError("model: no row has all variables", reason="group-size")
     chosen = {}
     for column in used.columns:

@@ -42,7 +42,7 @@ def test_planted_effect_is_the_first_row():
     point = 4 * 8 + 3
     assert first["statistic"] == test.statistic[point] < -5
     assert first["p"] == test.p[point]
-    assert first["p_adjusted"] == found.adjusted[point]
+    assert first["p_corrected"] == found.adjusted[point]
     assert first["effect"] == "cohen_d"
     assert first["effect_low"] < first["effect_size"] == test.cohen_d[point] < first["effect_high"]
 
@@ -82,5 +82,5 @@ def test_families_are_maps_or_both_hemispheres():
     np.testing.assert_array_equal(both[right].rejected, pooled.rejected[1])
     assert both[right].cutoff == pooled.cutoff
     np.testing.assert_array_equal(both[age].adjusted, each[age].adjusted)
-    single = discover(maps, MultiplicitySettings(method="benjamini-hochberg"))
+    single = discover(maps, MultiplicitySettings(method="bh"))
     assert single[left].n_null == pytest.approx(96)

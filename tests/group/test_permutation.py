@@ -10,13 +10,21 @@ from scipy import stats
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.contrasts import Contrast
 from hipsta_bids.group.glm import fit_points
-from hipsta_bids.group.permutation import permute
+from hipsta_bids.group.permutation import PermutationPart
+from hipsta_bids.group.permutation import permute as permute_parts
 from hipsta_bids.group.sheet_graph import enhance, find_clusters
 from hipsta_bids.group_settings import GlmSettings, MultiplicitySettings
 
-SETTINGS = MultiplicitySettings(permutations=400)
+SETTINGS = MultiplicitySettings(method="permutation-tfce", permutations=400)
 SHEET = (9, 7)
 GROUP = Contrast("group", np.array([0.0, 1.0, 0.0]))
+
+
+def permute(maps, matrix, contrast, shape, *, settings, blocks=None):
+    """One part."""
+    part = PermutationPart(maps, matrix, np.arange(len(maps)))
+    (found,) = permute_parts([part], contrast, shape, settings=settings, blocks=blocks)
+    return found
 
 
 def case(seed=0, subjects=40):
