@@ -28,9 +28,9 @@ from hipsta_bids.bids.dataset import find_hemispheres
 from hipsta_bids.bids.inputs import HemisphereInput, InputRequest
 from hipsta_bids.cost import cpu_seconds, helpers, peak_memory, reset_peak_memory
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.job import warm_up
 from hipsta_bids.phantom import write_demo_dataset
 from hipsta_bids.settings import GridSettings, Settings
+from hipsta_bids.worker import warm_up
 
 #: mm; the middle one is the default.
 SPACINGS = (0.5, 0.35, 0.25)

@@ -7,12 +7,21 @@ from collections.abc import Generator, Sequence
 from datetime import UTC, datetime
 from os import getpid
 from pathlib import Path
+from socket import gethostname
 
 from hipsta_bids import __version__
 from hipsta_bids.artifacts import Status
 from hipsta_bids.bids import files
 from hipsta_bids.bids.names import DATASET_FILES
-from hipsta_bids.bids.status import STAGE_PREFIX, identity, read_status, row_key, update_status
+from hipsta_bids.bids.status import (
+    NOT_FINISHED,
+    STAGE_PREFIX,
+    identity,
+    read_table,
+    row_key,
+    table_path,
+    update_status,
+)
 from hipsta_bids.errors import HipstaError, OutputError
 from hipsta_bids.job import Job, Outcome
 
@@ -28,11 +37,14 @@ class Books:
     ----------
     root : Path
         The output dataset.
+    shard : str, optional
+        Name of the part of the dataset that this run does, which has a table of its own.
     """
 
-    def __init__(self, root: Path) -> None:
-        self._root = root
-        self._known = {row_key(row): row.get("status") for row in read_status(root)}
+    def __init__(self, root: Path, shard: str | None = None) -> None:
+        self._root, self._shard = root, shard
+        rows = read_table(root / table_path(shard))
+        self._known = {row_key(row): row.get("status") for row in rows}
         self._pending: list[dict[str, str]] = []
         self._next_write = 0.0
 
@@ -49,20 +61,7 @@ class Books:
         OutputError
             If the table cannot be written.
         """
-        for job in jobs:
-            error = HipstaError(
-                "the run ended before this hemisphere; run the same command again",
-                reason="not-finished",
-            )
-            row = _row(
-                Outcome(
-                    job=job,
-                    status=Status.FAILED,
-                    reason=error.reason,
-                    message=str(error),
-                    error=error,
-                )
-            )
+        for row in map(status_row, map(not_finished, jobs)):
             self._pending.append(row)
             self._known[row_key(row)] = row["status"]
         self.close()
@@ -81,7 +80,7 @@ class Books:
             If the table cannot be written.
         """
         _log(outcome)
-        row = _row(outcome)
+        row = status_row(outcome)
         # Rows that are there already also have the times, which the quality record has not.
         if outcome.skipped and self._known.get(row_key(row)) == row["status"]:
             return
@@ -107,12 +106,22 @@ class Books:
         if not self._pending:
             return
         start = time.monotonic()
-        update_status(self._root, self._pending)
+        update_status(self._root, self._pending, shard=self._shard)
         self._pending = []
         cost = time.monotonic() - start
         # Tables of many thousand rows may take a twentieth of the time, not more.
         wait = 0.0 if cost < _CHEAP_WRITE else 20 * cost
         self._next_write = time.monotonic() + wait
+
+
+def not_finished(job: Job) -> Outcome:
+    """Say of a hemisphere that no run has come to its end with it."""
+    error = HipstaError(
+        "the run ended before this hemisphere; run the same command again", reason=NOT_FINISHED
+    )
+    return Outcome(
+        job=job, status=Status.FAILED, reason=error.reason, message=str(error), error=error
+    )
 
 
 def _log(outcome: Outcome) -> None:
@@ -129,7 +138,7 @@ def _log(outcome: Outcome) -> None:
         _LOGGER.error("%s: %s", title, outcome.trace)
 
 
-def _row(outcome: Outcome) -> dict[str, str]:
+def status_row(outcome: Outcome) -> dict[str, str]:
     """Spell one row of ``status.tsv``."""
     measured = {
         "seconds": outcome.seconds,
@@ -154,7 +163,7 @@ def _row(outcome: Outcome) -> dict[str, str]:
 
 
 @contextlib.contextmanager
-def log_file(root: Path, verbosity: int) -> Generator[Path]:
+def log_file(root: Path, verbosity: int, shard: str | None = None) -> Generator[Path]:
     """Log this run to a file of its own.
 
     Parameters
@@ -163,6 +172,8 @@ def log_file(root: Path, verbosity: int) -> Generator[Path]:
         The output dataset.
     verbosity : int
         Above 0, debugging messages too.
+    shard : str, optional
+        Name of the part of the dataset that this run does.
 
     Yields
     ------
@@ -176,7 +187,10 @@ def log_file(root: Path, verbosity: int) -> Generator[Path]:
     """
     folder = root / DATASET_FILES["logs"]
     files.make_folder(folder)
-    path = folder / f"run-{datetime.now(UTC):%Y%m%dT%H%M%S}-{getpid()}.log"
+    part = "" if shard is None else f"_shard-{shard}"
+    # Process numbers alone are not unique among the nodes of a cluster.
+    process = f"{gethostname().partition('.')[0]}-{getpid()}"
+    path = folder / f"run-{datetime.now(UTC):%Y%m%dT%H%M%S}-{process}{part}.log"
     try:
         handler = _QuietHandler(path, encoding="utf-8")
     except OSError as error:

@@ -6,22 +6,25 @@ import signal
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
 
 from hipsta_bids.console import Progress, complain, say, say_result, say_start, say_table
-from hipsta_bids.errors import ExitCode, HipstaError, UsageError
+from hipsta_bids.errors import ExitCode, HipstaError, NothingToDoError, UsageError
 from hipsta_bids.group_command import is_group_level, run_group_level
-from hipsta_bids.parser import LEVELS, build_parser
+from hipsta_bids.parser import COLLECT, LEVELS, build_parser
 from hipsta_bids.threads import pin_threads
 
 if TYPE_CHECKING:
     from argparse import Namespace
 
+    from hipsta_bids.bids.dataset import Findings
     from hipsta_bids.bids.inputs import HemisphereInput, InputRequest
     from hipsta_bids.runner import RunOptions
     from hipsta_bids.settings import Settings
+    from hipsta_bids.shard import Shard
 
 _SIGNALED = 128  # shells report death by signal n as 128 + n
 
@@ -110,18 +113,19 @@ def _participant(options: "Namespace") -> ExitCode:
     from hipsta_bids.settings_file import load_settings  # noqa: PLC0415  (start-up time)
 
     _check_folders(options)
+    if options.analysis_level == COLLECT and options.shard is not None:
+        raise UsageError("collect is about all parts; leave --shard out", reason="usage")
     settings = _with_region(load_settings(options.settings), options.region)
     request = _request(options)
-    say_start("participant", options.bids_dir)
-    from hipsta_bids.bids.dataset import (  # noqa: PLC0415  (heavy)
-        dataset_notes,
-        find_inputs,
-        selection_table,
-    )
+    say_start(options.analysis_level, options.bids_dir)
+    from hipsta_bids.bids.dataset import dataset_notes, selection_table  # noqa: PLC0415  (heavy)
     from hipsta_bids.bids.maps import attach, map_requests  # noqa: PLC0415  (heavy)
 
     wishes = map_requests(options.map, options.map_sampling, options.map_interpolation)
-    found = find_inputs(request)
+    found = _find(request, options.shard)
+    if found is None:
+        say(f"part {options.shard.name} of the dataset has nothing to process")
+        return ExitCode.OK
     items, map_notes = attach(found.items, wishes, options.roi, options.bids_dir)
     for note in (*dataset_notes(request, items), *found.notes, *map_notes):
         say(f"note: {note}")
@@ -129,6 +133,12 @@ def _participant(options: "Namespace") -> ExitCode:
         say_table(selection_table(items))
         return ExitCode.OK
     _check_output_is_no_input(options.output_dir, items)
+    if options.analysis_level == COLLECT:
+        from hipsta_bids.collect import collect  # noqa: PLC0415  (heavy)
+
+        result = collect(items, options.output_dir, settings, _run_options(options))
+        say_result(result, options.output_dir)
+        return result.exit_code
     from hipsta_bids.runner import run_participants  # noqa: PLC0415  (heavy)
 
     progress = Progress(len(items), options.verbose)
@@ -142,9 +152,22 @@ def _participant(options: "Namespace") -> ExitCode:
     return result.exit_code
 
 
-def _with_region(settings: "Settings", region: str | None) -> "Settings":
-    from dataclasses import replace  # noqa: PLC0415  (start-up time)
+def _find(request: "InputRequest", shard: "Shard | None") -> "Findings | None":
+    """Find inputs, of one part of the subjects if asked for; ``None`` if that has none."""
+    from hipsta_bids.bids.dataset import find_inputs, list_subjects  # noqa: PLC0415  (heavy)
 
+    if shard is None:
+        return find_inputs(request)
+    subjects = shard.take(list_subjects(request))
+    if not subjects:
+        return None
+    try:
+        return find_inputs(replace(request, participant_labels=subjects))
+    except NothingToDoError:
+        return None  # others may have something, and collecting says if none has
+
+
+def _with_region(settings: "Settings", region: str | None) -> "Settings":
     if region is None:
         return settings
     return replace(settings, body=replace(settings.body, region=region))
@@ -213,6 +236,7 @@ def _run_options(options: "Namespace") -> "RunOptions":
         force=options.force,
         write_meshes=options.write_meshes,
         timeout=options.timeout,
+        shard=options.shard,
     )
 
 

@@ -9,8 +9,10 @@ from typing import Any, NoReturn
 
 from hipsta_bids import __version__
 from hipsta_bids.errors import EXIT_MEANINGS, UsageError
+from hipsta_bids.shard import Shard, parse_shard
 
-LEVELS = ("participant",)
+COLLECT = "collect"
+LEVELS = ("participant", COLLECT)
 REGIONS = ("body", "extended", "entorhinal")
 
 EPILOG = """\
@@ -57,13 +59,17 @@ def build_parser() -> Parser:
     parser.add_argument("bids_dir", type=Path, help="a BIDS dataset")
     parser.add_argument("output_dir", type=Path, help="where the output dataset goes")
     parser.add_argument(
-        "analysis_level", type=_level, help="participant, or group (which has a --help of its own)"
+        "analysis_level",
+        type=_level,
+        help="participant; collect, which completes status.tsv after runs with --shard; or group"
+        " (which has a --help of its own)",
     )
     parser.add_argument("--version", action="version", version=f"hipsta_bids {__version__}")
     add_selection(parser)
     add_segmentations(parser)
     _add_signals(parser)
     _add_processing(parser)
+    _add_machines(parser)
     return parser
 
 
@@ -269,6 +275,16 @@ def _add_processing(parser: Parser) -> None:
     )
 
 
+def _add_machines(parser: Parser) -> None:
+    group = parser.add_argument_group("many machines")
+    _add(
+        group,
+        ("--shard",),
+        ("I/N", "do the I-th of N equal parts of the subjects; slurm: as the array job says"),
+        type=_shard,
+    )
+
+
 def _add(
     group: Any,  # noqa: ANN401  (argparse has no public name for groups)
     flags: Sequence[str],
@@ -284,7 +300,7 @@ def _add(
 def _level(text: str) -> str:
     if text not in LEVELS:
         raise argparse.ArgumentTypeError(
-            f"{text!r} does not exist; there are participant and group"
+            f"{text!r} does not exist; there are participant, collect and group"
         )
     return text
 
@@ -335,6 +351,10 @@ def _choice(*values: str) -> Any:  # noqa: ANN401  (a converter for argparse)
         return name or None, value
 
     return convert
+
+
+def _shard(text: str) -> Shard:
+    return parse_shard(text, os.environ)
 
 
 def _positive_int(text: str) -> int:

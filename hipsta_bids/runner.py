@@ -13,15 +13,17 @@ from hipsta_bids.artifacts import Status
 from hipsta_bids.bids import derivative, files, results
 from hipsta_bids.bids.inputs import HemisphereInput
 from hipsta_bids.bids.locks import DATASET, locked
-from hipsta_bids.bids.names import HemisphereName
+from hipsta_bids.bids.names import DATASET_FILES, HemisphereName
 from hipsta_bids.bids.results import ResultPlace
 from hipsta_bids.bids.status import write_sidecar
 from hipsta_bids.bookkeeping import Books, log_file
 from hipsta_bids.errors import ExitCode, HipstaError, InputError, OutputError, SchemeError
-from hipsta_bids.job import INTERNAL, Job, Outcome, fail, finished, run_job, warm_up
+from hipsta_bids.job import Job, Outcome, finished
 from hipsta_bids.pool import WorkerLost, WorkerPlan, run_jobs
 from hipsta_bids.schemes import Scheme
 from hipsta_bids.settings import Settings
+from hipsta_bids.shard import Shard
+from hipsta_bids.worker import INTERNAL, fail, run_job, warm_up
 
 WORKER_GB = 0.6
 """Memory that one worker may need, GB: 500 MB for a hemisphere, and its helper process."""
@@ -46,6 +48,8 @@ class RunOptions:
     write_meshes: bool = False
     timeout: float = 600.0
     """Seconds per hemisphere."""
+    shard: Shard | None = None
+    """Which part of the dataset this is, if other runs do the others."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,23 +123,11 @@ def run_participants(
     UsageError
         If it is a dataset of other software.
     """
-    sources = _source_names(items)
-    digest = _set_up(out_dir, settings, sources, _schemes(items))
-    jobs = [
-        Job(
-            item=item,
-            place=ResultPlace(root=out_dir, name=hemisphere_name(item, settings)),
-            settings=settings,
-            settings_hash=digest,
-            sources=tuple(sources.items()),
-            write_meshes=options.write_meshes,
-            force=options.force,
-        )
-        for item in items
-    ]
-    with log_file(out_dir, options.verbosity) as log:
-        _LOGGER.info("hipsta_bids %s, settings %s, %d hemispheres", __version__, digest, len(jobs))
-        books = Books(out_dir)
+    jobs = prepare(items, out_dir, settings, options)
+    shard = None if options.shard is None else options.shard.name
+    with log_file(out_dir, options.verbosity, shard) as log:
+        _LOGGER.info("hipsta_bids %s, %d hemispheres", __version__, len(jobs))
+        books = Books(out_dir, shard)
         # Closed at once, whatever ends the loop, so that no worker outlives it.
         with (
             contextlib.closing(books),
@@ -147,10 +139,19 @@ def run_participants(
     return result
 
 
-def _set_up(
-    out_dir: Path, settings: Settings, sources: dict[str, Path], schemes: Sequence[Scheme]
-) -> str:
-    """Write what describes the dataset as a whole; give the hash of its settings."""
+def prepare(
+    items: Sequence[HemisphereInput], out_dir: Path, settings: Settings, options: RunOptions
+) -> list[Job]:
+    """Write what describes the dataset as a whole, and say what is to be done.
+
+    Parameters, and what is raised, are those of :func:`run_participants`.
+
+    Returns
+    -------
+    list of Job
+        One per item.
+    """
+    sources = _source_names(items)
     derivative.check_not_foreign(out_dir)
     files.check_writable(out_dir)
     with locked(out_dir, DATASET) as alone:
@@ -158,9 +159,21 @@ def _set_up(
             files.remove_leftovers(out_dir, "*")
         digest = derivative.settle_settings(out_dir, settings)
         derivative.write_description(out_dir, sources)
-        derivative.write_citation(out_dir, settings, schemes)
+        if options.shard is None or not (out_dir / DATASET_FILES["citation"]).exists():
+            derivative.write_citation(out_dir, settings, _schemes(items))
         write_sidecar(out_dir)
-    return digest
+    return [
+        Job(
+            item=item,
+            place=ResultPlace(root=out_dir, name=hemisphere_name(item, settings)),
+            settings=settings,
+            settings_hash=digest,
+            sources=tuple(sources.items()),
+            write_meshes=options.write_meshes,
+            force=options.force,
+        )
+        for item in items
+    ]
 
 
 def _run(

@@ -23,8 +23,8 @@ from hipsta_bids.bids.names import HemisphereName
 from hipsta_bids.errors import GeometryError, InputError
 from hipsta_bids.geometry.catalog import MAPS, SECTIONS
 from hipsta_bids.geometry.measured import average_profiles
-from hipsta_bids.job import run_job
 from hipsta_bids.schemes import Label, Part, Scheme, Tissue
+from hipsta_bids.worker import run_job
 
 NX, NY, NZ = 5, 4, 3
 THICKNESS = 1.5

@@ -153,7 +153,7 @@ def test_spellings_of_other_bids_apps(alias, field, value):
     [
         ("", "required: bids_dir, output_dir, analysis_level"),
         ("in out", "required: analysis_level"),
-        ("in out cohort", "'cohort' does not exist; there are participant and group"),
+        ("in out cohort", "'cohort' does not exist; there are participant, collect and group"),
         ("in out participant --hemi X", "'X' is not a hemisphere; use L or R"),
         ("in out participant --n-procs 0", "'0' is not a whole number above 0"),
         ("in out participant --timeout -1", "'-1' is not a number above 0"),

@@ -11,10 +11,10 @@ from measured_phantoms import Damage, measured, results, spiral
 from hipsta_bids import cli, runner
 from hipsta_bids.bids import files
 from hipsta_bids.errors import ExitCode
-from hipsta_bids.job import run_job
 from hipsta_bids.phantom import encode
 from hipsta_bids.schemes import Tissue
 from hipsta_bids.settings import GridSettings, Settings
+from hipsta_bids.worker import run_job
 
 #: Coarse, for speed.
 SETTINGS = Settings(grid=GridSettings(spacing=0.5))

@@ -39,6 +39,7 @@ __all__ = [
     "dataset_notes",
     "find_hemispheres",
     "find_inputs",
+    "list_subjects",
     "selection_table",
 ]
 
@@ -106,6 +107,38 @@ def find_inputs(request: InputRequest) -> Findings:
     _check_analysis(found, request)
     items, notes = attach_edits(_without_clashes(found, sources), each_once(edited), selection)
     return Findings(items=items, notes=notes)
+
+
+def list_subjects(request: InputRequest) -> tuple[str, ...]:
+    """List the subjects that are asked for and have a folder in any dataset to be searched.
+
+    Takes one listing per dataset: what is in the folders is not looked at.
+
+    Parameters
+    ----------
+    request : InputRequest
+
+    Returns
+    -------
+    tuple of str
+        Sorted labels without ``sub-``.
+
+    Raises
+    ------
+    InputError, UsageError, SchemeError
+        As :func:`find_inputs`.
+    """
+    selection = make_selection(request)
+    return tuple(
+        sorted(
+            {
+                folder.subject
+                for source in list_sources(request)
+                for folder in subject_folders(source.path)
+                if selection.wants_folder(folder)
+            }
+        )
+    )
 
 
 def selection_table(items: Iterable[HemisphereInput]) -> list[dict[str, str]]:

@@ -12,7 +12,7 @@ from hipsta_bids.bids import files
 from hipsta_bids.bids.names import DATASET_FILES, HemisphereName
 from hipsta_bids.bids.quality_filter import QualityCondition
 from hipsta_bids.bids.results import ResultPlace
-from hipsta_bids.bids.status import read_status
+from hipsta_bids.bids.status import NOT_FINISHED, name_of, read_status
 from hipsta_bids.errors import InputError, NothingToDoError
 
 _RECORD = re.compile(
@@ -251,27 +251,20 @@ def _refuse_unfinished(
     pending = []
     for root in request.roots:
         for row in read_status(root):
-            session = row["session"].removeprefix("ses-")
-            name = HemisphereName(
-                subject=row["subject"].removeprefix("sub-"),
-                session=None if session == files.MISSING else session,
-                hemi=row["hemi"],
-                seg=row["seg"],
-            )
+            name = name_of(row)
             asked = (not request.subjects or name.subject in request.subjects) and (
                 not request.sessions or name.session in request.sessions
             )
             listed = any(_is_listed(name, one) for one in unwanted)
-            listed = listed or row.get("region", "body") != "body"  # the body alone is read here
-            same = name.seg == seg and row.get("region", "body") == "body"
-            if row.get("reason") == "not-finished" and same and asked and not listed:
+            same = name.seg == seg and name.region == "body"  # the body alone is read here
+            if row.get("reason") == NOT_FINISHED and same and asked and not listed:
                 pending.append(name.stem)
     if pending:
         shown = ", ".join(pending[:_SHOWN]) + (" ..." if len(pending) > _SHOWN else "")
         raise InputError(
             f"{request.roots[0]}: the participant level has not finished {len(pending)} hemispheres"
             f" ({shown}); complete it by the same command, or list them in --exclude",
-            reason="not-finished",
+            reason=NOT_FINISHED,
         )
 
 

@@ -1,11 +1,12 @@
 """``status.tsv``: one row per hemisphere, kept over all runs into the same folder."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from hipsta_bids.bids import files
 from hipsta_bids.bids.locks import DATASET, locked
-from hipsta_bids.bids.names import DATASET_FILES, HemisphereName
+from hipsta_bids.bids.names import DATASET_FILES, HemisphereName, output_path
 from hipsta_bids.errors import InputError
 
 Row = Mapping[str, str]
@@ -33,7 +34,15 @@ COLUMNS: dict[str, str] = {
     "peak_memory_mb": "largest resident memory of the process, MB (1e6 bytes)",
 }
 
+NOT_FINISHED = "not-finished"
+"""Reason of a hemisphere that a run has not come to yet."""
+
 _KEY = ("subject", "session", "hemi", "seg")
+
+#: Cells that the quality record has too.
+RECORDED = ("status", "reason", "version", "settings_hash", "input_hash")
+
+_SHARD_TABLE = "status_shard-*.tsv"
 
 
 def identity(name: HemisphereName) -> dict[str, str]:
@@ -54,8 +63,18 @@ def row_key(row: Row) -> tuple[str, ...]:
     return *(row[key] for key in _KEY), "body" if region == files.MISSING else region
 
 
+def table_path(shard: str | None = None) -> str:
+    """Spell the path of the table, or of that of one part of a dataset, in the output dataset."""
+    if shard is None:
+        return DATASET_FILES["status"]
+    return f"{DATASET_FILES['logs']}/{_SHARD_TABLE.replace('*', shard)}"
+
+
 def read_status(root: Path) -> list[dict[str, str]]:
-    """Read the rows of all runs so far.
+    """Read the rows of all runs so far, also of those that did parts of the dataset.
+
+    Where several have a row of the same hemisphere, the one is taken that its quality record
+    bears out.
 
     Parameters
     ----------
@@ -65,16 +84,65 @@ def read_status(root: Path) -> list[dict[str, str]]:
     Returns
     -------
     list of dict
-        Empty if there is no table yet, or not a readable one: it is rebuilt as hemispheres end.
+        Sorted. Empty if there is no table yet, or not a readable one: it is rebuilt as hemispheres
+        end.
     """
+    shards = sorted((root / DATASET_FILES["logs"]).glob(_SHARD_TABLE))
+    found: dict[tuple[str, ...], list[dict[str, str]]] = {}
+    for path in (root / DATASET_FILES["status"], *shards):
+        for row in read_table(path):
+            found.setdefault(row_key(row), []).append(row)
+    return [
+        rows[0] if len(rows) == 1 else _borne_out(root, rows) for _, rows in sorted(found.items())
+    ]
+
+
+def read_table(path: Path) -> list[dict[str, str]]:
+    """Read one table; empty if there is none, or not a readable one."""
     try:
-        rows = files.read_tsv(root / DATASET_FILES["status"])
+        rows = files.read_tsv(path)
     except InputError:
         return []
     return [row for row in rows if all(key in row for key in _KEY)]
 
 
-def update_status(root: Path, rows: Iterable[Row]) -> None:
+def _borne_out(root: Path, rows: Sequence[dict[str, str]]) -> dict[str, str]:
+    """Choose among rows of the same hemisphere."""
+    try:
+        record = files.read_json(root / output_path(name_of(rows[0]), "qc"))
+    except InputError:
+        record = {}
+
+    def rank(row: Row) -> tuple[bool, bool, bool]:
+        return (
+            agrees(row, record),
+            # Without any that agrees, one run has not come to its end.
+            row.get("reason") == NOT_FINISHED,
+            row.get("seconds", files.MISSING) != files.MISSING,
+        )
+
+    return max(rows, key=rank)
+
+
+def agrees(row: Row, record: Mapping[str, Any]) -> bool:
+    """Say whether a row tells what a quality record says."""
+    return all(row.get(key) == (record.get(key) or files.MISSING) for key in RECORDED)
+
+
+def name_of(row: Row) -> HemisphereName:
+    """Say whose row it is: the inverse of :func:`identity`."""
+    *_, seg, region = row_key(row)
+    session = row["session"].removeprefix("ses-")
+    return HemisphereName(
+        subject=row["subject"].removeprefix("sub-"),
+        session=None if session == files.MISSING else session,
+        hemi=row["hemi"],
+        seg=seg,
+        region=region,
+    )
+
+
+def update_status(root: Path, rows: Iterable[Row], *, shard: str | None = None) -> None:
     """Replace or add rows; those of other hemispheres stay.
 
     Safe for several runs at a time into the same folder, as on a cluster.
@@ -85,14 +153,17 @@ def update_status(root: Path, rows: Iterable[Row]) -> None:
         The output dataset.
     rows : iterable of mapping
         Cells by column.
+    shard : str, optional
+        Name of the part of the dataset whose table it is.
 
     Raises
     ------
     OutputError
         If the table cannot be written; the earlier one is then unharmed.
     """
-    with locked(root, DATASET):
-        merged = {row_key(row): row for row in read_status(root)}
+    path = root / table_path(shard)
+    with locked(root, DATASET if shard is None else path.name):
+        merged = {row_key(row): row for row in read_table(path)}
         merged |= {row_key(row): dict(row) for row in rows}
         ordered = [merged[key] for key in sorted(merged)]
         stages = dict.fromkeys(
@@ -100,7 +171,7 @@ def update_status(root: Path, rows: Iterable[Row]) -> None:
         )
         columns = (*COLUMNS, *stages)
         files.write_tsv(
-            root / DATASET_FILES["status"],
+            path,
             columns,
             ([row.get(column, files.MISSING) for column in columns] for row in ordered),
         )
