@@ -237,7 +237,7 @@ class ClassificationSettings:
         "area_mid",
         "area_exterior",
         "shape_index_mean",
-        "curvature_median",
+        "curvature_mean",
     )
     """Summary measures that are added to it, each by itself, where they were measured."""
     confidence: float = 0.95

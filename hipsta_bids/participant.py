@@ -46,6 +46,7 @@ from hipsta_bids.geometry.sheet import (
     sample_sheet,
     whole_body,
 )
+from hipsta_bids.geometry.subfields import subfield_areas, subfield_volumes
 from hipsta_bids.geometry.summary import summarize
 from hipsta_bids.geometry.surface import extract_surface, signed_volume
 from hipsta_bids.geometry.tetra import tetrahedralize
@@ -127,7 +128,8 @@ def measure_hemisphere(
             sheet=sheet,
             subfield=subfield,
             whole=whole,
-            whole_subfield=label_sheet(whole, body),
+            areas=subfield_areas(whole, body),
+            volumes=subfield_volumes(mesh, body),
             volume=signed_volume(surface.vertices, surface.triangles),
             settings=settings,
         )

@@ -33,6 +33,7 @@ class Case:
     phantom: Phantom
     volume: LabelVolume
     maps: HemisphereMaps
+    hemi: str = "L"
 
     @property
     def truth(self):
@@ -41,11 +42,12 @@ class Case:
 
 
 @cache
-def measured(spec, *, scheme="freesurfer", hemi="L", settings=None):
+def measured(spec, *, scheme="freesurfer", hemi="L", settings=None, voxel=0.4):
     """Draw and measure once for all tests (specifications and settings are hashable)."""
     phantom = Phantom(spec)
-    volume = phantom.label_volume(load_scheme(scheme), hemi=hemi)
-    return Case(phantom=phantom, volume=volume, maps=measure(volume, hemi, settings))
+    volume = phantom.label_volume(load_scheme(scheme), hemi=hemi, voxel_size=(voxel,) * 3)
+    maps = measure(volume, hemi, settings)
+    return Case(phantom=phantom, volume=volume, maps=maps, hemi=hemi)
 
 
 def spiral(**changes):

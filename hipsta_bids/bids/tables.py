@@ -209,7 +209,9 @@ def write_profile(table: Path, sidecar: Path, maps: HemisphereMaps) -> None:
         "node": _definition("node number along that axis, from 1", None),
     }
     for row in MAPS:
-        definitions[row.name] = _measure(row, "{}; mean over the columns measured directly")
+        definitions[row.name] = _measure(
+            row, "{}; mean over the area of the columns measured directly"
+        )
     _write_sidecar(sidecar, definitions)
 
 

@@ -7,17 +7,17 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from hipsta_bids.artifacts import Float, Sheet
+from hipsta_bids.artifacts import Bool, Float, Sheet
 from hipsta_bids.geometry.cross_sections import CrossSections, cut_sections
 from hipsta_bids.geometry.measures import (
-    column_volume,
+    away_from_edges,
+    column_area,
     gaussian_curvature,
-    layer_area,
     mean_curvature,
     measure_thickness,
-    node_shares,
 )
 from hipsta_bids.geometry.shape_lengths import at_columns, extent_x, extent_y, wall_area
+from hipsta_bids.schemes import Tissue
 from hipsta_bids.settings import Settings
 
 
@@ -31,7 +31,10 @@ class Measured:
     """(Nx, Ny) values of Tissue."""
     whole: Sheet
     """The same body from rim to rim, end to end and wall to wall."""
-    whole_subfield: NDArray[np.uint8]
+    areas: Mapping[Tissue, float]
+    """Of the mid-surface from rim to rim in each subfield, mm2."""
+    volumes: Mapping[Tissue, float]
+    """Of the mesh in each subfield, mm3."""
     volume: float
     """Of the mesh, mm3."""
     settings: Settings
@@ -46,18 +49,29 @@ class Measured:
         """The cross-sections."""
         extent = self.settings.sheet.y_extent
         count = self.whole.points.shape[1]
-        thickness = at_columns(self.thickness.mean(axis=0), 1 / extent, count)
+        means = np.average(self.thickness, axis=0, weights=self.area)
+        thickness = at_columns(means, 1 / extent, count)
         return cut_sections(self.whole, thickness, self.settings.measures)
 
     @cached_property
-    def mid_area(self) -> Float:
-        """(Nx, Ny) area of the mid-surface round each node of the whole sheet, mm2."""
-        return node_shares(layer_area(self.whole.points[:, :, self.whole.middle]))
+    def area(self) -> Float:
+        """(Nx, Ny) area of the mid-surface round each node, mm2."""
+        return column_area(self.sheet)
 
     @cached_property
-    def column_volume(self) -> Float:
-        """(Nx, Ny) volume round each column of the whole sheet, mm3."""
-        return column_volume(self.whole)
+    def away(self) -> Bool:
+        """(Nx, Ny) nodes so far from rims and ends that polynomials are fitted on both sides."""
+        return away_from_edges(self.thickness.shape, self.settings.measures)
+
+    def mean(self, values: Float, where: Bool) -> float:
+        """Mean of a map (Nx, Ny) over part of the sheet, for columns that were measured directly.
+
+        Every square millimeter counts the same: where the wall is thin, the lines of the grid lie
+        closer together, and a mean over nodes would be that of the thin parts. NaN if there are no
+        such columns.
+        """
+        here = where & self.sheet.valid
+        return float(np.average(values[here], weights=self.area[here])) if here.any() else np.nan
 
     def wall_area(self, level: int) -> float:
         """Area of the interior (0) or exterior (-1) wall, mm2."""
@@ -81,7 +95,7 @@ class Measured:
 
 
 def average_profiles(maps: Mapping[str, Float], sheet: Sheet) -> dict[str, dict[str, Float]]:
-    """Average maps along one axis of the sheet, over columns that were measured directly.
+    """Average maps along one axis of the sheet, over the area of columns measured directly.
 
     Returns
     -------
@@ -89,16 +103,16 @@ def average_profiles(maps: Mapping[str, Float], sheet: Sheet) -> dict[str, dict[
         ``x``: (Nx,) values by name, averaged over y; ``y``: (Ny,) values, averaged over x. NaN
         where a line has no such column.
     """
-    known = sheet.valid.astype(float)
+    weights = column_area(sheet) * sheet.valid
     profiles = {}
     for axis, other in (("x", 1), ("y", 0)):
-        count = known.sum(axis=other)
+        total = weights.sum(axis=other)
         profiles[axis] = {
             name: np.divide(
-                np.where(sheet.valid, values, 0).sum(axis=other),
-                count,
-                out=np.full(len(count), np.nan),
-                where=count > 0,
+                np.where(sheet.valid, values * weights, 0).sum(axis=other),
+                total,
+                out=np.full(len(total), np.nan),
+                where=total > 0,
             )
             for name, values in maps.items()
         }

@@ -1,8 +1,8 @@
-"""Thickness, curvature, areas and volumes of a sheet, point by point."""
+"""Thickness, curvature and areas of a sheet, point by point."""
 
 import numpy as np
 
-from hipsta_bids.artifacts import Float, Sheet
+from hipsta_bids.artifacts import Bool, Float, Sheet
 from hipsta_bids.geometry.local_polynomials import differentiate
 from hipsta_bids.settings import MeasureSettings
 
@@ -93,14 +93,17 @@ def layer_area(points: Float) -> Float:
     return np.asarray(0.5 * np.linalg.norm(np.cross(a, b), axis=-1))
 
 
-def column_volume(sheet: Sheet) -> Float:
-    """Volume round each column, (Nx, Ny), mm3, by the trapezoidal rule over layers."""
-    areas = np.stack(
-        [node_shares(layer_area(sheet.points[:, :, k])) for k in range(sheet.points.shape[2])],
-        axis=2,
-    )
-    steps = np.linalg.norm(np.diff(sheet.points, axis=2), axis=3)
-    return np.asarray((0.5 * (areas[:, :, 1:] + areas[:, :, :-1]) * steps).sum(axis=2))
+def column_area(sheet: Sheet) -> Float:
+    """Area of the mid-surface round each column, (Nx, Ny), mm2; none beside undefined points."""
+    return node_shares(np.nan_to_num(layer_area(sheet.points[:, :, sheet.middle])))
+
+
+def away_from_edges(shape: tuple[int, ...], settings: MeasureSettings) -> Bool:
+    """Nodes (Nx, Ny) on both sides of which local polynomials are fitted, or else the middle."""
+    margin = settings.curvature_window // 2
+    away = np.zeros(shape, dtype=np.bool_)
+    away[tuple(slice(m, n - m) for n in shape for m in (min(margin, (n - 1) // 2),))] = True
+    return away
 
 
 def node_shares(cells: Float) -> Float:

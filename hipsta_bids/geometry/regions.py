@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hipsta_bids.artifacts import Bool, Float, Sheet
-from hipsta_bids.geometry.measures import layer_area, node_shares
+from hipsta_bids.geometry.measures import column_area
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -58,7 +58,7 @@ def summarize_regions(
     Each quadrilateral of the grid belongs to its corners in quarters.
     """
     member = regions.member & sheet.valid
-    area = node_shares(layer_area(sheet.points[:, :, sheet.middle]))
+    area = column_area(sheet)
     moments = {name: _moments(member, values) for name, values in maps.items()}
     return RegionStatistics(
         n_points=regions.member.sum(axis=(1, 2)).astype(np.float64),

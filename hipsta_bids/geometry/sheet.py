@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.spatial import cKDTree
 
 from hipsta_bids.artifacts import Bool, Coordinates, Flag, Float, Sheet, TetMesh
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
+from hipsta_bids.geometry.subfields import labels_at
 from hipsta_bids.settings import SheetSettings
 
 
@@ -132,9 +132,7 @@ def check_turned(sheet: Sheet, hemi: str) -> list[Flag]:
 
 def label_sheet(sheet: Sheet, body: Body) -> NDArray[np.uint8]:
     """Subfield of each column, (Nx, Ny): the most frequent of the labels along it."""
-    index, points = body.inside_points()
-    _, nearest = cKDTree(points).query(sheet.points.reshape(-1, 3))
-    labels = body.tissue[tuple(index[nearest].T)].reshape(sheet.points.shape[:3])
+    labels = labels_at(sheet.points.reshape(-1, 3), body).reshape(sheet.points.shape[:3])
     kinds = np.unique(labels)
     votes = np.stack([(labels == kind).sum(axis=2) for kind in kinds], axis=-1)
     return np.asarray(kinds[votes.argmax(axis=-1)], dtype=np.uint8)

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hipsta_bids.artifacts import Float
 from hipsta_bids.geometry.catalog import DIERS, MAPS, SECTIONS, Column
 from hipsta_bids.geometry.measured import Measured
 from hipsta_bids.geometry.shape_lengths import extent_x, extent_y
@@ -23,9 +22,8 @@ class SummaryMeasure(Column):
 class SubfieldMeasure(Column):
     """One number per subfield; the name of the column goes on with the subfield's."""
 
-    compute: Callable[[Measured, Tissue], Float]
-    """Gives the values of the subfield's columns, of any number."""
-    merge: Callable[[Float], float]
+    compute: Callable[[Measured, Tissue], float]
+    """Gives NaN for a subfield that is absent."""
 
 
 def _over_body(name: str) -> SummaryMeasure:
@@ -42,18 +40,16 @@ def _over_body(name: str) -> SummaryMeasure:
 
 
 def _over_sheet(name: str) -> SummaryMeasure:
-    """Take the median of a map over the columns that were measured directly.
-
-    Curvature next to rims and ends is so much less sure that a mean would be theirs.
-    """
+    """Average a map over the part of the sheet where it is sure: away from rims and ends."""
     row = next(row for row in MAPS if row.name == name)
     return SummaryMeasure(
-        name=f"{name}_median",
+        name=f"{name}_mean",
         unit=row.unit,
-        definition=f"{row.definition}; median over the sheet",
+        definition=f"{row.definition}; mean over the mid-surface away from rims and ends, by half"
+        " of measures.curvature_window",
         source=row.source,
         digits=row.digits,
-        compute=lambda m: float(np.median(row.compute(m)[m.sheet.valid])),
+        compute=lambda m: m.mean(row.compute(m), m.away),
     )
 
 
@@ -61,9 +57,9 @@ SUMMARY: tuple[SummaryMeasure, ...] = (
     SummaryMeasure(
         name="thickness_mean",
         unit="mm",
-        definition="mean thickness over the sheet",
+        definition="mean thickness over the area of the sheet's mid-surface",
         source=DIERS,
-        compute=lambda m: float(m.thickness[m.sheet.valid].mean()),
+        compute=lambda m: m.mean(m.thickness, m.sheet.valid),
     ),
     SummaryMeasure(
         name="extent_x",
@@ -82,9 +78,10 @@ SUMMARY: tuple[SummaryMeasure, ...] = (
     SummaryMeasure(
         name="extent_z",
         unit="mm",
-        definition="mean length of the lines from the interior to the exterior wall",
+        definition="mean length of the lines from the interior to the exterior wall, evenly over"
+        " the mid-surface",
         source=DIERS,
-        compute=lambda m: float(m.thickness.mean()),
+        compute=lambda m: float(np.average(m.thickness, weights=m.area)),
     ),
     SummaryMeasure(
         name="volume",
@@ -105,7 +102,7 @@ SUMMARY: tuple[SummaryMeasure, ...] = (
         unit="mm^2",
         definition="area of the mid-surface",
         source=DIERS,
-        compute=lambda m: float(m.mid_area.sum()),
+        compute=lambda m: sum(m.areas.values()),
     ),
     SummaryMeasure(
         name="area_exterior",
@@ -141,26 +138,23 @@ PER_SUBFIELD: tuple[SubfieldMeasure, ...] = (
     SubfieldMeasure(
         name="thickness_mean",
         unit="mm",
-        definition="mean thickness over the part of the sheet in {}",
+        definition="mean thickness over the area of the sheet's mid-surface in {}",
         source=DIERS,
-        compute=lambda m, tissue: m.thickness[m.sheet.valid & (m.subfield == tissue)],
-        merge=lambda values: float(values.mean()),
+        compute=lambda m, tissue: m.mean(m.thickness, m.subfield == tissue),
     ),
     SubfieldMeasure(
         name="area",
         unit="mm^2",
         definition="area of the mid-surface in {}",
         source=DIERS,
-        compute=lambda m, tissue: m.mid_area[m.whole_subfield == tissue],
-        merge=lambda values: float(values.sum()),
+        compute=lambda m, tissue: m.areas.get(tissue, float("nan")),
     ),
     SubfieldMeasure(
         name="volume",
         unit="mm^3",
         definition="volume of the sheet in {}",
         source=DIERS,
-        compute=lambda m, tissue: m.column_volume[m.whole_subfield == tissue],
-        merge=lambda values: float(values.sum()),
+        compute=lambda m, tissue: m.volumes.get(tissue, float("nan")),
     ),
 )
 
@@ -179,9 +173,8 @@ def summarize(measured: Measured, tissues: tuple[Tissue, ...]) -> dict[str, floa
     dict
         By the names in ``SUMMARY`` and ``PER_SUBFIELD``.
     """
-    summary = {row.name: row.compute(measured) for row in SUMMARY}
-    for row in PER_SUBFIELD:
-        for tissue in tissues:
-            here = row.compute(measured, tissue)
-            summary[f"{row.name}_{tissue.name}"] = row.merge(here) if here.size else float("nan")
-    return summary
+    return {row.name: row.compute(measured) for row in SUMMARY} | {
+        f"{row.name}_{tissue.name}": row.compute(measured, tissue)
+        for row in PER_SUBFIELD
+        for tissue in tissues
+    }

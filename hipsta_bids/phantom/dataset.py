@@ -31,7 +31,7 @@ TRUTH_COLUMNS: Mapping[str, tuple[str, str | None]] = MappingProxyType(
         "subject": ("subject, with its sub- prefix", None),
         "hemi": ("L or R", None),
         "kind": ("shape of the cross-section", None),
-        "thickness_mean": ("mean thickness over the sheet, uniform in both its axes", "mm"),
+        "thickness_mean": ("mean thickness over the area of the mid-surface", "mm"),
         "extent_x": ("arc length of the mid-curve, medial to lateral", "mm"),
         "extent_y": ("mean length of the mid-surface, posterior to anterior", "mm"),
         "extent_z": ("mean thickness, interior to exterior", "mm"),

@@ -120,6 +120,17 @@ def subfield_at(u: Float) -> NDArray[np.uint8]:
     return np.asarray(tissues[np.searchsorted(starts[1:], u, side="right")])
 
 
+def subfield_spans(scheme: Scheme) -> dict[Tissue, tuple[float, float]]:
+    """Range of the hippocampal part of the sheet that a protocol gives each of its subfields."""
+    ends = [start for _, start in SUBFIELD_STARTS[1:]] + [1.0]
+    spans: dict[Tissue, tuple[float, float]] = {}
+    for (tissue, start), end in zip(SUBFIELD_STARTS, ends, strict=True):
+        label = label_for(scheme, tissue, Part.BODY)
+        if label is not None:
+            spans[label.tissue] = (spans.get(label.tissue, (start,))[0], end)
+    return spans
+
+
 def tissue_at(spec: PhantomSpec, u: Float, v: Float) -> NDArray[np.uint8]:
     """Tissue of the whole wall, cortex included, at positions ``u`` and ``v``."""
     place, cortex = _along(spec, u - spec.offset)

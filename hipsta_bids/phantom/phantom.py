@@ -6,7 +6,7 @@ from numpy.typing import ArrayLike
 from hipsta_bids.artifacts import Float, LabelVolume
 from hipsta_bids.phantom.body import Body
 from hipsta_bids.phantom.grid import make_grid
-from hipsta_bids.phantom.labels import draw, tissue_at
+from hipsta_bids.phantom.labels import draw, subfield_spans, tissue_at
 from hipsta_bids.phantom.spec import PhantomSpec
 from hipsta_bids.phantom.truth import (
     SURFACES,
@@ -16,7 +16,7 @@ from hipsta_bids.phantom.truth import (
     mean_curvature,
     summarize,
 )
-from hipsta_bids.schemes import Scheme
+from hipsta_bids.schemes import Scheme, Tissue
 
 
 class Phantom:
@@ -148,6 +148,31 @@ class Phantom:
         border += self.spec.offset if border else 0.0
         spans = {"body": (border, 1.0), "extended": (0.0, 1.0), "entorhinal": (0.0, border)}
         return summarize(self.body, span=spans[region])
+
+    def subfield_summary(self, scheme: Scheme) -> dict[Tissue, dict[str, float]]:
+        """Tell what a perfect method would measure in each subfield that a protocol draws.
+
+        Parameters
+        ----------
+        scheme : Scheme
+            Its subfields are those of the hippocampus.
+
+        Returns
+        -------
+        dict
+            See :func:`~hipsta_bids.phantom.truth.summarize`.
+        """
+        share, shift = self.spec.cortex_share, self.spec.offset
+        return {
+            tissue: summarize(
+                self.body,
+                span=(
+                    share + (1.0 - share) * start + (shift if start or share else 0.0),
+                    share + (1.0 - share) * end + (shift if end < 1.0 else 0.0),
+                ),
+            )
+            for tissue, (start, end) in subfield_spans(scheme).items()
+        }
 
     def _outline(self, hemi: str, pose: Float | None) -> Float:
         """Points (N, 3), RAS mm, that span head, body and tail with all they enclose."""

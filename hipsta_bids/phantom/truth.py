@@ -137,7 +137,7 @@ def summarize(body: Body, *, span: tuple[float, float] = (0.0, 1.0)) -> dict[str
     Returns
     -------
     dict
-        ``thickness_mean`` (mm, over uniform u and v), ``extent_x``, ``extent_y``, ``extent_z``
+        ``thickness_mean`` (mm, over the mid-surface), ``extent_x``, ``extent_y``, ``extent_z``
         (mm: arc length of the mid-curve, length along v averaged over u, mean thickness),
         ``volume`` (mm3), ``area_interior``, ``area_mid`` and ``area_exterior`` (mm2), and for the
         whole body what :func:`summarize_ratios` adds.
@@ -147,13 +147,13 @@ def summarize(body: Body, *, span: tuple[float, float] = (0.0, 1.0)) -> dict[str
     u, v = u[:, None], v[None, :]
     spec = body.spec
     cell = weights_u[:, None] * weights_v * (spec.width * spec.length)
-    uniform = cell / cell.sum()
     thickness = body.thickness(u, v)
     section = body.curve.curvature(u * spec.width)
     stretch, axis = _axis_stretch(body, u)
+    area = cell * stretch
     # Integral of (1 + n k) (stretch + n axis) over n from -T/2 to T/2; odd powers cancel.
     column = stretch * thickness + section * axis * thickness**3 / 12.0
-    mean = float((uniform * thickness).sum())
+    mean = float((area * thickness).sum() / area.sum())
     areas = {
         f"area_{name}": float((cell * _area_element(body, u, v, at)).sum())
         for name, at in SURFACES.items()
@@ -161,7 +161,7 @@ def summarize(body: Body, *, span: tuple[float, float] = (0.0, 1.0)) -> dict[str
     summary = {
         "thickness_mean": mean,
         "extent_x": spec.width * (span[1] - span[0]),
-        "extent_y": float((uniform * stretch).sum()) * spec.length,
+        "extent_y": float(area.sum() / cell.sum()) * spec.length,
         "extent_z": mean,
         "volume": float((cell * column).sum()),
         **areas,
@@ -170,7 +170,7 @@ def summarize(body: Body, *, span: tuple[float, float] = (0.0, 1.0)) -> dict[str
 
 
 def summarize_ratios(body: Body, summary: Mapping[str, float]) -> dict[str, float]:
-    """Average cross-sections and curvatures over the whole body, and relate its sizes.
+    """Average cross-sections over the whole body, and relate its sizes.
 
     Parameters
     ----------
@@ -182,11 +182,10 @@ def summarize_ratios(body: Body, summary: Mapping[str, float]) -> dict[str, floa
     Returns
     -------
     dict
-        ``area_ratio``, ``surface_volume_ratio`` (1/mm), means of what :func:`cut_sections`
-        gives over the body's length, and medians of the curvatures over uniform u and v.
+        ``area_ratio``, ``surface_volume_ratio`` (1/mm), and means of what :func:`cut_sections`
+        gives over the body's length.
     """
     v, weights_v = gauss_panels(0.0, 1.0, _PANELS_V)
-    even_u, even_v = np.linspace(0.0, 1.0, 201)[:, None], np.linspace(0.0, 1.0, 101)[None, :]
     sections = cut_sections(body, v)
     walls = summary["area_interior"] + summary["area_exterior"]
     ratios = {
@@ -195,12 +194,6 @@ def summarize_ratios(body: Body, summary: Mapping[str, float]) -> dict[str, floa
     }
     for name in ("circumference", "interior_exterior_ratio", "section_area", "shape_index"):
         ratios[f"{name}_mean"] = float(sections[name] @ weights_v)
-    kinds = {"curvature": mean_curvature, "gaussian_curvature": gaussian_curvature}
-    for kind, curvature in kinds.items():
-        for surface, at in SURFACES.items():
-            name = kind if surface == "mid" else f"{kind}_{surface}"
-            values = curvature(body, even_u, even_v, at=at)
-            ratios[f"{name}_median"] = float(np.median(values))
     return ratios
 
 

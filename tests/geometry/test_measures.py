@@ -8,8 +8,9 @@ from hypothesis import strategies as st
 from sheet_cases import grid, plates, quadric, saddle, sheet_of, shell, tube
 
 from hipsta_bids.geometry.measures import (
+    away_from_edges,
     bending_angle,
-    column_volume,
+    column_area,
     gaussian_curvature,
     layer_area,
     mean_curvature,
@@ -51,7 +52,7 @@ def test_rigid_motion_leaves_every_measure(degrees, shift, mirrored):
     moved = sheet_of(still.points @ pose[:3, :3].T + pose[:3, 3])
     for measure in (
         measure_thickness,
-        column_volume,
+        column_area,
         lambda s: mean_curvature(s, s.middle, MEASURES),
         lambda s: gaussian_curvature(s, s.middle, MEASURES),
         lambda s: bending_angle(s, MEASURES),
@@ -65,9 +66,9 @@ def test_rigid_motion_leaves_every_measure(degrees, shift, mirrored):
 def test_scaling(scale):
     still = tube()
     scaled = sheet_of(scale * still.points)
-    thickness, volume = measure_thickness(still), column_volume(still)
+    thickness, area = measure_thickness(still), column_area(still)
     np.testing.assert_allclose(measure_thickness(scaled), scale * thickness)
-    np.testing.assert_allclose(column_volume(scaled), scale**3 * volume)
+    np.testing.assert_allclose(column_area(scaled), scale**2 * area)
     curvature = mean_curvature(still, still.middle, MEASURES)
     np.testing.assert_allclose(mean_curvature(scaled, 4, MEASURES), curvature / scale)
 
@@ -149,11 +150,17 @@ def test_shares_of_nodes_add_up(seed):
     assert shares[3, 2] == pytest.approx(cells[2:4, 1:3].sum() / 4)
 
 
-def test_volumes_of_columns():
-    assert column_volume(plates()).sum() == pytest.approx(96.0 * 1.7)
-    truth = np.pi / 2 * (5**2 - 3**2) * 10
+def test_areas_of_columns():
+    assert column_area(plates()).sum() == pytest.approx(96.0)
     # Chords instead of arcs, as above.
-    assert column_volume(tube()).sum() == pytest.approx(truth, rel=3e-4)
+    assert column_area(tube()).sum() == pytest.approx(4 * np.pi * 10, rel=3e-4)
+
+
+def test_where_polynomials_reach_to_both_sides():
+    away = away_from_edges((41, 21), MEASURES)
+    assert away.sum() == 33 * 13  # windows of nine nodes
+    assert away[4:-4, 4:-4].all()
+    assert np.argwhere(away_from_edges((5, 4), MEASURES)).tolist() == [[2, 1], [2, 2]]
 
 
 @pytest.mark.parametrize("level", [0, 4, -1])
