@@ -111,6 +111,7 @@ def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOpti
             name=parsed.name,
         ),
         covariates=tuple(parsed.covariates),
+        volumes=tuple(parsed.volumes),
         measures=tuple(dict.fromkeys(parsed.measures)),
         template=parsed.template,
         comparison=Comparison(

@@ -64,6 +64,17 @@ class SideMaps:
         """
         return replace(self, maps={name: self.maps[name] for name in measures})
 
+    def with_summary(self, columns: pd.DataFrame) -> "SideMaps":
+        """Add summary measures.
+
+        Parameters
+        ----------
+        columns : DataFrame
+            One row per sheet, in their order.
+        """
+        joined = pd.concat([self.summary, columns.set_axis(self.summary.index)], axis=1)
+        return replace(self, summary=joined)
+
     def take(self, keep: NDArray[np.bool_]) -> "SideMaps":
         """Keep some rows of the cohort's table, which are numbered anew.
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from hipsta_bids import __version__
 from hipsta_bids.group_settings import CORRECTIONS
-from hipsta_bids.parser import Parser
+from hipsta_bids.parser import Parser, named_pattern
 
 LEVEL = "group"
 
@@ -100,6 +100,17 @@ def _add_model(parser: Parser) -> None:
         metavar="FILE.tsv",
         help="more tables with participant_id (participants.tsv, sessions.tsv and phenotype/*.tsv"
         " are read anyway)",
+    )
+    add(
+        "--volumes",
+        nargs="+",
+        action="extend",
+        default=[],
+        type=named_pattern,
+        metavar="NAME=PATTERN",
+        help="tables of volumes as FreeSurfer, ASHS or HippUnfold write them: path (also in"
+        " BIDS_DIR) with {subject}, {session}, {hemi} or {side} (lh, rh), * (those beside the"
+        " segmentations are found anyway)",
     )
     add("--model", type=Path, metavar="FILE.json", help="BIDS Stats Model with one dataset node")
     add("--formula", metavar="TEXT", help='such as "thickness ~ group + age + sex"')

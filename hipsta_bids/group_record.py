@@ -23,6 +23,8 @@ class GroupOptions:
     sheets: GroupRequest
     model: ModelRequest
     covariates: tuple[Path, ...] = ()
+    volumes: tuple[tuple[str, str], ...] = ()
+    """Names and patterns of other programs' tables of volumes."""
     measures: tuple[str, ...] = ()
     """What to fit the model to; empty for the default or the formula's left-hand side."""
     template: Path | None = None

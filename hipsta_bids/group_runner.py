@@ -11,8 +11,9 @@ import pandas as pd
 from hipsta_bids.bids import derivative, files, group_outputs
 from hipsta_bids.bids.covariates import read_covariates, read_icv
 from hipsta_bids.bids.group_inputs import Exclusion, collect_sheets
-from hipsta_bids.bids.measure_names import choose_measures
+from hipsta_bids.bids.measure_names import check_summaries, choose_measures
 from hipsta_bids.bids.sheets import Measured, read_sheets
+from hipsta_bids.bids.volume_join import add_volumes, check_volumes
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.analysis import Analysis, analyze_cohort
 from hipsta_bids.group.comparison import Comparison, choose_visits
@@ -65,7 +66,10 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
     found = collect_sheets(options.sheets)
     wanted = wanted_measures(options.model, options.measures)
     measures = choose_measures(wanted, found.records)
+    check_volumes(options.volumes)
     measured = read_sheets(found.records, found.settings, measures.maps)
+    measured, volume_notes = add_volumes(measured, found.records, options.volumes, options.bids_dir)
+    check_summaries(measures, measured.sides)
     cohort, reasons = choose_visits(_cohort(measured, options), options.comparison)
     cohort, icv = _with_icv(cohort, measured, settings)
     cohort, visits = _with_time(cohort, options.comparison, settings)
@@ -98,7 +102,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
     later = _other_visits(measured, reasons, options.comparison)
     exclusions = [*found.exclusions, *later, *_incomplete(analysis)]
     name = options.model.name or folder_name(model.formula, wanted) + options.comparison.suffix
-    notes = notes_of(found, analysis, n_other_visits=len(later))
+    notes = volume_notes + notes_of(found, analysis, n_other_visits=len(later))
     files.make_folder(options.out_dir)
     if not (options.out_dir / "dataset_description.json").exists():
         roots = derivative.source_names((root.name, root) for root in options.sheets.roots)

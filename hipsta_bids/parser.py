@@ -189,7 +189,7 @@ def _add_signals(parser: Parser) -> None:
         ),
         nargs="+",
         action="extend",
-        type=_named_pattern,
+        type=named_pattern,
         default=[],
     )
     _add(
@@ -332,7 +332,8 @@ def _named_path(text: str) -> tuple[str, Path]:
     return folder.name, folder
 
 
-def _named_pattern(text: str) -> tuple[str, str]:
+def named_pattern(text: str) -> tuple[str, str]:
+    """Read ``NAME=PATTERN``."""
     name, equals, pattern = text.partition("=")
     if not (equals and name and pattern):
         raise argparse.ArgumentTypeError(f"{text!r} is not of the form NAME=PATTERN")

@@ -7,7 +7,7 @@ from hipsta_bids.bids import files
 from hipsta_bids.bids.group_inputs import SheetRecord
 from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.catalog import MAPS
-from hipsta_bids.group_data import Measures
+from hipsta_bids.group_data import Measures, SideMaps
 
 #: What registration rests on.
 CURVATURE = "curvature"
@@ -61,6 +61,22 @@ def choose_measures(
             )
             raise InputError(f"no measure is called {name!r}; {hint}", reason="unknown-measure")
     return Measures(maps=tuple(maps), summaries=tuple(numbers) or None)
+
+
+def check_summaries(measures: Measures, sides: Mapping[str, SideMaps]) -> None:
+    """Refuse summary measures that no hemisphere has.
+
+    Raises
+    ------
+    InputError
+        Names the first.
+    """
+    known = sorted({str(name) for side in sides.values() for name in side.summary.columns})
+    for name in measures.summaries or ():
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1)
+            hint = f"did you mean {near[0]}?" if near else "are its tables there?"
+            raise InputError(f"no measure is called {name!r}; {hint}", reason="unknown-measure")
 
 
 def sampled_desc(name: str) -> str:

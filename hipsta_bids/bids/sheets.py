@@ -84,10 +84,15 @@ def _coordinates(extent: float, nodes: int) -> Float:
     return np.asarray(np.linspace(-extent, extent, nodes).round(10) + 0.0, dtype=np.float64)
 
 
+def visit_name(subject: str, session: str | None) -> str:
+    """Spell a visit as the covariates' rows are named; labels have no prefixes."""
+    return f"sub-{subject}_ses-{session}" if session else f"sub-{subject}"
+
+
 def _visit_table(visits: Sequence[tuple[str, str | None]]) -> pd.DataFrame:
     names = [f"sub-{subject}" for subject, _ in visits]
     sessions = [None if session is None else f"ses-{session}" for _, session in visits]
-    index = [f"{a}_{b}" if b else a for a, b in zip(names, sessions, strict=True)]
+    index = [visit_name(*visit) for visit in visits]
     return pd.DataFrame(
         {PARTICIPANT: names, SESSION: pd.array(sessions, dtype=object)}, index=index
     )

@@ -18,7 +18,7 @@ from hipsta_bids.group_settings import GroupSettings
 #: Meaning of every column; the unit is that of the measure unless said.
 COLUMNS: Mapping[str, str] = {
     "hemi": "hemisphere, L or R; LR is the mean of both, of asymmetry left minus right",
-    "measure": "map or summary measure",
+    "measure": "map or summary measure; volume_NAME_STRUCTURE is from NAME's own table of volumes",
     "unit": "unit of the measure",
     "contrast": "name of the contrast; A-B is positive where A has more",
     "model": "right-hand side of the model",

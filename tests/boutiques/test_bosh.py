@@ -28,6 +28,9 @@ SPEC = PhantomSpec(length=8.0, end_length=2.0)
 #: What is accepted for strings of a form of their own.
 SAMPLES = {
     "map": ["a=b c.nii", "d={subject}.nii"],
+    "volumes": ["a={subject} b.txt"],
+    "maps": ["a={subject}_{hemi}.gii"],
+    "maps_surface": ["a={hemi}.gii"],
     "map_sampling": ["a=mid"],
     "map_interpolation": ["nearest"],
     "mem": "8G",
