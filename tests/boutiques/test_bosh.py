@@ -3,7 +3,6 @@
 import json
 import re
 import shlex
-from pathlib import Path
 
 import pytest
 from bosh_cases import (
@@ -34,6 +33,7 @@ SAMPLES = {
     "map_sampling": ["a=mid"],
     "map_interpolation": ["nearest"],
     "mem": "8G",
+    "shard": "1/4",
     "reference": ["group=C N"],
     "contrast": ["group[NAME]-group[SEG]", "age"],
     "formula": "thickness ~ group * age",
@@ -57,21 +57,19 @@ def sample_of(entry):
     if "value-choices" in entry:
         value = entry["value-choices"][-1]
     else:
-        kinds = {"Flag": True, "Number": 2, "File": f"some/{entry['id']} $1", "String": "x1"}
+        kinds = {"Flag": True, "Number": 1234, "File": f"some/{entry['id']} $1", "String": "x1"}
         value = kinds[entry["type"]]
-    return [value] if entry.get("list") else value
+    return [value] * entry["min-list-entries"] if entry.get("list") else value
 
 
-def told(value):
-    """What argparse has made of a value, as it was given."""
-    if isinstance(value, list):
-        return [told(item) for item in value]
-    if isinstance(value, tuple):
-        name, content = value
-        # A folder without NAME= has its own name.
-        bare = name is None or (isinstance(content, Path) and content.name == name)
-        return str(content) if bare else f"{name}={content}"
-    return str(value) if isinstance(value, Path) else value
+def words_of(level, given):
+    """The command line as a user would write it, without quotes."""
+    given = dict(given)
+    words = [given.pop("bids_dir"), given.pop("output_dir"), level]
+    for key, value in given.items():
+        values = [] if value is True else value if isinstance(value, list) else [value]
+        words += ["--" + key.replace("_", "-"), *map(str, values)]
+    return words
 
 
 @pytest.mark.parametrize("name", DESCRIPTORS)
@@ -136,19 +134,17 @@ def test_usual_command_lines(tmp_path):
 def test_full_command_lines_are_understood_as_they_were_meant(level, tmp_path):
     name = f"hipsta_bids_{level}"
     given = full_invocation(read_descriptor(name))
-    command = shlex.split(simulate(tmp_path, name, **given))
-    assert command[0] == "hipsta-bids"
-    understood = vars(PARSERS[level]().parse_args(command[1:]))
-    assert understood["analysis_level"] == level
-    # One of them is counted, one is read as gigabytes.
-    read_as = {"verbose": 1, "mem": 8.0}
-    assert {key: told(understood[key]) for key in given} == {
-        key: read_as.get(key, value) for key, value in given.items()
-    }
+    parse = PARSERS[level]().parse_args
+    meant = vars(parse(words_of(level, given)))
+    defaults = vars(parse(["in", "out", level]))
+    assert all(meant[key] != defaults[key] for key in given)
+    command = simulate(tmp_path, name, **given)
+    assert command.startswith("hipsta-bids ")
+    assert vars(parse(shlex.split(command)[1:])) == meant
     both = simulate(tmp_path, "hipsta_bids", **given, analysis_level=level)
-    prefix, _, rest = both.partition("; ")
-    assert prefix == f"mkdir -p {given['output_dir']}"
-    assert vars(PARSERS[level]().parse_args(shlex.split(rest)[1:])) == understood
+    first, _, second = both.partition("; hipsta-bids ")
+    assert first == f"mkdir -p {given['output_dir']}"
+    assert vars(parse(shlex.split(second))) == meant
 
 
 @pytest.mark.parametrize(
