@@ -118,6 +118,7 @@ def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOpti
             longitudinal=parsed.longitudinal is not None,
             pair=None if parsed.paired is None else tuple(parsed.paired),
             asymmetry=parsed.asymmetry,
+            normative=parsed.normative,
         ),
         command=("hipsta-bids", *arguments),
     )

@@ -162,6 +162,12 @@ def _add_comparison(parser: Parser) -> None:
         help="the second session minus the first",
     )
     add("--asymmetry", action="store_true", help="also maps of left minus right")
+    add(
+        "--normative",
+        type=_reference,
+        metavar="FACTOR=LEVEL",
+        help="score each participant against these, as group=CN (w-scores)",
+    )
 
 
 def _add_methods(parser: Parser) -> None:

@@ -7,10 +7,13 @@ import pandas as pd
 
 from hipsta_bids.bids import files, gifti, group_outputs
 from hipsta_bids.bids.group_inputs import Exclusion
+from hipsta_bids.bids.group_scores import write_score_maps
 from hipsta_bids.group.analysis import Analysis
+from hipsta_bids.group.columns import COLUMNS
 from hipsta_bids.group.multiplicity import MapKey
 from hipsta_bids.group.report import methods_text
-from hipsta_bids.group.tables import COLUMNS, map_name, result_tables
+from hipsta_bids.group.scores import Scores
+from hipsta_bids.group.tables import entity_label, map_name, result_tables
 from hipsta_bids.group.template_json import templates_to_json
 from hipsta_bids.group_data import PARTICIPANT, SESSION, Cohort, ResultTable
 from hipsta_bids.group_figures import draw_figures
@@ -73,6 +76,8 @@ def write_results(
     if templates:
         files.write_json(folder / "template.json", templates_to_json(templates))
     _write_gifti(folder, cohort, analysis)
+    if analysis.scores is not None and analysis.scores.sides:
+        _write_scores(folder, analysis.compared, analysis.scores)
     text = methods_text(cohort, analysis, settings, len(exclusions))
     files.write_text(folder / "methods.md", text)
 
@@ -107,3 +112,18 @@ def _write_gifti(folder: Path, cohort: Cohort, analysis: Analysis) -> None:
                     # Of both sides, maps lie on the left sheet: they say left minus right.
                     content = gifti.shape_bytes(values, hemi=hemi[0], name=stem, unit="1")
                     files.write_bytes(folder / f"{stem}.shape.gii", content)
+
+
+def _write_scores(folder: Path, cohort: Cohort, scores: Scores) -> None:
+    """Write each participant's w-scores as maps."""
+    for hemi, side in scores.sides.items():
+        names = [str(name) for name in cohort.table.index[side.rows]]
+        for measure, found in side.scores.items():
+            content = gifti.maps_bytes(found.w.T, hemi=hemi, names=names, series=False)
+            name = f"hemi-{hemi}_stat-w_desc-{entity_label(measure)}_statmap.shape.gii"
+            files.write_bytes(folder / name, content)
+    maps = {
+        hemi: (side.rows, {name: found.w for name, found in side.scores.items()})
+        for hemi, side in scores.sides.items()
+    }
+    write_score_maps(folder / "wscores.parquet", cohort.table, maps, cohort.x, cohort.y)

@@ -117,7 +117,7 @@ def shape_bytes(values: Float, *, hemi: str, name: str, unit: str) -> bytes:
     return _encode([array], hemi)
 
 
-def maps_bytes(values: Float, *, hemi: str, names: Sequence[str]) -> bytes:
+def maps_bytes(values: Float, *, hemi: str, names: Sequence[str], series: bool = True) -> bytes:
     """Encode one or several numbers per vertex, of unknown unit.
 
     Parameters
@@ -128,13 +128,15 @@ def maps_bytes(values: Float, *, hemi: str, names: Sequence[str]) -> bytes:
         ``L`` or ``R``.
     names : sequence of str
         What the T maps are called in viewers.
+    series : bool
+        Whether several are a series, as over time.
 
     Returns
     -------
     bytes
-        A ``.shape.gii`` file if T is 1, else a ``.func.gii`` file.
+        A ``.shape.gii`` file, or of a series a ``.func.gii`` file.
     """
-    kind = "NIFTI_INTENT_SHAPE" if len(names) == 1 else "NIFTI_INTENT_TIME_SERIES"
+    kind = "NIFTI_INTENT_SHAPE" if len(names) == 1 or not series else "NIFTI_INTENT_TIME_SERIES"
     arrays = [
         GiftiDataArray(
             column.astype(np.float32),

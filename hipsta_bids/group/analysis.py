@@ -22,6 +22,7 @@ from hipsta_bids.group.pairs import PairComparison
 from hipsta_bids.group.profiles import GroupShift, mean_profiles, shift_by_group
 from hipsta_bids.group.registration import Registration, register, register_to
 from hipsta_bids.group.row_model import RowModel, longitudinal_model, with_mean
+from hipsta_bids.group.scores import Scores, score_cohort
 from hipsta_bids.group.summaries import MeasureFit, classify_groups, fit_summaries
 from hipsta_bids.group.template import Template
 from hipsta_bids.group.warps import warp_labels, warp_values
@@ -59,6 +60,8 @@ class Analysis:
     fitted: Mapping[str, FittedMaps]
     """By hemisphere; ``LR`` is left minus right."""
     found: Mapping[MapKey, Discoveries]
+    scores: Scores | None
+    """Of participants against a reference group, if there is one."""
     measures: Sequence[MeasureFit]
     pairs: Sequence[tuple[str, str, PairComparison]]
     """Hemisphere, added measure, and result."""
@@ -142,6 +145,16 @@ def analyze_cohort(
         maps = asymmetry_maps(compared, measures.maps, settings.asymmetry.relative)
         fitted[BOTH] = fit_maps(BOTH, maps, rows, settings, contrasts=with_mean(design))
     found = correct(fitted, rows, table, settings)
+    scores = None
+    if comparison.normative is not None:
+        scores = score_cohort(
+            compared,
+            model,
+            comparison.normative,
+            settings,
+            measures=measures,
+            references=references,
+        )
     summaries, notes = fit_summaries(
         compared,
         model,
@@ -164,6 +177,7 @@ def analyze_cohort(
         compared=compared,
         fitted=fitted,
         found=found,
+        scores=scores,
         measures=summaries,
         pairs=pairs,
         skipped=[*notes, *more],

@@ -9,6 +9,7 @@ from hipsta_bids import __version__
 from hipsta_bids.group.analysis import Analysis
 from hipsta_bids.group.inference import PERMUTATIONS
 from hipsta_bids.group.references import REFERENCES
+from hipsta_bids.group.scores import Scores
 from hipsta_bids.group_data import PARTICIPANT, Cohort
 from hipsta_bids.group_settings import GroupSettings, MultiplicitySettings
 
@@ -45,6 +46,8 @@ def methods_text(cohort: Cohort, analysis: Analysis, settings: GroupSettings, n_
     paragraphs.append(_models(analysis, settings, cite))
     if analysis.comparison.asymmetry:
         paragraphs.append(_asymmetry(settings, cite("asymmetry")))
+    if analysis.scores is not None:
+        paragraphs.append(_normative(analysis.scores, settings, cite("normative")))
     if analysis.pairs:
         paragraphs.append(_classification(analysis, settings, cite("delong"), cite("firth")))
     if analysis.sides:
@@ -162,6 +165,17 @@ def _asymmetry(settings: GroupSettings, source: str) -> str:
         "Left minus right was taken at each point of the registered sheets, which are numbered"
         f" alike on both sides; of {relative} as (L - R) / ((L + R) / 2) {source}, of other maps in"
         " their own unit. The contrast `mean` tests it over all participants."
+    )
+
+
+def _normative(scores: Scores, settings: GroupSettings, source: str) -> str:
+    return (
+        f"Each participant was scored against {scores.n_reference} with {scores.factor}"
+        f" {scores.level}: w is the difference from what a linear model `{scores.formula}` of these"
+        f" expects, over its residual standard deviation {source}. Members of the reference group"
+        " were scored by the model without themselves. Points count as low or high where the"
+        " two-sided p, with the uncertainty of the model, is below"
+        f" {1 - settings.glm.confidence:.2g}."
     )
 
 

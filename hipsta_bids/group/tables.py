@@ -1,6 +1,6 @@
 """Results as tables, and the meaning of their columns."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 
 import numpy as np
 import pandas as pd
@@ -14,81 +14,6 @@ from hipsta_bids.group.peaks import SheetFrame, peak_table
 from hipsta_bids.group.summaries import hemispheres, summary_values
 from hipsta_bids.group_data import Cohort, ResultTable
 from hipsta_bids.group_settings import GroupSettings
-
-#: Meaning of every column; the unit is that of the measure unless said.
-COLUMNS: Mapping[str, str] = {
-    "hemi": "hemisphere, L or R; LR is the mean of both, of asymmetry left minus right",
-    "measure": "map or summary measure; volume_NAME_STRUCTURE is from NAME's own table of volumes",
-    "unit": "unit of the measure",
-    "contrast": "name of the contrast; A-B is positive where A has more",
-    "model": "right-hand side of the model",
-    "test": "t, or F for contrasts of several rows",
-    "x": "sheet coordinate, -1 medial to 1 lateral",
-    "y": "sheet coordinate, -1 posterior to 1 anterior",
-    "node_x": "node along x, 1 is most medial; coordinates are registered",
-    "node_y": "node along y, 1 is most posterior",
-    "subfield": "subfield, most frequent after registration",
-    "n": "participants with a value",
-    "n_cases": "of these, in the second group",
-    "n_incomplete": "participants of the two groups that lack a value",
-    "estimate": "contrast of the model's coefficients, unit of the measure; n/a for F",
-    "se": "standard error of the estimate, unit of the measure; n/a for F",
-    "statistic": "t or F",
-    "df": "degrees of freedom; of F, the denominator's",
-    "p": "two-sided p-value, not corrected",
-    "p_corrected": "p-value corrected for the number of points, by the method of analysis.json",
-    "significant": "true where the corrected p-value is at most the level",
-    "effect": "kind of effect size",
-    "effect_size": "Cohen's d (estimate over residual SD), or partial eta squared",
-    "effect_low": "lower confidence limit of the effect size",
-    "effect_high": "upper confidence limit of the effect size",
-    "cohen_d": "estimate over residual SD; n/a for F",
-    "cohen_d_low": "lower confidence limit",
-    "cohen_d_high": "upper confidence limit",
-    "eta_squared": "partial eta squared",
-    "eta_squared_low": "lower confidence limit",
-    "eta_squared_high": "upper confidence limit",
-    "extent": "points of the cluster; 0 for the largest statistic of a map without findings",
-    "shares": "share of the cluster in each subfield",
-    "n_tests": "points tested in the family",
-    "n_significant": "points of the map that survive",
-    "p_cutoff": "largest p-value that survives; below all if none does; n/a if clusters decide",
-    "lenient": "true where p-values above the level survive, as they may with widespread effects",
-    "group": "group",
-    "mean": "mean, unit of the measure",
-    "sd": "standard deviation, unit of the measure",
-    "shift": "registered minus original position, in grid nodes; positive is lateral",
-    "shift_se": "standard error of the shift, grid nodes",
-    "explained_before": "share of the variance of curvature profiles that their mean explains",
-    "explained_after": "the same after registration",
-    "iterations": "turns of template and warps",
-    "converged": "whether warps had settled",
-    "displacement": "root mean square of warp minus identity, grid nodes",
-    "extreme": "true where the displacement is out of line with the others",
-    "control": "first group of the pair",
-    "case": "second group of the pair",
-    "base": "measures of the base model",
-    "added": "measure that is added to it",
-    "auc_base": "area under the curve of the base model, on the participants fitted",
-    "auc_base_low": "lower confidence limit (DeLong)",
-    "auc_base_high": "upper confidence limit (DeLong)",
-    "auc_full": "area under the curve with the measure added, on the participants fitted",
-    "auc_full_low": "lower confidence limit (DeLong)",
-    "auc_full_high": "upper confidence limit (DeLong)",
-    "auc_base_cv": "cross-validated area of the base model",
-    "auc_full_cv": "cross-validated area with the measure added",
-    "auc_base_cv_sd": "standard deviation over repeats",
-    "auc_full_cv_sd": "standard deviation over repeats",
-    "calibration_slope": "of the full model, cross-validated; below 1 if it is too sure",
-    "brier": "mean squared error of the chance, full model, cross-validated",
-    "likelihood_ratio": "chi squared of the likelihood-ratio test, base against full model",
-    "lr_df": "its degrees of freedom",
-    "separated": "true where groups were separated, and both models are Firth's",
-    "participant_id": "participant",
-    "session_id": "session",
-    "reason": "why",
-    "message": "what was said about it",
-}
 
 
 def result_tables(
@@ -120,6 +45,8 @@ def result_tables(
         yield ResultTable(name="descriptives", rows=_descriptives(analysis))
     if analysis.groups is not None and analysis.sides:
         yield ResultTable(name="shifts", rows=_shifts(analysis))
+    if analysis.scores is not None:
+        yield ResultTable(name="wscores", rows=analysis.scores.table)
     if analysis.pairs:
         yield ResultTable(name="classification", rows=_classification(analysis, settings))
     for hemi, one in analysis.fitted.items():
@@ -135,8 +62,12 @@ def map_name(hemi: str, measure: str, test: PointTest) -> str:
     contrast = _label(test.contrast.name) or "contrast"
     # BIDS knows L and R only: what is made of both has no hemisphere in its name.
     side = f"hemi-{hemi}_" if hemi in {"L", "R"} else ""
-    desc = _label(measure)
-    return f"{side}contrast-{contrast}_desc-{measure[:1] + desc[1:]}_statmap"
+    return f"{side}contrast-{contrast}_desc-{entity_label(measure)}_statmap"
+
+
+def entity_label(measure: str) -> str:
+    """Spell a measure as the value of an entity: ``mean_x`` as ``meanX``."""
+    return measure[:1] + _label(measure)[1:]
 
 
 def _label(text: str) -> str:

@@ -15,8 +15,8 @@ from hipsta_bids.bids.inputs import MapSource
 from hipsta_bids.bids.maps import write_map
 from hipsta_bids.cli import main
 from hipsta_bids.geometry.sampling import SampledMap
+from hipsta_bids.group.columns import COLUMNS
 from hipsta_bids.group.model_spec import left_side
-from hipsta_bids.group.tables import COLUMNS
 
 MISSING = ("03", "R")
 

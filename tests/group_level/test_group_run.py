@@ -12,9 +12,9 @@ from small_cohorts import GROUPS, NODES, PLAN, place_of, write_dataset
 from hipsta_bids import group_writer
 from hipsta_bids.bids import files
 from hipsta_bids.cli import main
+from hipsta_bids.group.columns import COLUMNS
 from hipsta_bids.group.contrasts import Contrast
 from hipsta_bids.group.glm import fit_points
-from hipsta_bids.group.tables import COLUMNS
 from hipsta_bids.group_settings import GlmSettings
 
 MODEL = "group-age-sex"
