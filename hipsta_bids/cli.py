@@ -317,6 +317,7 @@ def _phantom(arguments: list[str]) -> ExitCode:
         seed=options.seed,
         kind=options.kind,
         thickness=options.thickness,
+        cortex=options.cortex,
     )
     write_cohort(options.out, plan, layout=options.layout, voxel_size=tuple(options.voxel_size))
     say(f"synthetic dataset of {plan.n_subjects} subjects: {options.out}")

@@ -12,6 +12,7 @@ what is written:
   derivatives/LAYOUT/       segmentations, for the participant level
   participants.tsv          group, age, sex, intracranial volume, site
   phantom_truth.tsv         true thickness, extents, areas and volume of each hemisphere
+                            and region
   phantom_maps/             true maps of each hemisphere
   phantom_effect.tsv        where the effect was planted, and how large it is
 """
@@ -34,7 +35,12 @@ def phantom_parser() -> Parser:
     )
     add = parser.add_argument
     add("out", type=Path, metavar="OUT", help="new folder, or one of phantoms to write anew")
-    add("--layout", default="freesurfer", help="freesurfer (default) or ashs")
+    add(
+        "--layout",
+        default="freesurfer",
+        metavar="NAME",
+        help="freesurfer (default), ashs (the atlas ABC-3T) or ashsPMC",
+    )
     add("--n-subjects", type=int, default=20, metavar="N", help="in all groups (default: 20)")
     add(
         "--groups",
@@ -65,6 +71,14 @@ def phantom_parser() -> Parser:
         help="planted shift along x, to lateral, of the wall's pattern and subfields (default: 0)",
     )
     add("--kind", default="spiral", help="slab, arc, spiral (default), s-shape or tight")
+    add(
+        "--cortex",
+        type=float,
+        default=0.0,
+        metavar="MM",
+        help="so much neighboring cortex beside the subiculum, for --region extended and entorhinal"
+        " of the participant level; needs a layout of ASHS (default: 0)",
+    )
     add("--thickness", type=float, default=1.8, metavar="MM", help="cohort mean (default: 1.8)")
     add(
         "--voxel-size",

@@ -108,6 +108,32 @@ def test_regions_share_a_folder(bids, out, capsys):
     }
 
 
+@pytest.mark.parametrize(("layout", "seg"), [("ashs", "ashsABC3T"), ("ashsPMC", "ashsPMC")])
+def test_cohorts_with_cortex_can_be_measured_in_every_region(tmp_path, layout, seg):
+    cohort = tmp_path / "bids"
+    options = ["--n-subjects", "1", "--cortex", "10", "--layout", layout, "--thinning", "0"]
+    assert cli.main(["phantom", str(cohort), *options]) == ExitCode.OK
+    truth = {row["region"]: row for row in files.read_tsv(cohort / "phantom_truth.tsv")[:3]}
+    for region in ("extended", "entorhinal"):
+        assert run(cohort, tmp_path / "out", "--hemi", "L", "--region", region) == ExitCode.OK
+        summary = found(tmp_path / "out", "L", region, seg=seg).summary
+        # What is promised for the regions.
+        for column in ("thickness_mean", "extent_x"):
+            wanted = float(truth[region][column])
+            assert float(summary[column]) == pytest.approx(wanted, rel=0.02), (region, column)
+
+
+def test_cortex_needs_labels_and_a_shape_that_goes_on(tmp_path, capsys):
+    for options, words in (
+        (["--cortex", "10"], "freesurfer has no labels for cortex; choose from ashs, ashsPMC"),
+        (["--cortex", "10", "--layout", "ashs", "--kind", "tight"], "choose another kind"),
+        (["--cortex", "-1", "--layout", "ashs"], "cortex -1"),
+    ):
+        command = ["phantom", str(tmp_path / "none"), "--n-subjects", "1", *options]
+        assert cli.main(command) == ExitCode.USAGE
+        assert words in capsys.readouterr().err
+
+
 def test_regions_need_labels(tmp_path, capsys):
     plain = Hemisphere(subject="01", hemi="L", spec=PhantomSpec(length=8.0))
     write_dataset(tmp_path / "bids", [plain])

@@ -72,6 +72,8 @@ class CohortPlan:
     """mm per year."""
     sites: tuple[float, ...] = (0.0, 0.03)
     """mm that each site adds to thickness."""
+    cortex: float = 0.0
+    """mm of neighboring cortex, by which the mid-curve goes on beyond the subiculum."""
 
     def __post_init__(self) -> None:
         if self.region not in REGIONS:
@@ -82,6 +84,11 @@ class CohortPlan:
         if self.kind not in KINDS:
             raise UsageError(
                 f"phantom: kind {self.kind!r} is unknown; choose from {', '.join(KINDS)}",
+                reason="phantom-setting",
+            )
+        if self.cortex and KINDS[self.kind].power != 1:
+            raise UsageError(
+                f"phantom: the shape {self.kind} cannot go on into cortex; choose another kind",
                 reason="phantom-setting",
             )
         if self.n_subjects < 1 or not self.groups or len(set(self.groups)) < len(self.groups):
@@ -130,6 +137,13 @@ def typical_shape(plan: CohortPlan, dose: int) -> PhantomSpec:
     return _spec(plan, thickness=plan.thickness, scale=1.0, offset=plan.shift * dose, dose=dose)
 
 
+def region_limits(plan: CohortPlan) -> tuple[Range, Range]:
+    """Ranges of u and v of the plan's region, on a sheet that begins with the cortex."""
+    (low, high), v = REGIONS[plan.region]
+    share = plan.cortex / (PhantomSpec.width + plan.cortex)
+    return (share + (1.0 - share) * low, share + (1.0 - share) * high), v
+
+
 def _make_subject(plan: CohortPlan, number: int) -> Subject:
     random = np.random.default_rng((plan.seed, number))
     dose = number % len(plan.groups)
@@ -162,23 +176,29 @@ def _make_subject(plan: CohortPlan, number: int) -> Subject:
 def _spec(
     plan: CohortPlan, *, thickness: float, scale: float, offset: float, dose: int
 ) -> PhantomSpec:
-    """Shape of one hemisphere; a larger one has the same bends, only wider."""
+    """Shape of one hemisphere; a larger one has the same bends, only wider.
+
+    Curvature goes on into the cortex as it changes along the hippocampus, whose shape stays.
+    """
     plain = PhantomSpec(kind=plan.kind)
     bend = KINDS[plan.kind]
+    width = plain.width + plan.cortex
+    medial = bend.medial - (bend.lateral - bend.medial) * plan.cortex / plain.width
     thinnings: tuple[Thinning, ...] = ()
     if dose and plan.thinning:
-        u, v = REGIONS[plan.region]
+        u, v = region_limits(plan)
         thinnings = (Thinning(depth=plan.thinning * dose, u=u, v=v),)
     return replace(
         plain,
-        curvature=(bend.medial / scale, bend.lateral / scale),
+        curvature=(medial / scale, bend.lateral / scale),
         thickness=thickness,
         variation=plan.variation,
         variation_axis="x",
-        width=plain.width * scale,
+        width=width * scale,
+        cortex=plan.cortex * scale,
         length=plain.length * scale,
         thinnings=thinnings,
-        offset=offset / (plain.width * scale),
+        offset=offset / (width * scale),
     )
 
 

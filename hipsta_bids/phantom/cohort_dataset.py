@@ -9,7 +9,13 @@ import numpy as np
 
 from hipsta_bids.artifacts import Float
 from hipsta_bids.bids import files
-from hipsta_bids.phantom.cohort import REGIONS, CohortPlan, Subject, make_cohort, typical_shape
+from hipsta_bids.phantom.cohort import (
+    CohortPlan,
+    Subject,
+    make_cohort,
+    region_limits,
+    typical_shape,
+)
 from hipsta_bids.phantom.dataset import Hemisphere, Participants, refuse_taken, write_dataset
 from hipsta_bids.phantom.phantom import Phantom
 
@@ -39,7 +45,7 @@ def write_cohort(
     plan : CohortPlan
         Who is in it.
     layout : str
-        ``freesurfer`` or ``ashs``.
+        One of ``LAYOUTS``; cortex needs one whose protocol has labels for it.
     voxel_size : tuple of float
         mm along the image's axes, which point left, inferior and anterior.
 
@@ -130,7 +136,7 @@ def _write_effect(out: Path, plan: CohortPlan) -> None:
     planted = replace(with_effect.spec, offset=0.0)
     thinning = Phantom(planted).body.thickness(u, v) - without.body.thickness(u, v)
     observed = with_effect.body.thickness(u, v) - without.body.thickness(u, v)
-    limits = REGIONS[plan.region]
+    limits = region_limits(plan)
     inside = np.logical_and.reduce(
         [
             (low - _ROUNDING <= at) & (at <= high + _ROUNDING)

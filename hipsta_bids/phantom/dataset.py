@@ -30,6 +30,7 @@ TRUTH_COLUMNS: Mapping[str, tuple[str, str | None]] = MappingProxyType(
     {
         "subject": ("subject, with its sub- prefix", None),
         "hemi": ("L or R", None),
+        "region": ("body, or with cortex also extended and entorhinal, see --region", None),
         "kind": ("shape of the cross-section", None),
         "thickness_mean": ("mean thickness over the area of the mid-surface", "mm"),
         "extent_x": ("arc length of the mid-curve, medial to lateral", "mm"),
@@ -65,6 +66,11 @@ LAYOUTS: Mapping[str, Layout] = MappingProxyType(
         ),
         "ashs": Layout(
             scheme="ashsABC3T",
+            path="{subject}/final/{subject}_{side}_lfseg_corr_usegray.nii.gz",
+            sides={"L": "left", "R": "right"},
+        ),
+        "ashsPMC": Layout(
+            scheme="ashsPMC",
             path="{subject}/final/{subject}_{side}_lfseg_corr_usegray.nii.gz",
             sides={"L": "left", "R": "right"},
         ),
@@ -135,10 +141,12 @@ def write_dataset(
             f"phantom: layout {unknown[0]!r} is unknown; choose from {', '.join(LAYOUTS)}",
             reason="phantom-setting",
         )
+    if any(item.spec.cortex for item in hemispheres):
+        _refuse_without_cortex(layouts)
     truth = []
     for item in hemispheres:
         phantom = Phantom(item.spec)
-        truth.append(_truth_row(item, phantom))
+        truth += _truth_rows(item, phantom)
         for name in layouts:
             layout = LAYOUTS[name]
             volume = phantom.label_volume(
@@ -218,10 +226,26 @@ def rigid_motion(degrees: tuple[float, float, float], shift: tuple[float, float,
     return motion
 
 
-def _truth_row(item: Hemisphere, phantom: Phantom) -> dict[str, str]:
-    values = phantom.region_summary("body")
+def _refuse_without_cortex(layouts: Sequence[str]) -> None:
+    for name in layouts:
+        if not load_scheme(LAYOUTS[name].scheme).neighbors:
+            able = [key for key, row in LAYOUTS.items() if load_scheme(row.scheme).neighbors]
+            raise SettingsError(
+                f"phantom: the protocol of layout {name} has no labels for cortex; choose from"
+                f" {', '.join(able)}",
+                reason="phantom-setting",
+            )
+
+
+def _truth_rows(item: Hemisphere, phantom: Phantom) -> list[dict[str, str]]:
+    """One row, or with cortex one per region."""
     row = {"subject": f"sub-{item.subject}", "hemi": item.hemi, "kind": item.spec.kind}
-    return row | {name: f"{value:.4f}" for name, value in values.items()}
+    return [
+        row
+        | {"region": region}
+        | {name: f"{value:.4f}" for name, value in phantom.region_summary(region).items()}
+        for region in phantom.regions
+    ]
 
 
 def _write_image(path: Path, volume: LabelVolume) -> None:

@@ -130,6 +130,11 @@ class Phantom:
             summary=summarize(self.body),
         )
 
+    @property
+    def regions(self) -> tuple[str, ...]:
+        """Regions that can be measured in it."""
+        return ("body", "extended", "entorhinal") if self.spec.cortex else ("body",)
+
     def region_summary(self, region: str) -> dict[str, float]:
         """Tell what a perfect method would measure in a region as a whole.
 

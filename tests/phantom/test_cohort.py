@@ -10,7 +10,13 @@ from hipsta_bids.bids.dataset import find_hemispheres
 from hipsta_bids.bids.inputs import InputRequest
 from hipsta_bids.errors import ExitCode, UsageError
 from hipsta_bids.phantom import TRUTH_TABLE, Phantom
-from hipsta_bids.phantom.cohort import REGIONS, CohortPlan, make_cohort
+from hipsta_bids.phantom.cohort import (
+    REGIONS,
+    CohortPlan,
+    make_cohort,
+    region_limits,
+    typical_shape,
+)
 from hipsta_bids.phantom.cohort_dataset import EFFECT_TABLE, MAPS_FOLDER
 from hipsta_bids.subcommands import PHANTOM_EPILOG
 
@@ -66,6 +72,18 @@ def test_true_maps_are_those_of_the_phantoms(dataset):
     rows = files.read_tsv(dataset / TRUTH_TABLE)
     (row,) = [r for r in rows if (r["subject"], r["hemi"]) == ("sub-02", "R")]
     assert float(row["thickness_mean"]) == pytest.approx(truth.summary["thickness_mean"], abs=1e-4)
+
+
+def test_cortex_leaves_the_hippocampus_as_it_was():
+    plain, beside = (CohortPlan(n_subjects=1, cortex=mm, region="CA1") for mm in (0.0, 10.0))
+    first, second = (Phantom(typical_shape(plan, 1)) for plan in (plain, beside))
+    s = np.linspace(0.0, 20.0, 9)
+    np.testing.assert_allclose(
+        second.body.curve.curvature(10.0 + s), first.body.curve.curvature(s), atol=1e-12
+    )
+    # CA1 begins 7 mm and ends 15 mm from the border with the cortex.
+    assert np.multiply(30.0, region_limits(beside)[0]) == pytest.approx([17.0, 25.0])
+    assert region_limits(plain) == ((0.35, 0.75), (0.0, 1.0))
 
 
 def test_effect_table_tells_thinning_from_shift(dataset):
