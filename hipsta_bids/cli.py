@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from hipsta_bids.console import Progress, complain, say, say_result, say_start, say_table
 from hipsta_bids.errors import ExitCode, HipstaError, NothingToDoError, UsageError
 from hipsta_bids.group_command import is_group_level, run_group_level
-from hipsta_bids.parser import COLLECT, LEVELS, build_parser
+from hipsta_bids.parser import COLLECT, LEVELS, build_parser, join_slurm
 from hipsta_bids.threads import pin_threads
 
 if TYPE_CHECKING:
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from hipsta_bids.bids.dataset import Findings
     from hipsta_bids.bids.inputs import HemisphereInput, InputRequest
+    from hipsta_bids.cluster import Cluster
     from hipsta_bids.runner import RunOptions
     from hipsta_bids.settings import Settings
     from hipsta_bids.shard import Shard
@@ -105,7 +106,7 @@ def _dispatch(arguments: list[str]) -> ExitCode:
     is_app = any(level in arguments[1:] for level in LEVELS)
     if arguments and arguments[0] in commands and not is_app:
         return commands[arguments[0]](arguments[1:])
-    return _participant(build_parser().parse_args(arguments))
+    return _participant(build_parser().parse_args(join_slurm(arguments)))
 
 
 def _participant(options: "Namespace") -> ExitCode:
@@ -237,6 +238,7 @@ def _run_options(options: "Namespace") -> "RunOptions":
         write_meshes=options.write_meshes,
         timeout=options.timeout,
         shard=options.shard,
+        cluster=_cluster(options),
     )
 
 
@@ -246,6 +248,16 @@ def _descriptor() -> ExitCode:
 
     say(descriptor_text().rstrip())
     return ExitCode.OK
+
+
+def _cluster(options: "Namespace") -> "Cluster | None":
+    from hipsta_bids.cluster import Cluster, check_cluster  # noqa: PLC0415  (start-up time)
+
+    if options.dask_scheduler is None and options.slurm is None:
+        return None
+    cluster = Cluster(scheduler=options.dask_scheduler, slurm=options.slurm)
+    check_cluster(cluster)
+    return cluster
 
 
 def _no_arguments(arguments: list[str], command: str) -> None:

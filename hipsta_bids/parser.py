@@ -40,6 +40,17 @@ class Parser(argparse.ArgumentParser):
         raise UsageError(f"{message} (see {self.prog} --help)", reason="usage")
 
 
+def join_slurm(arguments: Sequence[str]) -> list[str]:
+    """Attach the value of ``--slurm``, since argparse takes what begins with a dash for options."""
+    joined: list[str] = []
+    for argument in arguments:
+        if joined and joined[-1] == "--slurm":
+            joined[-1] += f"={argument}"
+        else:
+            joined.append(argument)
+    return joined
+
+
 def build_parser() -> Parser:
     """Describe the participant level's command line.
 
@@ -282,6 +293,16 @@ def _add_machines(parser: Parser) -> None:
         ("--shard",),
         ("I/N", "do the I-th of N equal parts of the subjects; slurm: as the array job says"),
         type=_shard,
+    )
+    _add(
+        group,
+        ("--dask-scheduler", "--dask_scheduler"),
+        ("ADDRESS", "measure on the workers of this Dask scheduler (tcp://HOST:PORT, or its file)"),
+    )
+    _add(
+        group,
+        ("--slurm",),
+        ("OPTIONS", "measure in --n-procs SLURM jobs: sbatch's options in quotes, as '-p short'"),
     )
 
 

@@ -59,6 +59,8 @@ class WorkerLost:
     def cause(self) -> str:
         """For people: the signal's name or the exit code."""
         code = self.exit_code
+        if code is None:
+            return "its machine or allocation was lost several times"
         if code is not None and code < 0:
             with contextlib.suppress(ValueError):
                 return signal.Signals(-code).name
@@ -131,6 +133,73 @@ def run_jobs(plan: WorkerPlan, jobs: Iterable[Any]) -> Generator[tuple[Any, Any]
         _stop(slots)
 
 
+class Worker:
+    """One worker process, for callers that hand out jobs themselves; replaced when it dies.
+
+    Parameters
+    ----------
+    plan : WorkerPlan
+        How it runs.
+    patience : float
+        Seconds that it waits for a job before it ends.
+    """
+
+    def __init__(self, plan: WorkerPlan, *, patience: float) -> None:
+        self.plan = plan
+        self._patience = patience
+        self._slot: _Slot | None = None
+
+    def __call__(self, job: Any) -> Any:  # noqa: ANN401  (jobs are the caller's)
+        """Do one job.
+
+        Returns
+        -------
+        object
+            What the job gives, or a :class:`WorkerLost`.
+
+        Raises
+        ------
+        RuntimeError
+            If the process does not even start.
+        """
+        slot = self._ready()
+        _give(slot, job)
+        answer = self._heard(slot)
+        slot.job = None
+        return answer
+
+    def kill(self) -> None:
+        """End the process, whatever it is doing; may be called by another thread."""
+        slot = self._slot
+        if slot is None:
+            return
+        if slot.job is None:
+            _kill(slot)
+        else:
+            _kill_group(slot)  # who waits for it sees to the rest
+
+    def _ready(self) -> _Slot:
+        for _ in range(_STARTS):
+            if self._slot is not None and not self._slot.process.is_alive():
+                _kill(self._slot)
+                self._slot = None
+            self._slot = self._slot or _start(self.plan, self._patience)
+            slot = self._slot
+            if slot.ready or isinstance(self._heard(slot), _Ready):
+                slot.ready = True
+                return slot
+        raise RuntimeError(f"worker processes do not start; see {self.plan.log}")
+
+    def _heard(self, slot: _Slot) -> Any:  # noqa: ANN401  (jobs are the caller's)
+        events: list[tuple[_Slot, Any]] = []
+        while not events:
+            events = _poll([slot], self.plan.timeout)
+        ((_, message),) = events
+        if isinstance(message, WorkerLost):
+            self._slot = None
+        return message
+
+
 class _Ready:
     """Message of a worker that has loaded everything."""
 
@@ -179,7 +248,7 @@ def _lose(slot: _Slot, *, timed_out: bool) -> WorkerLost:
     )
 
 
-def _start(plan: WorkerPlan) -> _Slot:
+def _start(plan: WorkerPlan, patience: float | None = None) -> _Slot:
     context = _context()
     if plan.warm_up is not None and context.get_start_method() == "fork":
         # Once for all workers. What is wrong with it shows again in them, and in the log.
@@ -187,7 +256,9 @@ def _start(plan: WorkerPlan) -> _Slot:
             plan.warm_up()
     ours, theirs = context.Pipe()
     # Not daemonic: stages may start helper processes of their own.
-    process = context.Process(target=_serve, args=(theirs, plan, os.getpid()), daemon=False)
+    process = context.Process(
+        target=_serve, args=(theirs, plan, os.getpid(), patience), daemon=False
+    )
     with _inherited(plan):
         process.start()
     theirs.close()
@@ -230,11 +301,15 @@ def _kill(slot: _Slot) -> None:
 
     The worker must not have been waited for before: until then its number cannot be another's.
     """
-    with contextlib.suppress(ProcessLookupError, PermissionError, TypeError):
-        os.killpg(slot.process.pid, signal.SIGKILL)  # type: ignore[arg-type]  # None: TypeError
+    _kill_group(slot)
     slot.process.kill()
     slot.process.join()
     slot.connection.close()
+
+
+def _kill_group(slot: _Slot) -> None:
+    with contextlib.suppress(ProcessLookupError, PermissionError, TypeError):
+        os.killpg(slot.process.pid, signal.SIGKILL)  # type: ignore[arg-type]  # None: TypeError
 
 
 def _stop(slots: list[_Slot]) -> None:
@@ -249,8 +324,8 @@ def _stop(slots: list[_Slot]) -> None:
     slots.clear()
 
 
-def _serve(connection: Connection, plan: WorkerPlan, parent: int) -> None:
-    """Run in the worker: answer jobs until there are no more."""
+def _serve(connection: Connection, plan: WorkerPlan, parent: int, patience: float | None) -> None:
+    """Run in the worker: answer jobs until there are no more, or none comes for too long."""
     _separate(parent)
     _redirect(plan.log)
     from threadpoolctl import threadpool_limits  # noqa: PLC0415  (loads libraries)
@@ -259,7 +334,7 @@ def _serve(connection: Connection, plan: WorkerPlan, parent: int) -> None:
         plan.warm_up()
     with threadpool_limits(1):
         connection.send(_Ready())
-        while True:
+        while connection.poll(patience):
             try:
                 job = connection.recv()
             except EOFError:

@@ -17,6 +17,7 @@ from hipsta_bids.bids.names import DATASET_FILES, HemisphereName
 from hipsta_bids.bids.results import ResultPlace
 from hipsta_bids.bids.status import write_sidecar
 from hipsta_bids.bookkeeping import Books, log_file
+from hipsta_bids.cluster import Cluster, run_on_cluster
 from hipsta_bids.errors import ExitCode, HipstaError, InputError, OutputError, SchemeError
 from hipsta_bids.job import Job, Outcome, finished
 from hipsta_bids.pool import WorkerLost, WorkerPlan, run_jobs
@@ -50,6 +51,8 @@ class RunOptions:
     """Seconds per hemisphere."""
     shard: Shard | None = None
     """Which part of the dataset this is, if other runs do the others."""
+    cluster: Cluster | None = None
+    """Workers elsewhere; ``None`` is this machine."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -228,7 +231,11 @@ def _outcomes(
         if job.item.problem is not None:
             yield fail(job, job.item.problem)
     able = [job for job in todo if job.item.problem is None]
-    pool = run_jobs(_plan(options, len(able), log), able)
+    plan = _plan(options, len(able), log)
+    if options.cluster is None or not able:
+        pool = run_jobs(plan, able)
+    else:
+        pool = run_on_cluster(options.cluster, plan, able)
     try:
         for job, answer in pool:
             yield _lost(job, answer, options) if isinstance(answer, WorkerLost) else answer
