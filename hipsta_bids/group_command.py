@@ -102,6 +102,7 @@ def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOpti
             exclude_flagged=parsed.exclude_flagged,
             exclude_quality=condition,
             exclude_table=parsed.exclude,
+            segmentations=tuple(parsed.segmentations),
         ),
         model=ModelRequest(
             file=parsed.model,

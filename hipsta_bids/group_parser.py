@@ -58,6 +58,16 @@ def _add_sheets(parser: Parser) -> None:
         metavar="NAME=PATH",
         help="output datasets of the participant level, as of several sites (default: OUT_DIR)",
     )
+    add(
+        "--segmentations",
+        nargs="+",
+        action="extend",
+        default=[],
+        type=Path,
+        metavar="DIR",
+        help="folders of FreeSurfer, ASHS or HippUnfold, if they have moved since the participant"
+        " level: for the intracranial and other volumes beside the segmentations",
+    )
     add("--seg", metavar="NAME", help="segmentation protocol, where there are several")
     for what in ("participant", "session"):
         add(

@@ -12,6 +12,7 @@ from hipsta_bids.bids import files
 from hipsta_bids.bids.names import DATASET_FILES, HemisphereName
 from hipsta_bids.bids.quality_filter import QualityCondition
 from hipsta_bids.bids.results import ResultPlace
+from hipsta_bids.bids.source_links import relocate
 from hipsta_bids.bids.status import NOT_FINISHED, name_of, read_status
 from hipsta_bids.errors import InputError, NothingToDoError
 
@@ -39,6 +40,8 @@ class GroupRequest:
     exclude_quality: QualityCondition | None = None
     exclude_table: Path | None = None
     """Participants, or single sessions and hemispheres, to leave out."""
+    segmentations: tuple[Path, ...] = ()
+    """Where segmentations are now, if they have moved since they were measured."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,6 +98,9 @@ def collect_sheets(request: GroupRequest) -> Collection:
     UsageError
         The quality condition cannot be evaluated.
     """
+    for folder in request.segmentations:
+        if not folder.is_dir():
+            raise InputError(f"{folder}: no such folder; check --segmentations", reason="no-folder")
     found = [entry for root in request.roots for entry in _quality_files(root, request)]
     seg = _one_protocol(found, request)
     found = [place for place in found if place.name.seg == seg]
@@ -202,7 +208,7 @@ def _judge(
             place=place,
             settings_hash=str(record.get("settings_hash")),
             version=str(record.get("version")),
-            source=str(inputs[0].get("file", "")),
+            source=relocate(str(inputs[0].get("file", "")), request.segmentations),
             flagged=status == Status.FLAGGED,
         )
     name = place.name

@@ -5,6 +5,7 @@ import pytest
 
 from hipsta_bids.bids import files
 from hipsta_bids.bids.covariates import read_covariates, read_icv
+from hipsta_bids.bids.source_links import relocate
 from hipsta_bids.errors import InputError
 
 VISITS = pd.DataFrame(
@@ -64,3 +65,10 @@ def test_intracranial_volume_of_freesurfer_and_ashs(tmp_path):
         "bids:other:sub-3/x.nii.gz",
     ]
     assert read_icv(sources, [tmp_path] * 4) == [1567890.5, 1400000.25, None, None]
+    # The same folders elsewhere, in whatever order they are named.
+    (tmp_path / "f s").rename(tmp_path / "new fs")
+    (tmp_path / "ashs").rename(tmp_path / "new ashs")
+    assert read_icv(sources, [tmp_path] * 4) == [None] * 4
+    moved = [relocate(each, [tmp_path / "new ashs", tmp_path / "new fs"]) for each in sources]
+    assert moved[2:] == sources[2:]
+    assert read_icv(moved, [tmp_path] * 4) == [1567890.5, 1400000.25, None, None]

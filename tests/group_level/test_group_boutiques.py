@@ -39,6 +39,11 @@ def test_group_level_of_several_parts_leaves_all_outputs(folder):
 
 
 def test_group_level_in_place_by_the_descriptor_of_both(folder):
+    for path in (folder / "part 1").glob("sub-*"):
+        stats = folder / "subjects" / path.name / "stats" / "aseg.stats"
+        stats.parent.mkdir(parents=True)
+        volume = 1.4e6 + 1e4 * int(path.name[-2:])
+        stats.write_text(f"# Measure EstimatedTotalIntraCranialVol, eTIV, volume, {volume}, mm^3\n")
     done = launch(
         folder,
         "hipsta_bids",
@@ -46,9 +51,11 @@ def test_group_level_in_place_by_the_descriptor_of_both(folder):
         output_dir="part 1",
         output_mount="part 1",
         analysis_level="group",
+        segmentations=["subjects"],
         formula="thickness ~ age",
         name="age",
     )
     assert "Exit code\n0\n" in done.stdout, done.stdout
     assert outputs_found(done) == {"output_dataset"}
-    assert (folder / "part 1" / "group" / "age" / "methods.md").is_file()
+    covariates = folder / "part 1" / "group" / "age" / "covariates.tsv"
+    assert "icv" in covariates.read_text(encoding="utf-8").splitlines()[0].split("\t")
