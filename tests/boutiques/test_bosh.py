@@ -24,7 +24,15 @@ from hipsta_bids.phantom import Hemisphere, PhantomSpec, write_dataset
 PARSERS = {"participant": build_parser, "group": group_parser}
 SPEC = PhantomSpec(length=8.0, end_length=2.0)
 
-#: What is accepted for strings of a form of their own.
+#: What options such as FACTOR=LEVEL show in the help is what they accept.
+FORMS = {
+    action.dest: action.metavar
+    for build in PARSERS.values()
+    for action in build()._actions
+    if isinstance(action.metavar, str) and re.fullmatch(r"\w+=\w+", action.metavar)
+}
+
+#: What is accepted for other strings of a form of their own.
 SAMPLES = {
     "map": ["a=b c.nii", "d={subject}.nii"],
     "volumes": ["a={subject} b.txt"],
@@ -34,7 +42,6 @@ SAMPLES = {
     "map_interpolation": ["nearest"],
     "mem": "8G",
     "shard": "1/4",
-    "reference": ["group=C N"],
     "contrast": ["group[NAME]-group[SEG]", "age"],
     "formula": "thickness ~ group * age",
     "exclude_qc": "a > 1 or b < 2",
@@ -57,7 +64,8 @@ def sample_of(entry):
     if "value-choices" in entry:
         value = entry["value-choices"][-1]
     else:
-        kinds = {"Flag": True, "Number": 1234, "File": f"some/{entry['id']} $1", "String": "x1"}
+        text = FORMS.get(entry["id"], "x1")
+        kinds = {"Flag": True, "Number": 1234, "File": f"some/{entry['id']} $1", "String": text}
         value = kinds[entry["type"]]
     return [value] * entry["min-list-entries"] if entry.get("list") else value
 
