@@ -46,6 +46,11 @@ def notes_of(found: Collection, analysis: Analysis, *, n_other_visits: int) -> l
         )
     if len(found.versions) > 1:
         notes.append(f"hemispheres were measured by several versions, {', '.join(found.versions)}")
+    if separated := sum(pair.comparison.separated for _, _, pair in analysis.pairs):
+        notes.append(
+            f"{separated} of {len(analysis.pairs)} comparisons of classifiers are separated, and"
+            " fitted by Firth's method"
+        )
     for key, discoveries in analysis.found.items():
         if discoveries.lenient:
             notes.append(

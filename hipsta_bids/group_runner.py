@@ -24,6 +24,7 @@ from hipsta_bids.group_data import PARTICIPANT, SESSION, Cohort
 from hipsta_bids.group_model import choose_references, folder_name, model_document, wanted_measures
 from hipsta_bids.group_record import GroupOptions, notes_of, record_of
 from hipsta_bids.group_settings import GroupSettings
+from hipsta_bids.group_shapes import average_shapes, write_shapes
 from hipsta_bids.group_writer import draw, write_results
 
 #: Column that takes the intracranial volume estimated by the segmentation's program.
@@ -103,6 +104,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
     exclusions = [*found.exclusions, *later, *_incomplete(analysis)]
     name = options.model.name or folder_name(model.formula, wanted) + options.comparison.suffix
     notes = volume_notes + notes_of(found, analysis, n_other_visits=len(later))
+    shapes = average_shapes(found.records, cohort, analysis, settings)
     files.make_folder(options.out_dir)
     if not (options.out_dir / "dataset_description.json").exists():
         roots = derivative.source_names((root.name, root) for root in options.sheets.roots)
@@ -110,7 +112,10 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
     with group_outputs.model_folder(options.out_dir, name) as folder:
         write_results(folder, cohort, analysis, settings, exclusions)
         files.write_json(folder / "model.json", document)
-        notes += draw(folder, cohort, analysis)
+        write_shapes(folder, shapes)
+        if analysis.sides and not shapes:
+            notes.append("no average surfaces: those of the participant level are missing")
+        notes += draw(folder, cohort, analysis, shapes)
         record = record_of(options, found, settings, analysis, notes)
         files.write_json(folder / "analysis.json", record)
     return GroupResult(

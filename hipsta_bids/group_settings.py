@@ -222,6 +222,21 @@ class AsymmetrySettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ShapeSettings:
+    """Average surfaces; no statistic depends on them."""
+
+    most: int = 500
+    """Sheets per hemisphere that are averaged, spread evenly over all; bounds time and memory."""
+    iterations: int = 50
+    """Most turns of alignment to the mean and of the mean."""
+    tolerance: float = 1e-6
+    """They end when no point of the mean moves by more than this, mm."""
+
+    def __post_init__(self) -> None:
+        _require(self.most >= 1, "shapes.most must be at least 1")
+
+
+@dataclass(frozen=True, kw_only=True)
 class ClassificationSettings:
     """Logistic models and how well they tell groups apart."""
 
@@ -275,4 +290,5 @@ class GroupSettings:
     longitudinal: LongitudinalSettings = field(default_factory=LongitudinalSettings)
     asymmetry: AsymmetrySettings = field(default_factory=AsymmetrySettings)
     multiplicity: MultiplicitySettings = field(default_factory=MultiplicitySettings)
+    shapes: ShapeSettings = field(default_factory=ShapeSettings)
     classification: ClassificationSettings = field(default_factory=ClassificationSettings)

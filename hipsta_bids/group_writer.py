@@ -1,6 +1,6 @@
 """Writes all results of one model into its folder."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -13,6 +13,7 @@ from hipsta_bids.group.columns import COLUMNS
 from hipsta_bids.group.multiplicity import MapKey
 from hipsta_bids.group.report import methods_text
 from hipsta_bids.group.scores import Scores
+from hipsta_bids.group.shapes import AverageShape
 from hipsta_bids.group.tables import entity_label, map_name, result_tables
 from hipsta_bids.group.template_json import templates_to_json
 from hipsta_bids.group_data import PARTICIPANT, SESSION, Cohort, ResultTable
@@ -82,10 +83,12 @@ def write_results(
     files.write_text(folder / "methods.md", text)
 
 
-def draw(folder: Path, cohort: Cohort, analysis: Analysis) -> list[str]:
+def draw(
+    folder: Path, cohort: Cohort, analysis: Analysis, shapes: Mapping[str, AverageShape]
+) -> list[str]:
     """Draw the figures, if the library for it is there; notes otherwise."""
     try:
-        for drawing in draw_figures(cohort, analysis):
+        for drawing in draw_figures(cohort, analysis, shapes):
             files.write_bytes(folder / "figures" / f"{drawing.name}.png", drawing.png)
             files.write_bytes(folder / "figures" / f"{drawing.name}.svg", drawing.svg)
     except ImportError:

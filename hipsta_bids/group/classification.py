@@ -17,6 +17,8 @@ BoolArray = NDArray[np.bool_]
 
 #: Directions of a training set with less than this share of the largest are no columns.
 _RANK = 1e-9
+#: Subjects in a group of the table of calibration, or there are fewer groups.
+_LEAST_IN_BIN = 5
 
 
 @dataclass(frozen=True)
@@ -221,7 +223,8 @@ def calibrate(score: FloatArray, case: BoolArray, settings: ClassificationSettin
         apart = is_separated(line, case)
         slope = float(fit_logistic(line, case, settings, firth=apart).coefficients[1])
     chance = special.expit(score)
-    bins = np.array_split(np.argsort(score, kind="stable"), min(settings.bins, len(score)))
+    count = min(settings.bins, max(len(score) // _LEAST_IN_BIN, 2))
+    bins = np.array_split(np.argsort(score, kind="stable"), count)
     return Calibration(
         intercept=_shift(score, case),
         slope=slope,

@@ -66,6 +66,8 @@ COLUMNS: Mapping[str, str] = {
     "auc_full_cv": "cross-validated area with the measure added",
     "auc_base_cv_sd": "standard deviation over repeats",
     "auc_full_cv_sd": "standard deviation over repeats",
+    "calibration_intercept": "log odds by which cases are more frequent than the full model says,"
+    " cross-validated; 0 if it is right on average",
     "calibration_slope": "of the full model, cross-validated; below 1 if it is too sure",
     "brier": "mean squared error of the chance, full model, cross-validated",
     "likelihood_ratio": "chi squared of the likelihood-ratio test, base against full model",

@@ -280,6 +280,7 @@ def _classification(analysis: Analysis, settings: GroupSettings) -> pd.DataFrame
                 "n_incomplete": pair.n_incomplete,
                 **_areas("base", found.base),
                 **_areas("full", found.full),
+                "calibration_intercept": found.full.calibration.intercept,
                 "calibration_slope": found.full.calibration.slope,
                 "brier": found.full.calibration.brier,
                 "likelihood_ratio": found.likelihood_ratio,

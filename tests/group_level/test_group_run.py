@@ -250,12 +250,12 @@ def test_figures_are_drawn_as_pictures_and_drawings(results):
             for measure in ("thickness", "curvature")
             for what in ("means", "contrasts")
         ),
-        *("profiles", "warps", "roc"),
+        *("profiles", "warps", "roc", "calibration"),
     }
     for name in names:
         drawing = (results / "figures" / f"{name}.svg").read_text()
         # Words stay words, so that they can be searched and edited.
-        assert ">medial<" in drawing or name == "roc"
+        assert ">medial<" in drawing or name in {"roc", "calibration"}
     contrasts = (results / "figures" / "thickness_contrasts.svg").read_text()
     assert "CN-AD" in contrasts
     assert ">CA1<" in contrasts

@@ -1,0 +1,128 @@
+"""Average shapes: sheets of many participants laid upon each other without scaling."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hipsta_bids.group.warps import warp_values
+from hipsta_bids.group_data import Float
+from hipsta_bids.group_settings import ShapeSettings
+
+#: Surfaces of a sheet, in the order of the arrays here.
+LAYERS = ("interior", "midthickness", "exterior")
+_MIDDLE = 1
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AverageShape:
+    """Average surfaces of one hemisphere, in mm."""
+
+    mean: Float
+    """(3, x, y, 3) interior, middle and exterior, of all; axes are those of the scanner."""
+    by_group: Mapping[str, Float]
+    """The same of each group, laid upon ``mean``."""
+    counts: Mapping[str, int]
+    """Sheets by group."""
+
+
+def average_shape(
+    layers: Float,
+    warps: Float,
+    groups: Sequence[str] | NDArray[np.str_],
+    order: Sequence[str],
+    settings: ShapeSettings,
+) -> AverageShape:
+    """Average surfaces at registered nodes, after rigid alignment (generalized Procrustes).
+
+    Each middle surface is turned and moved to the mean of all, which is made anew until it stays
+    (Gower 1975); nothing is scaled or mirrored. The walls go along.
+
+    Parameters
+    ----------
+    layers : ndarray, shape (sheets, 3, x, y, 3)
+        Interior, middle and exterior surface in mm; NaN is missing.
+    warps : ndarray, shape (sheets, x)
+        Registered coordinate of each node.
+    groups : sequence of str, length (sheets,)
+        Group of each.
+    order : sequence of str
+        Groups to average; those who are in none count for the mean of all.
+    settings : ShapeSettings
+        When the mean has settled.
+    """
+    n, _, nx, ny, _ = layers.shape
+    # Along x, so that all other axes count as one.
+    flat = np.moveaxis(layers, 2, 1).reshape(n, nx, -1)
+    registered = np.moveaxis(warp_values(flat, warps).reshape(n, nx, len(LAYERS), ny, 3), 1, 2)
+    middle = registered[:, _MIDDLE].reshape(n, -1, 3)
+    turns, centers, center = align_rigidly(middle, settings)
+    moved = registered.reshape(n, -1, 3) - centers[:, None]
+    moved = (moved @ np.swapaxes(turns, 1, 2) + center).reshape(registered.shape)
+    names = np.asarray(groups)
+    members = {name: names == name for name in order}
+    return AverageShape(
+        mean=_mean(moved),
+        by_group={name: _mean(moved[own]) for name, own in members.items() if own.any()},
+        counts={name: int(own.sum()) for name, own in members.items() if own.any()},
+    )
+
+
+def align_rigidly(points: Float, settings: ShapeSettings) -> tuple[Float, Float, Float]:
+    """Turn and move shapes so that they lie on their mean.
+
+    Parameters
+    ----------
+    points : ndarray, shape (shapes, points, 3)
+        Corresponding points; NaN is missing.
+    settings : ShapeSettings
+        When the mean has settled.
+
+    Returns
+    -------
+    turns : ndarray, shape (shapes, 3, 3)
+        Rotations, which are the identity on average: the mean keeps the shapes' orientation.
+    centers : ndarray, shape (shapes, 3)
+        To be taken off before.
+    center : ndarray, shape (3,)
+        To be added after: the mean of the centers.
+    """
+    present: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=2))
+    common = present.all(axis=0)
+    # Centers of the same points, if there are any that all have.
+    weights = (present & common if common.any() else present).astype(np.float64)
+    values = np.where(present[:, :, None], points, 0.0)
+    centers = np.einsum("sp,spi->si", weights, values) / weights.sum(axis=1)[:, None]
+    values = np.where(present[:, :, None], values - centers[:, None], 0.0)
+    mean = values[0]
+    turns = np.tile(np.eye(3), (len(values), 1, 1))
+    count = np.maximum(present.sum(axis=0), 1)[:, None]
+    for _ in range(settings.iterations):
+        turns = _rotations(values, mean)
+        before, mean = mean, np.einsum("sij,spj->pi", turns, values) / count
+        if np.abs(mean - before).max() < settings.tolerance:
+            break
+    # Turn all back by the mean turn, so that the mean lies as the shapes did.
+    back = _nearest_rotation(turns.mean(axis=0))
+    return back.T @ turns, centers, centers.mean(axis=0)
+
+
+def _rotations(values: Float, mean: Float) -> Float:
+    """Rotations of each shape that bring it closest to the mean (Kabsch 1976)."""
+    return _nearest_rotation(np.einsum("pi,spj->sij", mean, values))
+
+
+def _nearest_rotation(matrix: Float) -> Float:
+    left, _, right = np.linalg.svd(matrix)
+    sign = np.ones(matrix.shape[:-1])
+    sign[..., 2] = np.linalg.det(left @ right)
+    return np.asarray((left * sign[..., None, :]) @ right, dtype=np.float64)
+
+
+def _mean(shapes: Float) -> Float:
+    """Mean of those known; NaN where nobody is."""
+    known = np.isfinite(shapes)
+    count = known.sum(axis=0)
+    total = np.where(known, shapes, 0.0).sum(axis=0)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
