@@ -15,6 +15,7 @@ from hipsta_bids.console import Progress, complain, say, say_result, say_start, 
 from hipsta_bids.errors import ExitCode, HipstaError, NothingToDoError, UsageError
 from hipsta_bids.group_command import is_group_level, run_group_level
 from hipsta_bids.parser import COLLECT, LEVELS, build_parser, join_slurm
+from hipsta_bids.report_command import command_line, rebuild_reports
 from hipsta_bids.threads import pin_threads
 
 if TYPE_CHECKING:
@@ -106,16 +107,19 @@ def _dispatch(arguments: list[str]) -> ExitCode:
     is_app = any(level in arguments[1:] for level in LEVELS)
     if arguments and arguments[0] in commands and not is_app:
         return commands[arguments[0]](arguments[1:])
-    return _participant(build_parser().parse_args(join_slurm(arguments)))
+    options = build_parser().parse_args(join_slurm(arguments))
+    return _participant(options, command_line(arguments))
 
 
-def _participant(options: "Namespace") -> ExitCode:
+def _participant(options: "Namespace", command: str | None = None) -> ExitCode:
     pin_threads()
     from hipsta_bids.settings_file import load_settings  # noqa: PLC0415  (start-up time)
 
     _check_folders(options)
     if options.analysis_level == COLLECT and options.shard is not None:
         raise UsageError("collect is about all parts; leave --shard out", reason="usage")
+    if options.reports_only:
+        return rebuild_reports(options)
     settings = _with_region(load_settings(options.settings), options.region)
     request = _request(options)
     say_start(options.analysis_level, options.bids_dir)
@@ -137,7 +141,7 @@ def _participant(options: "Namespace") -> ExitCode:
     if options.analysis_level == COLLECT:
         from hipsta_bids.collect import collect  # noqa: PLC0415  (heavy)
 
-        result = collect(items, options.output_dir, settings, _run_options(options))
+        result = collect(items, options.output_dir, settings, _run_options(options, command))
         say_result(result, options.output_dir)
         return result.exit_code
     from hipsta_bids.runner import run_participants  # noqa: PLC0415  (heavy)
@@ -145,7 +149,7 @@ def _participant(options: "Namespace") -> ExitCode:
     progress = Progress(len(items), options.verbose)
     try:
         result = run_participants(
-            items, options.output_dir, settings, _run_options(options), progress.report
+            items, options.output_dir, settings, _run_options(options, command), progress.report
         )
     finally:
         progress.close()
@@ -216,7 +220,7 @@ def _request(options: "Namespace") -> "InputRequest":
     )
 
 
-def _run_options(options: "Namespace") -> "RunOptions":
+def _run_options(options: "Namespace", command: str | None) -> "RunOptions":
     from hipsta_bids.bids.files import check_writable  # noqa: PLC0415  (start-up time)
     from hipsta_bids.runner import WORKER_GB, RunOptions  # noqa: PLC0415  (heavy)
 
@@ -239,6 +243,8 @@ def _run_options(options: "Namespace") -> "RunOptions":
         timeout=options.timeout,
         shard=options.shard,
         cluster=_cluster(options),
+        reports=not options.no_reports,
+        command=command,
     )
 
 

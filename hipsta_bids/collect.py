@@ -8,7 +8,7 @@ from hipsta_bids.bids.inputs import HemisphereInput
 from hipsta_bids.bids.status import RECORDED, read_status, row_key, update_status
 from hipsta_bids.bookkeeping import log_file, not_finished, status_row
 from hipsta_bids.job import recorded
-from hipsta_bids.runner import RunOptions, RunResult, prepare
+from hipsta_bids.runner import RunOptions, RunResult, pages_after, prepare
 from hipsta_bids.settings import Settings
 
 _LOGGER = logging.getLogger(__name__)
@@ -55,6 +55,11 @@ def collect(
             rows[row_key(row)] = row
     update_status(out_dir, rows.values())
     with log_file(out_dir, options.verbosity) as log:
-        result = RunResult(outcomes=outcomes, n_requested=len(jobs), log=log)
+        problems: list[str] = []
+        with pages_after(jobs, out_dir, options, log, problems):
+            pass
+        result = RunResult(
+            outcomes=outcomes, n_requested=len(jobs), log=log, page_problems=tuple(problems)
+        )
         _LOGGER.info("collected: %s, exit code %d", dict(result.counts), result.exit_code)
     return result

@@ -97,6 +97,11 @@ def say_result(result: "RunResult", out_dir: Path) -> None:
     say(f"{result.n_requested} hemispheres: {counts}{unchanged}")
     say(f"maps: {out_dir}")
     say(f"table of all hemispheres: {out_dir / 'status.tsv'}")
+    page = out_dir / "report.html"
+    if page.exists():
+        say(f"report: {page}")
+    for problem in result.page_problems:
+        complain(f"warning: report: {problem}")
     say(f"log: {result.log}")
 
 

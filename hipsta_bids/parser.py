@@ -250,6 +250,19 @@ def _add_processing(parser: Parser) -> None:
         action="store_true",
     )
     _add(group, ("--force",), (None, "redo what is up to date"), action="store_true")
+    pages = group.add_mutually_exclusive_group()
+    _add(
+        pages,
+        ("--no-reports", "--no_reports"),
+        (None, "make no pages to look at (OUT_DIR/*.html)"),
+        action="store_true",
+    )
+    _add(
+        pages,
+        ("--reports-only", "--reports_only"),
+        (None, "make these pages anew from the results that are there, and end"),
+        action="store_true",
+    )
     _add(
         group,
         ("--n-procs", "--nprocs", "--n_procs", "--n-cpus", "--n_cpus"),

@@ -5,6 +5,7 @@ import logging
 import math
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from hipsta_bids.cluster import Cluster, run_on_cluster
 from hipsta_bids.errors import ExitCode, HipstaError, InputError, OutputError, SchemeError
 from hipsta_bids.job import Job, Outcome, finished
 from hipsta_bids.pool import WorkerLost, WorkerPlan, run_jobs
+from hipsta_bids.reporting import PagePlan, reports_after
 from hipsta_bids.schemes import Scheme
 from hipsta_bids.settings import Settings
 from hipsta_bids.shard import Shard
@@ -53,6 +55,10 @@ class RunOptions:
     """Which part of the dataset this is, if other runs do the others."""
     cluster: Cluster | None = None
     """Workers elsewhere; ``None`` is this machine."""
+    reports: bool = False
+    """Make pages to look at afterwards."""
+    command: str | None = None
+    """The command line, for the log."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,6 +69,8 @@ class RunResult:
     """Of all hemispheres that ended or were skipped."""
     n_requested: int
     log: Path
+    page_problems: tuple[str, ...] = ()
+    """One line per page that could not be made."""
 
     @property
     def counts(self) -> Counter[str]:
@@ -130,14 +138,23 @@ def run_participants(
     shard = None if options.shard is None else options.shard.name
     with log_file(out_dir, options.verbosity, shard) as log:
         _LOGGER.info("hipsta_bids %s, %d hemispheres", __version__, len(jobs))
+        if options.command:
+            _LOGGER.info("command: %s", options.command)
         books = Books(out_dir, shard)
+        problems: list[str] = []
         # Closed at once, whatever ends the loop, so that no worker outlives it.
         with (
+            pages_after(jobs, out_dir, options, log, problems),
             contextlib.closing(books),
             contextlib.closing(_outcomes(jobs, books, options, log)) as found,
         ):
             outcomes = _run(found, books, options, report)
-        result = RunResult(outcomes=tuple(outcomes), n_requested=len(jobs), log=log)
+        result = RunResult(
+            outcomes=tuple(outcomes),
+            n_requested=len(jobs),
+            log=log,
+            page_problems=tuple(problems),
+        )
         _LOGGER.info("done: %s, exit code %d", dict(result.counts), result.exit_code)
     return result
 
@@ -196,6 +213,22 @@ def _run(
         if options.stop_on_first_crash and outcome.status == Status.FAILED:
             break
     return kept
+
+
+def pages_after(
+    jobs: Sequence[Job], out_dir: Path, options: RunOptions, log: Path, problems: list[str]
+) -> AbstractContextManager[None]:
+    """Make pages when a block ends, if they are wanted; that of all if this is no part."""
+    if not options.reports:
+        return contextlib.nullcontext()
+    visits = [(job.place.name.subject, job.place.name.session) for job in jobs]
+    plan = PagePlan(
+        root=out_dir,
+        n_workers=n_workers(options, len(visits)),
+        log=log,
+        cohort=options.shard is None,
+    )
+    return reports_after(plan, visits, problems)
 
 
 def hemisphere_name(item: HemisphereInput, settings: Settings) -> HemisphereName:

@@ -78,7 +78,8 @@ def test_defaults(seen, tmp_path):
     assert seen["request"] == InputRequest(bids_dir=Path("in"), output_dir=tmp_path)
     assert seen["settings"] == Settings()
     n_procs = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    assert seen["options"] == RunOptions(n_procs=n_procs)
+    command = f"hipsta-bids in {tmp_path} participant"
+    assert seen["options"] == RunOptions(n_procs=n_procs, reports=True, command=command)
     assert seen["out"] == tmp_path
 
 
@@ -86,13 +87,16 @@ def test_everything_reaches_its_place(seen, tmp_path):
     settings = tmp_path / "s.toml"
     settings.write_text('[body]\nlayer_rule = "nearest-label"\n')
     text = (
-        "in {0}/out participant --participant-label sub-01 02 --session-label ses-a b --hemi r"
+        f"in {tmp_path}/out participant --participant-label sub-01 02 --session-label ses-a b"
+        " --hemi r"
         " -d one=x -d two=y z --freesurfer-dir f --ashs-dir a --hippunfold-dir h --fs-analysis T1"
         " --ashs-atlas ashsPMC --scheme s.toml --edited-dir e --bids-filter-file j"
-        " --bids-database-dir db --skip-bids-validation --settings {0}/s.toml --write-meshes"
-        " --force --n-procs 3 --mem 4G --timeout 9 -w {0}/work --stop-on-first-crash -vv"
+        f" --bids-database-dir db --skip-bids-validation --settings {tmp_path}/s.toml"
+        " --write-meshes"
+        f" --force --n-procs 3 --mem 4G --timeout 9 -w {tmp_path}/work --stop-on-first-crash -vv"
+        " --no-reports"
     )
-    assert cli.main(text.format(tmp_path).split()) == 0
+    assert cli.main(text.split()) == 0
     assert seen["request"] == InputRequest(
         bids_dir=Path("in"),
         derivatives={"one": Path("x"), "two": Path("y"), "z": Path("z")},
@@ -119,6 +123,7 @@ def test_everything_reaches_its_place(seen, tmp_path):
         force=True,
         write_meshes=True,
         timeout=9.0,
+        command=f"hipsta-bids {text}",
     )
     assert seen["settings"] == load_settings(settings)
     assert (tmp_path / "work").is_dir()

@@ -6,6 +6,8 @@ specification (Harwell et al. 2011) and of Workbench.
 """
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
+from xml.parsers.expat import ExpatError
 
 import numpy as np
 from nibabel.gifti.gifti import (
@@ -19,6 +21,7 @@ from nibabel.gifti.gifti import (
 from numpy.typing import NDArray
 
 from hipsta_bids.artifacts import Float, Int
+from hipsta_bids.errors import InputError
 
 _STRUCTURE = {"L": "HippocampusLeft", "R": "HippocampusRight"}
 
@@ -195,3 +198,33 @@ def _encode(
     image = GiftiImage(meta=meta, darrays=list(arrays), labeltable=labels)
     content: bytes = image.to_bytes()
     return content
+
+
+def read_points(path: Path) -> Float:
+    """Read the vertices of a surface.
+
+    Parameters
+    ----------
+    path : Path
+        A ``.surf.gii`` file.
+
+    Returns
+    -------
+    (V, 3) float64
+        RAS mm.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    try:
+        image = GiftiImage.from_bytes(path.read_bytes())
+        points = image.agg_data("NIFTI_INTENT_POINTSET")
+        return np.asarray(points, dtype=np.float64).reshape(-1, 3)
+    except (OSError, ValueError, TypeError, ExpatError) as error:
+        raise InputError(
+            f"{path}: not readable as a surface ({error}); run the participant level again with"
+            " --force",
+            reason="unreadable-surface",
+        ) from error

@@ -4,6 +4,7 @@ Entities follow the order of BIDS 1.11 (``sub ses hemi space seg label desc``). 
 has no rule for is listed in ``.bidsignore`` from the same table.
 """
 
+import re
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 
@@ -269,7 +270,13 @@ DATASET_FILES: dict[str, str] = {
     "status_sidecar": "status.json",
     "logs": "logs",
     "group": "group",
+    "report": "report.html",
 }
+
+_RECORD = re.compile(
+    r"sub-(?P<subject>[^_]+)(?:_ses-(?P<session>[^_]+))?_hemi-(?P<hemi>[LR])_seg-(?P<seg>[^_]+)"
+    r"(?:_label-(?P<region>[^_]+))?_desc-qc_metrics\.json"
+)
 
 _BY_KEY = {output.key: output for output in (*OUTPUTS, *EXTRA_OUTPUTS)}
 
@@ -322,6 +329,31 @@ def output_path(name: HemisphereName, key: str, desc: str | None = None) -> Pure
     return name.folder / output_name(name, key, desc)
 
 
+def name_of_record(file_name: str) -> HemisphereName | None:
+    """Tell whose quality record a file is, the reverse of :func:`output_name`.
+
+    Parameters
+    ----------
+    file_name : str
+        Without folders.
+
+    Returns
+    -------
+    HemisphereName or None
+        ``None`` for any other file.
+    """
+    match = _RECORD.fullmatch(file_name)
+    if match is None:
+        return None
+    parts = match.groupdict()
+    return HemisphereName(**parts | {"region": parts["region"] or "body"})
+
+
+def participant_report(subject: str, session: str | None) -> str:
+    """Spell the name of the page about one visit, in the root of the output dataset."""
+    return f"sub-{subject}{f'_ses-{session}' if session else ''}.html"
+
+
 def ignore_patterns() -> tuple[str, ...]:
     """List the patterns of ``.bidsignore``: each output that BIDS 1.11 has no rule for.
 
@@ -339,4 +371,6 @@ def ignore_patterns() -> tuple[str, ...]:
     regions = [
         f"*_label-*_{output.suffix}{output.extension}" for output in OUTPUTS if output.in_standard
     ]
-    return (*dataset, *(f"{DATASET_FILES[key]}/" for key in ("logs", "group")), *patterns, *regions)
+    pages = ("*.html",)
+    folders = [f"{DATASET_FILES[key]}/" for key in ("logs", "group")]
+    return (*dataset, *pages, *folders, *patterns, *regions)

@@ -1,0 +1,67 @@
+"""``--reports-only``: the pages of an output dataset, made anew from its files."""
+
+import os
+import shlex
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from hipsta_bids.console import complain, say
+from hipsta_bids.errors import ExitCode, NothingToDoError
+
+if TYPE_CHECKING:
+    from argparse import Namespace
+
+
+def rebuild_reports(options: "Namespace") -> ExitCode:
+    """Make the pages of all visits that are asked for, and that of the cohort.
+
+    Parameters
+    ----------
+    options : Namespace
+        Of the participant level.
+
+    Returns
+    -------
+    ExitCode
+
+    Raises
+    ------
+    NothingToDoError
+        If the output dataset has no results of these visits.
+    OutputError
+        If it cannot be written.
+    """
+    from hipsta_bids.bids.files import check_writable  # noqa: PLC0415  (start-up time)
+    from hipsta_bids.bids.names import DATASET_FILES  # noqa: PLC0415
+    from hipsta_bids.bookkeeping import log_file  # noqa: PLC0415  (heavy)
+    from hipsta_bids.reporting import PagePlan, visits_of, write_reports  # noqa: PLC0415  (heavy)
+
+    root = options.output_dir
+    visits = [
+        (subject, session)
+        for subject, session in visits_of(root)
+        if subject in (options.participant_label or [subject])
+        and session in (options.session_label or [session])
+    ]
+    if not visits:
+        raise NothingToDoError(
+            f"{root}: no results of these participants; run without --reports-only first",
+            reason="nothing-to-report",
+        )
+    check_writable(root)
+    with log_file(root, options.verbose) as log:
+        plan = PagePlan(root=root, n_workers=options.n_procs, log=log)
+        problems = list(write_reports(plan, visits))
+    for problem in problems:
+        complain(f"report: {problem.message}")
+    say(f"reports of {len(visits)} visits: {root / DATASET_FILES['report']}")
+    if any(problem.fatal for problem in problems):
+        return ExitCode.NOT_WRITABLE
+    return ExitCode.INTERNAL if problems else ExitCode.OK
+
+
+def command_line(arguments: Sequence[str]) -> str:
+    """Spell a command line for the record; the home folder, which names a person, as ``~``."""
+    text = shlex.join(("hipsta-bids", *arguments))
+    home = os.path.expanduser("~")  # noqa: PTH111  (Path.home() fails where there is none)
+    return text.replace(f"{home}/", "~/") if len(home) > 1 else text

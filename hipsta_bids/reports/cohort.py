@@ -1,0 +1,258 @@
+"""All hemispheres of an output dataset: the range of their numbers, and who stands apart."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hipsta_bids.artifacts import Float
+from hipsta_bids.bids import files
+from hipsta_bids.bids.names import DATASET_FILES, HemisphereName
+from hipsta_bids.errors import InputError
+from hipsta_bids.geometry.summary import SUMMARY
+from hipsta_bids.reports.figures import MAP_KINDS
+from hipsta_bids.reports.results import Hemisphere, find_results, number_of
+
+#: Ranges are shown of at least so many hemispheres ...
+SMALLEST_COHORT = 5
+
+#: ... and distances from them of at least so many: of fewer, the spread is too unsure.
+SMALLEST_COMPARED = 10
+
+_MAD_TO_SD = 1.4826  # of a normal distribution
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measure:
+    """A number of the summary that pages show."""
+
+    name: str
+    title: str
+    unit: str
+    digits: int
+
+
+_TITLES = {
+    "thickness_mean": ("Mean thickness", 2),
+    "curvature_mean": ("Mean curvature", 3),
+    "volume": ("Volume", 0),
+    "area_mid": ("Area of the mid-surface", 0),
+    "extent_x": ("Width, medial to lateral", 1),
+    "extent_y": ("Length, posterior to anterior", 1),
+    "interior_exterior_ratio_mean": ("Interior to exterior length", 2),
+    "shape_index_mean": ("Shape index", 2),
+}
+_UNITS = {row.name: row.unit for row in SUMMARY}
+
+#: In the order in which they are shown.
+MEASURES = tuple(
+    Measure(name=name, title=title, unit="" if _UNITS[name] == "1" else _UNITS[name], digits=digits)
+    for name, (title, digits) in _TITLES.items()
+)
+
+_RUN = re.compile(r"^(?P<time>\d{4}-\d\d-\d\d \d\d:\d\d):\d\d,\d+ INFO (?P<text>.*)$")
+_COMMAND = "command: "
+_OUTCOME = re.compile(r"(?P<title>sub-\S+_hemi-\S+): (?:ok|repaired|flagged|failed)\b")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Origin:
+    """The run that measured a hemisphere, from its log."""
+
+    command: str | None
+    time: str
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Cohort:
+    """Hemispheres of one output dataset."""
+
+    hemispheres: tuple[Hemisphere, ...]
+    settings: Mapping[str, Any]
+    """Resolved, by stage."""
+    origins: Mapping[str, Origin] = field(default_factory=dict)
+    """By title of the hemisphere."""
+    _profiles: dict[str, dict[str, Float]] = field(default_factory=dict, repr=False)
+
+    def like(self, name: HemisphereName) -> list[Hemisphere]:
+        """Measured hemispheres of the same side, protocol and region."""
+        wanted = name.hemi, name.seg, name.region
+        return [
+            other
+            for other in self.hemispheres
+            if other.measured
+            and (other.place.name.hemi, other.place.name.seg, other.place.name.region) == wanted
+        ]
+
+    def origin(self, hemisphere: Hemisphere) -> Origin | None:
+        """Which run measured it, if its log is there."""
+        return self.origins.get(title_of(hemisphere.place.name))
+
+    def profiles(self, name: HemisphereName, column: str) -> Float:
+        """(N, Nx) means over y of a map, of all hemispheres of the same kind."""
+        found = [self._profile(other) for other in self.like(name)]
+        rows = [profile[column] for profile in found if column in profile]
+        same = [row for row in rows if len(row) == len(rows[0])]
+        return np.array(same, dtype=np.float64)
+
+    def _profile(self, hemisphere: Hemisphere) -> dict[str, Float]:
+        title = title_of(hemisphere.place.name)
+        if title not in self._profiles:
+            self._profiles[title] = _read_profile(hemisphere)
+        return self._profiles[title]
+
+    def values(self, name: HemisphereName, measure: str) -> Float:
+        """List a number of all hemispheres of the same kind, without NaN."""
+        found = [other.summary.get(measure, np.nan) for other in self.like(name)]
+        every = np.array(found, dtype=np.float64)
+        return every[np.isfinite(every)]
+
+
+def title_of(name: HemisphereName) -> str:
+    """Spell a hemisphere as the log does."""
+    return f"{name.stem}_{name.protocol}"
+
+
+def read_cohort(root: Path) -> Cohort:
+    """Read the numbers of all hemispheres.
+
+    Parameters
+    ----------
+    root : Path
+        The output dataset.
+
+    Returns
+    -------
+    Cohort
+        Hemispheres whose summary cannot be read are left out.
+    """
+    try:
+        settings = files.read_json(root / DATASET_FILES["settings"]).get("settings") or {}
+    except InputError:
+        settings = {}
+    found = tuple(hemisphere for hemisphere in find_results(root) if _is_readable(hemisphere))
+    return Cohort(hemispheres=found, settings=settings, origins=_read_origins(root))
+
+
+def _read_profile(hemisphere: Hemisphere) -> dict[str, Float]:
+    """Means over y by column; nothing where the table cannot be read."""
+    try:
+        rows = files.read_tsv(hemisphere.place.path("profile"))
+    except InputError:
+        return {}
+    rows = [row for row in rows if row.get("axis") == "x"]
+    return {
+        column: np.array([number_of(row[column]) for row in rows])
+        for column in (kind.column for kind in MAP_KINDS)
+        if rows and column in rows[0]
+    }
+
+
+def _is_readable(hemisphere: Hemisphere) -> bool:
+    try:
+        return bool(hemisphere.summary) or not hemisphere.measured
+    except InputError:
+        return False
+
+
+def _read_origins(root: Path) -> dict[str, Origin]:
+    """Read from the logs which command measured what; the last one counts."""
+    origins = {}
+    for path in sorted((root / DATASET_FILES["logs"]).glob("run-*.log")):
+        command = None
+        try:
+            text = path.read_text(encoding="utf-8", errors="replace")
+        except OSError:
+            continue
+        for line in text.splitlines():
+            entry = _RUN.match(line)
+            if entry is None:
+                continue
+            if entry["text"].startswith(_COMMAND):
+                command = entry["text"].removeprefix(_COMMAND)
+            elif (outcome := _OUTCOME.match(entry["text"])) is not None:
+                origins[outcome["title"]] = Origin(command=command, time=entry["time"])
+    return origins
+
+
+@dataclass(frozen=True, kw_only=True)
+class Distance:
+    """How far a hemisphere stands from the others."""
+
+    value: float
+    """Largest robust z-score; NaN where there are too few others."""
+    measure: str
+    """Title of the number in which it stands farthest."""
+
+
+def robust_scores(values: Float) -> Float:
+    """Robust z-scores: distance from the median over the scaled median absolute deviation.
+
+    Parameters
+    ----------
+    values : (N, ...) float64
+        NaN where missing.
+
+    Returns
+    -------
+    (N, ...) float64
+        NaN where missing, 0 where nothing varies.
+    """
+    away = values - np.nanmedian(values, axis=0)
+    spread = _MAD_TO_SD * np.nanmedian(np.abs(away), axis=0)
+    return np.where(spread > 0, away / np.where(spread > 0, spread, 1.0), 0.0 * away)
+
+
+def distances(cohort: Cohort, thickness: Mapping[str, Float]) -> dict[str, Distance]:
+    """Measure how far each hemisphere stands from those of its kind.
+
+    Parameters
+    ----------
+    cohort : Cohort
+    thickness : mapping of str to (Nx, Ny) float64
+        Thickness maps by title of the hemisphere, in which shapes are compared point by point.
+
+    Returns
+    -------
+    dict of str to Distance
+        By title of the hemisphere, of measured ones in cohorts of at least
+        :data:`SMALLEST_COMPARED`.
+    """
+    found = {}
+    for members in _kinds(cohort):
+        if len(members) < SMALLEST_COMPARED:
+            continue
+        table = np.array([[h.summary.get(m.name, np.nan) for m in MEASURES] for h in members])
+        titles = [m.title for m in MEASURES]
+        maps = [thickness.get(title_of(h.place.name), np.empty((0, 0))) for h in members]
+        scores = np.abs(np.nan_to_num(robust_scores(table)))
+        if maps[0].size and len({m.shape for m in maps}) == 1:
+            # Only a large departure is far; a small one is nearest.
+            departure = np.maximum(robust_scores(_departure(np.array(maps))), 0)
+            scores = np.column_stack([scores, departure])
+            titles.append("Map of thickness")
+        for row, hemisphere in zip(scores, members, strict=True):
+            farthest = int(np.argmax(row))
+            found[title_of(hemisphere.place.name)] = Distance(
+                value=float(row[farthest]), measure=titles[farthest]
+            )
+    return found
+
+
+def _departure(maps: Float) -> Float:
+    """(N,) root mean square over the sheet of each map's difference from the median map, mm."""
+    away = maps - np.nanmedian(maps, axis=0)
+    return np.asarray(np.sqrt(np.nanmean(away**2, axis=(1, 2))), dtype=np.float64)
+
+
+def _kinds(cohort: Cohort) -> list[Sequence[Hemisphere]]:
+    """Measured hemispheres by side, protocol and region."""
+    kinds: dict[tuple[str, str, str], list[Hemisphere]] = {}
+    for hemisphere in cohort.hemispheres:
+        name = hemisphere.place.name
+        if hemisphere.measured:
+            kinds.setdefault((name.hemi, name.seg, name.region), []).append(hemisphere)
+    return list(kinds.values())

@@ -1,0 +1,268 @@
+"""The page about one visit: is this hemisphere usable, and what went wrong."""
+
+import shlex
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from hipsta_bids.artifacts import Float, Status
+from hipsta_bids.bids.names import output_name
+from hipsta_bids.reports.cohort import SMALLEST_COHORT, Cohort
+from hipsta_bids.reports.figures import MAP_KINDS, THICKNESS, color_table, draw_map, draw_profiles
+from hipsta_bids.reports.figures import scale_of as scale_of_map
+from hipsta_bids.reports.numbers import key_numbers, quality_numbers
+from hipsta_bids.reports.page import Section, build_sections, render
+from hipsta_bids.reports.panels import place_panels, section_panels, slice_panels
+from hipsta_bids.reports.results import Hemisphere, find_results
+from hipsta_bids.reports.series import Series
+from hipsta_bids.reports.viewer import scales_of, scene_of, subfields_of
+from hipsta_bids.reports.volumes import input_path
+from hipsta_bids.reports.words import verdict_of
+
+#: So many places are shown in slices; all are listed.
+_PLACES_SHOWN = 4
+
+
+def participant_page(root: Path, subject: str, session: str | None, cohort: Cohort) -> str | None:
+    """Make the page about one visit.
+
+    Parameters
+    ----------
+    root : Path
+        The output dataset.
+    subject, session : str
+        Labels without ``sub-`` and ``ses-``; the session may be ``None``.
+    cohort : Cohort
+        Everybody, to compare with.
+
+    Returns
+    -------
+    str or None
+        The page; ``None`` if there is no record of any hemisphere.
+    """
+    kinds: dict[tuple[str, str], list[Hemisphere]] = {}
+    for hemisphere in find_results(root, subject, session):
+        name = hemisphere.place.name
+        kinds.setdefault((name.seg, name.region), []).append(hemisphere)
+    if not kinds:
+        return None
+    series = [Series(tuple(found), cohort) for found in kinds.values()]
+    parts = [
+        {
+            "title": one.title,
+            "protocol": one.hemispheres[0].record.get("scheme_title") or one.title,
+            "prefix": f"p{n}",
+            "sections": build_sections(SECTIONS, one, f"p{n}"),
+        }
+        for n, one in enumerate(series, start=1)
+    ]
+    visit = f"sub-{subject}" + (f", ses-{session}" if session else "")
+    every = [hemisphere for one in series for hemisphere in one.hemispheres]
+    versions = sorted({str(h.record.get("version")) for h in every})
+    hashes = sorted({str(h.record.get("settings_hash")) for h in every})
+    return render(
+        "participant.html",
+        title=visit,
+        parts=parts,
+        versions=versions,
+        hashes=hashes,
+        measured=max((_time_of(h, cohort) for h in every), default=""),
+    )
+
+
+def _time_of(hemisphere: Hemisphere, cohort: Cohort) -> str:
+    origin = cohort.origin(hemisphere)
+    if origin is not None:
+        return origin.time
+    written = hemisphere.place.path("qc").stat().st_mtime
+    return f"{datetime.fromtimestamp(written, UTC):%Y-%m-%d %H:%M} UTC"
+
+
+def _status(series: Series) -> Mapping[str, Any]:
+    return {
+        "cards": [
+            {
+                "side": h.side,
+                "status": str(h.status),
+                "verdict": verdict_of(h),
+                "findings": h.findings,
+                "reason": h.record.get("reason"),
+                "notes": h.record.get("notes") or [],
+                "edited": [str(e.get("what")) for e in h.record.get("edited") or []],
+            }
+            for h in series.hemispheres
+        ]
+    }
+
+
+def _places(series: Series) -> Mapping[str, Any] | None:
+    """Slices through the places that messages name."""
+    groups = []
+    for hemisphere in series.hemispheres:
+        view = series.view(hemisphere)
+        named = [finding for finding in hemisphere.findings if finding.point is not None]
+        if view is None or not named:
+            continue
+        shown = [
+            {"finding": finding, "panels": place_panels(hemisphere, view, finding.point)}
+            for finding in named[:_PLACES_SHOWN]
+            if finding.point is not None
+        ]
+        groups.append({"side": hemisphere.side, "places": shown, "more": len(named) - len(shown)})
+    return {"groups": groups, "legend": _legend(series)} if groups else None
+
+
+def _input(series: Series) -> Mapping[str, Any]:
+    groups = []
+    for hemisphere in series.hemispheres:
+        view = series.view(hemisphere)
+        path = input_path(hemisphere)
+        groups.append(
+            {
+                "side": hemisphere.side,
+                "file": path.name if path else "not known",
+                "why": hemisphere.record.get("chosen_because") or "",
+                "voxel": " by ".join(f"{edge:.2g}" for edge in view.voxel) if view else None,
+                "missing": view.missing if view else "neither labels nor mask are at hand",
+                "panels": slice_panels(hemisphere, view) if view else [],
+                "measured": hemisphere.measured,
+            }
+        )
+    return {"groups": groups, "legend": _legend(series)}
+
+
+def _legend(series: Series) -> list[Mapping[str, str]]:
+    """Names and colors of the labels, each name once."""
+    names: dict[str, str] = {}
+    for view in series.views.values():
+        for label in view.names.values() if view else ():
+            names[label.name] = label.color
+    return [{"name": name, "color": color} for name, color in names.items()]
+
+
+def _sheets(series: Series) -> Mapping[str, Any] | None:
+    measured = series.measured
+    if not measured:
+        return None
+    return {
+        "pictures": [draw_map(kind, measured) for kind in MAP_KINDS],
+        "repaired": any(h.sheet.repaired.any() for h in measured),
+        "invalid": any(not h.sheet.valid.all() for h in measured),
+    }
+
+
+def _view(series: Series) -> Mapping[str, Any] | None:
+    names = subfields_of(series.measured)
+    scenes = [scene_of(h, series.view(h), names) for h in series.hemispheres]
+    scenes = [scene for scene in scenes if "surfaces" in scene or "body" in scene]
+    if not scenes:
+        return None
+    return {"data": {"scenes": scenes, "scales": scales_of(series.measured)}}
+
+
+def _sections(series: Series) -> Mapping[str, Any] | None:
+    measured = series.measured
+    if not measured:
+        return None
+    scale = scale_of_map(THICKNESS, [h.sheet.columns["thickness"] for h in measured])
+    colors = color_table(THICKNESS)
+    return {
+        "groups": [{"side": h.side, "panels": section_panels(h, colors, scale)} for h in measured],
+        "scale": {
+            "low": f"{scale[0]:.2f}",
+            "high": f"{scale[1]:.2f}",
+            "colors": colors[::8].tolist(),
+        },
+    }
+
+
+def _profiles(series: Series) -> Mapping[str, Any] | None:
+    measured = series.measured
+    if not measured:
+        return None
+    pictures = [
+        draw_profiles(kind, measured, _cohort_profiles(series, kind.column)) for kind in MAP_KINDS
+    ]
+    return {"pictures": pictures, "others": bool(_cohort_profiles(series, "thickness"))}
+
+
+def _cohort_profiles(series: Series, column: str) -> dict[str, Float]:
+    """Mean profiles along x of all hemispheres of the same kind."""
+    found = {}
+    for hemisphere in series.measured:
+        like = series.cohort.profiles(hemisphere.place.name, column)
+        if len(like) >= SMALLEST_COHORT:
+            found[hemisphere.place.name.hemi] = like
+    return found
+
+
+def _correct(series: Series) -> Mapping[str, Any] | None:
+    """How to edit what was measured; nothing where nothing is to be said."""
+    wanted = [h for h in series.hemispheres if h.status != Status.OK]
+    if not wanted:
+        return None
+    first = wanted[0].place.name
+    choices = []
+    for hemisphere in wanted:
+        name = hemisphere.place.name
+        mask = hemisphere.place.path("body_mask")
+        path = input_path(hemisphere)
+        suffix = f"{name.stem}_{name.protocol}_desc-edited"
+        choices.append(
+            {
+                "side": hemisphere.side,
+                "labels": path.name if path else None,
+                "edited_labels": f"{suffix}_dseg.nii.gz",
+                "mask": output_name(name, "body_mask") if mask.exists() else None,
+                "edited_mask": f"{suffix}_mask.nii.gz",
+            }
+        )
+    command = ["hipsta-bids", "BIDS_DIR", "OUT_DIR", "participant", "--edited-dir", "EDITS"]
+    command += ["--participant-label", first.subject]
+    folder = f"EDITS/{first.folder}"
+    return {"choices": choices, "folder": folder, "command": shlex.join(command)}
+
+
+def _origin(series: Series) -> Mapping[str, Any]:
+    rows = []
+    for hemisphere in series.hemispheres:
+        record, origin = hemisphere.record, series.cohort.origin(hemisphere)
+        rows.append(
+            {
+                "side": hemisphere.side,
+                "inputs": [str(entry.get("file")) for entry in record.get("inputs") or []],
+                "edited": [str(entry.get("file")) for entry in record.get("edited") or []],
+                "version": record.get("version"),
+                "settings": record.get("settings_hash"),
+                "input_hash": record.get("input_hash") or "not known",
+                "time": _time_of(hemisphere, series.cohort),
+                "command": origin.command if origin and origin.command else None,
+                "passed_over": record.get("passed_over") or [],
+            }
+        )
+    return {"rows": rows}
+
+
+#: From top to bottom.
+SECTIONS: tuple[Section[Series], ...] = (
+    Section(key="status", title="Status", template="sections/status.html", build=_status),
+    Section(key="places", title="Where to look", template="sections/places.html", build=_places),
+    Section(
+        key="numbers", title="Key numbers", template="sections/numbers.html", build=key_numbers
+    ),
+    Section(key="input", title="Labels and body", template="sections/input.html", build=_input),
+    Section(key="sheet", title="Unfolded maps", template="sections/sheet.html", build=_sheets),
+    Section(key="view", title="Three dimensions", template="sections/view.html", build=_view),
+    Section(
+        key="sections", title="Cross-sections", template="sections/sections.html", build=_sections
+    ),
+    Section(key="profiles", title="Profiles", template="sections/profiles.html", build=_profiles),
+    Section(
+        key="quality", title="Quality", template="sections/quality.html", build=quality_numbers
+    ),
+    Section(
+        key="correct", title="How to correct it", template="sections/correct.html", build=_correct
+    ),
+    Section(key="origin", title="Origin", template="sections/origin.html", build=_origin),
+)

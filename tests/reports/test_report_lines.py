@@ -1,0 +1,50 @@
+"""Cuts and outlines against answers known exactly."""
+
+import base64
+import io
+
+import numpy as np
+from PIL import Image
+
+from hipsta_bids.reports.lines import cut, outline, path_data, png_address
+
+
+def test_a_cut_through_a_tilted_plane_is_a_straight_line():
+    x, y = np.meshgrid(np.arange(4.0), np.arange(5.0), indexing="ij")
+    points = np.stack([x, y, 2 * x + 1], axis=-1)
+    lines = cut(points, 2, 4.0)  # where x is 1.5
+    np.testing.assert_allclose(lines[..., 2], 4.0)
+    np.testing.assert_allclose(lines[..., 0], 1.5)
+    assert np.linalg.norm(lines[:, 0] - lines[:, 1], axis=1).sum() == 4.0  # from y = 0 to y = 4
+
+
+def test_a_plane_beside_the_grid_cuts_nothing():
+    points = np.zeros((3, 3, 3))
+    assert cut(points, 1, 5.0).shape == (0, 2, 3)
+
+
+def test_the_outline_of_a_rectangle_is_four_lines():
+    inside = np.zeros((5, 6), dtype=bool)
+    inside[1:3, 2:5] = True
+    edges = outline(inside)
+    assert len(edges) == 4
+    lengths = sorted(np.linalg.norm(edges[:, 0] - edges[:, 1], axis=1))
+    assert lengths == [2.0, 2.0, 3.0, 3.0]
+    np.testing.assert_array_equal(edges.min(axis=(0, 1)), [0.5, 1.5])
+    np.testing.assert_array_equal(edges.max(axis=(0, 1)), [2.5, 4.5])
+
+
+def test_the_outline_reaches_the_border_of_the_picture():
+    assert len(outline(np.ones((2, 2), dtype=bool))) == 4
+
+
+def test_lines_with_missing_points_are_left_out():
+    lines = np.array([[[0, 0], [1, 2.5]], [[np.nan, 0], [1, 1]]])
+    assert path_data(lines) == "M0.00 0.00L1.00 2.50"
+
+
+def test_pictures_come_back_as_they_were():
+    pixels = np.arange(2 * 3 * 4, dtype=np.uint8).reshape(2, 3, 4)
+    encoded = png_address(pixels).removeprefix("data:image/png;base64,")
+    read = np.asarray(Image.open(io.BytesIO(base64.b64decode(encoded))))
+    np.testing.assert_array_equal(read, pixels)

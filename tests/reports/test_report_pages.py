@@ -1,0 +1,250 @@
+"""What pages say, of a hemisphere of each kind; how they look is tested in a browser."""
+
+import json
+import re
+import shutil
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from hipsta_bids import cli, reporting
+from hipsta_bids.bids.names import DATASET_FILES
+from hipsta_bids.reports import participant as participant_module
+from hipsta_bids.reports.cohort import read_cohort
+from hipsta_bids.reports.cohort_page import cohort_page
+from hipsta_bids.reports.page import Section
+from hipsta_bids.reports.participant import participant_page
+
+EVIL = "<script>document.title='owned'</script>\"'&"
+
+
+class Outline(HTMLParser):
+    """Collects what tests ask of a page."""
+
+    VOID = frozenset({"meta", "link", "img", "input", "br", "path", "circle", "image"})
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.ids, self.addresses, self.headings, self.open = [], [], [], [], []
+        self.unlabeled = []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag, attributes):
+        given = dict(attributes)
+        self.tags.append(tag)
+        self.ids += [given["id"]] if "id" in given else []
+        self.addresses += [v for k, v in attributes if k in {"src", "href", "data", "action"}]
+        if re.fullmatch("h[1-6]", tag):
+            self.headings.append(int(tag[1]))
+        missing = {"img": "alt", "svg": "aria-label", "canvas": "aria-label"}.get(tag)
+        if missing and not given.get(missing):
+            self.unlabeled.append(tag)
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        if tag not in self.VOID:
+            assert self.open.pop() == tag
+
+
+@pytest.fixture(params=["sub-01.html", "sub-02.html", "report.html"])
+def page(out, request):
+    """Text of each page."""
+    return (out / request.param).read_text(encoding="utf-8")
+
+
+def test_a_page_is_whole_small_and_asks_for_nothing_outside(page):
+    outline = Outline(page)
+    assert outline.open == []
+    assert len(page) < 5_000_000
+    local = re.compile(r"data:|#|sub-\w+\.html|report\.html")
+    assert [a for a in outline.addresses if not local.match(a)] == []
+    assert "default-src 'none'" in page
+    assert not re.search(r"url\((?!data:)|@import|fetch\(|XMLHttpRequest|import\(", page)
+
+
+def test_a_page_is_made_for_all_readers(page):
+    outline = Outline(page)
+    assert outline.unlabeled == []
+    assert outline.headings[0] == 1
+    assert max(np.diff(outline.headings)) <= 1  # no level is left out
+    assert len(outline.ids) == len(set(outline.ids))
+    assert '<html lang="en">' in page
+
+
+def test_statuses_are_said_with_what_to_do(out):
+    first, second = ((out / f"sub-0{n}.html").read_text() for n in (1, 2))
+    assert "Nothing stood out" in first
+    assert "Measured after repair" in first
+    assert "Look before use" in second
+    assert "Not measured" in second
+    assert "the body is interrupted at RAS" in second
+    assert "fill in missing slices" in second
+    assert "sub-02_hemi-R_seg-freesurfer_desc-edited_mask.nii.gz" in second
+
+
+def scenes(text):
+    """What the three-dimensional view is given."""
+    found = re.search(r'<div class="viewer".*?application/json">(.*?)</script>', text, re.DOTALL)
+    return json.loads(found[1])["scenes"]
+
+
+def test_a_failed_hemisphere_has_its_body_and_the_defect_in_three_dimensions(out):
+    left, right = scenes((out / "sub-02.html").read_text())
+    assert "surfaces" in left
+    assert "surfaces" not in right
+    vertices = np.array(right["body"]["vertices"]).reshape(-1, 3)
+    assert max(right["body"]["triangles"]) == len(vertices) - 1
+    defect = np.array(right["findings"][0]["point"])
+    # The place of the gap is on the body's end, within a step of the thinned mask.
+    assert np.linalg.norm(vertices - defect, axis=1).min() < 2
+
+
+def test_numbers_are_those_of_the_tables(out):
+    summary = (out / "sub-01/anat").glob("*hemi-L*desc-summary_morph.tsv")
+    names, values = next(summary).read_text().splitlines()
+    row = dict(zip(names.split("\t"), values.split("\t"), strict=True))
+    text = (out / "sub-01.html").read_text()
+    assert f'<td class="n">{float(row["thickness_mean"]):.2f}</td>' in text
+    assert f'<td class="n">{float(row["volume"]):.0f}</td>' in text
+
+
+def test_the_command_and_the_settings_are_named(dataset):
+    text = (dataset / "out" / "sub-01.html").read_text()
+    assert "hipsta-bids" in text
+    assert "participant --n-procs 1</code>" in text
+    digest = json.loads((dataset / "out/desc-settings.json").read_text())["hash"]
+    assert digest in text
+
+
+def cohort_data(text):
+    return json.loads(re.search(r'id="data">(.*?)</script>', text, re.DOTALL)[1])
+
+
+def test_the_table_has_every_hemisphere(out):
+    data = cohort_data((out / "report.html").read_text())
+    assert [(r["participant"], r["hemi"], r["status"]) for r in data["rows"]] == [
+        ("sub-01", "L", "ok"),
+        ("sub-01", "R", "repaired"),
+        ("sub-02", "L", "flagged"),
+        ("sub-02", "R", "failed"),
+    ]
+    assert [r["tile"] for r in data["rows"]] == [0, 1, 2, None]
+    assert all((out / row["page"]).exists() for row in data["rows"])
+
+
+def test_the_same_files_give_the_same_pages(out):
+    cohort = read_cohort(out)
+    assert participant_page(out, "01", None, cohort) == (out / "sub-01.html").read_text()
+    assert cohort_page(cohort) == (out / "report.html").read_text()
+
+
+@pytest.fixture
+def copy(out, tmp_path):
+    """A copy to do harm to."""
+    return shutil.copytree(out, tmp_path / "copy")
+
+
+def spoil(path, change):
+    record = json.loads(path.read_text())
+    change(record)
+    path.write_text(json.dumps(record))
+
+
+def test_tags_in_any_text_of_the_results_stay_text(copy):
+    evil = {
+        "message": EVIL,
+        "reason": EVIL,
+        "scheme_title": EVIL,
+        "chosen_because": EVIL,
+        "notes": [EVIL],
+        "flags": [{"reason": EVIL, "message": f"{EVIL} at RAS -20 -20 -20 mm"}],
+        "inputs": [{"file": f"bids:x:{EVIL}"}],
+        "passed_over": [{"file": EVIL, "reason": EVIL}],
+        "status": "flagged",
+    }
+    for path in (copy / "sub-01/anat").glob("*_metrics.json"):
+        spoil(path, lambda record: record.update(evil))
+    sheet = next((copy / "sub-01/anat").glob("*hemi-L*desc-sheet_morph.tsv"))
+    sheet.write_text(sheet.read_text().replace("CA1", EVIL).replace("gaussian", EVIL))
+    cohort = read_cohort(copy)
+    for text in (participant_page(copy, "01", None, cohort), cohort_page(cohort)):
+        assert text.count("owned") > 0
+        assert "<script>document" not in text
+        Outline(text)
+
+
+def test_labels_that_are_gone_cost_the_labels_only(copy):
+    gone = dict.fromkeys(("bids", "freesurfer"), "file:///gone")
+    spoil(copy / DATASET_FILES["description"], lambda d: d.update(DatasetLinks=gone))
+    text = participant_page(copy, "01", None, read_cohort(copy))
+    assert "is not there any more" in text
+    assert 'class="line mask"' in text
+
+
+def test_a_section_that_fails_costs_itself_only(out, monkeypatch, caplog):
+    def fail(_series):
+        raise ZeroDivisionError("by zero")
+
+    broken = Section(key="x", title="Broken", template="sections/status.html", build=fail)
+    monkeypatch.setattr(participant_module, "SECTIONS", (broken, *participant_module.SECTIONS))
+    text = participant_page(out, "01", None, read_cohort(out))
+    assert "ZeroDivisionError: by zero" in text
+    assert "Nothing stood out" in text
+    assert "section x" in caplog.text
+
+
+def test_reports_only_makes_the_pages_anew(copy, capsys):
+    for path in copy.glob("*.html"):
+        path.unlink()
+    options = ["--reports-only", "--participant-label", "02", "--n-procs", "1"]
+    assert cli.main(["gone", str(copy), "participant", *options]) == 0
+    assert sorted(path.name for path in copy.glob("*.html")) == ["report.html", "sub-02.html"]
+    assert "reports of 1 visits" in capsys.readouterr().out
+
+
+def test_reports_only_of_nothing_says_so(tmp_path, capsys):
+    assert cli.main(["in", str(tmp_path), "participant", "--reports-only"]) == 66
+    assert "no results of these participants" in capsys.readouterr().err
+
+
+def test_a_page_that_cannot_be_made_is_a_warning(copy, monkeypatch):
+    monkeypatch.setattr("hipsta_bids.reports.participant.participant_page", lambda *_: 1 / 0)
+    job = reporting.PageJob(root=copy, visit=("01", None))
+    problem = reporting.make_page(job)
+    assert problem.message == "sub-01.html: not made (ZeroDivisionError: division by zero)"
+
+
+def run_block(root, problems, error=None):
+    plan = reporting.PagePlan(root=root, n_workers=1, log=root / "log")
+    with reporting.reports_after(plan, [("01", None)], problems):
+        if error:
+            raise error
+
+
+def test_pages_are_made_after_an_error_but_not_when_the_user_stops_the_run(tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr(reporting, "write_reports", lambda _plan, visits: made.append(visits) or [])
+    run_block(tmp_path, [])
+    with pytest.raises(ValueError, match="x"):
+        run_block(tmp_path, [], ValueError("x"))
+    assert len(made) == 2
+    with pytest.raises(KeyboardInterrupt):
+        run_block(tmp_path, [], KeyboardInterrupt())
+    assert len(made) == 2
+
+
+def test_an_error_in_reporting_is_a_line(tmp_path, monkeypatch):
+    monkeypatch.setattr(reporting, "write_reports", lambda *_: 1 / 0)
+    problems = []
+    run_block(tmp_path, problems)
+    assert problems == ["not made (ZeroDivisionError: division by zero)"]
+
+
+def test_pages_up_to_date_are_left_alone(out, monkeypatch):
+    monkeypatch.setattr(reporting, "write_reports", lambda *_: 1 / 0)
+    problems = []
+    run_block(out, problems)
+    assert problems == []
