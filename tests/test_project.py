@@ -80,7 +80,12 @@ def test_lock_has_a_hash_for_every_package_and_no_address(lock):
 
 
 def test_every_import_is_a_declared_dependency():
-    distributions = {"bids": "pybids", "skimage": "scikit-image", "sklearn": "scikit-learn"}
+    distributions = {
+        "PIL": "pillow",
+        "bids": "pybids",
+        "skimage": "scikit-image",
+        "sklearn": "scikit-learn",
+    }
     extras = PROJECT["optional-dependencies"]["figures"]
     declared = {canonical(requirement) for requirement in [*PROJECT["dependencies"], *extras]}
     trees = (
