@@ -38,6 +38,7 @@ from hipsta_bids.geometry.measured import Measured, average_profiles
 from hipsta_bids.geometry.measures import bending_angle
 from hipsta_bids.geometry.quality import Evidence, find_flags, quality_metrics
 from hipsta_bids.geometry.repaired import repaired_columns
+from hipsta_bids.geometry.sections import check_ridges
 from hipsta_bids.geometry.sheet import (
     check_turned,
     folded_fraction,
@@ -135,6 +136,7 @@ def measure_hemisphere(
         )
         doubts = check_end_labels(volume, body, settings.checks)
         doubts += check_thickness(measured.thickness, boundaries.sheet_thickness, settings.checks)
+        doubts += check_ridges(sheet, measured.thickness, settings.checks)
         doubts += check_turned(sheet, hemi) if body.region == "extended" else []
         doubts += _mask_doubts(volume, body, settings)
         repaired = repaired_columns(sheet, solid, settings.measures)

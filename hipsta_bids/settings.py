@@ -42,6 +42,16 @@ class BodySettings:
     """Without end labels: the body ends where a slice shows two pieces above this area, mm2."""
     head_growth: float = 1.35
     """Without end labels: ... or twice running an area above this multiple of the median."""
+    gap_directions: int = 3
+    """A voxel without a label lies in a thin gap if it has the sheet on both sides in so many of
+    13 directions."""
+    slit_area: float = 2.5
+    """Gaps larger than this are filled if they go through the sheet, mm2 ..."""
+    slit_openings: float = 0.2
+    """... so that what is beside them falls into two parts, each of at least this share (in
+    six real bodies: none, and gaps with one opening are up to 4.0 mm2) ..."""
+    slit_voxel: float = 0.8
+    """... and no edge of a voxel is longer than this, mm: between thick slices folds look alike."""
     max_mask_ratio: float = 1.5
     """Flag an edited mask whose voxels are more than this many times those of the labels ..."""
     max_mask_change: float = 0.5
@@ -375,13 +385,20 @@ class CheckSettings:
     real bodies)."""
     row_dip_reach: float = 8.0
     """... within this distance along the axis, mm."""
+    ridge_reach: tuple[float, ...] = (1.0, 2.0, 3.0)
+    """Thickness is compared with that at these distances along the axis on both sides, mm ..."""
+    ridge_columns: int = 9
+    """... as the mean of so many neighboring columns of a row."""
+    flag_ridge: tuple[float, ...] = (0.45, 0.75, 0.7)
+    """Flag a band that is thicker than both by more than this, one per distance, mm (0.32, 0.59 and
+    0.53 at most in twelve real bodies) ..."""
+    flag_groove: tuple[float, ...] = (0.55, 0.75, 0.75)
+    """... or thinner (0.39, 0.58 and 0.53)."""
     flag_pinholes: float = 0.01
     """Flag labels in which single voxels without a label are more than this share of the sheet's
     voxels (0.0015 at most in twelve real bodies)."""
-    gap_directions: int = 4
-    """A voxel lies in a gap if it has the sheet on both sides in so many of 13 directions."""
     flag_gap: int = 60
-    """Flag a gap of more voxels than this (38 at most in twelve real bodies, coarse or fine)."""
+    """Flag a gap of more voxels than this (44 at most in twelve real bodies, coarse or fine)."""
     flag_loose_part: float = 0.15
     """Flag a second piece of voxels, connected by faces, above this share of the sheet (0.04 at
     most in twelve real bodies)."""

@@ -1,6 +1,6 @@
 """From subfield labels to the hippocampal body: one ribbon between two end planes."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -12,6 +12,7 @@ from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.edited import MaskChange, apply_mask
 from hipsta_bids.geometry.ends import EndPlanes, find_end_planes
 from hipsta_bids.geometry.neighbors import check_reach, join_cortex
+from hipsta_bids.geometry.slits import fill_slits
 from hipsta_bids.schemes import Tissue, lateral_rank
 from hipsta_bids.settings import BodySettings
 
@@ -34,6 +35,10 @@ class Body:
     """Voxels of the molecular layer that went to a sheet subfield."""
     inside: Bool
     """(I, J, K) sheet voxels between the end planes."""
+    filled: NDArray[np.intp] = field(default_factory=lambda: np.zeros((0, 3), np.intp))
+    """(N, 3) indices of voxels in slits through the sheet that were filled."""
+    gap: NDArray[np.intp] = field(default_factory=lambda: np.zeros((0, 3), np.intp))
+    """(N, 3) indices of the largest thin gap in the labels that was not filled."""
     mask_change: MaskChange | None = None
     """What an edited mask changed; None if there is none."""
 
@@ -111,8 +116,11 @@ def extract_body(volume: LabelVolume, settings: BodySettings) -> Body:
         )
     if region != "body":
         check_reach(points, tissue[inside], ends, settings)
+    slits = fill_slits(tissue, inside, volume.tissue == Tissue.BACKGROUND, volume.affine, settings)
+    if len(slits.filled):
+        inside, _ = _between(slits.tissue > 0, volume.affine, ends)
     return Body(
-        tissue=tissue,
+        tissue=slits.tissue,
         hippocampal=hippocampal,
         region=region,
         interior=np.isin(volume.tissue, volume.scheme.interior),
@@ -120,6 +128,8 @@ def extract_body(volume: LabelVolume, settings: BodySettings) -> Body:
         ends=ends,
         layer_voxels=layer_voxels,
         inside=inside,
+        filled=slits.filled,
+        gap=slits.gap,
         mask_change=change,
     )
 

@@ -91,7 +91,10 @@ def find_boundaries(
     ]
     if not distance <= settings.max_distance:
         attempts.reverse()
-    rule, pair, strips, sides = _separating(wall, mesh, attempts, thickness, settings)
+    found = _separating(wall, mesh, attempts, thickness, settings)
+    if found is None:
+        raise _inseparable(rims)
+    rule, pair, strips, sides = found
     if _rank(pair[0], body) > _rank(pair[1], body):
         pair, strips = (pair[1], pair[0]), (strips[1], strips[0])
     sides, side_rule, margin = _interior_first(sides, wall, body, settings)
@@ -124,8 +127,8 @@ def _separating(
     attempts: list[tuple[str, tuple[Float, Float] | None]],
     thickness: float,
     settings: BoundarySettings,
-) -> tuple[str, tuple[Float, Float], tuple[Bool, Bool], tuple[Bool, Bool]]:
-    """Take the first pair of curves whose strips separate the wall into two sides."""
+) -> tuple[str, tuple[Float, Float], tuple[Bool, Bool], tuple[Bool, Bool]] | None:
+    """Take the first pair of curves whose strips separate the wall into two sides, if any."""
     for rule, pair in attempts:
         if pair is None:
             continue
@@ -135,9 +138,18 @@ def _separating(
             sides = wall.sides(strips[0] | strips[1])
             if sides is not None and not (strips[0] & strips[1]).any():
                 return rule, middle, strips, sides
-    raise GeometryError(
+    return None
+
+
+def _inseparable(rims: tuple[Float, Float]) -> GeometryError:
+    """Say where the rims come closest to each other."""
+    gap, nearest = (np.asarray(found) for found in cKDTree(rims[1]).query(rims[0]))
+    closest = int(gap.argmin())
+    place = " ".join(f"{v:.1f}" for v in (rims[0][closest] + rims[1][nearest[closest]]) / 2)
+    return GeometryError(
         "the medial and lateral boundary do not separate the interior from the exterior side: "
-        "check the labels for folds that touch each other",
+        f"check the labels for folds that touch each other, first near RAS {place} mm, where the "
+        f"two rims are only {gap[closest]:.1f} mm apart",
         reason="boundaries",
     )
 

@@ -84,6 +84,8 @@ class Field:
     """(A, B, W), -0.5 far outside and 0.5 deep inside; a little beyond near the wall."""
     parted: Bool | None = None
     """(A, B, W) nodes of the body that were taken out between turns that touch, if any."""
+    slits: Bool | None = None
+    """(A, B, W) nodes in slits of the labels that were filled, if any."""
 
 
 def resample_body(body: Body, settings: GridSettings, slices: SliceSettings) -> Field:
@@ -118,7 +120,21 @@ def resample_body(body: Body, settings: GridSettings, slices: SliceSettings) -> 
         values[between] = 0
     sigma = max(settings.smoothing * in_plane_voxel(body.affine), settings.min_smoothing)
     smooth = _smooth(values.reshape(grid.shape), sigma / settings.spacing)
-    return Field(grid=grid, values=smooth - np.float32(0.5), parted=parted)
+    return Field(
+        grid=grid,
+        values=smooth - np.float32(0.5),
+        parted=parted,
+        slits=_filled_nodes(body, points).reshape(grid.shape) if len(body.filled) else None,
+    )
+
+
+def _filled_nodes(body: Body, points: Float) -> Bool:
+    """Which of (N, 3) points, RAS mm, lie in voxels that were filled."""
+    filled = np.zeros(body.inside.shape, dtype=np.uint8)
+    filled[tuple(body.filled.T)] = 1
+    inverse = np.linalg.inv(body.affine)
+    voxels = points @ inverse[:3, :3].T + inverse[:3, 3]
+    return np.asarray(ndimage.map_coordinates(filled, voxels.T, order=0) > 0)
 
 
 def _sample_mask(body: Body, points: Float) -> NDArray[np.float32]:

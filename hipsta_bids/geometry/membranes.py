@@ -16,7 +16,7 @@ from hipsta_bids.artifacts import Bool
 from hipsta_bids.geometry.simple_points import euler_number, grow, shrink
 from hipsta_bids.settings import TopologySettings
 
-Kind = Literal["part", "cut", "fill", "island", "cavity"]
+Kind = Literal["part", "slit", "cut", "fill", "island", "cavity"]
 Contact = Callable[[NDArray[np.intp]], bool]
 FACES = ndimage.generate_binary_structure(3, 1)
 ALL = np.ones((3, 3, 3), dtype=bool)
@@ -81,7 +81,6 @@ def apply_membranes(
         if not (plates and _in_plates(where, solid))
     ]
     candidates = _priced(found, solid, values, settings, contact)
-    candidates.sort(key=lambda c: c[0])
     edits: list[Edit] = []
     for cost, edit in candidates:
         kind, where = edit.kind, edit.where
@@ -117,10 +116,13 @@ def _priced(
 ) -> list[tuple[float, Edit]]:
     """Price per tunnel of the membranes that deal with one.
 
-    A cut that leads from a hole to an end plane deals with none once the ends are closed.
+    A cut from a hole to an end plane deals with none once the ends are closed; one through a
+    strand along that plane does not either, but closing the ends opens its tunnel. So of such
+    cuts as many are taken at their price as there are tunnels more without closed ends.
     """
     closed = with_plates(solid, True)
-    open_hole = euler_number(closed) != 1
+    open_tunnels = euler_number(closed) - euler_number(solid)
+    any_hole = euler_number(closed) != 1
     candidates = []
     for kind, where, *_ in found:
         gain = _gain(solid, where, kind)
@@ -130,11 +132,20 @@ def _priced(
         factor = _implausibility(kind, where, solid, settings)
         if kind == "cut" and factor > 1 and contact(where):
             factor = 1.0
-        if kind == "cut" and open_hole and _gain(closed, where, kind) <= 0:
-            factor *= settings.across_factor
+        at_end = kind == "cut" and any_hole and _gain(closed, where, kind) <= 0
         doubtful = factor > 1 and (kind == "cut" or cost > settings.doubtful_fill_cost)
-        candidates.append((factor * cost / gain, Edit(kind, where, cost, doubtful)))
-    return candidates
+        candidates.append((factor * cost / gain, Edit(kind, where, cost, doubtful), at_end))
+    candidates.sort(key=lambda c: c[0])
+    priced = []
+    for price, edit, at_end in candidates:
+        wrong = at_end and open_tunnels <= 0
+        open_tunnels -= at_end
+        priced.append(
+            (price * settings.across_factor, edit._replace(doubtful=True))
+            if wrong
+            else (price, edit)
+        )
+    return sorted(priced, key=lambda c: c[0])
 
 
 def _ranked(values: NDArray[np.float32], settings: TopologySettings) -> NDArray[np.float32]:

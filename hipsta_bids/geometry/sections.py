@@ -1,5 +1,7 @@
 """Cross-sections and rows of the sheet that do not go with their neighbors."""
 
+from collections.abc import Iterator
+
 import numpy as np
 from scipy import ndimage
 
@@ -136,12 +138,70 @@ def check_rows(sheet: Sheet, settings: CheckSettings) -> list[Flag]:
     return found
 
 
+def check_ridges(sheet: Sheet, thickness: Float, settings: CheckSettings) -> list[Flag]:
+    """Flag a band across the axis where the sheet is thicker, or thinner, than on both sides.
+
+    Labels that leaked, or that a bar or a dent has changed, show in few cross-sections; thickness
+    of a whole sheet changes more slowly along the axis.
+
+    Parameters
+    ----------
+    sheet : Sheet
+    thickness : (Nx, Ny) array
+        mm
+    settings : CheckSettings
+
+    Returns
+    -------
+    list of Flag
+        ``thickness-ridge``, ``thickness-groove``.
+    """
+    middle = sheet.points[:, :, sheet.middle]
+    flags = []
+    for reason, sign, limits, what in (
+        ("thickness-ridge", 1, settings.flag_ridge, "thicker"),
+        ("thickness-groove", -1, settings.flag_groove, "thinner"),
+    ):
+        bands = _bands(sign * thickness, limits, _row_step(middle), settings)
+        excess, size, at = max(bands, default=(0.0, 0.0, (0, 0)))
+        if excess > 1:
+            place = " ".join(f"{value:.1f}" for value in middle[at])
+            flags.append(
+                Flag(
+                    reason=reason,
+                    message=f"a band of the sheet is {size:.1f} mm {what} than the sheet before "
+                    f"and behind it, near RAS {place} mm: look at the labels there",
+                )
+            )
+    return flags
+
+
+def _bands(
+    thickness: Float, limits: tuple[float, ...], step: float, settings: CheckSettings
+) -> Iterator[tuple[float, float, tuple[int, int]]]:
+    """Thickest band at each distance: times the limit, mm above both sides, and column."""
+    for reach, limit in zip(settings.ridge_reach, limits, strict=True):
+        k = max(round(reach / step), 1)
+        if 2 * k >= thickness.shape[1]:
+            continue
+        sides = np.maximum(thickness[:, : -2 * k], thickness[:, 2 * k :])
+        above = np.nan_to_num(thickness[:, k:-k] - sides)
+        band = ndimage.uniform_filter1d(above, settings.ridge_columns, axis=0)
+        at = np.unravel_index(band.argmax(), band.shape)
+        size = float(band[at])
+        yield size / limit, size, (int(at[0]), int(at[1]) + k)
+
+
+def _row_step(middle: Float) -> float:
+    """Distance of neighboring rows of the mid-surface (Nx, Ny, 3), mm."""
+    return float(np.nanmedian(np.linalg.norm(np.diff(middle, axis=1), axis=-1)))
+
+
 def _wider(lengths: Float, middle: Float, reach: float) -> Float:
     """Width (Ny,) that rows within a distance (mm) reach on both sides of each row."""
-    step = float(np.nanmedian(np.linalg.norm(np.diff(middle, axis=1), axis=-1)))
     rows = np.arange(len(lengths))
     offset = rows[None, :] - rows[:, None]
-    near = np.abs(offset) <= max(round(reach / step), 1)
+    near = np.abs(offset) <= max(round(reach / _row_step(middle)), 1)
     before = np.where(near & (offset <= 0), lengths, -np.inf).max(axis=1)
     after = np.where(near & (offset >= 0), lengths, -np.inf).max(axis=1)
     return np.asarray(np.minimum(before, after))

@@ -68,6 +68,20 @@ def triangle_areas(vertices: Float, triangles: Int) -> Float:
     return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
 
 
+def sharpest_fold(surface: Surface) -> Float:
+    """Middle (3,), RAS mm, of the edge at which two triangles enclose the smallest angle."""
+    triangles = surface.triangles
+    a, b, c = (surface.vertices[triangles[:, k]] for k in range(3))
+    normals = np.cross(b - a, c - a)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    # On a closed surface each edge stands twice: next to each other once they are in order.
+    order = np.lexsort(edges.T).reshape(-1, 2)
+    first, second = (order // 3).T
+    sharpest = order[np.argmin(np.einsum("ij,ij->i", normals[first], normals[second])), 0]
+    return np.asarray(surface.vertices[edges[sharpest]].mean(axis=0))
+
+
 def lateral_triangles(surface: Surface) -> Bool:
     """(F,) whether a triangle belongs to the wall, not to a cap."""
     caps = [

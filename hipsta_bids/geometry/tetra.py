@@ -4,7 +4,7 @@ import numpy as np
 
 from hipsta_bids.artifacts import Float, Int, Surface, TetMesh
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry.surface import signed_volume
+from hipsta_bids.geometry.surface import sharpest_fold, signed_volume
 from hipsta_bids.geometry.tetgen_worker import TetgenClient
 from hipsta_bids.settings import TetraSettings
 
@@ -43,10 +43,8 @@ def tetrahedralize(surface: Surface, settings: TetraSettings) -> TetMesh:
     }
     result = _CLIENT.mesh(surface.vertices, surface.triangles, options, settings.timeout)
     if isinstance(result, str):
-        raise GeometryError(
-            f"{result}: the surface may intersect itself; check the labels for touching parts",
-            reason="tetrahedralization",
-        )
+        remedy = _where_to_look(surface) if "intersect" in result else "check the labels"
+        raise GeometryError(f"{result}: {remedy}", reason="tetrahedralization")
     vertices, cells = result
     cells = cells.astype(np.int32)
     if not np.array_equal(vertices[: len(surface.vertices)], surface.vertices):
@@ -55,12 +53,20 @@ def tetrahedralize(surface: Surface, settings: TetraSettings) -> TetMesh:
     enclosed = signed_volume(surface.vertices, surface.triangles)
     if not np.isclose(np.abs(volume).sum(), enclosed, rtol=1e-6):  # rounding of 1e5 elements
         raise GeometryError(
-            f"the tetrahedra fill {np.abs(volume).sum():.1f} of {enclosed:.1f} mm3: the surface "
-            "intersects itself; check the labels for touching parts",
+            f"the tetrahedra fill {np.abs(volume).sum():.1f} of {enclosed:.1f} mm3: "
+            f"{_where_to_look(surface)}",
             reason="tetrahedralization",
         )
     cells[volume < 0] = cells[volume < 0][:, [0, 2, 1, 3]]
     return TetMesh(vertices=vertices, tetrahedra=cells[volume != 0])
+
+
+def _where_to_look(surface: Surface) -> str:
+    place = " ".join(f"{value:.1f}" for value in sharpest_fold(surface))
+    return (
+        "the surface intersects itself; check the labels for touching parts, first near "
+        f"RAS {place} mm, where it is most sharply folded"
+    )
 
 
 def tetra_volumes(vertices: Float, tetrahedra: Int) -> Float:

@@ -37,8 +37,8 @@ class Repair:
     """One change of the body's shape."""
 
     kind: Kind
-    """``part`` turns that touch, ``cut`` a bridge, ``fill`` a hole, remove an ``island``, fill a
-    ``cavity``."""
+    """``part`` turns that touch, fill a ``slit`` of the labels, ``cut`` a bridge, ``fill`` a hole,
+    remove an ``island``, fill a ``cavity``."""
     voxels: int
     """Changed nodes of the working grid."""
     cost: float
@@ -54,6 +54,7 @@ class Repair:
     def __str__(self) -> str:
         what = {
             "part": "parted two turns that touch, by a slit",
+            "slit": "filled a slit",
             "cut": "cut a bridge",
             "fill": "filled a hole",
             "island": "removed a separate piece",
@@ -125,7 +126,7 @@ def repair_topology(
     def touching(where: NDArray[np.intp]) -> bool:
         return contact is not None and contact(field.grid.to_ras((where - CORNER).astype(float)))
 
-    edits = _parted(field)
+    edits = _before_smoothing(field)
     edits += _remove_islands(state, field, locate) + _fill_cavities(state)
     for _ in range(settings.rounds):
         wrong = [plates for plates in (False, True) if euler(state, plates=plates) != 1]
@@ -144,22 +145,29 @@ def repair_topology(
         raise _unrepaired(edits, state, field, locate)
     after = state[INNER]
     size = int(np.count_nonzero(before))
+    changed = after != before
+    if field.slits is not None:
+        changed |= field.slits
     repairs = tuple(_describe(edit, field, size, settings, locate) for edit in edits)
     return SolidField(
         field=Field(grid=field.grid, values=consistent_values(lifted[INNER], after)),
         repairs=repairs,
-        touched=after != before if field.parted is None else (after != before) | field.parted,
+        touched=changed if field.parted is None else changed | field.parted,
         euler_before=euler_before,
         euler_after=euler(state),
-        changed_fraction=float(np.count_nonzero(after != before) / size),
+        changed_fraction=float(np.count_nonzero(changed) / size),
     )
 
 
-def _parted(field: Field) -> list[Edit]:
-    """List what was taken out between turns that touch, before smoothing."""
-    if field.parted is None or not field.parted.any():
-        return []
-    return [Edit("part", np.argwhere(field.parted) + CORNER)]
+def _before_smoothing(field: Field) -> list[Edit]:
+    """List what was taken out between turns that touch, and what was filled."""
+    edits = []
+    if field.parted is not None and field.parted.any():
+        edits.append(Edit("part", np.argwhere(field.parted) + CORNER))
+    if field.slits is not None:
+        pieces, count = ndimage.label(field.slits, structure=ALL)
+        edits += [Edit("slit", np.argwhere(pieces == n + 1) + CORNER) for n in range(count)]
+    return edits
 
 
 def _through_pieces(state: Bool) -> tuple[NDArray[Any], int, NDArray[Any]]:
@@ -287,5 +295,18 @@ def _describe(
         cost=cost,
         position=(float(centre[0]), float(centre[1]), float(centre[2])),
         subfield=locate(centre[None]) if locate else "",
-        large=bool(edit.doubtful or cost > limit or len(where) > share * size),
+        large=bool(
+            edit.doubtful
+            or cost > limit
+            or len(where) > share * size
+            or (kind == "fill" and _beside_part(inside, field))
+        ),
     )
+
+
+def _beside_part(nodes: NDArray[np.intp], field: Field) -> bool:
+    """Whether a hole lies next to a slit between turns: it went through a wall, not between two."""
+    if field.parted is None:
+        return False
+    near = ndimage.binary_dilation(field.parted, structure=ALL, iterations=2)
+    return bool(near[tuple(nodes.T)].any())

@@ -5,11 +5,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from geometry_cases import resampled, short_phantom
+from sheet_cases import plates
 
 from hipsta_bids.artifacts import Sheet
 from hipsta_bids.geometry.body import Body, extract_body
 from hipsta_bids.geometry.grid import Field
-from hipsta_bids.geometry.sections import check_cross_sections, check_rows
+from hipsta_bids.geometry.sections import check_cross_sections, check_ridges, check_rows
 from hipsta_bids.phantom import Phantom
 from hipsta_bids.schemes import load_scheme
 from hipsta_bids.settings import BodySettings, CheckSettings
@@ -137,3 +138,43 @@ def test_rows_that_jump_or_dip(widths, wanted):
 def test_dips_are_sought_within_a_reach():
     widths = 20 - 4 * np.exp(-(((np.arange(21) - 10) / 3.0) ** 2))
     assert check_rows(rows(widths), replace(CHECKS, row_dip_reach=2.0)) == []
+
+
+def banded(size, rows=slice(10, 11), columns=slice(10, 30)):
+    """Thickness of 41 x 21 columns, 8 mm long, with a band that departs by so many mm."""
+    thickness = np.full((41, 21), 1.7)
+    thickness[columns, rows] += size
+    return thickness
+
+
+@pytest.mark.parametrize(("size", "wanted"), [(1.0, "thickness-ridge"), (-1.0, "thickness-groove")])
+@pytest.mark.parametrize("rows", [slice(10, 11), slice(9, 13)])
+def test_a_band_across_the_axis_is_flagged_where_it_is(size, wanted, rows):
+    sheet = plates(thickness=1.7)
+    (flag,) = check_ridges(sheet, banded(size, rows), CHECKS)
+    assert flag.reason == wanted
+    assert f"{abs(size):.1f} mm" in flag.message
+    middle = sheet.points[20, rows, sheet.middle].mean(axis=0)
+    # Within the band: half of its 5.7 x 1.6 mm.
+    assert (np.abs(place_of(flag) - middle) <= [2.9, 0.9, 0.05]).all()
+
+
+@pytest.mark.parametrize(
+    "thickness",
+    [
+        banded(0.3),  # as rough as real bodies are
+        banded(1.0, columns=slice(10, 13)),  # too narrow
+        banded(1.0, rows=slice(0, 5)),  # goes on at the end: no band
+        banded(1.0, columns=slice(None), rows=slice(10, 21)),  # a step
+        np.broadcast_to(np.linspace(1.0, 3.0, 21), (41, 21)),
+        np.broadcast_to(np.linspace(1.0, 3.0, 41)[:, None], (41, 21)),
+    ],
+)
+def test_what_is_no_band_is_not_flagged(thickness):
+    assert check_ridges(plates(thickness=1.7), thickness, CHECKS) == []
+
+
+def test_missing_columns_make_no_band():
+    thickness = banded(0.0)
+    thickness[10:30, 10] = np.nan
+    assert check_ridges(plates(thickness=1.7), thickness, CHECKS) == []

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from geometry_cases import field_of, ribbon_mask
+from geometry_cases import field_of, ribbon_mask, straight_grid
 from scipy import ndimage
 
 from hipsta_bids.errors import GeometryError
@@ -176,6 +176,25 @@ def test_a_bridge_in_an_end_plane_is_cut():
         assert ndimage.label(~section)[1] == 1
 
 
+@pytest.mark.parametrize("hole", [False, True])
+def test_a_strand_along_an_end_plane_is_cut(hole):
+    """Closing the ends hides the tunnel under it, and nothing else that is wrong may speak for it.
+
+    To fill the tunnel instead would make the wall thick there.
+    """
+    values = np.full((24, 16, 24), -0.5, dtype=np.float32)
+    values[2:22, 4:12] = 0.5
+    values[4:9, 7:9, :5] = -0.2  # a pit
+    values[6, 7:9, 0] = 0.1  # the strand over it
+    if hole:
+        values[15:18, 4:12, 12:15] = -0.1
+    field = Field(grid=straight_grid(values.shape, SPACING), values=values)
+    first, *others = repair_topology(field, TopologySettings()).repairs
+    assert (first.kind, first.voxels) == ("cut", 1)
+    assert first.position[2] == 0
+    assert [repair.kind for repair in others] == (["fill"] if hole else []) + ["cavity"]
+
+
 def test_a_tunnel_that_opens_at_an_end_plane_is_closed():
     """A burrow from the posterior cap, along the wall, out through its side."""
     mask = ribbon_mask(half=4.0)
@@ -310,3 +329,15 @@ def test_parted_turns_are_reported(slab):
     assert (repair.kind, repair.voxels, repair.large) == ("part", 5, False)
     assert str(repair).startswith("parted two turns that touch, by a slit of 5 grid nodes at RAS")
     assert found.touched[parted].all()
+
+
+@pytest.mark.parametrize(("apart", "doubtful"), [(0, True), (6, False)])
+def test_a_hole_beside_a_slit_between_turns_is_doubtful(apart, doubtful):
+    """The slit has then gone through a wall instead of between two."""
+    mask, *_ = with_hole()
+    field = field_of(mask, spacing=SPACING)
+    parted = np.zeros(mask.shape, dtype=bool)
+    parted[6:10, 19:22, 16 + apart] = True
+    found = repair_topology(replace(field, parted=parted), TopologySettings())
+    (fill,) = [repair for repair in found.repairs if repair.kind == "fill"]
+    assert fill.large == doubtful

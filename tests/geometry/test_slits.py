@@ -1,0 +1,123 @@
+"""Slits through the sheet are filled; crevices between folds are not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from geometry_cases import resampled
+
+from hipsta_bids.geometry.body import extract_body
+from hipsta_bids.geometry.slits import fill_slits
+from hipsta_bids.geometry.topology import repair_topology
+from hipsta_bids.phantom.defects import make_defect
+from hipsta_bids.phantom.site import Site
+from hipsta_bids.schemes import Tissue
+from hipsta_bids.settings import BodySettings, TopologySettings
+
+BODY = BodySettings()
+VOXEL = 0.4
+AFFINE = np.diag([VOXEL, VOXEL, VOXEL, 1.0])
+SHAPE = (30, 16, 40)
+
+
+def plate(two=False):
+    """Tissue of a plate of five voxels, CA1 and CA2/3, or of two with one voxel between."""
+    tissue = np.zeros(SHAPE, dtype=np.uint8)
+    layers = [slice(2, 7), slice(8, 13)] if two else [slice(4, 9)]
+    for layer in layers:
+        tissue[2:28, layer, 2:38] = Tissue.CA1
+        tissue[15:28, layer, 2:38] = Tissue.CA2_3
+    return tissue
+
+
+def slits(tissue, settings=BODY, unlabeled=None):
+    empty = tissue == 0 if unlabeled is None else unlabeled
+    return fill_slits(tissue, tissue > 0, empty, AFFINE, settings)
+
+
+def with_slit(length=12, *, depth=16):
+    """A slit, one voxel wide, through the plate, or as deep as said from one side of it."""
+    tissue = plate()
+    tissue[15, :depth, 14 : 14 + length] = 0
+    return tissue
+
+
+def test_a_sound_plate_is_left_alone():
+    found = slits(plate())
+    assert len(found.filled) == len(found.gap) == 0
+    np.testing.assert_array_equal(found.tissue, plate())
+
+
+def test_a_slit_is_filled_with_the_labels_beside_it():
+    found = slits(with_slit())
+    assert len(found.filled) == 12 * 5
+    np.testing.assert_array_equal(found.tissue > 0, plate() > 0)
+    assert set(np.unique(found.tissue[15, 4:9, 14:26])) <= {Tissue.CA1, Tissue.CA2_3}
+    assert len(found.gap) == 0
+
+
+def test_a_crevice_from_one_side_stays_and_is_told():
+    """As between two folds: it is open on one side only."""
+    tissue = with_slit(depth=8)  # four of five voxels deep
+    found = slits(tissue)
+    assert len(found.filled) == 0
+    np.testing.assert_array_equal(found.tissue, tissue)
+    assert len(found.gap) == 12 * 4
+
+
+def test_two_sheets_side_by_side_stay_apart():
+    tissue = plate(two=True)
+    found = slits(tissue)
+    np.testing.assert_array_equal(found.tissue, tissue)
+
+
+def test_a_small_slit_is_left_to_the_smoothing():
+    area = 4 * 5 * VOXEL**2
+    assert area > BODY.slit_area
+    assert len(slits(with_slit(4)).filled) == 4 * 5
+    assert len(slits(with_slit(4), BodySettings(slit_area=area + 0.1)).filled) == 0
+
+
+def test_between_thick_slices_nothing_is_filled():
+    tissue = with_slit()
+    affine = np.diag([VOXEL, VOXEL, 1.5, 1.0])
+    found = fill_slits(tissue, tissue > 0, tissue == 0, affine, BODY)
+    assert len(found.filled) == 0
+    assert len(found.gap) == 12 * 5
+
+
+def test_slits_with_another_label_are_none():
+    """Such as the fissure: it says that nothing of the sheet is missing there."""
+    tissue = with_slit()
+    labeled = tissue == 0
+    labeled[15, 4:9, 14:26] = False
+    found = slits(tissue, unlabeled=labeled)
+    assert len(found.filled) == len(found.gap) == 0
+
+
+@pytest.mark.parametrize("place", [(0.5, 0.5), (0.15, 0.5)])
+def test_a_slit_in_a_phantom_is_filled(arc, place):
+    damaged = make_defect(Site(arc.volume, arc.sheet), "slit", VOXEL, place).volume
+    body = extract_body(damaged, BODY)
+    lost = arc.body.inside & (damaged.tissue == Tissue.BACKGROUND)
+    assert np.count_nonzero(lost) > 30
+    # All but voxels at the slit's openings, which do not lie between two others.
+    assert np.count_nonzero(lost & ~body.inside) <= 0.25 * np.count_nonzero(lost)
+    # The labels may move the end planes by a hair; elsewhere nothing is added.
+    added = body.inside & ~arc.body.inside
+    assert np.count_nonzero(added) <= 0.001 * np.count_nonzero(body.inside)
+    solid = repair_topology(resampled(body), TopologySettings())
+    assert [repair.kind for repair in solid.repairs] == ["slit"]
+    assert solid.changed_fraction > 0
+    assert solid.touched.any()
+
+
+def test_filled_nodes_are_known_to_the_field(arc):
+    index = np.argwhere(arc.body.inside)
+    height = arc.body.ends.height(arc.body.inside_points()[1], "posterior")
+    index = index[np.abs(height - np.median(height)) < 3][::200]  # mm; nodes at ends lie closer
+    field = resampled(replace(arc.body, filled=index))
+    points = index @ arc.body.affine[:3, :3].T + arc.body.affine[:3, 3]
+    nodes = np.argwhere(field.slits).astype(float)
+    distance = np.linalg.norm(field.grid.to_ras(nodes)[:, None] - points, axis=-1).min(axis=1)
+    assert distance.max() <= 0.5 * np.sqrt(3) * VOXEL + 1e-6  # half the diagonal of a voxel
