@@ -46,6 +46,7 @@ lint: $(STAMP)
 types: $(STAMP)
 	"$(BIN)/python" -m mypy --strict
 	"$(BIN)/python" -m mypy --strict tools/*.py
+	"$(BIN)/python" -m mypy --strict tools/make-descriptors
 	MYPYPATH=benchmarks "$(BIN)/python" -m mypy --strict benchmarks/*.py
 
 layers: $(STAMP)

@@ -52,10 +52,11 @@ def test_group_level_in_place_by_the_descriptor_of_both(folder):
         output_mount="part 1",
         analysis_level="group",
         segmentations=["subjects"],
-        formula="thickness ~ age",
-        name="age",
+        settings="quick.toml",
+        align="none",
+        name="mine",
     )
     assert "Exit code\n0\n" in done.stdout, done.stdout
     assert outputs_found(done) == {"output_dataset"}
-    covariates = folder / "part 1" / "group" / "age" / "covariates.tsv"
+    covariates = folder / "part 1" / "group" / "mine" / "covariates.tsv"
     assert "icv" in covariates.read_text(encoding="utf-8").splitlines()[0].split("\t")
