@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hipsta_bids.group.analysis import Analysis
+from hipsta_bids.group.comparison import BOTH
 from hipsta_bids.group.fitted import FittedMaps
 from hipsta_bids.group.glm import PointTest
 from hipsta_bids.group.multiplicity import MapKey
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_PANEL = (2.5, 3.3)  # inches
+_PANEL = (2.6, 3.4)  # inches
 _SHARED = (2.0, 98.0)  # percentiles that the colors of means span
 _EFFECTS = 99.0  # percentile of sizes that the colors of effects span
 _SMALLEST_P = 1e-10
@@ -46,11 +47,15 @@ def draw_means(cohort: Cohort, analysis: Analysis, measure: str) -> "Figure":
             means[hemi, group] = values.reshape(one.maps.shape)
             counts[hemi, group] = int(own.sum())
     low, high = np.nanpercentile(np.stack(list(means.values())), _SHARED)
+    colors = "viridis"
+    if analysis.comparison.pair or set(sides) == {BOTH}:  # differences, to either side of zero
+        high = max(abs(low), abs(high))
+        low, colors = -high, "PRGn"
     images: list[Any] = []
     for i, (hemi, one) in enumerate(sides.items()):
         for j, group in enumerate(groups):
             axis = axes[i, j]
-            images.append(_sheet(axis, cohort, means[hemi, group], "viridis", (low, high)))
+            images.append(_sheet(axis, cohort, means[hemi, group], colors, (low, high)))
             _borders(axis, cohort, one)
             axis.set_title(
                 f"{group}, {side_name(hemi)} (n = {counts[hemi, group]})", fontsize=TITLE
@@ -84,7 +89,7 @@ def draw_contrasts(cohort: Cohort, analysis: Analysis, measure: str) -> "Figure"
             images.append(_sheet(right, cohort, p, "PuOr_r", (-top, top)))
             for axis, what in ((left, "effect size"), (right, "significance")):
                 _borders(axis, cohort, one)
-                axis.set_title(f"{test.contrast.name}, {side_name(hemi)}\n{what}", fontsize=TITLE)
+                axis.set_title(f"{test.contrast.name}\n{side_name(hemi)}, {what}", fontsize=TITLE)
     kinds = {"t": "Cohen's d", "F": "partial eta squared"}
     label = ", ".join(kinds[kind] for kind in sorted({t.kind for t in tests}, reverse=True))
     _bar(figure, images[1], axes, "-log10 of corrected p,\nwith the sign of the effect")

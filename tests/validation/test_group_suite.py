@@ -24,9 +24,23 @@ def test_registered_must_pass_and_unregistered_must_fail(monkeypatch, unregister
         return unregistered if settings.registration.align == "none" else GOOD
 
     monkeypatch.setattr(group, "run_simulation", simulate)
-    (table,) = group.run(full=False).tables
+    monkeypatch.setattr(group, "_corrections", lambda _cohorts: None)
+    table, _ = group.run(full=False).tables
     assert table.targets == 3
     assert table.missed == missed
+
+
+def test_corrections_keep_the_family_wise_error_and_find_the_effect(monkeypatch):
+    monkeypatch.setattr(group, "PERMUTATIONS", 60)
+    table = group._corrections(12)
+    assert table.targets == 4
+    assert table.missed == 0
+    power = {row[0]: row[4] for row in table.rows}
+    wide, single = (
+        power[f"family-wise error, {how}"] for how in ("cluster enhancement", "largest t")
+    )
+    # The effect is wide and weak, as cluster enhancement likes it.
+    assert wide > single > 0.2
 
 
 def test_group_is_short_for_its_suite():
