@@ -176,6 +176,7 @@ def test_readme_lists_the_files_of_the_dataset():
         "docs/architecture.md",
         "docs/boutiques.md",
         "docs/validation.md",
+        "docs/measures.md",
     ],
 )
 def test_links_lead_somewhere(page):

@@ -1,0 +1,215 @@
+"""Write docs/measures.md: every measure, its figure, and how near it is to the truth.
+
+Run it after a change of a measure, or of the geometry by more than a rounding::
+
+    .venv/bin/python tools/make_measures.py docs
+
+With ``--results OUT_DIR`` it first takes the ranges of sizes in ``tools/real_sizes.json`` anew from
+the results of real hemispheres. A test compares the page with what the code says now.
+"""
+
+import argparse
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import nullcontext
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from measure_example import Example
+from measure_figures import DRAWINGS
+from measure_topics import ERRORS, INTRODUCTION, PUBLISHED, SIZES_TEXT, TOPICS, Topic
+from PIL import Image
+
+from hipsta_bids.geometry.catalog import MAPS, SECTIONS, Column
+from hipsta_bids.geometry.summary import PER_SUBFIELD, SUMMARY
+from hipsta_bids.participant import measure_hemisphere
+from hipsta_bids.phantom import Phantom, PhantomSpec
+from hipsta_bids.schemes import load_scheme
+from hipsta_bids.settings import Settings
+from hipsta_bids.validation.measures import Comparison
+from hipsta_bids.validation.report import markdown, render
+from hipsta_bids.validation.suite import Cell, Picture, Table
+
+#: Where measures are found, and the rows of the catalog that are there.
+TABLES: Mapping[str, Sequence[Column]] = {
+    "sheet": MAPS,
+    "sections": SECTIONS,
+    "summary": SUMMARY,
+    "subfields": PER_SUBFIELD,
+}
+FILES = {
+    "sheet": "`desc-sheet_morph.tsv`, GIFTI",
+    "sections": "`desc-sections_morph.tsv`",
+    "summary": "`desc-summary_morph.tsv`",
+    "subfields": "`desc-summary_morph.tsv`, with the subfield's name",
+}
+
+#: The phantom of the figures, and the others of the table of errors.
+SHOWN = PhantomSpec(kind="spiral", thickness=2.0, variation=0.2, variation_axis="x", bend=0.02)
+OTHERS: Mapping[str, PhantomSpec] = {
+    "slab": PhantomSpec(kind="slab", thickness=2.0),
+    "arc": PhantomSpec(kind="arc", thickness=2.0),
+    "spiral": PhantomSpec(kind="spiral", thickness=2.0),
+    "s-shape": PhantomSpec(kind="s-shape", thickness=2.0),
+    "spiral ±30 %": PhantomSpec(kind="spiral", thickness=2.0, variation=0.3),
+    "arc, bent axis": PhantomSpec(kind="arc", thickness=2.0, bend=-0.03),
+    "spiral 1.2 mm": PhantomSpec(kind="spiral", thickness=1.2),
+    "tight": PhantomSpec(kind="tight", thickness=2.0),
+}
+SUBFIELD = "CA1"
+"""Whose numbers stand for those of all subfields."""
+
+PAGE = "measures.md"
+LARGEST = 60_000
+"""Bytes of a figure."""
+SIZES = Path(__file__).with_name("real_sizes.json")
+
+
+def make_example(spec: PhantomSpec) -> Example:
+    """Draw a left phantom in voxels of 0.4 mm and measure it with default settings."""
+    phantom, scheme = Phantom(spec), load_scheme("freesurfer")
+    volume = phantom.label_volume(scheme)
+    maps = measure_hemisphere(volume, "L", Settings(), lambda _: nullcontext())
+    return Example(phantom=phantom, maps=maps, scheme=scheme)
+
+
+def write(out: Path) -> None:
+    """Write the page and its figures below a folder."""
+    shown = make_example(SHOWN)
+    others = {name: make_example(spec) for name, spec in OTHERS.items()}
+    for topic in TOPICS:
+        (out / image(topic)).write_bytes(_draw(topic, shown))
+    (out / PAGE).write_text(page(shown, others), encoding="utf-8")
+
+
+def page(shown: Example, others: Mapping[str, Example]) -> str:
+    """Write the page in Markdown.
+
+    Parameters
+    ----------
+    shown : Example
+        Of the figures and of the numbers beside them.
+    others : mapping of str to Example
+        Of the table of errors.
+    """
+    parts = [
+        "<!-- Written by `tools/make_measures.py`; do not edit, run it again. -->",
+        "# Measures",
+        INTRODUCTION,
+        *(_section(topic, shown) for topic in TOPICS),
+        "## How near they are",
+        ERRORS,
+        markdown(_errors(others)),
+        "## Sizes of real bodies",
+        _real_sizes(json.loads(SIZES.read_text(encoding="utf-8"))),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def image(topic: Topic) -> str:
+    """Name the file of a topic's figure, below the folder of the page."""
+    return f"images/measures-{topic.figure}.png"
+
+
+def ranges(results: Path) -> dict[str, object]:
+    """Take smallest, median and largest of every size from the summaries of an output dataset."""
+    found = sorted(results.glob("sub-*/**/*_desc-summary_morph.tsv"))
+    table = pd.concat([pd.read_csv(path, sep="\t", na_values="n/a") for path in found])
+    return {
+        "hemispheres": len(found),
+        "sizes": {
+            row.name: [float(f(table[row.name])) for f in (np.min, np.median, np.max)]
+            for row in SUMMARY
+        },
+    }
+
+
+def _section(topic: Topic, shown: Example) -> str:
+    rows = [
+        _row(column, name, shown)
+        for name, names in topic.measures.items()
+        for column in TABLES[name]
+        if column.name in names
+    ]
+    parts = [f"## {topic.title}", topic.text, f"![{topic.title} on a phantom]({image(topic)})"]
+    if rows:
+        headings = ("measure", "where", "unit", "what it is", "measured", "analytic", "source")
+        parts.append(_table(headings, rows))
+    return "\n\n".join(parts)
+
+
+def _row(column: Column, table: str, shown: Example) -> tuple[Cell, ...]:
+    name = f"{column.name}_{SUBFIELD}" if table == "subfields" else column.name
+    found, true = (f"{mean:.{column.digits - 1}f}" for mean in shown.measured[table][name].means)
+    words = column.definition.format("a subfield")
+    return (f"`{column.name}`", FILES[table], column.unit, words, found, true, column.source)
+
+
+def _errors(others: Mapping[str, Example]) -> Table:
+    rows: list[tuple[Cell, ...]] = []
+    for table in TABLES:
+        for name in next(iter(others.values())).measured[table]:
+            measured = [example.measured[table][name] for example in others.values()]
+            rows.append((f"`{name}`", table, *map(_error, measured)))
+    return Table(title="Errors", columns=("measure", "table", *others), rows=tuple(rows))
+
+
+def _error(one: Comparison) -> str:
+    """Spell an error: in percent, or in the unit of curvatures that are about zero."""
+    found, true = one.means
+    if "gaussian" in one.name or abs(true) < 1e-6:  # noqa: PLR2004 -- zero but for rounding
+        return f"{round(found - true, 4) + 0.0:+.4f}"  # no -0
+    return f"{round(100 * (found / true - 1), 1) + 0.0:+.1f} %"
+
+
+def _real_sizes(record: Mapping[str, object]) -> str:
+    sizes = record["sizes"]
+    assert isinstance(sizes, dict)  # noqa: S101 -- our own file
+    rows = [
+        (f"`{row.name}`", row.unit, *(f"{x:.{row.digits - 1}f}" for x in sizes[row.name]))
+        for row in SUMMARY
+        if row.name in sizes
+    ]
+    table = _table(("measure", "unit", "smallest", "median", "largest"), rows)
+    return f"{SIZES_TEXT.format(count=record['hemispheres'])}\n\n{table}\n\n{PUBLISHED}"
+
+
+def _table(headings: tuple[str, ...], rows: Iterable[tuple[Cell, ...]]) -> str:
+    """Write a table in Markdown, without a title."""
+    text = markdown(Table(title="", columns=headings, rows=tuple(rows)))
+    return text.split("\n\n", 1)[1]
+
+
+def _draw(topic: Topic, shown: Example) -> bytes:
+    """Draw a figure as a small PNG, with a palette if it is large otherwise."""
+    drawing = DRAWINGS[topic.figure]
+    picture = Picture(
+        name=topic.figure,
+        caption=topic.text,
+        draw=lambda figure: drawing(figure, shown),
+        size=(7.2, 4.0),
+    )
+    data = render(picture)
+    if len(data) < LARGEST:
+        return data
+    smaller = BytesIO()
+    Image.open(BytesIO(data)).convert("RGB").quantize(255).save(smaller, "png", optimize=True)
+    return smaller.getvalue()
+
+
+def main() -> None:
+    """Run from the command line."""
+    parser = argparse.ArgumentParser(description="write docs/measures.md and its figures")
+    parser.add_argument("out", type=Path, help="folder of the page, such as docs")
+    parser.add_argument("--results", type=Path, help="output dataset of real hemispheres")
+    options = parser.parse_args()
+    if options.results:
+        record = json.dumps(ranges(options.results), indent=1)
+        SIZES.write_text(f"{record}\n", encoding="utf-8")
+    write(options.out)
+
+
+if __name__ == "__main__":
+    main()
