@@ -2,14 +2,16 @@
 
 from dataclasses import replace
 
+import nibabel as nib
 import numpy as np
+import pandas as pd
 import pytest
 from measured_phantoms import Results, measure
 
 from hipsta_bids import cli
 from hipsta_bids.artifacts import EditedMask
 from hipsta_bids.bids import files
-from hipsta_bids.bids.names import HemisphereName
+from hipsta_bids.bids.names import HemisphereName, output_path
 from hipsta_bids.bids.status import read_status
 from hipsta_bids.errors import ExitCode, GeometryError, SchemeError
 from hipsta_bids.parser import REGIONS
@@ -106,6 +108,38 @@ def test_regions_share_a_folder(bids, out, capsys):
     assert {path.name for path in before if before[path] != after[path]} == {
         name for name in files_of_body if "_hemi-L_" in name
     }
+
+
+def test_maps_and_drawn_regions_on_other_regions(bids, tmp_path):
+    labels = nib.load(next(bids.rglob("sub-01_left_*.nii.gz")))
+    index = np.moveaxis(np.indices(labels.shape), 0, -1)
+    field = nib.affines.apply_affine(labels.affine, index) @ [1.5, -2.0, 0.7]
+    for name, data in (("field", field.astype(np.float32)), ("copy", labels.get_fdata())):
+        image = nib.Nifti1Image(data.astype(np.float32), labels.affine)
+        image.set_sform(labels.affine, 1)
+        nib.save(image, tmp_path / f"{name}.nii.gz")
+    (tmp_path / "roi.tsv").write_text("x\ty\tregion\n20\t10\tspot\n21\t10\tspot\n")
+    maps = [f"{name}={tmp_path / name}.nii.gz" for name in ("field", "copy")]
+    options = ["--map-sampling", "field=mid", "--map-interpolation", "copy=nearest", "--map"]
+    options += [*maps, "--roi", str(tmp_path / "roi.tsv")]
+    for region in ("extended", "entorhinal"):
+        assert run(bids, tmp_path / "out", "--hemi", "L", "--region", region, *options) == 0
+        done = found(tmp_path / "out", "L", region)
+        assert done.row["status"] == "ok"
+        sheet = done.sheet
+        values = {
+            name: pd.read_csv(done.out / output_path(done.name, "map_table", name), sep="\t")[name]
+            for name in ("field", "copy")
+        }
+        # Four decimals of each coordinate, seven digits of single precision.
+        wanted = sheet[["r", "a", "s"]] @ [1.5, -2.0, 0.7]
+        np.testing.assert_allclose(values["field"], wanted, atol=1e-3)
+        codes = {label.abbreviation: label.code for label in load_scheme("ashsABC3T").labels}
+        # Points beside the labels' voxels see background; the sheet's subfield is the nearest.
+        assert (values["copy"] == sheet.subfield.map(codes)).mean() > 0.9
+        (row,) = files.read_tsv(done.path("roi"))
+        spot = sheet[sheet.y.eq(10) & sheet.x.isin([20, 21])]
+        assert float(row["thickness_mean"]) == pytest.approx(spot.thickness.mean(), abs=1e-3)
 
 
 @pytest.mark.parametrize(("layout", "seg"), [("ashs", "ashsABC3T"), ("ashsPMC", "ashsPMC")])
