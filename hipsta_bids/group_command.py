@@ -112,6 +112,8 @@ def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOpti
             name=parsed.name,
         ),
         covariates=tuple(parsed.covariates),
+        maps=tuple(parsed.maps),
+        surfaces=tuple(parsed.maps_surface),
         volumes=tuple(parsed.volumes),
         measures=tuple(dict.fromkeys(parsed.measures)),
         template=parsed.template,

@@ -48,6 +48,8 @@ class SideMaps:
     """Abbreviations of subfields."""
     summary: pd.DataFrame
     """One row per sheet: the columns of the participant level's summaries, as numbers."""
+    mesh: Mesh | None = None
+    """Where the points lie if it is not on the grid: x are its vertices then, and y is 1."""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -84,11 +86,11 @@ class SideMaps:
             Which.
         """
         own = keep[self.rows]
-        return SideMaps(
+        return replace(
+            self,
             rows=(np.cumsum(keep) - 1)[self.rows[own]],
             maps={name: values[own] for name, values in self.maps.items()},
             subfield=self.subfield[own],
-            names=self.names,
             summary=self.summary[own].reset_index(drop=True),
         )
 
@@ -116,12 +118,10 @@ class Cohort:
         keep : ndarray of bool, shape (visits,)
             Which.
         """
-        return Cohort(
+        return replace(
+            self,
             table=self.table[keep],
             sides={hemi: side.take(keep) for hemi, side in self.sides.items()},
-            x=self.x,
-            y=self.y,
-            units=self.units,
         )
 
 

@@ -68,6 +68,27 @@ def _add_sheets(parser: Parser) -> None:
         help="folders of FreeSurfer, ASHS or HippUnfold, if they have moved since the participant"
         " level: for the intracranial and other volumes beside the segmentations",
     )
+    add(
+        "--maps",
+        nargs="+",
+        action="extend",
+        default=[],
+        type=named_pattern,
+        metavar="NAME=PATTERN",
+        help="other programs' maps with corresponding points, GIFTI or TSV, with sheets or alone:"
+        " path (also in BIDS_DIR) with {subject}, {session}, {hemi} or {side} (lh, rh), *",
+    )
+    add(
+        "--maps-surface",
+        "--maps_surface",
+        nargs="+",
+        action="extend",
+        default=[],
+        type=_maybe_named,
+        metavar="[NAME=]PATTERN",
+        help="surfaces (.surf.gii) whose vertices these points are (default: HippUnfold's unfolded"
+        " surface beside a map, or the grid of the sheets)",
+    )
     add("--seg", metavar="NAME", help="segmentation protocol, where there are several")
     for what in ("participant", "session"):
         add(
@@ -239,6 +260,11 @@ def _reference(text: str) -> tuple[str, str]:
     if not (factor and equals and level):
         raise argparse.ArgumentTypeError(f"{text!r} is not of the form FACTOR=LEVEL")
     return factor, level
+
+
+def _maybe_named(text: str) -> tuple[str | None, str]:
+    name, equals, pattern = text.partition("=")
+    return (name, pattern) if equals and name.isalnum() else (None, text)
 
 
 def _name(text: str) -> str:

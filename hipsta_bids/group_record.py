@@ -23,6 +23,10 @@ class GroupOptions:
     sheets: GroupRequest
     model: ModelRequest
     covariates: tuple[Path, ...] = ()
+    maps: tuple[tuple[str, str], ...] = ()
+    """Names and patterns of other programs' maps."""
+    surfaces: tuple[tuple[str | None, str], ...] = ()
+    """Patterns of the surfaces to draw these on, for one or for all."""
     volumes: tuple[tuple[str, str], ...] = ()
     """Names and patterns of other programs' tables of volumes."""
     measures: tuple[str, ...] = ()
@@ -83,7 +87,9 @@ def record_of(
             "datasets": [str(root.resolve()) for root in options.sheets.roots],
             "settings_hash": found.settings_hash,
             "versions": found.versions,
-            "seg": found.records[0].place.name.seg,
+            "seg": found.records[0].place.name.seg if found.records else None,
+            "maps": dict(options.maps),
+            "volumes": dict(options.volumes),
             "covariates": [str(path) for path in options.covariates],
             "template": None if options.template is None else str(options.template),
         },

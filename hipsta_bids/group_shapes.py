@@ -44,7 +44,7 @@ def average_shapes(
         for r in records
     }
     shapes = {}
-    for hemi, side in analysis.sides.items():
+    for hemi, side in analysis.sides.items() if records else ():
         visits = cohort.table.iloc[side.registered.rows]
         first = np.flatnonzero(~visits[PARTICIPANT].duplicated().to_numpy())
         most = min(len(first), settings.shapes.most)

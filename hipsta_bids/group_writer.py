@@ -3,18 +3,20 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 
 from hipsta_bids.bids import files, gifti, group_outputs
 from hipsta_bids.bids.group_inputs import Exclusion
 from hipsta_bids.bids.group_scores import write_score_maps
+from hipsta_bids.bids.map_parquet import write_maps
 from hipsta_bids.group.analysis import Analysis
 from hipsta_bids.group.columns import COLUMNS
 from hipsta_bids.group.multiplicity import MapKey
 from hipsta_bids.group.report import methods_text
 from hipsta_bids.group.scores import Scores
 from hipsta_bids.group.shapes import AverageShape
-from hipsta_bids.group.tables import entity_label, map_name, result_tables
+from hipsta_bids.group.tables import entity_label, map_name, point_tables, result_tables
 from hipsta_bids.group.template_json import templates_to_json
 from hipsta_bids.group_data import PARTICIPANT, SESSION, Cohort, ResultTable
 from hipsta_bids.group_figures import draw_figures
@@ -27,6 +29,8 @@ def write_results(
     analysis: Analysis,
     settings: GroupSettings,
     exclusions: Sequence[Exclusion],
+    *,
+    others: Mapping[str, tuple[Cohort, Analysis]],
 ) -> None:
     """Write tables, maps and text.
 
@@ -41,6 +45,8 @@ def write_results(
     settings : GroupSettings
     exclusions : sequence of Exclusion
         Who was left out.
+    others : mapping of str to (Cohort, Analysis)
+        Maps that lie on surfaces of their own, by name.
 
     Raises
     ------
@@ -49,6 +55,10 @@ def write_results(
     """
     for table in result_tables(cohort, analysis, settings):
         group_outputs.write_result_table(folder, table, COLUMNS)
+    for name, other in others.items():
+        for table in point_tables(name, *other, settings):
+            group_outputs.write_result_table(folder, table, COLUMNS)
+        _write_gifti(folder, *other)
     rows = pd.DataFrame(
         [
             {
@@ -67,8 +77,9 @@ def write_results(
     rows_of_model = analysis.compared.table.iloc[analysis.design.rows]
     group_outputs.write_covariates(folder / "covariates.tsv", rows_of_model)
     registered = {hemi: side.registered for hemi, side in analysis.sides.items()}
-    if registered:
-        group_outputs.write_maps(folder / "maps.parquet", cohort, registered)
+    if registered or others:
+        points = {name: other for name, (other, _) in others.items()}
+        write_maps(folder / "maps.parquet", cohort, registered, points)
     templates = {
         hemi: side.registration.template
         for hemi, side in analysis.sides.items()
@@ -79,18 +90,25 @@ def write_results(
     _write_gifti(folder, cohort, analysis)
     if analysis.scores is not None and analysis.scores.sides:
         _write_scores(folder, analysis.compared, analysis.scores)
-    text = methods_text(cohort, analysis, settings, len(exclusions))
+    text = methods_text(cohort, analysis, settings, len(exclusions), tuple(others))
     files.write_text(folder / "methods.md", text)
 
 
 def draw(
-    folder: Path, cohort: Cohort, analysis: Analysis, shapes: Mapping[str, AverageShape]
+    folder: Path,
+    cohort: Cohort,
+    analysis: Analysis,
+    shapes: Mapping[str, AverageShape],
+    *,
+    others: Mapping[str, tuple[Cohort, Analysis]],
 ) -> list[str]:
     """Draw the figures, if the library for it is there; notes otherwise."""
+    everything = ((cohort, analysis, shapes), *((*one, {}) for one in others.values()))
     try:
-        for drawing in draw_figures(cohort, analysis, shapes):
-            files.write_bytes(folder / "figures" / f"{drawing.name}.png", drawing.png)
-            files.write_bytes(folder / "figures" / f"{drawing.name}.svg", drawing.svg)
+        for one in everything:
+            for drawing in draw_figures(*one):
+                files.write_bytes(folder / "figures" / f"{drawing.name}.png", drawing.png)
+                files.write_bytes(folder / "figures" / f"{drawing.name}.svg", drawing.svg)
     except ImportError:
         return ["no figures, as matplotlib is missing: pip install 'hipsta_bids[figures]'"]
     return []
@@ -99,7 +117,19 @@ def draw(
 def _write_gifti(folder: Path, cohort: Cohort, analysis: Analysis) -> None:
     """Write statistics, effect sizes and corrected p-values on the sheet."""
     for hemi, one in analysis.fitted.items():
-        if hemi in cohort.sides:
+        if one.maps.mesh is not None and hemi in cohort.sides:
+            name = next(iter(one.fits))
+            surface = folder / f"hemi-{hemi}_space-{name}_midthickness.surf.gii"
+            mesh = one.maps.mesh
+            content = gifti.surface_bytes(
+                mesh.points,
+                mesh.triangles.astype(np.int32),
+                hemi=hemi,
+                secondary=None,
+                unfolded=True,
+            )
+            files.write_bytes(surface, content)
+        elif hemi in cohort.sides:
             surface = folder / f"hemi-{hemi}_space-unfold_midthickness.surf.gii"
             group_outputs.write_sheet_surface(surface, cohort.x, cohort.y, hemi)
         for measure, fit in one.fits.items():

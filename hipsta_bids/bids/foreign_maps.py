@@ -10,12 +10,10 @@ import numpy as np
 from hipsta_bids.bids.label_tables import entities
 from hipsta_bids.bids.patterns import Found, check_pattern, fields_of, fill, find, scan
 from hipsta_bids.bids.point_files import PointMap, read_map, read_mesh
+from hipsta_bids.bids.sheets import Visit
 from hipsta_bids.errors import InputError, NothingToDoError, UsageError
 from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.group_data import Float, Int, Mesh
-
-Visit = tuple[str, str | None]
-"""Subject and session, without prefixes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +32,7 @@ class ForeignSide:
     """One map of one hemisphere."""
 
     visits: tuple[Visit, ...]
-    values: Float
+    data: Float
     """(visits, points)"""
     unit: str
     mesh: Mesh | None
@@ -187,7 +185,9 @@ def _sessions(one: Found, known: Mapping[str, Sequence[str | None]]) -> Sequence
     return [one.session] if one.session in own else []
 
 
-def read_maps(found: ForeignFiles, grid: tuple[int, int]) -> dict[str, ForeignSide]:
+def read_maps(
+    found: ForeignFiles, grid: tuple[int, int], *, with_sheets: bool
+) -> dict[str, ForeignSide]:
     """Read one map of all hemispheres.
 
     Parameters
@@ -195,6 +195,8 @@ def read_maps(found: ForeignFiles, grid: tuple[int, int]) -> dict[str, ForeignSi
     found : ForeignFiles
     grid : (int, int)
         Nodes along x and y of the sheets.
+    with_sheets : bool
+        Whether there are any; if not, tables with nodes may have another grid.
 
     Returns
     -------
@@ -206,30 +208,33 @@ def read_maps(found: ForeignFiles, grid: tuple[int, int]) -> dict[str, ForeignSi
     InputError
         If a file cannot be read, maps have different numbers of points, or no surface fits.
     """
-    return {hemi: _read_side(found, hemi, grid) for hemi in found.files}
+    return {hemi: _read_side(found, hemi, grid, with_sheets=with_sheets) for hemi in found.files}
 
 
-def _read_side(found: ForeignFiles, hemi: str, grid: tuple[int, int]) -> ForeignSide:
+def _read_side(
+    found: ForeignFiles, hemi: str, grid: tuple[int, int], *, with_sheets: bool
+) -> ForeignSide:
     paths = found.files[hemi]
     visits = tuple(sorted(paths, key=lambda visit: (visit[0], visit[1] or "")))
     maps = [read_map(paths[visit], found.request.name) for visit in visits]
     _refuse_mixed(found.request.name, hemi, [paths[visit] for visit in visits], maps)
     first = maps[0]
     points = len(first.values)
-    mesh = None if first.nodes == grid else _mesh(found, hemi, points)
-    if mesh is None and first.nodes != grid and points != grid[0] * grid[1]:
+    own = first.nodes if first.nodes is not None and not with_sheets else grid
+    mesh = None if first.nodes == own else _mesh(found, hemi, points)
+    if mesh is None and points != own[0] * own[1]:
         raise InputError(
             f"--maps {found.request.name}, hemisphere {hemi}: no surface of {points} vertices lies"
-            f" beside {paths[visits[0]]}, and sheets have {grid[0]} x {grid[1]} points; name one by"
+            f" beside {paths[visits[0]]}, and sheets have {own[0]} x {own[1]} points; name one by"
             " --maps-surface",
             reason="no-surface",
         )
     return ForeignSide(
         visits=visits,
-        values=np.stack([one.values for one in maps]),
+        data=np.stack([one.values for one in maps]),
         unit=first.unit,
         mesh=mesh,
-        nodes=grid if mesh is None else (points, 1),
+        nodes=own if mesh is None else (points, 1),
     )
 
 

@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,8 @@ from hipsta_bids.bids.results import ResultPlace
 from hipsta_bids.bids.source_links import relocate
 from hipsta_bids.bids.status import NOT_FINISHED, name_of, read_status
 from hipsta_bids.errors import InputError, NothingToDoError
+from hipsta_bids.settings import Settings
+from hipsta_bids.settings_file import resolve, settings_hash
 
 _RECORD = re.compile(
     r"sub-(?P<subject>[^_]+)(?:_ses-(?P<session>[^_]+))?_hemi-(?P<hemi>[LR])_seg-(?P<seg>[^_]+)"
@@ -81,12 +83,14 @@ class Collection:
     versions: tuple[str, ...]
 
 
-def collect_sheets(request: GroupRequest) -> Collection:
+def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collection:
     """Find all complete hemispheres of one protocol, made with the same settings.
 
     Parameters
     ----------
     request : GroupRequest
+    may_lack : bool
+        Whether it is fine that nobody has been measured yet; then the settings are the default.
 
     Raises
     ------
@@ -101,7 +105,10 @@ def collect_sheets(request: GroupRequest) -> Collection:
     for folder in request.segmentations:
         if not folder.is_dir():
             raise InputError(f"{folder}: no such folder; check --segmentations", reason="no-folder")
-    found = [entry for root in request.roots for entry in _quality_files(root, request)]
+    roots = [root for root in request.roots if root.is_dir() or not may_lack]
+    found = [entry for root in roots for entry in _quality_files(root, request)]
+    if may_lack and not found:
+        return _nothing()
     seg = _one_protocol(found, request)
     found = [place for place in found if place.name.seg == seg]
     _refuse_twice(found)
@@ -129,6 +136,46 @@ def collect_sheets(request: GroupRequest) -> Collection:
         settings_hash=digest,
         versions=tuple(sorted({record.version for record in kept})),
     )
+
+
+def _nothing() -> Collection:
+    return Collection(
+        records=(),
+        exclusions=(),
+        settings=resolve(Settings()),
+        settings_hash=settings_hash(Settings()),
+        versions=(),
+    )
+
+
+def wanted_by(request: GroupRequest) -> Callable[[str, str | None, str], bool]:
+    """Tell whether a hemisphere is asked for, and not in the table of exclusions.
+
+    Parameters
+    ----------
+    request : GroupRequest
+
+    Returns
+    -------
+    callable
+        Takes subject, session and hemisphere, labels without prefixes.
+
+    Raises
+    ------
+    InputError
+        If the table cannot be read.
+    """
+    unwanted = _listed_exclusions(request.exclude_table)
+
+    def is_wanted(subject: str, session: str | None, hemi: str) -> bool:
+        name = HemisphereName(subject=subject, session=session, hemi=hemi, seg="")
+        return (
+            (not request.subjects or subject in request.subjects)
+            and (not request.sessions or session in request.sessions)
+            and not any(_is_listed(name, row) for row in unwanted)
+        )
+
+    return is_wanted
 
 
 def _quality_files(root: Path, request: GroupRequest) -> Iterator[ResultPlace]:

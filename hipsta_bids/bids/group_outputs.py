@@ -3,23 +3,18 @@
 import contextlib
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
-from pyarrow import parquet
 
 from hipsta_bids.bids import files, gifti
 from hipsta_bids.bids.names import DATASET_FILES
-from hipsta_bids.group_data import PARTICIPANT, SESSION, Cohort, Float, ResultTable, SideMaps
+from hipsta_bids.group_data import Float, ResultTable
 
 #: Folder of all models, in the output dataset.
 GROUP_FOLDER = DATASET_FILES["group"]
-
-#: Sheets per row group of the Parquet file; bounds the memory.
-_BLOCK = 500
 
 
 @contextlib.contextmanager
@@ -115,97 +110,6 @@ def write_covariates(path: Path, table: pd.DataFrame) -> None:
     """Write the table that models were fitted to."""
     columns = [str(name) for name in table.columns]
     files.write_tsv(path, columns, zip(*(_cells(table[name]) for name in columns), strict=True))
-
-
-def write_maps(path: Path, cohort: Cohort, registered: Mapping[str, SideMaps]) -> None:
-    """Write all maps as one Parquet file, for work in R or Python.
-
-    One row per visit, hemisphere and node: original and registered maps, with units in the
-    columns' metadata.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    cohort : Cohort
-        Original maps.
-    registered : mapping of str to SideMaps
-        The same after registration.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be written.
-    """
-    measures = list(next(iter(cohort.sides.values())).maps)
-    schema = _schema(cohort, measures)
-    try:
-        with parquet.ParquetWriter(path, schema, compression="zstd") as writer:
-            for hemi, side in cohort.sides.items():
-                for start in range(0, len(side.rows), _BLOCK):
-                    part = slice(start, start + _BLOCK)
-                    columns = _block(cohort, hemi, side, registered[hemi], part)
-                    arrays = [
-                        pa.array(columns[name], schema.field(name).type) for name in schema.names
-                    ]
-                    writer.write_table(pa.table(arrays, schema=schema))
-    except OSError as error:
-        raise files.output_error(path, error) from error
-
-
-def _schema(cohort: Cohort, measures: Sequence[str]) -> pa.Schema:
-    word = pa.dictionary(pa.int32(), pa.string())
-    fields = [pa.field(name, word) for name in (PARTICIPANT, SESSION, "hemi")]
-    fields += [pa.field("node_x", pa.int16()), pa.field("node_y", pa.int16())]
-    fields += [pa.field("x", pa.float32()), pa.field("y", pa.float32())]
-    for suffix, text in (("", "as measured"), ("_registered", "after registration")):
-        fields.append(pa.field(f"subfield{suffix}", word, metadata={"description": text}))
-        for name in measures:
-            about = {"unit": cohort.units.get(name, "1"), "description": f"{name}, {text}"}
-            fields.append(pa.field(f"{name}{suffix}", pa.float32(), metadata=about))
-    return pa.schema(
-        fields,
-        metadata={
-            "description": "one row per visit, hemisphere and node of the sheet; x from medial to"
-            " lateral, y from posterior to anterior"
-        },
-    )
-
-
-def _block(
-    cohort: Cohort, hemi: str, side: SideMaps, registered: SideMaps, part: slice
-) -> dict[str, object]:
-    rows = side.rows[part]
-    nx, ny = side.shape
-    points = nx * ny
-    x, y = np.divmod(np.tile(np.arange(points), len(rows)), ny)
-    visits = cohort.table.iloc[rows]
-    places = np.repeat(np.arange(len(rows), dtype=np.int32), points)
-
-    def words(values: Sequence[str | None]) -> pa.DictionaryArray:
-        return pa.array(list(values), pa.string()).dictionary_encode().take(pa.array(places))
-
-    columns: dict[str, object] = {
-        PARTICIPANT: words(visits[PARTICIPANT].tolist()),
-        SESSION: words([s if isinstance(s, str) else None for s in visits[SESSION]]),
-        "hemi": words([hemi] * len(rows)),
-        "node_x": x + 1,
-        "node_y": y + 1,
-        "x": cohort.x[x],
-        "y": cohort.y[y],
-    }
-    for suffix, source in (("", side), ("_registered", registered)):
-        columns[f"subfield{suffix}"] = _subfields(source, part)
-        for name, maps in source.maps.items():
-            values: Float = maps[part].ravel()
-            columns[f"{name}{suffix}"] = pa.array(values, pa.float32(), from_pandas=True)
-    return columns
-
-
-def _subfields(side: SideMaps, part: slice) -> pa.DictionaryArray:
-    codes = side.subfield[part].ravel().astype(np.int32)
-    indices = pa.array(codes, pa.int32(), mask=codes < 0)
-    return pa.DictionaryArray.from_arrays(indices, pa.array(side.names, pa.string()))
 
 
 def write_sheet_surface(path: Path, x: Float, y: Float, hemi: str) -> None:

@@ -20,6 +20,10 @@ from hipsta_bids.group_data import PARTICIPANT, SESSION, Float, SideMaps
 ARBITRARY = "arbitrary"
 
 
+Visit = tuple[str, str | None]
+"""Subject and session, without prefixes."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Measured:
     """Sheets and summaries, before covariates are known."""
@@ -30,14 +34,15 @@ class Measured:
     x: Float
     y: Float
     units: Mapping[str, str]
-    sources: Sequence[str]
-    """Address of one segmentation per visit."""
-    roots: Sequence[Path]
-    """Dataset of each visit."""
+    sources: Mapping[str, tuple[str, Path]]
+    """Address of one segmentation, and dataset that it is said in, of visits with sheets."""
 
 
 def read_sheets(
-    records: Sequence[SheetRecord], settings: Mapping[str, Any], maps: Sequence[str]
+    records: Sequence[SheetRecord],
+    settings: Mapping[str, Any],
+    maps: Sequence[str],
+    visits: Sequence[Visit] | None = None,
 ) -> Measured:
     """Read all sheets and summaries.
 
@@ -49,6 +54,8 @@ def read_sheets(
         Resolved settings of the participant level: number of nodes, extent of the grid.
     maps : sequence of str
         Columns of the sheet tables, or names of sampled maps. Curvature is read in any case.
+    visits : sequence of (str, str or None), optional
+        Subjects and sessions of the rows, if there are more than those of the sheets.
 
     Raises
     ------
@@ -57,11 +64,9 @@ def read_sheets(
     """
     grid = settings["sheet"]
     shape = (int(grid["x_nodes"]), int(grid["y_nodes"]))
-    keys = [(r.place.name.subject, r.place.name.session) for r in records]
-    visits = list(dict.fromkeys(keys))
+    visits = visits_of(records) if visits is None else visits
     row_of = {visit: row for row, visit in enumerate(visits)}
     names = tuple(dict.fromkeys((*maps, CURVATURE)))
-    first = dict(zip(reversed(keys), reversed(records), strict=True))
     sides = {}
     for hemi in "LR":
         own = [record for record in records if record.place.name.hemi == hemi]
@@ -73,10 +78,17 @@ def read_sheets(
         sides=sides,
         x=_coordinates(grid["x_extent"], shape[0]),
         y=_coordinates(grid["y_extent"], shape[1]),
-        units=_units(records[0]) | {n: ARBITRARY for n in names if n not in SHEET_MAPS},
-        sources=[first[visit].source for visit in visits],
-        roots=[first[visit].place.root for visit in visits],
+        units=_units(records) | {n: ARBITRARY for n in names if n not in SHEET_MAPS},
+        sources={
+            visit_name(r.place.name.subject, r.place.name.session): (r.source, r.place.root)
+            for r in reversed(records)
+        },
     )
+
+
+def visits_of(records: Sequence[SheetRecord]) -> list[Visit]:
+    """List subjects and sessions that have sheets, each once."""
+    return list(dict.fromkeys((r.place.name.subject, r.place.name.session) for r in records))
 
 
 def _coordinates(extent: float, nodes: int) -> Float:
@@ -89,7 +101,7 @@ def visit_name(subject: str, session: str | None) -> str:
     return f"sub-{subject}_ses-{session}" if session else f"sub-{subject}"
 
 
-def _visit_table(visits: Sequence[tuple[str, str | None]]) -> pd.DataFrame:
+def _visit_table(visits: Sequence[Visit]) -> pd.DataFrame:
     names = [f"sub-{subject}" for subject, _ in visits]
     sessions = [None if session is None else f"ses-{session}" for _, session in visits]
     index = [visit_name(*visit) for visit in visits]
@@ -187,11 +199,12 @@ def _read_summary(path: Path) -> dict[str, float]:
         ) from error
 
 
-def _units(record: SheetRecord) -> dict[str, str]:
-    """Units of maps and summary columns, from the sidecars."""
+def _units(records: Sequence[SheetRecord]) -> dict[str, str]:
+    """Units of maps and summary columns, from the sidecars of the first hemisphere."""
     units = {}
-    for key in ("sheet_sidecar", "summary_sidecar"):
-        for name, entry in files.read_json(record.place.path(key)).items():
+    paths = [r.place.path(key) for r in records[:1] for key in ("sheet_sidecar", "summary_sidecar")]
+    for path in paths:
+        for name, entry in files.read_json(path).items():
             if isinstance(entry, Mapping) and "Units" in entry:
                 units[name] = str(entry["Units"])
     return units

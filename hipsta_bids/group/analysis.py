@@ -57,6 +57,8 @@ class Analysis:
     """What the model was fitted to."""
     compared: Cohort
     """Rows of the model's table with registered maps; of two sessions, their differences."""
+    row_model: RowModel
+    """What was fitted to each row."""
     fitted: Mapping[str, FittedMaps]
     """By hemisphere; ``LR`` is left minus right."""
     found: Mapping[MapKey, Discoveries]
@@ -137,13 +139,7 @@ def analyze_cohort(
     }
     registered = {hemi: side.registered for hemi, side in sides.items()} or cohort.sides
     compared = compare_sessions(replace(cohort, sides=registered), comparison)
-    fitted = {
-        hemi: fit_maps(hemi, compared.sides[hemi].only(measures.maps), rows, settings)
-        for hemi in (compared.sides if measures.maps else ())
-    }
-    if comparison.asymmetry and measures.maps:
-        maps = asymmetry_maps(compared, measures.maps, settings.asymmetry.relative)
-        fitted[BOTH] = fit_maps(BOTH, maps, rows, settings, contrasts=with_mean(design))
+    fitted = _fit_sides(compared, measures.maps, rows, comparison, settings)
     found = correct(fitted, rows, table, settings)
     scores = None
     if comparison.normative is not None:
@@ -175,6 +171,7 @@ def analyze_cohort(
         sides=sides,
         measured=measures,
         compared=compared,
+        row_model=rows,
         fitted=fitted,
         found=found,
         scores=scores,
@@ -182,6 +179,64 @@ def analyze_cohort(
         pairs=pairs,
         skipped=[*notes, *more],
     )
+
+
+def analyze_points(cohort: Cohort, analysis: Analysis, settings: GroupSettings) -> Analysis:
+    """Fit the model of an analysis to further maps, which are not registered.
+
+    Parameters
+    ----------
+    cohort : Cohort
+        Maps whose points correspond, of the same visits.
+    analysis : Analysis
+        Of the sheets, or of covariates alone.
+    settings : GroupSettings
+
+    Returns
+    -------
+    Analysis
+        The same model, fitted to these maps alone.
+
+    Raises
+    ------
+    ModelError
+        If it cannot be fitted to them.
+    """
+    maps = tuple(dict.fromkeys(name for side in cohort.sides.values() for name in side.maps))
+    compared = compare_sessions(cohort, analysis.comparison)
+    fitted = _fit_sides(compared, maps, analysis.row_model, analysis.comparison, settings)
+    return replace(
+        analysis,
+        sides={},
+        measured=Measures(maps=maps, summaries=()),
+        compared=compared,
+        fitted=fitted,
+        found=correct(fitted, analysis.row_model, compared.table, settings),
+        measures=(),
+        pairs=(),
+        scores=None,
+        skipped=(),
+    )
+
+
+def _fit_sides(
+    compared: Cohort,
+    maps: tuple[str, ...],
+    rows: RowModel,
+    comparison: Comparison,
+    settings: GroupSettings,
+) -> dict[str, FittedMaps]:
+    """Fit each hemisphere, and left minus right if that is asked for."""
+    fitted = {
+        hemi: fit_maps(hemi, side.only(maps), rows, settings)
+        for hemi, side in compared.sides.items()
+        if maps
+    }
+    if comparison.asymmetry and maps:
+        both = asymmetry_maps(compared, maps, settings.asymmetry.relative)
+        contrasts = with_mean(rows.design)
+        fitted[BOTH] = fit_maps(BOTH, both, rows, settings, contrasts=contrasts)
+    return fitted
 
 
 def _references(

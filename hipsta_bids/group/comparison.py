@@ -139,6 +139,8 @@ def compare_sessions(cohort: Cohort, comparison: Comparison) -> Cohort:
     if comparison.pair is None:
         return cohort
     table = modeled_table(cohort.table, comparison)
+    if not cohort.sides:
+        return replace(cohort, table=table)
     row_of = {participant: row for row, participant in enumerate(table.index)}
     sides = {}
     for hemi, side in cohort.sides.items():
@@ -160,11 +162,11 @@ def compare_sessions(cohort: Cohort, comparison: Comparison) -> Cohort:
 
 def _change(side: SideMaps, rows: Int, first: Int, second: Int) -> SideMaps:
     summary = side.summary.iloc[second].to_numpy() - side.summary.iloc[first].to_numpy()
-    return SideMaps(
+    return replace(
+        side,
         rows=rows,
         maps={name: paired_difference(m[first], m[second]) for name, m in side.maps.items()},
         subfield=side.subfield[first],
-        names=side.names,
         summary=pd.DataFrame(summary, columns=side.summary.columns),
     )
 
@@ -197,6 +199,12 @@ def asymmetry_maps(cohort: Cohort, measures: Sequence[str], relative: Sequence[s
             reason="no-hemisphere",
         )
     left, right = (cohort.sides[hemi] for hemi in BOTH)
+    if left.shape != right.shape:
+        raise ModelError(
+            f"asymmetry: maps of {', '.join(measures)} have different numbers of points left and"
+            " right",
+            reason="mixed-grids",
+        )
     rows, a, b = np.intersect1d(left.rows, right.rows, return_indices=True)
     if not len(rows):
         raise ModelError("asymmetry: nobody has both hemispheres", reason="no-hemisphere")
@@ -212,6 +220,7 @@ def asymmetry_maps(cohort: Cohort, measures: Sequence[str], relative: Sequence[s
         subfield=_recoded(left, names)[a],
         names=names,
         summary=pd.DataFrame(index=range(len(rows))),
+        mesh=left.mesh,
     )
 
 

@@ -109,5 +109,7 @@ def most_frequent(labels: NDArray[np.int8], count: int) -> Int:
     ndarray of int, shape (x, y)
         -1 where there is none.
     """
+    if not count:
+        return np.full(labels.shape[1:], -1, dtype=np.int64)
     votes = np.stack([(labels == label).sum(axis=0) for label in range(count)])
     return np.where(votes.max(axis=0) > 0, votes.argmax(axis=0), -1).astype(np.int64)

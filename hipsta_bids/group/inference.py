@@ -7,6 +7,7 @@ import pandas as pd
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.fitted import FittedMaps
+from hipsta_bids.group.mesh_graph import mesh_edges
 from hipsta_bids.group.multiplicity import BELOW_ALL, Discoveries, MapKey, discover, families
 from hipsta_bids.group.permutation import PermutationPart, PermutationTest, permute
 from hipsta_bids.group.row_model import RowModel
@@ -99,7 +100,9 @@ def _blocks(model: RowModel, table: pd.DataFrame, how: MultiplicitySettings) -> 
 
 
 def _part(one: FittedMaps, measure: str, model: RowModel) -> PermutationPart:
-    return PermutationPart(one.values(measure), model.design.matrix[one.rows], one.rows)
+    mesh = one.maps.mesh
+    edges = None if mesh is None else mesh_edges(mesh.triangles)
+    return PermutationPart(one.values(measure), model.design.matrix[one.rows], one.rows, edges)
 
 
 def _discoveries(

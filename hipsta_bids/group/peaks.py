@@ -7,6 +7,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from hipsta_bids.group.glm import PointTest
+from hipsta_bids.group.mesh_graph import find_mesh_clusters
 from hipsta_bids.group.multiplicity import Discoveries
 from hipsta_bids.group.sheet_graph import Cluster, find_clusters
 
@@ -29,10 +30,61 @@ class SheetFrame:
         """Nodes along x and y."""
         return len(self.x), len(self.y)
 
+    def clusters(
+        self, significant: NDArray[np.bool_], statistic: FloatArray, neighbors: int
+    ) -> list[Cluster]:
+        """Find connected regions of one sign; see :func:`find_clusters`."""
+        return find_clusters(significant, statistic, self.subfield, neighbors)
 
-def peak_table(
-    test: PointTest, found: Discoveries, frame: SheetFrame, neighbors: int
-) -> pd.DataFrame:
+    def place(self, point: NDArray[np.int64]) -> dict[str, FloatArray]:
+        """Coordinates of points, by column."""
+        x, y = np.divmod(point, len(self.y))
+        return {"x": self.x[x], "y": self.y[y]}
+
+    def number(self, point: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
+        """Numbers of points, by column."""
+        x, y = np.divmod(point, len(self.y))
+        return {"node_x": x + 1, "node_y": y + 1}
+
+
+@dataclass(frozen=True)
+class MeshFrame:
+    """Where the points of a map lie, if these are the vertices of a mesh."""
+
+    points: FloatArray
+    """(points, 3) coordinates of the surface."""
+    edges: NDArray[np.int64]
+    """(edges, 2)"""
+    subfield: NDArray[np.str_]
+    """(points, 1) names."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Points, and 1."""
+        return len(self.points), 1
+
+    def clusters(
+        self,
+        significant: NDArray[np.bool_],
+        statistic: FloatArray,
+        neighbors: int,  # noqa: ARG002 -- triangles say who is next to whom
+    ) -> list[Cluster]:
+        """Find connected regions of one sign; see :func:`find_mesh_clusters`."""
+        return find_mesh_clusters(significant, statistic, self.subfield, self.edges)
+
+    def place(self, point: NDArray[np.int64]) -> dict[str, FloatArray]:
+        """Coordinates of points, by column."""
+        return {f"surface_{axis}": self.points[point, i] for i, axis in enumerate("xyz")}
+
+    def number(self, point: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
+        """Numbers of points, by column."""
+        return {"vertex": point}
+
+
+Frame = SheetFrame | MeshFrame
+
+
+def peak_table(test: PointTest, found: Discoveries, frame: Frame, neighbors: int) -> pd.DataFrame:
     """List the peak of each significant cluster; of the whole map if there is none.
 
     Parameters
@@ -41,7 +93,7 @@ def peak_table(
         One contrast; points in the order of the sheet, x slower than y.
     found : Discoveries
         Which points survive.
-    frame : SheetFrame
+    frame : SheetFrame or MeshFrame
         Where they lie.
     neighbors : int
         4 or 8, for clusters.
@@ -55,7 +107,7 @@ def peak_table(
     """
     statistic = test.statistic.reshape(frame.shape)
     rejected = found.rejected.reshape(frame.shape)
-    clusters = find_clusters(rejected, statistic, frame.subfield, neighbors)
+    clusters = frame.clusters(rejected, statistic, neighbors)
     if not clusters and np.isfinite(statistic).any():
         place = np.unravel_index(int(np.nanargmax(np.abs(statistic))), frame.shape)
         here = (int(place[0]), int(place[1]))
@@ -65,19 +117,19 @@ def peak_table(
 
 
 def _row(
-    test: PointTest, adjusted: FloatArray, frame: SheetFrame, cluster: Cluster
+    test: PointTest, adjusted: FloatArray, frame: Frame, cluster: Cluster
 ) -> dict[str, object]:
-    x, y = cluster.peak
-    point = x * len(frame.y) + y
+    point = int(np.ravel_multi_index(cluster.peak, frame.shape))
+    here = np.array([point])
+    numbers = frame.number(here) if isinstance(frame, MeshFrame) else {}
     is_t = test.kind == "t"
     size = test.cohen_d if is_t else test.eta_squared
     limits = test.cohen_d_limits if is_t else test.eta_squared_limits
     return {
         "contrast": test.contrast.name,
         "test": test.kind,
-        "x": frame.x[x],
-        "y": frame.y[y],
-        "subfield": frame.subfield[x, y],
+        **{name: value[0] for name, value in {**numbers, **frame.place(here)}.items()},
+        "subfield": frame.subfield[cluster.peak],
         "statistic": test.statistic[point],
         "df": test.df[point],
         "p": test.p[point],

@@ -10,6 +10,7 @@ from scipy.linalg import null_space
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.contrasts import Contrast
 from hipsta_bids.group.glm import fit_points
+from hipsta_bids.group.mesh_graph import enhance_on_mesh
 from hipsta_bids.group.sheet_graph import enhance
 from hipsta_bids.group_settings import GlmSettings, MultiplicitySettings
 
@@ -53,6 +54,8 @@ class PermutationPart:
     subjects: IntArray
     """(subjects,) which ones of the whole sample they are: the same subject is shuffled in the
     same way in all parts."""
+    edges: IntArray | None = None
+    """(edges, 2) neighbors among the points, if these are vertices of a mesh."""
 
 
 def permute(
@@ -116,6 +119,7 @@ class _Part:
     model: "_Model"
     contrast: Contrast
     shape: tuple[int, int]
+    edges: IntArray | None
     settings: MultiplicitySettings
     subjects: IntArray
     blocks: IntArray | None
@@ -134,6 +138,7 @@ class _Part:
         blocks: IntArray | None,
     ) -> "_Part":
         maps, matrix = part.maps, part.matrix
+        shape = shape if part.edges is None else (maps.shape[1], 1)
         if maps.shape[1] != shape[0] * shape[1] or maps.shape[0] != matrix.shape[0]:
             raise ModelError(
                 f"permutation: maps of shape {maps.shape} do not fit a sheet of {shape[0]} x"
@@ -149,11 +154,12 @@ class _Part:
             model=model,
             contrast=contrast,
             shape=shape,
+            edges=part.edges,
             settings=settings,
             subjects=part.subjects,
             blocks=own,
             observed=observed,
-            height=_enhanced(observed, shape, settings),
+            height=_enhanced(observed, shape, part.edges, settings),
             counts=np.ones((3, maps.shape[1])),
         )
 
@@ -164,7 +170,7 @@ class _Part:
             _shuffle(self.model.basis, self.blocks, key[self.subjects], flip=flip) for key in keys
         ]
         t = self.model.statistics(np.stack(bases))
-        return t, _enhanced(t, self.shape, self.settings)
+        return t, _enhanced(t, self.shape, self.edges, self.settings)
 
     def count(self, t: FloatArray, highest: FloatArray, highest_enhanced: FloatArray) -> None:
         """Count what reaches the observed statistics, alone and anywhere in the family."""
@@ -202,10 +208,14 @@ def _check_blocks(tested: FloatArray, blocks: IntArray, contrast: Contrast) -> N
         )
 
 
-def _enhanced(t: FloatArray, shape: tuple[int, int], settings: MultiplicitySettings) -> FloatArray:
+def _enhanced(
+    t: FloatArray, shape: tuple[int, int], edges: IntArray | None, settings: MultiplicitySettings
+) -> FloatArray:
     """Cluster enhancement, where it is asked for; else nothing."""
     if settings.method == _MAXIMUM:
         return np.zeros_like(t)
+    if edges is not None:
+        return enhance_on_mesh(t, edges, settings)
     return enhance(t.reshape(len(t), *shape), settings).reshape(t.shape)
 
 

@@ -14,7 +14,13 @@ from hipsta_bids.group_data import PARTICIPANT, Cohort
 from hipsta_bids.group_settings import GroupSettings, MultiplicitySettings
 
 
-def methods_text(cohort: Cohort, analysis: Analysis, settings: GroupSettings, n_out: int) -> str:
+def methods_text(
+    cohort: Cohort,
+    analysis: Analysis,
+    settings: GroupSettings,
+    n_out: int,
+    others: Sequence[str] = (),
+) -> str:
     """Word what was done and what came out.
 
     Parameters
@@ -27,6 +33,8 @@ def methods_text(cohort: Cohort, analysis: Analysis, settings: GroupSettings, n_
         Those in use.
     n_out : int
         Hemispheres and visits that were left out.
+    others : sequence of str, optional
+        Names of other programs' maps, which were not registered.
 
     Returns
     -------
@@ -40,9 +48,9 @@ def methods_text(cohort: Cohort, analysis: Analysis, settings: GroupSettings, n_
             cited.append(key)
         return f"[{cited.index(key) + 1}]"
 
-    paragraphs = [_sample(cohort, analysis, n_out, cite("method"))]
-    if analysis.sides:
-        paragraphs.append(_registration(analysis, settings, cite("registr")))
+    paragraphs = [_sample(cohort, analysis, n_out, cite("method"), others)]
+    if analysis.sides or others:
+        paragraphs.append(_alignment(analysis, settings, cite, others))
     paragraphs.append(_models(analysis, settings, cite))
     if analysis.comparison.asymmetry:
         paragraphs.append(_asymmetry(settings, cite("asymmetry")))
@@ -50,7 +58,7 @@ def methods_text(cohort: Cohort, analysis: Analysis, settings: GroupSettings, n_
         paragraphs.append(_normative(analysis.scores, settings, cite("normative")))
     if analysis.pairs:
         paragraphs.append(_classification(analysis, settings, cite("delong"), cite("firth")))
-    if analysis.sides:
+    if analysis.found:
         paragraphs.append(_findings(analysis))
     lines = ["# Methods and findings", "", "This text may be used freely, as it stands or changed."]
     for paragraph in paragraphs:
@@ -62,13 +70,16 @@ def methods_text(cohort: Cohort, analysis: Analysis, settings: GroupSettings, n_
     return "\n".join(lines) + "\n"
 
 
-def _sample(cohort: Cohort, analysis: Analysis, n_out: int, method: str) -> str:
+def _sample(
+    cohort: Cohort, analysis: Analysis, n_out: int, method: str, others: Sequence[str]
+) -> str:
     rows = analysis.design.rows
     table = analysis.compared.table.iloc[rows]
     people = cohort.table[PARTICIPANT].nunique()
     visits = f" ({len(cohort.table)} visits)" if len(cohort.table) > people else ""
+    maps = _words([*analysis.measured.maps, *others]) or "summaries"
     text = (
-        f"Measures of the hippocampus {method} ({_words(analysis.measured.maps) or 'summaries'}) of"
+        f"Measures of the hippocampus {method} ({maps}) of"
         f" {people} participants{visits} were analyzed with hipsta_bids {__version__};"
         f" {analysis.n_participants} had all variables of the model"
     )
@@ -83,6 +94,18 @@ def _sample(cohort: Cohort, analysis: Analysis, n_out: int, method: str) -> str:
 
 def _words(names: Sequence[str]) -> str:
     return ", ".join(f"map of {name.replace('_', ' ')}" for name in names)
+
+
+def _alignment(
+    analysis: Analysis, settings: GroupSettings, cite: Callable[[str], str], others: Sequence[str]
+) -> str:
+    parts = [_registration(analysis, settings, cite("registr"))] if analysis.sides else []
+    if others:
+        parts.append(
+            f"Maps of other programs ({', '.join(others)}) were taken as they are, point by point,"
+            " without registration."
+        )
+    return " ".join(parts)
 
 
 def _registration(analysis: Analysis, settings: GroupSettings, registr: str) -> str:

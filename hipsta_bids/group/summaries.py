@@ -101,10 +101,13 @@ def fit_summaries(
     list of MeasureFit, list of str
         And what could not be fitted, one line each.
     """
-    fits, notes = [], []
+    fits: list[MeasureFit] = []
+    notes: list[str] = []
     for hemi in hemispheres(cohort):
         values = summary_values(cohort, hemi, only)
         fits += _fit(values, hemi, model.formula, rows_of(design), settings)
+    if not fits:
+        return fits, notes
     if icv is None:
         notes.append("volumes are not adjusted: no intracranial volume is known")
         return fits, notes
@@ -178,6 +181,8 @@ def classify_groups(
     notes: list[str] = []
     for hemi in hemispheres(cohort):
         values = summary_values(cohort, hemi)
+        if values.columns.empty:
+            continue  # other programs' maps have no summaries
         base = _base(cohort, values, settings)
         measured = values.columns[values.notna().any().to_numpy()]
         for measure in settings.classification.added:

@@ -9,8 +9,9 @@ from hipsta_bids.group.analysis import Analysis
 from hipsta_bids.group.classification import ClassifierResult
 from hipsta_bids.group.fitted import FittedMaps
 from hipsta_bids.group.glm import PointTest
+from hipsta_bids.group.mesh_graph import mesh_edges
 from hipsta_bids.group.multiplicity import Discoveries, MapKey
-from hipsta_bids.group.peaks import SheetFrame, peak_table
+from hipsta_bids.group.peaks import Frame, MeshFrame, SheetFrame, peak_table
 from hipsta_bids.group.summaries import hemispheres, summary_values
 from hipsta_bids.group_data import Cohort, ResultTable
 from hipsta_bids.group_settings import GroupSettings
@@ -34,9 +35,11 @@ def result_tables(
     ------
     ResultTable
     """
-    if analysis.sides:
+    if analysis.fitted:
         yield ResultTable(name="peaks", rows=_peaks(cohort, analysis, settings))
+    if analysis.found:
         yield ResultTable(name="maps", rows=_overview(analysis))
+    if analysis.sides:
         yield ResultTable(name="registration", rows=_registration(analysis))
         yield ResultTable(name="warps", rows=_warps(cohort, analysis))
     if analysis.measures:
@@ -49,6 +52,30 @@ def result_tables(
         yield ResultTable(name="wscores", rows=analysis.scores.table)
     if analysis.pairs:
         yield ResultTable(name="classification", rows=_classification(analysis, settings))
+    yield from _statistics(cohort, analysis)
+
+
+def point_tables(
+    name: str, cohort: Cohort, analysis: Analysis, settings: GroupSettings
+) -> Iterator[ResultTable]:
+    """Give the tables of maps that lie on a surface of their own.
+
+    Parameters
+    ----------
+    name : str
+        Of the maps.
+    cohort, analysis, settings
+        As for :func:`result_tables`.
+
+    Yields
+    ------
+    ResultTable
+    """
+    yield ResultTable(name=f"{name}_peaks", rows=_peaks(cohort, analysis, settings))
+    yield from _statistics(cohort, analysis)
+
+
+def _statistics(cohort: Cohort, analysis: Analysis) -> Iterator[ResultTable]:
     for hemi, one in analysis.fitted.items():
         for measure, fit in one.fits.items():
             for test in fit.tests:
@@ -76,28 +103,27 @@ def _label(text: str) -> str:
     return "".join(word[:1].upper() + word[1:] for word in words)
 
 
-def frame_of(cohort: Cohort, one: FittedMaps) -> SheetFrame:
+def frame_of(cohort: Cohort, one: FittedMaps) -> Frame:
     """Where the points lie, and in which subfield most participants have them."""
     names = np.array([*one.maps.names, "n/a"])
+    if (mesh := one.maps.mesh) is not None:
+        return MeshFrame(mesh.points, mesh_edges(mesh.triangles), names[one.subfield])
     return SheetFrame(cohort.x, cohort.y, names[one.subfield])
 
 
 def _map(
-    frame: SheetFrame,
+    frame: Frame,
     n: np.ndarray,
     test: PointTest,
     found: Discoveries,
 ) -> pd.DataFrame:
-    nx, ny = frame.shape
-    x, y = np.divmod(np.arange(nx * ny), ny)
+    points = np.arange(frame.shape[0] * frame.shape[1])
     single = test.kind == "t"
-    blank = np.full(nx * ny, np.nan)
+    blank = np.full(len(points), np.nan)
     return pd.DataFrame(
         {
-            "node_x": x + 1,
-            "node_y": y + 1,
-            "x": frame.x[x],
-            "y": frame.y[y],
+            **frame.number(points),
+            **frame.place(points),
             "subfield": frame.subfield.ravel(),
             "n": n,
             "estimate": test.estimate[0] if single else blank,

@@ -10,6 +10,7 @@ from hipsta_bids.group.fitted import FittedMaps
 from hipsta_bids.group.glm import PointTest
 from hipsta_bids.group.multiplicity import MapKey
 from hipsta_bids.group_data import Cohort, Float
+from hipsta_bids.group_figures.meshes import draw_mesh
 from hipsta_bids.group_figures.panels import (
     LABEL,
     SMALL,
@@ -46,7 +47,7 @@ def draw_means(cohort: Cohort, analysis: Analysis, measure: str) -> "Figure":
             values = mean_of_known(one.values(measure)[own], 0)
             means[hemi, group] = values.reshape(one.maps.shape)
             counts[hemi, group] = int(own.sum())
-    low, high = np.nanpercentile(np.stack(list(means.values())), _SHARED)
+    low, high = np.nanpercentile(np.concatenate([m.ravel() for m in means.values()]), _SHARED)
     colors = "viridis"
     if analysis.comparison.pair or set(sides) == {BOTH}:  # differences, to either side of zero
         high = max(abs(low), abs(high))
@@ -55,8 +56,7 @@ def draw_means(cohort: Cohort, analysis: Analysis, measure: str) -> "Figure":
     for i, (hemi, one) in enumerate(sides.items()):
         for j, group in enumerate(groups):
             axis = axes[i, j]
-            images.append(_sheet(axis, cohort, means[hemi, group], colors, (low, high)))
-            _borders(axis, cohort, one)
+            images.append(_draw(axis, (cohort, one), means[hemi, group], colors, (low, high)))
             axis.set_title(
                 f"{group}, {side_name(hemi)} (n = {counts[hemi, group]})", fontsize=TITLE
             )
@@ -71,7 +71,7 @@ def draw_contrasts(cohort: Cohort, analysis: Analysis, measure: str) -> "Figure"
     sides = shown(analysis, measure)
     tests = next(iter(sides.values())).fits[measure].tests
     figure, axes = panels(len(tests), 2 * len(sides), _PANEL)
-    sizes = np.stack([_effect(t) for one in sides.values() for t in one.fits[measure].tests])
+    sizes = np.concatenate([_effect(t) for one in sides.values() for t in one.fits[measure].tests])
     reach = max(float(np.nanpercentile(np.abs(sizes), _EFFECTS)), 1e-6)
     signed = {
         (hemi, i): _signed_logarithm(analysis, MapKey(measure, test.contrast.name, hemi), test)
@@ -85,10 +85,9 @@ def draw_contrasts(cohort: Cohort, analysis: Analysis, measure: str) -> "Figure"
             left, right = axes[i, 2 * j], axes[i, 2 * j + 1]
             effect = _effect(test).reshape(one.maps.shape)
             p = signed[hemi, i].reshape(one.maps.shape)
-            images.append(_sheet(left, cohort, effect, "RdBu_r", (-reach, reach)))
-            images.append(_sheet(right, cohort, p, "PuOr_r", (-top, top)))
+            images.append(_draw(left, (cohort, one), effect, "RdBu_r", (-reach, reach)))
+            images.append(_draw(right, (cohort, one), p, "PuOr_r", (-top, top)))
             for axis, what in ((left, "effect size"), (right, "significance")):
-                _borders(axis, cohort, one)
                 axis.set_title(f"{test.contrast.name}\n{side_name(hemi)}, {what}", fontsize=TITLE)
     kinds = {"t": "Cohen's d", "F": "partial eta squared"}
     label = ", ".join(kinds[kind] for kind in sorted({t.kind for t in tests}, reverse=True))
@@ -112,6 +111,22 @@ def _bar(figure: "Figure", image: Any, axes: Any, label: str, extend: str = "nei
     bar = figure.colorbar(image, ax=axes, shrink=min(1.0, 2 / len(axes)), extend=extend)
     bar.set_label(label, fontsize=TITLE)
     bar.ax.tick_params(labelsize=LABEL)
+
+
+def _draw(
+    axis: "Axes",
+    place: tuple[Cohort, FittedMaps],
+    values: Float,
+    colors: str,
+    limits: tuple[float, float],
+) -> Any:  # noqa: ANN401  (what colorbars take)
+    """Draw one map on the sheet with its subfields, or on the surface that it lies on."""
+    cohort, one = place
+    if one.maps.mesh is not None:
+        return draw_mesh(axis, one.maps.mesh, values, colors, limits)
+    image = _sheet(axis, cohort, values, colors, limits)
+    _borders(axis, cohort, one)
+    return image
 
 
 def _sheet(

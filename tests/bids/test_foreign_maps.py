@@ -31,7 +31,7 @@ def write_subject(root, subject, version, values, hemi="L", **which):
 
 def find_and_read(root, pattern, *, surfaces=(), known=(), wanted=anybody):
     (request,) = map_patterns([("hipp", pattern)], surfaces, ())
-    return read_maps(find_maps(request, root, known, wanted), GRID)
+    return read_maps(find_maps(request, root, known, wanted), GRID, with_sheets=True)
 
 
 def test_maps_of_hippunfold_with_the_surface_beside(tmp_path, version):
@@ -43,11 +43,11 @@ def test_maps_of_hippunfold_with_the_surface_beside(tmp_path, version):
     sides = find_and_read(tmp_path, PATTERNS[version])
     assert sides["L"].visits == (("01", None), ("02", None))
     # Single precision is what the files hold.
-    np.testing.assert_allclose(sides["L"].values, [values, 2 * values], rtol=1e-6)
+    np.testing.assert_allclose(sides["L"].data, [values, 2 * values], rtol=1e-6)
     np.testing.assert_allclose(sides["L"].mesh.points, POINTS, rtol=1e-6)
     assert sides["L"].mesh.triangles.shape == TRIANGLES.shape
     assert sides["L"].unit == "mm"
-    assert np.isnan(sides["R"].values[0]).sum() == (values < 1).sum()
+    assert np.isnan(sides["R"].data[0]).sum() == (values < 1).sum()
 
 
 def test_sessions_of_the_sheets_decide(tmp_path):
@@ -74,7 +74,7 @@ def test_table_of_the_sheets_grid_needs_no_surface(tmp_path):
     side = find_and_read(tmp_path, "sub-{subject}_hemi-{hemi}_desc-T2_map.tsv")["R"]
     assert side.mesh is None
     assert side.nodes == GRID
-    np.testing.assert_array_equal(side.values[0], np.where(x == 0, np.nan, x + y))
+    np.testing.assert_array_equal(side.data[0], np.where(x == 0, np.nan, x + y))
 
 
 def test_named_surface_and_its_refusals(tmp_path):
