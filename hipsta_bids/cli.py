@@ -221,7 +221,7 @@ def _request(options: "Namespace") -> "InputRequest":
 
 
 def _run_options(options: "Namespace", command: str | None) -> "RunOptions":
-    from hipsta_bids.bids.files import check_writable  # noqa: PLC0415  (start-up time)
+    from hipsta_bids.bids.files import check_scratch  # noqa: PLC0415  (start-up time)
     from hipsta_bids.runner import WORKER_GB, RunOptions  # noqa: PLC0415  (heavy)
 
     if options.mem is not None and options.mem < WORKER_GB:
@@ -230,8 +230,7 @@ def _run_options(options: "Namespace", command: str | None) -> "RunOptions":
             f" ({WORKER_GB * 1000:g} MB); for gigabytes write 8G",
             reason="too-little-memory",
         )
-    if options.work_dir is not None:
-        check_writable(options.work_dir)
+    check_scratch(options.work_dir)
     return RunOptions(
         n_procs=options.n_procs,
         mem_gb=options.mem,

@@ -47,8 +47,10 @@ def run_group_level(arguments: Sequence[str]) -> ExitCode:
     from hipsta_bids.console import say, say_start  # noqa: PLC0415  (start-up time)
 
     say_start(LEVEL, parsed.bids_dir)
+    from hipsta_bids.bids.files import check_scratch  # noqa: PLC0415  (heavy)
     from hipsta_bids.group_runner import run_group  # noqa: PLC0415  (heavy)
 
+    check_scratch()
     settings = _settings(parsed)
     result = run_group(_options(parsed, arguments), settings)
     for note in result.notes:

@@ -44,9 +44,9 @@ def simulate(folder, descriptor, /, **invocation):
     return match[1] if match and done.returncode == 0 else None
 
 
-def launch(folder, descriptor, /, **invocation):
-    """Run an invocation without a container."""
-    options = ["--no-container", "--skip-data-collection"]
+def launch(folder, descriptor, /, *, how=("--no-container",), **invocation):
+    """Run an invocation, by default without a container."""
+    options = [*how, "--skip-data-collection"]
     return bosh(
         folder, "exec", "launch", *options, descriptor_path(descriptor), _write(folder, invocation)
     )

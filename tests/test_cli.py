@@ -2,6 +2,7 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -263,6 +264,20 @@ def test_run_says_what_happened(stand_in_run, tmp_path, capsys):
     assert len(errors) == 2
     assert errors[0].endswith("[body-too-short] body is 2 mm long; too short")
     assert "[internal-error] internal error (ZeroDivisionError: tests divide by zero)" in errors[1]
+
+
+@pytest.mark.parametrize("level", ["participant", "group"])
+@pytest.mark.usefixtures("seen")
+def test_without_a_folder_for_temporary_files_nothing_begins(level, tmp_path, monkeypatch, capsys):
+    def none():
+        raise FileNotFoundError
+
+    monkeypatch.setattr(tempfile, "gettempdir", none)
+    assert cli.main(["in", str(tmp_path / "out"), level]) == ExitCode.NOT_WRITABLE
+    said = capsys.readouterr()
+    assert said.err.startswith("hipsta-bids: no folder for temporary files can be written")
+    assert said.err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
 
 
 def test_opening_line_waits_for_no_library(monkeypatch, capsys):

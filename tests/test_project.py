@@ -174,6 +174,7 @@ def test_readme_lists_the_files_of_the_dataset():
         "README.md",
         "CONTRIBUTING.md",
         "docs/architecture.md",
+        "docs/containers.md",
         "docs/boutiques.md",
         "docs/validation.md",
         "docs/measures.md",

@@ -13,6 +13,7 @@ import json
 import math
 import os
 import secrets
+import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -96,6 +97,27 @@ def check_writable(folder: Path) -> None:
         with contextlib.suppress(OSError):
             probe.unlink()
         raise output_error(folder, error) from error
+
+
+def check_scratch(folder: Path | None = None) -> None:
+    """Prove that temporary files can be written, in a folder or where the system has them.
+
+    Raises
+    ------
+    OutputError
+        If not.
+    """
+    if folder is not None:
+        check_writable(folder)
+        return
+    try:
+        tempfile.gettempdir()
+    except FileNotFoundError as error:
+        raise OutputError(
+            "no folder for temporary files can be written; set TMPDIR to one (in a container,"
+            " mount one at /tmp)",
+            reason="no-scratch",
+        ) from error
 
 
 def write_bytes(path: Path, content: bytes) -> None:
