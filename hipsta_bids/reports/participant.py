@@ -14,7 +14,7 @@ from hipsta_bids.reports.figures import scale_of as scale_of_map
 from hipsta_bids.reports.numbers import key_numbers, quality_numbers
 from hipsta_bids.reports.page import Section, build_sections, render
 from hipsta_bids.reports.panels import place_panels, section_panels, slice_panels
-from hipsta_bids.reports.results import Hemisphere, find_results
+from hipsta_bids.reports.results import Finding, Hemisphere, find_results
 from hipsta_bids.reports.series import Series
 from hipsta_bids.reports.viewer import scales_of, scene_of, subfields_of
 from hipsta_bids.reports.volumes import input_path
@@ -101,15 +101,17 @@ def _places(series: Series) -> Mapping[str, Any] | None:
     groups = []
     for hemisphere in series.hemispheres:
         view = series.view(hemisphere)
-        named = [finding for finding in hemisphere.findings if finding.point is not None]
-        if view is None or not named:
+        places: dict[tuple[float, float, float], list[Finding]] = {}
+        for finding in hemisphere.findings:
+            if finding.point is not None:
+                places.setdefault(finding.point, []).append(finding)
+        if view is None or not places:
             continue
         shown = [
-            {"finding": finding, "panels": place_panels(hemisphere, view, finding.point)}
-            for finding in named[:_PLACES_SHOWN]
-            if finding.point is not None
+            {"findings": findings, "panels": place_panels(hemisphere, view, point)}
+            for point, findings in list(places.items())[:_PLACES_SHOWN]
         ]
-        groups.append({"side": hemisphere.side, "places": shown, "more": len(named) - len(shown)})
+        groups.append({"side": hemisphere.side, "places": shown, "more": len(places) - len(shown)})
     return {"groups": groups, "legend": _legend(series)} if groups else None
 
 

@@ -109,7 +109,7 @@
 
     start() {
       try {
-        this.renderer = new OGL.Renderer({ canvas: this.solid, dpr: Math.min(window.devicePixelRatio, 2), alpha: true, antialias: true });
+        this.renderer = new OGL.Renderer({ canvas: this.solid, dpr: Math.min(window.devicePixelRatio, 2), antialias: true });
       } catch { /* no WebGL */ }
       if (!this.renderer || !this.renderer.gl) {
         this.renderer = null;
@@ -117,7 +117,7 @@
         return;
       }
       this.gl = this.renderer.gl;
-      this.gl.clearColor(0, 0, 0, 0);
+      this.gl.clearColor(0.961, 0.969, 0.976, 1);
       this.camera = new OGL.Camera(this.gl, { fov: 28, near: 1, far: 500 });
       // The wheel scrolls the page until the view has been clicked.
       this.solid.addEventListener("wheel", (event) => {
@@ -232,7 +232,7 @@
       return out;
     }
 
-    mesh(points, index, color, { opacity = 1, flatness = 0 } = {}) {
+    mesh(points, index, color, { opacity = 1, flatness = 0, depthTest = true, order = 0 } = {}) {
       const count = points.length / 3, colors = new Float32Array(points.length);
       for (let n = 0; n < count; n++) colors.set(Array.isArray(color[0]) ? color[n] : color, 3 * n);
       const position = Float32Array.from(points);
@@ -241,10 +241,10 @@
         color: { size: 3, data: colors }, index: { data: new Uint32Array(index) },
       });
       const program = new OGL.Program(this.gl, {
-        vertex: VERTEX, fragment: FRAGMENT, cullFace: false, transparent: opacity < 1, depthWrite: opacity === 1,
+        vertex: VERTEX, fragment: FRAGMENT, cullFace: false, transparent: opacity < 1 || order > 0, depthWrite: opacity === 1, depthTest,
         uniforms: { opacity: { value: opacity }, flatness: { value: flatness } },
       });
-      const mesh = new OGL.Mesh(this.gl, { geometry, program });
+      const mesh = new OGL.Mesh(this.gl, { geometry, program, renderOrder: order });
       mesh.setParent(this.world);
       return mesh;
     }
@@ -275,7 +275,9 @@
       if (this.shows("findings")) {
         for (const finding of scene.findings) {
           const { points, index } = ball(toScene(finding.point), 0.55);
-          this.mesh(points, index, KINDS[finding.kind], { flatness: 0.3 });
+          // Inside a body it is drawn over what covers it.
+          const over = scene.surfaces ? {} : { depthTest: false, order: 1 };
+          this.mesh(points, index, KINDS[finding.kind], { flatness: 0.3, ...over });
         }
       }
       this.markNode();
