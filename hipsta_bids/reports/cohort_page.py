@@ -145,7 +145,7 @@ def _row(hemisphere: Hemisphere, distance: Distance | None, tile: int | None) ->
         "reason": record.get("reason") or "",
         "message": hemisphere.message,
         "distance": round(distance.value, 2) if distance else None,
-        "farthest": distance.measure if distance else "",
+        "farthest": distance.measure.partition(",")[0] if distance else "",
         "tile": tile,
         **{key: float(f"{v:.6g}") if np.isfinite(v) else None for key, v in numbers.items()},
     }
