@@ -33,6 +33,7 @@ from hipsta_bids.geometry.checks import (
 from hipsta_bids.geometry.coordinates import solve_coordinates
 from hipsta_bids.geometry.edited import check_mask
 from hipsta_bids.geometry.grid import in_plane_voxel, resample_body
+from hipsta_bids.geometry.laplace import HarmonicSolver
 from hipsta_bids.geometry.layers import check_layers, equal_volume_layers
 from hipsta_bids.geometry.measured import Measured, average_profiles
 from hipsta_bids.geometry.measures import bending_angle
@@ -95,9 +96,10 @@ def measure_hemisphere(
     with clock("tetrahedra"):
         surface, mesh, smoothed = _filled(solid, surface, settings)
     with clock("boundaries"):
-        boundaries = find_boundaries(surface, mesh, body, settings.boundaries)
+        solver = HarmonicSolver(mesh)
+        boundaries = find_boundaries(surface, mesh, body, settings.boundaries, solver)
     with clock("coordinates"):
-        coordinates = solve_coordinates(mesh, boundaries)
+        coordinates = solve_coordinates(mesh, boundaries, solver)
         order = check_label_order(mesh, coordinates, body, settings.checks)
     with clock("sheet"):
         sheet = sample_sheet(mesh, coordinates, settings.sheet)

@@ -8,7 +8,8 @@ from scipy.spatial import cKDTree
 from hipsta_bids.artifacts import Bool, Float, Int, Surface, TetMesh
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
-from hipsta_bids.geometry.laplace import smallest_eigenfunctions
+from hipsta_bids.geometry.checks import name_place
+from hipsta_bids.geometry.laplace import HarmonicSolver, smallest_eigenfunctions
 from hipsta_bids.geometry.rims import center_curves, guided_curves, rim_paths
 from hipsta_bids.geometry.strips import facing_strips
 from hipsta_bids.geometry.surface import (
@@ -51,7 +52,11 @@ class Boundaries:
 
 
 def find_boundaries(
-    surface: Surface, mesh: TetMesh, body: Body, settings: BoundarySettings
+    surface: Surface,
+    mesh: TetMesh,
+    body: Body,
+    settings: BoundarySettings,
+    solver: HarmonicSolver | None = None,
 ) -> Boundaries:
     """Find the boundary strips, sides and caps of the sheet.
 
@@ -66,6 +71,8 @@ def find_boundaries(
         Its first vertices are those of the surface.
     body : Body
     settings : BoundarySettings
+    solver : HarmonicSolver, optional
+        Of this mesh, if there is one already.
 
     Returns
     -------
@@ -91,9 +98,9 @@ def find_boundaries(
     ]
     if not distance <= settings.max_distance:
         attempts.reverse()
-    found = _separating(wall, mesh, attempts, thickness, settings)
+    found = _separating(wall, solver or HarmonicSolver(mesh), attempts, thickness, settings)
     if found is None:
-        raise _inseparable(rims)
+        raise _inseparable(rims, body)
     rule, pair, strips, sides = found
     if _rank(pair[0], body) > _rank(pair[1], body):
         pair, strips = (pair[1], pair[0]), (strips[1], strips[0])
@@ -123,7 +130,7 @@ def find_boundaries(
 
 def _separating(
     wall: Wall,
-    mesh: TetMesh,
+    solver: HarmonicSolver,
     attempts: list[tuple[str, tuple[Float, Float] | None]],
     thickness: float,
     settings: BoundarySettings,
@@ -134,21 +141,24 @@ def _separating(
             continue
         reach = settings.first_strip * thickness
         plain = (wall.near(pair[0], reach), wall.near(pair[1], reach))
-        for strips, middle in (facing_strips(wall, mesh, pair, thickness, settings), (plain, pair)):
+        for strips, middle in (
+            facing_strips(wall, solver, pair, thickness, settings),
+            (plain, pair),
+        ):
             sides = wall.sides(strips[0] | strips[1])
             if sides is not None and not (strips[0] & strips[1]).any():
                 return rule, middle, strips, sides
     return None
 
 
-def _inseparable(rims: tuple[Float, Float]) -> GeometryError:
+def _inseparable(rims: tuple[Float, Float], body: Body) -> GeometryError:
     """Say where the rims come closest to each other."""
     gap, nearest = (np.asarray(found) for found in cKDTree(rims[1]).query(rims[0]))
     closest = int(gap.argmin())
-    place = " ".join(f"{v:.1f}" for v in (rims[0][closest] + rims[1][nearest[closest]]) / 2)
+    place = name_place(np.stack([rims[0][closest], rims[1][nearest[closest]]]), body)
     return GeometryError(
         "the medial and lateral boundary do not separate the interior from the exterior side: "
-        f"check the labels for folds that touch each other, first near RAS {place} mm, where the "
+        f"check the labels for folds that touch each other, first near {place}, where the "
         f"two rims are only {gap[closest]:.1f} mm apart",
         reason="boundaries",
     )

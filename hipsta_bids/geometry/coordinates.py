@@ -7,7 +7,9 @@ from hipsta_bids.geometry.boundaries import Boundaries
 from hipsta_bids.geometry.laplace import HarmonicSolver
 
 
-def solve_coordinates(mesh: TetMesh, boundaries: Boundaries) -> Coordinates:
+def solve_coordinates(
+    mesh: TetMesh, boundaries: Boundaries, solver: HarmonicSolver | None = None
+) -> Coordinates:
     """Solve Laplace's equation between each pair of opposite boundaries.
 
     Each function is -1 on the first boundary (medial, posterior, interior), 1 on the second, and
@@ -17,6 +19,8 @@ def solve_coordinates(mesh: TetMesh, boundaries: Boundaries) -> Coordinates:
     ----------
     mesh : TetMesh
     boundaries : Boundaries
+    solver : HarmonicSolver, optional
+        Of this mesh, if there is one already.
 
     Returns
     -------
@@ -27,7 +31,7 @@ def solve_coordinates(mesh: TetMesh, boundaries: Boundaries) -> Coordinates:
     GeometryError
         ``laplace`` if a problem has no finite solution.
     """
-    solver = HarmonicSolver(mesh)
+    solver = solver or HarmonicSolver(mesh)
     values = (
         solver.between(boundaries.medial, boundaries.lateral),
         solver.between(boundaries.posterior, boundaries.anterior),

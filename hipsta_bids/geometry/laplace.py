@@ -95,6 +95,7 @@ def solve_dirichlet(
     fixed: NDArray[np.intp],
     values: Float,
     groups: NDArray[np.intp] | None = None,
+    guess: Float | None = None,
 ) -> Float:
     """Harmonic function with given values at some vertices and free boundary elsewhere.
 
@@ -107,6 +108,8 @@ def solve_dirichlet(
     groups : (V,) array of int, optional
         Of :func:`~hipsta_bids.geometry.two_level.compact_groups`: solve by iteration, which pays
         where thousands of vertices are free; missing: by factorization.
+    guess : (V,) array, optional
+        A similar function, from which iteration starts.
 
     Returns
     -------
@@ -124,7 +127,7 @@ def solve_dirichlet(
     result[fixed] = values
     right = -(matrix @ result)
     if groups is not None:
-        result += solve_two_level(matrix.tocsr(), right, free, groups)
+        result += solve_two_level(matrix.tocsr(), right, free, groups, guess)
     else:
         result[free] = _factor(matrix[free][:, free].tocsc()).solve(right[free])
     if not np.isfinite(result).all():
@@ -140,10 +143,13 @@ class HarmonicSolver:
     _MANY = 4000  # vertices from which on iterating is faster than factorizing
 
     def __init__(self, mesh: TetMesh) -> None:
+        self.mesh = mesh
         self._matrix = stiffness(mesh.vertices, mesh.tetrahedra)
         self._groups = compact_groups(mesh.vertices) if len(mesh.vertices) > self._MANY else None
 
-    def between(self, first: Int, second: Int, *, few: bool = False) -> Float:
+    def between(
+        self, first: Int, second: Int, *, few: bool = False, guess: Float | None = None
+    ) -> Float:
         """Solve Laplace's equation between two sets of vertices, without flux elsewhere.
 
         Parameters
@@ -152,6 +158,8 @@ class HarmonicSolver:
             Vertices where the function is -1 and 1.
         few : bool
             Few vertices are left between them, so that a factorization is faster.
+        guess : (V,) array, optional
+            A similar function: it saves time.
 
         Returns
         -------
@@ -167,6 +175,7 @@ class HarmonicSolver:
             np.concatenate([first, second]),
             np.repeat([-1.0, 1.0], [len(first), len(second)]),
             None if few else self._groups,
+            guess,
         )
 
 

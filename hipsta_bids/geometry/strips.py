@@ -14,7 +14,7 @@ Pair = tuple[Float, Float]
 
 
 def facing_strips(
-    wall: Wall, mesh: TetMesh, curves: Pair, thickness: float, settings: BoundarySettings
+    wall: Wall, solver: HarmonicSolver, curves: Pair, thickness: float, settings: BoundarySettings
 ) -> tuple[tuple[Bool, Bool], Pair]:
     """Find the parts of the wall near two curves that face along the sheet, away from it.
 
@@ -26,7 +26,8 @@ def facing_strips(
     Parameters
     ----------
     wall : Wall
-    mesh : TetMesh
+    solver : HarmonicSolver
+        Of the mesh.
     curves : two (N, 3) arrays
         Medial and lateral, or the other way round, RAS mm.
     thickness : float
@@ -40,14 +41,15 @@ def facing_strips(
     curves : two (N, 3) arrays
         Their middle lines.
     """
-    solver = HarmonicSolver(mesh)
+    mesh = solver.mesh
     finder = _Finder(wall, mesh, thickness, settings)
-    starts = curves
+    starts, function = curves, None
     strips = _near(wall, curves, settings.first_strip * thickness)
     for reach in settings.strip_reach:
         lines = _near(wall, curves, settings.least_strip * thickness)
         limits = _near(wall, curves, reach * thickness)
-        function = solver.between(wall.index[strips[0]], wall.index[strips[1]])
+        ends = wall.index[strips[0]], wall.index[strips[1]]
+        function = solver.between(*ends, guess=function)
         flow = gradients(mesh.vertices, mesh.tetrahedra, function)
         strips = (
             finder.strip(starts[0], flow, lines[0], limits[0]),

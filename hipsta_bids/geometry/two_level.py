@@ -43,7 +43,11 @@ def compact_groups(points: Float) -> NDArray[np.intp]:
 
 
 def solve_two_level(
-    matrix: sparse.csr_array, right: Float, free: Bool, groups: NDArray[np.intp]
+    matrix: sparse.csr_array,
+    right: Float,
+    free: Bool,
+    groups: NDArray[np.intp],
+    guess: Float | None = None,
 ) -> Float:
     """Solve a symmetric positive definite system on some of the unknowns.
 
@@ -55,6 +59,8 @@ def solve_two_level(
         The unknowns; the other rows and columns are left out.
     groups : (N,) array of int
         Of :func:`compact_groups`.
+    guess : (N,) array, optional
+        To start from; it changes the time and not the accuracy.
 
     Returns
     -------
@@ -90,13 +96,14 @@ def solve_two_level(
         sums = coarse @ np.bincount(groups, root * rest, len(coarse))
         return np.asarray(rest + root * sums[groups])
 
-    return inverse * _conjugate_gradients(scaled, inverse * right, both_levels)
+    start = np.zeros(len(right)) if guess is None else root * guess
+    return inverse * _conjugate_gradients(scaled, inverse * right, start, both_levels)
 
 
 def _conjugate_gradients(
-    matrix: sparse.csr_array, right: Float, precondition: Callable[[Float], Float]
+    matrix: sparse.csr_array, right: Float, start: Float, precondition: Callable[[Float], Float]
 ) -> Float:
-    result, rest = np.zeros(len(right)), right.copy()
+    result, rest = start.copy(), right - matrix @ start
     step = precondition(rest)
     size = float(rest @ step)
     limit = _RESIDUAL * float(np.linalg.norm(right))
