@@ -29,23 +29,27 @@ def key_numbers(series: Series) -> Mapping[str, Any] | None:
 
 
 def _subfield_measures(series: Series) -> list[Measure]:
+    """Mean thickness of each subfield that one of the hemispheres has."""
     prefix = "thickness_mean_"
-    names = [
+    names = dict.fromkeys(
         name
-        for name, value in series.measured[0].summary.items()
+        for hemisphere in series.measured
+        for name, value in hemisphere.summary.items()
         if name.startswith(prefix) and np.isfinite(value)
-    ]
+    )
     return [
         Measure(
             name=name,
-            title=f"Mean thickness, {name.removeprefix(prefix).replace('_', '/').lower()}".replace(
-                "ca", "CA"
-            ),
+            title=f"Mean thickness, {_subfield_title(name.removeprefix(prefix))}",
             unit="mm",
             digits=2,
         )
         for name in names
     ]
+
+
+def _subfield_title(name: str) -> str:
+    return name.replace("_", "/") if name.startswith(("CA", "BA")) else name.lower()
 
 
 def _number_row(measure: Measure, series: Series) -> Mapping[str, Any]:

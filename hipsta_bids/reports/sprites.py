@@ -10,7 +10,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from pyarrow import csv
 
-from hipsta_bids.artifacts import Float
+from hipsta_bids.artifacts import Float, Status
 from hipsta_bids.bids import files
 from hipsta_bids.reports.figures import MAP_KINDS, MapKind, color_table, scale_of
 from hipsta_bids.reports.results import Hemisphere
@@ -105,15 +105,24 @@ def make_sprites(
     )
     step = 1 if len(shown) <= _FULL_SIZE else 2
     mirrored = [hemispheres[row].place.name.hemi == "L" for row in shown]
-    return [
-        _sprites(kind, [maps[row][kind.column][::step, ::step] for row in shown], mirrored, grid)
-        for kind in MAP_KINDS
-        if shown
-    ], grid
+    trusted = [row for row in shown if hemispheres[row].status != Status.FLAGGED] or shown
+    sprites = []
+    for kind in MAP_KINDS if shown else ():
+        # What is flagged may be far off; it need not stretch the colors of all others.
+        scale = scale_of(kind, [maps[row][kind.column] for row in trusted])
+        tiles = [maps[row][kind.column][::step, ::step] for row in shown]
+        sprites.append(_sprites(kind, tiles, mirrored, grid, scale))
+    return sprites, grid
 
 
-def _sprites(kind: MapKind, maps: Sequence[Float], mirrored: Sequence[bool], grid: Grid) -> Sprites:
-    low, high = scale_of(kind, maps)
+def _sprites(
+    kind: MapKind,
+    maps: Sequence[Float],
+    mirrored: Sequence[bool],
+    grid: Grid,
+    scale: tuple[float, float],
+) -> Sprites:
+    low, high = scale
     width, height = maps[0].shape
     picture = np.full((grid.rows * height, grid.columns * width), _COLORS, dtype=np.uint8)
     for place, (values, mirror) in enumerate(zip(maps, mirrored, strict=True)):

@@ -82,8 +82,8 @@ def texts(browser, selector):
     return [element.text for element in browser.find_elements(By.CSS_SELECTOR, selector)]
 
 
-def until(condition, seconds=10.0):
-    """Wait until something holds."""
+def until(condition, seconds=60.0):
+    """Wait until something holds; long, for machines that are busy otherwise."""
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end
