@@ -14,7 +14,6 @@ from hipsta_bids.group.analysis import Analysis
 from hipsta_bids.group.columns import COLUMNS
 from hipsta_bids.group.multiplicity import MapKey
 from hipsta_bids.group.report import methods_text
-from hipsta_bids.group.scores import Scores
 from hipsta_bids.group.shapes import AverageShape
 from hipsta_bids.group.tables import entity_label, map_name, point_tables, result_tables
 from hipsta_bids.group.template_json import templates_to_json
@@ -59,6 +58,7 @@ def write_results(
         for table in point_tables(name, *other, settings):
             group_outputs.write_result_table(folder, table, COLUMNS)
         _write_gifti(folder, *other)
+        _write_scores(folder, *other)
     rows = pd.DataFrame(
         [
             {
@@ -88,8 +88,7 @@ def write_results(
     if templates:
         files.write_json(folder / "template.json", templates_to_json(templates))
     _write_gifti(folder, cohort, analysis)
-    if analysis.scores is not None and analysis.scores.sides:
-        _write_scores(folder, analysis.compared, analysis.scores)
+    _write_scores(folder, cohort, analysis)
     text = methods_text(cohort, analysis, settings, len(exclusions), tuple(others))
     files.write_text(folder / "methods.md", text)
 
@@ -147,16 +146,20 @@ def _write_gifti(folder: Path, cohort: Cohort, analysis: Analysis) -> None:
                     files.write_bytes(folder / f"{stem}.shape.gii", content)
 
 
-def _write_scores(folder: Path, cohort: Cohort, scores: Scores) -> None:
-    """Write each participant's w-scores as maps."""
+def _write_scores(folder: Path, cohort: Cohort, analysis: Analysis) -> None:
+    """Write each participant's w-scores as maps; those of the sheet also as one table."""
+    scores, table = analysis.scores, analysis.compared.table
+    if scores is None:
+        return
     for hemi, side in scores.sides.items():
-        names = [str(name) for name in cohort.table.index[side.rows]]
+        names = [str(name) for name in table.index[side.rows]]
         for measure, found in side.scores.items():
             content = gifti.maps_bytes(found.w.T, hemi=hemi, names=names, series=False)
             name = f"hemi-{hemi}_stat-w_desc-{entity_label(measure)}_statmap.shape.gii"
             files.write_bytes(folder / name, content)
-    maps = {
-        hemi: (side.rows, {name: found.w for name, found in side.scores.items()})
-        for hemi, side in scores.sides.items()
-    }
-    write_score_maps(folder / "wscores.parquet", cohort.table, maps, cohort.x, cohort.y)
+    if analysis.sides and scores.sides:
+        maps = {
+            hemi: (side.rows, {name: found.w for name, found in side.scores.items()})
+            for hemi, side in scores.sides.items()
+        }
+        write_score_maps(folder / "wscores.parquet", table, maps, cohort.x, cohort.y)

@@ -205,16 +205,27 @@ def analyze_points(cohort: Cohort, analysis: Analysis, settings: GroupSettings) 
     maps = tuple(dict.fromkeys(name for side in cohort.sides.values() for name in side.maps))
     compared = compare_sessions(cohort, analysis.comparison)
     fitted = _fit_sides(compared, maps, analysis.row_model, analysis.comparison, settings)
+    measured = Measures(maps=maps, summaries=())
+    scores = None
+    if analysis.comparison.normative is not None:
+        scores = score_cohort(
+            compared,
+            analysis.model,
+            analysis.comparison.normative,
+            settings,
+            measures=measured,
+            references=analysis.design.references,
+        )
     return replace(
         analysis,
         sides={},
-        measured=Measures(maps=maps, summaries=()),
+        measured=measured,
         compared=compared,
         fitted=fitted,
         found=correct(fitted, analysis.row_model, compared.table, settings),
         measures=(),
         pairs=(),
-        scores=None,
+        scores=scores,
         skipped=(),
     )
 

@@ -126,7 +126,7 @@ def score_cohort(
         formula=formula,
         n_reference=int(reference.sum()),
         sides=sides,
-        table=pd.concat(parts, ignore_index=True),
+        table=pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(),
     )
 
 

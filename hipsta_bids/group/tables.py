@@ -48,7 +48,7 @@ def result_tables(
         yield ResultTable(name="descriptives", rows=_descriptives(analysis))
     if analysis.groups is not None and analysis.sides:
         yield ResultTable(name="shifts", rows=_shifts(analysis))
-    if analysis.scores is not None:
+    if analysis.scores is not None and len(analysis.scores.table):
         yield ResultTable(name="wscores", rows=analysis.scores.table)
     if analysis.pairs:
         yield ResultTable(name="classification", rows=_classification(analysis, settings))
@@ -72,6 +72,8 @@ def point_tables(
     ResultTable
     """
     yield ResultTable(name=f"{name}_peaks", rows=_peaks(cohort, analysis, settings))
+    if analysis.scores is not None:
+        yield ResultTable(name=f"{name}_wscores", rows=analysis.scores.table)
     yield from _statistics(cohort, analysis)
 
 

@@ -27,12 +27,10 @@ def draw_roc(analysis: Analysis) -> "Figure":
     for axis, pair in _pairs(analysis, axes):
         for color, name, result in _models(analysis, pair):
             area, validation = result.auc, result.cross_validation
-            text = (
-                f"{name}: {area.area:.2f} ({area.low:.2f}-{area.high:.2f}),"
-                f" left out {validation.auc:.2f}"
-            )
+            text = f"{name}: {area.area:.2f} ({area.low:.2f}-{area.high:.2f})"
+            text += f"\nleft out: {validation.auc:.2f}"
             axis.plot(*_roc(result.score, pair.is_case), color=color, label=text, linewidth=1.2)
-        title = "area of participants fitted, and of those left out"
+        title = "area, participants fitted and left out"
         _finish(axis, ("1 - specificity", "sensitivity"), title, "lower right")
     return figure
 

@@ -315,3 +315,18 @@ def test_refused_without_sheets_too(study, capsys):
     assert run(study, "--maps", "hipp=nothing/{subject}_{hemi}.gii", out="new") == 66
     assert capsys.readouterr().err.count("\n") == 1
     assert not (study / "new").exists()
+
+
+def test_maps_of_others_are_scored_against_a_reference_group(written):
+    options = ["--maps", f"hipp={PATTERNS[1]}", "--normative", "group=CN", "--name", "scored"]
+    assert run(written, *options, out="alone") == 0
+    folder = written / "alone" / "group" / "scored"
+    image = nib.load(folder / "hemi-L_stat-w_desc-hipp_statmap.shape.gii")
+    assert len(image.darrays) == COUNT
+    patient = image.darrays[-1].data
+    # Three standard deviations thinner; the mean of a fifth of 160 vertices is .2 off.
+    assert np.nanmean(patient[thinned("L")]) == pytest.approx(-3, abs=0.7)
+    assert abs(np.nanmean(patient[~thinned("L")])) < 0.5
+    rows = table(folder / "hipp_wscores.tsv")
+    assert set(rows.region) == {"all"}
+    assert rows[~rows.reference].low.mean() > rows[rows.reference].low.mean()
