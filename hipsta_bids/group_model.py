@@ -122,6 +122,8 @@ def model_document(
             raise UsageError("give --model or --formula, not both", reason="usage")
         return files.read_json(request.file)
     if request.formula is not None:
+        if not request.formula.rpartition("~")[2].strip():
+            raise UsageError("--formula is empty; write it as group + age", reason="usage")
         formula = request.formula
         contrasts = list(request.contrasts)
         if not contrasts and groups is not None and groups.column in formula:

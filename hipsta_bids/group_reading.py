@@ -99,7 +99,7 @@ def read_inputs(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
         time=time,
         exclusions=(*found.exclusions, *_other_visits(measured, reasons, options.comparison)),
         n_other_visits=len(reasons),
-        notes=(*foreign.notes, *volume_notes),
+        notes=(*found.notes, *foreign.notes, *volume_notes),
     )
 
 

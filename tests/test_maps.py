@@ -300,7 +300,7 @@ def test_a_run_with_other_maps_redoes_and_tidies_up(bids_dir, regions, tmp_path,
         ("x\ty\tregion\n1\t1\tn/a\n", "no point belongs to a region"),
         ("", "no point belongs to a region"),
         ("x\ty\tregion\n1\t1\n", "rows and header differ"),
-        (None, "not readable as a table"),
+        (None, "no such file"),
     ],
 )
 def test_bad_regions_are_one_line(content, what, tmp_path):

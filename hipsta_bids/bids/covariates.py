@@ -36,23 +36,46 @@ def read_covariates(visits: pd.DataFrame, bids_dir: Path, extra: Sequence[Path])
     Raises
     ------
     InputError
-        If a table cannot be read, has no ``participant_id``, or names somebody twice.
+        If the dataset does not exist, a table cannot be read, has no ``participant_id`` or names
+        somebody twice, or ``participants.tsv`` is about others.
     """
     joined = visits.copy()
     main = bids_dir / "participants.tsv"
     tables = [main] if main.is_file() else []
+    if not bids_dir.is_dir():
+        raise InputError(f"{bids_dir}: no such folder; check its name", reason="no-folder")
     for path in (*tables, *sorted((bids_dir / "phenotype").glob("*.tsv")), *extra):
-        joined = _join(joined, _read(path), path)
+        table = _read(path)
+        if path == main:
+            _check_anybody(joined, table, path)
+        joined = _join(joined, table, path)
         if path == main:
             joined = _join_sessions(joined, bids_dir)
     return joined
 
 
+def _check_anybody(visits: pd.DataFrame, table: pd.DataFrame, path: Path) -> None:
+    """Refuse a table of other people: labels may be spelled differently."""
+    if not set(visits[PARTICIPANT]) & set(table[PARTICIPANT]):
+        raise InputError(
+            f"{path}: names none of the participants here; it has {table[PARTICIPANT].iloc[0]} ...,"
+            f" here are {visits[PARTICIPANT].iloc[0]} ...",
+            reason="other-participants",
+        )
+
+
 def _read(path: Path) -> pd.DataFrame:
     rows = files.read_tsv(path)
+    if not rows:
+        raise InputError(
+            f"{path}: has no rows; it needs a column participant_id, and a row per participant",
+            reason="bad-table",
+        )
     table = pd.DataFrame(rows, dtype=object)
     if PARTICIPANT not in table.columns:
-        raise InputError(f"{path}: has no column participant_id", reason="bad-table")
+        raise InputError(
+            f"{path}: has no column participant_id; columns are parted by tabs", reason="bad-table"
+        )
     table[PARTICIPANT] = [_prefixed(cell, "sub-") for cell in table[PARTICIPANT]]
     if SESSION in table.columns:
         table[SESSION] = [_prefixed(cell, "ses-") for cell in table[SESSION]]
@@ -60,6 +83,7 @@ def _read(path: Path) -> pd.DataFrame:
 
 
 def _prefixed(cell: str, prefix: str) -> str:
+    cell = cell.strip()
     return cell if cell == files.MISSING or cell.startswith(prefix) else prefix + cell
 
 

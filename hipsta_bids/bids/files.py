@@ -264,10 +264,19 @@ def read_tsv(path: Path) -> list[dict[str, str]]:
     Raises
     ------
     InputError
-        If the file is missing or unreadable, or a row has another length than the header.
+        If the file is missing or unreadable, a row has another length than the header, or a name
+        stands in this twice.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file; check its name", reason="no-file") from error
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"{path}: not readable as a table: no UTF-8 text; save it as that (not as Excel's"
+            " Unicode text)",
+            reason="unreadable-table",
+        ) from error
     except (OSError, ValueError) as error:
         raise InputError(
             f"{path}: not readable as a table ({error}); restore or delete it",
@@ -279,6 +288,10 @@ def read_tsv(path: Path) -> list[dict[str, str]]:
     if any(len(row) != len(header) for row in rows):
         raise InputError(
             f"{path}: rows and header differ in length; restore or delete it", reason="bad-table"
+        )
+    if twice := sorted({name for name in header if header.count(name) > 1}):
+        raise InputError(
+            f"{path}: column {twice[0]!r} stands there more than once; keep one", reason="bad-table"
         )
     return [dict(zip(header, row, strict=True)) for row in rows]
 

@@ -81,6 +81,8 @@ class Collection:
     """Those of the participant level, resolved."""
     settings_hash: str
     versions: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+    """What to know, one line each."""
 
 
 def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collection:
@@ -135,6 +137,7 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
         settings=_settings_of(kept[0].place.root),
         settings_hash=digest,
         versions=tuple(sorted({record.version for record in kept})),
+        notes=_lost_exclusions(request.exclude_table, unwanted, found),
     )
 
 
@@ -285,6 +288,25 @@ def _listed_exclusions(path: Path | None) -> list[dict[str, str]]:
             reason="bad-table",
         )
     return rows
+
+
+def _lost_exclusions(
+    path: Path | None, rows: Sequence[Mapping[str, str]], found: Sequence[ResultPlace]
+) -> tuple[str, ...]:
+    """Say which rows of the user's table are about nobody here: labels may be misspelled."""
+    if path is None:
+        return ()
+    if not rows:
+        return (f"{path}: lists nobody to exclude",)
+    lost = [
+        row["participant_id"]
+        for row in rows
+        if not any(_is_listed(place.name, row) for place in found)
+    ]
+    if not lost:
+        return ()
+    more = f" and {len(lost) - _SHOWN} more" if len(lost) > _SHOWN else ""
+    return (f"{path}: not here, or not so, are {', '.join(lost[:_SHOWN])}{more}",)
 
 
 def _is_listed(name: HemisphereName, row: Mapping[str, str]) -> bool:

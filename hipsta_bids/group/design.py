@@ -14,7 +14,14 @@ from numpy.typing import NDArray
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.contrasts import Contrast
 from hipsta_bids.group.model_spec import ContrastSpec, ModelSpec
-from hipsta_bids.group.variables import check_names, listed, rows_by_lack, set_levels, typed
+from hipsta_bids.group.variables import (
+    check_left,
+    check_names,
+    listed,
+    rows_by_lack,
+    set_levels,
+    typed,
+)
 from hipsta_bids.group_settings import DesignSettings
 
 FloatArray = NDArray[np.float64]
@@ -67,6 +74,7 @@ def build_design(
     complete = used.notna().all(axis=1).to_numpy()
     dropped = rows_by_lack(used, complete)
     used = used.loc[complete].copy()
+    check_left(used, dropped)
     chosen = set_levels(used, references, settings)
     try:
         made = formula.get_model_matrix(used, na_action="raise", context={})
@@ -150,7 +158,9 @@ def _read_formula(text: str) -> Formula:
         formula.required_variables  # noqa: B018 -- finds names that are none
     except (FormulaicError, ValueError, AttributeError) as error:
         raise ModelError(
-            f"formula {text!r} cannot be read; write it as group + age", reason="formula"
+            f"formula {text!r} cannot be read; write it as group + age, and names with blanks in"
+            " backticks",
+            reason="formula",
         ) from error
     if hasattr(formula, "rhs"):
         raise ModelError(

@@ -12,6 +12,8 @@ from hipsta_bids.group_settings import DesignSettings
 
 #: Texts that mean a missing value, besides what pandas takes for one.
 _MISSING = ("n/a", "NA", "N/A", "nan", "NaN", "")
+#: Numbers from here on overflow when they are squared and summed.
+_LARGEST = 1e100
 #: Rows that a message names.
 _NAMED = 8
 
@@ -50,7 +52,7 @@ def typed(values: pd.Series, settings: DesignSettings) -> pd.Series:
     Raises
     ------
     ModelError
-        If a few texts stand among numbers; names their rows.
+        If a few texts stand among numbers, or numbers are too large; names their rows.
     """
     if pd.api.types.is_bool_dtype(values):
         return values.map({True: "yes", False: "no"}).astype(object)
@@ -63,6 +65,13 @@ def typed(values: pd.Series, settings: DesignSettings) -> pd.Series:
     present = text.notna()
     numbers = pd.to_numeric(text, errors="coerce").astype(np.float64)
     if present.any() and numbers[present].notna().all():
+        too_large = present & ~(numbers.abs() < _LARGEST)
+        if too_large.any():
+            raise ModelError(
+                f"model: column {values.name!r} holds numbers that are too large for rows"
+                f" {listed(values.index[too_large])}; correct them, or mark them n/a",
+                reason="not-numeric",
+            )
         return numbers
     if numbers[present].notna().mean() > settings.numeric_share:
         bad = present & numbers.isna()
@@ -84,6 +93,20 @@ def rows_by_lack(used: pd.DataFrame, complete: NDArray[np.bool_]) -> dict[str, t
     return {name: tuple(rows) for name, rows in result.items()}
 
 
+def check_left(used: pd.DataFrame, dropped: Mapping[str, tuple[str, ...]]) -> None:
+    """Refuse a model that leaves no row; says what the rows lack.
+
+    Raises
+    ------
+    ModelError
+        With the number of rows per variable.
+    """
+    if not len(used):
+        lack = ", ".join(f"{name} ({len(rows)})" for name, rows in dropped.items())
+        why = f"; missing are {lack}" if lack else ""
+        raise ModelError(f"model: no row has all variables{why}", reason="group-size")
+
+
 def set_levels(
     used: pd.DataFrame, references: Mapping[str, str], settings: DesignSettings
 ) -> dict[str, list[str]]:
@@ -97,10 +120,8 @@ def set_levels(
     Raises
     ------
     ModelError
-        If nothing is left, a column does not vary, a level is unknown or has too few rows.
+        If a column does not vary, a level is unknown or has too few rows.
     """
-    if not len(used):
-        raise ModelError("model: no row has all variables", reason="group-size")
     chosen = {}
     for column in used.columns:
         name = str(column)

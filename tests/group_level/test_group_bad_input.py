@@ -58,6 +58,46 @@ def twice(study):
     write_participants(study.data, [*rows, rows[0]])
 
 
+def huge_age(study):
+    rows = read_participants(study.data)
+    rows[3][2] = "1e300"
+    write_participants(study.data, rows)
+
+
+def no_age(study):
+    rows = read_participants(study.data)
+    write_participants(study.data, [[*row[:2], "n/a", row[3]] for row in rows])
+
+
+def other_people(study):
+    rows = read_participants(study.data)
+    write_participants(study.data, [[f"{row[0]}x", *row[1:]] for row in rows])
+
+
+def header_only(study):
+    write_participants(study.data, [])
+
+
+def other_encoding(study):
+    path = study.data / "participants.tsv"
+    path.write_bytes(path.read_text().replace("CN", "Contrôle").encode("latin-1"))
+
+
+def with_commas(study):
+    path = study.data / "participants.tsv"
+    path.write_text(path.read_text().replace("\t", ","))
+
+
+def column_twice(study):
+    rows = read_participants(study.data)
+    columns = ("participant_id", "group", "age", "age")
+    write_participants(study.data, rows, columns)
+
+
+def no_dataset(study):
+    shutil.rmtree(study.data)
+
+
 def text_age(study):
     rows = read_participants(study.data)
     rows[3][2] = "old"
@@ -114,6 +154,17 @@ def no_values(study):
         (no_table, [], 65, "no column that tells groups"),
         (twice, [], 65, "sub-01 stand more than once"),
         (text_age, [], 65, "sub-04"),
+        (huge_age, [], 65, "too large for rows sub-04"),
+        (no_age, ["--formula", "group + age"], 65, "missing are age (30)"),
+        (other_people, [], 65, "names none of the participants here"),
+        (header_only, [], 65, "has no rows"),
+        (other_encoding, [], 65, "no UTF-8 text"),
+        (with_commas, [], 65, "parted by tabs"),
+        (column_twice, [], 65, "'age' stands there more than once"),
+        (no_dataset, [], 65, "no such folder"),
+        (None, ["--formula", " "], 64, "--formula is empty"),
+        (None, ["--formula", "group + my age"], 65, "backticks"),
+        (None, ["--exclude", "nowhere.tsv"], 65, "no such file"),
         (one_patient, [], 65, "AD (1)"),
         (mixed_settings, [], 65, "sub-07_hemi-R"),
         (other_grid, [], 65, "21 x 7 nodes"),
@@ -166,3 +217,21 @@ def test_same_subject_in_two_datasets_is_refused(written, study, tmp_path, capsy
     assert main(arguments) == 65
     assert "different sites need different labels" in capsys.readouterr().err
     assert not (tmp_path / "o").exists()
+
+
+def test_table_of_a_spreadsheet_is_read(study):
+    """With a byte order mark, line ends of Windows, and blanks round the labels."""
+    path = study.data / "participants.tsv"
+    text = path.read_text().replace("\n", "\r\n").replace("sub-02", "sub-02 ")
+    path.write_bytes(b"\xef\xbb\xbf" + text.encode())
+    assert main([str(study.data), str(study.out), "group", "--align", "none"]) == 0
+    left_out = (study.out / "group" / "group-age-sex" / "excluded.tsv").read_text()
+    assert left_out.count("\n") == 1
+
+
+def test_exclusions_of_nobody_are_told(study, tmp_path, capsys):
+    listed = tmp_path / "listed.tsv"
+    listed.write_text("participant_id\themi\nsub-77\tn/a\nsub-01\tL\n")
+    options = ["--align", "none", "--exclude", str(listed)]
+    assert main([str(study.data), str(study.out), "group", *options]) == 0
+    assert "not here, or not so, are sub-77" in capsys.readouterr().out
