@@ -19,7 +19,8 @@ def collect(
 ) -> RunResult:
     """Make ``status.tsv`` complete: a row for each hemisphere, from its quality record.
 
-    Nothing is measured. Times come from the tables of the runs.
+    Nothing is measured. Times come from the tables of the runs. Pages that are missing are made,
+    and that of all hemispheres.
 
     Parameters
     ----------

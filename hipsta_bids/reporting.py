@@ -13,6 +13,7 @@ from pathlib import Path
 
 from hipsta_bids.bids import files
 from hipsta_bids.bids.names import DATASET_FILES, name_of_record, participant_report
+from hipsta_bids.cluster import Cluster, run_on_cluster
 from hipsta_bids.errors import HipstaError, OutputError
 from hipsta_bids.pool import WorkerLost, WorkerPlan, run_jobs
 from hipsta_bids.reports.cohort import Cohort, read_cohort
@@ -51,6 +52,8 @@ class PagePlan:
     """Receives tracebacks and what libraries print."""
     cohort: bool = True
     """Whether the page of all is made, too."""
+    cluster: Cluster | None = None
+    """Workers elsewhere; ``None`` is this machine."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +115,11 @@ def write_reports(plan: PagePlan, visits: Iterable[Visit]) -> Iterator[Problem]:
         log=plan.log,
         warm_up=warm_up,
     )
-    with contextlib.closing(run_jobs(workers, jobs)) as pages:
+    if plan.cluster is None or not jobs:
+        found = run_jobs(workers, jobs)
+    else:
+        found = run_on_cluster(plan.cluster, workers, jobs)
+    with contextlib.closing(found) as pages:
         for job, answer in pages:
             problem = answer
             if isinstance(answer, WorkerLost):

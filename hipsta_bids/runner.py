@@ -227,6 +227,7 @@ def pages_after(
         n_workers=n_workers(options, len(visits)),
         log=log,
         cohort=options.shard is None,
+        cluster=options.cluster,
     )
     return reports_after(plan, visits, problems)
 
