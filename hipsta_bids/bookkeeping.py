@@ -192,7 +192,7 @@ def log_file(root: Path, verbosity: int, shard: str | None = None) -> Generator[
     process = f"{gethostname().partition('.')[0]}-{getpid()}"
     path = folder / f"run-{datetime.now(UTC):%Y%m%dT%H%M%S}-{process}{part}.log"
     try:
-        handler = _QuietHandler(path, encoding="utf-8")
+        handler = _QuietHandler(path, encoding="utf-8", errors="surrogateescape")
     except OSError as error:
         raise files.output_error(path, error) from error
     handler.setFormatter(logging.Formatter(_LOG_FORMAT))

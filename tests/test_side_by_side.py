@@ -25,7 +25,7 @@ from stand_ins import make_input, stand_in_job
 from hipsta_bids import runner
 from hipsta_bids.settings import Settings
 runner.run_job, runner.warm_up = stand_in_job, None
-where = Path({where!r})
+where = Path(sys.argv[1])
 items = [make_input(where / "in", f"{{k:02d}}", act="slow") for k in range(6)]
 result = runner.run_participants(
     items, where / "out", Settings(), runner.RunOptions(n_procs=2), lambda outcome: None
@@ -38,12 +38,10 @@ sys.exit(result.exit_code)
 def test_two_runs_measure_each_hemisphere_once_and_lose_nothing(tmp_path):
     for k in range(6):  # an input that is written anew by the second run is another input
         make_input(tmp_path / "in", f"{k:02d}", act="slow")
-    script = RUN.format(tests=str(Path(__file__).parent), where=str(tmp_path))
-    runs = [
-        subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
-        for _ in range(2)
-    ]
-    measured = [int(run.communicate(timeout=60)[0]) for run in runs]
+    script = RUN.format(tests=str(Path(__file__).parent))
+    command = [sys.executable, "-c", script, tmp_path]
+    runs = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    measured = [int(run.communicate(timeout=200)[0]) for run in runs]
     assert [run.returncode for run in runs] == [0, 0]
     assert sum(measured) == 6
     out = tmp_path / "out"
@@ -53,10 +51,60 @@ def test_two_runs_measure_each_hemisphere_once_and_lose_nothing(tmp_path):
     json.loads((out / "dataset_description.json").read_text())
 
 
+@pytest.mark.parametrize(
+    "environment",
+    [
+        {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
+        {"LC_ALL": "tr_TR.UTF-8", "TZ": "Pacific/Kiritimati"},
+    ],
+)
+def test_locale_and_time_zone_change_nothing(tmp_path, environment):
+    outs = []
+    # not in ASCII, with the letters that Turkish has capitals of its own for
+    for name, more in (("plain", {}), ("ıİß", environment)):
+        where = tmp_path / name
+        for k in range(6):
+            make_input(where / "in", f"{k:02d}", act=("repaired", "bug")[k % 2])
+        script = RUN.format(tests=str(Path(__file__).parent))
+        script = script.replace('"slow"', '("repaired", "bug")[k % 2]')
+        command = [sys.executable, "-c", script, where]
+        run = subprocess.run(command, env=os.environ | more, check=False)
+        assert run.returncode == 70
+        outs.append(where / "out")
+    plain, odd = ({p.name: p.read_bytes() for p in out.rglob("sub-*.*")} for out in outs)
+    assert plain.keys() == odd.keys()
+    assert [name for name in plain if plain[name] != odd[name]] == []
+
+
+def test_an_input_that_vanishes_fails_alone(tmp_path, monkeypatch):
+    for name in ("hipsta_bids.bids.images", "hipsta_bids.participant"):
+        monkeypatch.setitem(sys.modules, name, None)  # put back afterwards
+    items = [make_input(tmp_path / "in", f"0{k}") for k in range(3)]
+
+    def vanish(_plan, jobs):
+        for job in jobs:
+            items[1].files[0].unlink(missing_ok=True)
+            yield job, stand_in_job(job)
+
+    monkeypatch.setattr(runner, "run_jobs", vanish)
+
+    def run():
+        out = tmp_path / "out"
+        options = runner.RunOptions()
+        return runner.run_participants(items, out, Settings(), options, lambda _: None)
+
+    assert run().exit_code == 1
+    rows = read_status(tmp_path / "out")
+    assert [row["reason"] for row in rows] == ["n/a", "unreadable-file", "n/a"]
+    items[1].files[0].write_text("ok")
+    monkeypatch.setattr(runner, "run_jobs", lambda _, jobs: ((j, stand_in_job(j)) for j in jobs))
+    assert run().exit_code == 0
+
+
 def hold(root, ready, release):
     with locked(root, "this"):
         ready.set()
-        release.wait(10)
+        release.wait(100)
 
 
 def test_locks_exclude_others_and_end_with_their_process(tmp_path):
@@ -64,7 +112,7 @@ def test_locks_exclude_others_and_end_with_their_process(tmp_path):
     ready, release = context.Event(), context.Event()
     holder = context.Process(target=hold, args=(tmp_path, ready, release))
     holder.start()
-    assert ready.wait(10)
+    assert ready.wait(100)
     with locked(tmp_path, "that") as alone:
         assert alone
     killer = context.Process(target=kill_later, args=(holder.pid,))

@@ -191,8 +191,11 @@ def remove_leftovers(folder: Path, pattern: str) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a UTF-8 text file atomically (see :func:`write_bytes`)."""
-    write_bytes(path, text.encode())
+    """Write a UTF-8 text file atomically (see :func:`write_bytes`).
+
+    Names of files that the locale cannot spell keep their bytes.
+    """
+    write_bytes(path, text.encode(errors="surrogateescape"))
 
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:

@@ -152,3 +152,9 @@ def test_leftovers_of_a_killed_run_are_removed_but_no_others(tmp_path):
         ".s_seg-b_x.tsv.12.tmp",
         "s_seg-a_x.tsv",
     ]
+
+
+def test_names_that_the_locale_cannot_spell_keep_their_bytes(tmp_path):
+    name = "ıİß".encode().decode("ascii", errors="surrogateescape")  # as in LC_ALL=C
+    files.write_text(tmp_path / "text", name)
+    assert (tmp_path / "text").read_text(encoding="utf-8") == "ıİß"
