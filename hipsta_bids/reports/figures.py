@@ -116,6 +116,12 @@ def color_table(kind: MapKind, n: int = 64) -> NDArray[np.str_]:
     return np.array([to_hex(color) for color in colormaps[kind.colors](np.linspace(0, 1, n))])
 
 
+def gradient_of(colors: NDArray[np.str_]) -> str:
+    """Spell a color table as a CSS gradient from left to right."""
+    stops = colors[np.linspace(0, len(colors) - 1, 9).round().astype(int)]
+    return f"linear-gradient(to right,{','.join(stops.tolist())})"
+
+
 def draw_map(kind: MapKind, hemispheres: Sequence[Hemisphere]) -> Picture:
     """Draw one map of both hemispheres, unfolded, side by side on one color scale.
 

@@ -9,7 +9,14 @@ from typing import Any
 from hipsta_bids.artifacts import Float, Status
 from hipsta_bids.bids.names import output_name
 from hipsta_bids.reports.cohort import SMALLEST_COHORT, Cohort
-from hipsta_bids.reports.figures import MAP_KINDS, THICKNESS, color_table, draw_map, draw_profiles
+from hipsta_bids.reports.figures import (
+    MAP_KINDS,
+    THICKNESS,
+    color_table,
+    draw_map,
+    draw_profiles,
+    gradient_of,
+)
 from hipsta_bids.reports.figures import scale_of as scale_of_map
 from hipsta_bids.reports.numbers import key_numbers, quality_numbers
 from hipsta_bids.reports.page import Section, build_sections, render
@@ -108,7 +115,11 @@ def _places(series: Series) -> Mapping[str, Any] | None:
         if view is None or not places:
             continue
         shown = [
-            {"findings": findings, "panels": place_panels(hemisphere, view, point)}
+            {
+                "findings": findings,
+                "urgent": any(finding.kind != "repair" for finding in findings),
+                "panels": place_panels(hemisphere, view, point),
+            }
             for point, findings in list(places.items())[:_PLACES_SHOWN]
         ]
         groups.append({"side": hemisphere.side, "places": shown, "more": len(places) - len(shown)})
@@ -174,7 +185,7 @@ def _sections(series: Series) -> Mapping[str, Any] | None:
         "scale": {
             "low": f"{scale[0]:.2f}",
             "high": f"{scale[1]:.2f}",
-            "colors": colors[::8].tolist(),
+            "gradient": gradient_of(colors),
         },
     }
 

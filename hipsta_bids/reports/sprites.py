@@ -12,7 +12,7 @@ from pyarrow import csv
 
 from hipsta_bids.artifacts import Float, Status
 from hipsta_bids.bids import files
-from hipsta_bids.reports.figures import MAP_KINDS, MapKind, color_table, scale_of
+from hipsta_bids.reports.figures import MAP_KINDS, MapKind, color_table, gradient_of, scale_of
 from hipsta_bids.reports.results import Hemisphere
 
 _COLUMNS = 20  # tiles side by side
@@ -31,7 +31,8 @@ class Sprites:
     low: str
     high: str
     """Values at the ends of the colors."""
-    colors: Sequence[str]
+    gradient: str
+    """Of the color bar, as CSS spells it."""
     address: str
     """Data address of the picture."""
 
@@ -139,7 +140,7 @@ def _sprites(
         unit=kind.unit,
         low=f"{low:.{kind.digits}f}",
         high=f"{high:.{kind.digits}f}",
-        colors=colors[:: _COLORS // 8].tolist(),
+        gradient=gradient_of(colors),
         address=_palette_png(picture, colors),
     )
 
