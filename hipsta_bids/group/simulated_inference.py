@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from hipsta_bids.group.contrasts import Contrast
 from hipsta_bids.group.design import Design
@@ -13,8 +14,10 @@ from hipsta_bids.group.inference import correct
 from hipsta_bids.group.multiplicity import MapKey
 from hipsta_bids.group.row_model import RowModel
 from hipsta_bids.group.simulation import SimulatedCohort, SimulationPlan, simulate_cohort
-from hipsta_bids.group_data import SideMaps
+from hipsta_bids.group_data import Float, SideMaps
 from hipsta_bids.group_settings import CORRECTIONS, GroupSettings
+
+Bool = NDArray[np.bool_]
 
 _GROUP = "group"
 
@@ -52,27 +55,33 @@ def simulate_corrections(
     mapping of str to CorrectionResult
         By the name of the correction.
     """
-    results = {}
-    for method in CORRECTIONS:
-        found, null = [], []
-        for seed in seeds:
+    found: dict[str, list[tuple[Bool, Bool]]] = {method: [] for method in CORRECTIONS}
+    affected = []
+    for seed in seeds:
+        cohort = simulate_cohort(plan, seed)
+        empty = simulate_cohort(replace(plan, effect=0.0), seed)
+        affected.append(cohort.affected)
+        for method, results in found.items():
             how = replace(settings.multiplicity, method=method, seed=seed)
             chosen = replace(settings, multiplicity=how)
-            cohort = simulate_cohort(plan, seed)
-            found.append((_found(cohort, chosen), cohort.affected))
-            empty = simulate_cohort(replace(plan, effect=0.0), seed)
-            null.append(_found(empty, chosen).any())
-        shares = [(one & (where == 0)).sum() / max(one.sum(), 1) for one, where in found]
-        results[method] = CorrectionResult(
-            null_findings=float(np.mean(null)),
-            false_discovery_rate=float(np.mean(shares)),
-            core_power=float(np.mean([one[where == 1].mean() for one, where in found])),
-            cohorts=len(null),
-        )
-    return results
+            results.append((_found(cohort, chosen), _found(empty, chosen)))
+    return {method: _summary(results, affected) for method, results in found.items()}
 
 
-def _found(cohort: SimulatedCohort, settings: GroupSettings) -> np.ndarray:
+def _summary(results: Sequence[tuple[Bool, Bool]], affected: Sequence[Float]) -> CorrectionResult:
+    shares, power = [], []
+    for (found, _), where in zip(results, affected, strict=True):
+        shares.append((found & (where == 0)).sum() / max(found.sum(), 1))
+        power.append(found[where == 1].mean())
+    return CorrectionResult(
+        null_findings=float(np.mean([empty.any() for _, empty in results])),
+        false_discovery_rate=float(np.mean(shares)),
+        core_power=float(np.mean(power)),
+        cohorts=len(results),
+    )
+
+
+def _found(cohort: SimulatedCohort, settings: GroupSettings) -> Bool:
     """(x, y) points that survive."""
     n = len(cohort.age)
     matrix = np.column_stack([np.ones(n), cohort.group, cohort.age - cohort.age.mean(), cohort.sex])
@@ -94,5 +103,5 @@ def _found(cohort: SimulatedCohort, settings: GroupSettings) -> np.ndarray:
     model = RowModel(design)
     fitted = {"L": fit_maps("L", side, model, settings)}
     found = correct(fitted, model, pd.DataFrame(index=range(n)), settings)
-    flags: np.ndarray = found[MapKey("thickness", _GROUP, "L")].rejected
+    flags: Bool = found[MapKey("thickness", _GROUP, "L")].rejected
     return flags.reshape(cohort.affected.shape)

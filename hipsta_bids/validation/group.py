@@ -14,7 +14,7 @@ MIN_FALSE_UNREGISTERED = 0.4
 """Without registration, the shift has to be taken for thinning; else this is no test of it."""
 
 #: For corrections: cohorts without displacement, whose effect is hard to find.
-NULL_COHORTS, FEW_NULL_COHORTS, PERMUTATIONS = 200, 10, 200
+NULL_COHORTS, FEW_NULL_COHORTS, PERMUTATIONS = 100, 10, 200
 SMALL = SimulationPlan(sizes=(40, 40), effect=0.8, shift=0.0, warp_sd=(0.0, 0.0))
 LEVEL = 0.05
 
