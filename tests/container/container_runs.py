@@ -3,6 +3,7 @@
 import csv
 import io
 import os
+import re
 import subprocess
 import sys
 import time
@@ -92,11 +93,11 @@ def _impersonal(path: Path, names):
             for row in rows
         ]
         return sorted(timeless, key=str)
-    if path.name in {"dataset_description.json", "analysis.json"}:
+    if path.name in {"dataset_description.json", "analysis.json"} or path.suffix == ".html":
         text = path.read_text(encoding="utf-8")
         for name, stand_in in names.items():
             text = text.replace(name, stand_in)
-        return text
+        return re.sub(r"\d{4}-\d{2}-\d{2} \d{2}:\d{2}", "TIME", text)
     return path.read_bytes()
 
 

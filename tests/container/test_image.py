@@ -1,5 +1,6 @@
 """What is in the image, and how fast it starts."""
 
+import os
 import time
 
 import pytest
@@ -73,28 +74,35 @@ def test_descriptor_is_the_one_in_the_repository():
     assert in_container("--bids-exec-spec").stdout.strip() == expected.strip()
 
 
-# Other work on the machine only adds to durations: the shortest of several counts.
+@pytest.fixture
+def check_seconds(record_figure):
+    """Compare the shortest of several durations with a limit: other work only adds to them."""
+
+    def check(name, durations, limit):
+        shortest = min(durations)
+        record_figure(f"{name} {shortest:.2f} s")
+        load = os.getloadavg()[0]
+        if shortest >= limit and load > os.cpu_count():
+            pytest.skip(f"{name} took {shortest:.2f} s on a busy machine (load {load:.0f})")
+        assert shortest < limit
+
+    return check
 
 
-def test_version_within_a_second(record_figure):
+def test_version_within_a_second(check_seconds):
     def version():
         start = time.monotonic()
         assert in_container("--version").stdout == f"hipsta_bids {__version__}\n"
         return time.monotonic() - start
 
-    seconds = min(version() for _ in range(5))
-    record_figure(f"--version {seconds:.2f} s")
-    assert seconds < 1
+    check_seconds("--version", [version() for _ in range(5)], 1)
 
 
-def test_first_line_within_two_seconds(phantoms, tmp_path, record_figure):
+def test_first_line_within_two_seconds(phantoms, tmp_path, check_seconds):
     out = shared_folder(tmp_path / "out")
     options = (*mount(phantoms, "/data", "ro"), *mount(out, "/out"))
     arguments = ("/data", "/out", "participant", "--dry-run")
-    seen = [first_line_of(*arguments, options=options) for _ in range(3)]
-    assert {line for line, _ in seen} == {
-        f"hipsta_bids {__version__}, participant level of /data\n"
-    }
-    seconds = min(seconds for _, seconds in seen)
-    record_figure(f"first line {seconds:.2f} s")
-    assert seconds < 2
+    seen = [first_line_of(*arguments, options=options) for _ in range(5)]
+    opening = f"hipsta_bids {__version__}, participant level of /data\n"
+    assert {line for line, _ in seen} == {opening}
+    check_seconds("first line", [seconds for _, seconds in seen], 2)
