@@ -311,6 +311,26 @@ def test_refused_in_one_line(study, capsys, spoil, options, code, words):  # noq
     assert not list((study / "out").glob("group/*"))
 
 
+def test_change_between_sessions_of_other_maps(study):
+    data = study / "bids" / "two"
+    for subject in subjects():
+        person = np.random.default_rng(int(subject)).normal(1.5, 0.3)  # cancels
+        for session in (1, 2):
+            path, surface = names(data, subject, "L", version=2, session=str(session))
+            noise = np.random.default_rng(int(subject) * 10 + session).normal(0, 0.1, 160)
+            thinning = 0.5 * thinned("L") * (session == 2) * (int(subject) > PLAN.sizes[0])
+            write_map(path, person + noise - thinning)
+            write_surface(surface, *SURFACES["L"])
+    pattern = "two/sub-{subject}/ses-{session}/metric/*_hemi-{hemi}_*_thickness.shape.gii"
+    options = ["--maps", f"hipp={pattern}", "--paired", "1", "2", "--name", "change"]
+    assert run(study, *options, out="new") == 0
+    rows = statmap(study / "new" / "group" / "change", "L")
+    assert set(rows.n) == {COUNT}
+    assert rows.significant[thinned("L")].mean() > 0.95
+    assert rows.significant[~thinned("L")].mean() < 0.1
+    assert rows.estimate[thinned("L")].mean() == pytest.approx(0.5, abs=0.05)
+
+
 def test_refused_without_sheets_too(study, capsys):
     assert run(study, "--maps", "hipp=nothing/{subject}_{hemi}.gii", out="new") == 66
     assert capsys.readouterr().err.count("\n") == 1

@@ -31,6 +31,9 @@ def _no_figures(monkeypatch):
 def written(tmp_path_factory):
     folder = tmp_path_factory.mktemp("volumes")
     write_dataset(folder)
+    for path in (folder / "out").rglob("*_desc-summary_morph.tsv"):
+        header, row = path.read_text().splitlines()
+        path.write_text(f"{header}\tvolume_CA1\n{row}\t{float(row.split()[1]) / 2}\n")
     (folder / "group.toml").write_text("[classification]\nrepeats = 2\nfolds = 3\n")
     return folder
 
@@ -150,7 +153,7 @@ def test_volumes_are_adjusted_for_intracranial_volume_of_each_source(study, sour
     rows = measures(study)
     name = "eTIV" if source == "column" else "icv"
     adjusted = rows[rows.model == f"group + age + sex + {name}"]
-    expected = {"volume"}
+    expected = {"volume", "volume_CA1"}  # the participant level's own
     if source == "freesurfer":
         expected |= {"volume_freesurfer_CA1_body", "volume_freesurfer_Whole_hippocampus"}
     if source == "ashs":
