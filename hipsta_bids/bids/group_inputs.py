@@ -9,6 +9,7 @@ from typing import Any
 
 from hipsta_bids.artifacts import Status
 from hipsta_bids.bids import files
+from hipsta_bids.bids.exclusion_table import is_listed, lost_exclusions, read_exclusions
 from hipsta_bids.bids.names import DATASET_FILES, HemisphereName
 from hipsta_bids.bids.quality_filter import QualityCondition
 from hipsta_bids.bids.results import ResultPlace
@@ -114,7 +115,7 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
     seg = _one_protocol(found, request)
     found = [place for place in found if place.name.seg == seg]
     _refuse_twice(found)
-    unwanted = _listed_exclusions(request.exclude_table)
+    unwanted = read_exclusions(request.exclude_table)
     kept: list[SheetRecord] = []
     left_out: list[Exclusion] = []
     for place in sorted(found, key=_order):
@@ -137,7 +138,7 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
         settings=_settings_of(kept[0].place.root),
         settings_hash=digest,
         versions=tuple(sorted({record.version for record in kept})),
-        notes=_lost_exclusions(request.exclude_table, unwanted, found),
+        notes=lost_exclusions(request.exclude_table, unwanted, [place.name for place in found]),
     )
 
 
@@ -168,14 +169,14 @@ def wanted_by(request: GroupRequest) -> Callable[[str, str | None, str], bool]:
     InputError
         If the table cannot be read.
     """
-    unwanted = _listed_exclusions(request.exclude_table)
+    unwanted = read_exclusions(request.exclude_table)
 
     def is_wanted(subject: str, session: str | None, hemi: str) -> bool:
         name = HemisphereName(subject=subject, session=session, hemi=hemi, seg="")
         return (
             (not request.subjects or subject in request.subjects)
             and (not request.sessions or session in request.sessions)
-            and not any(_is_listed(name, row) for row in unwanted)
+            and not any(is_listed(name, row) for row in unwanted)
         )
 
     return is_wanted
@@ -243,7 +244,7 @@ def _judge(
     record = files.read_json(place.path("qc"))
     status = record.get("status")
     reason, message = record.get("reason") or str(status), record.get("message") or ""
-    listed = next((row for row in unwanted if _is_listed(place.name, row)), None)
+    listed = next((row for row in unwanted if is_listed(place.name, row)), None)
     if listed is not None:
         reason, message = "listed", listed.get("reason", "in the table of --exclude")
     elif status == Status.FAILED:
@@ -278,47 +279,6 @@ def _metrics(record: Mapping[str, Any]) -> dict[str, Any]:
     return {k: v for k, v in both.items() if not isinstance(v, (list, dict))}
 
 
-def _listed_exclusions(path: Path | None) -> list[dict[str, str]]:
-    if path is None:
-        return []
-    rows = files.read_tsv(path)
-    if rows and "participant_id" not in rows[0]:
-        raise InputError(
-            f"{path}: no column participant_id; it may have session_id, hemi and reason besides",
-            reason="bad-table",
-        )
-    return rows
-
-
-def _lost_exclusions(
-    path: Path | None, rows: Sequence[Mapping[str, str]], found: Sequence[ResultPlace]
-) -> tuple[str, ...]:
-    """Say which rows of the user's table are about nobody here: labels may be misspelled."""
-    if path is None:
-        return ()
-    if not rows:
-        return (f"{path}: lists nobody to exclude",)
-    lost = [
-        row["participant_id"]
-        for row in rows
-        if not any(_is_listed(place.name, row) for place in found)
-    ]
-    if not lost:
-        return ()
-    more = f" and {len(lost) - _SHOWN} more" if len(lost) > _SHOWN else ""
-    return (f"{path}: not here, or not so, are {', '.join(lost[:_SHOWN])}{more}",)
-
-
-def _is_listed(name: HemisphereName, row: Mapping[str, str]) -> bool:
-    """Whether a row of the user's table means this hemisphere; empty cells mean any."""
-    own = {"participant_id": name.subject, "session_id": name.session or "", "hemi": name.hemi}
-    for key, value in own.items():
-        cell = row.get(key, files.MISSING).removeprefix("sub-").removeprefix("ses-")
-        if cell not in {files.MISSING, "", value}:
-            return False
-    return True
-
-
 def _refuse_unfinished(
     request: GroupRequest, seg: str, unwanted: Sequence[Mapping[str, str]]
 ) -> None:
@@ -330,7 +290,7 @@ def _refuse_unfinished(
             asked = (not request.subjects or name.subject in request.subjects) and (
                 not request.sessions or name.session in request.sessions
             )
-            listed = any(_is_listed(name, one) for one in unwanted)
+            listed = any(is_listed(name, one) for one in unwanted)
             same = name.seg == seg and name.region == "body"  # the body alone is read here
             if row.get("reason") == NOT_FINISHED and same and asked and not listed:
                 pending.append(name.stem)
