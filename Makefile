@@ -1,6 +1,7 @@
 # Set-up and checks. On a bare machine with Python >= 3.11, make and git:
 #   make demo    make the environment, make a synthetic dataset, measure it, compare with the truth
 #   make test    lint, types, layer contracts and tests, exactly as in CI
+#   make docs    the documentation as a site in build/site, without network
 
 VENV ?= .venv
 DEMO ?= demo
@@ -15,7 +16,7 @@ BIN := $(VENV)/bin
 # Changes to either file mean that the environment is out of date.
 STAMP := $(VENV)/.made-from-lock
 
-.PHONY: help env demo test lint types layers unit format lock clean
+.PHONY: help env demo test lint types layers unit docs format lock clean
 help:
 	@sed -n '2,/^$$/s/^# \{0,1\}//p' Makefile
 
@@ -47,6 +48,7 @@ types: $(STAMP)
 	"$(BIN)/python" -m mypy --strict
 	"$(BIN)/python" -m mypy --strict tools/*.py
 	"$(BIN)/python" -m mypy --strict tools/make-descriptors
+	MYPYPATH=tools "$(BIN)/python" -m mypy --strict tools/make-docs
 	MYPYPATH=benchmarks "$(BIN)/python" -m mypy --strict benchmarks/*.py
 
 layers: $(STAMP)
@@ -54,6 +56,10 @@ layers: $(STAMP)
 
 unit: $(STAMP)
 	"$(BIN)/python" -m pytest -n 2
+
+docs: $(STAMP)
+	NO_MKDOCS_2_WARNING=1 "$(BIN)/python" -m mkdocs build --strict --quiet
+	@echo "build/site/index.html"
 
 format: $(STAMP)
 	"$(BIN)/python" -m ruff format .
@@ -68,7 +74,7 @@ COMPILE = "$(BIN)/python" -m uv pip compile pyproject.toml --quiet --universal \
 lock: $(STAMP)
 	"$(BIN)/python" -m pip install -qq --disable-pip-version-check "uv>=0.8"
 	$(COMPILE) --output-file requirements.lock
-	$(COMPILE) --extra dev --constraints requirements.lock --output-file requirements-dev.lock
+	$(COMPILE) --extra dev --extra docs --constraints requirements.lock --output-file requirements-dev.lock
 
 clean:
 	rm -rf demo build .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis

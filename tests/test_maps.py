@@ -371,9 +371,9 @@ def test_sessions_are_filled_in(bids_dir, tmp_path, capsys):
     assert "map T1w: 2 of 2 hemispheres\n" in capsys.readouterr().out
 
 
-def test_the_readme_lists_the_extra_outputs():
+def test_the_page_lists_the_extra_outputs():
     name = HemisphereName(subject="X", session=None, hemi="L", seg="P")
-    readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[1] / "docs" / "maps.md").read_text(encoding="utf-8")
     for row in EXTRA_OUTPUTS:
         spelled = output_name(name, row.key, "NAME" if row.desc == "*" else None)
-        assert f"`{spelled.removeprefix(name.stem)}`" in readme
+        assert f"`{spelled.removeprefix(name.stem)}`" in page

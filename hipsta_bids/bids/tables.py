@@ -15,37 +15,37 @@ from hipsta_bids.geometry.layers import layer_depth
 from hipsta_bids.geometry.summary import PER_SUBFIELD, SUMMARY
 from hipsta_bids.schemes import Label, Part, Scheme, Tissue
 
-_NODES: dict[str, tuple[str, str | None]] = {
+NODES: dict[str, tuple[str, str | None]] = {
     "x": ("node number along x, 1 at the medial end (subiculum)", None),
     "y": ("node number along y, 1 at the posterior end", None),
 }
 
 #: Columns of the sheet table that are no measures: definition and unit.
-_PLACE: dict[str, tuple[str, str | None]] = {
+PLACE: dict[str, tuple[str, str | None]] = {
     "r": ("position on the mid-surface, scanner RAS, left to right", "mm"),
     "a": ("position on the mid-surface, scanner RAS, posterior to anterior", "mm"),
     "s": ("position on the mid-surface, scanner RAS, inferior to superior", "mm"),
 }
-_STATE: dict[str, tuple[str, str | None]] = {
+STATE: dict[str, tuple[str, str | None]] = {
     "subfield": ("subfield at the mid-surface", None),
     "valid": ("true where measured directly, false where filled or missing", None),
     "repaired": ("true where a repair of the labels' topology touched the column", None),
 }
 
 #: Columns of each table, in order.
-SHEET_COLUMNS = (*_NODES, *_PLACE, *(row.name for row in MAPS), *_STATE)
+SHEET_COLUMNS = (*NODES, *PLACE, *(row.name for row in MAPS), *STATE)
 SUMMARY_COLUMNS = tuple(row.name for row in SUMMARY)
 PROFILE_COLUMNS = ("axis", "node", *(row.name for row in MAPS))
 SECTION_COLUMNS = ("y", *(row.name for row in SECTIONS))
 
-_LAYERS: dict[str, tuple[str, str | None]] = {
-    **_NODES,
+LAYERS: dict[str, tuple[str, str | None]] = {
+    **NODES,
     "layer": ("number of the layer, 1 on the interior and the last on the exterior wall", None),
     "depth": ("distance from the interior wall along the column", "mm"),
     "relative_depth": ("the same over the length of the column", None),
     **{
         axis: (definition.replace("on the mid-surface", "of the point"), unit)
-        for axis, (definition, unit) in _PLACE.items()
+        for axis, (definition, unit) in PLACE.items()
     },
 }
 
@@ -140,8 +140,8 @@ def write_sheet(table: Path, sidecar: Path, maps: HemisphereMaps, scheme: Scheme
         list(SHEET_COLUMNS),
         zip(*(columns[name] for name in SHEET_COLUMNS), strict=True),
     )
-    definitions = _definitions(_NODES) | _definitions(_PLACE)
-    definitions |= {row.name: _measure(row) for row in MAPS} | _definitions(_STATE)
+    definitions = _definitions(NODES) | _definitions(PLACE)
+    definitions |= {row.name: _measure(row) for row in MAPS} | _definitions(STATE)
     definitions["subfield"]["Levels"] = {
         label.abbreviation: label.name for label in labels.values()
     }
@@ -263,8 +263,8 @@ def write_layers(table: Path, sidecar: Path, layers: Sheet) -> None:
         format_column(depth / length, _MILLIMETER_DIGITS),
         *(format_column(layers.points[..., k], _MILLIMETER_DIGITS) for k in range(3)),
     ]
-    files.write_tsv(table, list(_LAYERS), zip(*columns, strict=True))
-    _write_sidecar(sidecar, _definitions(_LAYERS))
+    files.write_tsv(table, list(LAYERS), zip(*columns, strict=True))
+    _write_sidecar(sidecar, _definitions(LAYERS))
 
 
 def _truths(values: Bool) -> list[str]:

@@ -1,0 +1,235 @@
+"""Pages of docs/ that are made from the code: outputs, settings, reasons, options."""
+
+import argparse
+import dataclasses
+import inspect
+import json
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any
+
+from hipsta_bids.bids.names import (
+    DATASET_FILES,
+    EXTRA_OUTPUTS,
+    OUTPUTS,
+    HemisphereName,
+    Output,
+    output_name,
+)
+from hipsta_bids.bids.tables import LAYERS, NODES, PLACE, STATE
+from hipsta_bids.errors import EXIT_MEANINGS
+from hipsta_bids.geometry.catalog import MAPS, SECTIONS, Column
+from hipsta_bids.geometry.summary import PER_SUBFIELD, SUMMARY
+from hipsta_bids.group.columns import COLUMNS
+from hipsta_bids.group_parser import group_parser
+from hipsta_bids.group_settings import GroupSettings
+from hipsta_bids.parser import build_parser
+from hipsta_bids.reasons import SECTIONS as REASONS
+from hipsta_bids.settings import Settings
+from hipsta_bids.settings_file import field_meanings
+from hipsta_bids.subcommands import phantom_parser, surrogate_parser, validate_parser
+
+NOTE = "<!-- Written by `tools/make-docs`; do not edit, run it again. -->"
+
+OUTPUTS_TEXT = """\
+A BIDS derivative dataset. Files of a hemisphere lie in `sub-X[/ses-Y]/anat/` and begin with
+`sub-X[_ses-Y]_hemi-<L|R>`; `P` is the name of the segmentation protocol. Other regions than the
+body have `label-extended` or `label-entorhinal` after `seg-P`. Missing values are `n/a` in tables
+and NaN in GIFTI files. What the numbers mean, with figures: [Measures](measures.md)."""
+
+COLUMNS_TEXT = """\
+Which table has which is said in [Group level](group.md#what-is-written) and in the `.json` beside
+each."""
+
+SETTINGS_TEXT = """\
+Every number that changes a result. `hipsta-bids settings` prints those of the participant level
+as a TOML file, `hipsta-bids settings group` those of the group level. Change what you need, keep
+the rest out, and give the file with `--settings`:"""
+
+ONE_SET_TEXT = """\
+One output folder holds results of one set of settings. Do not pool results of different settings.
+Where a meaning begins with an ellipsis (...), it goes on from the row above."""
+
+REASONS_TEXT = """\
+Every reason has a short name that programs can read: in the column `reason` of `status.tsv`, in
+`desc-qc_metrics.json`, and in the group level's `excluded.tsv`. The message beside it says where,
+with the numbers. Here is what the names mean, and what to do."""
+
+OPTIONS_TEXT = """\
+`hipsta-bids BIDS_DIR OUTPUT_DIR participant` measures, `... group` compares. Other commands:
+`demo`, `phantom`, `surrogate`, `validate`, `settings`, `schemes`. All print these texts with
+`--help`. Underscores do in place of hyphens (`--n_procs`)."""
+
+_DATASET_FILES = {
+    "description": "what BIDS asks for, with versions and sources",
+    "ignore": "which files are not in the standard, for the BIDS validator",
+    "settings": "all settings of these results, and their hash",
+    "citation": "a methods paragraph with references, for your article",
+    "status": "one row per hemisphere: status, reason, message, time per stage, peak memory",
+    "status_sidecar": "its columns",
+    "logs": "one file per run",
+    "group": "results of the [group level](group.md#what-is-written), one folder per model",
+    "report": "all hemispheres; beside it a page per participant and session",
+}
+
+
+def outputs_page() -> str:
+    """Write the page of files and columns."""
+    place = [(name, unit, words) for name, (words, unit) in (NODES | PLACE).items()]
+    state = [(name, unit, words) for name, (words, unit) in STATE.items()]
+    layers = [(name, unit, words) for name, (words, unit) in LAYERS.items()]
+    columns = ("column", "unit", "what it is")
+    parts = [
+        "# Outputs",
+        OUTPUTS_TEXT,
+        "## Files of a hemisphere",
+        _table(("file", "content"), _files(OUTPUTS)),
+        "With an option or another command:",
+        _table(("file", "content"), _files(EXTRA_OUTPUTS)),
+        "## Files of the dataset",
+        _table(
+            ("file", "content"),
+            ((f"`{name}`", _DATASET_FILES[key]) for key, name in DATASET_FILES.items()),
+        ),
+        "## Columns of `desc-sheet_morph.tsv`",
+        "One row per point of the sheet.",
+        _table(columns, _named([*place, *_measures(MAPS), *state])),
+        "## Columns of `desc-sections_morph.tsv`",
+        "One row per cross-section, `y` from the posterior to the anterior end.",
+        _table(columns, _named(_measures(SECTIONS))),
+        "## Columns of `desc-summary_morph.tsv`",
+        "One row per hemisphere.",
+        _table(columns, _named(_measures(SUMMARY))),
+        "And per subfield:",
+        _table(columns, _named(_measures(PER_SUBFIELD, ending="_NAME"))),
+        "## Columns of `desc-profile_morph.tsv`",
+        "`axis`, `node`, and the maps of the sheet table, averaged over the other axis by area.",
+        "## Columns of `desc-layers_morph.tsv`",
+        "One row per point of the three-dimensional grid (`--write-meshes`).",
+        _table(columns, _named(layers)),
+        "## Columns of the group level's tables",
+        COLUMNS_TEXT,
+        _table(("column", "what it is"), ((f"`{k}`", v) for k, v in COLUMNS.items())),
+    ]
+    return _page(parts)
+
+
+def _files(outputs: Iterable[Output]) -> Iterator[tuple[str, str]]:
+    name = HemisphereName(subject="X", session=None, hemi="L", seg="P")
+    for output in outputs:
+        desc = "NAME" if output.desc == "*" else None
+        spelled = output_name(name, output.key, desc).removeprefix(name.stem)
+        yield f"`{spelled}`", output.description
+
+
+def _measures(rows: Iterable[Column], ending: str = "") -> list[tuple[str, str, str]]:
+    words = "the subfield"
+    return [(f"{x.name}{ending}", x.unit, x.definition.format(words)) for x in rows]
+
+
+def _named(rows: Iterable[tuple[str, str | None, str]]) -> Iterator[tuple[str, str, str]]:
+    return ((f"`{name}`", unit or "", words) for name, unit, words in rows)
+
+
+def settings_page() -> str:
+    """Write the page of settings of both levels."""
+    parts = [
+        "# Settings",
+        SETTINGS_TEXT,
+        '```toml\n[sheet]\nx_nodes = 61\n\n[body]\nlayer_rule = "nearest-label"\n```',
+        ONE_SET_TEXT,
+        "## Participant level",
+        *_stages(Settings()),
+        "## Group level",
+        *_stages(GroupSettings()),
+    ]
+    return _page(parts)
+
+
+def _stages(settings: Settings | GroupSettings) -> Iterator[str]:
+    for field in dataclasses.fields(settings):
+        stage = getattr(settings, field.name)
+        meanings = field_meanings(type(stage))
+        yield f"### {field.name}"
+        yield " ".join((inspect.getdoc(type(stage)) or "").split()).replace("``", "`")
+        yield _table(("setting", "default", "meaning"), _settings(stage, meanings))
+
+
+def _settings(stage: Any, meanings: Mapping[str, str]) -> Iterator[tuple[str, ...]]:  # noqa: ANN401  (any dataclass)
+    for field in dataclasses.fields(stage):
+        words = " ".join(meanings[field.name].split()).replace("``", "`")
+        yield f"`{field.name}`", f"`{json.dumps(getattr(stage, field.name))}`", words
+
+
+def reasons_page() -> str:
+    """Write the page of flags, refusals and what to do about them."""
+    parts = [
+        "# Flags and refusals",
+        REASONS_TEXT,
+    ]
+    for section in REASONS:
+        rows = sorted((f"`{k}`", x.meaning, x.remedy) for k, x in section.reasons.items())
+        table = _table(("reason", "what it means", "what to do"), rows)
+        parts += [f"## {section.title}", section.text, table]
+    codes = ((str(int(code)), words) for code, words in EXIT_MEANINGS.items())
+    return _page([*parts, "## Exit codes", _table(("code", "meaning"), codes)])
+
+
+def options_page() -> str:
+    """Write the page of all options of all commands."""
+    parts = [
+        "# Command line",
+        OPTIONS_TEXT,
+    ]
+    for title, parser in (
+        ("Participant level", build_parser()),
+        ("Group level", group_parser()),
+        ("hipsta-bids phantom", phantom_parser()),
+        ("hipsta-bids surrogate", surrogate_parser()),
+        ("hipsta-bids validate", validate_parser()),
+    ):
+        parts.append(f"## {title}")
+        for group in parser._action_groups:  # noqa: SLF001  (argparse shows nothing in public)
+            rows = [_option(a) for a in group._group_actions if a.help != argparse.SUPPRESS]  # noqa: SLF001
+            if rows:
+                parts += [
+                    f"**{str(group.title).capitalize()}**",
+                    _table(("option", "meaning"), rows),
+                ]
+    return _page(parts)
+
+
+def _option(action: argparse.Action) -> tuple[str, str]:
+    spellings = action.option_strings or [action.dest.upper()]
+    names = [name for name in spellings if name[0] != "-" or "_" not in name]
+    values = action.metavar or (action.dest.upper() if action.option_strings else "")
+    if action.choices is not None and action.metavar is None:
+        values = "{" + ",".join(map(str, action.choices)) + "}"
+    text = values if isinstance(values, str) else " ".join(values)
+    shown = f" {text}" if text and action.nargs != 0 else ""
+    return ", ".join(f"`{name}{shown}`" for name in names), _escape(
+        (action.help or "") % vars(action)
+    )
+
+
+def _escape(text: str) -> str:
+    """Keep stars, braces and angle brackets as they are written."""
+    return re.sub(r"([*_<>\[\]])", r"\\\1", " ".join(text.split()))
+
+
+def _table(headings: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
+    lines = [headings, ("---",) * len(headings), *rows]
+    return "\n".join(f"| {' | '.join(x.replace('|', '&#124;') for x in line)} |" for line in lines)
+
+
+def _page(parts: Iterable[str]) -> str:
+    return "\n\n".join([NOTE, *(part for part in parts if part)]) + "\n"
+
+
+#: Every page, by its file below docs/.
+PAGES: Mapping[str, Callable[[], str]] = {
+    "outputs.md": outputs_page,
+    "settings.md": settings_page,
+    "reasons.md": reasons_page,
+    "command-line.md": options_page,
+}

@@ -1,0 +1,54 @@
+"""Hook of MkDocs: files beside docs/ that its pages link to become part of the site."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
+
+ROOT = Path(__file__).resolve().parents[1]
+
+#: Pages of the site that lie beside docs/.
+BESIDE = ("CONTRIBUTING.md", "CHANGELOG.md")
+
+_LINK = re.compile(r"(?<=\]\()(?![a-z]+:|#)(?P<path>[^)#\s]+)")
+
+
+def on_config(config: MkDocsConfig) -> None:
+    """Show pages that the navigation does not name, under its last heading."""
+    text = Path(str(config.config_file_path)).read_text(encoding="utf-8")
+    pages = sorted(path.name for path in Path(config.docs_dir).glob("*.md"))
+    last = (config.nav or [])[-1]
+    last["Background"] += [name for name in pages if f" {name}\n" not in text]
+
+
+def on_files(files: Files, *, config: MkDocsConfig) -> None:
+    """Add what pages link to beyond docs/."""
+    pages = [page.content_string for page in files.documentation_pages()]
+    linked = {path for text in pages for path in _beyond(text)}
+    for name in sorted({*BESIDE, *linked} - {"README.md"}):
+        files.append(File.generated(config, name, abs_src_path=str(ROOT / name)))
+
+
+def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Turn links between the files of the repository into links between pages."""
+    del config, files
+    if page.file.src_uri in BESIDE:
+        return _LINK.sub(lambda found: found["path"].removeprefix("docs/"), markdown)
+    if page.file.src_uri.count("/"):  # a page from a folder beside docs/: its links stay there
+        return _LINK.sub(r"#", markdown)
+    return _LINK.sub(lambda found: _inside(found["path"]), markdown)
+
+
+def _beyond(text: str) -> Iterator[str]:
+    """List the files beside docs/ that a page links to."""
+    for found in _LINK.finditer(text):
+        path = found["path"].removeprefix("../")
+        if path != found["path"] and (ROOT / path).is_file():
+            yield path
+
+
+def _inside(path: str) -> str:
+    return "index.md" if path == "../README.md" else path.removeprefix("../")
