@@ -32,6 +32,7 @@ COMMAND: dict[str, Reason] = {
     ),
     "missing-folder": Reason("A folder does not exist.", "Check the path."),
     "not-a-folder": Reason("A file was given for a folder.", "Give the folder."),
+    "no-file": Reason("A file that was named does not exist.", "Check the path."),
     "unreadable-folder": Reason("A folder cannot be listed.", "Check its permissions."),
     "no-segmentation": Reason(
         "No hippocampal segmentation was found.",

@@ -41,6 +41,10 @@ GROUP: dict[str, Reason] = {
         "A participant or session stands more than once.",
         "Keep one row each; participants of different sites need different labels.",
     ),
+    "other-participants": Reason(
+        "A table of covariates has none of the participants that were measured.",
+        "Check the table, and how it spells `participant_id`.",
+    ),
     "unknown-measure": Reason(
         "No measure has this name.",
         "See [Outputs](outputs.md); the message names similar ones.",
