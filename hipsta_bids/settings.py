@@ -52,6 +52,11 @@ class BodySettings:
     six real bodies: none, and gaps with one opening are up to 4.0 mm2) ..."""
     slit_voxel: float = 0.8
     """... and no edge of a voxel is longer than this, mm: between thick slices folds look alike."""
+    end_fullness: float = 0.9
+    """Without end labels: cross-sections at an end are left out if they have less than this share
+    of the area ..."""
+    end_reach: float = 3.0
+    """... of those within this distance behind them, mm; at most so much is left out."""
     max_mask_ratio: float = 1.5
     """Flag an edited mask whose voxels are more than this many times those of the labels ..."""
     max_mask_change: float = 0.5

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from hipsta_bids.artifacts import Bool, Float, LabelVolume
+from hipsta_bids.artifacts import Bool, Float, Int, LabelVolume
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.schemes import Tissue
 from hipsta_bids.settings import BodySettings
@@ -63,16 +63,41 @@ def automatic_range(
     step = float(np.abs(axis @ volume.affine[:3, :3]).max())
     slices = _Slices(axis=axis, first=float(along.min()), step=step)
     number = np.floor((along - slices.first) / step + 0.5).astype(int)
-    values = sheet[sheet > 0]
+    low, high = _subfield_range(sheet[sheet > 0], number, slices, known)
+    section, pixel = _sections(sheet > 0, volume.affine, slices, (low, high))
+    first, last = (low + number for number in _body_like(section, pixel, settings))
+    area = section.sum(axis=(1, 2))[first - low : last - low + 1]
+    reach = max(round(settings.end_reach / step), 1)
+    before, after = (_grazed(a, reach, settings.end_fullness) for a in (area, area[::-1]))
+    # Each kept slice reaches half a step to both sides.
+    return {
+        "posterior": (
+            slices.level(first + before - 0.5) + settings.end_margin,
+            "cross-section" if first > low else "subfields",
+        ),
+        "anterior": (
+            slices.level(last - after + 0.5) - settings.end_margin,
+            "cross-section" if last < high else "subfields",
+        ),
+    }
+
+
+def _subfield_range(
+    values: NDArray[np.uint8],
+    number: Int,
+    slices: _Slices,
+    known: dict[End, tuple[Float, Float, str]],
+) -> tuple[int, int]:
+    """First slice that has CA1 and CA2 or CA3, and last that has CA2 or CA3, between known ends."""
     count = int(number.max()) + 1
     ca1 = np.bincount(number[values == Tissue.CA1], minlength=count) > 0
     lateral = np.isin(values, (Tissue.CA2, Tissue.CA2_3, Tissue.CA3))
     ca23 = np.bincount(number[lateral], minlength=count) > 0
-    levels = slices.first + step * np.arange(count)
+    levels = slices.first + slices.step * np.arange(count)
     if "posterior" in known:
-        ca23 &= levels > known["posterior"][0] @ axis
+        ca23 &= levels > known["posterior"][0] @ slices.axis
     if "anterior" in known:
-        ca23 &= levels < known["anterior"][0] @ axis
+        ca23 &= levels < known["anterior"][0] @ slices.axis
     both = np.flatnonzero(ca1 & ca23)
     if not len(both):
         raise GeometryError(
@@ -80,31 +105,16 @@ def automatic_range(
             "tail labels: cannot tell where the body lies",
             reason="no-body",
         )
-    low, high = int(both[0]), int(np.flatnonzero(ca23)[-1])
-    first, last = _body_like(sheet > 0, volume.affine, slices, (low, high), settings)
-    # Each kept slice reaches half a step to both sides.
-    return {
-        "posterior": (
-            slices.level(first - 0.5) + settings.end_margin,
-            "cross-section" if first > low else "subfields",
-        ),
-        "anterior": (
-            slices.level(last + 0.5) - settings.end_margin,
-            "cross-section" if last < high else "subfields",
-        ),
-    }
+    return int(both[0]), int(np.flatnonzero(ca23)[-1])
 
 
-def _body_like(
-    mask: Bool, affine: Float, slices: _Slices, bounds: tuple[int, int], settings: BodySettings
-) -> tuple[int, int]:
-    """First and last slice, counted from the middle, that look like the body.
+def _body_like(section: Bool, pixel: float, settings: BodySettings) -> tuple[int, int]:
+    """First and last cross-section, counted from the middle, that look like the body.
 
     Where CA2/CA3 is labeled in the head or in the tail's bend, the rule of the paper runs deep
     into them. The body ends where the cross-section falls into two large pieces, or twice running
     exceeds the usual area.
     """
-    section, pixel = _sections(mask, affine, slices, bounds)
     area = section.sum(axis=(1, 2)) * pixel**2
     count = len(area)
     usual = float(np.median(area[count // 4 : count - count // 4]))
@@ -124,7 +134,18 @@ def _body_like(
     before, after = odd[odd < count // 2], odd[odd > count // 2]
     first = int(before[-1]) + 1 if len(before) else 0
     last = int(after[0]) - 1 if len(after) else count - 1
-    return bounds[0] + first, bounds[0] + last
+    return first, last
+
+
+def _grazed(area: Int, reach: int, fullness: float) -> int:
+    """How many of the first cross-sections are smaller than those that follow them.
+
+    Labels that end obliquely leave cross-sections that have a part of them only.
+    """
+    outer = area[: min(reach, len(area) // 4)]
+    usual = [np.median(area[i + 1 : i + 1 + reach]) for i in range(len(outer))]
+    whole = np.flatnonzero(outer >= fullness * np.array(usual))
+    return int(whole[0]) if len(whole) else len(outer)
 
 
 def _sections(

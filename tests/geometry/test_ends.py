@@ -286,3 +286,31 @@ def test_labels_that_do_not_lead_away_from_their_end_are_refused():
             0.2,
         )
     assert caught.value.reason == "labels-end"
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.06, 0.1])
+def test_cross_sections_that_have_a_part_of_the_labels_only_are_left_out(slope):
+    """A slab whose labels end obliquely on both sides."""
+    tissue = np.zeros((40, 64, 30), dtype=np.uint8)
+    tissue[4:24, :, 12:16] = Tissue.CA1
+    tissue[24:34, :, 12:16] = Tissue.CA2
+    x, y, _ = np.indices(tissue.shape)
+    low, high = 8 + slope * (x - 4), 52 + slope * (x - 4)
+    tissue[(y < low) | (y > high)] = 0
+    volume = LabelVolume(
+        tissue=tissue,
+        part=np.zeros(tissue.shape),
+        affine=np.diag([0.5, 0.5, 0.5, 1.0]),
+        scheme=HIPPUNFOLD,
+    )
+    ends = ends_of(volume)
+    assert (ends.posterior_rule, ends.anterior_rule) == ("subfields", "subfields")
+    corners = np.array([[2.0, 0.5 * 8, 6.75], [17.0, 0.5 * (8 + slope * 30), 6.75]])
+    # The principal axis leans the other way. A tenth of the cross-section may be missing, 1.5 of
+    # 15 mm, and half a slice of 0.5 mm either way.
+    steep = slope + ends.axis[0] / ends.axis[1]
+    most = 1.5 * steep + 0.25 + 0.05
+    assert ends.height(corners, "posterior").max() < most
+    corners[:, 1] += 0.5 * 44
+    assert ends.height(corners, "anterior").min() > -most
+    assert ends.length(corners) > 22.0 - 15.0 * steep - 1.5
