@@ -25,6 +25,7 @@ from typing import Any
 from hipsta_bids.threads import THREAD_VARIABLES
 
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
+_FIRST_TO_GO = "500"  # of -1000 to 1000: if memory runs out, a worker is lost and not the run
 _GRACE = 5.0  # s that an idle worker gets to end by itself
 _START_TIME = 300.0  # s that a worker gets to load its libraries, on a slow network disk
 _STARTS = 3  # a worker that never gets ready is a broken installation, not bad luck
@@ -350,6 +351,8 @@ def _separate(parent: int) -> None:
         os.setsid()
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     if sys.platform == "linux":
+        with contextlib.suppress(OSError):
+            Path("/proc/self/oom_score_adj").write_text(_FIRST_TO_GO)
         with contextlib.suppress(OSError, AttributeError):
             ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent:

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 
 def work(job):
@@ -22,6 +23,8 @@ def work(job):
     if act == "helper":
         helper = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
         return [os.getpid(), helper.pid]
+    if act == "oom-score":
+        return int(Path("/proc/self/oom_score_adj").read_text())
     return json.dumps(dict(os.environ))
 
 

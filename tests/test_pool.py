@@ -74,6 +74,12 @@ def test_environment_reaches_workers_and_is_put_back(tmp_path, monkeypatch):
     assert "HIPSTA_TEST" not in os.environ
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="Linux has such a score")
+def test_if_memory_runs_out_workers_go_before_the_run(tmp_path):
+    ((_, score),) = run_jobs(plan(tmp_path), ["oom-score"])
+    assert score > int(Path("/proc/self/oom_score_adj").read_text())
+
+
 def test_no_jobs_need_no_workers(tmp_path):
     assert list(run_jobs(plan(tmp_path), [])) == []
     assert not (tmp_path / "log").exists()

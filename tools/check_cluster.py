@@ -131,14 +131,16 @@ def check_lost_task(work: Path, data: Path, reference: dict[str, bytes]) -> None
 
 
 def check_memory(work: Path, data: Path) -> None:
-    """Jobs with too little memory: the system kills what measures, and nothing else."""
+    """Give jobs too little memory: the system kills what measures, and nothing else."""
     out = work / "memory"
     options = ("--mem=150M", f"--array=1-{PARTS}", "measure.sbatch")
     code = submit(work, data, out, *options, wait=True)
     demand(code == "1", "array that runs out of memory ends with 1")
     hipsta(data, out, "collect", code=1)
     found = reasons(out)
-    demand(set(found) == {"worker-died"}, f"all {len(found)} hemispheres: worker-died")
+    n_died = found.count("worker-died")
+    demand(n_died > 0, f"{n_died} of {len(found)} hemispheres failed by it")
+    demand(set(found) <= {"worker-died", "n/a"}, "the run went on with the others")
 
 
 def check_dask(work: Path, data: Path, reference: dict[str, bytes]) -> None:
