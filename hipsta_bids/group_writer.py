@@ -12,6 +12,7 @@ from hipsta_bids.bids.group_scores import write_score_maps
 from hipsta_bids.bids.map_parquet import write_maps
 from hipsta_bids.group.analysis import Analysis
 from hipsta_bids.group.columns import COLUMNS
+from hipsta_bids.group.figure_tables import design_table
 from hipsta_bids.group.multiplicity import MapKey
 from hipsta_bids.group.report import methods_text
 from hipsta_bids.group.shapes import AverageShape
@@ -75,7 +76,8 @@ def write_results(
     excluded = ResultTable(name="excluded", rows=rows)
     group_outputs.write_result_table(folder, excluded, COLUMNS)
     rows_of_model = analysis.compared.table.iloc[analysis.design.rows]
-    group_outputs.write_covariates(folder / "covariates.tsv", rows_of_model)
+    group_outputs.write_plain_table(folder / "covariates.tsv", rows_of_model)
+    group_outputs.write_plain_table(folder / "design.tsv", design_table(analysis))
     registered = {hemi: side.registered for hemi, side in analysis.sides.items()}
     if registered or others:
         points = {name: other for name, (other, _) in others.items()}
@@ -140,7 +142,9 @@ def _write_gifti(folder: Path, cohort: Cohort, analysis: Analysis) -> None:
                     ("d", test.cohen_d) if single else ("eta2", test.eta_squared),
                     ("pcorrected", found.adjusted),
                 ):
-                    stem = map_name(hemi, measure, test).replace("_desc-", f"_stat-{stat}_desc-")
+                    stem = map_name(hemi, measure, test.contrast.name).replace(
+                        "_desc-", f"_stat-{stat}_desc-"
+                    )
                     # Of both sides, maps lie on the left sheet: they say left minus right.
                     content = gifti.shape_bytes(values, hemi=hemi[0], name=stem, unit="1")
                     files.write_bytes(folder / f"{stem}.shape.gii", content)

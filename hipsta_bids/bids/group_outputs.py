@@ -106,8 +106,8 @@ def _cells(values: pd.Series) -> list[str]:
     return [spell(value) for value in values.tolist()]
 
 
-def write_covariates(path: Path, table: pd.DataFrame) -> None:
-    """Write the table that models were fitted to."""
+def write_plain_table(path: Path, table: pd.DataFrame) -> None:
+    """Write a table whose columns are the user's or the model's, without a sidecar."""
     columns = [str(name) for name in table.columns]
     files.write_tsv(path, columns, zip(*(_cells(table[name]) for name in columns), strict=True))
 

@@ -6,10 +6,12 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from hipsta_bids.group.fitted import FittedMaps
 from hipsta_bids.group.glm import PointTest
-from hipsta_bids.group.mesh_graph import find_mesh_clusters
+from hipsta_bids.group.mesh_graph import find_mesh_clusters, mesh_edges
 from hipsta_bids.group.multiplicity import Discoveries
 from hipsta_bids.group.sheet_graph import Cluster, find_clusters
+from hipsta_bids.group_data import Cohort
 
 FloatArray = NDArray[np.float64]
 
@@ -82,6 +84,14 @@ class MeshFrame:
 
 
 Frame = SheetFrame | MeshFrame
+
+
+def frame_of(cohort: Cohort, one: FittedMaps) -> Frame:
+    """Where the points lie, and in which subfield most participants have them."""
+    names = np.array([*one.maps.names, "n/a"])
+    if (mesh := one.maps.mesh) is not None:
+        return MeshFrame(mesh.points, mesh_edges(mesh.triangles), names[one.subfield])
+    return SheetFrame(cohort.x, cohort.y, names[one.subfield])
 
 
 def peak_table(test: PointTest, found: Discoveries, frame: Frame, neighbors: int) -> pd.DataFrame:

@@ -52,6 +52,27 @@ def delong(score: FloatArray, case: BoolArray, confidence: float) -> Area:
     return Area(area, se, max(area - reach, 0.0), min(area + reach, 1.0))
 
 
+def roc_curve(score: FloatArray, case: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Shares of controls and of cases at or above each score, from none to all.
+
+    Parameters
+    ----------
+    score : ndarray, shape (subjects,)
+        Higher for cases.
+    case : ndarray of bool, shape (subjects,)
+        Which subjects are cases; both kinds must occur.
+
+    Returns
+    -------
+    ndarray, ndarray
+        One minus specificity, and sensitivity, at each cut.
+    """
+    cuts = np.concatenate([[np.inf], np.unique(score)[::-1]])
+    controls, cases = np.sort(score[~case]), np.sort(score[case])
+    above = [1 - np.searchsorted(part, cuts) / len(part) for part in (controls, cases)]
+    return above[0], above[1]
+
+
 def area_under(score: FloatArray, case: BoolArray) -> float:
     """Chance that a case scores higher than a control, ties counted half (Mann and Whitney)."""
     cases = int(case.sum())

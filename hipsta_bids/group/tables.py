@@ -7,11 +7,10 @@ import pandas as pd
 
 from hipsta_bids.group.analysis import Analysis
 from hipsta_bids.group.classification import ClassifierResult
-from hipsta_bids.group.fitted import FittedMaps
+from hipsta_bids.group.figure_tables import figure_tables, mean_table
 from hipsta_bids.group.glm import PointTest
-from hipsta_bids.group.mesh_graph import mesh_edges
 from hipsta_bids.group.multiplicity import Discoveries, MapKey
-from hipsta_bids.group.peaks import Frame, MeshFrame, SheetFrame, peak_table
+from hipsta_bids.group.peaks import Frame, frame_of, peak_table
 from hipsta_bids.group.summaries import hemispheres, summary_values
 from hipsta_bids.group_data import Cohort, ResultTable
 from hipsta_bids.group_settings import GroupSettings
@@ -52,6 +51,7 @@ def result_tables(
         yield ResultTable(name="wscores", rows=analysis.scores.table)
     if analysis.pairs:
         yield ResultTable(name="classification", rows=_classification(analysis, settings))
+    yield from figure_tables(cohort, analysis)
     yield from _statistics(cohort, analysis)
 
 
@@ -74,6 +74,7 @@ def point_tables(
     yield ResultTable(name=f"{name}_peaks", rows=_peaks(cohort, analysis, settings))
     if analysis.scores is not None:
         yield ResultTable(name=f"{name}_wscores", rows=analysis.scores.table)
+    yield ResultTable(name=f"{name}_means", rows=mean_table(cohort, analysis))
     yield from _statistics(cohort, analysis)
 
 
@@ -83,15 +84,15 @@ def _statistics(cohort: Cohort, analysis: Analysis) -> Iterator[ResultTable]:
             for test in fit.tests:
                 found = analysis.found[MapKey(measure, test.contrast.name, hemi)]
                 rows = _map(frame_of(cohort, one), fit.n, test, found)
-                yield ResultTable(name=map_name(hemi, measure, test), rows=rows)
+                yield ResultTable(name=map_name(hemi, measure, test.contrast.name), rows=rows)
 
 
-def map_name(hemi: str, measure: str, test: PointTest) -> str:
+def map_name(hemi: str, measure: str, contrast: str) -> str:
     """Name of the files of one map of statistics, without suffix and extension."""
-    contrast = _label(test.contrast.name) or "contrast"
+    label = _label(contrast) or "contrast"
     # BIDS knows L and R only: what is made of both has no hemisphere in its name.
     side = f"hemi-{hemi}_" if hemi in {"L", "R"} else ""
-    return f"{side}contrast-{contrast}_desc-{entity_label(measure)}_statmap"
+    return f"{side}contrast-{label}_desc-{entity_label(measure)}_statmap"
 
 
 def entity_label(measure: str) -> str:
@@ -103,14 +104,6 @@ def _label(text: str) -> str:
     """Spell a name with letters and digits only, as entities want it."""
     words = "".join(c if c.isalnum() else " " for c in text).split()
     return "".join(word[:1].upper() + word[1:] for word in words)
-
-
-def frame_of(cohort: Cohort, one: FittedMaps) -> Frame:
-    """Where the points lie, and in which subfield most participants have them."""
-    names = np.array([*one.maps.names, "n/a"])
-    if (mesh := one.maps.mesh) is not None:
-        return MeshFrame(mesh.points, mesh_edges(mesh.triangles), names[one.subfield])
-    return SheetFrame(cohort.x, cohort.y, names[one.subfield])
 
 
 def _map(
@@ -167,6 +160,7 @@ def _overview(analysis: Analysis) -> pd.DataFrame:
                 "measure": key.measure,
                 "contrast": key.contrast,
                 "hemi": key.hemi,
+                "file": map_name(key.hemi, key.measure, key.contrast),
                 "n_tests": found.n_tests,
                 "n_significant": int(found.rejected.sum()),
                 "p_cutoff": found.cutoff,

@@ -3,13 +3,10 @@
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
 from hipsta_bids.group.analysis import Analysis
 from hipsta_bids.group.classification import ClassifierResult
 from hipsta_bids.group.pairs import PairComparison
-from hipsta_bids.group_data import Float
+from hipsta_bids.group.roc import roc_curve
 from hipsta_bids.group_figures.panels import COLORS, LABEL, SMALL, TITLE, panels, spelled
 
 if TYPE_CHECKING:
@@ -29,7 +26,8 @@ def draw_roc(analysis: Analysis) -> "Figure":
             area, validation = result.auc, result.cross_validation
             text = f"{name}: {area.area:.2f} ({area.low:.2f}-{area.high:.2f})"
             text += f"\nleft out: {validation.auc:.2f}"
-            axis.plot(*_roc(result.score, pair.is_case), color=color, label=text, linewidth=1.2)
+            curve = roc_curve(result.score, pair.is_case)
+            axis.plot(*curve, color=color, label=text, linewidth=1.2)
         title = "area, participants fitted and left out"
         _finish(axis, ("1 - specificity", "sensitivity"), title, "lower right")
     return figure
@@ -93,11 +91,3 @@ def _finish(axis: "Axes", labels: tuple[str, str], title: str, place: _Place) ->
     axis.set_aspect("equal")
     axis.tick_params(labelsize=LABEL)
     axis.legend(fontsize=SMALL, loc=place, title=title, title_fontsize=SMALL)
-
-
-def _roc(score: Float, case: NDArray[np.bool_]) -> tuple[Float, Float]:
-    """Shares of controls and of cases at or above each score."""
-    cuts = np.concatenate([[np.inf], np.unique(score)[::-1]])
-    controls, cases = np.sort(score[~case]), np.sort(score[case])
-    above = [1 - np.searchsorted(part, cuts) / len(part) for part in (controls, cases)]
-    return above[0], above[1]

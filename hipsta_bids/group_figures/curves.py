@@ -5,13 +5,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hipsta_bids.group.analysis import Analysis
+from hipsta_bids.group.members import mean_of_known, members_of, spread_of_known
 from hipsta_bids.group_data import Cohort, Float
 from hipsta_bids.group_figures.panels import (
     LABEL,
     TITLE,
     mark_medial,
-    mean_of_known,
-    members_of,
     panels,
     repeat_colors,
     side_name,
@@ -73,7 +72,6 @@ def _band(axis: "Axes", x: Float, values: Float, name: str, color: str) -> None:
     """Draw a mean and twice its standard error to both sides."""
     count = np.isfinite(values).sum(axis=0)
     mean = mean_of_known(values, 0)
-    spread = np.sqrt(mean_of_known((values - mean) ** 2, 0) * count / np.maximum(count - 1, 1))
-    error = spread / np.sqrt(np.maximum(count, 1))
+    error = spread_of_known(values) / np.sqrt(np.maximum(count, 1))
     axis.plot(x, mean, color=color, label=f"{name} (n = {len(values)})", linewidth=1.2)
     axis.fill_between(x, mean - 2 * error, mean + 2 * error, color=color, alpha=0.25, linewidth=0)

@@ -5,14 +5,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-import pandas as pd
-from numpy.typing import NDArray
-
 from hipsta_bids.drawing import new_figure
 from hipsta_bids.group.analysis import Analysis
 from hipsta_bids.group.fitted import FittedMaps
-from hipsta_bids.group_data import Cohort, Float
+from hipsta_bids.group_data import Cohort
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -67,27 +63,6 @@ def spelled(measure: str) -> str:
 def shown(analysis: Analysis, measure: str) -> Mapping[str, FittedMaps]:
     """Give hemispheres, or their difference, that have maps of a measure."""
     return {hemi: one for hemi, one in analysis.fitted.items() if measure in one.fits}
-
-
-def rows_of(analysis: Analysis, one: FittedMaps) -> pd.DataFrame:
-    """Rows of the model's table that the sheets used belong to."""
-    return analysis.compared.table.iloc[one.maps.rows[one.used]]
-
-
-def members_of(analysis: Analysis, table: pd.DataFrame) -> Mapping[str, NDArray[np.bool_]]:
-    """Tell which rows belong to each group."""
-    if analysis.groups is None:
-        return {"all": np.ones(len(table), dtype=bool)}
-    names = table[analysis.groups.column]
-    return {level: (names == level).to_numpy() for level in analysis.groups.levels}
-
-
-def mean_of_known(values: Float, axis: int) -> Float:
-    """Mean without what is missing; NaN where nothing is known."""
-    known = np.isfinite(values)
-    count = known.sum(axis=axis)
-    total = np.where(known, values, 0.0).sum(axis=axis)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
 def repeat_colors() -> Iterator[str]:

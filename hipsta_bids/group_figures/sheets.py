@@ -8,6 +8,7 @@ from hipsta_bids.group.analysis import Analysis
 from hipsta_bids.group.comparison import BOTH
 from hipsta_bids.group.fitted import FittedMaps
 from hipsta_bids.group.glm import PointTest
+from hipsta_bids.group.members import mean_of_known, members_of, rows_of
 from hipsta_bids.group.multiplicity import MapKey
 from hipsta_bids.group_data import Cohort, Float
 from hipsta_bids.group_figures.meshes import draw_mesh
@@ -16,10 +17,7 @@ from hipsta_bids.group_figures.panels import (
     SMALL,
     TITLE,
     mark_medial,
-    mean_of_known,
-    members_of,
     panels,
-    rows_of,
     shown,
     side_name,
     spelled,

@@ -106,9 +106,14 @@ def test_tables_say_what_their_columns_are(results):
         "shifts",
         "classification",
         "excluded",
+        "means",
+        "profiles",
+        "roc",
+        "calibration",
+        "design",
     }
     for path in found:
-        if path.stem == "covariates":
+        if path.stem in {"covariates", "design"}:
             continue
         columns = path.read_text().split("\n", 1)[0].split("\t")
         described = json.loads(path.with_suffix(".json").read_text())
@@ -281,3 +286,30 @@ def test_first_of_several_sessions_is_analyzed(tmp_path, quick):
     left_out = table(out / "group" / MODEL / "excluded.tsv")
     kept = left_out[["participant_id", "session_id", "reason"]]
     assert kept.to_numpy().tolist() == [["sub-01", "ses-2", "later-session"]]
+
+
+def test_means_and_design_are_those_of_maps_and_covariates(results):
+    means = table(results / "means.tsv")
+    long = parquet.read_table(results / "maps.parquet").to_pandas()
+    people = table(results / "covariates.tsv")
+    cases = people[people.group == "AD"].participant_id
+    own = long[(long.hemi == "R") & long.participant_id.isin(cases)]
+    wanted = own.groupby(["node_x", "node_y"]).thickness_registered.agg(["mean", "std"])
+    found = means[(means.hemi == "R") & (means.measure == "thickness") & (means.group == "AD")]
+    # Maps are handed over in single precision.
+    np.testing.assert_allclose(found["mean"], wanted["mean"], rtol=1e-5)
+    np.testing.assert_allclose(found["sd"], wanted["std"], rtol=1e-4)
+    design = table(results / "design.tsv")
+    assert list(design.participant_id) == list(people.participant_id)
+    np.testing.assert_array_equal(design["group[T.AD]"], people.group == "AD")
+    np.testing.assert_allclose(design["age"], people.age)
+
+
+def test_curves_are_those_of_the_classifiers(results):
+    curves, areas = table(results / "roc.tsv"), table(results / "classification.tsv")
+    for row in areas.itertuples():
+        same = (curves.hemi == row.hemi) & (curves.added == row.added)
+        for which, area in (("base", row.auc_base), ("full", row.auc_full)):
+            one = curves[same & (curves.classifier == which)]
+            under = np.trapezoid(one.true_positives, one.false_positives)
+            assert under == pytest.approx(area, abs=1e-9)
