@@ -31,9 +31,9 @@ class Section:
 SECTIONS: tuple[Section, ...] = (
     Section(
         title="Flags",
-        text="The hemisphere was measured and has the status `flagged`. Its page in the report"
-        " shows the place. Look, then use it, correct the labels, or leave it out of the group"
-        " level (`--exclude-flagged`, `--exclude`).",
+        text="The hemisphere was measured and has the status `flagged`; several reasons are joined"
+        " by `+`. Its page in the report shows the place. Look, then use it, correct the labels,"
+        " or leave it out of the group level (`--exclude-flagged`, `--exclude`).",
         reasons=FLAGS,
     ),
     Section(

@@ -3,6 +3,11 @@
 from hipsta_bids.reasons.reason import Reason
 
 FLAGS: dict[str, Reason] = {
+    "repaired": Reason(
+        "Small holes or bridges of the labels were mended (status `repaired`, unless there are"
+        " flags, too).",
+        "Look at the places. If the repair fits, the hemisphere can be used.",
+    ),
     "large-repair": Reason(
         "A hole was filled, or a bridge cut, against clear evidence of the labels.",
         "Look at the place. If the repair is wrong, correct the labels there.",
