@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from reference_pages import PAGES
 
 import hipsta_bids
 from hipsta_bids.bids.names import DATASET_FILES, OUTPUTS, HemisphereName, output_name
@@ -187,6 +188,12 @@ def test_links_lead_somewhere(page):
     local = [target for target in targets if "://" not in target]
     missing = [target for target in local if not (ROOT / page).parent.joinpath(target).exists()]
     assert not missing
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_pages_say_what_the_code_says(name):
+    written = (ROOT / "docs" / name).read_text(encoding="utf-8")
+    assert written == PAGES[name](), "run tools/make-docs"
 
 
 def test_architecture_page_names_each_module():

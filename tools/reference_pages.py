@@ -35,7 +35,10 @@ OUTPUTS_TEXT = """\
 A BIDS derivative dataset. Files of a hemisphere lie in `sub-X[/ses-Y]/anat/` and begin with
 `sub-X[_ses-Y]_hemi-<L|R>`; `P` is the name of the segmentation protocol. Other regions than the
 body have `label-extended` or `label-entorhinal` after `seg-P`. Missing values are `n/a` in tables
-and NaN in GIFTI files. What the numbers mean, with figures: [Measures](measures.md)."""
+and NaN in GIFTI files. What the numbers mean, with figures: [Measures](measures.md).
+
+Axes mean the same on both sides: x runs from medial (subiculum) to lateral (CA3), y from posterior
+to anterior, z from interior to exterior. Head and tail are part of no number."""
 
 COLUMNS_TEXT = """\
 Which table has which is said in [Group level](group.md#what-is-written) and in the `.json` beside

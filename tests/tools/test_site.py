@@ -1,4 +1,4 @@
-"""The documentation site: pages that the code writes, and a build without warnings or network."""
+"""The documentation site: a build without warnings or network, and an example that runs."""
 
 import os
 import re
@@ -7,15 +7,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from reference_pages import PAGES
 
 ROOT = Path(__file__).parents[2]
-
-
-@pytest.mark.parametrize("name", PAGES)
-def test_pages_say_what_the_code_says(name):
-    written = (ROOT / "docs" / name).read_text(encoding="utf-8")
-    assert written == PAGES[name](), "run tools/make-docs"
 
 
 def test_the_example_of_the_python_page_runs(capsys):
