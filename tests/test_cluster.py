@@ -19,6 +19,7 @@ JOBS = ["square 3", "exit 5", "kill 9", "raise", "sleep 60", "square 4"]
 #: Two runs on one Dask worker with two threads: one to its end, one that is stopped.
 SCRIPT = """
 import sys, time
+from dataclasses import replace
 from pathlib import Path
 from distributed import LocalCluster
 from pool_jobs import work
@@ -34,10 +35,10 @@ if __name__ == "__main__":
         there = Cluster(scheduler=dask.scheduler_address)
         for job, answer in run_on_cluster(there, plan, {jobs!r}):
             print(job, "->", getattr(answer, "cause", answer))
-        stopped = run_on_cluster(there, plan, ["helper", "sleep 60"])
+        stopped = run_on_cluster(there, replace(plan, timeout=100), ["helper", "sleep 60"])
         _, processes = next(stopped)
         stopped.close()
-        deadline = time.monotonic() + 10
+        deadline = time.monotonic() + 100
         # The helper is left to the system, which may be slow to notice its end.
         while Path(f"/proc/{{processes[0]}}").exists():
             assert time.monotonic() < deadline

@@ -79,11 +79,10 @@ def check_kills(work: Path, data: Path, reference: dict[str, bytes], n_kills: in
         victim = generator.choice(sorted(killed))
         main = start(data, out, "--n-procs", "2")
         time.sleep(generator.uniform(0, duration))
-        target = main.pid if victim == "run" else worker_of(main.pid, generator)
-        if target is not None:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(target, signal.SIGKILL)
-                killed[victim] += 1
+        worker = None if victim == "run" else worker_of(main.pid, generator)
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(worker or main.pid, signal.SIGKILL)
+            killed["run" if worker is None else victim] += 1
         main.communicate()
         demand_whole(out, reference, f"kill {number} ({victim})")
         if (out / "status.tsv").exists():
