@@ -171,9 +171,10 @@ def reasons_page() -> str:
         REASONS_TEXT,
     ]
     for section in REASONS:
-        rows = sorted((f"`{k}`", x.meaning, x.remedy) for k, x in section.reasons.items())
-        table = _table(("reason", "what it means", "what to do"), rows)
-        parts += [f"## {section.title}", section.text, table]
+        parts += [f"## {section.title}", section.text]
+        # A heading for each, so that it can be searched for and linked to.
+        for name, reason in sorted(section.reasons.items()):
+            parts += [f"#### `{name}`", f"{reason.meaning}\n**Try:** {reason.remedy}"]
     codes = ((str(int(code)), words) for code, words in EXIT_MEANINGS.items())
     return _page([*parts, "## Exit codes", _table(("code", "meaning"), codes)])
 
