@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from hipsta_bids.errors import ExitCode, UsageError
 from hipsta_bids.group_parser import LEVEL, group_parser
+from hipsta_bids.report_command import rebuild_group_reports
 
 if TYPE_CHECKING:
     from hipsta_bids.group_record import GroupOptions
@@ -41,10 +42,12 @@ def run_group_level(arguments: Sequence[str]) -> ExitCode:
     parsed = group_parser().parse_args(arguments)
     if parsed.model is not None and (parsed.formula or parsed.contrast):
         raise UsageError("give --model, or --formula and --contrast", reason="usage")
+    if parsed.reports_only:
+        return rebuild_group_reports(parsed.output_dir, parsed.name)
     # Thousands of tiny fits: threads of the linear algebra would only get in each other's way.
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
-    from hipsta_bids.console import say, say_start  # noqa: PLC0415  (start-up time)
+    from hipsta_bids.console import complain, say, say_start  # noqa: PLC0415  (start-up time)
 
     say_start(LEVEL, parsed.bids_dir)
     from hipsta_bids.bids.files import check_scratch  # noqa: PLC0415  (heavy)
@@ -57,7 +60,9 @@ def run_group_level(arguments: Sequence[str]) -> ExitCode:
         say(f"note: {note}")
     say(f"{result.n_participants} participants in the model, {result.n_excluded} left out")
     say(f"results: {result.folder}")
-    say(f"what was done and found: {result.folder / 'methods.md'}")
+    say(f"what was done and found: {result.page or result.folder / 'methods.md'}")
+    if result.problem is not None:
+        complain(f"report: {result.problem}")
     return ExitCode.OK
 
 
@@ -125,5 +130,6 @@ def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOpti
             asymmetry=parsed.asymmetry,
             normative=parsed.normative,
         ),
+        reports=not parsed.no_reports,
         command=("hipsta-bids", *arguments),
     )

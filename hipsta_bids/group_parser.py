@@ -13,7 +13,7 @@ _EPILOG = """\
 without --model and --formula: group + age + sex (+ site), each group against its reference level
 (CN, CU, HC, control ..., else the most frequent), from BIDS_DIR/participants.tsv
 
-results: OUT_DIR/group/MODEL/; begin with methods.md and peaks.tsv
+results: OUT_DIR/group/MODEL/; begin with OUT_DIR/group/MODEL.html
 
 exit codes: 0 done; 64 wrong use; 65 the data do not allow it; 66 no hemispheres; 73 cannot write
 """
@@ -43,6 +43,7 @@ def group_parser() -> Parser:
     _add_model(parser)
     _add_comparison(parser)
     _add_methods(parser)
+    _add_reports(parser)
     return parser
 
 
@@ -240,6 +241,23 @@ def _add_methods(parser: Parser) -> None:
         type=Path,
         metavar="FILE.toml",
         help="settings that change results (see `hipsta-bids settings group`)",
+    )
+
+
+def _add_reports(parser: Parser) -> None:
+    add = parser.add_argument_group("report").add_argument
+    add(
+        "--no-reports",
+        "--no_reports",
+        action="store_true",
+        help="make no page to look at (OUT_DIR/group/MODEL.html)",
+    )
+    add(
+        "--reports-only",
+        "--reports_only",
+        action="store_true",
+        help="make these pages anew from the results that are there, of all analyses or that of"
+        " --name, and end",
     )
 
 

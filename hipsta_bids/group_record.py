@@ -33,6 +33,8 @@ class GroupOptions:
     """What to fit the model to; empty for the default or the formula's left-hand side."""
     template: Path | None = None
     comparison: Comparison = field(default_factory=Comparison)
+    reports: bool = True
+    """Whether a page is made."""
     command: tuple[str, ...] = ()
     """The command line, for the record."""
 

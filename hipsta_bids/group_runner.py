@@ -7,6 +7,7 @@ from typing import Any
 
 from hipsta_bids.bids import derivative, files, group_outputs
 from hipsta_bids.bids.group_inputs import Exclusion
+from hipsta_bids.bids.names import group_report
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.analysis import Analysis, analyze_cohort, analyze_points
 from hipsta_bids.group.model_spec import parse_model
@@ -18,6 +19,7 @@ from hipsta_bids.group_record import GroupOptions, notes_of, record_of
 from hipsta_bids.group_settings import GroupSettings
 from hipsta_bids.group_shapes import average_shapes, write_shapes
 from hipsta_bids.group_writer import draw, write_results
+from hipsta_bids.reporting import write_group_report
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +33,10 @@ class GroupResult:
     """Hemispheres and visits."""
     notes: tuple[str, ...]
     """What to know, one line each."""
+    page: Path | None
+    """To look at; ``None`` if there is none."""
+    problem: str | None = None
+    """Why the page could not be made."""
 
 
 def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
@@ -104,12 +110,25 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         notes += draw(folder, cohort, analysis, shapes, others=others)
         record = record_of(options, read.found, settings, analysis, notes)
         files.write_json(folder / "analysis.json", record)
+    page, problem = _report(options, name)
     return GroupResult(
         folder=options.out_dir / group_outputs.GROUP_FOLDER / name,
+        page=page,
+        problem=problem,
         n_participants=analysis.n_participants,
         n_excluded=len(exclusions),
         notes=tuple(notes),
     )
+
+
+def _report(options: GroupOptions, name: str) -> tuple[Path | None, str | None]:
+    """Make the page, and say why if it is not there."""
+    path = options.out_dir / group_report(name)
+    if not options.reports:
+        files.remove([path])  # it would be that of an earlier analysis of this name
+        return None, None
+    problem = write_group_report(options.out_dir, name)
+    return (path if problem is None else None), problem
 
 
 def _describe(options: GroupOptions) -> None:

@@ -3,6 +3,7 @@
 import os
 import shlex
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hipsta_bids.console import complain, say
@@ -58,6 +59,48 @@ def rebuild_reports(options: "Namespace") -> ExitCode:
     if any(problem.fatal for problem in problems):
         return ExitCode.NOT_WRITABLE
     return ExitCode.INTERNAL if problems else ExitCode.OK
+
+
+def rebuild_group_reports(root: Path, name: str | None) -> ExitCode:
+    """Make the pages of analyses of the group level.
+
+    Parameters
+    ----------
+    root : Path
+        The output dataset.
+    name : str or None
+        Of one analysis; else all.
+
+    Returns
+    -------
+    ExitCode
+
+    Raises
+    ------
+    NothingToDoError
+        If there is no such analysis.
+    OutputError
+        If it cannot be written.
+    """
+    from hipsta_bids.bids.files import check_writable  # noqa: PLC0415  (start-up time)
+    from hipsta_bids.bids.names import group_report  # noqa: PLC0415
+    from hipsta_bids.reporting import group_models, write_group_report  # noqa: PLC0415  (heavy)
+
+    models = [model for model in group_models(root) if name in {None, model}]
+    if not models:
+        raise NothingToDoError(
+            f"{root}: no analysis{f' of the name {name}' if name else ''}; run the group level"
+            " without --reports-only first",
+            reason="nothing-to-report",
+        )
+    check_writable(root)
+    problems = [write_group_report(root, model) for model in models]
+    for model, problem in zip(models, problems, strict=True):
+        if problem is None:
+            say(f"report: {root / group_report(model)}")
+        else:
+            complain(f"report: {problem}")
+    return ExitCode.INTERNAL if any(problems) else ExitCode.OK
 
 
 def command_line(arguments: Sequence[str]) -> str:

@@ -12,7 +12,12 @@ from functools import cache
 from pathlib import Path
 
 from hipsta_bids.bids import files
-from hipsta_bids.bids.names import DATASET_FILES, name_of_record, participant_report
+from hipsta_bids.bids.names import (
+    DATASET_FILES,
+    group_report,
+    name_of_record,
+    participant_report,
+)
 from hipsta_bids.cluster import Cluster, run_on_cluster
 from hipsta_bids.errors import HipstaError, OutputError
 from hipsta_bids.pool import WorkerLost, WorkerPlan, run_jobs
@@ -216,6 +221,43 @@ def make_page(job: PageJob) -> Problem | None:
         traceback.print_exc()  # to the log, as everything that a worker prints
         return Problem(message=f"{job.path.name}: not made ({type(error).__name__}: {error})")
     return None
+
+
+def write_group_report(root: Path, model: str) -> str | None:
+    """Make the page about one analysis of the group level; a failure leaves no page.
+
+    Parameters
+    ----------
+    root : Path
+        The output dataset.
+    model : str
+        Name of the analysis, which is that of its folder.
+
+    Returns
+    -------
+    str or None
+        Why there is no page; ``None`` if all went well.
+    """
+    path = root / group_report(model)
+    try:
+        from hipsta_bids.reports.group_page import group_page  # noqa: PLC0415  (slow to load)
+
+        files.write_text(path, group_page(root / DATASET_FILES["group"] / model))
+    except Exception as error:  # results are worth more than pages
+        if not isinstance(error, HipstaError):  # a bug shows its traceback
+            _LOGGER.exception("report: %s", path.name)
+        # That of an earlier analysis would be taken for this one's.
+        with contextlib.suppress(OSError):
+            path.unlink(missing_ok=True)
+        cause = str(error) if isinstance(error, HipstaError) else f"{type(error).__name__}: {error}"
+        return f"{path.name}: not made ({cause})"
+    return None
+
+
+def group_models(root: Path) -> list[str]:
+    """List the analyses of the group level that an output dataset holds."""
+    records = (root / DATASET_FILES["group"]).glob("*/analysis.json")
+    return sorted(path.parent.name for path in records if not path.parent.name.startswith("."))
 
 
 @cache

@@ -354,6 +354,11 @@ def participant_report(subject: str, session: str | None) -> str:
     return f"sub-{subject}{f'_ses-{session}' if session else ''}.html"
 
 
+def group_report(model: str) -> str:
+    """Spell the path of the page about one analysis of the group level, in the output dataset."""
+    return f"{DATASET_FILES['group']}/{model}.html"
+
+
 def ignore_patterns() -> tuple[str, ...]:
     """List the patterns of ``.bidsignore``: each output that BIDS 1.11 has no rule for.
 

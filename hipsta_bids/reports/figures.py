@@ -2,9 +2,11 @@
 
 import base64
 import io
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -110,10 +112,15 @@ def scale_of(kind: MapKind, values: Sequence[Float]) -> tuple[float, float]:
 
 def color_table(kind: MapKind, n: int = 64) -> NDArray[np.str_]:
     """List the colors of a map as ``#rrggbb``."""
+    return colors_of(kind.colors, n)
+
+
+def colors_of(name: str, n: int = 64) -> NDArray[np.str_]:
+    """List the colors of one of matplotlib's color maps as ``#rrggbb``."""
     from matplotlib import colormaps  # noqa: PLC0415  (slow to load)
     from matplotlib.colors import to_hex  # noqa: PLC0415
 
-    return np.array([to_hex(color) for color in colormaps[kind.colors](np.linspace(0, 1, n))])
+    return np.array([to_hex(color) for color in colormaps[name](np.linspace(0, 1, n))])
 
 
 def gradient_of(colors: NDArray[np.str_]) -> str:
@@ -205,6 +212,25 @@ def draw_profiles(
         figure,
         alt=f"{kind.title} from medial to lateral, {sides}: mean over the rows of the sheet",
         caption=f"{kind.title} along x",
+    )
+
+
+def picture_of_file(path: Path, *, alt: str, caption: str) -> Picture:
+    """Embed a drawing that was made before.
+
+    Parameters
+    ----------
+    path : Path
+        SVG file of matplotlib.
+    alt, caption : str
+    """
+    content = path.read_bytes()
+    width = re.search(rb'<svg[^>]*? width="([\d.]+)pt"', content)
+    return Picture(
+        address="data:image/svg+xml;base64," + base64.b64encode(content).decode(),
+        alt=alt,
+        caption=caption,
+        width=round(float(width[1]) / 0.75) if width else 800,
     )
 
 
