@@ -1,6 +1,5 @@
 """``--reports-only``: the pages of an output dataset, made anew from its files."""
 
-import os
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -105,6 +104,6 @@ def rebuild_group_reports(root: Path, name: str | None) -> ExitCode:
 
 def command_line(arguments: Sequence[str]) -> str:
     """Spell a command line for the record; the home folder, which names a person, as ``~``."""
-    text = shlex.join(("hipsta-bids", *arguments))
-    home = os.path.expanduser("~")  # noqa: PTH111  (Path.home() fails where there is none)
-    return text.replace(f"{home}/", "~/") if len(home) > 1 else text
+    from hipsta_bids.bids.files import hide_home  # noqa: PLC0415  (start-up time)
+
+    return hide_home(shlex.join(("hipsta-bids", *arguments)))

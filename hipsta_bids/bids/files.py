@@ -162,6 +162,12 @@ def _write_through(path: Path, content: bytes) -> None:
         os.fsync(file.fileno())
 
 
+def hide_home(text: str) -> str:
+    """Spell the home folder, which names a person, as ``~``."""
+    home = os.path.expanduser("~")  # noqa: PTH111  (Path.home() fails where there is none)
+    return text.replace(f"{home}/", "~/") if len(home) > 1 else text
+
+
 def remove(paths: Iterable[Path]) -> None:
     """Remove files; those that do not exist are fine.
 

@@ -2,11 +2,13 @@
 
 import base64
 import io
+import shlex
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
+from hipsta_bids.bids.files import hide_home
 from hipsta_bids.reports.figures import colors_of
 from hipsta_bids.reports.group_results import GroupResults, number_text, spelled
 
@@ -88,15 +90,14 @@ def _picture(table: Any, columns: list[str]) -> dict[str, Any]:  # noqa: ANN401 
 
 def origin(results: GroupResults) -> Mapping[str, Any]:
     """List what is needed to repeat the analysis."""
-    import shlex  # noqa: PLC0415  (here only)
-
     record = results.record
     inputs = record.get("inputs") or {}
     settings = record.get("settings") or {}
     return {
-        "command": shlex.join(str(part) for part in record.get("command") or ()),
+        "command": hide_home(shlex.join(str(part) for part in record.get("command") or ())),
         "version": record.get("version"),
         "inputs": inputs,
+        "datasets": [hide_home(str(path)) for path in inputs.get("datasets") or ()],
         "settings": [
             (f"{stage}.{name}", value)
             for stage, part in settings.items()

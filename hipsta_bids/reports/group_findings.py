@@ -70,17 +70,21 @@ def _side(results: GroupResults, row: Mapping[str, Any]) -> dict[str, Any]:
         return {"title": title, "found": False, "text": "nothing could be tested.", "peak": ""}
     if n:
         where = _where(results, row, points)
-        text = f"{n} of {total} points survive ({n / total:.0%} of the map): {where}."
-        first = own.iloc[int(np.argmax(own["statistic"].abs()))]
+        text = f"{n} of {total} points survive ({_percent(n / total)} of the map): {where}."
+        first = records(own)[int(np.argmax(own["statistic"].abs()))]
     else:
         text = f"none of {total} points survives."
-        first = own.iloc[0]
+        first = records(own)[0]
     return {
         "title": title,
         "found": n > 0,
         "text": text,
         "peak": f"Strongest at {_peak(results, first, points)}.",
     }
+
+
+def _percent(share: float) -> str:
+    return f"{share:.0%}" if share >= 0.01 else "less than 1%"  # noqa: PLR2004
 
 
 def _where(results: GroupResults, row: Mapping[str, Any], points: pd.DataFrame) -> str:
@@ -101,12 +105,12 @@ def _where(results: GroupResults, row: Mapping[str, Any], points: pd.DataFrame) 
     return "; ".join(parts)
 
 
-def _peak(results: GroupResults, peak: pd.Series, points: pd.DataFrame) -> str:
+def _peak(results: GroupResults, peak: Mapping[str, Any], points: pd.DataFrame) -> str:
     here = point_of(peak, points)
     what = [f"{effect_name(peak['effect'])} {number_text(peak['effect_size'])}"]
     if here is not None and np.isfinite(here["estimate"]):
         unit = _unit(results, str(peak["measure"]))
-        what.insert(0, f"difference {with_unit(number_text(here['estimate']), unit)}")
+        what.insert(0, f"estimate {with_unit(number_text(here['estimate']), unit)}")
     place = place_words(peak)
     return f"{place}: {', '.join(what)}, corrected p {p_text(peak['p_corrected'])}"
 
@@ -119,14 +123,14 @@ def _unit(results: GroupResults, measure: str) -> str:
     return str(own.iloc[0]) if len(own) else "1"
 
 
-def point_of(peak: pd.Series, points: pd.DataFrame) -> pd.Series | None:
+def point_of(peak: Mapping[str, Any], points: pd.DataFrame) -> pd.Series | None:
     """Find the point of a map that a peak is."""
     names = ("vertex",) if "vertex" in points else ("x", "y")
     same = np.all([points[name] == peak[name] for name in names], axis=0)
     return points[same].iloc[0] if same.any() else None
 
 
-def place_words(peak: pd.Series) -> str:
+def place_words(peak: Mapping[str, Any]) -> str:
     """Say where a peak lies."""
     field = peak["subfield"] if isinstance(peak["subfield"], str) else ""
     if np.isfinite(peak.get("x", np.nan)):

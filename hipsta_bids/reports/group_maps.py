@@ -76,10 +76,9 @@ def _block(
         _side(results, str(hemi), means, rows) for hemi, rows in maps.groupby("hemi", sort=False)
     ]
     contrasts = maps["contrast"].unique().tolist()
-    kinds = {test["kind"] for side in sides for test in side["tests"]}
     scene = {
         "unit": unit_of(unit),
-        "scales": _scales(results, sides, unit, kinds),
+        "scales": _scales(results, sides, unit),
         "sides": [_rounded(side) for side in sides],
     }
     block = {
@@ -143,9 +142,7 @@ def _test(results: GroupResults, row: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _scales(
-    results: GroupResults, sides: Sequence[Mapping[str, Any]], unit: str, kinds: set[str]
-) -> dict[str, Any]:
+def _scales(results: GroupResults, sides: Sequence[Mapping[str, Any]], unit: str) -> dict[str, Any]:
     """Choose ends, colors and words of the color bars; sides share them."""
     pair = (results.record.get("comparison") or {}).get("pair")
     means = _known([group["values"] for side in sides for group in side["means"]])
@@ -154,11 +151,8 @@ def _scales(
     if centered:  # differences, to either side of zero
         high = max(abs(low), abs(high), 1e-6)
         low = -high
-    sizes = np.abs(_known([test["effect"] for side in sides for test in side["tests"]]))
-    reach = max(float(np.percentile(sizes, _EFFECTS)) if len(sizes) else 0.0, 1e-6)
     powers = np.abs(_known([test["significance"] for side in sides for test in side["tests"]]))
     top = max(_LEAST_REACH, float(powers.max(initial=0)))
-    effect = ", ".join(_EFFECT_NAMES[kind] for kind in sorted(kinds, reverse=True))
     mean_label = "mean change" if pair else "mean"
     return {
         "mean": _scale(
@@ -166,11 +160,23 @@ def _scales(
             (float(low), max(float(high), float(low) + 1e-6)),
             f"{mean_label} [{unit_of(unit)}]" if unit_of(unit) else mean_label,
         ),
-        "effect": _scale("RdBu_r", (-reach, reach), f"effect size, {effect}"),
+        "effect": {
+            test["contrast"]: _effect_scale(sides, test["contrast"], test["kind"])
+            for side in sides
+            for test in side["tests"]
+        },
         "significance": _scale(
             "PuOr_r", (-top, top), f"{MINUS}log₁₀ of corrected p, with the sign of the effect"
         ),
     }
+
+
+def _effect_scale(sides: Sequence[Mapping[str, Any]], contrast: str, kind: str) -> dict[str, Any]:
+    """Give each contrast its own ends: effects per year and of groups differ by far."""
+    tests = [test for side in sides for test in side["tests"] if test["contrast"] == contrast]
+    sizes = np.abs(_known([test["effect"] for test in tests]))
+    reach = max(float(np.percentile(sizes, _EFFECTS)) if len(sizes) else 0.0, 1e-6)
+    return _scale("RdBu_r", (-reach, reach), f"effect size, {_EFFECT_NAMES[kind]}")
 
 
 def _scale(colors: str, ends: tuple[float, float], label: str) -> dict[str, Any]:

@@ -111,6 +111,14 @@ def with_unit(text: str, unit: str) -> str:
     return f"{text} {unit_of(unit)}".rstrip()
 
 
+def statistic_text(row: Mapping[str, Any]) -> str:
+    """Spell a statistic with its degrees of freedom; of F, tables have those of the error."""
+    value = number_text(row["statistic"])
+    if row["test"] == "t":
+        return f"t({row['df']:.0f}) {value}"
+    return f"{row['test']} {value}, error df {row['df']:.0f}"
+
+
 def number_text(value: float) -> str:
     """Spell a number with three digits."""
     if not np.isfinite(value):
@@ -145,9 +153,10 @@ def direction(results: GroupResults, contrast: str, hemi: str, sign: float) -> s
         return "larger on the left" if sign > 0 else "larger on the right"
     if contrast == "mean" and comparison.get("pair"):
         return "an increase" if sign > 0 else "a decrease"
+    # Contrasts as users write them, and as the default model names them: of change in time, too.
+    short = re.sub(r"\w+\[([^\]]*)\]", r"\1", contrast).replace(" - ", "-")
     for first in results.levels:
         for second in results.levels:
-            # The contrast may be about change in time as well.
-            if re.fullmatch(rf"(?:.* in )?{re.escape(first)}-{re.escape(second)}", contrast):
+            if re.fullmatch(rf"(?:.* in )?{re.escape(first)}-{re.escape(second)}", short):
                 return f"larger in {first if sign > 0 else second}"
     return "positive" if sign > 0 else "negative"

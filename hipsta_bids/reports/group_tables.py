@@ -20,6 +20,7 @@ from hipsta_bids.reports.group_results import (
     p_text,
     records,
     spelled,
+    statistic_text,
     unit_of,
 )
 
@@ -36,7 +37,7 @@ def peaks(results: GroupResults) -> Mapping[str, Any] | None:
     files = results.table("maps").set_index(["measure", "contrast", "hemi"])["file"]
     numbers = table.groupby(["measure", "contrast", "hemi"]).cumcount() + 1
     rows = []
-    for number, (_, row) in zip(numbers, table.iterrows(), strict=True):
+    for number, row in zip(numbers, records(table), strict=True):
         points = results.table(files[row["measure"], row["contrast"], row["hemi"]])
         here = point_of(row, points)
         rows.append(
@@ -49,7 +50,7 @@ def peaks(results: GroupResults) -> Mapping[str, Any] | None:
                 "extent": int(row["extent"]),
                 "shares": row["shares"] if isinstance(row["shares"], str) else "",
                 "estimate": number_text(np.nan if here is None else here["estimate"]),
-                "statistic": f"{row['test']}({row['df']:.0f}) {number_text(row['statistic'])}",
+                "statistic": statistic_text(row),
                 "p": p_text(row["p"]),
                 "adjusted": p_text(row["p_corrected"]),
                 "effect": effect_text(row),
@@ -137,7 +138,7 @@ def summaries(results: GroupResults) -> Mapping[str, Any] | None:
                     for one in known
                 ],
                 "estimate": number_text(row["estimate"]),
-                "statistic": f"{row['test']}({row['df']:.0f}) {number_text(row['statistic'])}",
+                "statistic": statistic_text(row),
                 "p": p_text(row["p"]),
                 "low": bool(row["p"] < 0.05),  # noqa: PLR2004  (emphasis only)
                 "effect": effect_text(row),

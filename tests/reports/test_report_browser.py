@@ -1,102 +1,24 @@
-"""How pages behave in a real browser: Chromium without a network.
-
-Skipped where there is none, unless HIPSTA_BIDS_BROWSER=required; ``tools/test-reports`` sets that.
-"""
-
-import io
-import os
-import re
-import shutil
-import time
+"""How pages behave in a real browser; see :mod:`browsing`."""
 
 import numpy as np
 import pytest
-from PIL import Image
-
-selenium = pytest.importorskip("selenium", reason="selenium is not installed")
-from selenium import webdriver  # noqa: E402
-from selenium.webdriver.chrome.service import Service  # noqa: E402
-from selenium.webdriver.common.by import By  # noqa: E402
-from selenium.webdriver.common.keys import Keys  # noqa: E402
-
-FLAGS = (
-    *("--headless", "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader"),
-    *("--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run"),
-    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
-    "--host-resolver-rules=MAP * ~NOTFOUND",
-    "--hide-scrollbars",
-)
-#: What Chromium says of its own speed when pixels are read.
-NOISE = "GL Driver Message"
+from browsing import colored, fits, one, open_browser, open_page, pixels, texts, until, watched
+from selenium import webdriver
+from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
 
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory):
-    chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
-    if not (chromium and driver):
-        if os.environ.get("HIPSTA_BIDS_BROWSER") == "required":
-            pytest.fail("no chromium or chromedriver on the PATH")
-        pytest.skip("no chromium or chromedriver on the PATH")
-    options = webdriver.ChromeOptions()
-    options.binary_location = chromium
-    profile, downloads = (tmp_path_factory.mktemp(name) for name in ("profile", "downloads"))
-    for flag in (*FLAGS, f"--user-data-dir={profile}"):
-        options.add_argument(flag)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
-    session = webdriver.Chrome(options=options, service=Service(driver))
-    session.downloads = downloads
-    session.execute_cdp_cmd(
-        "Browser.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(downloads)}
-    )
-    yield session
-    session.quit()
+    with open_browser(tmp_path_factory.mktemp("browser")) as session:
+        yield session
 
 
 @pytest.fixture
 def visit(browser, out):
     """Open a page at a width; afterwards nothing may have gone wrong or outside."""
-
-    def open_page(name, width=1280):
-        size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
-        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-        browser.get((out / name).as_uri())
-        return browser
-
-    browser.get_log("browser")
-    browser.get_log("performance")
-    yield open_page
-    said = [entry["message"] for entry in browser.get_log("browser")]
-    assert [message for message in said if NOISE not in message] == []
-    sent = [entry["message"] for entry in browser.get_log("performance")]
-    asked = [message for message in sent if '"Network.requestWillBeSent"' in message]
-    own = re.compile('"url":"(file|data|blob):')
-    assert asked
-    assert [message for message in asked if not own.search(message)] == []
-
-
-def one(browser, selector):
-    return browser.find_element(By.CSS_SELECTOR, selector)
-
-
-def texts(browser, selector):
-    return [element.text for element in browser.find_elements(By.CSS_SELECTOR, selector)]
-
-
-def until(condition, seconds=60.0):
-    """Wait until something holds; long, for machines that are busy otherwise."""
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.05)
-
-
-def pixels(element):
-    return np.asarray(Image.open(io.BytesIO(element.screenshot_as_png)).convert("RGB")).astype(int)
-
-
-def colored(picture):
-    """Share of the pixels that have a color, which neither the background nor letters have."""
-    return float((np.ptp(picture, axis=-1) > 40).mean())
+    with watched(browser):
+        yield lambda name, width=1280: open_page(browser, out / name, width)
 
 
 def show_view(browser):
@@ -110,9 +32,7 @@ def show_view(browser):
 @pytest.mark.parametrize("name", ["sub-01.html", "sub-02.html", "report.html"])
 def test_a_page_fits_its_window(visit, name, width):
     browser = visit(name, width)
-    assert browser.execute_script("return document.documentElement.scrollWidth") <= width
-    broken = "return [...document.images].filter(i => !i.complete || !i.naturalWidth).length"
-    assert browser.execute_script(broken) == 0
+    assert fits(browser, width)
 
 
 def test_the_view_draws_the_sheet_and_turns(visit):

@@ -10,7 +10,8 @@
     const own = blocks[block].sides[side];
     const item = kind === "mean" ? own.means[index] : own.tests[index];
     const values = kind === "mean" ? item.values : item[kind];
-    return { canvas, block: blocks[block], side: own, kind, item, values, scale: blocks[block].scales[kind] };
+    const scales = blocks[block].scales[kind];
+    return { canvas, block: blocks[block], side: own, kind, item, values, scale: kind === "effect" ? scales[item.contrast] : scales };
   });
   let place = null; // [i, j], where the reader is; the same in all maps of a measure
   let active = null;
@@ -139,7 +140,7 @@
       const { estimate, statistic, df, p, p_corrected: adjusted, n } = item.values;
       const is_t = item.kind === "t";
       if (is_t) rows.push([item.contrast, spell(estimate[at]) + unit]);
-      rows.push([`${item.kind}(${spell(df[at])})`, spell(statistic[at])], ["p", probability(p[at])]);
+      rows.push([is_t ? `t(${spell(df[at])})` : "F", spell(statistic[at])], ["p", probability(p[at])]);
       rows.push(["corrected p", probability(adjusted[at]) + (item.significant[at] ? ", survives" : "")]);
       rows.push([is_t ? "Cohen's d" : "partial η²", spell(item.effect[at])], ["n", spell(n[at])]);
     }
