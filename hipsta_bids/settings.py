@@ -76,9 +76,9 @@ class GridSettings:
 
     spacing: float = 0.35
     """Distance of grid nodes and so the edge length of the meshes, mm."""
-    smoothing: float = 0.85
+    smoothing: float = 0.9
     """Standard deviation of the Gaussian, in in-plane voxels of the segmentation."""
-    min_smoothing: float = 0.34
+    min_smoothing: float = 0.36
     """... but at least this, mm, so that finer voxels do not leave other maps: what smoothing
     takes from thin rims and narrow bends changes the mean thickness."""
     margin: float = 1.5
@@ -395,10 +395,10 @@ class CheckSettings:
     ridge_columns: int = 9
     """... as the mean of so many neighboring columns of a row."""
     flag_ridge: tuple[float, ...] = (0.45, 0.75, 0.7)
-    """Flag a band that is thicker than both by more than this, one per distance, mm (0.32, 0.59 and
-    0.53 at most in twelve real bodies) ..."""
+    """Flag a band that is thicker than both by more than this, one per distance, mm (0.31, 0.56 and
+    0.54 at most in twelve real bodies) ..."""
     flag_groove: tuple[float, ...] = (0.55, 0.75, 0.75)
-    """... or thinner (0.39, 0.58 and 0.53)."""
+    """... or thinner (0.38, 0.59 and 0.53)."""
     flag_pinholes: float = 0.01
     """Flag labels in which single voxels without a label are more than this share of the sheet's
     voxels (0.0015 at most in twelve real bodies)."""
