@@ -29,14 +29,9 @@ def new_figure(size: tuple[float, float], layout: Literal["constrained", "compre
     Returns
     -------
     Figure
-
-    Raises
-    ------
-    ImportError
-        Without matplotlib.
     """
     with contextlib.nullcontext() if "matplotlib" in sys.modules else _own_settings():
-        from matplotlib.figure import Figure  # noqa: PLC0415  (optional, slow to load)
+        from matplotlib.figure import Figure  # noqa: PLC0415  (slow to load)
 
     return Figure(figsize=size, layout=layout)
 

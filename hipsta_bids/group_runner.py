@@ -107,7 +107,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         write_shapes(folder, shapes)
         if analysis.sides and read.found.records and not shapes:
             notes.append("no average surfaces: those of the participant level are missing")
-        notes += draw(folder, cohort, analysis, shapes, others=others)
+        draw(folder, cohort, analysis, shapes, others=others)
         record = record_of(options, read.found, settings, analysis, notes)
         files.write_json(folder / "analysis.json", record)
     page, problem = _report(options, name)

@@ -102,17 +102,12 @@ def draw(
     shapes: Mapping[str, AverageShape],
     *,
     others: Mapping[str, tuple[Cohort, Analysis]],
-) -> list[str]:
-    """Draw the figures, if the library for it is there; notes otherwise."""
-    everything = ((cohort, analysis, shapes), *((*one, {}) for one in others.values()))
-    try:
-        for one in everything:
-            for drawing in draw_figures(*one):
-                files.write_bytes(folder / "figures" / f"{drawing.name}.png", drawing.png)
-                files.write_bytes(folder / "figures" / f"{drawing.name}.svg", drawing.svg)
-    except ImportError:
-        return ["no figures, as matplotlib is missing: pip install 'hipsta_bids[figures]'"]
-    return []
+) -> None:
+    """Draw the figures."""
+    for one in ((cohort, analysis, shapes), *((*one, {}) for one in others.values())):
+        for drawing in draw_figures(*one):
+            files.write_bytes(folder / "figures" / f"{drawing.name}.png", drawing.png)
+            files.write_bytes(folder / "figures" / f"{drawing.name}.svg", drawing.svg)
 
 
 def _write_gifti(folder: Path, cohort: Cohort, analysis: Analysis) -> None:

@@ -29,11 +29,6 @@ def draw_figures(
     Yields
     ------
     Drawing
-
-    Raises
-    ------
-    ImportError
-        Without matplotlib.
     """
     for measure in dict.fromkeys(m for one in analysis.fitted.values() for m in one.fits):
         yield encode(f"{measure}_means", draw_means(cohort, analysis, measure))

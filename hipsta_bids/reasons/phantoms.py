@@ -18,7 +18,6 @@ PHANTOMS: dict[str, Reason] = {
     "defect-kind": Reason("There is no defect of this kind.", "The message lists them."),
     "defect-empty": Reason("The defect changes no voxel.", "Make it larger."),
     "unknown-suite": Reason("There is no such suite.", "The message lists them."),
-    "matplotlib-missing": Reason("Figures need matplotlib.", "Install the extra `figures`."),
     "crash": Reason(
         "A measurement of the validation ended with a bug.",
         "Please report it; the table names the case.",

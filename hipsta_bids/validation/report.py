@@ -5,16 +5,12 @@ from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from hipsta_bids import __version__
 from hipsta_bids.bids import files
 from hipsta_bids.drawing import new_figure
 from hipsta_bids.errors import UsageError
 from hipsta_bids.validation.suite import SUITES, Cell, Picture, Suite, Table, run_suite
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 #: What is written, below the output folder.
 PAGE = "validation.md"
@@ -55,7 +51,7 @@ def validate(
     Raises
     ------
     UsageError
-        If a suite is unknown, or figures cannot be drawn because matplotlib is absent.
+        If a suite is unknown.
     OutputError
         If a file cannot be written.
     """
@@ -65,7 +61,6 @@ def validate(
             f"validate: suite {unknown[0]!r} is unknown; choose from {', '.join(SUITES)}",
             reason="unknown-suite",
         )
-    _new_figure((1.0, 1.0))  # before hours of work, not after
     files.check_writable(out)
     suites = []
     for name in names or SUITES:
@@ -127,14 +122,8 @@ def show(cell: Cell, digits: int) -> str:
 
 
 def render(picture: Picture) -> bytes:
-    """Draw a figure as PNG, without anything that changes from run to run.
-
-    Raises
-    ------
-    UsageError
-        If matplotlib is absent.
-    """
-    figure = _new_figure(picture.size)
+    """Draw a figure as PNG, without anything that changes from run to run."""
+    figure = new_figure(picture.size, layout="compressed")
     picture.draw(figure)
     data = BytesIO()
     figure.savefig(data, format="png", dpi=_DPI, metadata={"Software": None})
@@ -144,16 +133,6 @@ def render(picture: Picture) -> bytes:
 def file_name(picture: Picture) -> str:
     """Name the file of a figure."""
     return f"validation-{picture.name}.png"
-
-
-def _new_figure(size: tuple[float, float]) -> "Figure":
-    try:
-        return new_figure(size, layout="compressed")
-    except ImportError as error:
-        raise UsageError(
-            "validate: figures need matplotlib; try: pip install 'hipsta_bids[figures]'",
-            reason="matplotlib-missing",
-        ) from error
 
 
 def _overview(suites: Sequence[Suite]) -> Table:

@@ -7,8 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from hipsta_bids import cli
-from hipsta_bids.errors import ExitCode, UsageError
-from hipsta_bids.validation import report
+from hipsta_bids.errors import ExitCode
 from hipsta_bids.validation.report import markdown, page, render, show
 from hipsta_bids.validation.suite import SUITES, Picture, Suite, Table, run_suite
 
@@ -114,14 +113,6 @@ def test_unknown_suites_are_refused(tmp_path, capsys):
 def test_a_file_in_the_way_is_an_output_error(tmp_path):
     (tmp_path / "out").write_text("taken")
     assert cli.main(["validate", "--out", str(tmp_path / "out")]) == ExitCode.NOT_WRITABLE
-
-
-def test_without_matplotlib_nothing_is_measured(monkeypatch, tmp_path, one_suite):
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)  # as if it were not installed
-    with pytest.raises(UsageError, match="figures need matplotlib; try: pip install"):
-        report.validate(tmp_path, full=False)
-    assert not one_suite
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", SUITES)
