@@ -56,10 +56,7 @@ def tracked_files() -> list[Path]:
 @pytest.mark.parametrize(
     ("lock", "requirements"),
     [
-        (
-            "requirements.lock",
-            [*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["figures"]],
-        ),
+        ("requirements.lock", PROJECT["dependencies"]),
         (
             "requirements-dev.lock",
             [
@@ -92,8 +89,7 @@ def test_every_import_is_a_declared_dependency():
         "skimage": "scikit-image",
         "sklearn": "scikit-learn",
     }
-    extras = PROJECT["optional-dependencies"]["figures"]
-    declared = {canonical(requirement) for requirement in [*PROJECT["dependencies"], *extras]}
+    declared = {canonical(requirement) for requirement in PROJECT["dependencies"]}
     trees = (
         ast.parse(path.read_text(encoding="utf-8")) for path in (ROOT / "hipsta_bids").rglob("*.py")
     )
