@@ -84,7 +84,7 @@ def _picture(table: Any, columns: list[str]) -> dict[str, Any]:  # noqa: ANN401 
         "height": int(min(_TALLEST, max(60, _CELL[1] * len(matrix)))),
         "columns": list(zip(columns, ends, strict=True)),
         "rows": len(matrix),
-        "colors": colors[::8].tolist(),
+        "colors": colors[::9].tolist(),
     }
 
 

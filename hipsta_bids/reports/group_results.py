@@ -152,7 +152,7 @@ def direction(results: GroupResults, contrast: str, hemi: str, sign: float) -> s
     if contrast == "mean" and hemi == BOTH:
         return "larger on the left" if sign > 0 else "larger on the right"
     if contrast == "mean" and comparison.get("pair"):
-        return "an increase" if sign > 0 else "a decrease"
+        return "with an increase" if sign > 0 else "with a decrease"
     # Contrasts as users write them, and as the default model names them: of change in time, too.
     short = re.sub(r"\w+\[([^\]]*)\]", r"\1", contrast).replace(" - ", "-")
     for first in results.levels:

@@ -24,6 +24,7 @@ from hipsta_bids.cli import main
 from hipsta_bids.group.contrasts import Contrast
 from hipsta_bids.group.glm import fit_points
 from hipsta_bids.group_settings import GlmSettings
+from hipsta_bids.reports.group_page import group_page
 
 COUNT = sum(PLAN.sizes)
 MODEL = "group-age-sex"
@@ -169,6 +170,10 @@ def test_results_without_sheets_are_complete(alone):
     }
     for path in alone.glob("*_statmap.json"):
         assert "vertex" in json.loads(path.read_text())
+    page = group_page(alone)
+    assert "could not be made" not in page
+    assert "Strongest at vertex " in page
+    assert "Hipp: effects and significance" in page
 
 
 def test_maps_come_beside_the_sheets(study, capsys):

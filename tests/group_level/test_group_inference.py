@@ -14,6 +14,7 @@ from hipsta_bids import group_writer
 from hipsta_bids.bids import derivative, files
 from hipsta_bids.cli import main
 from hipsta_bids.group.simulation import simulate_cohort
+from hipsta_bids.reports.group_page import group_page
 
 ALIGNED = ["--align", "none"]
 
@@ -166,6 +167,11 @@ def test_changes_of_groups_are_compared_between_two_sessions(sessions, quick):
     # .08 mm; noise of .02 in 30 participants and four columns leaves .011 at a point.
     assert change.estimate.mean() == pytest.approx(0.08, abs=0.003)
     assert np.abs(change.estimate - 0.08).max() < 0.06
+    page = group_page(folder)
+    assert "could not be made" not in page
+    assert "change from ses-1 to ses-2" in page
+    assert "points larger in CN" in page
+    assert "points with a decrease" in page
 
 
 @pytest.mark.parametrize("random", ["intercept", "slope"])
@@ -187,6 +193,10 @@ def test_longitudinal_model_finds_the_slopes(sessions, quick, random):
     assert "30 participants (90 visits)" in text
     # Classification wants independent rows.
     assert set(table(folder / "classification.tsv").n) == {30}
+    page = group_page(folder)
+    assert "could not be made" not in page
+    assert "30 participants with 90 visits" in page
+    assert "points larger in CN" in page
 
 
 def test_first_session_is_the_default_and_says_so(sessions, quick, capsys):
