@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from hipsta_bids.artifacts import Float
 from hipsta_bids.reports.charts import COLORS, Axis, Line, chart
 from hipsta_bids.reports.group_findings import summary_side
 from hipsta_bids.reports.group_results import MINUS, SIDES, GroupResults, records, spelled, unit_of
@@ -13,6 +14,7 @@ from hipsta_bids.reports.group_tables import classification
 
 _ENDS = ("medial", "lateral")
 _ERRORS = 2.0  # standard errors to either side
+_MOST_WARPS = 300  # that are drawn, so that pages of large studies stay small
 
 
 def registration(results: GroupResults) -> Mapping[str, Any] | None:
@@ -119,7 +121,7 @@ def _warps(results: GroupResults, warps: pd.DataFrame) -> Iterator[dict[str, Any
     place = np.arange(1.0, len(nodes) + 1)
     for hemi, rows in warps.groupby("hemi", sort=False):
         moved = rows[nodes].to_numpy(dtype=np.float64) * (len(nodes) - 1) - (place - 1)
-        lines = [Line(x=place, y=one, color="#57606a", faint=True) for one in moved]
+        lines = [Line(x=place, y=one, color="#57606a", faint=True) for one in _some(moved)]
         if len(shifts):
             lines += _group_lines(results, shifts[shifts["hemi"] == hemi], "shift", "shift_se")
         title = f"Warps, {SIDES.get(str(hemi), hemi)}"
@@ -130,6 +132,12 @@ def _warps(results: GroupResults, warps: pd.DataFrame) -> Iterator[dict[str, Any
             Axis(label="", ends=_ENDS),
             Axis(label="shift to lateral [nodes]"),
         )
+
+
+def _some(rows: Float) -> Float:
+    """Take rows at even distances, if there are too many to draw."""
+    step = -(-len(rows) // _MOST_WARPS)
+    return rows[:: max(step, 1)]
 
 
 def classifiers(results: GroupResults) -> Mapping[str, Any] | None:
