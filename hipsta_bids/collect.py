@@ -8,6 +8,7 @@ from hipsta_bids.bids.inputs import HemisphereInput
 from hipsta_bids.bids.status import RECORDED, read_status, row_key, update_status
 from hipsta_bids.bookkeeping import log_file, not_finished, status_row
 from hipsta_bids.job import recorded
+from hipsta_bids.reporting import Pages
 from hipsta_bids.runner import RunOptions, RunResult, pages_after, prepare
 from hipsta_bids.settings import Settings
 
@@ -56,11 +57,11 @@ def collect(
             rows[row_key(row)] = row
     update_status(out_dir, rows.values())
     with log_file(out_dir, options.verbosity) as log:
-        problems: list[str] = []
-        with pages_after(jobs, out_dir, options, log, problems):
+        pages = Pages()
+        with pages_after(jobs, out_dir, options, log, pages):
             pass
         result = RunResult(
-            outcomes=outcomes, n_requested=len(jobs), log=log, page_problems=tuple(problems)
+            outcomes=outcomes, n_requested=len(jobs), log=log, page_problems=tuple(pages.problems)
         )
         _LOGGER.info("collected: %s, exit code %d", dict(result.counts), result.exit_code)
     return result

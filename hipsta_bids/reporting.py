@@ -7,7 +7,7 @@ import contextlib
 import logging
 import traceback
 from collections.abc import Generator, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 
@@ -28,6 +28,16 @@ _LOGGER = logging.getLogger(__name__)
 
 Visit = tuple[str, str | None]
 """Labels of subject and session."""
+
+
+@dataclass
+class Pages:
+    """What becomes of the pages of a run."""
+
+    problems: list[str] = field(default_factory=list)
+    """A line per page that could not be made."""
+    wanted: bool = True
+    """Not where nothing can be written."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,7 +148,7 @@ def write_reports(plan: PagePlan, visits: Iterable[Visit]) -> Iterator[Problem]:
 
 
 @contextlib.contextmanager
-def reports_after(plan: PagePlan, visits: Sequence[Visit], problems: list[str]) -> Generator[None]:
+def reports_after(plan: PagePlan, visits: Sequence[Visit], pages: Pages) -> Generator[None]:
     """Make pages when the block ends, also by an error; not when the user stops the run.
 
     Parameters
@@ -146,15 +156,16 @@ def reports_after(plan: PagePlan, visits: Sequence[Visit], problems: list[str]) 
     plan : PagePlan
     visits : sequence of Visit
         Pages that are up to date stay as they are.
-    problems : list of str
+    pages : Pages
         Receives a line per page that could not be made.
     """
     try:
         yield
     except Exception:
-        _try_all(plan, visits, problems)
+        _try_all(plan, visits, pages.problems)
         raise
-    _try_all(plan, visits, problems)
+    if pages.wanted:
+        _try_all(plan, visits, pages.problems)
 
 
 def _try_all(plan: PagePlan, visits: Sequence[Visit], problems: list[str]) -> None:

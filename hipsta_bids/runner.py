@@ -22,7 +22,7 @@ from hipsta_bids.cluster import Cluster, run_on_cluster
 from hipsta_bids.errors import ExitCode, HipstaError, InputError, OutputError, SchemeError
 from hipsta_bids.job import Job, Outcome, finished
 from hipsta_bids.pool import WorkerLost, WorkerPlan, run_jobs
-from hipsta_bids.reporting import PagePlan, reports_after
+from hipsta_bids.reporting import PagePlan, Pages, reports_after
 from hipsta_bids.schemes import Scheme
 from hipsta_bids.settings import Settings
 from hipsta_bids.shard import Shard
@@ -141,19 +141,20 @@ def run_participants(
         if options.command:
             _LOGGER.info("command: %s", options.command)
         books = Books(out_dir, shard)
-        problems: list[str] = []
+        pages = Pages()
         # Closed at once, whatever ends the loop, so that no worker outlives it.
         with (
-            pages_after(jobs, out_dir, options, log, problems),
+            pages_after(jobs, out_dir, options, log, pages),
             contextlib.closing(books),
             contextlib.closing(_outcomes(jobs, books, options, log)) as found,
         ):
             outcomes = _run(found, books, options, report)
+            pages.wanted = not any(isinstance(one.error, OutputError) for one in outcomes)
         result = RunResult(
             outcomes=tuple(outcomes),
             n_requested=len(jobs),
             log=log,
-            page_problems=tuple(problems),
+            page_problems=tuple(pages.problems),
         )
         _LOGGER.info("done: %s, exit code %d", dict(result.counts), result.exit_code)
     return result
@@ -216,7 +217,7 @@ def _run(
 
 
 def pages_after(
-    jobs: Sequence[Job], out_dir: Path, options: RunOptions, log: Path, problems: list[str]
+    jobs: Sequence[Job], out_dir: Path, options: RunOptions, log: Path, pages: Pages
 ) -> AbstractContextManager[None]:
     """Make pages when a block ends, if they are wanted; that of all if this is no part."""
     if not options.reports:
@@ -229,7 +230,7 @@ def pages_after(
         cohort=options.shard is None,
         cluster=options.cluster,
     )
-    return reports_after(plan, visits, problems)
+    return reports_after(plan, visits, pages)
 
 
 def hemisphere_name(item: HemisphereInput, settings: Settings) -> HemisphereName:

@@ -217,34 +217,37 @@ def test_a_page_that_cannot_be_made_is_a_warning(copy, monkeypatch):
     assert problem.message == "sub-01.html: not made (ZeroDivisionError: division by zero)"
 
 
-def run_block(root, problems, error=None):
+def run_block(root, error=None, **changes):
     plan = reporting.PagePlan(root=root, n_workers=1, log=root / "log")
-    with reporting.reports_after(plan, [("01", None)], problems):
+    pages = reporting.Pages(**changes)
+    with reporting.reports_after(plan, [("01", None)], pages):
         if error:
             raise error
+    return pages.problems
 
 
 def test_pages_are_made_after_an_error_but_not_when_the_user_stops_the_run(tmp_path, monkeypatch):
     made = []
     monkeypatch.setattr(reporting, "write_reports", lambda _plan, visits: made.append(visits) or [])
-    run_block(tmp_path, [])
+    run_block(tmp_path)
     with pytest.raises(ValueError, match="x"):
-        run_block(tmp_path, [], ValueError("x"))
+        run_block(tmp_path, ValueError("x"))
     assert len(made) == 2
     with pytest.raises(KeyboardInterrupt):
-        run_block(tmp_path, [], KeyboardInterrupt())
+        run_block(tmp_path, KeyboardInterrupt())
     assert len(made) == 2
+
+
+def test_no_pages_are_made_where_nothing_can_be_written(tmp_path, monkeypatch):
+    monkeypatch.setattr(reporting, "write_reports", lambda *_: 1 / 0)
+    assert run_block(tmp_path, wanted=False) == []
 
 
 def test_an_error_in_reporting_is_a_line(tmp_path, monkeypatch):
     monkeypatch.setattr(reporting, "write_reports", lambda *_: 1 / 0)
-    problems = []
-    run_block(tmp_path, problems)
-    assert problems == ["not made (ZeroDivisionError: division by zero)"]
+    assert run_block(tmp_path) == ["not made (ZeroDivisionError: division by zero)"]
 
 
 def test_pages_up_to_date_are_left_alone(out, monkeypatch):
     monkeypatch.setattr(reporting, "write_reports", lambda *_: 1 / 0)
-    problems = []
-    run_block(out, problems)
-    assert problems == []
+    assert run_block(out) == []
