@@ -68,7 +68,7 @@ def notes_of(found: Collection, analysis: Analysis, *, n_other_visits: int) -> l
             notes.append(f"hemisphere {hemi}: registration had not settled when it ended")
         if side.registration.extreme.any():
             notes.append(
-                f"hemisphere {hemi}: {int(side.registration.extreme.sum())} warps are extreme, see"
+                f"hemisphere {hemi}: extreme warps: {int(side.registration.extreme.sum())}, see"
                 " warps.tsv"
             )
     return notes

@@ -125,7 +125,7 @@ def _registration(analysis: Analysis, settings: GroupSettings, registr: str) -> 
         "Curvature profiles from medial to lateral (means from posterior to anterior) were"
         f" registered by {method}, and the warps were applied to all maps. The share of the"
         f" variance of the profiles that their mean explains went from {shares}."
-        f" {extreme} warps were out of line with the others."
+        f" Warps out of line with the others: {extreme}."
     )
 
 
