@@ -245,7 +245,8 @@ def _add_methods(parser: Parser) -> None:
 
 
 def _add_reports(parser: Parser) -> None:
-    add = parser.add_argument_group("report").add_argument
+    group = parser.add_argument_group("report")
+    add = group.add_mutually_exclusive_group().add_argument
     add(
         "--no-reports",
         "--no_reports",

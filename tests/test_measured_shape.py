@@ -111,8 +111,9 @@ def test_every_number_of_the_subfields_is_that_of_the_phantom(case):
     limits = {
         **{f"area_{name}": strip for name in tissues},
         **{f"volume_{name}": strip * spec.thickness for name in tissues},
-        # A wall of three voxels at a strong bend: its bias is 0.025 mm.
-        "thickness_mean_CA2_3": 0.03 if spec.thickness < 2 else 0,
+        # A wall of three voxels at a strong bend comes out 0.030 mm too thick, 2.5 %: the price of
+        # smoothing (sigma 0.9 voxels; with 0.85 it is 0.026), which takes noise off every point.
+        "thickness_mean_CA2_3": 0.032 if spec.thickness < 2 else 0,
     }
     assert misses(compared, limits) == {}
 

@@ -123,8 +123,10 @@ def merge_inputs(levels: Mapping[str, Sequence[Entry]]) -> list[Entry]:
 def merge_groups(levels: Iterable[Sequence[Entry]]) -> list[Entry]:
     """Join groups of several levels; an input stays in the first section that it is in."""
     seen: set[str] = set()
-    merged = []
+    merged: list[Entry] = []
     for group in (group for groups in levels for group in groups):
+        if group in merged:
+            continue  # options that exclude each other at both levels
         members = [name for name in group["members"] if name not in seen]
         if "mutually-exclusive" in group:
             members = group["members"]
