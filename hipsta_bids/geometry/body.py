@@ -55,6 +55,11 @@ class Body:
         near = cKDTree(_millimetres(medial, self.affine))
         return np.asarray(-near.query(self.inside_points()[1])[0])
 
+    def to_voxels(self, points: Float) -> Float:
+        """Voxel indices (..., 3), fractions included, of points (..., 3), RAS mm."""
+        inverse = np.linalg.inv(self.affine)
+        return np.asarray(points @ inverse[:3, :3].T + inverse[:3, 3])
+
     def inside_points(self) -> tuple[NDArray[np.intp], Float]:
         """Voxel indices (N, 3) and RAS mm (N, 3) of the sheet between the end planes."""
         return self._inside_points

@@ -197,10 +197,9 @@ def _interior_first(
         return sides, "bending", float("nan")
     normals = vertex_normals(wall)
     target = body.interior & (body.tissue == 0)
-    inverse = np.linalg.inv(body.affine)
     hit = np.zeros(len(normals), dtype=bool)
     for reach in settings.probe_distances:
-        probe = (wall.vertices + reach * normals) @ inverse[:3, :3].T + inverse[:3, 3]
+        probe = body.to_voxels(wall.vertices + reach * normals)
         voxel = np.clip(np.rint(probe).astype(int), 0, np.array(target.shape) - 1)
         hit |= target[tuple(voxel.T)]
     share = [float(hit[side].mean()) for side in sides]

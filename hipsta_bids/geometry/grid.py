@@ -132,15 +132,12 @@ def _filled_nodes(body: Body, points: Float) -> Bool:
     """Which of (N, 3) points, RAS mm, lie in voxels that were filled."""
     filled = np.zeros(body.inside.shape, dtype=np.uint8)
     filled[tuple(body.filled.T)] = 1
-    inverse = np.linalg.inv(body.affine)
-    voxels = points @ inverse[:3, :3].T + inverse[:3, 3]
-    return np.asarray(ndimage.map_coordinates(filled, voxels.T, order=0) > 0)
+    return np.asarray(ndimage.map_coordinates(filled, body.to_voxels(points).T, order=0) > 0)
 
 
 def _sample_mask(body: Body, points: Float) -> NDArray[np.float32]:
     """Linear interpolation of the body's mask at (N, 3) points, RAS mm."""
-    inverse = np.linalg.inv(body.affine)
-    voxels = points @ inverse[:3, :3].T + inverse[:3, 3]
+    voxels = body.to_voxels(points)
     mask = (body.tissue > 0).astype(np.float32)
     return np.asarray(
         ndimage.map_coordinates(mask, voxels.T, order=1, output=np.float32, mode="nearest")
@@ -201,8 +198,7 @@ def _fit_grid(body: Body, settings: GridSettings) -> WedgeGrid:
     """
     _, points = body.inside_points()
     axis = body.ends.axis
-    inverse = np.linalg.inv(body.affine)
-    nearest = np.rint(inverse[:3, :3] @ body.ends.posterior_point + inverse[:3, 3])
+    nearest = np.rint(body.to_voxels(body.ends.posterior_point))
     anchor = body.affine[:3, :3] @ nearest + body.affine[:3, 3]
     flat = (points - anchor) - np.outer((points - anchor) @ axis, axis)
     across = _directions_across(body, flat)

@@ -5,6 +5,7 @@ from scipy import ndimage
 
 from hipsta_bids.artifacts import Bool, Flag
 from hipsta_bids.geometry.body import Body
+from hipsta_bids.geometry.boxes import box_around, low_corner
 from hipsta_bids.geometry.checks import name_place
 from hipsta_bids.settings import CheckSettings
 
@@ -23,8 +24,8 @@ def check_labels(body: Body, settings: CheckSettings) -> list[Flag]:
         large part of the sheet touches the rest by edges of voxels at most.
     """
     index, _ = body.inside_points()
-    low = np.maximum(index.min(axis=0) - 1, 0)
-    around = tuple(slice(a, b) for a, b in zip(low, index.max(axis=0) + 2, strict=True))
+    around = box_around(index)
+    low = low_corner(around)
     sheet = np.pad(body.tissue[around] > 0, 1)
     within = np.pad(body.inside[around], 1)
     gap = np.zeros_like(sheet)

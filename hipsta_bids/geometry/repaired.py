@@ -6,6 +6,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from hipsta_bids.artifacts import Bool, Float, Sheet
+from hipsta_bids.geometry.boxes import box_around, low_corner
 from hipsta_bids.geometry.topology import SolidField
 from hipsta_bids.settings import MeasureSettings
 
@@ -69,11 +70,11 @@ def _changed_nodes(
     solid: SolidField, points: Float, settings: MeasureSettings
 ) -> tuple[Float, Float]:
     """Points (N, 3), RAS mm, of changed nodes and faces of cuts, and how far each of them marks."""
-    box = _surrounding(solid.touched)
+    box = box_around(np.argwhere(solid.touched))
     inside, touched = solid.field.values[box] > 0, solid.touched[box]
     faces = ndimage.binary_dilation(touched & ~inside, structure=_ALL) & inside
     places, _ = ndimage.label(faces & ~touched)
-    low = np.array([side.start for side in box])
+    low = low_corner(box)
     changed = solid.field.grid.to_ras((np.argwhere(touched) + low).astype(np.float64))
     radius = np.full(len(changed), settings.repair_reach)
     where = np.argwhere(places)
@@ -85,16 +86,6 @@ def _changed_nodes(
     nearest = np.asarray(ndimage.minimum(distance, number, np.arange(number.max() + 1)))
     stumps = nearest[number] + settings.stump_reach
     return np.vstack([changed, face]), np.concatenate([radius, stumps])
-
-
-def _surrounding(mask: Bool) -> tuple[slice, slice, slice]:
-    """Box round all true nodes and their neighbors."""
-    index = np.argwhere(mask)
-    low = np.maximum(index.min(axis=0) - 1, 0)
-    first, second, third = (
-        slice(int(a), int(b)) for a, b in zip(low, index.max(axis=0) + 2, strict=True)
-    )
-    return first, second, third
 
 
 def _cells(points: Float, columns: NDArray[np.intp], parts: NDArray[np.intp]) -> Float:

@@ -81,9 +81,8 @@ def check_cross_sections(
 
 def _interior_nodes(field: Field, body: Body) -> Bool:
     """Nodes whose nearest voxel has an interior label and is not of the sheet."""
-    inverse = np.linalg.inv(body.affine)
     points = field.grid.node_points(clamp=0.0)
-    voxels = np.rint(points @ inverse[:3, :3].T + inverse[:3, 3]).astype(np.intp)
+    voxels = np.rint(body.to_voxels(points)).astype(np.intp)
     voxels = np.clip(voxels, 0, np.array(body.interior.shape) - 1)
     return np.asarray((body.interior & (body.tissue == 0))[tuple(np.moveaxis(voxels, -1, 0))])
 

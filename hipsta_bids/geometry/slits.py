@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from hipsta_bids.artifacts import Bool, Float
+from hipsta_bids.geometry.boxes import Box, box_around, low_corner
 from hipsta_bids.settings import BodySettings
 
 _ALL = np.ones((3, 3, 3), dtype=bool)
@@ -53,7 +54,7 @@ def fill_slits(
     -------
     Slits
     """
-    low, around = _box(inside)
+    around = box_around(np.argwhere(inside))
     sheet = np.pad(tissue[around] > 0, 1)
     # Between the end planes: next to voxels that lie there.
     beside = ndimage.binary_dilation(np.pad(inside[around], 1), structure=_ALL)
@@ -74,19 +75,12 @@ def fill_slits(
     slit = np.isin(pieces, through)
     sizes[through] = 0
     gap = (pieces == sizes.argmax()) & (pieces > 0)
-    corner = low - 1
+    corner = low_corner(around) - 1
     return Slits(
         tissue=_with_nearest(tissue, np.argwhere(slit) + corner, around),
         filled=np.argwhere(slit) + corner,
         gap=np.argwhere(gap) + corner,
     )
-
-
-def _box(inside: Bool) -> tuple[NDArray[np.intp], tuple[slice, ...]]:
-    """Lowest index (3,) and slices of the voxels inside, with one voxel to spare."""
-    index = np.argwhere(inside)
-    low = np.maximum(index.min(axis=0) - 1, 0)
-    return low, tuple(slice(a, b) for a, b in zip(low, index.max(axis=0) + 2, strict=True))
 
 
 def _between(sheet: Bool, directions: int) -> Bool:
@@ -108,14 +102,14 @@ def _opens_on_both_sides(piece: Bool, sheet: Bool, least: float) -> bool:
     return bool(sizes[-2] >= least * sizes.sum())
 
 
-def _with_nearest(tissue: Tissues, index: NDArray[np.intp], around: tuple[slice, ...]) -> Tissues:
+def _with_nearest(tissue: Tissues, index: NDArray[np.intp], around: Box) -> Tissues:
     """Give voxels (N, 3) the label that is nearest within a box."""
     if not len(index):
         return tissue
     nearest = ndimage.distance_transform_edt(
         tissue[around] == 0, return_distances=False, return_indices=True
     )
-    low = np.array([side.start for side in around])
+    low = low_corner(around)
     found = nearest[:, *(index - low).T].T + low
     filled = tissue.copy()
     filled[tuple(index.T)] = tissue[tuple(found.T)]

@@ -20,8 +20,7 @@ _PLACES = 4
 
 def labels_at(points: Float, body: Body) -> NDArray[np.uint8]:
     """Tissue (N,) at points (N, 3), RAS mm: that of the body's voxel there, or else the nearest."""
-    inverse = np.linalg.inv(body.affine)
-    voxel = np.rint(points @ inverse[:3, :3].T + inverse[:3, 3]).astype(np.intp)
+    voxel = np.rint(body.to_voxels(points)).astype(np.intp)
     last = np.array(body.inside.shape) - 1
     place = tuple(np.clip(voxel, 0, last).T)
     labels = body.tissue[place]

@@ -4,12 +4,12 @@ import json
 import re
 import shutil
 import time
-from html.parser import HTMLParser
 
 import numpy as np
 import pandas as pd
 import pytest
 from browsing import colored, fits, one, open_browser, open_page, pixels, texts, until, watched
+from page_outline import Outline
 from selenium import webdriver
 from selenium.webdriver.common.keys import Keys
 from small_cohorts import NODES, write_dataset
@@ -63,34 +63,6 @@ def page(out):
 def copy(out, tmp_path):
     """A copy to do harm to."""
     return shutil.copytree(out, tmp_path / "copy")
-
-
-class Outline(HTMLParser):
-    """Collects what tests ask of a page."""
-
-    VOID = frozenset({"meta", "link", "img", "input", "br", "path", "circle"})
-
-    def __init__(self, text):
-        super().__init__()
-        self.ids, self.addresses, self.headings, self.open, self.unlabeled = [], [], [], [], []
-        self.feed(text)
-        self.close()
-
-    def handle_starttag(self, tag, attributes):
-        given = dict(attributes)
-        self.ids += [given["id"]] if "id" in given else []
-        self.addresses += [v for k, v in attributes if k in {"src", "href", "data", "action"}]
-        if re.fullmatch("h[1-6]", tag):
-            self.headings.append(int(tag[1]))
-        missing = {"img": "alt", "svg": "aria-label", "canvas": "aria-label"}.get(tag)
-        if missing and not given.get(missing):
-            self.unlabeled.append(tag)
-        if tag not in self.VOID:
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        if tag not in self.VOID:
-            assert self.open.pop() == tag
 
 
 def table(path):

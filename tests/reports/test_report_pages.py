@@ -3,10 +3,10 @@
 import json
 import re
 import shutil
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from page_outline import Outline
 
 from hipsta_bids import cli, reporting
 from hipsta_bids.bids.names import DATASET_FILES
@@ -17,36 +17,6 @@ from hipsta_bids.reports.page import Section
 from hipsta_bids.reports.participant import participant_page
 
 EVIL = "<script>document.title='owned'</script>\"'&"
-
-
-class Outline(HTMLParser):
-    """Collects what tests ask of a page."""
-
-    VOID = frozenset({"meta", "link", "img", "input", "br", "path", "circle", "image"})
-
-    def __init__(self, text):
-        super().__init__()
-        self.tags, self.ids, self.addresses, self.headings, self.open = [], [], [], [], []
-        self.unlabeled = []
-        self.feed(text)
-        self.close()
-
-    def handle_starttag(self, tag, attributes):
-        given = dict(attributes)
-        self.tags.append(tag)
-        self.ids += [given["id"]] if "id" in given else []
-        self.addresses += [v for k, v in attributes if k in {"src", "href", "data", "action"}]
-        if re.fullmatch("h[1-6]", tag):
-            self.headings.append(int(tag[1]))
-        missing = {"img": "alt", "svg": "aria-label", "canvas": "aria-label"}.get(tag)
-        if missing and not given.get(missing):
-            self.unlabeled.append(tag)
-        if tag not in self.VOID:
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        if tag not in self.VOID:
-            assert self.open.pop() == tag
 
 
 @pytest.fixture(params=["sub-01.html", "sub-02.html", "report.html"])
