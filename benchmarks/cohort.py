@@ -22,7 +22,7 @@ from pathlib import Path
 import pandas as pd
 from report import print_table, write_report
 
-COMMAND = (sys.executable, "-m", "hipsta_bids.cli")
+COMMAND = (sys.executable, "-m", "hipsta_bids.cli.main")
 
 
 @dataclass(frozen=True, kw_only=True)

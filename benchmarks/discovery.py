@@ -17,10 +17,10 @@ from typing import Any
 
 from report import write_report
 
-from hipsta_bids.bids.dataset import dataset_notes, find_inputs, list_subjects
-from hipsta_bids.bids.inputs import InputRequest
-from hipsta_bids.cost import peak_memory
-from hipsta_bids.shard import Shard
+from hipsta_bids.inputs.request import InputRequest
+from hipsta_bids.inputs.search import dataset_notes, find_inputs, list_subjects
+from hipsta_bids.participant.cluster import Shard
+from hipsta_bids.participant.job import peak_memory
 
 _HIPPUNFOLD = "space-cropT1w_desc-subfields_atlas-multihist7_dseg.nii.gz"
 

@@ -25,11 +25,11 @@ import pandas as pd
 from report import print_table, write_report
 
 from hipsta_bids.group.analysis import analyze_cohort
-from hipsta_bids.group.default_model import Groups
-from hipsta_bids.group.model_spec import model_from_shortcut, parse_model
-from hipsta_bids.group.simulation import SimulationPlan, simulate_cohort
-from hipsta_bids.group_data import PARTICIPANT, SESSION, Cohort, Measures, SideMaps
-from hipsta_bids.group_settings import GroupSettings
+from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Measures, SideMaps
+from hipsta_bids.group.formula import model_from_shortcut, parse_model
+from hipsta_bids.group.model import Groups
+from hipsta_bids.group.settings import GroupSettings
+from hipsta_bids.validation.group import SimulationPlan, simulate_cohort
 
 GROUPS = ("CN", "MCI", "AD")
 #: Drawn at once: a simulation needs several times the memory of its maps.

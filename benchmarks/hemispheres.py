@@ -23,14 +23,19 @@ import numpy as np
 from report import print_table, write_report
 from threadpoolctl import threadpool_limits
 
-from hipsta_bids.artifacts import LabelVolume
-from hipsta_bids.bids.dataset import find_hemispheres
-from hipsta_bids.bids.inputs import HemisphereInput, InputRequest
-from hipsta_bids.cost import cpu_seconds, helpers, peak_memory, reset_peak_memory
 from hipsta_bids.errors import GeometryError
+from hipsta_bids.inputs.request import HemisphereInput, InputRequest
+from hipsta_bids.inputs.search import find_hemispheres
+from hipsta_bids.participant.job import (
+    cpu_seconds,
+    helpers,
+    peak_memory,
+    reset_peak_memory,
+    warm_up,
+)
 from hipsta_bids.phantom import write_demo_dataset
 from hipsta_bids.settings import GridSettings, Settings
-from hipsta_bids.worker import warm_up
+from hipsta_bids.types import LabelVolume
 
 #: mm; the middle one is the default.
 SPACINGS = (0.5, 0.35, 0.25)
@@ -74,7 +79,7 @@ class Cost:
 
 def measure(volume: LabelVolume, hemi: str, settings: Settings, repeats: int) -> Cost | None:
     """Measure one hemisphere several times; ``None`` if it is refused."""
-    from hipsta_bids.participant import measure_hemisphere  # noqa: PLC0415  (part of start-up)
+    from hipsta_bids.participant.measure import measure_hemisphere  # noqa: PLC0415  (part of start-up)
 
     costs = []
     for _ in range(repeats):
@@ -105,7 +110,7 @@ def measure(volume: LabelVolume, hemi: str, settings: Settings, repeats: int) ->
 
 def benchmark(items: Sequence[HemisphereInput], spacings: Sequence[float], repeats: int) -> Any:  # noqa: ANN401  (JSON)
     """Measure all hemispheres at all spacings and print tables."""
-    from hipsta_bids.bids.images import read_label_volume  # noqa: PLC0415  (part of start-up)
+    from hipsta_bids.inputs.labels import read_label_volume  # noqa: PLC0415  (part of start-up)
 
     measure(read_label_volume(items[0]), items[0].hemi, Settings(), 1)  # starts TetGen's process
     reading: list[float] = []

@@ -1,12 +1,43 @@
-"""Makes the stand-ins beside it importable from every folder of tests."""
+"""What every test gets: no pages unless asked for, and no reason that the table does not know."""
+
+import sys
+from pathlib import Path
 
 import pytest
+
+import hipsta_bids
+from hipsta_bids.errors import HipstaError
+from hipsta_bids.reports.words import reason_sections
+from hipsta_bids.types import Flag
 
 
 @pytest.fixture(scope="module", autouse=True)
 def without_pages():
     """Make no pages, for the sake of time: they have tests of their own, in ``reports/``."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hipsta_bids.reporting._try_all", lambda *_: None)
-        patch.setattr("hipsta_bids.group_runner.write_group_report", lambda *_: None)
+        patch.setattr("hipsta_bids.participant.pages._try_all", lambda *_: None)
+        patch.setattr("hipsta_bids.group.run.write_group_report", lambda *_: None)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def known_reasons():
+    """Fail where an error or a flag of the package gives a reason without a row in the table."""
+    known = {name for section in reason_sections() for name in section.reasons}
+    package = Path(hipsta_bids.__file__).parent
+
+    def checked(kind):
+        make = kind.__init__
+
+        def begin(self, *positional, **named):
+            make(self, *positional, **named)
+            giver = Path(sys._getframe(1).f_code.co_filename)
+            if giver.is_relative_to(package) and giver.name != "errors.py":  # not of stand-ins
+                assert self.reason in known, f"{self.reason}: add it to reports/reasons.toml"
+
+        return begin
+
+    with pytest.MonkeyPatch.context() as patch:
+        for kind in (HipstaError, Flag):
+            patch.setattr(kind, "__init__", checked(kind))
         yield

@@ -5,7 +5,7 @@ import json
 import nibabel as nib
 import numpy as np
 
-from hipsta_bids.bids.dataset import InputRequest, find_hemispheres
+from hipsta_bids.inputs.search import InputRequest, find_hemispheres
 
 #: 0.5 mm voxels, rotated a little so that mistakes in affines show.
 ANGLE = np.deg2rad(20)

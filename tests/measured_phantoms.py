@@ -8,14 +8,15 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from hipsta_bids.artifacts import HemisphereMaps, LabelVolume
-from hipsta_bids.bids import files
-from hipsta_bids.bids.names import HemisphereName, output_path
-from hipsta_bids.bids.status import identity, read_status, row_key
-from hipsta_bids.participant import measure_hemisphere
+from hipsta_bids.derivatives.names import HemisphereName, output_path
+from hipsta_bids.derivatives.status import identity, read_status, row_key
+from hipsta_bids.io import files
+from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.phantom import Phantom, PhantomSpec
-from hipsta_bids.schemes import Part, Tissue, load_scheme
+from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import Settings
+from hipsta_bids.types import HemisphereMaps, LabelVolume
 
 #: Long enough for two end planes with a body between them, short enough for quick tests.
 LENGTH = 10.0

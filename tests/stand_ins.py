@@ -10,21 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from hipsta_bids.artifacts import (
-    BodyMask,
-    Coordinates,
-    Flag,
-    HemisphereMaps,
-    Sheet,
-    TetMesh,
-)
-from hipsta_bids.bids.inputs import HemisphereInput
-from hipsta_bids.bids.names import HemisphereName
+from hipsta_bids.derivatives.names import HemisphereName
 from hipsta_bids.errors import GeometryError, InputError
-from hipsta_bids.geometry.catalog import MAPS, SECTIONS
-from hipsta_bids.geometry.measured import average_profiles
-from hipsta_bids.schemes import Label, Part, Scheme, Tissue
-from hipsta_bids.worker import run_job
+from hipsta_bids.geometry.catalog import MAPS, SECTIONS, average_profiles
+from hipsta_bids.inputs.request import HemisphereInput
+from hipsta_bids.participant.job import run_job
+from hipsta_bids.protocols.protocol import Label, Part, Scheme, Tissue
+from hipsta_bids.types import BodyMask, Coordinates, Flag, HemisphereMaps, Sheet, TetMesh
 
 NX, NY, NZ = 5, 4, 3
 THICKNESS = 1.5
@@ -154,9 +146,9 @@ def act_out(act, hemi, clock):
 
 def replace_measurement():
     """Put stand-ins in the place of reading and measuring, in this process."""
-    images = types.ModuleType("hipsta_bids.bids.images")
+    images = types.ModuleType("hipsta_bids.inputs.labels")
     images.read_label_volume = lambda item, _region: item.files[0].read_text()
-    participant = types.ModuleType("hipsta_bids.participant")
+    participant = types.ModuleType("hipsta_bids.participant.measure")
     participant.find_body = lambda *_: None
     participant.measure_hemisphere = lambda volume, hemi, _, clock: act_out(volume, hemi, clock)
     sys.modules[images.__name__] = images

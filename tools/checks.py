@@ -8,7 +8,7 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-COMMAND = (sys.executable, "-m", "hipsta_bids.cli")
+COMMAND = (sys.executable, "-m", "hipsta_bids.cli.main")
 
 _START = time.monotonic()
 

@@ -22,15 +22,13 @@ from measure_figures import DRAWINGS
 from measure_topics import ERRORS, INTRODUCTION, PUBLISHED, SIZES_TEXT, TOPICS, Topic
 from PIL import Image
 
-from hipsta_bids.geometry.catalog import MAPS, SECTIONS, Column
-from hipsta_bids.geometry.summary import PER_SUBFIELD, SUMMARY
-from hipsta_bids.participant import measure_hemisphere
+from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY, Column
+from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.phantom import Phantom, PhantomSpec
-from hipsta_bids.schemes import load_scheme
+from hipsta_bids.protocols.load import load_scheme
 from hipsta_bids.settings import Settings
-from hipsta_bids.validation.measures import Comparison
-from hipsta_bids.validation.report import markdown, render
-from hipsta_bids.validation.suite import Cell, Picture, Table
+from hipsta_bids.validation.accuracy import Comparison
+from hipsta_bids.validation.report import Cell, Picture, Table, markdown, render
 
 #: Where measures are found, and the rows of the catalog that are there.
 TABLES: Mapping[str, Sequence[Column]] = {

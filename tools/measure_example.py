@@ -5,13 +5,13 @@ from functools import cached_property
 
 import numpy as np
 
-from hipsta_bids.artifacts import Float, HemisphereMaps, Sheet
 from hipsta_bids.geometry.sheet import sample_sheet, whole_body
 from hipsta_bids.phantom import Phantom
-from hipsta_bids.phantom.body import placement
-from hipsta_bids.schemes import Scheme
+from hipsta_bids.phantom.shape import placement
+from hipsta_bids.protocols.protocol import Scheme
 from hipsta_bids.settings import Settings
-from hipsta_bids.validation.measures import (
+from hipsta_bids.types import Float, HemisphereMaps, Sheet
+from hipsta_bids.validation.accuracy import (
     Comparison,
     compare_maps,
     compare_sections,

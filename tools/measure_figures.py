@@ -8,8 +8,8 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from measure_example import Example, spell
 
-from hipsta_bids.artifacts import Float
-from hipsta_bids.geometry.layers import equal_volume_layers
+from hipsta_bids.geometry.sheet import equal_volume_layers
+from hipsta_bids.types import Float
 
 #: Colors that people with any kind of color vision tell apart (Okabe & Ito 2008).
 INTERIOR, MID, EXTERIOR, ACCENT = "#0072B2", "#000000", "#D55E00", "#009E73"

@@ -3,8 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from hipsta_bids.geometry.catalog import SECTIONS
-from hipsta_bids.geometry.summary import PER_SUBFIELD
+from hipsta_bids.geometry.catalog import PER_SUBFIELD, SECTIONS
 
 
 @dataclass(frozen=True, kw_only=True)

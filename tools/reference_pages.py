@@ -8,7 +8,11 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
-from hipsta_bids.bids.names import (
+from hipsta_bids.cli.group import group_parser
+from hipsta_bids.cli.participant import build_parser
+from hipsta_bids.cli.phantom import phantom_parser, surrogate_parser, validate_parser
+from hipsta_bids.derivatives.hemisphere import LAYERS, NODES, PLACE, STATE
+from hipsta_bids.derivatives.names import (
     DATASET_FILES,
     EXTRA_OUTPUTS,
     OUTPUTS,
@@ -16,18 +20,12 @@ from hipsta_bids.bids.names import (
     Output,
     output_name,
 )
-from hipsta_bids.bids.tables import LAYERS, NODES, PLACE, STATE
 from hipsta_bids.errors import EXIT_MEANINGS
-from hipsta_bids.geometry.catalog import MAPS, SECTIONS, Column
-from hipsta_bids.geometry.summary import PER_SUBFIELD, SUMMARY
-from hipsta_bids.group.columns import COLUMNS
-from hipsta_bids.group_parser import group_parser
-from hipsta_bids.group_settings import GroupSettings
-from hipsta_bids.parser import build_parser
-from hipsta_bids.reasons import SECTIONS as REASONS
-from hipsta_bids.settings import Settings
-from hipsta_bids.settings_file import field_meanings
-from hipsta_bids.subcommands import phantom_parser, surrogate_parser, validate_parser
+from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY, Column
+from hipsta_bids.group.settings import GroupSettings
+from hipsta_bids.group.tables import COLUMNS
+from hipsta_bids.reports.words import reason_sections
+from hipsta_bids.settings import Settings, field_meanings
 
 NOTE = "<!-- Written by `tools/make-docs`; do not edit, run it again. -->"
 
@@ -170,7 +168,7 @@ def reasons_page() -> str:
         "# Flags and refusals",
         REASONS_TEXT,
     ]
-    for section in REASONS:
+    for section in reason_sections():
         parts += [f"## {section.title}", section.text]
         # A heading for each, so that it can be searched for and linked to.
         for name, reason in sorted(section.reasons.items()):

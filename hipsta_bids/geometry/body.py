@@ -1,20 +1,324 @@
 """From subfield labels to the hippocampal body: one ribbon between two end planes."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from hipsta_bids.artifacts import Bool, Float, LabelVolume
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry.edited import MaskChange, apply_mask
+from hipsta_bids.geometry.digital import Box, box_around, low_corner
 from hipsta_bids.geometry.ends import EndPlanes, find_end_planes
-from hipsta_bids.geometry.neighbors import check_reach, join_cortex
-from hipsta_bids.geometry.slits import fill_slits
-from hipsta_bids.schemes import Tissue, lateral_rank
+from hipsta_bids.protocols.load import for_region
+from hipsta_bids.protocols.protocol import Tissue, lateral_rank
 from hipsta_bids.settings import BodySettings
+from hipsta_bids.types import Bool, EditedMask, Flag, Float, LabelVolume
+
+# Cortex beside the hippocampal body: the sheet's way on beyond the subiculum.
+
+
+def join_cortex(
+    volume: LabelVolume, hippocampal: NDArray[np.uint8], region: str
+) -> NDArray[np.uint8]:
+    """Add the neighboring cortex to the hippocampal sheet, or take it alone.
+
+    Parameters
+    ----------
+    volume : LabelVolume
+    hippocampal : (I, J, K) uint8
+        Tissue of the hippocampal sheet; 0 elsewhere.
+    region : {"extended", "entorhinal"}
+
+    Returns
+    -------
+    (I, J, K) uint8
+        Tissue of the region's sheet; 0 elsewhere.
+
+    Raises
+    ------
+    SchemeError
+        ``no-cortex-labels`` if the protocol has no neighboring cortex.
+    GeometryError
+        ``no-cortex-labels`` if nothing has these labels, ``edited-mask-region`` if there is an
+        edited mask, which is one of the body.
+    """
+    kinds = [t for t in for_region(volume.scheme, region).sheet if t in volume.scheme.neighbors]
+    if volume.edited_mask is not None:
+        raise GeometryError(
+            f"region {region}: an edited mask is about the body, not about the cortex beside it; "
+            "edit the labels instead (desc-edited_dseg)",
+            reason="edited-mask-region",
+        )
+    cortex = np.isin(volume.tissue, kinds)
+    if not cortex.any():
+        raise GeometryError(
+            f"region {region}: no voxel is labeled {_names(kinds)}; measure the body, or label the "
+            "cortex beside it",
+            reason="no-cortex-labels",
+        )
+    kept = hippocampal if region == "extended" else np.zeros_like(hippocampal)
+    return np.where(cortex, volume.tissue, kept).astype(np.uint8)
+
+
+def check_reach(
+    points: Float, tissue: NDArray[np.uint8], ends: EndPlanes, settings: BodySettings
+) -> None:
+    """Refuse cortex that does not reach from one end plane to the other.
+
+    Parameters
+    ----------
+    points : (N, 3) array
+        The region between the end planes, RAS mm.
+    tissue : (N,) array of uint8
+    ends : EndPlanes
+    settings : BodySettings
+
+    Raises
+    ------
+    GeometryError
+        ``cortex-incomplete``.
+    """
+    cortex = tissue > Tissue.HIPPOCAMPUS
+    below = ends.height(points[cortex], "posterior")
+    above = -ends.height(points[cortex], "anterior")
+    length = ends.length(points)
+    # Levels are as long as a voxel, so that each level with labels has the center of one.
+    count = max(int(length / (2 * ends.half_slice)), 1)
+    level = np.minimum((count * below / (below + above)).astype(int), count - 1)
+    share = len(np.unique(level)) / count
+    if share < settings.min_cortex_reach:
+        raise GeometryError(
+            f"region {settings.region}: the cortex is labeled along {share * length:.1f} mm of the "
+            f"{length:.1f} mm between the end planes: measure the body, or label the cortex beside "
+            "all of it",
+            reason="cortex-incomplete",
+        )
+
+
+def _names(kinds: list[Tissue]) -> str:
+    return " or ".join(kind.name for kind in kinds)
+
+
+# Layers of about one voxel without a label that part the sheet; slits through it are filled.
+
+
+_ALL = np.ones((3, 3, 3), dtype=bool)
+#: One of each two opposite directions to the 26 neighbors.
+_DIRECTIONS = [step for step in product((-1, 0, 1), repeat=3) if step > (0, 0, 0)]
+
+Tissues = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Slits:
+    """What was found between voxels of the sheet."""
+
+    tissue: Tissues
+    """(I, J, K) with the slits filled."""
+    filled: NDArray[np.intp]
+    """(N, 3) indices of voxels that were filled."""
+    gap: NDArray[np.intp]
+    """(N, 3) indices of the largest thin gap that was not filled."""
+
+
+def fill_slits(
+    tissue: Tissues, inside: Bool, unlabeled: Bool, affine: Float, settings: BodySettings
+) -> Slits:
+    """Fill slits through the sheet.
+
+    A voxel without any label lies in a gap if the sheet is on both sides of it in several
+    directions. A gap opens on both sides of the sheet if it goes through it, and on one if it is a
+    crevice between two folds: only the first kind is filled, with the nearest labels.
+
+    Parameters
+    ----------
+    tissue : (I, J, K) array of uint8
+        Tissue of the sheet, 0 elsewhere.
+    inside : (I, J, K) array of bool
+        Voxels of the sheet between the end planes.
+    unlabeled : (I, J, K) array of bool
+        Voxels without any label.
+    affine : (4, 4) array
+    settings : BodySettings
+
+    Returns
+    -------
+    Slits
+    """
+    around = box_around(np.argwhere(inside))
+    sheet = np.pad(tissue[around] > 0, 1)
+    # Between the end planes: next to voxels that lie there.
+    beside = ndimage.binary_dilation(np.pad(inside[around], 1), structure=_ALL)
+    empty = np.pad(unlabeled[around], 1)
+    pieces, count = ndimage.label(
+        empty & beside & _enclosed(sheet, settings.gap_directions), structure=_ALL
+    )
+    sizes = np.bincount(pieces.ravel(), minlength=count + 1)
+    sizes[0] = 0
+    edges = np.sort(np.linalg.norm(affine[:3, :3], axis=0))
+    least = settings.slit_area / float(edges[0] * edges[1])
+    through = [
+        number
+        for number in np.flatnonzero(sizes > least)
+        if edges[2] <= settings.slit_voxel
+        and _opens_on_both_sides(pieces == number, sheet, settings.slit_openings)
+    ]
+    slit = np.isin(pieces, through)
+    sizes[through] = 0
+    gap = (pieces == sizes.argmax()) & (pieces > 0)
+    corner = low_corner(around) - 1
+    return Slits(
+        tissue=_with_nearest(tissue, np.argwhere(slit) + corner, around),
+        filled=np.argwhere(slit) + corner,
+        gap=np.argwhere(gap) + corner,
+    )
+
+
+def _enclosed(sheet: Bool, directions: int) -> Bool:
+    """Voxels that have the sheet on both sides in so many of 13 directions."""
+    opposite = np.zeros(sheet.shape, dtype=np.int8)
+    for step in _DIRECTIONS:
+        back = tuple(-s for s in step)
+        opposite += np.roll(sheet, step, (0, 1, 2)) & np.roll(sheet, back, (0, 1, 2))
+    return np.asarray(~sheet & (opposite >= directions))
+
+
+def _opens_on_both_sides(piece: Bool, sheet: Bool, least: float) -> bool:
+    """Whether what surrounds a gap, and is not of the sheet, falls into two parts of fair size."""
+    rim = ndimage.binary_dilation(piece, structure=_ALL) & ~sheet & ~piece
+    openings, count = ndimage.label(rim, structure=_ALL)
+    if count < 2:  # noqa: PLR2004 -- two sides
+        return False
+    sizes = np.sort(np.bincount(openings.ravel())[1:])
+    return bool(sizes[-2] >= least * sizes.sum())
+
+
+def _with_nearest(tissue: Tissues, index: NDArray[np.intp], around: Box) -> Tissues:
+    """Give voxels (N, 3) the label that is nearest within a box."""
+    if not len(index):
+        return tissue
+    nearest = ndimage.distance_transform_edt(
+        tissue[around] == 0, return_distances=False, return_indices=True
+    )
+    low = low_corner(around)
+    found = nearest[:, *(index - low).T].T + low
+    filled = tissue.copy()
+    filled[tuple(index.T)] = tissue[tuple(found.T)]
+    return filled
+
+
+# A body mask that a person corrected takes the place of the labels' own.
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaskChange:
+    """What an edited mask changed of the body, in voxels."""
+
+    before: int
+    """Voxels of the body as labeled."""
+    added: int
+    removed: int
+
+    @property
+    def share(self) -> float:
+        """Changed voxels over those of the body as labeled."""
+        return (self.added + self.removed) / max(self.before, 1)
+
+
+def apply_mask(
+    volume: LabelVolume, tissue: NDArray[np.uint8], mask: EditedMask, ends: EndPlanes
+) -> tuple[LabelVolume, NDArray[np.uint8], MaskChange]:
+    """Make the body between its end planes what an edited mask says it is.
+
+    Voxels outside of the mask lose their label, and voxels of the mask without a sheet label get
+    that of the nearest voxel of the mask that has one. Beyond the end planes nothing changes: head
+    and tail are those of the labels.
+
+    Parameters
+    ----------
+    volume : LabelVolume
+    tissue : (I, J, K) uint8
+        Its sheet tissue; 0 elsewhere.
+    mask : EditedMask
+    ends : EndPlanes
+
+    Returns
+    -------
+    volume : LabelVolume
+        What the labels would be, had they been corrected themselves.
+    tissue : (I, J, K) uint8
+        Its sheet tissue.
+    change : MaskChange
+
+    Raises
+    ------
+    GeometryError
+        ``edited-mask-elsewhere`` if no labeled voxel of the body lies in the mask.
+    """
+    affine = volume.affine
+    index = np.argwhere(mask.inside | (tissue > 0))
+    points = index @ affine[:3, :3].T + affine[:3, 3]
+    between = (ends.height(points, "posterior") > 0) & (ends.height(points, "anterior") < 0)
+    index, points = index[between], points[between]
+    old, inside = tissue[tuple(index.T)], mask.inside[tuple(index.T)]
+    kept = inside & (old > 0)
+    if not kept.any():
+        raise GeometryError(
+            "the edited mask and the sheet's labels have no voxel in common between the end "
+            "planes: check that the mask is of this hemisphere and in the space of the labels",
+            reason="edited-mask-elsewhere",
+        )
+    new = np.where(kept, old, np.uint8(0))
+    bare = inside & (old == 0)
+    if bare.any():
+        _, nearest = cKDTree(points[kept]).query(points[bare])
+        new[bare] = old[kept][nearest]
+    edited = tissue.copy()
+    edited[tuple(index.T)] = new
+    labels = np.where(edited == tissue, volume.tissue, edited)
+    change = MaskChange(
+        before=int(np.count_nonzero(old)),
+        added=int(np.count_nonzero(bare)),
+        removed=int(np.count_nonzero((old > 0) & ~inside)),
+    )
+    return replace(volume, tissue=labels), edited, change
+
+
+def check_mask(
+    mask: EditedMask, change: MaskChange, voxel: float, settings: BodySettings
+) -> list[Flag]:
+    """Flag an edited mask that is coarser than the labels, or differs very much from them.
+
+    Parameters
+    ----------
+    mask : EditedMask
+    change : MaskChange
+    voxel : float
+        Edge of the labels' voxels in plane, mm.
+    settings : BodySettings
+
+    Returns
+    -------
+    list of Flag
+        Empty if the mask is as it should be.
+    """
+    flags = []
+    if mask.voxel > settings.max_mask_ratio * voxel:
+        coarse = (
+            f"the edited mask has voxels of {mask.voxel:.2f} mm, the labels of {voxel:.2f} mm: "
+            "draw it on the grid of the labels"
+        )
+        flags.append(Flag(reason="edited-mask-coarse", message=coarse))
+    if change.share > settings.max_mask_change:
+        different = (
+            f"the edited mask adds {change.added} voxels to the body and removes {change.removed} "
+            f"of {change.before}: check that it is in the space of the labels"
+        )
+        flags.append(Flag(reason="edited-mask-different", message=different))
+    return flags
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -1,23 +1,274 @@
 """Medial and lateral boundary of the sheet, and its two sides, on the surface of the body."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, sparse
 from scipy.spatial import cKDTree
 
-from hipsta_bids.artifacts import Bool, Float, Int, Surface, TetMesh
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.checks import name_place
-from hipsta_bids.geometry.laplace import HarmonicSolver, smallest_eigenfunctions
-from hipsta_bids.geometry.rims import center_curves, guided_curves, rim_paths
-from hipsta_bids.geometry.strips import facing_strips
-from hipsta_bids.geometry.surface import (
-    mean_wall_thickness,
-    signed_volume,
+from hipsta_bids.geometry.fem import (
+    HarmonicSolver,
+    gradients,
+    smallest_eigenfunctions,
+    solve_dirichlet,
 )
-from hipsta_bids.geometry.wall import Wall, end_to_end, vertex_normals
+from hipsta_bids.geometry.surface import mean_wall_thickness, signed_volume, unique_edges
+from hipsta_bids.geometry.wall import Wall, edge_graph, end_to_end, vertex_normals
 from hipsta_bids.settings import BoundarySettings
+from hipsta_bids.types import Bool, Float, Int, Surface, TetMesh
+
+# The rims of the sheet, found by distances inside the body.
+
+
+def rim_paths(
+    wall: Wall, mesh: TetMesh, body: Body, settings: BoundarySettings
+) -> tuple[tuple[NDArray[np.intp], NDArray[np.intp]], tuple[Float, Float]]:
+    """Paths from end to end along which the wall is farthest from the opposite rim.
+
+    Distances run inside the volume and mostly across the long axis, as steps along it are
+    stretched. The first ones start from the sheet's most lateral labels.
+
+    Returns
+    -------
+    paths : two (N,) arrays of int
+        Medial and lateral path, vertices of the wall.
+    depths : two (V,) arrays
+        How much nearer than the rim of their slice the wall's vertices are to the opposite rim, mm.
+    """
+    edges = unique_edges(mesh.tetrahedra)
+    steps = np.diff(mesh.vertices[edges], axis=1)[:, 0]
+    along = steps @ body.ends.axis
+    stretch = settings.axial_stretch**2 - 1
+    lengths = np.sqrt(np.einsum("ij,ij->i", steps, steps) + stretch * along**2)
+    graph = edge_graph(edges, lengths, len(mesh.vertices))
+    start = _most_lateral(mesh, body, settings)
+    paths: list[NDArray[np.intp]] = []
+    depths: list[Float] = []
+    for _ in range(3):  # medial from labels, lateral from medial, medial again from lateral
+        distance = sparse.csgraph.dijkstra(graph, indices=start, min_only=True)[wall.index]
+        depth = _below_top(distance, wall.share)
+        path = _rim_path(depth, wall, settings)
+        start = wall.index[path].astype(np.intp)
+        paths.append(path)
+        depths.append(depth)
+    return (paths[2], paths[1]), (depths[2], depths[1])
+
+
+def guided_curves(
+    wall: Wall,
+    paths: tuple[NDArray[np.intp], NDArray[np.intp]],
+    depths: tuple[Float, Float],
+    thickness: float,
+    settings: BoundarySettings,
+) -> tuple[Float, Float] | None:
+    """Middle lines between the two sides within the zones at the rims.
+
+    Without the rim zones the wall falls into its two sides. The zero line of the harmonic
+    function between them, with the same curvature-aware diffusion, runs along the rims.
+    """
+    zones = [
+        (_below_rim(depth, path, wall) < settings.rim_zone * thickness)
+        | wall.near(wall.vertices[path], settings.rim_reach * thickness)
+        for path, depth in zip(paths, depths, strict=True)
+    ]
+    return middle_lines(wall, zones)
+
+
+def center_curves(
+    wall: Wall, curves: tuple[Float, Float], thickness: float, settings: BoundarySettings
+) -> tuple[Float, Float]:
+    """Move curves to the middle of the rims.
+
+    The middle lines are found again in ever narrower bands of equal width on both sides: a side
+    that bends more, or reaches farther into a zone, pulls the line towards itself.
+    """
+    for width in settings.rim_bands:
+        bands = [wall.near(curve, width * thickness) for curve in curves]
+        curves = middle_lines(wall, bands) or curves
+    return curves
+
+
+def middle_lines(wall: Wall, zones: Sequence[Bool]) -> tuple[Float, Float] | None:
+    """Zero lines, within zones at the rims, of the harmonic function between the two sides."""
+    sides = wall.sides(zones[0] | zones[1])
+    if sides is None:
+        return None
+    fixed = np.flatnonzero(sides[0] | sides[1])
+    values = np.where(sides[1][fixed], 1.0, -1.0)
+    return end_to_end(wall, solve_dirichlet(wall.evenly_aware, fixed, values))
+
+
+def _most_lateral(mesh: TetMesh, body: Body, settings: BoundarySettings) -> NDArray[np.intp]:
+    """Vertices whose surroundings carry the most lateral labels."""
+    _, points = body.inside_points()
+    count = min(settings.label_neighbors, len(points))
+    asked = np.arange(0, len(mesh.vertices), settings.label_stride)
+    _, nearest = cKDTree(points).query(mesh.vertices[asked], k=count)
+    mean = body.lateral[nearest].mean(axis=1)
+    return np.asarray(asked[mean >= np.quantile(mean, 1 - settings.lateral_share)])
+
+
+def _rim_path(depth: Float, wall: Wall, settings: BoundarySettings) -> NDArray[np.intp]:
+    """Cheapest path from end to end; being away from the rim costs."""
+    cost = wall.lengths * (
+        settings.rim_floor + (np.maximum(depth, 0)[wall.edges].mean(axis=1)) ** 2
+    )
+    start = _lowest(depth, wall.posterior)
+    end = _lowest(depth, wall.anterior)
+    graph = edge_graph(wall.edges, cost, len(depth))
+    _, before, _ = sparse.csgraph.dijkstra(
+        graph, indices=np.array([start]), return_predecessors=True, min_only=True
+    )
+    path = [end]
+    while path[-1] != start and len(path) <= len(depth):
+        path.append(int(before[path[-1]]))
+    return np.array(path)
+
+
+def _lowest(depth: Float, where: Bool) -> int:
+    return int(np.flatnonzero(where)[np.argmin(depth[where])])
+
+
+def _below_top(values: Float, share: Float) -> Float:
+    """How far values lie below the largest of their slice."""
+    count = 40
+    slices = np.minimum((share * count).astype(int), count - 1)
+    top = np.full(count, -np.inf)
+    np.maximum.at(top, slices, values)
+    centres = (np.arange(count) + 0.5) / count
+    known = np.isfinite(top)
+    top = ndimage.median_filter(np.interp(centres, centres[known], top[known]), 5, mode="nearest")
+    return np.asarray(np.interp(share, centres, top) - values)
+
+
+def _below_rim(depth: Float, path: NDArray[np.intp], wall: Wall) -> Float:
+    """Depth below the rim path of the same slice, mm."""
+    order = np.argsort(wall.share[path], kind="stable")
+    return np.asarray(depth - np.interp(wall.share, wall.share[path][order], depth[path][order]))
+
+
+# The boundary strips: the part of the wall that closes the sheet at its rims.
+
+
+Pair = tuple[Float, Float]
+
+
+def facing_strips(
+    wall: Wall, solver: HarmonicSolver, curves: Pair, thickness: float, settings: BoundarySettings
+) -> tuple[tuple[Bool, Bool], Pair]:
+    """Find the parts of the wall near two curves that face along the sheet, away from it.
+
+    A flat rim is such a part from edge to edge; of a round one, it is the middle. The direction
+    of the sheet at its rim is that of a harmonic function from rim to rim, continued from inside
+    the sheet, where it does not depend on where exactly the curves lie. The middle lines of the
+    strips replace the curves, and the same is done again.
+
+    Parameters
+    ----------
+    wall : Wall
+    solver : HarmonicSolver
+        Of the mesh.
+    curves : two (N, 3) arrays
+        Medial and lateral, or the other way round, RAS mm.
+    thickness : float
+        Of the sheet, mm.
+    settings : BoundarySettings
+
+    Returns
+    -------
+    strips : two (V,) arrays of bool
+        Vertices of the wall.
+    curves : two (N, 3) arrays
+        Their middle lines.
+    """
+    mesh = solver.mesh
+    finder = _Finder(wall, mesh, thickness, settings)
+    starts, function = curves, None
+    strips = _near(wall, curves, settings.first_strip * thickness)
+    for reach in settings.strip_reach:
+        lines = _near(wall, curves, settings.least_strip * thickness)
+        limits = _near(wall, curves, reach * thickness)
+        ends = wall.index[strips[0]], wall.index[strips[1]]
+        function = solver.between(*ends, guess=function)
+        flow = gradients(mesh.vertices, mesh.tetrahedra, function)
+        strips = (
+            finder.strip(starts[0], flow, lines[0], limits[0]),
+            finder.strip(starts[1], -flow, lines[1], limits[1]),
+        )
+        starts = (wall.vertices[strips[0]], wall.vertices[strips[1]])
+        curves = middle_lines(wall, strips) or curves
+    return strips, curves
+
+
+def _near(wall: Wall, curves: Pair, reach: float) -> tuple[Bool, Bool]:
+    return wall.near(curves[0], reach), wall.near(curves[1], reach)
+
+
+class _Finder:
+    """Finds the vertices that face away from the sheet."""
+
+    def __init__(
+        self, wall: Wall, mesh: TetMesh, thickness: float, settings: BoundarySettings
+    ) -> None:
+        self._wall, self._settings = wall, settings
+        self._step = settings.strip_step * thickness
+        links = edge_graph(wall.edges, np.ones(len(wall.edges)), len(wall.vertices))
+        self._normals = _unit((links + sparse.eye_array(len(wall.vertices))) @ vertex_normals(wall))
+        self._centers = cKDTree(mesh.vertices[mesh.tetrahedra].mean(axis=1))
+
+    def strip(self, starts: Float, inward: Float, line: Bool, limit: Bool) -> Bool:
+        """Vertices (V,) within a limit that face away from the sheet, with a line among them.
+
+        Parameters
+        ----------
+        starts : (N, 3) array
+            Points of the rim.
+        inward : (T, 3) array
+            From this rim into the sheet, in each tetrahedron.
+        line, limit : (V,) arrays of bool
+            Vertices that belong to the strip, and those that may.
+
+        Returns
+        -------
+        (V,) array of bool
+        """
+        away = -self._direction_at_rim(starts, inward)
+        close = np.flatnonzero(limit)
+        count = min(self._settings.rim_neighbors, len(starts))
+        _, nearest = cKDTree(starts).query(self._wall.vertices[close], k=count)
+        towards = _unit(away[nearest].mean(axis=1))
+        facing = line.copy()
+        cosine = (self._normals[close] * towards).sum(axis=1)
+        facing[close] |= cosine > self._settings.strip_facing
+        return self._wall.connected(facing, line)
+
+    def _direction_at_rim(self, starts: Float, inward: Float) -> Float:
+        """Direction (N, 3) of the sheet at its rim.
+
+        Three steps are made into the sheet; a line through the directions found there gives the
+        one at the rim, since the sheet may bend.
+        """
+        place, direction = starts, self._mean(starts, inward)
+        found = []
+        for _ in range(3):
+            place = place + self._step * direction
+            direction = self._mean(place, inward)
+            found.append(direction)
+        # Least squares through steps 1, 2 and 3, continued to 0.
+        return _unit((4 * found[0] + found[1] - 2 * found[2]) / 3)
+
+    def _mean(self, places: Float, flow: Float) -> Float:
+        _, nearest = self._centers.query(places, k=self._settings.strip_neighbors)
+        return _unit(flow[nearest].mean(axis=1))
+
+
+def _unit(vectors: Float) -> Float:
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -4,12 +4,130 @@ A row here is a column of the output tables with its entry in the sidecar; a row
 also a GIFTI file and a column of the profiles. The numbers per hemisphere are in ``summary.py``.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
-from hipsta_bids.artifacts import Float
-from hipsta_bids.geometry.cross_sections import CrossSections
-from hipsta_bids.geometry.measured import Measured
+import numpy as np
+from numpy.typing import NDArray
+
+from hipsta_bids.geometry.measures import (
+    CrossSections,
+    at_columns,
+    away_from_edges,
+    column_area,
+    cut_sections,
+    extent_x,
+    extent_y,
+    gaussian_curvature,
+    mean_curvature,
+    measure_thickness,
+    wall_area,
+)
+from hipsta_bids.protocols.protocol import Tissue
+from hipsta_bids.settings import Settings
+from hipsta_bids.types import Bool, Float, Sheet
+
+# One hemisphere's sheet with what several measures share.
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Measured:
+    """One hemisphere's sheet, and what several measures share."""
+
+    sheet: Sheet
+    """Where maps are measured."""
+    subfield: NDArray[np.uint8]
+    """(Nx, Ny) values of Tissue."""
+    whole: Sheet
+    """The same body from rim to rim, end to end and wall to wall."""
+    areas: Mapping[Tissue, float]
+    """Of the mid-surface from rim to rim in each subfield, mm2."""
+    volumes: Mapping[Tissue, float]
+    """Of the mesh in each subfield, mm3."""
+    volume: float
+    """Of the mesh, mm3."""
+    settings: Settings
+
+    @cached_property
+    def thickness(self) -> Float:
+        """(Nx, Ny) mm."""
+        return measure_thickness(self.sheet)
+
+    @cached_property
+    def sections(self) -> CrossSections:
+        """The cross-sections."""
+        extent = self.settings.sheet.y_extent
+        count = self.whole.points.shape[1]
+        means = np.average(self.thickness, axis=0, weights=self.area)
+        thickness = at_columns(means, 1 / extent, count)
+        return cut_sections(self.whole, thickness, self.settings.measures)
+
+    @cached_property
+    def area(self) -> Float:
+        """(Nx, Ny) area of the mid-surface round each node, mm2."""
+        return column_area(self.sheet)
+
+    @cached_property
+    def away(self) -> Bool:
+        """(Nx, Ny) nodes so far from rims and ends that polynomials are fitted on both sides."""
+        return away_from_edges(self.thickness.shape, self.settings.measures)
+
+    def mean(self, values: Float, where: Bool) -> float:
+        """Mean of a map (Nx, Ny) over part of the sheet, for columns that were measured directly.
+
+        Every square millimeter counts the same: where the wall is thin, the lines of the grid lie
+        closer together, and a mean over nodes would be that of the thin parts. NaN if there are no
+        such columns.
+        """
+        here = where & self.sheet.valid
+        return float(np.average(values[here], weights=self.area[here])) if here.any() else np.nan
+
+    def wall_area(self, level: int) -> float:
+        """Area of the interior (0) or exterior (-1) wall, mm2."""
+        return wall_area(self.whole, level, self.settings.measures)
+
+    def mean_curvature(self, level: int) -> Float:
+        """(Nx, Ny) 1/mm."""
+        return mean_curvature(self.sheet, level, self.settings.measures)
+
+    def gaussian_curvature(self, level: int) -> Float:
+        """(Nx, Ny) 1/mm2."""
+        return gaussian_curvature(self.sheet, level, self.settings.measures)
+
+    def lines(self, axis: int) -> Float:
+        """(Nx, Ny) length of the whole mid-surface line along an axis through each node, mm."""
+        nx, ny = self.thickness.shape
+        grid = self.settings.sheet
+        if axis:
+            return np.tile(at_columns(extent_y(self.whole), grid.x_extent, nx)[:, None], (1, ny))
+        return np.tile(at_columns(extent_x(self.whole), grid.y_extent, ny), (nx, 1))
+
+
+def average_profiles(maps: Mapping[str, Float], sheet: Sheet) -> dict[str, dict[str, Float]]:
+    """Average maps along one axis of the sheet, over the area of columns measured directly.
+
+    Returns
+    -------
+    dict
+        ``x``: (Nx,) values by name, averaged over y; ``y``: (Ny,) values, averaged over x. NaN
+        where a line has no such column.
+    """
+    weights = column_area(sheet) * sheet.valid
+    profiles = {}
+    for axis, other in (("x", 1), ("y", 0)):
+        total = weights.sum(axis=other)
+        profiles[axis] = {
+            name: np.divide(
+                np.where(sheet.valid, values * weights, 0).sum(axis=other),
+                total,
+                out=np.full(len(total), np.nan),
+                where=total > 0,
+            )
+            for name, values in maps.items()
+        }
+    return profiles
+
 
 DIERS = "Diers et al. 2023, NeuroImage 276:120182, section 2.2"
 DO_CARMO = "do Carmo 1976, Differential Geometry of Curves and Surfaces, section 3.3"
@@ -189,3 +307,175 @@ def measure_maps(measured: Measured) -> dict[str, Float]:
 def measure_sections(measured: Measured) -> dict[str, Float]:
     """Compute what is measured per cross-section, (Ny,) each, by name."""
     return {row.name: row.compute(measured.sections) for row in SECTIONS}
+
+
+# Every number per hemisphere and per subfield: its name, its meaning and its function.
+
+
+@dataclass(frozen=True, kw_only=True)
+class SummaryMeasure(Column):
+    """One number per hemisphere."""
+
+    compute: Callable[[Measured], float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SubfieldMeasure(Column):
+    """One number per subfield; the name of the column goes on with the subfield's."""
+
+    compute: Callable[[Measured, Tissue], float]
+    """Gives NaN for a subfield that is absent."""
+
+
+def _over_body(name: str) -> SummaryMeasure:
+    """Average a section's measure over the body's length."""
+    row = next(row for row in SECTIONS if row.name == name)
+    return SummaryMeasure(
+        name=f"{name}_mean",
+        unit=row.unit,
+        definition=f"{row.definition}, mean over the length of the body",
+        source=row.source,
+        digits=row.digits,
+        compute=lambda m: m.sections.mean(row.compute(m.sections)),
+    )
+
+
+def _over_sheet(name: str) -> SummaryMeasure:
+    """Average a map over the part of the sheet where it is sure: away from rims and ends."""
+    row = next(row for row in MAPS if row.name == name)
+    return SummaryMeasure(
+        name=f"{name}_mean",
+        unit=row.unit,
+        definition=f"{row.definition}; mean over the mid-surface away from rims and ends, by half"
+        " of measures.curvature_window",
+        source=row.source,
+        digits=row.digits,
+        compute=lambda m: m.mean(row.compute(m), m.away),
+    )
+
+
+SUMMARY: tuple[SummaryMeasure, ...] = (
+    SummaryMeasure(
+        name="thickness_mean",
+        unit="mm",
+        definition="mean thickness over the area of the sheet's mid-surface",
+        source=DIERS,
+        compute=lambda m: m.mean(m.thickness, m.sheet.valid),
+    ),
+    SummaryMeasure(
+        name="extent_x",
+        unit="mm",
+        definition="mean length of the mid-surface's lines from medial to lateral rim",
+        source=DIERS,
+        compute=lambda m: float(extent_x(m.whole).mean()),
+    ),
+    SummaryMeasure(
+        name="extent_y",
+        unit="mm",
+        definition="mean length of the mid-surface's lines from the posterior to the anterior end",
+        source=DIERS,
+        compute=lambda m: float(extent_y(m.whole).mean()),
+    ),
+    SummaryMeasure(
+        name="extent_z",
+        unit="mm",
+        definition="mean length of the lines from the interior to the exterior wall, evenly over"
+        " the mid-surface",
+        source=DIERS,
+        compute=lambda m: float(np.average(m.thickness, weights=m.area)),
+    ),
+    SummaryMeasure(
+        name="volume",
+        unit="mm^3",
+        definition="volume of the sheet, enclosed by its triangle mesh",
+        source=DIERS,
+        compute=lambda m: m.volume,
+    ),
+    SummaryMeasure(
+        name="area_interior",
+        unit="mm^2",
+        definition="area of the interior wall; next to the rims continued along the mid-surface",
+        source=DIERS,
+        compute=lambda m: m.wall_area(0),
+    ),
+    SummaryMeasure(
+        name="area_mid",
+        unit="mm^2",
+        definition="area of the mid-surface",
+        source=DIERS,
+        compute=lambda m: sum(m.areas.values()),
+    ),
+    SummaryMeasure(
+        name="area_exterior",
+        unit="mm^2",
+        definition="area of the exterior wall; next to the rims continued along the mid-surface",
+        source=DIERS,
+        compute=lambda m: m.wall_area(-1),
+    ),
+    SummaryMeasure(
+        name="area_ratio",
+        unit="1",
+        definition="area of the interior over that of the exterior wall",
+        source=DIERS,
+        digits=5,
+        compute=lambda m: m.wall_area(0) / m.wall_area(-1),
+    ),
+    SummaryMeasure(
+        name="surface_volume_ratio",
+        unit="1/mm",
+        definition="area of both walls over the volume; rims and end planes do not count",
+        source=DIERS,
+        digits=5,
+        compute=lambda m: (m.wall_area(0) + m.wall_area(-1)) / m.volume,
+    ),
+    *map(
+        _over_body,
+        ("circumference", "interior_exterior_ratio", "section_area", "shape_index"),
+    ),
+    *map(_over_sheet, (row.name for row in MAPS if "curvature" in row.name)),
+)
+
+PER_SUBFIELD: tuple[SubfieldMeasure, ...] = (
+    SubfieldMeasure(
+        name="thickness_mean",
+        unit="mm",
+        definition="mean thickness over the area of the sheet's mid-surface in {}",
+        source=DIERS,
+        compute=lambda m, tissue: m.mean(m.thickness, m.subfield == tissue),
+    ),
+    SubfieldMeasure(
+        name="area",
+        unit="mm^2",
+        definition="area of the mid-surface in {}",
+        source=DIERS,
+        compute=lambda m, tissue: m.areas.get(tissue, float("nan")),
+    ),
+    SubfieldMeasure(
+        name="volume",
+        unit="mm^3",
+        definition="volume of the sheet in {}",
+        source=DIERS,
+        compute=lambda m, tissue: m.volumes.get(tissue, float("nan")),
+    ),
+)
+
+
+def summarize(measured: Measured, tissues: tuple[Tissue, ...]) -> dict[str, float]:
+    """Compute one number per measure for the whole body, and per subfield.
+
+    Parameters
+    ----------
+    measured : Measured
+    tissues : tuple of Tissue
+        The subfields of the protocol; absent ones are NaN.
+
+    Returns
+    -------
+    dict
+        By the names in ``SUMMARY`` and ``PER_SUBFIELD``.
+    """
+    return {row.name: row.compute(measured) for row in SUMMARY} | {
+        f"{row.name}_{tissue.name}": row.compute(measured, tissue)
+        for row in PER_SUBFIELD
+        for tissue in tissues
+    }

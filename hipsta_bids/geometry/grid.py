@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from hipsta_bids.artifacts import Bool, Float
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.slices import has_thick_slices, points_of_ends, sample_slices
 from hipsta_bids.settings import GridSettings, SliceSettings
+from hipsta_bids.types import Bool, Float
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -1,10 +1,66 @@
 """Thickness, curvature and areas of a sheet, point by point."""
 
-import numpy as np
+import math
+from dataclasses import dataclass
+from functools import lru_cache
 
-from hipsta_bids.artifacts import Bool, Float, Sheet
-from hipsta_bids.geometry.local_polynomials import differentiate
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from hipsta_bids.geometry.body import Body
+from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import MeasureSettings
+from hipsta_bids.types import Bool, Float, Sheet, TetMesh
+
+# Smoothed derivatives of values on a regular grid.
+
+
+def differentiate(values: Float, window: int, degree: int, times: int, axis: int) -> Float:
+    """Differentiate along one axis with polynomials fitted to windows of nodes.
+
+    The derivative at a node is that of the polynomial fitted to the window around it; within half
+    a window of either end, to the first or last window.
+
+    Parameters
+    ----------
+    values : array
+    window : int
+        Nodes per window, odd, no more than the axis has.
+    degree : int
+        Of the polynomials, less than ``window``.
+    times : int
+        Order of the derivative; 0 smooths.
+    axis : int
+
+    Returns
+    -------
+    array
+        Of the shape of ``values``; per node distance to the power of ``times``.
+
+    Notes
+    -----
+    Savitzky & Golay 1964, Anal Chem 36:1627-1639. The same as SciPy's ``savgol_filter``, to which
+    a test compares it; importing that takes longer than measuring half a hemisphere, and 36 MB.
+    """
+    weights = _weights(values.shape[axis], window, degree, times)
+    return np.asarray(np.moveaxis(np.tensordot(weights, values, axes=(1, axis)), 0, axis))
+
+
+@lru_cache(maxsize=64)
+def _weights(count: int, window: int, degree: int, times: int) -> Float:
+    """Matrix (count, count) that maps values to derivatives."""
+    result = np.zeros((count, count))
+    if times > degree:
+        return result
+    place = np.arange(window)
+    steps = place - place[:, None]  # from each place in the window to all of it
+    powers = steps[..., None] ** np.arange(degree + 1.0)
+    rows = math.factorial(times) * np.linalg.pinv(powers)[:, times]
+    node = np.arange(count)
+    first = np.clip(node - window // 2, 0, count - window)
+    result[node[:, None], first[:, None] + place] = rows[node - first]
+    return result
 
 
 def measure_thickness(sheet: Sheet) -> Float:
@@ -149,3 +205,216 @@ def _derivative(
         window = min(windows[axis], points.shape[axis] - 1 + points.shape[axis] % 2)
         points = differentiate(points, window, min(degree, window - 1), times, axis)
     return points
+
+
+# Lengths and areas of the walls and the mid-surface, line by line.
+
+
+def extent_x(whole: Sheet) -> Float:
+    """Length of each mid-surface line from rim to rim, (Ny,), mm."""
+    return np.asarray(_steps(whole, whole.middle, 0).sum(axis=0))
+
+
+def extent_y(whole: Sheet) -> Float:
+    """Length of each mid-surface line from end to end, (Nx,), mm."""
+    return np.asarray(_steps(whole, whole.middle, 1).sum(axis=1))
+
+
+def wall_length(whole: Sheet, level: int, settings: MeasureSettings) -> Float:
+    """Length of each line of a wall from rim to rim, (Ny,), mm.
+
+    Parameters
+    ----------
+    whole : Sheet
+        From rim to rim.
+    level : int
+        0 for the interior and -1 for the exterior wall.
+    settings : MeasureSettings
+
+    Returns
+    -------
+    (Ny,) array
+        One length per cross-section.
+    """
+    steps, middle = _steps(whole, level, 0), _steps(whole, whole.middle, 0)
+    return np.asarray(_continued(steps, middle, settings).sum(axis=0))
+
+
+def wall_area(whole: Sheet, level: int, settings: MeasureSettings) -> float:
+    """Area of a wall from rim to rim and end to end, mm2; parameters as for lengths."""
+    cells = layer_area(whole.points[:, :, level])
+    middle = layer_area(whole.points[:, :, whole.middle])
+    return float(_continued(cells, middle, settings).sum())
+
+
+def at_columns(values: Float, extent: float, count: int) -> Float:
+    """Interpolate values at lines from -1 to 1 to ``count`` lines within plus and minus extent."""
+    return np.interp(np.linspace(-extent, extent, count), np.linspace(-1, 1, len(values)), values)
+
+
+def _steps(sheet: Sheet, level: int, axis: int) -> Float:
+    """Distances of neighbors along x or y in one layer, mm."""
+    return np.asarray(np.linalg.norm(np.diff(sheet.points[:, :, level], axis=axis), axis=-1))
+
+
+def _continued(wall: Float, middle: Float, settings: MeasureSettings) -> Float:
+    """Replace steps (Nx - 1, M) of a wall next to the rims."""
+    count = len(wall)
+    rim = round((1 - settings.rim_start) / 2 * count)
+    window = max(round(settings.rim_window / 2 * count), 1)
+    if not rim or 2 * (rim + window) > count:
+        return wall
+    result = wall.copy()
+    for near, before in (
+        (slice(None, rim), slice(rim, rim + window)),
+        (slice(-rim, None), slice(-rim - window, -rim)),
+    ):
+        result[near] = middle[near] * (wall[before].sum(axis=0) / middle[before].sum(axis=0))
+    return result
+
+
+# Cross-sections of the body: what is measured where y is constant (Diers et al. 2023, 2.2).
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CrossSections:
+    """One value per cross-section, all (Ny,), from posterior to anterior."""
+
+    position: Float
+    """Distance from the posterior end plane along the mid-surface, mean over x, mm."""
+    interior: Float
+    """Length of the interior wall, mm."""
+    middle: Float
+    """Length of the mid-line, mm."""
+    exterior: Float
+    """Length of the exterior wall, mm."""
+    area: Float
+    """mm2."""
+    thickness: Float
+    """Mean over the columns of the section, mm."""
+
+    @property
+    def circumference(self) -> Float:
+        """Length of both walls, mm."""
+        return self.interior + self.exterior
+
+    @property
+    def ratio(self) -> Float:
+        """Interior over exterior length."""
+        return self.interior / self.exterior
+
+    @property
+    def shape_index(self) -> Float:
+        """Circumference over area, 1/mm; 2 / thickness in a sheet of even thickness."""
+        return self.circumference / self.area
+
+    def mean(self, values: Float) -> float:
+        """Mean of values (Ny,) over the body; every millimeter of its length counts the same."""
+        return float(np.trapezoid(values, self.position) / np.ptp(self.position))
+
+
+def cut_sections(whole: Sheet, thickness: Float, settings: MeasureSettings) -> CrossSections:
+    """Measure the cross-sections of a body.
+
+    Parameters
+    ----------
+    whole : Sheet
+        From rim to rim and wall to wall.
+    thickness : (Ny,) array
+        Mean of each section, mm.
+    settings : MeasureSettings
+
+    Returns
+    -------
+    CrossSections
+    """
+    middle = whole.points[:, :, whole.middle]
+    steps = np.linalg.norm(np.diff(middle, axis=1), axis=-1).mean(axis=0)
+    return CrossSections(
+        position=np.concatenate([[0.0], steps.cumsum()]),
+        interior=wall_length(whole, 0, settings),
+        middle=extent_x(whole),
+        exterior=wall_length(whole, -1, settings),
+        area=section_area(whole),
+        thickness=thickness,
+    )
+
+
+def section_area(whole: Sheet) -> Float:
+    """Area of each cross-section, (Ny,), mm2.
+
+    Half the length of the sum of the cells' diagonals' cross products: in a plane the area of the
+    polygon round the section, whatever its cells do next to rounded rims. What chords cut off goes
+    with the square of their length; it is extrapolated from every second one (Richardson 1911).
+    """
+    area = _polygon_area(whole.points)
+    if whole.points.shape[0] % 2 == 0:  # the last line would be left out
+        return area
+    return area + (area - _polygon_area(whole.points[::2])) / 3
+
+
+def _polygon_area(points: Float) -> Float:
+    p = np.moveaxis(points, 1, 0)
+    first, second = p[:, 1:, 1:] - p[:, :-1, :-1], p[:, 1:, :-1] - p[:, :-1, 1:]
+    return np.asarray(0.5 * np.linalg.norm(np.cross(first, second).sum(axis=(1, 2)), axis=-1))
+
+
+# Which subfield a place belongs to, and how much of the mid-surface and of the volume each has.
+
+
+#: Places per cell along x and y, about a tenth of a millimeter apart along x on the default grid.
+_PLACES = 4
+
+
+def labels_at(points: Float, body: Body) -> NDArray[np.uint8]:
+    """Tissue (N,) at points (N, 3), RAS mm: that of the body's voxel there, or else the nearest."""
+    voxel = np.rint(body.to_voxels(points)).astype(np.intp)
+    last = np.array(body.inside.shape) - 1
+    place = tuple(np.clip(voxel, 0, last).T)
+    labels = body.tissue[place]
+    beside = np.flatnonzero(~body.inside[place] | ((voxel < 0) | (voxel > last)).any(axis=1))
+    if len(beside):
+        index, centers = body.inside_points()
+        _, nearest = cKDTree(centers).query(points[beside])
+        labels[beside] = body.tissue[tuple(index[nearest].T)]
+    return np.asarray(labels, dtype=np.uint8)
+
+
+def subfield_areas(whole: Sheet, body: Body) -> dict[Tissue, float]:
+    """Area of the mid-surface in each subfield that it has, mm2.
+
+    Parameters
+    ----------
+    whole : Sheet
+        From rim to rim and end to end.
+    body : Body
+
+    Returns
+    -------
+    dict
+        The areas add up to that of the mid-surface.
+    """
+    at = (np.arange(_PLACES) + 0.5) / _PLACES
+    inner = whole.points[:, :, 1:-1]  # walls lie beside the voxels as often as in them
+    along_x = _between(inner[:-1], inner[1:], at)
+    places = _between(along_x[:, :, :-1], along_x[:, :, 1:], at)
+    shares = layer_area(whole.points[:, :, whole.middle])[..., None] / places[..., 0, 0, :, 0].size
+    weights = np.broadcast_to(shares, places.shape[:-1])
+    return _sums(labels_at(places.reshape(-1, 3), body), weights.ravel())
+
+
+def subfield_volumes(mesh: TetMesh, body: Body) -> dict[Tissue, float]:
+    """Volume in each subfield, mm3; the volumes add up to that of the mesh."""
+    corners = mesh.vertices[mesh.tetrahedra]
+    volume = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6
+    return _sums(labels_at(corners.mean(axis=1), body), volume)
+
+
+def _between(start: Float, end: Float, at: Float) -> Float:
+    """Points at fractions of the way, along a new first axis."""
+    return np.stack([start + fraction * (end - start) for fraction in at])
+
+
+def _sums(labels: NDArray[np.uint8], weights: Float) -> dict[Tissue, float]:
+    total = np.bincount(labels, weights)
+    return {Tissue(int(kind)): float(total[kind]) for kind in np.unique(labels)}

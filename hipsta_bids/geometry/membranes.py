@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from hipsta_bids.artifacts import Bool
-from hipsta_bids.geometry.simple_points import euler_number, grow, shrink
+from hipsta_bids.geometry.digital import euler_number, grow, shrink
 from hipsta_bids.settings import TopologySettings
+from hipsta_bids.types import Bool
 
 Kind = Literal["part", "slit", "cut", "fill", "island", "cavity"]
 Contact = Callable[[NDArray[np.intp]], bool]

@@ -5,16 +5,14 @@ from typing import Any
 
 import numpy as np
 
-from hipsta_bids.artifacts import Flag, Float, Sheet, Surface, TetMesh
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.boundaries import Boundaries
-from hipsta_bids.geometry.checks import check_image
-from hipsta_bids.geometry.label_checks import check_labels
-from hipsta_bids.geometry.sections import check_cross_sections, check_rows
+from hipsta_bids.geometry.checks import check_cross_sections, check_image, check_labels, check_rows
 from hipsta_bids.geometry.tetra import tetra_quality
 from hipsta_bids.geometry.topology import SolidField
-from hipsta_bids.schemes import Tissue
+from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import Settings
+from hipsta_bids.types import Flag, Float, Sheet, Surface, TetMesh
 
 #: What every protocol labels along the sheet, from medial to lateral.
 _PARTS = {

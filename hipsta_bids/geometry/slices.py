@@ -7,20 +7,238 @@ of both, moved along the registration. Where head or tail labels hide how the sh
 shapes are continued from inside. Where the two ends of the ribbon touch, they are kept apart.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.special import ndtri
 
-from hipsta_bids.artifacts import Bool, Float
 from hipsta_bids.geometry.body import Body
-from hipsta_bids.geometry.outlines import outline_slice, part_distance
-from hipsta_bids.geometry.registration import register_slices
-from hipsta_bids.schemes import Tissue
+from hipsta_bids.protocols.protocol import Tissue, lateral_rank
 from hipsta_bids.settings import SliceSettings
+from hipsta_bids.types import Bool, Float
+
+# The outline of the ribbon in one slice: between the pixels, fragments joined, holes filled.
+
+
+Image = NDArray[np.float32]
+
+
+def outline_slice(tissue: NDArray[np.uint8], pixel: float, settings: SliceSettings) -> Image:
+    """Find the signed distance from the ribbon's outline in a slice.
+
+    Parameters
+    ----------
+    tissue : (I, J) array of uint8
+        Sheet tissue at the pixels of the segmentation.
+    pixel : float
+        Edge of a pixel, mm.
+    settings : SliceSettings
+
+    Returns
+    -------
+    (upsampling I, upsampling J) array of float32
+        mm at finer pixels, positive inside, between minus and plus ``reach``.
+
+    Notes
+    -----
+    Across a straight edge, a mask smoothed by a Gaussian is the normal distribution function of the
+    distance over sigma. Its inverse finds the outline between pixels; whole pixels put it off by
+    up to half of one, which the smoothing of the working grid cannot undo along the slice.
+    """
+    block = np.ones((settings.upsampling,) * 2, dtype=np.uint8)
+    labels = np.kron(tissue, block)
+    if not labels.any():
+        return np.full(labels.shape, -settings.reach, dtype=np.float32)
+    fine = pixel / settings.upsampling
+    sigma = settings.smoothing * settings.upsampling
+    smooth = ndimage.gaussian_filter((labels > 0).astype(np.float64), sigma)
+    distance = _signed_distance(smooth > 0.5, fine)  # noqa: PLR2004 -- the outline
+    exact = sigma * fine * ndtri(np.clip(smooth, 1e-6, 1 - 1e-6))
+    distance = np.where(np.abs(distance) < sigma * fine, exact, distance)
+    distance = _join(distance, lateral_rank(labels).astype(int), labels > 0, fine, settings)
+    return np.asarray(np.clip(distance, -settings.reach, settings.reach), dtype=np.float32)
+
+
+def part_distance(
+    tissue: NDArray[np.uint8], kinds: Collection[Tissue], pixel: float, settings: SliceSettings
+) -> Image:
+    """Find the signed distance from some subfields of a slice, to the pixel.
+
+    Parameters
+    ----------
+    tissue : (I, J) array of uint8
+    kinds : collection of Tissue
+    pixel : float
+        Edge of a pixel, mm.
+    settings : SliceSettings
+
+    Returns
+    -------
+    (upsampling I, upsampling J) array of float32
+        As :func:`outline_slice`.
+    """
+    fine = np.kron(np.isin(tissue, tuple(kinds)), np.ones((settings.upsampling,) * 2, dtype=bool))
+    distance = _signed_distance(fine, pixel / settings.upsampling)
+    return np.asarray(np.clip(distance, -settings.reach, settings.reach), dtype=np.float32)
+
+
+def _signed_distance(mask: Bool, pixel: float) -> Float:
+    """Distance from the border between pixels, mm, positive inside."""
+    if not mask.any():
+        return np.full(mask.shape, -np.inf)
+    inside = ndimage.distance_transform_edt(mask)
+    outside = ndimage.distance_transform_edt(~mask)
+    return np.asarray((np.maximum(inside - 0.5, 0) - np.maximum(outside - 0.5, 0)) * pixel)
+
+
+def _join(
+    distance: Float, ranks: NDArray[np.intp], labeled: Bool, pixel: float, settings: SliceSettings
+) -> Float:
+    """Bridge near fragments of a slice to the largest, drop crumbs, fill holes.
+
+    A large piece farther away is left alone: whether it belongs to the ribbon (it may turn into
+    the uncus) is seen in three dimensions only.
+    """
+    for _ in range(settings.max_fragments):
+        pieces, count = ndimage.label(distance > 0)
+        if count < 2:  # noqa: PLR2004 -- one piece is the aim
+            break
+        sizes = np.bincount(pieces.ravel()) * pixel**2
+        sizes[0] = 0
+        main = pieces == sizes.argmax()
+        gap, nearest = ndimage.distance_transform_edt(~main, return_indices=True)
+        gap *= pixel
+        # The sheet is one ribbon: a fragment belongs to a neighbor in medial-to-lateral order,
+        # not to the part that happens to lie across the sulcus.
+        jump = np.abs(ranks - ranks[tuple(nearest)]) > settings.max_rank_jump
+        cost = gap + np.where(jump & labeled, settings.reach, 0)
+        crumbs = (sizes < settings.crumb_area)[pieces]
+        cost[(pieces == 0) | main | ((cost > settings.max_gap) & ~crumbs)] = np.inf
+        end = np.array(np.unravel_index(np.argmin(cost), cost.shape))
+        nearest_cost = cost[tuple(end)]
+        if not np.isfinite(nearest_cost):
+            break
+        if nearest_cost > settings.max_gap:
+            distance = np.where(pieces == pieces[tuple(end)], -0.5 * pixel, distance)
+        else:
+            start = np.array([axis[tuple(end)] for axis in nearest])
+            bridge = _segment_distance(distance.shape, start, end) * pixel
+            distance = np.maximum(distance, settings.bridge - bridge)
+    holes, _ = ndimage.label(distance <= 0)
+    area = np.bincount(holes.ravel()) * pixel**2
+    small = (area < settings.hole_area)[holes] & (distance <= 0)
+    return np.where(small, 0.5 * pixel, distance)
+
+
+def _segment_distance(
+    shape: tuple[int, ...], start: NDArray[np.intp], end: NDArray[np.intp]
+) -> Float:
+    """Distance of each pixel from a segment, in pixels."""
+    grid = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1)
+    along = end - start
+    share = ((grid - start) @ along) / max(float(along @ along), 1e-9)
+    foot = start + np.clip(share, 0, 1)[..., None] * along
+    return np.asarray(np.linalg.norm(grid - foot, axis=-1))
+
+
+# The way from each slice to the next.
+
 
 Stack = NDArray[np.float32]
+
+_LEVELS = (2, 1)  # sizes of pixels, those of the segmentation last
+
+
+def register_slices(outlines: Stack, pixel: float, settings: SliceSettings) -> Stack:
+    """Register each slice to the next, both sides alike.
+
+    Parameters
+    ----------
+    outlines : (N, I, J) array of float32
+        Signed distances at fine pixels, mm.
+    pixel : float
+        Edge of a pixel of the segmentation, ``upsampling`` times that of a fine one, mm. The
+        registration works with them: fine ones would cost much and tell no more.
+    settings : SliceSettings
+
+    Returns
+    -------
+    (2, N - 1, I / upsampling, J / upsampling) array of float32
+        Displacement u in fine pixels with first(x - u / 2) = second(x + u / 2).
+
+    Notes
+    -----
+    Lucas & Kanade 1981, IJCAI:674-679, with a Gaussian window, from coarse to fine, all slices
+    at once. Halfway between both slices, no direction is preferred, and one displacement serves
+    both.
+    """
+    flow = np.zeros((2, len(outlines) - 1, 1, 1), dtype=np.float32)
+    for level in _LEVELS:
+        small = _shrunk(outlines, settings.upsampling * level)
+        flow = _doubled(flow, small.shape[1:])
+        for _ in range(settings.flow_iterations):
+            flow = _improved(small, flow, pixel * level, settings)
+    return np.asarray(settings.upsampling * flow, dtype=np.float32)
+
+
+def _improved(images: Stack, flow: Stack, pixel: float, settings: SliceSettings) -> Stack:
+    """One step of Gauss and Newton in a window around each pixel."""
+    first, second = _moved(images[:-1], -0.5 * flow), _moved(images[1:], 0.5 * flow)
+    slope_i, slope_j = np.gradient((0.5 / pixel) * (first + second), axis=(1, 2))
+    error = (first - second) / pixel
+    ii, ij, jj, ei, ej = (
+        _windowed(product, settings.flow_window / pixel)
+        for product in (
+            slope_i * slope_i,
+            slope_i * slope_j,
+            slope_j * slope_j,
+            slope_i * error,
+            slope_j * error,
+        )
+    )
+    # Along a straight edge only the way across it is known; the ridge chooses the shortest.
+    ii, jj = ii + settings.flow_ridge, jj + settings.flow_ridge
+    det = ii * jj - ij * ij
+    step = np.stack([(jj * ei - ij * ej) / det, (ii * ej - ij * ei) / det])
+    width = settings.flow_smoothing / pixel
+    return np.asarray(ndimage.gaussian_filter(flow + step, (0, 0, width, width)), dtype=np.float32)
+
+
+def _windowed(values: Stack, sigma: float) -> Stack:
+    return np.asarray(ndimage.gaussian_filter(values, (0, sigma, sigma), truncate=2.5))
+
+
+def _moved(images: Stack, by: Stack) -> Stack:
+    where = np.indices(images.shape, dtype=np.float32)
+    where[1:] += by
+    return np.asarray(
+        ndimage.map_coordinates(images, where, order=1, mode="nearest", output=np.float32)
+    )
+
+
+def _shrunk(images: Stack, factor: int) -> Stack:
+    """Means over blocks of pixels; the border is repeated to whole blocks."""
+    pad = [(0, -n % factor) for n in images.shape[1:]]
+    whole = np.pad(images, [(0, 0), *pad], mode="edge")
+    count, rows, columns = whole.shape
+    blocks = whole.reshape(count, rows // factor, factor, columns // factor, factor)
+    return np.asarray(blocks.mean(axis=(2, 4)), dtype=np.float32)
+
+
+def _doubled(flow: Stack, shape: tuple[int, ...]) -> Stack:
+    """Displacements at pixels of half the size, counted in them."""
+    at = (0.5 * np.arange(n, dtype=np.float32) - 0.25 for n in shape)
+    where = np.stack(
+        np.meshgrid(*(np.arange(n) for n in flow.shape[:2]), *at, indexing="ij")
+    ).astype(np.float32)
+    return np.asarray(
+        2 * ndimage.map_coordinates(flow, where, order=1, mode="nearest", output=np.float32)
+    )
+
+
 Box = tuple[slice, slice, slice]
 
 #: Subfields of the medial and the lateral end of the ribbon. CA1 lies between them.

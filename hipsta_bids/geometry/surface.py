@@ -4,10 +4,10 @@ import numpy as np
 from scipy import sparse
 from skimage.measure import marching_cubes
 
-from hipsta_bids.artifacts import Bool, Float, Int, Surface
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.grid import Field
 from hipsta_bids.settings import SurfaceSettings
+from hipsta_bids.types import Bool, Float, Int, Surface
 
 
 def extract_surface(field: Field, settings: SurfaceSettings) -> Surface:

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from hipsta_bids.artifacts import Float, Int, Surface, TetMesh
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.surface import sharpest_fold, signed_volume
 from hipsta_bids.geometry.tetgen_worker import TetgenClient
 from hipsta_bids.settings import TetraSettings
+from hipsta_bids.types import Float, Int, Surface, TetMesh
 
 _CLIENT = TetgenClient()
 

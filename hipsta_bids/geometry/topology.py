@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
-from hipsta_bids.artifacts import Bool, Float
 from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry.digital import box_around, low_corner
 from hipsta_bids.geometry.grid import Field
-from hipsta_bids.geometry.marching import consistent_values
 from hipsta_bids.geometry.membranes import (
     ALL,
     CORNER,
@@ -24,7 +24,52 @@ from hipsta_bids.geometry.membranes import (
     euler,
     with_plates,
 )
-from hipsta_bids.settings import TopologySettings
+from hipsta_bids.settings import MeasureSettings, TopologySettings
+from hipsta_bids.types import Bool, Float, Sheet
+
+# Fields whose sign marching cubes reads as digital topology does.
+
+
+def consistent_values(values: NDArray[np.float32], after: Bool) -> NDArray[np.float32]:
+    """Make the field's sign that of the repaired body, and marching cubes agree with it.
+
+    Where the sign is ambiguous on a face or inside a cube, marching cubes decides by the values;
+    small positive and larger negative ones keep foreground corners apart, as 6-connectivity does.
+    """
+    result = np.where(after, np.maximum(values, 0.01), np.minimum(values, -0.01))
+    edited = after != (values > 0)
+    result = np.where(edited, np.where(after, 0.1, -0.1), result)
+    corners = np.zeros(after.shape, dtype=bool)
+    for axis in range(3):
+        a = np.moveaxis(after, axis, 0)
+        faces = (a[:, 1:, 1:] == a[:, :-1, :-1]) & (a[:, 1:, :-1] == a[:, :-1, 1:])
+        faces &= a[:, 1:, 1:] != a[:, 1:, :-1]
+        _mark(np.moveaxis(corners, axis, 0), faces, cube=False)
+    opposite = np.zeros(tuple(n - 1 for n in after.shape), dtype=bool)
+    total = after.astype(np.int8)
+    for axis in range(3):
+        total = np.take(total, range(1, total.shape[axis]), axis) + np.take(
+            total, range(total.shape[axis] - 1), axis
+        )
+    for dx, dy in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        first = after[dx : dx - 1 or None, dy : dy - 1 or None, :-1]
+        last = after[1 - dx : -dx or None, 1 - dy : -dy or None, 1:]
+        opposite |= first & last & (total == 2)  # noqa: PLR2004 -- two opposite corners only
+        opposite |= ~first & ~last & (total == 6)  # noqa: PLR2004 -- the reverse
+    _mark(corners, opposite, cube=True)
+    positive = np.minimum(result, 0.03)
+    negative = np.minimum(result, -0.08)
+    return np.where(corners, np.where(after, positive, negative), result).astype(np.float32)
+
+
+def _mark(corners: Bool, cells: Bool, *, cube: bool) -> None:
+    """Mark the corners of flagged faces (first axis runs over nodes) or cubes, in place."""
+    for dx in (0, 1) if cube else (None,):
+        for dy in (0, 1):
+            for dz in (0, 1):
+                first = slice(None) if dx is None else slice(dx, dx - 1 or None)
+                corners[first, dy : dy - 1 or None, dz : dz - 1 or None] |= cells
+
 
 Locate = Callable[[Float], str]
 """Names the subfields at (N, 3) points, RAS mm."""
@@ -310,3 +355,113 @@ def _beside_part(nodes: NDArray[np.intp], field: Field) -> bool:
         return False
     near = ndimage.binary_dilation(field.parted, structure=ALL, iterations=2)
     return bool(near[tuple(nodes.T)].any())
+
+
+# Which columns of the sheet rest on repaired voxels.
+
+
+_ALL = np.ones((3, 3, 3), dtype=bool)
+
+
+def repaired_columns(sheet: Sheet, solid: SolidField, settings: MeasureSettings) -> Bool:
+    """Mark the columns of the sheet that a repair of the topology touched.
+
+    A column stands for the part of the sheet up to halfway to its neighbors, so that a repair
+    between two columns is not lost. A cut bridge leaves its two stumps standing: what is nearest
+    to either face of the cut is marked, too. Pieces that were removed leave no mark.
+
+    Parameters
+    ----------
+    sheet : Sheet
+    solid : SolidField
+        Knows the grid nodes whose side was changed.
+    settings : MeasureSettings
+
+    Returns
+    -------
+    (Nx, Ny) bool
+        False where a column is undefined.
+    """
+    marked = np.zeros(sheet.valid.shape, dtype=bool)
+    if not solid.touched.any():
+        return marked
+    known = np.isfinite(sheet.points).all(axis=(2, 3))
+    if not known.any():
+        return marked
+    nodes, radii = _changed_nodes(solid, sheet.points[known].reshape(-1, 3), settings)
+    gaps = np.stack([_gaps(sheet.points, axis) for axis in (0, 1)], axis=-1)
+    # Most columns are far from all repairs: looking closely at the others only saves much time.
+    near = np.asarray(cKDTree(nodes).query(sheet.points[known])[0])
+    candidates = np.argwhere(known)[near.min(axis=1) <= radii.max() + gaps[known].mean(axis=-1)]
+    if not len(candidates):
+        return marked
+    widest = gaps[tuple(candidates.T)].max(axis=0)
+    parts = np.maximum(np.ceil(widest / settings.repair_reach), 1).astype(int)
+    dense = _cells(sheet.points, candidates, parts)
+    defined = np.isfinite(dense).all(axis=-1)
+    hits = cKDTree(dense[defined]).query_ball_point(nodes, radii)
+    hit = np.unique(np.concatenate([np.asarray(found, dtype=np.intp) for found in hits]))
+    owner = candidates[np.nonzero(defined)[0][hit]]
+    marked[tuple(owner.T)] = True
+    return marked
+
+
+def _gaps(points: Float, axis: int) -> Float:
+    """Distance (Nx, Ny) of each column to the farther of its neighbors along an axis, mm."""
+    gap = np.nan_to_num(np.linalg.norm(np.diff(points, axis=axis), axis=-1)).max(axis=-1)
+    ends = [(int(k == axis), int(k == axis)) for k in range(2)]
+    padded = np.pad(gap, ends)
+    count = points.shape[axis]
+    before, after = (padded.take(range(k, count + k), axis=axis) for k in (0, 1))
+    return np.asarray(np.maximum(before, after))
+
+
+def _changed_nodes(
+    solid: SolidField, points: Float, settings: MeasureSettings
+) -> tuple[Float, Float]:
+    """Points (N, 3), RAS mm, of changed nodes and faces of cuts, and how far each of them marks."""
+    box = box_around(np.argwhere(solid.touched))
+    inside, touched = solid.field.values[box] > 0, solid.touched[box]
+    faces = ndimage.binary_dilation(touched & ~inside, structure=_ALL) & inside
+    places, _ = ndimage.label(faces & ~touched)
+    low = low_corner(box)
+    changed = solid.field.grid.to_ras((np.argwhere(touched) + low).astype(np.float64))
+    radius = np.full(len(changed), settings.repair_reach)
+    where = np.argwhere(places)
+    if not len(where):
+        return changed, radius
+    face = solid.field.grid.to_ras((where + low).astype(np.float64))
+    number = places[tuple(where.T)]
+    distance, _ = cKDTree(points).query(face)
+    nearest = np.asarray(ndimage.minimum(distance, number, np.arange(number.max() + 1)))
+    stumps = nearest[number] + settings.stump_reach
+    return np.vstack([changed, face]), np.concatenate([radius, stumps])
+
+
+def _cells(points: Float, columns: NDArray[np.intp], parts: NDArray[np.intp]) -> Float:
+    """Interpolate round columns, up to halfway to their neighbors.
+
+    Parameters
+    ----------
+    points : (Nx, Ny, Nz, 3) float64
+    columns : (C, 2) int
+        Numbers along x and y.
+    parts : (2,) int
+        Steps from half before to half behind a column, along x and y.
+
+    Returns
+    -------
+    (C, steps, Nz, 3) float64
+        NaN where a neighbor is undefined.
+    """
+    steps = [np.linspace(-0.5, 0.5, int(n) + 1) for n in parts]
+    offsets = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 2)
+    last = np.array(points.shape[:2]) - 1
+    place = np.clip(columns[:, None] + offsets, 0, last)
+    low, high = np.floor(place).astype(np.intp), np.ceil(place).astype(np.intp)
+    share = (place - low)[..., None, None]
+    x, y = share[:, :, 0], share[:, :, 1]
+    (a, b), (c, d) = np.moveaxis(low, -1, 0), np.moveaxis(high, -1, 0)
+    before = (1 - y) * points[a, b] + y * points[a, d]
+    after = (1 - y) * points[c, b] + y * points[c, d]
+    return np.asarray((1 - x) * before + x * after)

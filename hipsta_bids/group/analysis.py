@@ -4,7 +4,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
 
+from hipsta_bids.group.classify import PairComparison
 from hipsta_bids.group.comparison import (
     BOTH,
     Comparison,
@@ -12,22 +15,25 @@ from hipsta_bids.group.comparison import (
     compare_sessions,
     modeled_table,
 )
-from hipsta_bids.group.default_model import Groups
+from hipsta_bids.group.data import PARTICIPANT, Cohort, Float, Measures, SideMaps
 from hipsta_bids.group.design import Design, build_design
-from hipsta_bids.group.fitted import FittedMaps, fit_maps
-from hipsta_bids.group.inference import check_permutations, correct
-from hipsta_bids.group.model_spec import ModelSpec
-from hipsta_bids.group.multiplicity import Discoveries, MapKey
-from hipsta_bids.group.pairs import PairComparison
-from hipsta_bids.group.profiles import GroupShift, mean_profiles, shift_by_group
-from hipsta_bids.group.registration import Registration, register, register_to
-from hipsta_bids.group.row_model import RowModel, longitudinal_model, with_mean
-from hipsta_bids.group.scores import Scores, score_cohort
+from hipsta_bids.group.fit import FittedMaps, RowModel, fit_maps, longitudinal_model, with_mean
+from hipsta_bids.group.formula import ModelSpec
+from hipsta_bids.group.inference import Discoveries, MapKey, check_permutations, correct
+from hipsta_bids.group.model import Groups
+from hipsta_bids.group.normative import Scores, score_cohort
+from hipsta_bids.group.registration import (
+    GroupShift,
+    Registration,
+    mean_profiles,
+    register,
+    register_to,
+    shift_by_group,
+)
+from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.summaries import MeasureFit, classify_groups, fit_summaries
 from hipsta_bids.group.template import Template
 from hipsta_bids.group.warps import warp_labels, warp_values
-from hipsta_bids.group_data import PARTICIPANT, Cohort, Float, Measures, SideMaps
-from hipsta_bids.group_settings import GroupSettings
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -300,3 +306,38 @@ def _register_maps(side: SideMaps, warps: Float) -> SideMaps:
         names=side.names,
         summary=side.summary,
     )
+
+
+# Which rows belong to which group, and what they have in common.
+
+
+#: Group of all, where there are no groups.
+ALL = "all"
+
+
+def rows_of(analysis: Analysis, one: FittedMaps) -> pd.DataFrame:
+    """Rows of the model's table that the sheets used belong to."""
+    return analysis.compared.table.iloc[one.maps.rows[one.used]]
+
+
+def members_of(analysis: Analysis, table: pd.DataFrame) -> Mapping[str, NDArray[np.bool_]]:
+    """Tell which rows belong to each group."""
+    if analysis.groups is None:
+        return {ALL: np.ones(len(table), dtype=bool)}
+    names = table[analysis.groups.column]
+    return {level: (names == level).to_numpy() for level in analysis.groups.levels}
+
+
+def mean_of_known(values: Float, axis: int) -> Float:
+    """Mean without what is missing; NaN where nothing is known."""
+    known = np.isfinite(values)
+    count = known.sum(axis=axis)
+    total = np.where(known, values, 0.0).sum(axis=axis)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def spread_of_known(values: Float) -> Float:
+    """Take the standard deviation over the first axis of what is known; NaN below two values."""
+    count = np.isfinite(values).sum(axis=0)
+    variance = mean_of_known((values - mean_of_known(values, 0)) ** 2, 0)
+    return np.where(count > 1, np.sqrt(variance * count / np.maximum(count - 1, 1)), np.nan)

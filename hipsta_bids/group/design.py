@@ -12,9 +12,10 @@ from formulaic.errors import FormulaicError
 from numpy.typing import NDArray
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.contrasts import Contrast
-from hipsta_bids.group.model_spec import ContrastSpec, ModelSpec
-from hipsta_bids.group.variables import (
+from hipsta_bids.group.formula import (
+    Contrast,
+    ContrastSpec,
+    ModelSpec,
     check_left,
     check_names,
     listed,
@@ -22,7 +23,7 @@ from hipsta_bids.group.variables import (
     set_levels,
     typed,
 )
-from hipsta_bids.group_settings import DesignSettings
+from hipsta_bids.group.settings import DesignSettings
 
 FloatArray = NDArray[np.float64]
 

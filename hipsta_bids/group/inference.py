@@ -1,19 +1,192 @@
 """What survives when many points are tested: false discovery rate, or permutations."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
+from statsmodels.stats.multitest import multipletests
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.fitted import FittedMaps
-from hipsta_bids.group.mesh_graph import mesh_edges
-from hipsta_bids.group.multiplicity import BELOW_ALL, Discoveries, MapKey, discover, families
+from hipsta_bids.group.adjacency import mesh_edges
+from hipsta_bids.group.data import Float, Int
+from hipsta_bids.group.fit import FittedMaps, RowModel
+from hipsta_bids.group.formula import check_names, listed
 from hipsta_bids.group.permutation import PermutationPart, PermutationTest, permute
-from hipsta_bids.group.row_model import RowModel
-from hipsta_bids.group.variables import check_names, listed
-from hipsta_bids.group_data import Float, Int
-from hipsta_bids.group_settings import GroupSettings, MultiplicitySettings
+from hipsta_bids.group.settings import GroupSettings, MultiplicitySettings
+
+# False discovery rates over the points of a map.
+
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+#: Share of the smallest p that serves as cut-off when nothing is rejected.
+BELOW_ALL = 0.1
+
+
+@dataclass(frozen=True)
+class Discoveries:
+    """Tests that survive, in the shape of the p-values."""
+
+    adjusted: FloatArray
+    """Compare with ``alpha``; of false discovery rates it holds for this level. NaN where there
+    was no test."""
+    rejected: BoolArray
+    cutoff: float
+    """Largest raw p that is rejected; a tenth of the smallest p if none is (the convention of
+    FreeSurfer's ``lme_mass_FDR``), so that nothing lies at or below it; NaN without tests,
+    and where clusters decide."""
+    n_tests: int
+    n_null: int
+    """Estimated number of true null hypotheses; but for ``fdr2`` the number of tests."""
+    alpha: float
+
+    @property
+    def lenient(self) -> bool:
+        """Whether raw p-values above ``alpha`` pass, as they may when effects are widespread."""
+        return bool(self.rejected.any()) and self.cutoff > self.alpha
+
+
+def fdr_two_stage(p: FloatArray, alpha: float) -> Discoveries:
+    """Two-stage step-up procedure of Benjamini, Krieger and Yekutieli (2006), "FDR2".
+
+    The first stage, at ``alpha / (1 + alpha)``, estimates how many null hypotheses are true; the
+    second allows for that many only.
+
+    Parameters
+    ----------
+    p : ndarray
+        Of any shape; NaN is no test.
+    alpha : float
+        False discovery rate.
+
+    Returns
+    -------
+    Discoveries
+        With the adjusted p-values of statsmodels' ``fdr_tsbky``.
+    """
+    return _discoveries(p, alpha, "fdr_tsbky")
+
+
+def fdr_benjamini_hochberg(p: FloatArray, alpha: float) -> Discoveries:
+    """Step-up procedure of Benjamini and Hochberg (1995); see :func:`fdr_two_stage`."""
+    return _discoveries(p, alpha, "fdr_bh")
+
+
+@dataclass(frozen=True, order=True)
+class MapKey:
+    """Which map of statistics."""
+
+    measure: str
+    contrast: str
+    hemi: str
+
+
+def families(maps: Iterable[MapKey], scope: str) -> list[list[MapKey]]:
+    """Group maps whose points are tested together.
+
+    Parameters
+    ----------
+    maps : iterable of MapKey
+        All maps.
+    scope : str
+        ``map`` or ``hemispheres``.
+    """
+    found: dict[tuple[str, ...], list[MapKey]] = {}
+    for key in maps:
+        family = (key.measure, key.contrast, *(() if scope == "hemispheres" else (key.hemi,)))
+        found.setdefault(family, []).append(key)
+    return list(found.values())
+
+
+def discover(
+    maps: Mapping[MapKey, FloatArray], settings: MultiplicitySettings
+) -> dict[MapKey, Discoveries]:
+    """Control the false discovery rate of several maps, in families.
+
+    Parameters
+    ----------
+    maps : mapping of MapKey to ndarray
+        p-values of any shape; NaN is no test.
+    settings : MultiplicitySettings
+        Method, level, and what is one family.
+
+    Returns
+    -------
+    dict
+        In pooled families cut-off and counts are those of the family.
+    """
+    method = fdr_benjamini_hochberg if settings.method == "bh" else fdr_two_stage
+    found = {}
+    for keys in families(maps, settings.scope):
+        together = method(np.concatenate([maps[key].ravel() for key in keys]), settings.alpha)
+        ends = np.cumsum([maps[key].size for key in keys])[:-1]
+        adjusted, rejected = np.split(together.adjusted, ends), np.split(together.rejected, ends)
+        for key, values, flags in zip(keys, adjusted, rejected, strict=True):
+            shape = maps[key].shape
+            found[key] = replace(
+                together, adjusted=values.reshape(shape), rejected=flags.reshape(shape)
+            )
+    return {key: found[key] for key in maps}
+
+
+def _discoveries(p: FloatArray, alpha: float, method: str) -> Discoveries:
+    valid = np.isfinite(p)
+    tests = p[valid]
+    adjusted = np.full(p.shape, np.nan)
+    rejected = np.zeros(p.shape, dtype=bool)
+    cutoff, n_null = np.nan, len(tests)
+    if len(tests):
+        rejected[valid], adjusted[valid], *_ = multipletests(tests, alpha, method)
+        cutoff = tests[rejected[valid]].max() if rejected.any() else tests.min() * BELOW_ALL
+        if method == "fdr_tsbky":
+            stage = multipletests(tests, alpha / (1 + alpha), "fdr_bh")[0]
+            n_null = int(len(tests) - stage.sum())
+    return Discoveries(adjusted, rejected, float(cutoff), len(tests), n_null, alpha)
+
+
+def adjusted_at_any_level(p: FloatArray) -> FloatArray:
+    """Smallest false discovery rate at which the two-stage procedure rejects each test.
+
+    Unlike :attr:`Discoveries.adjusted` the value does not depend on a level chosen before, and
+    can be compared with any. The first stage at rate b = alpha / (1 + alpha) rejects k of m
+    tests if the k-th smallest Benjamini-Hochberg value q is at most b, the second stage test i if
+    q_i (m - k) / m is; so the answer is the least over k of the larger of the two.
+
+    Parameters
+    ----------
+    p : ndarray
+        Of any shape; NaN is no test.
+
+    Returns
+    -------
+    ndarray
+        In the shape of ``p``; at most 1.
+    """
+    result = np.full(p.shape, np.nan)
+    valid = np.isfinite(p)
+    m = int(valid.sum())
+    if not m:
+        return result
+    single = np.asarray(multipletests(p[valid], method="fdr_bh")[1], dtype=np.float64)
+    ordered = np.sort(single)
+
+    def rate(k: NDArray[np.int64]) -> FloatArray:
+        return np.maximum(ordered[k - 1], single * (m - k) / m)
+
+    # The first term rises with k and the second falls: look for where they cross by bisection.
+    low, high = np.ones(m, dtype=np.int64), np.full(m, m, dtype=np.int64)
+    while (low < high).any():
+        middle = (low + high) // 2
+        crossed = ordered[middle - 1] >= single * (m - middle) / m
+        high = np.where(crossed, middle, high)
+        low = np.where(crossed, low, np.minimum(middle + 1, high))
+    least = np.minimum(rate(low), rate(np.maximum(low - 1, 1)))
+    result[valid] = np.minimum(least / np.maximum(1 - least, np.finfo(np.float64).tiny), 1.0)
+    return result
+
 
 #: Methods that hold the family-wise error rate.
 PERMUTATIONS = ("permutation-tfce", "permutation-max")
@@ -57,7 +230,7 @@ def correct(
         shape = fitted[keys[0].hemi].maps.shape
         results = permute(parts, tests[keys[0]].contrast, shape, settings=how, blocks=blocks)
         raw = [tests[key].p for key in keys]
-        found |= dict(zip(keys, _discoveries(results, raw, how), strict=True))
+        found |= dict(zip(keys, _permuted_discoveries(results, raw, how), strict=True))
     return {key: found[key] for key in tests}
 
 
@@ -105,7 +278,7 @@ def _part(one: FittedMaps, measure: str, model: RowModel) -> PermutationPart:
     return PermutationPart(one.values(measure), model.design.matrix[one.rows], one.rows, edges)
 
 
-def _discoveries(
+def _permuted_discoveries(
     results: Sequence[PermutationTest], raw: Sequence[Float], how: MultiplicitySettings
 ) -> list[Discoveries]:
     enhanced = how.method == "permutation-tfce"

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy import optimize, special
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group_settings import ClassificationSettings
+from hipsta_bids.group.settings import ClassificationSettings
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

@@ -1,14 +1,22 @@
 """How far each subject is from what a reference group would have, given the covariates."""
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
+import pandas as pd
+from formulaic import Formula
 from numpy.typing import NDArray
 from scipy import special
 
 from hipsta_bids.errors import ModelError
+from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float, Int, Measures
+from hipsta_bids.group.design import build_design
+from hipsta_bids.group.fit import most_frequent
+from hipsta_bids.group.formula import ModelSpec, check_names, listed
 from hipsta_bids.group.glm import chunks, fit_block
-from hipsta_bids.group_settings import GlmSettings
+from hipsta_bids.group.settings import GlmSettings, GroupSettings
+from hipsta_bids.group.summaries import hemispheres, summary_values
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -121,3 +129,205 @@ def _score(
     freedom = np.where(member, df - 1, df)
     p = 2 * special.stdtr(freedom, -np.abs(w) / np.sqrt(1 + spread))
     return NormativeScores(w, np.asarray(p, dtype=np.float64), fit.n)
+
+
+# Each participant against a reference group: w-scores of maps and of summary measures.
+
+
+#: Region of a score that is the mean over the whole sheet.
+WHOLE = "all"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScoredMaps:
+    """Scores of one hemisphere."""
+
+    rows: Int
+    """(sheets,) rows of the cohort's table."""
+    reference: NDArray[np.bool_]
+    """(sheets,) who belongs to the reference group."""
+    scores: Mapping[str, NormativeScores]
+    """By measure; points in the order of the sheet."""
+    subfield: Int
+    """(x, y) most frequent subfield, place in ``names``."""
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Scores:
+    """All scores against one reference group."""
+
+    factor: str
+    level: str
+    formula: str
+    """Covariates that are adjusted for."""
+    n_reference: int
+    sides: Mapping[str, ScoredMaps]
+    """By hemisphere; empty without maps."""
+    table: pd.DataFrame
+    """One row per participant, hemisphere and summary measure or region of a map."""
+
+
+def score_cohort(
+    cohort: Cohort,
+    model: ModelSpec,
+    normative: tuple[str, str],
+    settings: GroupSettings,
+    *,
+    measures: Measures,
+    references: Mapping[str, str],
+) -> Scores:
+    """Score everybody who has the covariates of a model, whatever their group.
+
+    Parameters
+    ----------
+    cohort : Cohort
+        One row per participant, with registered maps or changes.
+    model : ModelSpec
+        Its terms without the factor are the covariates.
+    normative : (str, str)
+        Factor and level of the reference group.
+    settings : GroupSettings
+        Of the linear model; points count as low or high at its level of confidence.
+    measures : Measures
+        Maps and summaries to score.
+    references : mapping of str to str
+        Reference levels of factors.
+
+    Raises
+    ------
+    ModelError
+        If factor or level are unknown, or the reference group is too small for the covariates.
+    """
+    factor, level = normative
+    formula = _without(model.formula, factor)
+    known = {str(name) for name in Formula(formula).required_variables}
+    check_names([factor], cohort.table.columns)
+    chosen = {name: text for name, text in references.items() if name in known}
+    spec = replace(model, formula=formula, contrasts=(), dummy=None)
+    design = build_design(cohort.table, spec, settings.design, chosen)
+    column = cohort.table[factor].astype(object).iloc[design.rows]
+    reference = (column.astype(str) == level).to_numpy()
+    if not reference.any():
+        raise ModelError(
+            f"w-scores: nobody with the covariates has {factor!r} {level!r}; there are"
+            f" {listed(sorted(column.dropna().astype(str).unique()))}",
+            reason="unknown-level",
+        )
+    sides = {}
+    for hemi, side in cohort.sides.items() if measures.maps else ():
+        _, used, rows = np.intersect1d(side.rows, design.rows, return_indices=True)
+        matrix, own = design.matrix[rows], reference[rows]
+        sides[hemi] = ScoredMaps(
+            rows=design.rows[rows],
+            reference=own,
+            scores={
+                name: w_scores(
+                    side.maps[name][used].reshape(len(used), -1), matrix, own, settings.glm
+                )
+                for name in measures.maps
+            },
+            subfield=most_frequent(side.subfield[used], len(side.names)),
+            names=side.names,
+        )
+    parts = [
+        *_map_rows(cohort, sides, settings),
+        *_summary_rows(
+            cohort, design.rows, design.matrix, reference, measures=measures, settings=settings
+        ),
+    ]
+    return Scores(
+        factor=factor,
+        level=level,
+        formula=formula,
+        n_reference=int(reference.sum()),
+        sides=sides,
+        table=pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(),
+    )
+
+
+def _without(formula: str, factor: str) -> str:
+    """Leave out all terms in which a variable has a part."""
+    terms = [
+        str(term)
+        for term in Formula(formula)
+        if factor not in {str(name) for name in Formula(str(term)).required_variables}
+    ]
+    return " + ".join(terms) or "1"
+
+
+def _map_rows(
+    cohort: Cohort, sides: Mapping[str, ScoredMaps], settings: GroupSettings
+) -> Iterator[pd.DataFrame]:
+    """Means over the sheet and over each subfield, and how many points are out of line."""
+    alpha = 1 - settings.glm.confidence
+    for hemi, side in sides.items():
+        fields = side.subfield.ravel()
+        regions = {WHOLE: np.ones(len(fields), dtype=bool)}
+        regions |= {name: fields == i for i, name in enumerate(side.names)}
+        for measure, found in side.scores.items():
+            out = found.p < alpha
+            for region, points in regions.items():
+                if not points.any():
+                    continue
+                scored = np.isfinite(found.w[:, points])
+                count = np.where(scored.any(axis=1), scored.sum(axis=1), np.nan)
+
+                def share(
+                    flags: NDArray[np.bool_],
+                    points: NDArray[np.bool_] = points,
+                    count: Float = count,
+                ) -> Float:
+                    return np.asarray(flags[:, points].sum(axis=1) / count)
+
+                yield _rows(
+                    cohort,
+                    side.rows,
+                    hemi=hemi,
+                    measure=measure,
+                    region=region,
+                    reference=side.reference,
+                    w=np.where(scored, found.w[:, points], 0.0).sum(axis=1) / count,
+                    p=np.nan,
+                    low=share(out & (found.w < 0)),
+                    high=share(out & (found.w > 0)),
+                )
+
+
+def _summary_rows(
+    cohort: Cohort,
+    rows: Int,
+    matrix: Float,
+    reference: NDArray[np.bool_],
+    *,
+    measures: Measures,
+    settings: GroupSettings,
+) -> Iterator[pd.DataFrame]:
+    for hemi in hemispheres(cohort):
+        values = summary_values(cohort, hemi, measures.summaries).iloc[rows]
+        own = values[reference]
+        varying = values.columns[(own.max() > own.min()).to_numpy()]
+        if not len(varying):
+            continue
+        found = w_scores(
+            values[varying].to_numpy(dtype=np.float64), matrix, reference, settings.glm
+        )
+        for i, measure in enumerate(varying):
+            yield _rows(
+                cohort,
+                rows,
+                hemi=hemi,
+                measure=str(measure),
+                region=None,
+                reference=reference,
+                w=found.w[:, i],
+                p=found.p[:, i],
+                low=np.nan,
+                high=np.nan,
+            )
+
+
+def _rows(cohort: Cohort, rows: Int, **columns: object) -> pd.DataFrame:
+    visits = cohort.table.iloc[rows]
+    names = {name: visits[name].to_numpy() for name in (PARTICIPANT, SESSION)}
+    return pd.DataFrame({**names, **columns})

@@ -6,12 +6,11 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from hipsta_bids.group.fitted import FittedMaps
+from hipsta_bids.group.adjacency import Cluster, find_clusters, find_mesh_clusters, mesh_edges
+from hipsta_bids.group.data import Cohort
+from hipsta_bids.group.fit import FittedMaps
 from hipsta_bids.group.glm import PointTest
-from hipsta_bids.group.mesh_graph import find_mesh_clusters, mesh_edges
-from hipsta_bids.group.multiplicity import Discoveries
-from hipsta_bids.group.sheet_graph import Cluster, find_clusters
-from hipsta_bids.group_data import Cohort
+from hipsta_bids.group.inference import Discoveries
 
 FloatArray = NDArray[np.float64]
 

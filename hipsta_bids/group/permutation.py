@@ -8,11 +8,10 @@ from numpy.typing import NDArray
 from scipy.linalg import null_space
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.contrasts import Contrast
+from hipsta_bids.group.adjacency import enhance, enhance_on_mesh
+from hipsta_bids.group.formula import Contrast
 from hipsta_bids.group.glm import fit_points
-from hipsta_bids.group.mesh_graph import enhance_on_mesh
-from hipsta_bids.group.sheet_graph import enhance
-from hipsta_bids.group_settings import GlmSettings, MultiplicitySettings
+from hipsta_bids.group.settings import GlmSettings, MultiplicitySettings
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -13,7 +13,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from hipsta_bids.group_settings import LongitudinalSettings
+from hipsta_bids.group.settings import LongitudinalSettings
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -1,5 +1,6 @@
 """Registration of curvature profiles, so that the same grid node means the same place."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -7,10 +8,15 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.splines import inner_knots, make_basis
-from hipsta_bids.group.template import Template, fit_template, subject_curves
+from hipsta_bids.group.settings import RegistrationSettings
+from hipsta_bids.group.template import (
+    Template,
+    fit_template,
+    inner_knots,
+    make_basis,
+    subject_curves,
+)
 from hipsta_bids.group.warps import WarpBasis, fit_warps, warp_values
-from hipsta_bids.group_settings import RegistrationSettings
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -243,3 +249,74 @@ def _finish(
 def _explained(profiles: FloatArray) -> float:
     """Share of the variance that the mean profile explains."""
     return 1 - float(np.mean(profiles.var(axis=0))) / max(float(profiles.var()), 1e-300)
+
+
+# Profiles along x before registration, and displacements of groups after it.
+
+
+@dataclass(frozen=True)
+class GroupShift:
+    """By how much a group was displaced."""
+
+    mean: FloatArray
+    """(nodes,) registered minus original position, in grid nodes; positive is lateral."""
+    se: FloatArray
+    """(nodes,)"""
+    n: int
+
+
+def mean_profiles(maps: FloatArray, settings: RegistrationSettings) -> FloatArray:
+    """Profiles along x: means over y, with gaps filled linearly.
+
+    Parameters
+    ----------
+    maps : ndarray, shape (subjects, x, y)
+        Curvature, NaN where missing.
+    settings : RegistrationSettings
+        How much may be missing.
+
+    Raises
+    ------
+    ModelError
+        If too much of a profile is missing; names the rows.
+    """
+    present = np.isfinite(maps)
+    counts = present.sum(axis=2)
+    sums = np.where(present, maps, 0.0).sum(axis=2)
+    profiles = sums / np.maximum(counts, 1)
+    empty = counts == 0
+    bad = np.flatnonzero(empty.mean(axis=1) > settings.max_gap)
+    if len(bad):
+        raise ModelError(
+            f"registration: rows {', '.join(map(str, bad[:10]))} of the maps lack more than"
+            f" {settings.max_gap:.0%} of the profile; leave them out",
+            reason="profile-missing",
+        )
+    nodes = np.arange(maps.shape[1])
+    for row in np.flatnonzero(empty.any(axis=1)):  # few
+        gaps = empty[row]
+        profiles[row, gaps] = np.interp(nodes[gaps], nodes[~gaps], profiles[row, ~gaps])
+    return np.asarray(profiles, dtype=np.float64)
+
+
+def shift_by_group(
+    registration: Registration, groups: Sequence[str] | NDArray[np.str_]
+) -> Mapping[str, GroupShift]:
+    """Mean displacement of each group along x (figure A5 of the paper).
+
+    Parameters
+    ----------
+    registration : Registration
+        Of all subjects.
+    groups : sequence of str, length (subjects,)
+        Group of each.
+    """
+    names = np.asarray(groups)
+    nodes = registration.warps.shape[1]
+    shift = (registration.warps - np.linspace(0, 1, nodes)) * (nodes - 1)
+    result = {}
+    for name in np.unique(names):
+        part = shift[names == name]
+        spread = part.std(axis=0, ddof=1) if len(part) > 1 else np.full(nodes, np.nan)
+        result[str(name)] = GroupShift(part.mean(axis=0), spread / np.sqrt(len(part)), len(part))
+    return result

@@ -2,13 +2,21 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hipsta_bids.derivatives.hemisphere import ResultPlace, fill_from_nearest
+from hipsta_bids.errors import InputError
+from hipsta_bids.geometry.sheet import is_left_handed
+from hipsta_bids.group.analysis import Analysis
+from hipsta_bids.group.collect import SheetRecord
+from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float
+from hipsta_bids.group.settings import GroupSettings, ShapeSettings
 from hipsta_bids.group.warps import warp_values
-from hipsta_bids.group_data import Float
-from hipsta_bids.group_settings import ShapeSettings
+from hipsta_bids.io import files, gifti
+from hipsta_bids.io.gifti import read_mesh
 
 #: Surfaces of a sheet, in the order of the arrays here.
 LAYERS = ("interior", "midthickness", "exterior")
@@ -126,3 +134,131 @@ def _mean(shapes: Float) -> Float:
     count = known.sum(axis=0)
     total = np.where(known, shapes, 0.0).sum(axis=0)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+# Reads the surfaces of many sheets.
+
+
+_KEYS = ("interior_surface", "midthickness_surface", "exterior_surface")
+
+
+def read_layer_surfaces(
+    places: Sequence[ResultPlace], shape: tuple[int, int]
+) -> tuple[list[int], Float]:
+    """Read interior, middle and exterior surfaces of those sheets that have all of them.
+
+    Parameters
+    ----------
+    places : sequence of ResultPlace
+        Hemispheres.
+    shape : (int, int)
+        Nodes of the sheet along x and y.
+
+    Returns
+    -------
+    list of int
+        Places of those read, in the sequence.
+    ndarray, shape (sheets, 3, x, y, 3)
+        mm, in the space of each scan.
+    """
+    found, layers = [], []
+    for i, place in enumerate(places):
+        try:
+            surfaces = [read_mesh(place.path(key)).points for key in _KEYS]
+        except InputError:  # maps and statistics do without it
+            continue
+        if all(surface.shape == (shape[0] * shape[1], 3) for surface in surfaces):
+            found.append(i)
+            layers.append(np.stack(surfaces).reshape(len(_KEYS), *shape, 3))
+    return found, np.array(layers, dtype=np.float64).reshape(-1, len(_KEYS), *shape, 3)
+
+
+# Average surfaces of the sheets that were analyzed, read and written.
+
+
+_MIDTHICKNESS = LAYERS.index("midthickness")
+
+
+def average_shapes(
+    records: Sequence[SheetRecord], cohort: Cohort, analysis: Analysis, settings: GroupSettings
+) -> dict[str, AverageShape]:
+    """Average the surfaces of each hemisphere, of the first visit of each participant.
+
+    Parameters
+    ----------
+    records : sequence of SheetRecord
+        Where the sheets are.
+    cohort : Cohort
+        Visits that were analyzed.
+    analysis : Analysis
+        Warps and groups.
+    settings : GroupSettings
+        How many are read at most; they are spread evenly over all.
+
+    Returns
+    -------
+    dict
+        By hemisphere; without those whose surfaces are missing.
+    """
+    place_of = {
+        (f"sub-{r.place.name.subject}", r.place.name.session or "", r.place.name.hemi): r.place
+        for r in records
+    }
+    shapes = {}
+    for hemi, side in analysis.sides.items() if records else ():
+        visits = cohort.table.iloc[side.registered.rows]
+        first = np.flatnonzero(~visits[PARTICIPANT].duplicated().to_numpy())
+        most = min(len(first), settings.shapes.most)
+        chosen = first[np.linspace(0, len(first) - 1, most).round().astype(np.int64)]
+        keys = [
+            (str(row[PARTICIPANT]), str(row[SESSION] or "").removeprefix("ses-"), hemi)
+            for row in visits.iloc[chosen].to_dict("records")
+        ]
+        chosen = chosen[[key in place_of for key in keys]]
+        places = [place_of[key] for key in keys if key in place_of]
+        read, layers = read_layer_surfaces(places, side.registered.shape)
+        if not read:
+            continue
+        own = chosen[read]
+        groups = analysis.groups
+        names = (
+            np.full(len(own), "all")
+            if groups is None
+            else visits[groups.column].iloc[own].astype(str).to_numpy(dtype=np.str_)
+        )
+        shapes[hemi] = average_shape(
+            layers,
+            side.registration.warps[own],
+            names,
+            ("all",) if groups is None else groups.levels,
+            settings.shapes,
+        )
+    return shapes
+
+
+def write_shapes(folder: Path, shapes: Mapping[str, AverageShape]) -> None:
+    """Write the average middle surfaces, on which maps of statistics can be drawn.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the model.
+    shapes : mapping of str to AverageShape
+        By hemisphere.
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written.
+    """
+    for hemi, shape in shapes.items():
+        points = fill_from_nearest(shape.mean[_MIDTHICKNESS])
+        flip = is_left_handed(np.moveaxis(shape.mean, 0, 2))
+        content = gifti.surface_bytes(
+            points.reshape(-1, 3),
+            gifti.sheet_triangles(*points.shape[:2], flip=flip),
+            hemi=hemi,
+            secondary="MidThickness",
+            unfolded=False,
+        )
+        files.write_bytes(folder / f"hemi-{hemi}_desc-average_midthickness.surf.gii", content)

@@ -8,17 +8,15 @@ import pandas as pd
 from formulaic import Formula
 
 from hipsta_bids.errors import ModelError
+from hipsta_bids.group.classify import PairComparison, compare_pairs
 from hipsta_bids.group.comparison import BOTH
-from hipsta_bids.group.contrasts import Contrast
-from hipsta_bids.group.default_model import Groups
+from hipsta_bids.group.data import Cohort, Float
 from hipsta_bids.group.design import Design, build_design
+from hipsta_bids.group.fit import MEAN, RowModel, with_mean
+from hipsta_bids.group.formula import Contrast, ModelSpec, check_names, typed
 from hipsta_bids.group.glm import PointwiseFit
-from hipsta_bids.group.model_spec import ModelSpec
-from hipsta_bids.group.pairs import PairComparison, compare_pairs
-from hipsta_bids.group.row_model import MEAN, RowModel, with_mean
-from hipsta_bids.group.variables import check_names, typed
-from hipsta_bids.group_data import Cohort, Float
-from hipsta_bids.group_settings import GroupSettings
+from hipsta_bids.group.model import Groups
+from hipsta_bids.group.settings import GroupSettings
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -1,19 +1,252 @@
 """Results as tables, and the meaning of their columns."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 import pandas as pd
 
-from hipsta_bids.group.analysis import Analysis
-from hipsta_bids.group.classification import ClassifierResult
-from hipsta_bids.group.figure_tables import figure_tables, mean_table
+from hipsta_bids.group.analysis import Analysis, mean_of_known, members_of, rows_of, spread_of_known
+from hipsta_bids.group.classify import ClassifierResult, roc_curve
+from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float, ResultTable
 from hipsta_bids.group.glm import PointTest
-from hipsta_bids.group.multiplicity import Discoveries, MapKey
+from hipsta_bids.group.inference import Discoveries, MapKey
 from hipsta_bids.group.peaks import Frame, frame_of, peak_table
+from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.summaries import hemispheres, summary_values
-from hipsta_bids.group_data import Cohort, ResultTable
-from hipsta_bids.group_settings import GroupSettings
+
+# The meaning of every column of the group level's tables.
+
+
+#: Meaning of every column; the unit is that of the measure unless said.
+COLUMNS: Mapping[str, str] = {
+    "hemi": "hemisphere, L or R; LR is the mean of both, of asymmetry left minus right",
+    "measure": "map or summary measure; volume_NAME_STRUCTURE is from NAME's own table of volumes",
+    "unit": "unit of the measure",
+    "contrast": "name of the contrast; A-B is positive where A has more",
+    "model": "right-hand side of the model",
+    "test": "t, or F for contrasts of several rows",
+    "x": "sheet coordinate, -1 medial to 1 lateral",
+    "y": "sheet coordinate, -1 posterior to 1 anterior",
+    "vertex": "vertex of the surface, the first is 0",
+    "surface_x": "coordinate of the vertex on the surface that the maps lie on",
+    "surface_y": "the same along the second axis",
+    "surface_z": "the same along the third axis",
+    "node_x": "node along x, 1 is most medial; coordinates are registered",
+    "node_y": "node along y, 1 is most posterior",
+    "subfield": "subfield, most frequent after registration",
+    "n": "participants with a value",
+    "n_cases": "of these, in the second group",
+    "n_incomplete": "participants of the two groups that lack a value",
+    "estimate": "contrast of the model's coefficients, unit of the measure; n/a for F",
+    "se": "standard error of the estimate, unit of the measure; n/a for F",
+    "statistic": "t or F",
+    "df": "degrees of freedom; of F, the denominator's",
+    "p": "two-sided p-value, not corrected",
+    "p_corrected": "p-value corrected for the number of points, by the method of analysis.json",
+    "significant": "true where the corrected p-value is at most the level",
+    "effect": "kind of effect size",
+    "effect_size": "Cohen's d (estimate over residual SD), or partial eta squared",
+    "effect_low": "lower confidence limit of the effect size",
+    "effect_high": "upper confidence limit of the effect size",
+    "cohen_d": "estimate over residual SD; n/a for F",
+    "cohen_d_low": "lower confidence limit",
+    "cohen_d_high": "upper confidence limit",
+    "eta_squared": "partial eta squared",
+    "eta_squared_low": "lower confidence limit",
+    "eta_squared_high": "upper confidence limit",
+    "extent": "points of the cluster; 0 for the largest statistic of a map without findings",
+    "shares": "share of the cluster in each subfield",
+    "file": "name of the files with this map, without suffix",
+    "n_tests": "points tested in the family",
+    "n_significant": "points of the map that survive",
+    "p_cutoff": "largest p-value that survives; below all if none does; n/a if clusters decide",
+    "lenient": "true where p-values above the level survive, as they may with widespread effects",
+    "group": "group",
+    "registered": "false before registration, true after it",
+    "mean": "mean, unit of the measure",
+    "sd": "standard deviation, unit of the measure",
+    "mean_se": "standard error of the mean, unit of the measure",
+    "shift": "registered minus original position, in grid nodes; positive is lateral",
+    "shift_se": "standard error of the shift, grid nodes",
+    "explained_before": "share of the variance of curvature profiles that their mean explains",
+    "explained_after": "the same after registration",
+    "iterations": "turns of template and warps",
+    "converged": "whether warps had settled",
+    "displacement": "root mean square of warp minus identity, grid nodes",
+    "extreme": "true where the displacement is out of line with the others",
+    "control": "first group of the pair",
+    "case": "second group of the pair",
+    "base": "measures of the base model",
+    "added": "measure that is added to it",
+    "auc_base": "area under the curve of the base model, on the participants fitted",
+    "auc_base_low": "lower confidence limit (DeLong)",
+    "auc_base_high": "upper confidence limit (DeLong)",
+    "auc_full": "area under the curve with the measure added, on the participants fitted",
+    "auc_full_low": "lower confidence limit (DeLong)",
+    "auc_full_high": "upper confidence limit (DeLong)",
+    "auc_base_cv": "cross-validated area of the base model",
+    "auc_full_cv": "cross-validated area with the measure added",
+    "auc_base_cv_sd": "standard deviation over repeats",
+    "auc_full_cv_sd": "standard deviation over repeats",
+    "calibration_intercept": "log odds by which cases are more frequent than the full model says,"
+    " cross-validated; 0 if it is right on average",
+    "calibration_slope": "of the full model, cross-validated; below 1 if it is too sure",
+    "brier": "mean squared error of the chance, full model, cross-validated",
+    "classifier": "base, or full with the measure added",
+    "false_positives": "share of the first group at or above a score, one minus specificity",
+    "true_positives": "share of the second group at or above this score, sensitivity",
+    "predicted": "mean predicted chance of a fifth of the participants, or less, cross-validated",
+    "observed": "share of cases among these",
+    "likelihood_ratio": "chi squared of the likelihood-ratio test, base against full model",
+    "lr_df": "its degrees of freedom",
+    "separated": "true where groups were separated, and both models are Firth's",
+    "region": "part of the map that w is the mean of: all, or a subfield; n/a of summary measures",
+    "reference": "true for members of the reference group, who are scored as if not in it",
+    "w": "observed minus expected from the reference group, in its residual standard deviations",
+    "low": "share of points with a two-sided p below the level, and w below zero",
+    "high": "the same, and w above zero",
+    "participant_id": "participant",
+    "session_id": "session",
+    "reason": "why",
+    "message": "what was said about it",
+}
+
+
+# What the figures show, as tables, so that pages and other programs can draw it anew.
+
+
+def figure_tables(cohort: Cohort, analysis: Analysis) -> Iterator[ResultTable]:
+    """Give the tables behind the figures of one model.
+
+    Parameters
+    ----------
+    cohort : Cohort
+        What was analyzed.
+    analysis : Analysis
+        Results.
+
+    Yields
+    ------
+    ResultTable
+    """
+    if analysis.fitted:
+        yield ResultTable(name="means", rows=mean_table(cohort, analysis))
+    if analysis.sides:
+        yield ResultTable(name="profiles", rows=_profiles(cohort, analysis))
+    if analysis.pairs:
+        yield ResultTable(name="roc", rows=_roc(analysis))
+        yield ResultTable(name="calibration", rows=_calibration(analysis))
+
+
+def mean_table(cohort: Cohort, analysis: Analysis) -> pd.DataFrame:
+    """Means and standard deviations of groups at each point of the maps that were fitted.
+
+    Parameters
+    ----------
+    cohort : Cohort
+        Gives coordinates and units.
+    analysis : Analysis
+        Results.
+
+    Returns
+    -------
+    DataFrame
+        One row per measure, hemisphere, group and point.
+    """
+    parts = []
+    for hemi, one in analysis.fitted.items():
+        frame = frame_of(cohort, one)
+        points = np.arange(frame.shape[0] * frame.shape[1])
+        place = {**frame.number(points), **frame.place(points)}
+        members = members_of(analysis, rows_of(analysis, one))
+        for measure in one.fits:
+            values = one.values(measure)
+            for group, own in members.items():
+                what = {
+                    "measure": measure,
+                    "unit": cohort.units.get(measure, "1"),
+                    "hemi": hemi,
+                    "group": group,
+                }
+                parts.append(
+                    pd.DataFrame(
+                        {
+                            **what,
+                            **place,
+                            "n": np.isfinite(values[own]).sum(axis=0),
+                            "mean": mean_of_known(values[own], 0),
+                            "sd": spread_of_known(values[own]),
+                        }
+                    )
+                )
+    return pd.concat(parts, ignore_index=True)
+
+
+def design_table(analysis: Analysis) -> pd.DataFrame:
+    """Give the design matrix, a row per row of the model."""
+    names = analysis.compared.table.iloc[analysis.design.rows][[PARTICIPANT, SESSION]]
+    matrix = pd.DataFrame(
+        analysis.design.matrix, columns=list(analysis.design.columns), index=names.index
+    )
+    return pd.concat([names, matrix], axis=1)
+
+
+def _profiles(cohort: Cohort, analysis: Analysis) -> pd.DataFrame:
+    parts = []
+    for hemi, side in analysis.sides.items():
+        for registered, source in ((False, cohort.sides[hemi]), (True, side.registered)):
+            members = members_of(analysis, cohort.table.iloc[source.rows])
+            for measure, maps in source.maps.items():
+                values = mean_of_known(maps, 2)
+                for group, own in members.items():
+                    count = np.isfinite(values[own]).sum(axis=0)
+                    error = spread_of_known(values[own]) / np.sqrt(np.maximum(count, 1))
+                    parts.append(
+                        pd.DataFrame(
+                            {
+                                "measure": measure,
+                                "unit": cohort.units.get(measure, "1"),
+                                "hemi": hemi,
+                                "registered": registered,
+                                "group": group,
+                                "node_x": np.arange(len(cohort.x)) + 1,
+                                "n": count,
+                                "mean": mean_of_known(values[own], 0),
+                                "mean_se": error,
+                            }
+                        )
+                    )
+    return pd.concat(parts, ignore_index=True)
+
+
+def _curves(
+    analysis: Analysis, curves: Mapping[tuple[int, str], Mapping[str, Float]]
+) -> pd.DataFrame:
+    """Put curves, by number of the comparison and model, under each other."""
+    parts = []
+    for (i, classifier), columns in curves.items():
+        hemi, measure, pair = analysis.pairs[i]
+        what = {"hemi": hemi, "control": pair.control, "case": pair.case, "added": measure}
+        parts.append(pd.DataFrame({**what, "classifier": classifier, **columns}))
+    return pd.concat(parts, ignore_index=True)
+
+
+def _roc(analysis: Analysis) -> pd.DataFrame:
+    curves = {}
+    for i, (_, _, pair) in enumerate(analysis.pairs):
+        for classifier, result in (("base", pair.comparison.base), ("full", pair.comparison.full)):
+            wrong, right = roc_curve(result.score, pair.is_case)
+            curves[i, classifier] = {"false_positives": wrong, "true_positives": right}
+    return _curves(analysis, curves)
+
+
+def _calibration(analysis: Analysis) -> pd.DataFrame:
+    curves = {}
+    for i, (_, _, pair) in enumerate(analysis.pairs):
+        for classifier, result in (("base", pair.comparison.base), ("full", pair.comparison.full)):
+            found = result.calibration
+            curves[i, classifier] = {"predicted": found.predicted, "observed": found.observed}
+    return _curves(analysis, curves)
 
 
 def result_tables(

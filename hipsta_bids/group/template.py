@@ -1,14 +1,35 @@
 """What profiles have in common: a mean and principal components, by expectation-maximization."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import BSpline
 
-from hipsta_bids.group.splines import inner_knots, make_basis
-from hipsta_bids.group_settings import RegistrationSettings
+from hipsta_bids.errors import ModelError
+from hipsta_bids.group.settings import RegistrationSettings
+
+# Cubic B-splines on the unit interval, clamped at its ends.
+
 
 FloatArray = NDArray[np.float64]
+
+_DEGREE = 3
+
+
+def inner_knots(values: FloatArray, splines: int) -> FloatArray:
+    """Knots at quantiles of the values, so many that there are ``splines`` functions."""
+    shares = np.linspace(0.0, 1.0, splines - _DEGREE + 1)[1:-1]
+    return np.asarray(np.quantile(values, shares), dtype=np.float64)
+
+
+def make_basis(knots: FloatArray) -> BSpline[np.float64]:
+    """All B-splines of the inner knots as one function, of shape (..., splines)."""
+    ends = np.repeat([0.0, 1.0], _DEGREE + 1)
+    padded = np.concatenate([ends[: _DEGREE + 1], knots, ends[_DEGREE + 1 :]])
+    return BSpline(padded, np.eye(len(padded) - _DEGREE - 1), _DEGREE)
 
 
 @dataclass(frozen=True)
@@ -185,3 +206,63 @@ def _maximize(moments: _Moments, scores: _Scores) -> tuple[FloatArray, FloatArra
     right = np.einsum("si,sp->ip", moments.products, first)
     found = np.linalg.solve(system.reshape(size, size), right.ravel()).reshape(splines, -1)
     return found[:, components], found[:, :components]
+
+
+# Templates of registration as JSON objects, so that they can be kept and used again.
+
+
+_ARRAYS = {"knots", "mean", "components", "center"}
+#: JSON has no infinity; that of the penalty's variance is left out.
+_INFINITE = "warp_variance"
+
+
+def templates_to_json(templates: Mapping[str, Template]) -> dict[str, Any]:
+    """Spell templates by hemisphere.
+
+    Parameters
+    ----------
+    templates : mapping of str to Template
+    """
+    entries = {}
+    for hemi, template in templates.items():
+        entry = {
+            name: value.tolist() if name in _ARRAYS else value
+            for name, value in asdict(template).items()
+        }
+        if not np.isfinite(template.warp_variance):
+            entry[_INFINITE] = None
+        entries[hemi] = entry
+    return {"Description": "template of curvature profiles along x", "Hemispheres": entries}
+
+
+def templates_from_json(content: Mapping[str, Any], where: str) -> dict[str, Template]:
+    """Read templates by hemisphere.
+
+    Parameters
+    ----------
+    content : mapping
+        From :func:`templates_to_json`.
+    where : str
+        File, for messages.
+
+    Raises
+    ------
+    ModelError
+        If it is no such object.
+    """
+    try:
+        found = {}
+        for hemi, entry in content["Hemispheres"].items():
+            values = {field.name: entry[field.name] for field in fields(Template)}
+            for name in _ARRAYS:
+                values[name] = np.array(values[name], dtype=np.float64)
+            if values[_INFINITE] is None:
+                values[_INFINITE] = np.inf
+            found[str(hemi)] = Template(**values)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise ModelError(
+            f"{where}: not a template ({type(error).__name__}: {error}); use the template.json of"
+            " another analysis",
+            reason="template-file",
+        ) from error
+    return found

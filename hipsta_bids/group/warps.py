@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hipsta_bids.group.splines import inner_knots, make_basis
-from hipsta_bids.group_settings import RegistrationSettings
+from hipsta_bids.group.settings import RegistrationSettings
+from hipsta_bids.group.template import inner_knots, make_basis
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -12,13 +12,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hipsta_bids import __version__
-from hipsta_bids.artifacts import Float, LabelVolume
-from hipsta_bids.bids import files
 from hipsta_bids.errors import SettingsError, UsageError
+from hipsta_bids.io import files
 from hipsta_bids.phantom.labels import encode
 from hipsta_bids.phantom.phantom import Phantom
 from hipsta_bids.phantom.spec import PhantomSpec
-from hipsta_bids.schemes import load_scheme
+from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.types import Float, LabelVolume
 
 #: Name of the table of true values, at the top of the dataset.
 TRUTH_TABLE = "phantom_truth.tsv"

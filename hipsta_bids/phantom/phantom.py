@@ -3,10 +3,8 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hipsta_bids.artifacts import Float, LabelVolume
-from hipsta_bids.phantom.body import Body
-from hipsta_bids.phantom.grid import make_grid
-from hipsta_bids.phantom.labels import draw, subfield_spans, tissue_at
+from hipsta_bids.phantom.labels import draw, make_grid, subfield_spans, tissue_at
+from hipsta_bids.phantom.shape import Body
 from hipsta_bids.phantom.spec import PhantomSpec
 from hipsta_bids.phantom.truth import (
     SURFACES,
@@ -16,7 +14,8 @@ from hipsta_bids.phantom.truth import (
     mean_curvature,
     summarize,
 )
-from hipsta_bids.schemes import Scheme, Tissue
+from hipsta_bids.protocols.protocol import Scheme, Tissue
+from hipsta_bids.types import Float, LabelVolume
 
 
 class Phantom:

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hipsta_bids.artifacts import Float
-from hipsta_bids.phantom.body import Body
-from hipsta_bids.phantom.curve import gauss_panels
+from hipsta_bids.phantom.shape import Body, gauss_panels
+from hipsta_bids.types import Float
 
 #: Where a surface lies in the wall, as a fraction of its thickness from the mid-surface.
 SURFACES: Mapping[str, float] = {"interior": -0.5, "mid": 0.0, "exterior": 0.5}

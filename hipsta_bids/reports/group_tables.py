@@ -1,28 +1,342 @@
 """Tables of a group page: participants, model, summary measures, classification, w-scores."""
 
+import csv
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from hipsta_bids.reports.group_findings import (
-    effect_name,
-    place_words,
-    point_of,
-    summary_side,
+from hipsta_bids.io import files
+
+# Reads the files of one analysis of the group level.
+
+
+#: Sides as they stand in tables; of maps and of summary measures, both mean different things.
+SIDES = {"L": "left", "R": "right", "LR": "left minus right"}
+BOTH = "LR"
+
+MINUS = "\N{MINUS SIGN}"
+
+_TEXT = (
+    *("measure", "unit", "contrast", "hemi", "group", "subfield", "shares", "test", "effect"),
+    *("file", "model", "control", "case", "base", "added", "classifier", "region"),
+    *("participant_id", "session_id", "reason", "message"),
 )
-from hipsta_bids.reports.group_results import (
-    SIDES,
-    GroupResults,
-    number_text,
-    p_text,
-    records,
-    spelled,
-    statistic_text,
-    unit_of,
-)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class GroupResults:
+    """The folder of one analysis."""
+
+    folder: Path
+    record: Mapping[str, Any]
+    """What was run, from ``analysis.json``."""
+    _tables: dict[str, pd.DataFrame] = field(default_factory=dict, repr=False)
+
+    @property
+    def name(self) -> str:
+        """Of the model."""
+        return self.folder.name
+
+    @property
+    def levels(self) -> tuple[str, ...]:
+        """Groups that are compared, from least to most affected; perhaps none."""
+        return tuple(str(level) for level in (self.record.get("groups") or {}).get("levels", ()))
+
+    def table(self, name: str) -> pd.DataFrame:
+        """Read a table; empty if there is none.
+
+        Parameters
+        ----------
+        name : str
+            File name without ``.tsv``.
+        """
+        if name not in self._tables:
+            path = self.folder / f"{name}.tsv"
+            self._tables[name] = (
+                pd.read_csv(
+                    path,
+                    sep="\t",
+                    na_values=[files.MISSING],
+                    keep_default_na=False,
+                    dtype=dict.fromkeys(_TEXT, str),
+                    quoting=csv.QUOTE_NONE,
+                )
+                if path.exists()
+                else pd.DataFrame()
+            )
+        return self._tables[name]
+
+    def everywhere(self, name: str) -> pd.DataFrame:
+        """Join a table of the sheets and those of other programs' maps."""
+        others = (self.record.get("inputs") or {}).get("maps") or {}
+        parts = [self.table(name), *(self.table(f"{other}_{name}") for other in others)]
+        return pd.concat([part for part in parts if len(part)] or parts[:1], ignore_index=True)
+
+
+def read_group(folder: Path) -> GroupResults:
+    """Read what an analysis says of itself.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the model.
+
+    Raises
+    ------
+    InputError
+        If ``analysis.json`` cannot be read.
+    """
+    return GroupResults(folder=folder, record=files.read_json(folder / "analysis.json"))
+
+
+def records(table: pd.DataFrame) -> list[dict[str, Any]]:
+    """List the rows of a table by column."""
+    return [dict(zip(map(str, table.columns), row, strict=True)) for row in table.to_numpy(object)]
+
+
+def spelled(measure: str) -> str:
+    """Spell a measure with spaces."""
+    return measure.replace("_", " ")
+
+
+def unit_of(unit: str) -> str:
+    """Spell a unit as people write it; nothing for pure numbers."""
+    return "" if unit == "1" else unit.replace("^2", "²").replace("^3", "³")
+
+
+def with_unit(text: str, unit: str) -> str:
+    """Put a unit behind a number or a name."""
+    return f"{text} {unit_of(unit)}".rstrip()
+
+
+def statistic_text(row: Mapping[str, Any]) -> str:
+    """Spell a statistic with its degrees of freedom; of F, tables have those of the error."""
+    value = number_text(row["statistic"])
+    if row["test"] == "t":
+        return f"t({row['df']:.0f}) {value}"
+    return f"{row['test']} {value}, error df {row['df']:.0f}"
+
+
+def number_text(value: float) -> str:
+    """Spell a number with three digits."""
+    if not np.isfinite(value):
+        return files.MISSING
+    text = f"{value:.3g}"
+    text = f"{value:.0f}" if "e+" in text else text
+    return text.replace("-", MINUS)
+
+
+def p_text(p: float) -> str:
+    """Spell a p-value."""
+    if not np.isfinite(p):
+        return files.MISSING
+    return "< 0.001" if p < 0.001 else f"{p:.3f}"  # noqa: PLR2004  (as papers have it)
+
+
+def direction(results: GroupResults, contrast: str, hemi: str, sign: float) -> str:
+    """Say what a contrast above or below zero means.
+
+    Parameters
+    ----------
+    results : GroupResults
+    contrast : str
+        Its name.
+    hemi : str
+        ``L``, ``R`` or ``LR``.
+    sign : float
+        Of the estimate.
+    """
+    comparison = results.record.get("comparison") or {}
+    if contrast == "mean" and hemi == BOTH:
+        return "larger on the left" if sign > 0 else "larger on the right"
+    if contrast == "mean" and comparison.get("pair"):
+        return "with an increase" if sign > 0 else "with a decrease"
+    # Contrasts as users write them, and as the default model names them: of change in time, too.
+    short = re.sub(r"\w+\[([^\]]*)\]", r"\1", contrast).replace(" - ", "-")
+    for first in results.levels:
+        for second in results.levels:
+            if re.fullmatch(rf"(?:.* in )?{re.escape(first)}-{re.escape(second)}", short):
+                return f"larger in {first if sign > 0 else second}"
+    return "positive" if sign > 0 else "negative"
+
+
+# What an analysis found, and where, in sentences.
+
+
+_THIRD = 1 / 3
+_ALPHA = 0.05  # of tests that are not corrected, for a word only
+
+
+def findings(results: GroupResults) -> Mapping[str, Any] | None:
+    """Say per measure and contrast what survived.
+
+    Parameters
+    ----------
+    results : GroupResults
+
+    Returns
+    -------
+    mapping or None
+        For the template.
+    """
+    maps = results.table("maps")
+    cards = []
+    if len(maps):
+        for (measure, contrast), rows in maps.groupby(["measure", "contrast"], sort=False):
+            sides = [_side(results, row) for row in records(rows)]
+            cards.append(
+                {
+                    "title": f"{spelled(str(measure)).capitalize()}, {contrast}",
+                    "found": any(side["found"] for side in sides),
+                    "sides": sides,
+                }
+            )
+    cards.sort(key=lambda card: not card["found"])
+    settings = results.record.get("settings") or {}
+    multiplicity = settings.get("multiplicity") or {}
+    return {
+        "cards": cards,
+        "n_found": sum(card["found"] for card in cards),
+        "summaries": list(_summaries(results)),
+        "classification": list(_classification(results)),
+        "method": multiplicity.get("method"),
+        "alpha": multiplicity.get("alpha"),
+    }
+
+
+def _side(results: GroupResults, row: Mapping[str, Any]) -> dict[str, Any]:
+    points = results.table(str(row["file"]))
+    peaks = results.everywhere("peaks")
+    same = (peaks["measure"] == row["measure"]) & (peaks["contrast"] == row["contrast"])
+    own = peaks[same & (peaks["hemi"] == row["hemi"])]
+    n, total = int(row["n_significant"]), int(row["n_tests"])
+    title = SIDES.get(str(row["hemi"]), str(row["hemi"])).capitalize()
+    if not len(own):
+        return {"title": title, "found": False, "text": "nothing could be tested.", "peak": ""}
+    if n:
+        where = _where(results, row, points)
+        text = f"{n} of {total} points survive ({_percent(n / total)} of the map): {where}."
+        first = records(own)[int(np.argmax(own["statistic"].abs()))]
+    else:
+        text = f"none of {total} points survives."
+        first = records(own)[0]
+    return {
+        "title": title,
+        "found": n > 0,
+        "text": text,
+        "peak": f"Strongest at {_peak(results, first, points)}.",
+    }
+
+
+def _percent(share: float) -> str:
+    return f"{share:.0%}" if share >= 0.01 else "less than 1%"  # noqa: PLR2004
+
+
+def _where(results: GroupResults, row: Mapping[str, Any], points: pd.DataFrame) -> str:
+    """Say how many points lie in which subfield, by direction."""
+    found = points[points["significant"] == True]  # noqa: E712  (may hold missing values)
+    signed = points["cohen_d"].notna().any()
+    parts = []
+    for sign in (1, -1):
+        own = found[np.sign(found["statistic"]) == sign]
+        if not len(own):
+            continue
+        shares = own["subfield"].fillna("n/a").value_counts(normalize=True)
+        places = [f"{name} {share:.0%}" for name, share in shares.items() if name != "n/a"]
+        words = [f"{len(own)} points"]
+        if signed:
+            words.append(direction(results, str(row["contrast"]), str(row["hemi"]), sign))
+        parts.append(" ".join(words) + (f" ({', '.join(places)})" if places else ""))
+    return "; ".join(parts)
+
+
+def _peak(results: GroupResults, peak: Mapping[str, Any], points: pd.DataFrame) -> str:
+    here = point_of(peak, points)
+    what = [f"{effect_name(peak['effect'])} {number_text(peak['effect_size'])}"]
+    if here is not None and np.isfinite(here["estimate"]):
+        unit = _unit(results, str(peak["measure"]))
+        what.insert(0, f"estimate {with_unit(number_text(here['estimate']), unit)}")
+    place = place_words(peak)
+    return f"{place}: {', '.join(what)}, corrected p {p_text(peak['p_corrected'])}"
+
+
+def _unit(results: GroupResults, measure: str) -> str:
+    means = results.everywhere("means")
+    if not len(means):
+        return "1"
+    own = means.loc[means["measure"] == measure, "unit"]
+    return str(own.iloc[0]) if len(own) else "1"
+
+
+def point_of(peak: Mapping[str, Any], points: pd.DataFrame) -> pd.Series | None:
+    """Find the point of a map that a peak is."""
+    names = ("vertex",) if "vertex" in points else ("x", "y")
+    same = np.all([points[name] == peak[name] for name in names], axis=0)
+    return points[same].iloc[0] if same.any() else None
+
+
+def place_words(peak: Mapping[str, Any]) -> str:
+    """Say where a peak lies."""
+    field = peak["subfield"] if isinstance(peak["subfield"], str) else ""
+    if np.isfinite(peak.get("x", np.nan)):
+        words = [
+            ends[1] if abs(peak[axis]) < _THIRD else ends[0 if peak[axis] < 0 else 2]
+            for axis, ends in (
+                ("x", ("medial", "middle", "lateral")),
+                ("y", ("posterior", "midway", "anterior")),
+            )
+        ]
+        x, y = (f"{peak[axis]:.2f}".replace("-", MINUS) for axis in "xy")
+        inside = f"{field}, " if field else ""
+        return f"{inside}{', '.join(words)} (x {x}, y {y})"
+    inside = f"{field}, " if field else ""
+    return f"{inside}vertex {int(peak['vertex'])}"
+
+
+def effect_name(effect: str) -> str:
+    """Spell the kind of an effect size."""
+    return {"cohen_d": "d", "partial_eta_squared": "partial η²"}.get(effect, effect)
+
+
+def _summaries(results: GroupResults) -> Iterator[str]:
+    """Summary measures that differ, uncorrected."""
+    table = results.table("measures")
+    if not len(table):
+        return
+    for (contrast, measure), rows in table.groupby(["contrast", "measure"], sort=False):
+        own = rows[rows["p"] < _ALPHA]
+        if len(own):
+            yield f"{spelled(str(measure))}, {contrast}: " + "; ".join(
+                f"{summary_side(row['hemi'], str(measure))} {effect_name(row['effect'])}"
+                f" {number_text(row['effect_size'])}, p {p_text(row['p'])}"
+                for row in records(own)
+            )
+
+
+def summary_side(hemi: str, measure: str) -> str:
+    """Spell the side of a summary measure."""
+    if hemi == "LR" and not measure.endswith("_asymmetry"):
+        return "mean of both sides"
+    return SIDES.get(hemi, hemi)
+
+
+def _classification(results: GroupResults) -> Iterator[str]:
+    """Name the pairs in which a measure adds to the base model."""
+    table = results.table("classification")
+    for row in records(table):
+        if row["p"] < _ALPHA:
+            yield (
+                f"{row['control']} against {row['case']},"
+                f" {summary_side(row['hemi'], row['added'])}:"
+                f" {spelled(row['added'])} adds to {row['base']} (p {p_text(row['p'])});"
+                f" cross-validated area {row['auc_base_cv']:.2f} to {row['auc_full_cv']:.2f}"
+            )
+
 
 _MOST_ROWS = 200  # of lists, so that pages stay small
 _IDS = ("participant_id", "session_id")

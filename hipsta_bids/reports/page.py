@@ -12,6 +12,7 @@ from hipsta_bids import __version__
 if TYPE_CHECKING:
     from jinja2 import Environment
 
+
 _LOGGER = logging.getLogger(__name__)
 _Topic = TypeVar("_Topic")
 

@@ -6,10 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hipsta_bids.artifacts import Float
-from hipsta_bids.reports.figures import MAP_KINDS, color_table, scale_of
-from hipsta_bids.reports.results import SURFACES, Hemisphere
-from hipsta_bids.reports.volumes import Views
+from hipsta_bids.reports.maps import MAP_KINDS, color_table, scale_of
+from hipsta_bids.reports.results import SURFACES, Hemisphere, Views
+from hipsta_bids.types import Float
 
 #: Finer masks of failed hemispheres are thinned to about this edge before they are drawn, mm.
 _EDGE = 0.6

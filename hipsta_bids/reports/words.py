@@ -1,13 +1,48 @@
 """Words for people: what a status means, and which quality numbers are usual."""
 
 import math
+import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from functools import cache
+from importlib.resources import files
 from typing import Any
 
-from hipsta_bids.artifacts import Status
 from hipsta_bids.reports.results import Hemisphere
 from hipsta_bids.settings import Settings
+from hipsta_bids.types import Status
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reason:
+    """What a machine-readable reason means, and what to do about it."""
+
+    meaning: str
+    remedy: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReasonSection:
+    """Reasons that are met in the same place."""
+
+    title: str
+    text: str
+    reasons: Mapping[str, Reason]
+    """By their names."""
+
+
+@cache
+def reason_sections() -> tuple[ReasonSection, ...]:
+    """Read the table of all reasons, in the order of the reference page."""
+    text = (files("hipsta_bids.reports") / "reasons.toml").read_text(encoding="utf-8")
+    return tuple(
+        ReasonSection(
+            title=section["title"],
+            text=section["text"],
+            reasons={name: Reason(**row) for name, row in section["reasons"].items()},
+        )
+        for section in tomllib.loads(text)["section"]
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

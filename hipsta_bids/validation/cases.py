@@ -1,18 +1,27 @@
 """One phantom, drawn, measured and set beside its truth; and the poses in which to draw it."""
 
-from collections.abc import Mapping
+import contextlib
+import os
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hipsta_bids.artifacts import Float, HemisphereMaps, LabelVolume
-from hipsta_bids.participant import measure_hemisphere
+from hipsta_bids.errors import HipstaError
+from hipsta_bids.inputs.labels import read_label_volume
+from hipsta_bids.inputs.search import HemisphereInput, InputRequest, find_hemispheres
+from hipsta_bids.participant.measure import measure_hemisphere
+from hipsta_bids.participant.pool import WorkerLost, WorkerPlan, run_jobs
 from hipsta_bids.phantom import Phantom, PhantomSpec
-from hipsta_bids.phantom.body import PITCH
-from hipsta_bids.schemes import load_scheme
+from hipsta_bids.phantom.shape import PITCH
+from hipsta_bids.protocols.load import load_scheme
 from hipsta_bids.settings import GridSettings, Settings
+from hipsta_bids.types import Float, HemisphereMaps, LabelVolume
 
 #: Maps of curvature that are compared with the truth, interior to exterior.
 CURVATURES = ("curvature_interior", "curvature", "curvature_exterior")
@@ -172,3 +181,173 @@ def _motion(turn: Float, shift: Float) -> Float:
     motion = np.eye(4)
     motion[:3, :3], motion[:3, 3] = turn, shift
     return motion
+
+
+# Bodies that suites damage or reslice: phantoms, and segmentations of a dataset.
+
+
+ValidationBody = PhantomSpec | HemisphereInput
+
+
+def fine_segmentations(labels: Path, largest: float) -> list[HemisphereInput]:
+    """Find the usable segmentations of a dataset with voxels of at most ``largest`` mm."""
+    return [
+        item
+        for item in find_hemispheres(InputRequest(bids_dir=labels))
+        if item.problem is None
+        and np.linalg.norm(read_label_volume(item).affine[:3, :3], axis=0).max() <= largest
+    ]
+
+
+def load_body(body: ValidationBody, voxel: float) -> tuple[LabelVolume, str]:
+    """Labels of a body and its hemisphere; phantoms are drawn in voxels of ``voxel`` mm."""
+    if isinstance(body, PhantomSpec):
+        volume = Phantom(body).label_volume(load_scheme("freesurfer"), voxel_size=(voxel,) * 3)
+        return volume, "L"
+    return read_label_volume(body), body.hemi
+
+
+def name_body(body: ValidationBody) -> str:
+    """Name a body for people."""
+    if isinstance(body, PhantomSpec):
+        return body.kind
+    return f"labels {body.subject} {body.hemi}"
+
+
+def measure_body(volume: LabelVolume, hemi: str) -> HemisphereMaps:
+    """Measure with default settings, without a clock."""
+    return measure_hemisphere(volume, hemi, Settings(), lambda _: nullcontext())
+
+
+# Cases of a suite on all processors, each in a worker that may die or hang without harm.
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refusal:
+    """In place of a case's result: the package refused it, or its worker was lost."""
+
+    reason: str
+    """Of the error in kebab case; ``timeout``, ``worker-died`` or ``crash`` (a bug)."""
+    message: str
+
+    def __str__(self) -> str:
+        return f"{self.reason}: {self.message}"
+
+    @property
+    def is_bug(self) -> bool:
+        """Whether this is anything but a foreseen error."""
+        return self.reason in ("timeout", "worker-died", "crash")
+
+
+def run_cases(
+    work: Callable[[Any], Any], cases: Sequence[Any], *, timeout: float = 60.0
+) -> list[Any]:
+    """Work off cases in parallel, one processor each.
+
+    Parameters
+    ----------
+    work : callable
+        Importable function of one case; case and result have to be picklable.
+    cases : sequence
+        What to work off.
+    timeout : float
+        s per case.
+
+    Returns
+    -------
+    list
+        Results in the order of the cases, a :class:`Refusal` where there is none.
+    """
+    results: list[Any] = [None] * len(cases)
+    with tempfile.TemporaryDirectory() as folder:
+        plan = WorkerPlan(
+            work=_work,
+            n_workers=max(1, min(len(cases), processors())),
+            timeout=timeout,
+            log=Path(folder) / "workers.log",
+        )
+        jobs = [(number, work, case) for number, case in enumerate(cases)]
+        # Closed here and now: what is left of the workers ends before their log goes.
+        with contextlib.closing(run_jobs(plan, jobs)) as done:
+            for job, result in done:
+                results[job[0]] = _lost(result) if isinstance(result, WorkerLost) else result
+    return results
+
+
+def processors() -> int:
+    """Count the processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _lost(lost: WorkerLost) -> Refusal:
+    if lost.timed_out:
+        return Refusal(reason="timeout", message=f"no result after {lost.seconds:.0f} s")
+    return Refusal(reason="worker-died", message=f"the worker died ({lost.cause})")
+
+
+def _work(job: tuple[int, Callable[[Any], Any], Any]) -> Any:  # noqa: ANN401  (any result)
+    _, work, case = job
+    try:
+        return work(case)
+    except HipstaError as error:
+        return Refusal(reason=error.reason, message=str(error))
+    except Exception as error:  # noqa: BLE001  (a bug becomes a row of the report)
+        return Refusal(reason="crash", message=f"{type(error).__name__}: {error}")
+
+
+# Labels as a scanner with thick slices would give them.
+
+
+def reslice(
+    volume: LabelVolume,
+    axis: Float,
+    voxel_size: tuple[float, float, float],
+    *,
+    offset: float = 0.0,
+    tilt: float = 0.0,
+) -> LabelVolume:
+    """Take the labels at the centers of the voxels of another grid.
+
+    Parameters
+    ----------
+    volume : LabelVolume
+    axis : (3,) array
+        Unit vector across the slices, RAS.
+    voxel_size : tuple of float
+        Pixel, pixel, distance of slices, mm.
+    offset : float
+        Shift along the slices' normal as a fraction of their distance.
+    tilt : float
+        Degrees by which the slices miss the perpendicular to ``axis``.
+
+    Returns
+    -------
+    LabelVolume
+        Covers the whole volume; background beyond it.
+    """
+    aside = np.cross(axis, [0.0, 0.0, 1.0])
+    aside /= np.linalg.norm(aside)
+    turn = Rotation.from_euler("x", tilt, degrees=True).as_matrix()
+    matrix = np.column_stack([aside, np.cross(axis, aside), axis]) @ turn * np.array(voxel_size)
+    size = np.array(volume.tissue.shape) - 1
+    corners = np.array(np.meshgrid(*([0, n] for n in size))).reshape(3, -1)
+    corners = volume.affine[:3, :3] @ corners + volume.affine[:3, 3:]
+    middle = corners.mean(axis=1)
+    reach = np.linalg.solve(matrix, corners - middle[:, None])
+    low = np.floor(reach.min(axis=1)) - 1
+    shape = (np.ceil(reach.max(axis=1)) + 2 - low).astype(int)
+    affine = np.eye(4)
+    affine[:3, :3] = matrix
+    affine[:3, 3] = middle + matrix @ (low + np.array([0.0, 0.0, offset]))
+    to_volume = np.linalg.inv(volume.affine) @ affine
+    index = np.indices(shape).reshape(3, -1)
+    nearest = np.rint(to_volume[:3, :3] @ index + to_volume[:3, 3:]).astype(int)
+    inside = ((nearest >= 0) & (nearest <= size[:, None])).all(axis=0)
+    tissue, part = (np.zeros(index.shape[1], dtype=np.uint8) for _ in range(2))
+    tissue[inside] = volume.tissue[tuple(nearest[:, inside])]
+    part[inside] = volume.part[tuple(nearest[:, inside])]
+    return LabelVolume(
+        tissue=tissue.reshape(shape), part=part.reshape(shape), affine=affine, scheme=volume.scheme
+    )

@@ -7,19 +7,19 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from hipsta_bids.artifacts import Float, HemisphereMaps, Status
 from hipsta_bids.phantom import PhantomSpec
-from hipsta_bids.phantom.defects import make_defect
-from hipsta_bids.phantom.site import Place, Site
-from hipsta_bids.validation.bodies import (
+from hipsta_bids.types import Float, HemisphereMaps, Status
+from hipsta_bids.validation.cases import (
+    Refusal,
     ValidationBody,
     fine_segmentations,
     load_body,
     measure_body,
     name_body,
+    run_cases,
 )
-from hipsta_bids.validation.suite import Cell, Suite, Table
-from hipsta_bids.validation.workers import Refusal, run_cases
+from hipsta_bids.validation.damage import Place, Site, make_defect
+from hipsta_bids.validation.report import Cell, Suite, Table
 
 NEAR = 2.0
 """mm; columns within this distance of a changed voxel are near the defect."""

@@ -70,7 +70,7 @@ def first_line_of(*arguments, options=()):
 
 def outside(*arguments):
     """Run this checkout in this environment, which is made from the same lock."""
-    done = run(sys.executable, "-m", "hipsta_bids.cli", *arguments)
+    done = run(sys.executable, "-m", "hipsta_bids.cli.main", *arguments)
     assert done.returncode == 0, done.stderr
     return done
 

@@ -6,19 +6,18 @@ from itertools import permutations
 import numpy as np
 from scipy import ndimage
 
-from hipsta_bids.artifacts import Coordinates, LabelVolume, Sheet, Surface, TetMesh
 from hipsta_bids.geometry.body import Body, extract_body
 from hipsta_bids.geometry.boundaries import Boundaries, find_boundaries
-from hipsta_bids.geometry.coordinates import solve_coordinates
 from hipsta_bids.geometry.ends import EndPlanes
 from hipsta_bids.geometry.grid import Field, WedgeGrid, resample_body
-from hipsta_bids.geometry.sheet import sample_sheet
+from hipsta_bids.geometry.sheet import sample_sheet, solve_coordinates
 from hipsta_bids.geometry.surface import extract_surface
 from hipsta_bids.geometry.tetra import tetrahedralize
 from hipsta_bids.geometry.topology import SolidField, repair_topology
 from hipsta_bids.phantom import Phantom, PhantomSpec
-from hipsta_bids.schemes import load_scheme
+from hipsta_bids.protocols.load import load_scheme
 from hipsta_bids.settings import Settings
+from hipsta_bids.types import Coordinates, LabelVolume, Sheet, Surface, TetMesh
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

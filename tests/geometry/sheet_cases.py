@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hipsta_bids.artifacts import Sheet
+from hipsta_bids.types import Sheet
 
 
 def sheet_of(points):

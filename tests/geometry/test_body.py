@@ -8,11 +8,12 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from scipy import ndimage
 
-from hipsta_bids.artifacts import LabelVolume
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import _give_away_layer, check_side, extract_body
-from hipsta_bids.schemes import Part, Tissue, load_scheme
+from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import BodySettings
+from hipsta_bids.types import LabelVolume
 
 FREESURFER = load_scheme("freesurfer")
 

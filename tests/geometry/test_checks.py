@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from hipsta_bids.artifacts import Coordinates
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import extract_body
 from hipsta_bids.geometry.checks import (
@@ -22,8 +21,10 @@ from hipsta_bids.geometry.checks import (
 from hipsta_bids.geometry.measures import measure_thickness
 from hipsta_bids.geometry.surface import extract_surface
 from hipsta_bids.geometry.topology import repair_topology
-from hipsta_bids.schemes import Part, Tissue, load_scheme
+from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import CheckSettings, Settings
+from hipsta_bids.types import Coordinates
 
 CHECKS, ALL = CheckSettings(), Settings()
 

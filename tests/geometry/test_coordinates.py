@@ -5,7 +5,7 @@ import pytest
 from geometry_cases import box_mesh
 
 from hipsta_bids.geometry.boundaries import Boundaries
-from hipsta_bids.geometry.coordinates import solve_coordinates
+from hipsta_bids.geometry.sheet import solve_coordinates
 
 SIZE = (6.0, 4.0, 2.0)
 

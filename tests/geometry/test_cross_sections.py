@@ -6,8 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sheet_cases import grid, plates, sheet_of, tube
 
-from hipsta_bids.geometry.cross_sections import cut_sections, section_area
-from hipsta_bids.geometry.measures import measure_thickness
+from hipsta_bids.geometry.measures import cut_sections, measure_thickness, section_area
 from hipsta_bids.settings import MeasureSettings
 
 MEASURES = MeasureSettings()

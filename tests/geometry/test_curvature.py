@@ -5,7 +5,7 @@ import pytest
 from geometry_cases import cylinder
 from lapy import TriaMesh
 
-from hipsta_bids.geometry.curvature import least_curvature
+from hipsta_bids.geometry.wall import least_curvature
 
 
 def open_wall(case):

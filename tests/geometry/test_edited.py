@@ -7,13 +7,13 @@ import pytest
 from geometry_cases import short_phantom
 from scipy import ndimage
 
-from hipsta_bids.artifacts import EditedMask
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry.body import extract_body
-from hipsta_bids.geometry.edited import MaskChange, check_mask
-from hipsta_bids.participant import find_body
-from hipsta_bids.schemes import Tissue, load_scheme
+from hipsta_bids.geometry.body import MaskChange, check_mask, extract_body
+from hipsta_bids.participant.measure import find_body
+from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import BodySettings, Settings
+from hipsta_bids.types import EditedMask
 
 SETTINGS = BodySettings()
 

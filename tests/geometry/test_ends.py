@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 from geometry_cases import degrees_between, rigid, rotation, short_phantom
 
-from hipsta_bids.artifacts import LabelVolume
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry import ends as ends_mod
 from hipsta_bids.geometry.body import extract_body
 from hipsta_bids.geometry.ends import find_end_planes
-from hipsta_bids.schemes import Part, Tissue, load_scheme
+from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import BodySettings
+from hipsta_bids.types import LabelVolume
 
 FREESURFER, HIPPUNFOLD = load_scheme("freesurfer"), load_scheme("hippunfold")
 BODY = BodySettings()

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.ends import EndPlanes
 from hipsta_bids.geometry.grid import in_plane_voxel
-from hipsta_bids.schemes import Tissue
+from hipsta_bids.protocols.protocol import Tissue
 
 EXACT = 1e-9  # rounding of coordinates of some ten mm
 

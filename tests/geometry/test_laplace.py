@@ -8,15 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import sparse
 
-from hipsta_bids.artifacts import TetMesh
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry.laplace import (
+from hipsta_bids.geometry.fem import (
     lumped_mass,
     smallest_eigenfunctions,
     solve_dirichlet,
     stiffness,
     triangle_stiffness,
 )
+from hipsta_bids.types import TetMesh
 
 EXACT = 1e-10  # rounding in a sparse solve
 SIZE = (2.0, 1.0, 3.0)

@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sheet_cases import grid, plates, sheet_of, shell, tube
 
-from hipsta_bids.artifacts import Sheet
-from hipsta_bids.geometry.layers import check_layers, equal_volume_layers, layer_depth
 from hipsta_bids.geometry.measures import column_area
+from hipsta_bids.geometry.sheet import check_layers, equal_volume_layers, layer_depth
+from hipsta_bids.types import Sheet
 
 
 def test_layers_of_plates_stay():

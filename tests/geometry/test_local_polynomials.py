@@ -5,7 +5,7 @@ import pytest
 from numpy.polynomial import Polynomial
 from scipy.signal import savgol_filter
 
-from hipsta_bids.geometry.local_polynomials import differentiate
+from hipsta_bids.geometry.measures import differentiate
 
 
 @pytest.mark.parametrize("times", [0, 1, 2, 3, 4])

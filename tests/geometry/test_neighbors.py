@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from geometry_cases import plain_body
 
-from hipsta_bids.artifacts import LabelVolume, Sheet
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry.body import Body, extract_body
+from hipsta_bids.geometry.body import Body, check_reach, extract_body, join_cortex
 from hipsta_bids.geometry.ends import EndPlanes
-from hipsta_bids.geometry.neighbors import check_reach, join_cortex
 from hipsta_bids.geometry.sheet import check_turned, is_turned
-from hipsta_bids.schemes import Tissue, load_scheme
+from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import BodySettings
+from hipsta_bids.types import LabelVolume, Sheet
 
 UP = np.array([0.0, 0.0, 1.0])
 ENDS = EndPlanes(

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from hipsta_bids.geometry.outlines import outline_slice
-from hipsta_bids.schemes import Tissue
+from hipsta_bids.geometry.slices import outline_slice
+from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import Settings
 
 SETTINGS = Settings().slices

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hipsta_bids.artifacts import Sheet
 from hipsta_bids.geometry.quality import Evidence, find_flags, quality_metrics
 from hipsta_bids.geometry.topology import Repair
-from hipsta_bids.schemes import Tissue
+from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import Settings
+from hipsta_bids.types import Sheet
 
 SETTINGS = Settings()
 

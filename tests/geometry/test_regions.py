@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from hipsta_bids.artifacts import Sheet
-from hipsta_bids.geometry.regions import Regions, summarize_regions
+from hipsta_bids.geometry.sampling import Regions, summarize_regions
+from hipsta_bids.types import Sheet
 
 
 def flat():

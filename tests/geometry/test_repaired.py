@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from hipsta_bids.artifacts import Sheet
 from hipsta_bids.geometry.grid import Field, WedgeGrid
-from hipsta_bids.geometry.repaired import repaired_columns
-from hipsta_bids.geometry.topology import SolidField
+from hipsta_bids.geometry.topology import SolidField, repaired_columns
 from hipsta_bids.settings import MeasureSettings
+from hipsta_bids.types import Sheet
 
 SETTINGS = MeasureSettings()
 #: The wall, y from 5 to 7 mm; columns stand 1 mm apart, grid nodes 0.5 mm.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from hipsta_bids.geometry.rims import center_curves, guided_curves, rim_paths
+from hipsta_bids.geometry.boundaries import center_curves, guided_curves, rim_paths
 from hipsta_bids.geometry.surface import mean_wall_thickness
 from hipsta_bids.geometry.wall import Wall
 from hipsta_bids.settings import BoundarySettings

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from hipsta_bids.artifacts import Sheet
 from hipsta_bids.geometry.sampling import ScalarVolume, sample_on_sheet
 from hipsta_bids.settings import MapSettings
+from hipsta_bids.types import Sheet
 
 #: 0.5 x 0.6 x 0.8 mm voxels, turned and shifted, so that mistakes in affines show.
 ANGLE = np.deg2rad(30)

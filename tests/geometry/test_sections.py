@@ -7,13 +7,13 @@ import pytest
 from geometry_cases import resampled, short_phantom
 from sheet_cases import plates
 
-from hipsta_bids.artifacts import Sheet
 from hipsta_bids.geometry.body import Body, extract_body
+from hipsta_bids.geometry.checks import check_cross_sections, check_ridges, check_rows
 from hipsta_bids.geometry.grid import Field
-from hipsta_bids.geometry.sections import check_cross_sections, check_ridges, check_rows
 from hipsta_bids.phantom import Phantom
-from hipsta_bids.schemes import load_scheme
+from hipsta_bids.protocols.load import load_scheme
 from hipsta_bids.settings import BodySettings, CheckSettings
+from hipsta_bids.types import Sheet
 
 CHECKS = CheckSettings()
 

@@ -4,13 +4,7 @@ import numpy as np
 import pytest
 from sheet_cases import grid, plates, sheet_of, tube
 
-from hipsta_bids.geometry.shape_lengths import (
-    at_columns,
-    extent_x,
-    extent_y,
-    wall_area,
-    wall_length,
-)
+from hipsta_bids.geometry.measures import at_columns, extent_x, extent_y, wall_area, wall_length
 from hipsta_bids.settings import MeasureSettings
 
 MEASURES = MeasureSettings()

@@ -6,7 +6,6 @@ from geometry_cases import box_mesh, plain_body, rigid, straight_ends
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hipsta_bids.artifacts import Coordinates, Sheet, TetMesh
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.sheet import (
     folded_fraction,
@@ -15,8 +14,9 @@ from hipsta_bids.geometry.sheet import (
     sheet_levels,
     whole_body,
 )
-from hipsta_bids.schemes import Tissue
+from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import SheetSettings
+from hipsta_bids.types import Coordinates, Sheet, TetMesh
 
 SIZE = np.array([6.0, 4.0, 2.0])
 GRID = SheetSettings()

@@ -8,13 +8,7 @@ from hypothesis.extra import numpy as arrays
 from scipy import ndimage
 from skimage import measure
 
-from hipsta_bids.geometry.simple_points import (
-    NEIGHBORS,
-    are_simple,
-    euler_number,
-    grow,
-    shrink,
-)
+from hipsta_bids.geometry.digital import NEIGHBORS, are_simple, euler_number, grow, shrink
 
 FACES = ndimage.generate_binary_structure(3, 1)
 EDGES = ndimage.generate_binary_structure(3, 2)

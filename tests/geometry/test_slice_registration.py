@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hipsta_bids.geometry.registration import register_slices
+from hipsta_bids.geometry.slices import register_slices
 from hipsta_bids.settings import Settings
 
 SETTINGS = Settings().slices

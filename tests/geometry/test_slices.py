@@ -8,7 +8,7 @@ from scipy import ndimage
 from hipsta_bids.geometry import slices
 from hipsta_bids.geometry.measures import measure_thickness
 from hipsta_bids.phantom import Phantom, PhantomSpec
-from hipsta_bids.schemes import Tissue
+from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import Settings
 
 SETTINGS = Settings().slices

@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 from geometry_cases import resampled
 
-from hipsta_bids.geometry.body import extract_body
-from hipsta_bids.geometry.slits import fill_slits
+from hipsta_bids.geometry.body import extract_body, fill_slits
 from hipsta_bids.geometry.topology import repair_topology
-from hipsta_bids.phantom.defects import make_defect
-from hipsta_bids.phantom.site import Site
-from hipsta_bids.schemes import Tissue
+from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import BodySettings, TopologySettings
+from hipsta_bids.validation.damage import Site, make_defect
 
 BODY = BodySettings()
 VOXEL = 0.4

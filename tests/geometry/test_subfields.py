@@ -5,8 +5,8 @@ import pytest
 from geometry_cases import box_mesh, plain_body, straight_ends
 from sheet_cases import plates
 
-from hipsta_bids.geometry.subfields import labels_at, subfield_areas, subfield_volumes
-from hipsta_bids.schemes import Tissue
+from hipsta_bids.geometry.measures import labels_at, subfield_areas, subfield_volumes
+from hipsta_bids.protocols.protocol import Tissue
 
 VOXEL = 0.5
 

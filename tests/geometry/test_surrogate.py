@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry.agreement import agreement, compare_nearby
 from hipsta_bids.geometry.body import extract_body
-from hipsta_bids.geometry.surrogate import draw_slice, surrogate_profiles
+from hipsta_bids.geometry.surrogate import agreement, compare_nearby, draw_slice, surrogate_profiles
 from hipsta_bids.phantom import Phantom, PhantomSpec
-from hipsta_bids.schemes import load_scheme
+from hipsta_bids.protocols.load import load_scheme
 from hipsta_bids.settings import Settings
 
 SETTINGS = Settings()

@@ -9,17 +9,13 @@ import numpy as np
 import pytest
 from geometry_cases import box_mesh
 
-from hipsta_bids.artifacts import Surface, TetMesh
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry import tetra
 from hipsta_bids.geometry.surface import signed_volume
 from hipsta_bids.geometry.tetgen_worker import TetgenClient
-from hipsta_bids.geometry.tetra import (
-    tetra_quality,
-    tetra_volumes,
-    tetrahedralize,
-)
+from hipsta_bids.geometry.tetra import tetra_quality, tetra_volumes, tetrahedralize
 from hipsta_bids.settings import TetraSettings
+from hipsta_bids.types import Surface, TetMesh
 
 SETTINGS = TetraSettings()
 OPTIONS = {"plc": True, "quality": True, "minratio": 2.0, "nobisect": True, "quiet": True}

@@ -8,8 +8,8 @@ from geometry_cases import field_of, ribbon_mask, straight_grid
 from scipy import ndimage
 
 from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry.digital import euler_number
 from hipsta_bids.geometry.grid import Field
-from hipsta_bids.geometry.simple_points import euler_number
 from hipsta_bids.geometry.surface import extract_surface
 from hipsta_bids.geometry.topology import repair_topology
 from hipsta_bids.settings import SurfaceSettings, TopologySettings

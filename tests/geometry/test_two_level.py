@@ -5,8 +5,7 @@ import pytest
 from scipy import sparse
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry.laplace import solve_dirichlet, stiffness
-from hipsta_bids.geometry.two_level import compact_groups, solve_two_level
+from hipsta_bids.geometry.fem import compact_groups, solve_dirichlet, solve_two_level, stiffness
 
 
 def test_groups_are_compact_and_of_equal_size():

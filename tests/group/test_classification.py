@@ -8,10 +8,16 @@ from scipy import optimize, special, stats
 from statsmodels.discrete.discrete_model import Logit
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.classification import calibrate, compare_models, cross_validate
+from hipsta_bids.group.classify import (
+    area_under,
+    calibrate,
+    compare_models,
+    cross_validate,
+    delong,
+    delong_difference,
+)
 from hipsta_bids.group.logistic import fit_logistic, is_separated
-from hipsta_bids.group.roc import area_under, delong, delong_difference
-from hipsta_bids.group_settings import ClassificationSettings
+from hipsta_bids.group.settings import ClassificationSettings
 
 SETTINGS = ClassificationSettings(repeats=2, folds=5)
 

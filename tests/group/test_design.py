@@ -10,10 +10,14 @@ from scipy import stats
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.design import build_design
+from hipsta_bids.group.formula import (
+    check_unique,
+    model_from_shortcut,
+    parse_expression,
+    parse_model,
+)
 from hipsta_bids.group.glm import fit_points
-from hipsta_bids.group.model_spec import model_from_shortcut, parse_expression, parse_model
-from hipsta_bids.group.variables import check_unique
-from hipsta_bids.group_settings import DesignSettings, GlmSettings
+from hipsta_bids.group.settings import DesignSettings, GlmSettings
 
 SETTINGS = DesignSettings()
 

@@ -5,10 +5,9 @@ import pytest
 from scipy import stats
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.contrasts import Contrast
-from hipsta_bids.group.effects import f_limits, t_limits
-from hipsta_bids.group.glm import fit_points
-from hipsta_bids.group_settings import GlmSettings
+from hipsta_bids.group.formula import Contrast
+from hipsta_bids.group.glm import f_limits, fit_points, t_limits
+from hipsta_bids.group.settings import GlmSettings
 
 SETTINGS = GlmSettings()
 HC3 = GlmSettings(covariance="hc3")

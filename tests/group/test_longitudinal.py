@@ -8,11 +8,11 @@ from scipy import stats
 from statsmodels.regression.mixed_linear_model import MixedLM
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.contrasts import Contrast
-from hipsta_bids.group.differences import asymmetry, paired_difference
+from hipsta_bids.group.comparison import asymmetry, paired_difference
+from hipsta_bids.group.formula import Contrast
 from hipsta_bids.group.glm import fit_points
-from hipsta_bids.group.longitudinal import fit_mixed
-from hipsta_bids.group_settings import GlmSettings, LongitudinalSettings
+from hipsta_bids.group.mixed import fit_mixed
+from hipsta_bids.group.settings import GlmSettings, LongitudinalSettings
 
 SETTINGS = LongitudinalSettings()
 

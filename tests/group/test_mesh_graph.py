@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
-from hipsta_bids.bids.gifti import sheet_triangles
-from hipsta_bids.group.contrasts import Contrast
-from hipsta_bids.group.mesh_graph import (
+from hipsta_bids.group.adjacency import (
+    enhance,
     enhance_on_mesh,
     find_mesh_clusters,
     label_mesh,
     mesh_edges,
 )
+from hipsta_bids.group.formula import Contrast
 from hipsta_bids.group.permutation import PermutationPart, permute
-from hipsta_bids.group.sheet_graph import enhance
-from hipsta_bids.group_settings import MultiplicitySettings
+from hipsta_bids.group.settings import MultiplicitySettings
+from hipsta_bids.io.gifti import sheet_triangles
 
 SHAPE = (9, 6)
 

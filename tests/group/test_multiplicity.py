@@ -4,11 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hipsta_bids.group.multiplicity import (
-    adjusted_at_any_level,
-    fdr_benjamini_hochberg,
-    fdr_two_stage,
-)
+from hipsta_bids.group.inference import adjusted_at_any_level, fdr_benjamini_hochberg, fdr_two_stage
 
 #: Example of Benjamini and Hochberg (1995), used again in the paper of 2006.
 P = np.concatenate(

@@ -6,7 +6,7 @@ from scipy import stats
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.normative import w_scores
-from hipsta_bids.group_settings import GlmSettings
+from hipsta_bids.group.settings import GlmSettings
 
 SETTINGS = GlmSettings()
 

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.classification import compare_models
-from hipsta_bids.group.pairs import compare_pairs
-from hipsta_bids.group_settings import ClassificationSettings
+from hipsta_bids.group.classify import compare_models, compare_pairs
+from hipsta_bids.group.settings import ClassificationSettings
 
 SETTINGS = ClassificationSettings(folds=3, repeats=1)
 ORDER = ["CU", "MCI", "DAT"]

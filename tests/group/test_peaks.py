@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hipsta_bids.group.contrasts import Contrast
+from hipsta_bids.group.formula import Contrast
 from hipsta_bids.group.glm import fit_points
-from hipsta_bids.group.multiplicity import MapKey, discover, fdr_two_stage
+from hipsta_bids.group.inference import MapKey, discover, fdr_two_stage
 from hipsta_bids.group.peaks import SheetFrame, peak_table
-from hipsta_bids.group_settings import GlmSettings, MultiplicitySettings
+from hipsta_bids.group.settings import GlmSettings, MultiplicitySettings
 
 SHAPE = (12, 8)
 FRAME = SheetFrame(

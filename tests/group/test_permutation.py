@@ -8,12 +8,12 @@ import pytest
 from scipy import stats
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.contrasts import Contrast
+from hipsta_bids.group.adjacency import enhance, find_clusters
+from hipsta_bids.group.formula import Contrast
 from hipsta_bids.group.glm import fit_points
 from hipsta_bids.group.permutation import PermutationPart
 from hipsta_bids.group.permutation import permute as permute_parts
-from hipsta_bids.group.sheet_graph import enhance, find_clusters
-from hipsta_bids.group_settings import GlmSettings, MultiplicitySettings
+from hipsta_bids.group.settings import GlmSettings, MultiplicitySettings
 
 SETTINGS = MultiplicitySettings(method="permutation-tfce", permutations=400)
 SHEET = (9, 7)

@@ -4,21 +4,22 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from hipsta_bids import cli
-from hipsta_bids.bids import files
-from hipsta_bids.bids.dataset import find_hemispheres
-from hipsta_bids.bids.inputs import InputRequest
+from hipsta_bids.cli import main
+from hipsta_bids.cli.phantom import PHANTOM_EPILOG
 from hipsta_bids.errors import ExitCode, UsageError
+from hipsta_bids.inputs.request import InputRequest
+from hipsta_bids.inputs.search import find_hemispheres
+from hipsta_bids.io import files
 from hipsta_bids.phantom import TRUTH_TABLE, Phantom
 from hipsta_bids.phantom.cohort import (
+    EFFECT_TABLE,
+    MAPS_FOLDER,
     REGIONS,
     CohortPlan,
     make_cohort,
     region_limits,
     typical_shape,
 )
-from hipsta_bids.phantom.cohort_dataset import EFFECT_TABLE, MAPS_FOLDER
-from hipsta_bids.subcommands import PHANTOM_EPILOG
 
 COARSE = ("--voxel-size", "0.8", "0.8", "0.8")
 QUIET = {"subject_sd": 0.0, "hemisphere_sd": 0.0, "offset_sd": 0.0}
@@ -28,7 +29,7 @@ QUIET = {"subject_sd": 0.0, "hemisphere_sd": 0.0, "offset_sd": 0.0}
 def dataset(tmp_path_factory):
     out = tmp_path_factory.mktemp("cohort") / "with blank"
     options = ("--n-subjects", "3", "--groups", "young", "old", "--seed", "4", "--shift", "0.6")
-    assert cli.main(["phantom", str(out), *options, *COARSE]) == ExitCode.OK
+    assert main.main(["phantom", str(out), *options, *COARSE]) == ExitCode.OK
     return out
 
 
@@ -102,7 +103,7 @@ def test_effect_table_tells_thinning_from_shift(dataset):
 
 def test_the_same_seed_gives_the_same_files(dataset, tmp_path):
     options = ("--n-subjects", "3", "--groups", "young", "old", "--seed", "4", "--shift", "0.6")
-    assert cli.main(["phantom", str(tmp_path / "again"), *options, *COARSE]) == ExitCode.OK
+    assert main.main(["phantom", str(tmp_path / "again"), *options, *COARSE]) == ExitCode.OK
     assert tree(dataset) == tree(tmp_path / "again")
 
 
@@ -180,7 +181,7 @@ def test_help_names_the_regions():
     ],
 )
 def test_wrong_options_are_one_line(tmp_path, capsys, options, message):
-    code = cli.main(["phantom", str(tmp_path / "out"), *options])
+    code = main.main(["phantom", str(tmp_path / "out"), *options])
     assert code == ExitCode.USAGE
     text = capsys.readouterr().err
     assert message in text
@@ -189,7 +190,7 @@ def test_wrong_options_are_one_line(tmp_path, capsys, options, message):
 
 def test_a_folder_with_something_else_is_left_alone(tmp_path, capsys):
     (tmp_path / "thesis.txt").write_text("years of work")
-    assert cli.main(["phantom", str(tmp_path)]) == ExitCode.USAGE
+    assert main.main(["phantom", str(tmp_path)]) == ExitCode.USAGE
     assert "holds something other than phantoms" in capsys.readouterr().err
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.txt"]
 

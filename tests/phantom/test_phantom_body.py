@@ -5,7 +5,7 @@ import pytest
 
 from hipsta_bids.errors import SettingsError
 from hipsta_bids.phantom import KINDS, PhantomSpec, rigid_motion
-from hipsta_bids.phantom.body import CENTER, Body
+from hipsta_bids.phantom.shape import CENTER, Body
 
 EXACT = 1e-9  # mm or a fraction: rounding is 1e-13, any mistake is far larger
 POSE = rigid_motion((20.0, -35.0, 50.0), (3.0, -4.0, 12.0))

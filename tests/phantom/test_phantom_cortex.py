@@ -6,7 +6,8 @@ import pytest
 from hipsta_bids.errors import SettingsError
 from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.phantom.labels import CORTEX, subfield_at
-from hipsta_bids.schemes import Part, Tissue, load_scheme
+from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.protocol import Part, Tissue
 
 SPEC = PhantomSpec(kind="s-shape", width=30.0, curvature=(-0.15, 0.3), cortex=10.0, length=8.0)
 PMC = load_scheme("ashsPMC")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hipsta_bids.phantom.curve import START_ANGLE, MidCurve, gauss_panels
+from hipsta_bids.phantom.shape import START_ANGLE, MidCurve, gauss_panels
 from hipsta_bids.phantom.spec import KINDS, Bend
 
 WIDTH = 20.0

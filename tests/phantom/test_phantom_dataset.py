@@ -6,11 +6,11 @@ import nibabel as nib
 import numpy as np
 import pytest
 
-from hipsta_bids.bids import files
-from hipsta_bids.bids.dataset import find_hemispheres
-from hipsta_bids.bids.images import read_label_volume
-from hipsta_bids.bids.inputs import InputRequest
 from hipsta_bids.errors import OutputError, SettingsError
+from hipsta_bids.inputs.labels import read_label_volume
+from hipsta_bids.inputs.request import InputRequest
+from hipsta_bids.inputs.search import find_hemispheres
+from hipsta_bids.io import files
 from hipsta_bids.phantom import (
     TRUTH_TABLE,
     Hemisphere,
@@ -21,7 +21,8 @@ from hipsta_bids.phantom import (
     write_demo_dataset,
 )
 from hipsta_bids.phantom.dataset import LAYOUTS
-from hipsta_bids.schemes import Part, Tissue, load_scheme, translate
+from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.protocol import Part, Tissue, translate
 
 SMALL = PhantomSpec(length=8.0, end_length=2.0)
 COARSE = (0.6, 0.6, 0.6)

@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hipsta_bids.artifacts import LabelVolume
 from hipsta_bids.errors import SchemeError, SettingsError
 from hipsta_bids.phantom import KINDS, Phantom, PhantomSpec, encode, rigid_motion
 from hipsta_bids.phantom.labels import label_for, subfield_at
-from hipsta_bids.schemes import Part, Tissue, load_scheme, scheme_names, translate
+from hipsta_bids.protocols.load import load_scheme, scheme_names
+from hipsta_bids.protocols.protocol import Part, Tissue, translate
+from hipsta_bids.types import LabelVolume
 
 SMALL = PhantomSpec(length=8.0, end_length=2.0)
 COARSE = (0.6, 0.6, 0.6)

@@ -6,9 +6,10 @@ from test_phantom_truth import _curvature_by_differences
 
 from hipsta_bids.errors import SettingsError
 from hipsta_bids.phantom import Phantom, PhantomSpec, Thinning
-from hipsta_bids.phantom.body import Body, window_jet
+from hipsta_bids.phantom.shape import Body, window_jet
 from hipsta_bids.phantom.truth import SURFACES, mean_curvature
-from hipsta_bids.schemes import Tissue, load_scheme
+from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.protocol import Tissue
 
 REGION = Thinning(depth=0.4, u=(0.35, 0.75), v=(0.5, 1.0))
 THINNED = PhantomSpec(thickness=1.8, thinnings=(REGION,))

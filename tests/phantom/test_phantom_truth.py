@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from hipsta_bids.phantom import KINDS, Phantom, PhantomSpec
-from hipsta_bids.phantom.body import Body
-from hipsta_bids.phantom.curve import START_ANGLE
 from hipsta_bids.phantom.labels import SUBFIELD_STARTS
+from hipsta_bids.phantom.shape import START_ANGLE, Body
 from hipsta_bids.phantom.truth import (
     SURFACES,
     cut_sections,
@@ -16,7 +15,8 @@ from hipsta_bids.phantom.truth import (
     mean_curvature,
     summarize,
 )
-from hipsta_bids.schemes import Tissue, load_scheme
+from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.protocol import Tissue
 
 EXACT = 1e-9  # relative: quadrature of smooth functions and rounding
 

@@ -8,7 +8,7 @@ import nibabel as nib
 import numpy as np
 import pytest
 
-from hipsta_bids import cli
+from hipsta_bids.cli import main
 
 #: FreeSurfer's codes of the sheet: presubiculum, subiculum, CA1, CA3 (body).
 SHEET = (234, 236, 238, 240)
@@ -61,7 +61,7 @@ def dataset(tmp_path_factory):
     folder = tmp_path_factory.mktemp("reports")
     source = folder / "in"
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-        assert cli.main(["phantom", str(source), "--n-subjects", "2", "--seed", "1"]) == 0
+        assert main.main(["phantom", str(source), "--n-subjects", "2", "--seed", "1"]) == 0
         labels = source / "derivatives" / "freesurfer"
         for subject, side, change in (
             ("01", "rh", bridge),
@@ -70,7 +70,7 @@ def dataset(tmp_path_factory):
         ):
             (path,) = (labels / f"sub-{subject}" / "mri").glob(f"{side}.hippo*.mgz")
             edit(path, change)
-        assert cli.main([str(source), str(folder / "out"), "participant", "--n-procs", "1"]) == 1
+        assert main.main([str(source), str(folder / "out"), "participant", "--n-procs", "1"]) == 1
     return folder
 
 

@@ -170,7 +170,7 @@ def test_maps_are_drawn_and_lead_to_their_page(visit):
 
 
 def test_the_selection_is_a_list_that_the_group_level_takes(visit, out):
-    from hipsta_bids.bids.group_inputs import GroupRequest, collect_sheets  # noqa: PLC0415
+    from hipsta_bids.group.collect import GroupRequest, collect_sheets  # noqa: PLC0415
 
     browser = visit("report.html")
     assert not one(browser, "#save").is_enabled()

@@ -6,7 +6,7 @@ import io
 import numpy as np
 from PIL import Image
 
-from hipsta_bids.reports.lines import cut, outline, path_data, png_address
+from hipsta_bids.reports.slices import cut, outline, path_data, png_address
 
 
 def test_a_cut_through_a_tilted_plane_is_a_straight_line():

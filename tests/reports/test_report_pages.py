@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from page_outline import Outline
 
-from hipsta_bids import cli, reporting
-from hipsta_bids.bids.names import DATASET_FILES
+from hipsta_bids.cli import main
+from hipsta_bids.derivatives.names import DATASET_FILES
+from hipsta_bids.participant import pages as reporting
 from hipsta_bids.reports import participant as participant_module
-from hipsta_bids.reports.cohort import read_cohort
-from hipsta_bids.reports.cohort_page import cohort_page
+from hipsta_bids.reports.cohort import cohort_page, read_cohort
 from hipsta_bids.reports.page import Section
 from hipsta_bids.reports.participant import participant_page
 
@@ -170,13 +170,13 @@ def test_reports_only_makes_the_pages_anew(copy, capsys):
     for path in copy.glob("*.html"):
         path.unlink()
     options = ["--reports-only", "--participant-label", "02", "--n-procs", "1"]
-    assert cli.main(["gone", str(copy), "participant", *options]) == 0
+    assert main.main(["gone", str(copy), "participant", *options]) == 0
     assert sorted(path.name for path in copy.glob("*.html")) == ["report.html", "sub-02.html"]
     assert "reports of 1 visits" in capsys.readouterr().out
 
 
 def test_reports_only_of_nothing_says_so(tmp_path, capsys):
-    assert cli.main(["in", str(tmp_path), "participant", "--reports-only"]) == 66
+    assert main.main(["in", str(tmp_path), "participant", "--reports-only"]) == 66
     assert "no results of these participants" in capsys.readouterr().err
 
 

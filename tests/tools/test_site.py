@@ -57,7 +57,7 @@ def test_nothing_is_loaded_from_elsewhere(site):
 
 def test_docstrings_are_on_the_python_page(site):
     text = (site / "api.html").read_text(encoding="utf-8")
-    assert 'id="hipsta_bids.participant.measure_hemisphere"' in text
+    assert 'id="hipsta_bids.participant.measure.measure_hemisphere"' in text
     assert "With the reason why this hemisphere cannot be measured." in text
 
 

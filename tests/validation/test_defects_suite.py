@@ -7,8 +7,8 @@ import pytest
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.validation import defects
+from hipsta_bids.validation.cases import Refusal
 from hipsta_bids.validation.defects import Damage, Trial, compare, measure_trial
-from hipsta_bids.validation.workers import Refusal
 
 SPIRAL = defects.SPECS[0]
 

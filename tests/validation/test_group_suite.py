@@ -2,9 +2,9 @@
 
 import pytest
 
-from hipsta_bids.group.simulation import SimulationResult
-from hipsta_bids.subcommands import validate_parser
+from hipsta_bids.cli.phantom import validate_parser
 from hipsta_bids.validation import group
+from hipsta_bids.validation.group import SimulationResult
 
 GOOD = SimulationResult(
     false_discovery_rate=0.02, core_power=0.8, peak_error=1.0, null_findings=0.03, cohorts=4

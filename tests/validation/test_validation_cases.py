@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from hipsta_bids.phantom import Phantom, PhantomSpec
-from hipsta_bids.phantom.body import PITCH
-from hipsta_bids.schemes import load_scheme
-from hipsta_bids.validation.accuracy import _poses, _thickness_table
-from hipsta_bids.validation.accuracy_rows import ROWS, Row
+from hipsta_bids.phantom.shape import PITCH
+from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.validation.accuracy import ROWS, Row, _poses, _thickness_table
 from hipsta_bids.validation.cases import (
     CURVATURES,
     GAUSSIAN_CURVATURES,
     Case,
     Measured,
+    Refusal,
     along_slices,
     any_pose,
     compare,
@@ -23,10 +23,9 @@ from hipsta_bids.validation.cases import (
     measure_case,
     random_motion,
 )
+from hipsta_bids.validation.convergence import _limits_table as limit_table
 from hipsta_bids.validation.convergence import rate
 from hipsta_bids.validation.invariance import Motions, _motion_table, _pair_table
-from hipsta_bids.validation.limits import _table as limit_table
-from hipsta_bids.validation.workers import Refusal
 
 SMALL = PhantomSpec(length=8.0, end_length=2.0, variation=0.2)
 

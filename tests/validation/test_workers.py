@@ -2,7 +2,7 @@
 
 from validation_jobs import work
 
-from hipsta_bids.validation.workers import Refusal, processors, run_cases
+from hipsta_bids.validation.cases import Refusal, processors, run_cases
 
 
 def test_results_come_in_the_order_of_the_cases():

@@ -1,1 +1,0 @@
-"""The dataset side: finds inputs, opens images, spells output names, writes files."""

@@ -1,0 +1,113 @@
+"""What a run says on the terminal."""
+
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hipsta_bids import __version__
+
+if TYPE_CHECKING:
+    from hipsta_bids.participant.job import Outcome
+    from hipsta_bids.participant.run import RunResult
+
+
+def say(text: str) -> None:
+    """Print a line of results."""
+    sys.stdout.write(f"{text}\n")
+    sys.stdout.flush()
+
+
+def complain(text: str) -> None:
+    """Print one line about what went wrong."""
+    sys.stderr.write(" ".join(text.split()) + "\n")
+    sys.stderr.flush()
+
+
+def say_start(level: str, bids_dir: Path) -> None:
+    """Say at once what runs: finding the inputs can take a while."""
+    say(f"hipsta_bids {__version__}, {level} level of {bids_dir}")
+
+
+class Progress:
+    """One line per hemisphere, and a bar below them where there is a terminal.
+
+    Parameters
+    ----------
+    total : int
+        Number of hemispheres.
+    verbosity : int
+        Above 0, unchanged hemispheres get a line too.
+    """
+
+    def __init__(self, total: int, verbosity: int) -> None:
+        self._verbosity = verbosity
+        self._bar: Any = None
+        if sys.stderr.isatty():
+            from tqdm import tqdm  # noqa: PLC0415  (not needed elsewhere)
+
+            tqdm.monitor_interval = 0  # its thread would keep workers from being forked
+            self._bar = tqdm(total=total, unit="hemisphere", file=sys.stderr, leave=False)
+
+    def report(self, outcome: "Outcome") -> None:
+        """Show one outcome."""
+        if self._bar is not None:
+            self._bar.clear()
+        if outcome.status == "failed":
+            complain(summary_line(outcome))
+            if outcome.trace and self._verbosity:
+                sys.stderr.write(outcome.trace)
+        elif not outcome.skipped or self._verbosity:
+            say(summary_line(outcome))
+        if self._bar is not None:
+            self._bar.update()
+
+    def close(self) -> None:
+        """Take the bar away."""
+        if self._bar is not None:
+            self._bar.close()
+
+
+def summary_line(outcome: "Outcome") -> str:
+    """Sum up one hemisphere: whose, status, mean thickness, time, and what to know."""
+    name = outcome.job.place.name
+    parts = [f"{name.stem}_{name.protocol}", str(outcome.status)]
+    if outcome.thickness is not None:
+        parts.append(f"mean thickness {outcome.thickness:.3f} mm")
+    if outcome.seconds is not None:
+        parts.append(f"{outcome.seconds:.1f} s")
+    if outcome.job.item.edited:
+        parts.append(f"edited {' and '.join(outcome.job.item.edited)}")
+    if outcome.skipped:
+        parts.append("unchanged, skipped")
+    if outcome.status == "repaired" and outcome.message:
+        parts.append(f"{outcome.message.count('; ') + 1} repairs, see its quality metrics")
+    elif outcome.reason:
+        parts.append(f"[{outcome.reason}] {outcome.message}")
+    return "  ".join(parts)
+
+
+def say_result(result: "RunResult", out_dir: Path) -> None:
+    """Say where the outputs are and how many hemispheres ended how."""
+    counts = ", ".join(f"{n} {status}" for status, n in sorted(result.counts.items()))
+    missing = result.n_requested - len(result.outcomes)
+    counts += f", {missing} not run" if missing else ""
+    skipped = sum(outcome.skipped for outcome in result.outcomes)
+    unchanged = f" ({skipped} unchanged, skipped)" if skipped else ""
+    say(f"{result.n_requested} hemispheres: {counts}{unchanged}")
+    say(f"maps: {out_dir}")
+    say(f"table of all hemispheres: {out_dir / 'status.tsv'}")
+    page = out_dir / "report.html"
+    if page.exists():
+        say(f"report: {page}")
+    for problem in result.page_problems:
+        complain(f"warning: report: {problem}")
+    say(f"log: {result.log}")
+
+
+def say_table(rows: Sequence[Mapping[str, str]]) -> None:
+    """Print rows as aligned columns; a column that is empty throughout is left out."""
+    columns = [c for c in (rows[0] if rows else ()) if any(row[c] for row in rows)]
+    widths = {c: max(len(c), *(len(row[c]) for row in rows)) for c in columns}
+    for row in [{c: c for c in columns}, *rows]:
+        say("  ".join(row[c].ljust(widths[c]) for c in columns).rstrip())

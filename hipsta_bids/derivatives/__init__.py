@@ -1,0 +1,1 @@
+"""Names, files and tables of the output dataset."""

@@ -1,0 +1,335 @@
+"""The files of the output dataset as a whole: description, settings, what to cite."""
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from hipsta_bids import __version__
+from hipsta_bids.derivatives.names import DATASET_FILES, ignore_patterns
+from hipsta_bids.errors import InputError, SettingsError, UsageError
+from hipsta_bids.io import files
+from hipsta_bids.protocols.protocol import Scheme
+from hipsta_bids.settings import BodySettings, Settings, flatten, resolve, settings_hash
+
+NAME = "hipsta_bids"
+BIDS_VERSION = "1.11.0"
+
+#: Set in container images, read into ``GeneratedBy``: type, tag and address of the container.
+CONTAINER_VARIABLES = {
+    "Type": "HIPSTA_BIDS_CONTAINER_TYPE",
+    "Tag": "HIPSTA_BIDS_CONTAINER_TAG",
+    "URI": "HIPSTA_BIDS_CONTAINER_URI",
+}
+
+
+def check_not_foreign(root: Path) -> None:
+    """Refuse to write into a dataset that another program made.
+
+    Parameters
+    ----------
+    root : Path
+        The output folder; it need not exist.
+
+    Raises
+    ------
+    UsageError
+        If its description names other software.
+    InputError
+        If its description cannot be read.
+    """
+    path = root / DATASET_FILES["description"]
+    if not path.exists():
+        return
+    makers = generated_by(files.read_json(path))
+    if NAME not in makers:
+        raise UsageError(
+            f"{root}: already a dataset of {', '.join(makers) or 'another kind'}; choose an output"
+            " folder of its own",
+            reason="foreign-output",
+        )
+
+
+def generated_by(description: Mapping[str, Any]) -> list[str]:
+    """Names of the software that a dataset description says it was made by."""
+    entries = description.get("GeneratedBy")
+    return [
+        str(entry.get("Name"))
+        for entry in (entries if isinstance(entries, list) else [])
+        if isinstance(entry, Mapping)
+    ]
+
+
+def settle_settings(root: Path, settings: Settings) -> str:
+    """Record the resolved settings, or check that they are those of the earlier runs here.
+
+    One folder holds results of one set of settings only: maps made with different ones must
+    not be pooled, so this holds for every run, ``--force`` or not.
+
+    Parameters
+    ----------
+    root : Path
+        The output dataset.
+    settings : Settings
+        Those of this run.
+
+    Returns
+    -------
+    str
+        Their hash.
+
+    Raises
+    ------
+    SettingsError
+        If the folder has results with other settings; the message names them.
+    OutputError
+        If the file cannot be written.
+    InputError
+        If an earlier file cannot be read.
+    """
+    path = root / DATASET_FILES["settings"]
+    digest, resolved = shared_settings(settings)
+    if path.exists():
+        earlier = files.read_json(path)
+        if earlier.get("hash") == digest:
+            return digest
+        theirs = flatten(earlier.get("settings", {}))
+        ours = flatten(resolved)
+        changes = [
+            f"{key} was {theirs.get(key, 'not there')}, now {ours.get(key, 'not there')}"
+            for key in dict.fromkeys((*theirs, *ours))
+            if theirs.get(key) != ours.get(key)
+        ]
+        raise SettingsError(
+            f"{root}: holds results with other settings ({'; '.join(changes) or 'hash differs'});"
+            " use a new output folder, or delete this one to redo all of it",
+            reason="other-settings",
+        )
+    content = {"hash": digest, "version": __version__, "settings": resolved}
+    files.write_json(path, content)
+    return digest
+
+
+def shared_settings(settings: Settings) -> tuple[str, dict[str, Any]]:
+    """Hash and resolve what all results of a folder share: everything but the region.
+
+    The region is in the names of the files, so that one folder may hold several.
+    """
+    anywhere = replace(settings, body=replace(settings.body, region=BodySettings().region))
+    resolved = resolve(anywhere)
+    del resolved["body"]["region"]
+    return settings_hash(anywhere), resolved
+
+
+def write_description(root: Path, sources: Mapping[str, Path]) -> None:
+    """Write ``dataset_description.json`` and ``.bidsignore``.
+
+    Sources of earlier runs into the same folder are kept.
+
+    Parameters
+    ----------
+    root : Path
+        The output dataset.
+    sources : mapping of str to Path
+        Input datasets by the names used in the quality records' ``bids:<name>:`` addresses.
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written.
+    InputError
+        If an earlier description cannot be read.
+    """
+    path = root / DATASET_FILES["description"]
+    earlier = files.read_json(path) if path.exists() else {}
+    entries = [_source(folder) for folder in sources.values()]
+    known = {entry["URL"] for entry in entries}
+    kept = [e for e in earlier.get("SourceDatasets", []) if e.get("URL") not in known]
+    links = {name: folder.resolve().as_uri() for name, folder in sources.items()}
+    made_by = {
+        "Name": NAME,
+        "Version": __version__,
+        "Description": "Thickness, curvature and shape of the hippocampal body from subfields",
+    }
+    container = {
+        key: os.environ[variable]
+        for key, variable in CONTAINER_VARIABLES.items()
+        if os.environ.get(variable)
+    }
+    description = {
+        "Name": "Hippocampal thickness and curvature maps",
+        "BIDSVersion": BIDS_VERSION,
+        "DatasetType": "derivative",
+        "GeneratedBy": [made_by | ({"Container": container} if container else {})],
+        "SourceDatasets": sorted(kept + entries, key=lambda entry: str(entry["URL"])),
+        "DatasetLinks": dict(sorted((earlier.get("DatasetLinks", {}) | links).items())),
+    }
+    files.write_json(path, description)
+    files.write_text(root / DATASET_FILES["ignore"], "\n".join(ignore_patterns()) + "\n")
+
+
+def _source(folder: Path) -> dict[str, str]:
+    """Where a source dataset is, with its identifier and version if its description has them."""
+    entry = {"URL": folder.resolve().as_uri()}
+    try:
+        description = files.read_json(folder / DATASET_FILES["description"])
+    except InputError:  # most FreeSurfer and ASHS folders have none
+        return entry
+    for key, theirs in (("DOI", "DatasetDOI"), ("Version", "DatasetVersion")):
+        if isinstance(description.get(theirs), str):
+            entry[key] = description[theirs]
+    return entry
+
+
+def source_names(folders: Iterable[tuple[str, Path]]) -> dict[str, Path]:
+    """Give each source dataset a name of its own.
+
+    Parameters
+    ----------
+    folders : iterable of (str, Path)
+        Wished name and folder; folders may repeat.
+
+    Returns
+    -------
+    dict of str to Path
+        Letters, digits, ``-`` and ``_`` only; numbered where two folders wish the same name.
+    """
+    names: dict[str, Path] = {}
+    for wish, folder in dict.fromkeys(folders):
+        base = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "-" for c in wish)
+        name, number = base, 2
+        while names.get(name, folder) != folder:
+            name, number = f"{base}-{number}", number + 1
+        names[name] = folder
+    return names
+
+
+def source_address(path: Path, sources: Mapping[str, Path]) -> str:
+    """Spell an input file as a BIDS address, ``bids:<dataset>:<path in it>``.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    sources : mapping of str to Path
+        Datasets by name.
+
+    Returns
+    -------
+    str
+        The plain path if the file is in none of them.
+    """
+    for name, folder in sources.items():
+        if path.is_relative_to(folder):
+            return f"bids:{name}:{path.relative_to(folder).as_posix()}"
+    return str(path)
+
+
+def write_citation(root: Path, settings: Settings, schemes: Sequence[Scheme]) -> None:
+    """Write ``CITATION.md``: a methods paragraph with this run's settings, and the references.
+
+    Parameters
+    ----------
+    root : Path
+        The output dataset.
+    settings : Settings
+        Those of this run.
+    schemes : sequence of Scheme
+        Segmentation protocols in use.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written.
+    """
+    files.write_text(root / DATASET_FILES["citation"], citation_text(settings, schemes))
+
+
+# Wording of ``CITATION.md``: a methods paragraph that says what was done, with references.
+
+
+_LAYER_RULES = {
+    "nearest-sheet": "was given to the nearest subfield of the sheet",
+    "nearest-label": "was given to the nearest label, the dentate gyrus and CA4 included",
+}
+
+_REGIONS = {
+    "body": "",
+    "extended": " For files with label-extended, the sheet goes on beyond the subiculum into the"
+    " neighboring cortex, between the same end planes.",
+    "entorhinal": " For files with label-entorhinal, the neighboring cortex alone was taken,"
+    " between the same end planes; its interior side is the one that continues the hippocampal"
+    " sheet's.",
+}
+
+#: Key and entry of each work that the methods rest on.
+REFERENCES: dict[str, str] = {
+    "method": "Diers K, Baumeister H, Jessen F, Düzel E, Berron D, Reuter M. An automated,"
+    " geometry-based method for hippocampal shape and thickness analysis. NeuroImage"
+    " 2023;276:120182. doi:10.1016/j.neuroimage.2023.120182",
+    "shapedna": "Reuter M, Wolter FE, Peinecke N. Laplace-Beltrami spectra as 'Shape-DNA' of"
+    " surfaces and solids. Computer-Aided Design 2006;38(4):342-366."
+    " doi:10.1016/j.cad.2005.10.011",
+    "brainprint": "Wachinger C, Golland P, Kremen W, Fischl B, Reuter M. BrainPrint: a"
+    " discriminative characterization of brain morphology. NeuroImage 2015;109:232-248."
+    " doi:10.1016/j.neuroimage.2015.01.032",
+    "tetgen": "Si H. TetGen, a Delaunay-based quality tetrahedral mesh generator. ACM Transactions"
+    " on Mathematical Software 2015;41(2):11. doi:10.1145/2629697",
+    "pybids": "Yarkoni T, Markiewicz CJ, de la Vega A, et al. PyBIDS: Python tools for BIDS"
+    " datasets. Journal of Open Source Software 2019;4(40):1294. doi:10.21105/joss.01294",
+}
+
+
+def citation_text(settings: Settings, schemes: Sequence[Scheme]) -> str:
+    """Word the methods paragraph.
+
+    Parameters
+    ----------
+    settings : Settings
+        Those in use.
+    schemes : sequence of Scheme
+        Segmentation protocols in use.
+
+    Returns
+    -------
+    str
+        Markdown.
+    """
+    entries = list(REFERENCES.values())
+    entries += [scheme.citation for scheme in schemes if scheme.citation not in entries]
+    number = {entry: i for i, entry in enumerate(entries, start=1)}
+    cite = {key: f"[{number[entry]}]" for key, entry in REFERENCES.items()}
+    protocols = ", ".join(f"{s.title} [{number[s.citation]}]" for s in schemes) or "none"
+    lines = [
+        "# Methods",
+        "",
+        "This text may be used freely, as it stands or changed.",
+        "",
+        (
+            f"Hippocampal thickness and curvature were measured with hipsta_bids {__version__},"
+            f" an implementation of the method of Diers et al. {cite['method']}."
+            f" Segmentations were found with PyBIDS {cite['pybids']} and follow: {protocols}."
+            " The subfields of the hippocampal body from presubiculum to CA3 were merged into one"
+            " sheet; the molecular layer, where labeled,"
+            f" {_LAYER_RULES.get(settings.body.layer_rule, settings.body.layer_rule)}."
+            f"{_REGIONS[settings.body.region]}"
+            " The sheet was meshed as a closed surface of checked topology and filled with"
+            f" tetrahedra by TetGen {cite['tetgen']}. Its medial and lateral ends were located with"
+            " an eigenfunction of the anisotropic Laplace-Beltrami operator, computed with LaPy"
+            f" {cite['shapedna']}{cite['brainprint']} and checked against the lines farthest from"
+            " each other inside the body; three harmonic functions between opposite"
+            " faces gave each point a medial-to-lateral, posterior-to-anterior and"
+            " interior-to-exterior coordinate. Thickness is the length of a line from the interior"
+            " to the exterior wall; curvature is the mean curvature of the mid-surface."
+        ),
+        "",
+        "All settings:",
+        "",
+        *(f"- `{key}`: {value}" for key, value in flatten(resolve(settings)).items()),
+        "",
+        "# References",
+        "",
+        *(f"{i}. {entry}" for entry, i in number.items()),
+    ]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,339 @@
+"""Covariates of participants and sessions, from the tables of a BIDS dataset and from others."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from urllib.parse import unquote, urlsplit
+
+import numpy as np
+import pandas as pd
+
+from hipsta_bids.errors import InputError, ModelError
+from hipsta_bids.group.data import PARTICIPANT, SESSION
+from hipsta_bids.group.formula import typed
+from hipsta_bids.group.settings import GroupSettings
+from hipsta_bids.io import files
+
+# From the addresses in quality records back to the segmentations on disk.
+
+
+def locate_sources(sources: Sequence[str], roots: Sequence[Path]) -> list[Path | None]:
+    """Resolve addresses of segmentations.
+
+    Parameters
+    ----------
+    sources : sequence of str
+        ``bids:<dataset>:<path in it>``, or a plain path.
+    roots : sequence of Path
+        Output dataset that each is from; its description knows where the datasets are.
+
+    Returns
+    -------
+    list of Path or None
+        ``None`` where the address names no known dataset. Files may be gone.
+    """
+    links: dict[Path, Mapping[str, str]] = {}
+    result = []
+    for source, root in zip(sources, roots, strict=True):
+        if root not in links:
+            links[root] = files.read_json(root / "dataset_description.json").get("DatasetLinks", {})
+        result.append(_resolve(source, links[root]))
+    return result
+
+
+def relocate(source: str, folders: Sequence[Path]) -> str:
+    """Find a segmentation in folders where it may be now.
+
+    Parameters
+    ----------
+    source : str
+        ``bids:<dataset>:<path in it>``, or a plain path.
+    folders : sequence of Path
+        Datasets that may hold it, in order of preference.
+
+    Returns
+    -------
+    str
+        Its plain path there; the address as it was if none of them has the subject.
+    """
+    if not source.startswith("bids:"):
+        return source
+    inside = PurePosixPath(source.split(":", 2)[2])
+    for folder in folders:
+        # The image itself is not needed, only the subject's folder, for what lies beside it.
+        if (folder / inside.parts[0]).is_dir():
+            return str(folder / inside)
+    return source
+
+
+def _resolve(source: str, links: Mapping[str, str]) -> Path | None:
+    if not source.startswith("bids:"):
+        return Path(source) if source else None
+    _, dataset, inside = source.split(":", 2)
+    link = links.get(dataset, "")
+    return Path(unquote(urlsplit(link).path)) / inside if link.startswith("file:") else None
+
+
+_NAMED = 6
+
+
+def read_covariates(visits: pd.DataFrame, bids_dir: Path, extra: Sequence[Path]) -> pd.DataFrame:
+    """Join covariates to visits; cells stay text.
+
+    In this order: ``participants.tsv``, ``sessions.tsv`` of the participants, ``phenotype/*.tsv``,
+    and the user's own tables. A later table fills or replaces columns of the same name.
+
+    Parameters
+    ----------
+    visits : DataFrame
+        Participant and session, one row per visit.
+    bids_dir : Path
+        The BIDS dataset.
+    extra : sequence of Path
+        Tables with ``participant_id`` and perhaps ``session_id``.
+
+    Returns
+    -------
+    DataFrame
+        The visits with all covariates; ``None`` where there is none.
+
+    Raises
+    ------
+    InputError
+        If the dataset does not exist, a table cannot be read, has no ``participant_id`` or names
+        somebody twice, or ``participants.tsv`` is about others.
+    """
+    joined = visits.copy()
+    main = bids_dir / "participants.tsv"
+    tables = [main] if main.is_file() else []
+    if not bids_dir.is_dir():
+        raise InputError(f"{bids_dir}: no such folder; check its name", reason="no-folder")
+    for path in (*tables, *sorted((bids_dir / "phenotype").glob("*.tsv")), *extra):
+        table = _read(path)
+        if path == main:
+            _check_anybody(joined, table, path)
+        joined = _join(joined, table, path)
+        if path == main:
+            joined = _join_sessions(joined, bids_dir)
+    return joined
+
+
+def _check_anybody(visits: pd.DataFrame, table: pd.DataFrame, path: Path) -> None:
+    """Refuse a table of other people: labels may be spelled differently."""
+    if not set(visits[PARTICIPANT]) & set(table[PARTICIPANT]):
+        raise InputError(
+            f"{path}: names none of the participants here; it has {table[PARTICIPANT].iloc[0]} ...,"
+            f" here are {visits[PARTICIPANT].iloc[0]} ...",
+            reason="other-participants",
+        )
+
+
+def _read(path: Path) -> pd.DataFrame:
+    rows = files.read_tsv(path)
+    if not rows:
+        raise InputError(
+            f"{path}: has no rows; it needs a column participant_id, and a row per participant",
+            reason="bad-table",
+        )
+    table = pd.DataFrame(rows, dtype=object)
+    if PARTICIPANT not in table.columns:
+        raise InputError(
+            f"{path}: has no column participant_id; columns are parted by tabs", reason="bad-table"
+        )
+    table[PARTICIPANT] = [_prefixed(cell, "sub-") for cell in table[PARTICIPANT]]
+    if SESSION in table.columns:
+        table[SESSION] = [_prefixed(cell, "ses-") for cell in table[SESSION]]
+    return table.where(table != files.MISSING, None)
+
+
+def _prefixed(cell: str, prefix: str) -> str:
+    cell = cell.strip()
+    return cell if cell == files.MISSING or cell.startswith(prefix) else prefix + cell
+
+
+def _join_sessions(joined: pd.DataFrame, bids_dir: Path) -> pd.DataFrame:
+    parts = []
+    for participant in joined.loc[joined[SESSION].notna(), PARTICIPANT].unique():
+        path = bids_dir / participant / f"{participant}_sessions.tsv"
+        if path.is_file():
+            part = pd.DataFrame(files.read_tsv(path), dtype=object)
+            if SESSION not in part.columns:
+                raise InputError(f"{path}: has no column session_id", reason="bad-table")
+            part[SESSION] = [_prefixed(cell, "ses-") for cell in part[SESSION]]
+            part = part.where(part != files.MISSING, None)
+            parts.append(part.assign(**{PARTICIPANT: participant}))
+    if not parts:
+        return joined
+    return _join(joined, pd.concat(parts, ignore_index=True), bids_dir / "sub-*_sessions.tsv")
+
+
+def _join(joined: pd.DataFrame, table: pd.DataFrame, path: Path) -> pd.DataFrame:
+    """Add the columns of one table, by participant, and by session where it tells sessions."""
+    by_session = SESSION in table.columns and bool(table[SESSION].notna().any())
+    keys = [PARTICIPANT, SESSION] if by_session else [PARTICIPANT]
+    table = table.drop(columns=[SESSION]) if SESSION in table and not by_session else table
+    table = table[table[PARTICIPANT].isin(joined[PARTICIPANT])]
+    twice = table.loc[table.duplicated(keys), keys].astype(str).agg(" ".join, axis=1)
+    if len(twice):
+        names = sorted(set(twice))
+        more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+        raise InputError(
+            f"{path}: {', '.join(names[:_NAMED])}{more} stand more than once; keep one row each",
+            reason="duplicate-rows",
+        )
+    indexed = table.set_index(keys)
+    wanted = pd.MultiIndex.from_frame(joined[keys]) if by_session else joined[PARTICIPANT]
+    aligned = indexed.reindex(wanted)
+    result = joined.copy()
+    for column in indexed.columns:
+        values = pd.Series(aligned[column].to_numpy(), index=joined.index, dtype=object)
+        values = values.where(values.notna(), None)
+        if column in result.columns:
+            values = values.where(values.notna(), result[column])
+        result[column] = values
+    return result
+
+
+def read_icv(sources: Sequence[str], roots: Sequence[Path]) -> list[float | None]:
+    """Find the intracranial volume that the segmentation's own program estimated.
+
+    FreeSurfer's ``stats/aseg.stats`` (EstimatedTotalIntraCranialVol) beside the ``mri`` folder, or
+    ASHS's ``*_icv.txt`` beside or above the segmentation.
+
+    Parameters
+    ----------
+    sources : sequence of str
+        Address of a segmentation of each visit, ``bids:<dataset>:<path>``.
+    roots : sequence of Path
+        Dataset whose description knows that name, per visit.
+
+    Returns
+    -------
+    list of float or None
+        mm^3.
+    """
+    paths = locate_sources(sources, roots)
+    return [None if path is None else _icv_beside(path) for path in paths]
+
+
+def _icv_beside(path: Path) -> float | None:
+    stats = path.parent.parent / "stats" / "aseg.stats"
+    if stats.is_file():
+        for line in stats.read_text(encoding="utf-8", errors="replace").splitlines():
+            if line.startswith("# Measure EstimatedTotalIntraCranialVol,"):
+                return _number(line.split(",")[-2])
+    for folder in (path.parent, path.parent.parent, path.parent.parent / "final"):
+        for found in sorted(folder.glob("*icv.txt")):
+            words = found.read_text(encoding="utf-8", errors="replace").split()
+            if words:  # subject and volume, or the volume alone
+                return _number(words[-1])
+    return None
+
+
+def _number(text: str) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if value > 0 else None
+
+
+# The time of visits, for longitudinal models.
+
+
+#: Column of BIDS' sessions.tsv with dates, and columns that are made here.
+_DATE, TIME, FIRST_AGE = "acq_time", "time", "age_first"
+_DAYS_PER_YEAR = 365.25
+
+
+@dataclass(frozen=True)
+class VisitTime:
+    """Visits with their time."""
+
+    table: pd.DataFrame
+    column: str | None
+    """Of the time; None if nothing tells it."""
+    covariates: tuple[str, ...]
+    """Names of covariates of the default model, age being that of the first visit."""
+
+
+def add_time(table: pd.DataFrame, settings: GroupSettings) -> VisitTime:
+    """Find the time of each visit, or make it from dates or ages.
+
+    A column of ``longitudinal.time_columns`` that varies between the sessions of somebody; else
+    ``acq_time``, in years since the participant's first session; else age, likewise. If age
+    varies between sessions, the age at the first one is added, since the other would take part of
+    the change.
+
+    Parameters
+    ----------
+    table : DataFrame
+        Visits with covariates.
+    settings : GroupSettings
+        Names of columns.
+
+    Raises
+    ------
+    ModelError
+        If dates cannot be read.
+    """
+    covariates = tuple(settings.model.covariates)
+    by_name = {str(column).casefold(): str(column) for column in table.columns}
+    age = by_name.get("age")
+    result = table
+    ages = None
+    if age is not None:
+        ages = typed(table[age], settings.design)
+        if pd.api.types.is_numeric_dtype(ages) and varies_within(ages, table):
+            first = ages.groupby(table[PARTICIPANT]).transform("first")
+            result = result.assign(**{FIRST_AGE: first})
+            covariates = tuple(
+                FIRST_AGE if name.casefold() == "age" else name for name in covariates
+            )
+        else:
+            ages = None
+    column = _given(table, settings.longitudinal.time_columns, by_name, settings)
+    if column is None and _DATE in table.columns and table[_DATE].notna().any():
+        days = _dates(table[_DATE])
+        result, column = result.assign(**{TIME: _since_first(days, table) / _DAYS_PER_YEAR}), TIME
+    elif column is None and ages is not None:
+        result, column = result.assign(**{TIME: _since_first(ages, table)}), TIME
+    elif column is not None:
+        result = result.assign(**{column: typed(table[column], settings.design)})
+    return VisitTime(result, column, covariates)
+
+
+def varies_within(values: pd.Series, table: pd.DataFrame) -> bool:
+    """Whether somebody has different values at different sessions."""
+    own = values.groupby(table[PARTICIPANT])
+    return bool((own.transform("min") < own.transform("max")).any())
+
+
+def _given(
+    table: pd.DataFrame, names: Sequence[str], by_name: dict[str, str], settings: GroupSettings
+) -> str | None:
+    for name in names:
+        column = by_name.get(name.casefold())
+        if column is None:
+            continue
+        values = typed(table[column], settings.design)
+        if pd.api.types.is_numeric_dtype(values) and varies_within(values, table):
+            return column
+    return None
+
+
+def _dates(values: pd.Series) -> pd.Series:
+    """Days, from ISO dates."""
+    try:
+        dates = pd.to_datetime(values, format="ISO8601", utc=True)
+    except (ValueError, TypeError) as error:
+        raise ModelError(
+            f"sessions: acq_time is not a date and time as 2001-02-03T04:05:06 ({error})",
+            reason="bad-date",
+        ) from error
+    days = (dates - dates.min()) / pd.Timedelta(days=1)
+    return days.astype(np.float64)
+
+
+def _since_first(values: pd.Series, table: pd.DataFrame) -> pd.Series:
+    return values - values.groupby(table[PARTICIPANT]).transform("min")

@@ -1,0 +1,126 @@
+"""Values that pass between reading, analyzing and writing at the group level."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from hipsta_bids.types import Mesh
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+#: Columns that tell visits apart, with the prefixes of BIDS.
+PARTICIPANT, SESSION = "participant_id", "session_id"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measures:
+    """What the model is fitted to."""
+
+    maps: tuple[str, ...]
+    """Maps of the sheet, by the names of their columns or by those that a user gave."""
+    summaries: tuple[str, ...] | None = None
+    """Summary measures; ``None`` for all."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SideMaps:
+    """Sheets of one hemisphere of all visits that have it."""
+
+    rows: Int
+    """(sheets,) row of each in the cohort's table, rising."""
+    maps: Mapping[str, Float]
+    """(sheets, x, y) per measure; NaN is missing."""
+    subfield: NDArray[np.int8]
+    """(sheets, x, y) place in ``names``; -1 is missing."""
+    names: tuple[str, ...]
+    """Abbreviations of subfields."""
+    summary: pd.DataFrame
+    """One row per sheet: the columns of the participant level's summaries, as numbers."""
+    mesh: Mesh | None = None
+    """Where the points lie if it is not on the grid: x are its vertices then, and y is 1."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Nodes along x and y."""
+        return self.subfield.shape[1], self.subfield.shape[2]
+
+    def only(self, measures: Sequence[str]) -> "SideMaps":
+        """Keep some maps.
+
+        Parameters
+        ----------
+        measures : sequence of str
+            Which.
+        """
+        return replace(self, maps={name: self.maps[name] for name in measures})
+
+    def with_summary(self, columns: pd.DataFrame) -> "SideMaps":
+        """Add summary measures.
+
+        Parameters
+        ----------
+        columns : DataFrame
+            One row per sheet, in their order.
+        """
+        joined = pd.concat([self.summary, columns.set_axis(self.summary.index)], axis=1)
+        return replace(self, summary=joined)
+
+    def take(self, keep: NDArray[np.bool_]) -> "SideMaps":
+        """Keep some rows of the cohort's table, which are numbered anew.
+
+        Parameters
+        ----------
+        keep : ndarray of bool, shape (rows of the table,)
+            Which.
+        """
+        own = keep[self.rows]
+        return replace(
+            self,
+            rows=(np.cumsum(keep) - 1)[self.rows[own]],
+            maps={name: values[own] for name, values in self.maps.items()},
+            subfield=self.subfield[own],
+            summary=self.summary[own].reset_index(drop=True),
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Cohort:
+    """All that the models are fitted to."""
+
+    table: pd.DataFrame
+    """One row per visit: participant, session and covariates; the index names the visits."""
+    sides: Mapping[str, SideMaps]
+    """By hemisphere, ``L`` and ``R``; only those that occur."""
+    x: Float
+    """(x,) sheet coordinates of the nodes, medial to lateral, -1..1."""
+    y: Float
+    """(y,) sheet coordinates of the nodes, posterior to anterior, -1..1."""
+    units: Mapping[str, str]
+    """Units of maps and summary columns."""
+
+    def take(self, keep: NDArray[np.bool_]) -> "Cohort":
+        """Keep some visits.
+
+        Parameters
+        ----------
+        keep : ndarray of bool, shape (visits,)
+            Which.
+        """
+        return replace(
+            self,
+            table=self.table[keep],
+            sides={hemi: side.take(keep) for hemi, side in self.sides.items()},
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ResultTable:
+    """A table of results, to be written with a sidecar."""
+
+    name: str
+    """File name without its extension."""
+    rows: pd.DataFrame

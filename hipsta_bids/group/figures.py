@@ -1,0 +1,579 @@
+"""How well groups are told apart: receiver operating characteristics and calibration."""
+
+import io
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from hipsta_bids.group.analysis import Analysis, mean_of_known, members_of, rows_of, spread_of_known
+from hipsta_bids.group.classify import ClassifierResult, PairComparison, roc_curve
+from hipsta_bids.group.comparison import BOTH
+from hipsta_bids.group.data import Cohort, Float, Int
+from hipsta_bids.group.fit import FittedMaps
+from hipsta_bids.group.glm import PointTest
+from hipsta_bids.group.inference import MapKey
+from hipsta_bids.group.shapes import AverageShape
+from hipsta_bids.reports.plotting import new_figure
+from hipsta_bids.types import Mesh
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+# What the figures of the group level share.
+
+
+#: Colors of groups that people who cannot tell red from green can tell (Okabe and Ito 2008).
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+#: Points; of titles, of axes, and of what stands inside.
+TITLE, LABEL, SMALL = 9, 7.5, 6.5
+_DOTS_PER_INCH = 150
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drawing:
+    """One figure, encoded."""
+
+    name: str
+    """File name without its extension."""
+    png: bytes
+    svg: bytes
+
+
+def encode(name: str, figure: "Figure") -> Drawing:
+    """Encode a figure as a picture and as a drawing; the same results give the same bytes."""
+    from matplotlib import rc_context  # noqa: PLC0415  (optional, slow to load)
+
+    encoded = {}
+    with rc_context({"svg.hashsalt": "hipsta_bids", "svg.fonttype": "none"}):
+        for kind, metadata in (("png", {"Software": None}), ("svg", {"Date": None})):
+            buffer = io.BytesIO()
+            figure.savefig(buffer, format=kind, dpi=_DOTS_PER_INCH, metadata=metadata)
+            encoded[kind] = buffer.getvalue()
+    return Drawing(name=name, png=encoded["png"], svg=encoded["svg"])
+
+
+def panels(n_rows: int, n_columns: int, size: tuple[float, float]) -> tuple["Figure", Any]:
+    """Return an empty figure and its panels, of a size in inches."""
+    figure = new_figure((size[0] * n_columns + 0.8, size[1] * n_rows + 0.4), layout="constrained")
+    return figure, figure.subplots(n_rows, n_columns, squeeze=False)
+
+
+def side_name(hemi: str) -> str:
+    """Spell a hemisphere out."""
+    return {"L": "left", "R": "right"}.get(hemi, "left minus right")
+
+
+def spelled(measure: str) -> str:
+    """Spell a measure with spaces."""
+    return measure.replace("_", " ")
+
+
+def shown(analysis: Analysis, measure: str) -> Mapping[str, FittedMaps]:
+    """Give hemispheres, or their difference, that have maps of a measure."""
+    return {hemi: one for hemi, one in analysis.fitted.items() if measure in one.fits}
+
+
+def repeat_colors() -> Iterator[str]:
+    """Colors of groups, again and again."""
+    while True:
+        yield from COLORS
+
+
+def mark_medial(axis: "Axes", cohort: Cohort) -> None:
+    """Say on the x axis which end is medial."""
+    axis.set_xticks([cohort.x[0], cohort.x[-1]], ["medial", "lateral"], fontsize=LABEL)
+    left, right = axis.get_xticklabels()
+    left.set_horizontalalignment("left")
+    right.set_horizontalalignment("right")
+
+
+_Place = Literal["lower right", "upper left"]
+_SQUARE_PANEL = (3.1, 3.2)  # inches
+_SIDES = {"L": "left", "R": "right"}
+
+
+def draw_roc(analysis: Analysis) -> "Figure":
+    """Draw the curves of the first added measure."""
+    figure, axes = panels(*_shape(analysis), _SQUARE_PANEL)
+    for axis, pair in _pairs(analysis, axes):
+        for color, name, result in _models(analysis, pair):
+            area, validation = result.auc, result.cross_validation
+            text = f"{name}: {area.area:.2f} ({area.low:.2f}-{area.high:.2f})"
+            text += f"\nleft out: {validation.auc:.2f}"
+            curve = roc_curve(result.score, pair.is_case)
+            axis.plot(*curve, color=color, label=text, linewidth=1.2)
+        title = "area, participants fitted and left out"
+        _finish(axis, ("1 - specificity", "sensitivity"), title, "lower right")
+    return figure
+
+
+def draw_calibration(analysis: Analysis) -> "Figure":
+    """Draw predicted chances, cross-validated, against what happened."""
+    figure, axes = panels(*_shape(analysis), _SQUARE_PANEL)
+    for axis, pair in _pairs(analysis, axes):
+        for color, name, result in _models(analysis, pair):
+            found = result.calibration
+            text = f"{name}: {found.slope:.2f}, {found.brier:.2f}"
+            axis.plot(found.predicted, found.observed, "o-", color=color, label=text, markersize=3)
+        labels = ("predicted chance, cross-validated", "share of cases")
+        _finish(axis, labels, "slope, Brier score", "upper left")
+    return figure
+
+
+def _shape(analysis: Analysis) -> tuple[int, int]:
+    hemis, pairs = _names(analysis)
+    return len(pairs), len(hemis)
+
+
+def _names(analysis: Analysis) -> tuple[list[str], list[tuple[str, str]]]:
+    hemis = list(dict.fromkeys(hemi for hemi, _, _ in analysis.pairs))
+    pairs = list(dict.fromkeys((pair.control, pair.case) for _, _, pair in analysis.pairs))
+    return hemis, pairs
+
+
+def _pairs(analysis: Analysis, axes: Any) -> Iterator[tuple["Axes", PairComparison]]:  # noqa: ANN401  (of matplotlib)
+    """Give the first added measure of each pair and hemisphere, with its panel."""
+    hemis, pairs = _names(analysis)
+    first: dict[tuple[str, str, str], PairComparison] = {}
+    for hemi, _, pair in analysis.pairs:
+        first.setdefault((hemi, pair.control, pair.case), pair)
+    for i, (control, case) in enumerate(pairs):
+        for j, hemi in enumerate(hemis):
+            axis = axes[i, j]
+            if (hemi, control, case) not in first:
+                axis.set_axis_off()
+                continue
+            pair = first[hemi, control, case]
+            how = "\n(separated: Firth's method)" if pair.comparison.separated else ""
+            side = _SIDES.get(hemi, "both sides")
+            axis.set_title(f"{control} against {case}, {side}{how}", fontsize=TITLE)
+            axis.plot([0, 1], [0, 1], color="0.6", linewidth=0.5)
+            yield axis, pair
+
+
+def _models(
+    analysis: Analysis, pair: PairComparison
+) -> Iterator[tuple[str, str, ClassifierResult]]:
+    added = next(measure for _, measure, other in analysis.pairs if other is pair)
+    yield COLORS[0], "base", pair.comparison.base
+    yield COLORS[1], f"with {spelled(added)}", pair.comparison.full
+
+
+def _finish(axis: "Axes", labels: tuple[str, str], title: str, place: _Place) -> None:
+    axis.set_xlabel(labels[0], fontsize=LABEL)
+    axis.set_ylabel(labels[1], fontsize=LABEL)
+    axis.set_aspect("equal")
+    axis.tick_params(labelsize=LABEL)
+    axis.legend(fontsize=SMALL, loc=place, title=title, title_fontsize=SMALL)
+
+
+# Curves along x by group: profiles before and after registration, and warps.
+
+
+def draw_profiles(cohort: Cohort, analysis: Analysis) -> "Figure":
+    """Draw means over y by group, before and after registration."""
+    measures = list(next(iter(cohort.sides.values())).maps)
+    figure, axes = panels(len(analysis.sides), 2 * len(measures), (3.0, 2.4))
+    for i, (hemi, side) in enumerate(analysis.sides.items()):
+        sources = {"before": cohort.sides[hemi], "after": side.registered}
+        for j, measure in enumerate(measures):
+            pair = axes[i, 2 * j : 2 * j + 2]
+            for axis, (when, source) in zip(pair, sources.items(), strict=True):
+                values = mean_of_known(source.maps[measure], 2)
+                members = members_of(analysis, cohort.table.iloc[source.rows])
+                for color, (group, own) in zip(repeat_colors(), members.items(), strict=False):
+                    _band(axis, cohort.x, values[own], group, color)
+                axis.set_title(
+                    f"{spelled(measure)}, {side_name(hemi)},\n{when} registration", fontsize=TITLE
+                )
+                _finish_curve(
+                    axis, cohort, f"{spelled(measure)} [{cohort.units.get(measure, '1')}]"
+                )
+            pair[1].sharey(pair[0])
+    axes[0, 0].legend(fontsize=LABEL, title="mean, 2 SE", title_fontsize=LABEL)
+    return figure
+
+
+def draw_warps(cohort: Cohort, analysis: Analysis) -> "Figure":
+    """Draw displacements by group."""
+    figure, axes = panels(len(analysis.sides), 2, (3.6, 2.6))
+    for i, (hemi, side) in enumerate(analysis.sides.items()):
+        nodes = side.registration.warps.shape[1]
+        moved = (side.registration.warps - np.linspace(0, 1, nodes)) * (nodes - 1)
+        members = members_of(analysis, cohort.table.iloc[side.registered.rows])
+        for color, (group, own) in zip(repeat_colors(), members.items(), strict=False):
+            axes[i, 0].plot(cohort.x, moved[own].T, color=color, alpha=0.4, linewidth=0.6)
+            _band(axes[i, 1], cohort.x, moved[own], group, color)
+        for axis, what in zip(axes[i], ("each participant", "means, 2 SE"), strict=True):
+            axis.axhline(0, color="black", linewidth=0.5)
+            axis.set_title(f"warps, {side_name(hemi)}, {what}", fontsize=TITLE)
+            _finish_curve(axis, cohort, "shift to lateral [nodes]")
+    axes[0, 1].legend(fontsize=LABEL)
+    return figure
+
+
+def _finish_curve(axis: "Axes", cohort: Cohort, label: str) -> None:
+    axis.set_ylabel(label, fontsize=LABEL)
+    mark_medial(axis, cohort)
+    axis.tick_params(labelsize=LABEL)
+
+
+def _band(axis: "Axes", x: Float, values: Float, name: str, color: str) -> None:
+    """Draw a mean and twice its standard error to both sides."""
+    count = np.isfinite(values).sum(axis=0)
+    mean = mean_of_known(values, 0)
+    error = spread_of_known(values) / np.sqrt(np.maximum(count, 1))
+    axis.plot(x, mean, color=color, label=f"{name} (n = {len(values)})", linewidth=1.2)
+    axis.fill_between(x, mean - 2 * error, mean + 2 * error, color=color, alpha=0.25, linewidth=0)
+
+
+# Maps on a triangle mesh, flat or folded.
+
+
+#: A surface is flat if it is thinner than this share of its length.
+_FLAT = 1e-3
+
+
+def draw_mesh(
+    axis: "Axes", mesh: Mesh, values: Float, colors: str, limits: tuple[float, float]
+) -> Any:  # noqa: ANN401  (what colorbars take)
+    """Draw one map, upright as sheets are.
+
+    A flat surface is drawn in its own coordinates. HippUnfold's runs from anterior to posterior
+    along x and from the subiculum to the dentate gyrus along y, so that x goes down and y to the
+    right, as on a sheet. A folded surface is seen along its thinnest direction.
+
+    Parameters
+    ----------
+    axis : Axes
+    mesh : Mesh
+        Surface.
+    values : ndarray
+        One number per vertex; triangles are drawn where all three are known.
+    colors : str
+        Color map.
+    limits : (float, float)
+        Values at its ends.
+    """
+    plane, triangles, words = _laid_out(mesh)
+    flat = values.reshape(-1)
+    known = np.isfinite(flat[triangles]).all(axis=1)
+    axis.set_facecolor("0.92")
+    axis.set_aspect("equal")
+    axis.set_xlabel(words[0], fontsize=LABEL)
+    axis.set_ylabel(words[1], fontsize=LABEL)
+    axis.tick_params(labelsize=SMALL)
+    (left, bottom), (right, top) = plane.min(axis=0), plane.max(axis=0)
+    axis.set_xlim(left, right)
+    axis.set_ylim(*((top, bottom) if words[1].startswith("x") else (bottom, top)))
+    # One invisible triangle carries the colors if nothing is known.
+    some = triangles[known] if known.any() else triangles[:1]
+    return axis.tripcolor(
+        plane[:, 0],
+        plane[:, 1],
+        some,
+        facecolors=np.nan_to_num(flat[some].mean(axis=1)),
+        cmap=colors,
+        vmin=limits[0],
+        vmax=limits[1],
+        edgecolors="none",
+        rasterized=True,
+        visible=bool(known.any()),
+    )
+
+
+def _laid_out(mesh: Mesh) -> tuple[Float, Int, tuple[str, str]]:
+    """Positions in the plane, triangles from back to front, and what the axes are."""
+    centered = mesh.points - mesh.points.mean(axis=0)
+    reach = np.ptp(mesh.points, axis=0)
+    if reach[2] <= _FLAT * reach.max():
+        names = ("x of the surface", "y of the surface")
+        if reach[0] > reach[1]:
+            return mesh.points[:, [1, 0]], mesh.triangles, (names[1], names[0])
+        return mesh.points[:, :2], mesh.triangles, names
+    axes = np.linalg.svd(centered, full_matrices=False)[2]
+    turned = centered @ axes.T
+    order = np.argsort(turned[mesh.triangles, 2].mean(axis=1))
+    return turned[:, [1, 0]], mesh.triangles[order], ("second axis", "longest axis")
+
+
+# Average cross-sections of the groups: interior wall, middle and exterior wall.
+
+
+#: Where along the long axis, as a fraction from posterior to anterior.
+_PLACES = (0.1, 0.5, 0.9)
+_WIDTHS = (1.2, 0.7, 1.2)  # of the lines of interior, middle and exterior, points
+_STYLES = ("-", ":", "-")
+
+
+def draw_sections(
+    cohort: Cohort, analysis: Analysis, shapes: Mapping[str, AverageShape]
+) -> "Figure":
+    """Draw the groups' mean walls at three places along the long axis, superior up."""
+    figure, axes = panels(len(shapes), len(_PLACES), (3.2, 2.8))
+    for i, (hemi, shape) in enumerate(shapes.items()):
+        for j, place in enumerate(_PLACES):
+            axis, node = axes[i, j], round(place * (len(cohort.y) - 1))
+            plane = _plane(shape.mean[1], node, left=hemi == "L")
+            center = np.nanmean(shape.mean[:, :, node], axis=(0, 1))
+            for color, (group, layers) in zip(
+                repeat_colors(), shape.by_group.items(), strict=False
+            ):
+                flat = (layers[:, :, node] - center) @ plane.T
+                for line, width, style in zip(flat, _WIDTHS, _STYLES, strict=True):
+                    axis.plot(*line.T, color=color, linewidth=width, linestyle=style)
+                # One line more for the legend alone.
+                label = f"{group} (n = {shape.counts[group]})"
+                axis.plot([], [], color=color, label=label)
+            if hemi in analysis.fitted:
+                middle = (shape.mean[:, :, node] - center) @ plane.T
+                _mark_subfields(axis, middle, analysis.fitted[hemi], node)
+            axis.set_title(
+                f"{side_name(hemi)}, y = {cohort.y[node]:.2g} ({_where(place)})", fontsize=TITLE
+            )
+            axis.set_xlabel("to lateral [mm]", fontsize=LABEL)
+            axis.set_ylabel("to superior [mm]", fontsize=LABEL)
+            axis.set_aspect("equal", adjustable="datalim")
+            axis.tick_params(labelsize=LABEL)
+    axes[0, 0].legend(fontsize=SMALL, title="walls, and dotted the middle", title_fontsize=SMALL)
+    return figure
+
+
+def _where(place: float) -> str:
+    return {0.5: "middle"}.get(place, "posterior" if place < 0.5 else "anterior")  # noqa: PLR2004 -- the middle
+
+
+def _plane(middle: Float, node: int, *, left: bool) -> Float:
+    """Two directions across the long axis: to lateral, and to superior.
+
+    Parameters
+    ----------
+    middle : ndarray, shape (x, y, 3)
+        Mean middle surface, RAS mm.
+    node : int
+        Along y.
+    left : bool
+        Whether lateral is to the left.
+
+    Returns
+    -------
+    ndarray, shape (2, 3)
+        Orthonormal rows.
+    """
+    centers = np.nanmean(middle, axis=0)
+    along = centers[min(node + 2, len(centers) - 1)] - centers[max(node - 2, 0)]
+    along = along / np.linalg.norm(along)
+    lateral = np.array([-1.0 if left else 1.0, 0.0, 0.0])
+    lateral -= along * (along @ lateral)
+    lateral /= np.linalg.norm(lateral)
+    superior = np.cross(along, lateral)
+    return np.stack([lateral, superior if superior[2] > 0 else -superior])
+
+
+def _mark_subfields(axis: "Axes", layers: Float, one: FittedMaps, node: int) -> None:
+    """Draw borders of subfields across the mean wall, and name them inside it."""
+    fields = one.subfield[:, node]
+    inner, middle, outer = layers
+    for i in np.flatnonzero(fields[1:] != fields[:-1]):
+        ends = [(layer[i] + layer[i + 1]) / 2 for layer in (inner, outer)]
+        axis.plot(*np.transpose(ends), color="0.3", linewidth=0.6)
+    for number, name in enumerate(one.maps.names):
+        nodes = np.flatnonzero(fields == number)
+        if len(nodes):
+            place = nodes[len(nodes) // 2]
+            box = {"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 0.3}
+            x, y = middle[place]
+            axis.text(x, y, name, fontsize=SMALL, ha="center", va="center", bbox=box)
+
+
+# Maps on the sheet: means of groups, effect sizes and significance.
+
+
+_PANEL = (2.6, 3.4)  # inches
+_SHARED = (2.0, 98.0)  # percentiles that the colors of means span
+_EFFECTS = 99.0  # percentile of sizes that the colors of effects span
+_SMALLEST_P = 1e-10
+_LEAST_REACH = 3.0  # powers of ten of p that colors span at least
+
+
+def draw_means(cohort: Cohort, analysis: Analysis, measure: str) -> "Figure":
+    """Draw the mean map of each group."""
+    groups = analysis.groups.levels if analysis.groups else ("all",)
+    sides = shown(analysis, measure)
+    figure, axes = panels(len(sides), len(groups), _PANEL)
+    means, counts = {}, {}
+    for hemi, one in sides.items():
+        for group, own in members_of(analysis, rows_of(analysis, one)).items():
+            values = mean_of_known(one.values(measure)[own], 0)
+            means[hemi, group] = values.reshape(one.maps.shape)
+            counts[hemi, group] = int(own.sum())
+    low, high = np.nanpercentile(np.concatenate([m.ravel() for m in means.values()]), _SHARED)
+    colors = "viridis"
+    if analysis.comparison.pair or set(sides) == {BOTH}:  # differences, to either side of zero
+        high = max(abs(low), abs(high))
+        low, colors = -high, "PRGn"
+    images: list[Any] = []
+    for i, (hemi, one) in enumerate(sides.items()):
+        for j, group in enumerate(groups):
+            axis = axes[i, j]
+            images.append(_draw(axis, (cohort, one), means[hemi, group], colors, (low, high)))
+            axis.set_title(
+                f"{group}, {side_name(hemi)} (n = {counts[hemi, group]})", fontsize=TITLE
+            )
+    change = " change of" if analysis.comparison.pair else ""
+    unit = cohort.units.get(measure, "1")
+    _bar(figure, images[0], axes, f"mean{change} {spelled(measure)} [{unit}]")
+    return figure
+
+
+def draw_contrasts(cohort: Cohort, analysis: Analysis, measure: str) -> "Figure":
+    """Draw effect sizes and corrected p-values, one row per contrast."""
+    sides = shown(analysis, measure)
+    tests = next(iter(sides.values())).fits[measure].tests
+    figure, axes = panels(len(tests), 2 * len(sides), _PANEL)
+    sizes = np.concatenate([_effect(t) for one in sides.values() for t in one.fits[measure].tests])
+    reach = max(float(np.nanpercentile(np.abs(sizes), _EFFECTS)), 1e-6)
+    signed = {
+        (hemi, i): _signed_logarithm(analysis, MapKey(measure, test.contrast.name, hemi), test)
+        for hemi, one in sides.items()
+        for i, test in enumerate(one.fits[measure].tests)
+    }
+    top = max(_LEAST_REACH, *(float(np.nanmax(np.abs(v), initial=0)) for v in signed.values()))
+    images: list[Any] = []
+    for j, (hemi, one) in enumerate(sides.items()):
+        for i, test in enumerate(one.fits[measure].tests):
+            left, right = axes[i, 2 * j], axes[i, 2 * j + 1]
+            effect = _effect(test).reshape(one.maps.shape)
+            p = signed[hemi, i].reshape(one.maps.shape)
+            images.append(_draw(left, (cohort, one), effect, "RdBu_r", (-reach, reach)))
+            images.append(_draw(right, (cohort, one), p, "PuOr_r", (-top, top)))
+            for axis, what in ((left, "effect size"), (right, "significance")):
+                axis.set_title(f"{test.contrast.name}\n{side_name(hemi)}, {what}", fontsize=TITLE)
+    kinds = {"t": "Cohen's d", "F": "partial eta squared"}
+    label = ", ".join(kinds[kind] for kind in sorted({t.kind for t in tests}, reverse=True))
+    _bar(figure, images[1], axes, "-log10 of corrected p,\nwith the sign of the effect")
+    _bar(figure, images[0], axes, label, extend="both")
+    return figure
+
+
+def _effect(test: PointTest) -> Float:
+    return test.cohen_d if test.kind == "t" else test.eta_squared
+
+
+def _signed_logarithm(analysis: Analysis, key: MapKey, test: PointTest) -> Float:
+    """Minus the logarithm of corrected p where it survives, with the sign of the statistic."""
+    found = analysis.found[key]
+    size = -np.log10(np.clip(found.adjusted, _SMALLEST_P, 1))
+    return np.where(found.rejected, size * np.sign(test.statistic), np.nan)
+
+
+def _bar(figure: "Figure", image: Any, axes: Any, label: str, extend: str = "neither") -> None:  # noqa: ANN401  (of matplotlib)
+    bar = figure.colorbar(image, ax=axes, shrink=min(1.0, 2 / len(axes)), extend=extend)
+    bar.set_label(label, fontsize=TITLE)
+    bar.ax.tick_params(labelsize=LABEL)
+
+
+def _draw(
+    axis: "Axes",
+    place: tuple[Cohort, FittedMaps],
+    values: Float,
+    colors: str,
+    limits: tuple[float, float],
+) -> Any:  # noqa: ANN401  (what colorbars take)
+    """Draw one map on the sheet with its subfields, or on the surface that it lies on."""
+    cohort, one = place
+    if one.maps.mesh is not None:
+        return draw_mesh(axis, one.maps.mesh, values, colors, limits)
+    image = _sheet(axis, cohort, values, colors, limits)
+    _borders(axis, cohort, one)
+    return image
+
+
+def _sheet(
+    axis: "Axes", cohort: Cohort, values: Float, colors: str, limits: tuple[float, float]
+) -> Any:  # noqa: ANN401  (what colorbars take)
+    """Draw one map: medial left, posterior below."""
+    image = axis.pcolormesh(
+        cohort.x,
+        cohort.y,
+        values.T,
+        cmap=colors,
+        vmin=limits[0],
+        vmax=limits[1],
+        shading="nearest",
+        rasterized=True,
+    )
+    axis.set_facecolor("0.92")
+    mark_medial(axis, cohort)
+    ends = ["posterior", "anterior"]
+    axis.set_yticks([cohort.y[0], cohort.y[-1]], ends, fontsize=LABEL, rotation=90)
+    lower, upper = axis.get_yticklabels()
+    lower.set_verticalalignment("bottom")
+    upper.set_verticalalignment("top")
+    return image
+
+
+def _borders(axis: "Axes", cohort: Cohort, one: FittedMaps) -> None:
+    """Draw where the most frequent subfield changes, and name the subfields."""
+    fields = one.subfield
+    x, y = cohort.x, cohort.y
+    dx, dy = (x[1] - x[0]) / 2, (y[1] - y[0]) / 2
+    i, j = np.nonzero(fields[1:] != fields[:-1])
+    axis.vlines(x[i] + dx, y[j] - dy, y[j] + dy, colors="black", linewidth=0.8)
+    i, j = np.nonzero(fields[:, 1:] != fields[:, :-1])
+    axis.hlines(y[j] + dy, x[i] - dx, x[i] + dx, colors="black", linewidth=0.8)
+    for number, name in enumerate(one.maps.names):
+        places = np.nonzero(fields == number)
+        if len(places[0]):
+            axis.text(
+                float(x[places[0]].mean()),
+                float(y[0]) + 2 * dy,
+                name,
+                fontsize=SMALL,
+                ha="center",
+                bbox={"facecolor": "white", "alpha": 0.6, "edgecolor": "none", "pad": 0.5},
+            )
+
+
+# Which figures a model has.
+
+
+def draw_figures(
+    cohort: Cohort, analysis: Analysis, shapes: Mapping[str, AverageShape]
+) -> Iterator[Drawing]:
+    """Draw all figures of one model.
+
+    Parameters
+    ----------
+    cohort : Cohort
+        What was analyzed.
+    analysis : Analysis
+        Results.
+    shapes : mapping of str to AverageShape
+        By hemisphere; those whose surfaces are known.
+
+    Yields
+    ------
+    Drawing
+    """
+    for measure in dict.fromkeys(m for one in analysis.fitted.values() for m in one.fits):
+        yield encode(f"{measure}_means", draw_means(cohort, analysis, measure))
+        if any(one.fits[measure].tests for one in analysis.fitted.values() if measure in one.fits):
+            yield encode(f"{measure}_contrasts", draw_contrasts(cohort, analysis, measure))
+    if analysis.sides:
+        yield encode("profiles", draw_profiles(cohort, analysis))
+    if (
+        analysis.groups is not None
+        and analysis.sides
+        and all(side.registration.template is not None for side in analysis.sides.values())
+    ):
+        yield encode("warps", draw_warps(cohort, analysis))
+    if shapes:
+        yield encode("sections", draw_sections(cohort, analysis, shapes))
+    if analysis.pairs:
+        yield encode("roc", draw_roc(analysis))
+        yield encode("calibration", draw_calibration(analysis))

@@ -1,0 +1,440 @@
+"""What is to be fitted and tested: BIDS Stats Models 1.0.0, one dataset-level node."""
+
+import difflib
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from hipsta_bids.errors import ModelError
+from hipsta_bids.group.settings import DesignSettings
+
+_VERSION = "1.0.0"
+#: A weight and a name such as ``age``, ``group[CU]`` or ``group[T.CU]:age``.
+_TERM = re.compile(
+    r"\s*(?P<sign>[+-])?\s*(?:(?P<weight>\d+\.?\d*|\.\d+)\s*\*?\s*)?"
+    r"(?P<name>[^\W\d](?:[\w.:]|\[[^\]]*\]|\([^)]*\))*)"
+)
+
+
+@dataclass(frozen=True)
+class ContrastSpec:
+    """A contrast by the names of what it combines."""
+
+    name: str
+    conditions: tuple[str, ...]
+    """Columns of the design, or levels such as ``group[CU]``: then means of the model there."""
+    weights: tuple[tuple[float, ...], ...]
+    """Rows; one for t, one or more for F."""
+    test: str
+    """``t`` or ``F``."""
+
+
+@dataclass(frozen=True)
+class ModelSpec:
+    """One linear model."""
+
+    name: str
+    formula: str
+    """Right-hand side, in formulaic's grammar."""
+    contrasts: tuple[ContrastSpec, ...]
+    dummy: str | None
+    """Also test each column by itself, with this test."""
+    measures: tuple[str, ...] = ()
+    """Left-hand side: what the model is fitted to; empty for the default."""
+
+
+def model_from_shortcut(formula: str, contrasts: Sequence[str], name: str) -> dict[str, Any]:
+    """Write the BIDS Stats Model that says the same as a formula and contrasts.
+
+    Parameters
+    ----------
+    formula : str
+        Such as ``thickness ~ group + age``.
+    contrasts : sequence of str
+        Such as ``group[CU]-group[DAT]``, ``0.5*a+0.5*b``; rows of an F test are parted by
+        commas; ``name=...`` in front gives a name. Without any, each column is tested.
+    name : str
+        Of the model.
+
+    Raises
+    ------
+    ModelError
+        If a contrast cannot be read.
+    """
+    node: dict[str, Any] = {
+        "Level": "Dataset",
+        "Name": name,
+        "GroupBy": ["contrast"],
+        "Model": {"Type": "glm", "X": [1], "Formula": formula},
+    }
+    if contrasts:
+        node["Contrasts"] = [_contrast_json(text) for text in contrasts]
+    else:
+        node["DummyContrasts"] = {"Test": "t"}
+    return {"Name": name, "BIDSModelVersion": _VERSION, "Nodes": [node]}
+
+
+def parse_model(document: Mapping[str, Any]) -> ModelSpec:
+    """Read a BIDS Stats Model.
+
+    Parameters
+    ----------
+    document : mapping
+        The JSON object. One node at dataset level, type ``glm``, with ``Model.X`` (1, names of
+        columns, and ``a*b`` or ``a:b``) or ``Model.Formula``.
+
+    Raises
+    ------
+    ModelError
+        If it is no such model, or asks for what is not supported.
+    """
+    nodes = document.get("Nodes")
+    if not isinstance(nodes, list) or len(nodes) != 1 or not isinstance(nodes[0], Mapping):
+        raise _refusal("needs exactly one node, at dataset level")
+    node = nodes[0]
+    if str(node.get("Level", "")).lower() != "dataset":
+        raise _refusal(f"has a node at level {node.get('Level')!r}; only Dataset is supported")
+    if node.get("Transformations"):
+        raise _refusal("has transformations; write them into the formula instead, as log(age)")
+    model = node.get("Model")
+    if not isinstance(model, Mapping) or str(model.get("Type", "glm")).lower() != "glm":
+        raise _refusal("needs a Model of Type glm")
+    name = str(node.get("Name") or document.get("Name") or "model")
+    dummy = node.get("DummyContrasts")
+    specs = tuple(_parse_contrast(one) for one in node.get("Contrasts", ()))
+    names = [spec.name for spec in specs]
+    if twice := sorted({one for one in names if names.count(one) > 1}):
+        raise _refusal(f"has contrasts of the same name: {', '.join(twice)}")
+    return ModelSpec(
+        name=name,
+        formula=_formula(model),
+        measures=left_side(str(model.get("Formula") or "")),
+        contrasts=specs,
+        dummy=str(dummy.get("Test", "t")) if isinstance(dummy, Mapping) else None,
+    )
+
+
+def left_side(formula: str) -> tuple[str, ...]:
+    """Names on the left of the tilde, as in ``thickness + curvature ~ group``.
+
+    Parameters
+    ----------
+    formula : str
+
+    Returns
+    -------
+    tuple of str
+        Empty if there is no left-hand side.
+
+    Raises
+    ------
+    ModelError
+        If it is not a sum of names.
+    """
+    left, tilde, right = formula.partition("~")
+    if not tilde or not left.strip():
+        return ()
+    names = tuple(dict.fromkeys(name.strip() for name in left.split("+")))
+    if "~" in right or not all(name.isidentifier() for name in names):
+        raise ModelError(
+            f"formula {formula!r}: on the left of ~ stand names of measures, joined by +, as"
+            " thickness + curvature",
+            reason="formula",
+        )
+    return names
+
+
+def parse_expression(text: str) -> dict[str, float]:
+    """Read a linear combination, such as ``0.5*a + 0.5*b - group[CU]``.
+
+    Raises
+    ------
+    ModelError
+        If it is none.
+    """
+    weights: dict[str, float] = {}
+    position = 0
+    while position < len(text.rstrip()):
+        found = _TERM.match(text, position)
+        if found is None or (position and found["sign"] is None):
+            raise ModelError(
+                f"contrast {text!r}: cannot read {text[position:].strip()!r}; write it as"
+                " group[A]-group[B] or 0.5*age",
+                reason="contrast-syntax",
+            )
+        weight = float(found["weight"] or 1) * (-1 if found["sign"] == "-" else 1)
+        weights[found["name"]] = weights.get(found["name"], 0.0) + weight
+        position = found.end()
+    if not weights:
+        raise ModelError("contrast: empty; name what to compare", reason="contrast-syntax")
+    return weights
+
+
+def _contrast_json(text: str) -> dict[str, Any]:
+    given, _, body = text.rpartition("=")
+    rows = [parse_expression(row) for row in re.split(r",(?![^\[(]*[\])])", body)]
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    weights = [[row.get(name, 0.0) for name in names] for row in rows]
+    return {
+        "Name": given.strip() or body.strip(),
+        "ConditionList": names,
+        "Weights": weights[0] if len(rows) == 1 else weights,
+        "Test": "t" if len(rows) == 1 else "F",
+    }
+
+
+def _parse_contrast(contrast: Mapping[str, Any]) -> ContrastSpec:
+    if not isinstance(contrast, Mapping) or not contrast.get("Name"):
+        raise _refusal("has a contrast without a name")
+    name = str(contrast["Name"])
+    test = str(contrast.get("Test", "t"))
+    if test not in {"t", "F"}:
+        raise _refusal(f"has contrast {name!r} with test {test!r}; use t or F")
+    conditions = tuple(str(one) for one in contrast.get("ConditionList", ()))
+    given = contrast.get("Weights", [1] * len(conditions))
+    rows = given if given and isinstance(given[0], list) else [given]
+    try:
+        weights = tuple(tuple(_number(value) for value in row) for row in rows)
+    except (TypeError, ValueError):
+        raise _refusal(f"has contrast {name!r} with weights that are no numbers") from None
+    if not conditions or any(len(row) != len(conditions) for row in weights):
+        raise _refusal(f"has contrast {name!r} with {len(conditions)} conditions and other weights")
+    if test == "t" and len(weights) > 1:
+        raise _refusal(f"has contrast {name!r} with several rows; its test must be F")
+    return ContrastSpec(name, conditions, weights, test)
+
+
+def _number(value: object) -> float:
+    """Weights may be fractions such as ``1/3``."""
+    if isinstance(value, str) and "/" in value:
+        above, below = value.split("/")
+        return float(above) / float(below)
+    return float(value)  # type: ignore[arg-type]
+
+
+def _formula(model: Mapping[str, Any]) -> str:
+    if text := model.get("Formula"):
+        return str(text).rpartition("~")[2].strip()
+    terms = model.get("X")
+    if not isinstance(terms, list) or not terms:
+        raise _refusal("needs Model.X or Model.Formula")
+    names = [str(term) for term in terms if str(term) != "1"]
+    plain = re.compile(r"[\w.*: ]+")
+    if bad := [name for name in names if not plain.fullmatch(name)]:
+        raise _refusal(f"has {bad[0]!r} in X; use names of columns, or a Formula")
+    return " + ".join(["1" if len(names) < len(terms) else "0", *names])
+
+
+def _refusal(what: str) -> ModelError:
+    return ModelError(f"model file {what} (BIDS Stats Models {_VERSION})", reason="model-file")
+
+
+# Variables of a model: which rows are complete, what is a number and what a factor.
+
+
+#: Texts that mean a missing value, besides what pandas takes for one.
+_MISSING = ("n/a", "NA", "N/A", "nan", "NaN", "")
+#: Numbers from here on overflow when they are squared and summed.
+_LARGEST = 1e100
+#: Rows that a message names.
+_NAMED = 8
+
+
+def check_unique(table: pd.DataFrame, keys: list[str]) -> None:
+    """Refuse a table in which a participant (or session) stands twice.
+
+    Raises
+    ------
+    ModelError
+        Names those that do.
+    """
+    twice = table.loc[table.duplicated(keys), keys].astype(str).agg(" ".join, axis=1)
+    if len(twice):
+        raise ModelError(
+            f"table: {listed(sorted(set(twice)))} stand more than once; keep one row each",
+            reason="duplicate-rows",
+        )
+
+
+def check_names(names: Iterable[str], columns: pd.Index) -> None:
+    """Refuse names that the table does not have."""
+    known = [str(column) for column in columns]
+    for name in names:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1)
+            hint = f"did you mean {near[0]}?" if near else f"the table has {listed(known)}"
+            raise ModelError(
+                f"model: the table has no column {name!r}; {hint}", reason="unknown-variable"
+            )
+
+
+def typed(values: pd.Series, settings: DesignSettings) -> pd.Series:
+    """Return numbers as floats, text as text, and what is missing as missing.
+
+    Raises
+    ------
+    ModelError
+        If a few texts stand among numbers, or numbers are too large; names their rows.
+    """
+    if pd.api.types.is_bool_dtype(values):
+        return values.map({True: "yes", False: "no"}).astype(object)
+    if pd.api.types.is_numeric_dtype(values):
+        numbers = values.astype(np.float64)
+        return numbers.where(np.isfinite(numbers))
+    text = values.astype(object).where(values.notna(), None)
+    text = text.map(lambda value: None if value is None else str(value).strip())
+    text = text.where(~text.isin(_MISSING), None)
+    present = text.notna()
+    numbers = pd.to_numeric(text, errors="coerce").astype(np.float64)
+    if present.any() and numbers[present].notna().all():
+        too_large = present & ~(numbers.abs() < _LARGEST)
+        if too_large.any():
+            raise ModelError(
+                f"model: column {values.name!r} holds numbers that are too large for rows"
+                f" {listed(values.index[too_large])}; correct them, or mark them n/a",
+                reason="not-numeric",
+            )
+        return numbers
+    if numbers[present].notna().mean() > settings.numeric_share:
+        bad = present & numbers.isna()
+        raise ModelError(
+            f"model: column {values.name!r} holds numbers but for rows"
+            f" {listed(values.index[bad])}; correct them, or mark them n/a",
+            reason="not-numeric",
+        )
+    return text
+
+
+def rows_by_lack(used: pd.DataFrame, complete: NDArray[np.bool_]) -> dict[str, tuple[str, ...]]:
+    """Group incomplete rows by the first variable that they lack."""
+    result: dict[str, list[str]] = {}
+    lacking = used.isna().to_numpy()
+    for row in np.flatnonzero(~complete).tolist():
+        name = str(used.columns[int(np.argmax(lacking[row]))])
+        result.setdefault(name, []).append(str(used.index[row]))
+    return {name: tuple(rows) for name, rows in result.items()}
+
+
+def check_left(used: pd.DataFrame, dropped: Mapping[str, tuple[str, ...]]) -> None:
+    """Refuse a model that leaves no row; says what the rows lack.
+
+    Raises
+    ------
+    ModelError
+        With the number of rows per variable.
+    """
+    if not len(used):
+        lack = ", ".join(f"{name} ({len(rows)})" for name, rows in dropped.items())
+        why = f"; missing are {lack}" if lack else ""
+        raise ModelError(f"model: no row has all variables{why}", reason="group-size")
+
+
+def set_levels(
+    used: pd.DataFrame, references: Mapping[str, str], settings: DesignSettings
+) -> dict[str, list[str]]:
+    """Make factors of text columns in place.
+
+    Returns
+    -------
+    dict
+        Levels of each factor, the reference first.
+
+    Raises
+    ------
+    ModelError
+        If a column does not vary, a level is unknown or has too few rows.
+    """
+    chosen = {}
+    for column in used.columns:
+        name = str(column)
+        if pd.api.types.is_numeric_dtype(used[name]):
+            _check_varies(used[name], name)
+        else:
+            chosen[name] = _levels(used[name], name, references.get(name), settings)
+            used[name] = pd.Categorical(used[name], categories=chosen[name])
+    if unknown := sorted(set(references) - set(chosen)):
+        raise ModelError(
+            f"model: reference level given for {listed(unknown)}, which is no factor of the model",
+            reason="unknown-variable",
+        )
+    return chosen
+
+
+def _check_varies(values: pd.Series, name: str) -> None:
+    numbers = values.to_numpy(dtype=np.float64)
+    if numbers.min() == numbers.max():
+        raise ModelError(
+            f"model: {name!r} is {numbers[0]:g} in all {len(numbers)} complete rows; leave it out",
+            reason="constant-column",
+        )
+
+
+def _levels(
+    values: pd.Series, name: str, reference: str | None, settings: DesignSettings
+) -> list[str]:
+    """Levels of a factor, reference first."""
+    counts = {str(level): int(count) for level, count in values.value_counts().items()}
+    levels = sorted(counts)
+    first = levels[0] if reference is None else reference
+    if first not in levels:
+        raise ModelError(
+            f"model: {name!r} has no level {first!r} in the complete rows, only {listed(levels)}",
+            reason="unknown-level",
+        )
+    if len(levels) == 1:
+        raise ModelError(
+            f"model: all {len(values)} complete rows have {name!r} {first}; leave it out",
+            reason="constant-column",
+        )
+    small = [f"{level} ({counts[level]})" for level in levels if counts[level] < settings.min_level]
+    if small:
+        raise ModelError(
+            f"model: too few complete rows in {name!r}: {listed(small)}; at least"
+            f" {settings.min_level} are needed",
+            reason="group-size",
+        )
+    levels.remove(first)
+    return [first, *levels]
+
+
+def listed(items: Iterable[object]) -> str:
+    """Join names for a message, not too many."""
+    texts = [str(item) for item in items]
+    more = f" and {len(texts) - _NAMED} more" if len(texts) > _NAMED else ""
+    return ", ".join(texts[:_NAMED]) + more
+
+
+# Linear combinations of coefficients that are tested.
+
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """One hypothesis: that ``weights @ coefficients`` is zero."""
+
+    name: str
+    weights: FloatArray
+    """(rows, columns of the design); one row is tested by t, several together by F."""
+
+    def __post_init__(self) -> None:
+        weights = np.atleast_2d(np.array(self.weights, dtype=np.float64))
+        if np.linalg.matrix_rank(weights) < weights.shape[0]:
+            raise ModelError(
+                f"contrast {self.name!r}: its rows say the same thing twice, or one is all zero;"
+                " leave out the redundant row",
+                reason="contrast-redundant",
+            )
+        weights.flags.writeable = False
+        object.__setattr__(self, "weights", weights)
+
+    @property
+    def n_rows(self) -> int:
+        """Degrees of freedom of the hypothesis."""
+        return int(self.weights.shape[0])

@@ -1,0 +1,269 @@
+"""A methods and results paragraph with the numbers of one analysis filled in."""
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from hipsta_bids import __version__
+from hipsta_bids.group.analysis import Analysis
+from hipsta_bids.group.data import PARTICIPANT, Cohort
+from hipsta_bids.group.inference import PERMUTATIONS
+from hipsta_bids.group.normative import Scores
+from hipsta_bids.group.settings import GroupSettings, MultiplicitySettings
+
+# Works that methods of the group level rest on.
+
+
+#: Key and entry of each work that the methods rest on.
+REFERENCES: Mapping[str, str] = {
+    "method": "Diers K, Baumeister H, Jessen F, Düzel E, Berron D, Reuter M. An automated,"
+    " geometry-based method for hippocampal shape and thickness analysis. NeuroImage"
+    " 2023;276:120182. doi:10.1016/j.neuroimage.2023.120182",
+    "registr": "Wrobel J. register: registration for exponential family functional data. Journal"
+    " of Open Source Software 2018;3(22):557. doi:10.21105/joss.00557",
+    "fdr2": "Benjamini Y, Krieger AM, Yekutieli D. Adaptive linear step-up procedures that"
+    " control the false discovery rate. Biometrika 2006;93(3):491-507."
+    " doi:10.1093/biomet/93.3.491",
+    "bh": "Benjamini Y, Hochberg Y. Controlling the false discovery rate: a"
+    " practical and powerful approach to multiple testing. Journal of the Royal Statistical"
+    " Society B 1995;57(1):289-300.",
+    "permutation": "Winkler AM, Ridgway GR, Webster MA, Smith SM, Nichols TE. Permutation inference"
+    " for the general linear model. NeuroImage 2014;92:381-397."
+    " doi:10.1016/j.neuroimage.2014.01.060",
+    "tfce": "Smith SM, Nichols TE. Threshold-free cluster enhancement: addressing problems of"
+    " smoothing, threshold dependence and localisation in cluster inference. NeuroImage"
+    " 2009;44(1):83-98. doi:10.1016/j.neuroimage.2008.03.061",
+    "mixed": "Kuznetsova A, Brockhoff PB, Christensen RHB. lmerTest package: tests in linear mixed"
+    " effects models. Journal of Statistical Software 2017;82(13):1-26."
+    " doi:10.18637/jss.v082.i13",
+    "asymmetry": "Kong XZ, Mathias SR, Guadalupe T, et al. Mapping cortical brain asymmetry in"
+    " 17,141 healthy individuals worldwide via the ENIGMA Consortium. Proceedings of the National"
+    " Academy of Sciences 2018;115(22):E5154-E5163. doi:10.1073/pnas.1718418115",
+    "normative": "Jack CR, Petersen RC, Xu YC, et al. Medial temporal atrophy on MRI in normal"
+    " aging and very mild Alzheimer's disease. Neurology 1997;49(3):786-794."
+    " doi:10.1212/WNL.49.3.786",
+    "delong": "DeLong ER, DeLong DM, Clarke-Pearson DL. Comparing the areas under two or more"
+    " correlated receiver operating characteristic curves: a nonparametric approach. Biometrics"
+    " 1988;44(3):837-845.",
+    "firth": "Heinze G, Schemper M. A solution to the problem of separation in logistic"
+    " regression. Statistics in Medicine 2002;21(16):2409-2419. doi:10.1002/sim.1047",
+}
+
+
+def methods_text(
+    cohort: Cohort,
+    analysis: Analysis,
+    settings: GroupSettings,
+    n_out: int,
+    others: Sequence[str] = (),
+) -> str:
+    """Word what was done and what came out.
+
+    Parameters
+    ----------
+    cohort : Cohort
+        What was analyzed.
+    analysis : Analysis
+        Results.
+    settings : GroupSettings
+        Those in use.
+    n_out : int
+        Hemispheres and visits that were left out.
+    others : sequence of str, optional
+        Names of other programs' maps, which were not registered.
+
+    Returns
+    -------
+    str
+        Markdown.
+    """
+    cited: list[str] = []
+
+    def cite(key: str) -> str:
+        if key not in cited:
+            cited.append(key)
+        return f"[{cited.index(key) + 1}]"
+
+    paragraphs = [_sample(cohort, analysis, n_out, cite("method"), others)]
+    if analysis.sides or others:
+        paragraphs.append(_alignment(analysis, settings, cite, others))
+    paragraphs.append(_models(analysis, settings, cite))
+    if analysis.comparison.asymmetry:
+        paragraphs.append(_asymmetry(settings, cite("asymmetry")))
+    if analysis.scores is not None:
+        paragraphs.append(_normative(analysis.scores, settings, cite("normative")))
+    if analysis.pairs:
+        paragraphs.append(_classification(analysis, settings, cite("delong"), cite("firth")))
+    if analysis.found:
+        paragraphs.append(_findings(analysis))
+    lines = ["# Methods and findings", "", "This text may be used freely, as it stands or changed."]
+    for paragraph in paragraphs:
+        lines += ["", paragraph]
+    if analysis.skipped:
+        lines += ["", "Left out:", "", *(f"- {note}" for note in analysis.skipped)]
+    lines += ["", "# References", ""]
+    lines += [f"{i}. {REFERENCES[key]}" for i, key in enumerate(cited, start=1)]
+    return "\n".join(lines) + "\n"
+
+
+def _sample(
+    cohort: Cohort, analysis: Analysis, n_out: int, method: str, others: Sequence[str]
+) -> str:
+    rows = analysis.design.rows
+    table = analysis.compared.table.iloc[rows]
+    people = cohort.table[PARTICIPANT].nunique()
+    visits = f" ({len(cohort.table)} visits)" if len(cohort.table) > people else ""
+    maps = _words([*analysis.measured.maps, *others]) or "summaries"
+    text = (
+        f"Measures of the hippocampus {method} ({maps}) of"
+        f" {people} participants{visits} were analyzed with hipsta_bids {__version__};"
+        f" {analysis.n_participants} had all variables of the model"
+    )
+    if analysis.groups is not None:
+        names = table[analysis.groups.column][~table[PARTICIPANT].duplicated()]
+        counts = Counter(names.dropna().astype(str))
+        text += f" ({', '.join(f'{counts[g]} {g}' for g in analysis.groups.levels)})"
+    if sheets := ", ".join(f"{len(one.used)} {hemi}" for hemi, one in analysis.fitted.items()):
+        text += f", with hemispheres {sheets}"
+    return f"{text}. {n_out} hemispheres or visits were left out; the table of exclusions says why."
+
+
+def _words(names: Sequence[str]) -> str:
+    return ", ".join(f"map of {name.replace('_', ' ')}" for name in names)
+
+
+def _alignment(
+    analysis: Analysis, settings: GroupSettings, cite: Callable[[str], str], others: Sequence[str]
+) -> str:
+    parts = [_registration(analysis, settings, cite("registr"))] if analysis.sides else []
+    if others:
+        parts.append(
+            f"Maps of other programs ({', '.join(others)}) were taken as they are, point by point,"
+            " without registration."
+        )
+    return " ".join(parts)
+
+
+def _registration(analysis: Analysis, settings: GroupSettings, registr: str) -> str:
+    how = settings.registration
+    if how.align == "none":
+        return "Maps were not registered to each other."
+    method = f"alternating fits of a template and of monotone B-spline warps {registr}"
+    if how.align == "penalized":
+        method += ", with a penalty on local stretch that was estimated from the data"
+    shares = "; ".join(
+        f"{hemi}: {side.registration.explained_before:.0%} to"
+        f" {side.registration.explained_after:.0%}"
+        for hemi, side in analysis.sides.items()
+    )
+    extreme = sum(int(side.registration.extreme.sum()) for side in analysis.sides.values())
+    return (
+        "Curvature profiles from medial to lateral (means from posterior to anterior) were"
+        f" registered by {method}, and the warps were applied to all maps. The share of the"
+        f" variance of the profiles that their mean explains went from {shares}."
+        f" Warps out of line with the others: {extreme}."
+    )
+
+
+def _models(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], str]) -> str:
+    names = ", ".join(contrast.name for contrast in analysis.design.contrasts)
+    levels = ", ".join(f"{name} {level}" for name, level in analysis.design.references.items())
+    errors = " with HC3 standard errors" if settings.glm.covariance == "hc3" else ""
+    kind, what, d = "linear model", "", "estimate over residual standard deviation"
+    if analysis.comparison.pair:
+        first, second = analysis.comparison.pair
+        what = f" to the change from {first} to {second}, with the covariates of {first}"
+    if analysis.comparison.longitudinal:
+        own = "intercepts and slopes" if settings.longitudinal.random == "slope" else "intercepts"
+        kind = f"linear mixed model with {own} of participants"
+        errors = (
+            " by restricted maximum likelihood, with Satterthwaite's degrees of freedom"
+            f" {cite('mixed')}"
+        )
+        d = "estimate over the standard deviation of single visits"
+    return (
+        f"At each point of the sheet a {kind} `{analysis.model.formula}` was fitted{what}{errors}"
+        f" (reference levels: {levels or 'none'}); contrasts: {names}."
+        f" {_correction(settings.multiplicity, cite)} Effect sizes are"
+        f" Cohen's d ({d}) or partial eta squared, with"
+        f" {settings.glm.confidence:.0%} confidence limits from non-central distributions. Summary"
+        " measures were tested in the same model, volumes also with intracranial volume."
+    )
+
+
+def _correction(how: MultiplicitySettings, cite: Callable[[str], str]) -> str:
+    family = "each map" if how.scope == "map" else "both hemispheres together"
+    if how.method in PERMUTATIONS:
+        statistic = "the largest absolute statistic"
+        if how.method == "permutation-tfce":
+            statistic = (
+                f"the largest threshold-free cluster enhancement {cite('tfce')} (extent"
+                f" {how.tfce_extent:g}, height {how.tfce_height:g})"
+            )
+        inside = f" within levels of {how.blocks}" if how.blocks else ""
+        return (
+            f"The family-wise error rate was held at {how.alpha:g} by {statistic} in"
+            f" {how.permutations} permutations{inside} of the residuals of the model without the"
+            " contrast (Freedman and Lane's; of signs, where a mean was tested; seed"
+            f" {how.seed}) {cite('permutation')}, for {family}."
+        )
+    kind = (
+        "the procedure of Benjamini and Hochberg"
+        if how.method == "bh"
+        else "the two-stage procedure of Benjamini, Krieger and Yekutieli"
+    )
+    return (
+        f"The false discovery rate was held at {how.alpha:g} by {kind} {cite(how.method)}, for"
+        f" {family}."
+    )
+
+
+def _asymmetry(settings: GroupSettings, source: str) -> str:
+    relative = " and ".join(settings.asymmetry.relative) or "no map"
+    return (
+        "Left minus right was taken at each point of the registered sheets, which are numbered"
+        f" alike on both sides; of {relative} as (L - R) / ((L + R) / 2) {source}, of other maps in"
+        " their own unit. The contrast `mean` tests it over all participants."
+    )
+
+
+def _normative(scores: Scores, settings: GroupSettings, source: str) -> str:
+    return (
+        f"Each participant was scored against {scores.n_reference} with {scores.factor}"
+        f" {scores.level}: w is the difference from what a linear model `{scores.formula}` of these"
+        f" expects, over its residual standard deviation {source}. Members of the reference group"
+        " were scored by the model without themselves. Points count as low or high where the"
+        " two-sided p, with the uncertainty of the model, is below"
+        f" {1 - settings.glm.confidence:.2g}."
+    )
+
+
+def _classification(analysis: Analysis, settings: GroupSettings, delong: str, firth: str) -> str:
+    how = settings.classification
+    separated = sum(pair.comparison.separated for _, _, pair in analysis.pairs)
+    by_firth = (
+        f" {separated} comparisons were separated and fitted by Firth's method {firth}."
+        if separated
+        else f" No comparison was separated (else Firth's method {firth} is used)."
+    )
+    return (
+        f"Pairs of groups were told apart by logistic models of {' + '.join(how.base)}, and of the"
+        " same with one measure added; a likelihood-ratio test compares the two, on the same"
+        f" participants. Areas under the curve have DeLong intervals {delong}, and are also given"
+        f" from {how.folds}-fold stratified cross-validation repeated {how.repeats} times (seed"
+        f" {how.seed}).{by_firth}"
+    )
+
+
+def _findings(analysis: Analysis) -> str:
+    parts = []
+    for key, found in analysis.found.items():
+        count = int(found.rejected.sum())
+        text = f"{key.measure}, {key.contrast}, {key.hemi}: {count} of {found.n_tests} points"
+        if count and np.isfinite(found.cutoff):
+            text += f" (p up to {found.cutoff:.2g})"
+        if found.lenient:
+            text += " - this cut-off is above the level, as happens with widespread effects"
+        parts.append(text)
+    return "Points that survive: " + "; ".join(parts) + "."

@@ -1,0 +1,301 @@
+"""Volumes of structures, in mm^3, from the tables that segmentation programs write.
+
+FreeSurfer's ``mri/{lh,rh}.hippoSfVolumes*.txt`` (a name and a number per line), ASHS's
+``*_volumes.txt`` (subject, side, name, number of slices and volume per line), and HippUnfold's
+``*_volumes.tsv`` (a row per hemisphere, a column per subfield).
+"""
+
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from hipsta_bids.errors import InputError, NothingToDoError, UsageError
+from hipsta_bids.group.collect import VOLUME, Measured, SheetRecord, visit_name
+from hipsta_bids.group.covariates import locate_sources
+from hipsta_bids.inputs import ashs, freesurfer
+from hipsta_bids.inputs.maps import check_pattern, fields_of, scan
+from hipsta_bids.io import files
+from hipsta_bids.io.files import entities
+
+#: Unit of all of them.
+UNIT = "mm^3"
+
+Volumes = Mapping[str, Mapping[str, float]]
+"""By hemisphere, then by structure."""
+
+_SIDES = {"left": "L", "right": "R", "lh": "L", "rh": "R", "L": "L", "R": "R"}
+_FREESURFER = re.compile(r"(?P<side>[lr]h)\.hippoSfVolumes.*\.txt")
+
+
+@dataclass(frozen=True, kw_only=True)
+class VolumeTable:
+    """A table of one visit."""
+
+    name: str
+    """What its measures are called after: the program, or the user's word."""
+    visit: str
+    """Row of the covariates."""
+    path: Path
+    hemi: str | None = None
+    """The only hemisphere to take; ``None`` for all that are there."""
+
+
+def table_beside(segmentation: Path) -> tuple[str, Path] | None:
+    """Find the table that belongs to a segmentation.
+
+    Parameters
+    ----------
+    segmentation : Path
+        The participant level's input.
+
+    Returns
+    -------
+    (str, Path) or None
+        Program and file, if it exists.
+    """
+    for name, beside in _BESIDE.items():
+        path = beside(segmentation)
+        if path is not None and path.is_file():
+            return name, path
+    return None
+
+
+def _hippunfold(segmentation: Path) -> Path | None:
+    """Find the table of the same space and atlas."""
+    own = entities(segmentation.name)
+    if own.get("desc") != "subfields":
+        return None
+    keys = ("sub", "ses", "space", "atlas")
+    found = [
+        path
+        for path in sorted(segmentation.parent.glob("sub-*_volumes.tsv"))
+        if all(entities(path.name).get(key) == own.get(key) for key in keys)
+    ]
+    return found[0] if found else None
+
+
+_BESIDE: Mapping[str, Callable[[Path], Path | None]] = {
+    "freesurfer": freesurfer.volume_table,
+    "ashs": ashs.volume_table,
+    "hippunfold": _hippunfold,
+}
+
+
+def read_volumes(path: Path) -> Volumes:
+    """Read one table, in whichever form it is.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    mapping of str to mapping of str to float
+        mm^3 by hemisphere (``L``, ``R``) and structure.
+
+    Raises
+    ------
+    InputError
+        If it is not such a table.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+        found: dict[str, dict[str, float]] = {}
+        for hemi, structure, volume in _entries(path, text):
+            found.setdefault(hemi, {})[re.sub(r"\W+", "_", structure)] = volume
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(
+            f"{path}: not readable as a table of volumes ({error}); FreeSurfer's hippoSfVolumes,"
+            " ASHS's and HippUnfold's _volumes are known",
+            reason="unreadable-volumes",
+        ) from error
+    return found
+
+
+def _entries(path: Path, text: str) -> Iterator[tuple[str, str, float]]:
+    lines = [line.split() for line in text.splitlines() if line.strip()]
+    if not lines:
+        raise ValueError("it is empty")
+    if match := _FREESURFER.fullmatch(path.name):
+        for name, volume in lines:
+            yield _SIDES[match["side"]], name, _volume(volume)
+    elif path.suffix == ".tsv":
+        header, *rows = [line.split("\t") for line in text.splitlines() if line.strip()]
+        for row in rows:
+            cells = dict(zip(header, row, strict=True))
+            hemi = _SIDES[cells.pop("hemi")]
+            cells.pop("subject", None)
+            for name, volume in cells.items():
+                yield hemi, name, _volume(volume)
+    else:
+        for _, side, name, _, volume in lines:
+            yield _SIDES[side], name, _volume(volume)
+
+
+def _volume(text: str) -> float:
+    if text in {files.MISSING, "nan", "NaN"}:
+        return float("nan")
+    value = float(text)
+    if not 0 <= value < float("inf"):
+        raise ValueError(f"{text} is no volume")
+    return value
+
+
+def join_volumes(
+    tables: Iterable[VolumeTable], visits: pd.Index, *, strict: Sequence[str] = ()
+) -> tuple[dict[str, pd.DataFrame], list[str]]:
+    """Read tables into one measure per structure.
+
+    Parameters
+    ----------
+    tables : iterable of VolumeTable
+    visits : Index
+        Rows of the covariates.
+    strict : sequence of str, optional
+        Names whose tables must be readable; others are left out with a note.
+
+    Returns
+    -------
+    dict of str to DataFrame
+        By hemisphere: rows are visits, columns ``volume_<name>_<structure>``; NaN is missing.
+    list of str
+        What was left out, one line each.
+
+    Raises
+    ------
+    InputError
+        If a table that must be readable is not, or two give the same structure of one hemisphere.
+    """
+    cells: dict[str, dict[str, dict[str, float]]] = {}
+    origin: dict[tuple[str, str, str], Path] = {}
+    notes = []
+    for table in tables:
+        try:
+            volumes = read_volumes(table.path)
+        except InputError as error:
+            if table.name in strict:
+                raise
+            notes.append(f"volumes of {table.visit} are left out: {error}")
+            continue
+        for hemi, structures in volumes.items():
+            if table.hemi not in {None, hemi}:
+                continue
+            for structure, volume in structures.items():
+                column = f"{VOLUME}{table.name}_{structure}"
+                first = origin.setdefault((hemi, column, table.visit), table.path)
+                if first != table.path:
+                    raise InputError(
+                        f"volumes {table.name}: both {first} and {table.path} have {structure} of"
+                        f" {table.visit}; make the pattern match one of them",
+                        reason="several-files",
+                    )
+                cells.setdefault(hemi, {}).setdefault(column, {})[table.visit] = volume
+    frames = {
+        hemi: pd.DataFrame(cells[hemi], index=visits, dtype=np.float64) for hemi in sorted(cells)
+    }
+    return frames, notes
+
+
+# Volumes from other programs' tables as further summary measures of the sheets.
+
+
+def check_volumes(patterns: Sequence[tuple[str, str]]) -> None:
+    """Refuse wrong names and patterns of volume tables.
+
+    Parameters
+    ----------
+    patterns : sequence of (str, str)
+        Names and patterns.
+
+    Raises
+    ------
+    UsageError
+        If a name is none or occurs twice, or a placeholder is unknown or lacking.
+    """
+    names = [name for name, _ in patterns]
+    for name, pattern in patterns:
+        if not (name.isalnum() and name.isascii()) or names.count(name) > 1:
+            why = "occurs twice" if names.count(name) > 1 else "has more than letters and digits"
+            raise UsageError(f"--volumes: the name {name!r} {why}", reason="usage")
+        check_pattern("--volumes", name, pattern)
+        if "subject" not in fields_of(pattern):
+            raise UsageError(f"--volumes {name}: the pattern needs {{subject}}", reason="usage")
+
+
+def add_volumes(
+    measured: Measured,
+    records: Sequence[SheetRecord],
+    patterns: Sequence[tuple[str, str]],
+    root: Path,
+) -> tuple[Measured, list[str]]:
+    """Add the volumes found beside the segmentations, and those that the user names.
+
+    Parameters
+    ----------
+    measured : Measured
+    records : sequence of SheetRecord
+        Hemispheres of the sheets, which say where their segmentations are.
+    patterns : sequence of (str, str)
+        Names and patterns of further tables, checked. A name that a program would have replaces
+        what lies beside.
+    root : Path
+        What patterns are relative to.
+
+    Returns
+    -------
+    Measured
+        Summaries have one column more per structure, ``volume_<name>_<structure>``.
+    list of str
+        What was found and what was left out, one line each.
+
+    Raises
+    ------
+    InputError
+        If a table that the user names cannot be read, or two are for the same hemisphere.
+    NothingToDoError
+        If no file matches a pattern.
+    """
+    named = [name for name, _ in patterns]
+    tables = [table for table in _beside(records) if table.name not in named]
+    for name, pattern in patterns:
+        tables += _matching(name, pattern, root, measured)
+    frames, notes = join_volumes(tables, measured.visits.index, strict=named)
+    sides = {
+        hemi: side.with_summary(frames[hemi].iloc[side.rows]) if hemi in frames else side
+        for hemi, side in measured.sides.items()
+    }
+    units = {str(column): UNIT for frame in frames.values() for column in frame.columns}
+    for name in dict.fromkeys(table.name for table in tables):
+        count = len({table.path for table in tables if table.name == name})
+        notes.append(f"volumes {name}: {count} tables")
+    return replace(measured, sides=sides, units={**measured.units, **units}), notes
+
+
+def _beside(records: Sequence[SheetRecord]) -> Iterator[VolumeTable]:
+    paths = locate_sources([r.source for r in records], [r.place.root for r in records])
+    for record, path in zip(records, paths, strict=True):
+        found = None if path is None else table_beside(path)
+        if found is not None:
+            name, table = found
+            own = record.place.name
+            visit = visit_name(own.subject, own.session)
+            yield VolumeTable(name=name, visit=visit, path=table, hemi=own.hemi)
+
+
+def _matching(name: str, pattern: str, root: Path, measured: Measured) -> list[VolumeTable]:
+    visits = set(measured.visits.index)
+    tables = []
+    for one in scan(pattern, root):
+        visit = visit_name(one.subject, one.session)
+        if visit in visits:
+            tables.append(VolumeTable(name=name, visit=visit, path=one.path, hemi=one.hemi))
+    if not tables:
+        raise NothingToDoError(
+            f"--volumes {name}: no file matches {pattern} (in {root}) for any participant here",
+            reason="no-volumes",
+        )
+    return tables

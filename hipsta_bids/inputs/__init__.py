@@ -1,0 +1,1 @@
+"""Find segmentations in a dataset and read them."""

@@ -1,0 +1,251 @@
+"""Labels and masks that a person corrected: ``*_desc-edited_dseg`` and ``*_desc-edited_mask``.
+
+They lie beside the labels that they correct, in the output dataset, or in a folder of their own
+(``--edited-dir``), laid out like a BIDS derivative:
+``sub-X[/ses-Y]/anat/sub-X[_ses-Y]_hemi-H[_seg-P]_desc-edited_dseg``.
+"""
+
+import contextlib
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from hipsta_bids.errors import HipstaError, InputError
+from hipsta_bids.inputs.request import Edit, HemisphereInput, InputRequest
+from hipsta_bids.inputs.scan import Selection, Visit, list_visits, subject_folders
+from hipsta_bids.inputs.tables import read_table
+from hipsta_bids.io.files import entities
+from hipsta_bids.protocols.load import scheme_from_names
+
+#: Names under which ``--edited-dir`` and the output dataset appear in addresses.
+_EDITED, _OUTPUT = "edited", "output"
+
+#: What an edited file replaces, by its suffix.
+_KINDS = {"dseg": "labels", "mask": "mask"}
+
+_IMAGES = (".nii.gz", ".nii", ".mgz", ".mgh")
+
+
+@dataclass(frozen=True, kw_only=True)
+class EditedFile:
+    """An edited file, and whose it is."""
+
+    edit: Edit
+    subject: str
+    session: str | None
+    beside: bool
+    """Found in a dataset of segmentations, not in the folder of edits."""
+
+    @property
+    def names(self) -> dict[str, str]:
+        """Entities of its name."""
+        return entities(self.edit.path.name)
+
+
+def is_edited(name: str) -> bool:
+    """Say whether a file name is that of edited labels or an edited mask."""
+    if "desc-edited" not in name:
+        return False
+    pairs = entities(name)
+    return (
+        pairs.get("desc") == "edited"
+        and pairs["suffix"] in _KINDS
+        and pairs["extension"] in _IMAGES
+    )
+
+
+def edits_of_visit(visit: Visit, root: Path, source: str, *, beside: bool) -> Iterator[EditedFile]:
+    """List the edited files in the folders of one visit.
+
+    Parameters
+    ----------
+    visit : Visit
+    root : Path
+        The dataset.
+    source : str
+        Its name.
+    beside : bool
+        Whether it is a dataset of segmentations.
+
+    Yields
+    ------
+    EditedFile
+    """
+    for folder in visit.folders:
+        for name in filter(is_edited, folder.names):
+            kind = _KINDS[entities(name)["suffix"]]
+            edit = Edit(kind=kind, path=folder.path / name, source=source, source_path=root)
+            yield EditedFile(edit=edit, subject=visit.subject, session=visit.session, beside=beside)
+
+
+def list_edits(request: InputRequest, selection: Selection) -> list[EditedFile]:
+    """List the edited files of ``--edited-dir`` and of the output dataset.
+
+    Parameters
+    ----------
+    request : InputRequest
+    selection : Selection
+        Subjects and sessions that are not wanted are left out.
+
+    Returns
+    -------
+    list of EditedFile
+
+    Raises
+    ------
+    InputError
+        If the folder that the user gave is missing or cannot be listed.
+    """
+    found = []
+    if request.edited_dir is not None:
+        found += _edits_of_dataset(request.edited_dir, _EDITED, selection)
+    # Whether it can be read is for those to say who write there.
+    with contextlib.suppress(InputError):
+        if request.output_dir is not None:
+            found += _edits_of_dataset(request.output_dir, _OUTPUT, selection)
+    return each_once(found)
+
+
+def _edits_of_dataset(root: Path, name: str, selection: Selection) -> list[EditedFile]:
+    folders = [folder for folder in subject_folders(root) if selection.wants_folder(folder)]
+    return [
+        file
+        for visit in filter(selection.wants_visit, list_visits(folders))
+        for file in edits_of_visit(visit, root, name, beside=False)
+    ]
+
+
+def each_once(edited: Iterable[EditedFile]) -> list[EditedFile]:
+    """Keep the first of entries for the same file: folders may be given twice."""
+    return list({file.edit.path.resolve(): file for file in reversed(list(edited))}.values())[::-1]
+
+
+def attach_edits(
+    items: Iterable[HemisphereInput], edited: Iterable[EditedFile], selection: Selection
+) -> tuple[tuple[HemisphereInput, ...], tuple[str, ...]]:
+    """Give each hemisphere the files that correct it.
+
+    Parameters
+    ----------
+    items : iterable of HemisphereInput
+    edited : iterable of EditedFile
+    selection : Selection
+        Files of hemispheres that are not wanted are passed over in silence.
+
+    Returns
+    -------
+    items : tuple of HemisphereInput
+        With a ``problem`` where it is not clear which file corrects what.
+    notes : tuple of str
+        One line for each file that corrects nothing.
+    """
+    found = list(items)
+    corrections: dict[int, list[EditedFile]] = {}
+    notes = []
+    for file in edited:
+        hemi = file.names.get("hemi")
+        if hemi in ("L", "R") and hemi not in selection.wanted_hemis():
+            continue
+        matching = [n for n, item in enumerate(found) if _corrects(file, item)]
+        for n in matching:
+            corrections.setdefault(n, []).append(file)
+        if not matching:
+            notes.append(f"{file.edit.path}: edited file not used: {_why_not(file, found)}")
+        elif len(matching) > 1:
+            names = " and ".join(found[n].scheme.name for n in matching)
+            problem = InputError(
+                f"{file.edit.path}: corrects the labels of {names}; say in its name which ones, "
+                f"as in _seg-{found[matching[0]].scheme.name}_desc-edited_",
+                reason="edit-ambiguous",
+            )
+            for n in matching:
+                found[n] = replace(found[n], problem=found[n].problem or problem)
+    for n, files in corrections.items():
+        found[n] = _corrected(found[n], [file.edit for file in files])
+    return tuple(found), tuple(notes)
+
+
+def _corrects(file: EditedFile, item: HemisphereInput) -> bool:
+    names = file.names
+    return (
+        _misnamed(file) is None
+        and (file.subject, file.session, names["hemi"]) == (item.subject, item.session, item.hemi)
+        and names.get("seg", item.scheme.name) == item.scheme.name
+        and (not file.beside or file.edit.path.parent in {path.parent for path in item.files})
+    )
+
+
+def _misnamed(file: EditedFile) -> str | None:
+    """Say what is wrong with a name, if anything."""
+    names = file.names
+    if names.get("hemi") not in ("L", "R"):
+        return "its name has no hemi-L or hemi-R"
+    for key, own in (("sub", file.subject), ("ses", file.session)):
+        if names.get(key, own) != own:
+            return f"its name says {key}-{names[key]}, but its folder is another one's"
+    return None
+
+
+def _why_not(file: EditedFile, items: list[HemisphereInput]) -> str:
+    """Say why a file corrects nothing."""
+    misnamed = _misnamed(file)
+    if misnamed:
+        return misnamed
+    hemi = file.names["hemi"]
+    whose = f"sub-{file.subject}{f' ses-{file.session}' if file.session else ''} hemi-{hemi}"
+    rivals = [
+        item
+        for item in items
+        if (item.subject, item.session, item.hemi) == (file.subject, file.session, hemi)
+    ]
+    if not rivals:
+        return f"no labels of {whose} are processed"
+    schemes = {item.scheme.name for item in rivals}
+    if file.names.get("seg", rivals[0].scheme.name) not in schemes:
+        return (
+            f"its name says seg-{file.names['seg']}, but {whose} has seg-{', seg-'.join(schemes)}"
+        )
+    return (
+        f"it does not lie beside the labels of {whose} ({rivals[0].files[0].parent}); move it "
+        "there, or name its folder with --edited-dir"
+    )
+
+
+def _corrected(item: HemisphereInput, edits: list[Edit]) -> HemisphereInput:
+    """Attach the edits of one hemisphere, if there is one of each kind at most."""
+    for kind in _KINDS.values():
+        rivals = [edit.path for edit in edits if edit.kind == kind]
+        if len(rivals) > 1:
+            problem = InputError(
+                f"{' and '.join(map(str, rivals))}: two edited files with the {kind} of one "
+                "hemisphere; keep one",
+                reason="edit-ambiguous",
+            )
+            return replace(item, edits=tuple(edits), problem=item.problem or problem)
+    return _described(replace(item, edits=tuple(edits)))
+
+
+def _described(item: HemisphereInput) -> HemisphereInput:
+    """Let a label table of the same name as the edited labels say what their codes are."""
+    labels = item.edit("labels")
+    if labels is None:
+        return item
+    name = labels.path.name.partition(".")[0]
+    table = labels.path.with_name(f"{name}.tsv")
+    if not table.exists():
+        return item
+    try:
+        scheme = scheme_from_names(read_table(table), name=item.scheme.name, origin=table.name)
+    except HipstaError as error:
+        return replace(item, problem=item.problem or error)
+    # The citation is that of the protocol; a table has none.
+    scheme = replace(scheme, title=item.scheme.title, citation=item.scheme.citation)
+    return replace(
+        item,
+        scheme=scheme,
+        parts_scheme=None,
+        files=item.files[:1],
+        bilateral=False,
+        code_offset=0,
+        notes=(*item.notes, f"edited labels are named by {table.name}"),
+    )

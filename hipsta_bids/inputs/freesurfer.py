@@ -1,0 +1,240 @@
+"""FreeSurfer's hippocampal subfields: ``mri/{lh,rh}.hippoAmygLabels*`` and ``hippoSfLabels*``.
+
+File names consist of the analysis (which scans, and the version: ``-T1.v22``, ``-T1-T2.v21``,
+``.long``, or nothing), the hierarchy (``.CA``, ``.FS60``, ``.HBT``; nothing for the full one) and
+``.FSvoxelSpace`` for a copy resampled to 1 mm.
+"""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from hipsta_bids.errors import HipstaError, InputError
+from hipsta_bids.inputs.request import HemisphereInput
+from hipsta_bids.inputs.scan import Selection, Source, Visit
+from hipsta_bids.protocols.load import load_scheme
+
+_NAME = re.compile(
+    r"(?P<hemi>[lr])h\.(?P<base>hippoAmygLabels|hippoSfLabels)(?P<analysis>(?:[-.].+?)??)"
+    r"(?:\.(?P<hierarchy>CA|FS60|HBT))?(?P<coarse>\.FSvoxelSpace)?\.(?:mgz|mgh|nii|nii\.gz)"
+)
+
+#: FreeSurfer 6.0, whose files have no hierarchies.
+_OLD = "hippoSfLabels"
+
+#: Ways to get subfields, best first: hierarchy with subfields, with parts, and the protocol.
+#: FS60 comes before CA because it keeps the molecular layer apart.
+_WAYS = (
+    ("full", None, "freesurfer"),
+    ("FS60", "HBT", "freesurferFS60"),
+    ("CA", "HBT", "freesurferCA"),
+    ("FS60", None, "freesurferFS60"),
+    ("CA", None, "freesurferCA"),
+)
+
+_UNNAMED = "unnamed"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Analysis:
+    """One run of FreeSurfer's subfield segmentation, as its files' suffix says."""
+
+    scans: tuple[str, ...]
+    """``("T1",)``, ``("T1", "T2")``, or nothing."""
+    longitudinal: bool
+    version: int | None
+
+    @property
+    def name(self) -> str:
+        """As ``--fs-analysis`` takes it."""
+        long = ["long"] if self.longitudinal else []
+        version = [f"v{self.version}"] if self.version is not None else []
+        return ".".join([*(["-".join(self.scans)] if self.scans else []), *long, *version]) or (
+            _UNNAMED
+        )
+
+    @property
+    def rank(self) -> tuple[object, ...]:
+        """Order of preference: cross-sectional, most scans, T2 before T1, newest version."""
+        scans = {0: 3, 1: 2 if self.scans == ("T1",) else 1}.get(len(self.scans), 0)
+        return self.longitudinal, scans, -(self.version or 0)
+
+    def answers(self, wanted: "Analysis") -> bool:
+        """Say whether this is the wanted analysis (of any version, if none is wanted)."""
+        return (
+            self.scans == wanted.scans
+            and self.longitudinal == wanted.longitudinal
+            and wanted.version in (None, self.version)
+        )
+
+
+def parse_analysis(text: str, *, longitudinal: bool = False) -> Analysis:
+    """Understand a suffix such as ``-T1-T2.v21`` or ``.long``, or a user's spelling of it.
+
+    Parameters
+    ----------
+    text : str
+    longitudinal : bool
+        The subject's folder is a longitudinal one, whatever the suffix says.
+
+    Returns
+    -------
+    Analysis
+    """
+    words = [word for word in re.split(r"[-.]", text) if word and word != _UNNAMED]
+    versions = [int(word[1:]) for word in words if re.fullmatch(r"v\d+", word)]
+    return Analysis(
+        scans=tuple(word for word in words if not re.fullmatch(r"long|v\d+", word)),
+        longitudinal=longitudinal or "long" in words,
+        version=versions[0] if versions else None,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Run:
+    """The files of one analysis at one resolution, by hierarchy."""
+
+    analysis: Analysis
+    coarse: bool
+    old: bool
+    files: dict[str, Path]
+
+    @property
+    def rank(self) -> tuple[object, ...]:
+        return self.coarse, self.analysis.rank, self.old, self.way is None
+
+    @property
+    def way(self) -> tuple[str, str | None, str] | None:
+        """The best way to get subfields from these files."""
+        have = self.files.keys()
+        ways = (way for way in _WAYS if {way[0], way[1] or way[0]} <= have)
+        return next(ways, None)
+
+
+def volume_table(path: Path) -> Path | None:
+    """Name the table of volumes that was written with a segmentation.
+
+    Parameters
+    ----------
+    path : Path
+        A file of any hierarchy.
+
+    Returns
+    -------
+    Path or None
+        Of the same analysis, in the same folder, there or not; ``None`` if the file is not
+        FreeSurfer's.
+    """
+    match = _NAME.fullmatch(path.name)
+    if match is None:
+        return None
+    return path.with_name(f"{match['hemi']}h.hippoSfVolumes{match['analysis']}.txt")
+
+
+def find_freesurfer(
+    visit: Visit, source: Source, selection: Selection
+) -> Iterator[HemisphereInput]:
+    """Find FreeSurfer's segmentations of one visit.
+
+    Taken are the files that are not resampled, of the preferred analysis (see
+    :attr:`Analysis.rank`), in the full hierarchy; else ``.FS60`` or ``.CA``, combined with
+    ``.HBT`` where that exists.
+
+    Parameters
+    ----------
+    visit : Visit
+    source : Source
+    selection : Selection
+        ``fs_analysis`` restricts the choice.
+
+    Yields
+    ------
+    HemisphereInput
+    """
+    for hemi in selection.wanted_hemis():
+        runs = _runs(visit, hemi)
+        if not runs:
+            continue
+        wanted = parse_analysis(selection.fs_analysis) if selection.fs_analysis else None
+        matching = [run for run in runs if wanted is None or run.analysis.answers(wanted)]
+        usable = [run for run in matching if run.way]
+        chosen = usable[0] if usable else None
+        problem = None if chosen else _problem(runs, matching, selection.fs_analysis)
+        run = chosen or runs[0]
+        subfields, parts, scheme = run.way or (next(iter(run.files)), None, "freesurfer")
+        files = tuple(run.files[name] for name in (subfields, parts) if name)
+        if run.old and run.way:
+            scheme = "freesurferFS60"
+        coarse = "only .FSvoxelSpace exists: labels resampled to 1 mm lose thin layers"
+        yield HemisphereInput(
+            subject=visit.subject,
+            session=visit.session,
+            hemi=hemi,
+            scheme=load_scheme(scheme),
+            files=files,
+            parts_scheme=load_scheme("freesurferHBT") if parts else None,
+            source=source.name,
+            source_path=source.path,
+            why=_why(run, subfields, parts, selection.fs_analysis),
+            passed_over=tuple(_passed_over(runs, run, files)),
+            problem=problem,
+            notes=(coarse,) if chosen and run.coarse else (),
+        )
+
+
+def _runs(visit: Visit, hemi: str) -> list[_Run]:
+    """Group a hemisphere's files by analysis and resolution, best first."""
+    runs: dict[tuple[object, ...], _Run] = {}
+    for folder in visit.folders:
+        for name in folder.names:
+            match = _NAME.fullmatch(name) if ".hippo" in name else None
+            if match is None or match["hemi"] != hemi.lower():
+                continue
+            analysis = parse_analysis(match["analysis"], longitudinal=folder.longitudinal)
+            coarse, old = match["coarse"] is not None, match["base"] == _OLD
+            key = (str(folder.path), analysis.name, coarse, old)
+            run = runs.setdefault(key, _Run(analysis=analysis, coarse=coarse, old=old, files={}))
+            # Of several formats, the first by name: .mgz before .nii.
+            run.files.setdefault(match["hierarchy"] or "full", folder.path / name)
+    return sorted(runs.values(), key=lambda run: run.rank)
+
+
+def _why(run: _Run, subfields: str, parts: str | None, asked: str | None) -> str:
+    what = "full hierarchy" if subfields == "full" else f"subfields from .{subfields}"
+    if run.old:
+        what = "subfields of FreeSurfer 6.0"
+    combined = f", head/body/tail from .{parts}" if parts else ""
+    choice = " (--fs-analysis)" if asked else ""
+    return f"{what}{combined}, analysis {run.analysis.name}{choice}"
+
+
+def _passed_over(
+    runs: list[_Run], chosen: _Run, taken: tuple[Path, ...]
+) -> Iterator[tuple[str, str]]:
+    for run in runs:
+        for hierarchy, path in run.files.items():
+            if path in taken:
+                continue
+            if run.coarse and not chosen.coarse:
+                reason = "resampled to 1 mm; a finer file exists"
+            elif run is chosen:
+                reason = f"{hierarchy} hierarchy: less detail than what was taken"
+            else:
+                name = run.analysis.name
+                reason = f"analysis {name} comes later by default; --fs-analysis {name} selects it"
+            yield path.name, reason
+
+
+def _problem(runs: list[_Run], matching: list[_Run], asked: str | None) -> HipstaError:
+    folder = next(iter(runs[0].files.values())).parent
+    if asked and not matching:
+        names = ", ".join(dict.fromkeys(run.analysis.name for run in runs))
+        return InputError(
+            f"{folder}: no analysis {asked} here (found {names}); change --fs-analysis",
+            reason="analysis-missing",
+        )
+    return InputError(
+        f"{folder}: only head/body/tail (.HBT) files, no subfields; run the segmentation again",
+        reason="no-subfields",
+    )

@@ -1,0 +1,168 @@
+"""Any other BIDS derivative: ``*_hemi-{L,R}_*_dseg`` with a table that names its labels."""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+from hipsta_bids.errors import HipstaError, InputError, SchemeError
+from hipsta_bids.inputs.edits import is_edited
+from hipsta_bids.inputs.hippunfold import is_hippunfold
+from hipsta_bids.inputs.request import HemisphereInput
+from hipsta_bids.inputs.scan import Selection, Source, Visit
+from hipsta_bids.inputs.tables import find_table, read_table
+from hipsta_bids.io.files import entities
+from hipsta_bids.protocols.load import scheme_from_names
+from hipsta_bids.protocols.protocol import Scheme
+
+_IMAGES = {".nii.gz", ".nii", ".mgz", ".mgh"}
+
+#: Spaces of the subject's own anatomy; the others are templates of another size.
+_OWN_SPACE = re.compile(r"|T1w|T2w|orig|scanner|individual|crop\w*")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _File:
+    path: Path
+    space: str
+    scheme: Scheme | None
+    """None where nothing says what the codes are."""
+    origin: str
+    """Where the protocol comes from."""
+    problem: HipstaError | None = None
+    """Why there is no protocol."""
+
+    @property
+    def rank(self) -> tuple[bool, bool, bool, int, str]:
+        """Described, in the subject's space, cropped or in no named space, fewest entities."""
+        coarse = bool(self.space) and not self.space.startswith("crop")
+        template = not _OWN_SPACE.fullmatch(self.space)
+        return self.scheme is None, template, coarse, self.path.name.count("_"), self.path.name
+
+
+def find_named(visit: Visit, source: Source, selection: Selection) -> Iterator[HemisphereInput]:
+    """Find segmentations of one visit that a table or the user's protocol describes.
+
+    Files whose table names no subiculum and CA1 are of something else, and are left out; so are
+    files without any table in datasets that the user did not name.
+
+    Parameters
+    ----------
+    visit : Visit
+    source : Source
+    selection : Selection
+        ``scheme``, if given, describes all of these files.
+
+    Yields
+    ------
+    HemisphereInput
+    """
+    for hemi in selection.wanted_hemis():
+        files = _files(visit, hemi, source, selection)
+        groups: dict[str, list[_File]] = {}
+        for file in sorted(files, key=lambda file: file.rank):
+            groups.setdefault(file.scheme.name if file.scheme else "", []).append(file)
+        for name, group in groups.items():
+            # A file that nothing describes matters only if there is no other.
+            if name or (source.explicit and len(groups) == 1):
+                yield _choose(group, visit, hemi, source)
+
+
+def _choose(files: list[_File], visit: Visit, hemi: str, source: Source) -> HemisphereInput:
+    chosen = files[0]
+    problem = chosen.problem
+    if problem is None and not _OWN_SPACE.fullmatch(chosen.space):
+        problem = InputError(
+            f"{chosen.path}: space {chosen.space} is a template's, which changes thickness; "
+            "use labels in the subject's own space",
+            reason="template-space",
+        )
+    order = "the subject's own space, the finest grid and the shortest name come first"
+    return HemisphereInput(
+        subject=visit.subject,
+        session=visit.session,
+        hemi=hemi,
+        scheme=chosen.scheme or _placeholder(chosen.path),
+        files=(chosen.path,),
+        source=source.name,
+        source_path=source.path,
+        why=f"labels named by {chosen.origin}" if chosen.scheme else "labels not described",
+        passed_over=tuple((file.path.name, order) for file in files[1:]),
+        problem=problem,
+    )
+
+
+def _files(visit: Visit, hemi: str, source: Source, selection: Selection) -> Iterator[_File]:
+    for folder in visit.folders:
+        for name in folder.names:
+            if f"_hemi-{hemi}_" not in name or "dseg." not in name or is_edited(name):
+                continue
+            pairs = entities(name)
+            path = folder.path / name
+            if (
+                pairs["suffix"] == "dseg"
+                and pairs["extension"] in _IMAGES
+                and not is_hippunfold(name, source)
+                and selection.wants_file(path)
+            ):
+                file = _describe(path, pairs, source, selection)
+                if file is not None:
+                    yield file
+
+
+def _describe(
+    path: Path, pairs: dict[str, str], source: Source, selection: Selection
+) -> _File | None:
+    """Find out what a file's labels mean; None if they are not the hippocampus's."""
+    space = pairs.get("space", "")
+    if selection.scheme is not None:
+        return _File(path=path, space=space, scheme=selection.scheme, origin="--scheme")
+    table = find_table(path, source.path)
+    problem: HipstaError
+    if table is None:
+        problem = SchemeError(
+            f"{path}: no _dseg.tsv says what its labels are; add one, "
+            "or describe them in a TOML file and pass it with --scheme",
+            reason="undescribed-labels",
+        )
+        return _File(path=path, space=space, scheme=None, origin="", problem=problem)
+    try:
+        scheme = _scheme(table, _scheme_name(pairs, source))
+    except (InputError, SchemeError) as error:
+        if error.reason == "unclear-names":
+            return None
+        return _File(path=path, space=space, scheme=None, origin=table.name, problem=error)
+    return _File(path=path, space=space, scheme=scheme, origin=table.name)
+
+
+# One table at the top of a dataset describes all of its files.
+@lru_cache(maxsize=64)
+def _scheme(table: Path, name: str) -> Scheme:
+    return scheme_from_names(read_table(table), name=name, origin=table.name)
+
+
+def forget_tables() -> None:
+    """Read tables anew from now on."""
+    _scheme.cache_clear()
+
+
+def _scheme_name(pairs: dict[str, str], source: Source) -> str:
+    """Name a protocol after the file's atlas, or else its dataset."""
+    for text in (pairs.get("atlas"), pairs.get("seg"), source.name):
+        plain = re.sub("[^A-Za-z0-9]", "", text or "")
+        if plain:
+            return plain
+    return "labels"
+
+
+def _placeholder(path: Path) -> Scheme:
+    return Scheme(
+        name="unknown",
+        title=f"Labels of {path.name}, not described",
+        citation="",
+        sheet=(),
+        layer=(),
+        interior=(),
+        labels=(),
+    )

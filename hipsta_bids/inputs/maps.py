@@ -1,0 +1,361 @@
+"""Other volumes to be sampled on the sheet (``--map``): which files, and what is written."""
+
+import glob
+import re
+import string
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from hipsta_bids.derivatives import hemisphere
+from hipsta_bids.derivatives.names import EXTRA_OUTPUTS, OUTPUTS
+from hipsta_bids.errors import InputError, UsageError
+from hipsta_bids.geometry.catalog import MAPS
+from hipsta_bids.geometry.sampling import Regions
+from hipsta_bids.inputs.request import HemisphereInput, MapSource
+from hipsta_bids.io import files
+
+# Tables of regions drawn on the sheet (``--roi``), and of what the maps are in them.
+
+
+#: Columns of a region file: node numbers as in the sheet table, and the region's name.
+COLUMNS = ("x", "y", "region")
+
+
+def read_regions(path: Path, shape: tuple[int, int]) -> Regions:
+    """Read regions drawn on the sheet.
+
+    Parameters
+    ----------
+    path : Path
+        TSV with the columns ``x``, ``y`` (node numbers, from 1, as in the sheet table) and
+        ``region``; rows whose region is ``n/a`` or empty belong to none. Other columns of the sheet
+        table may be there too and are not looked at. A point may belong to several regions.
+    shape : tuple of int
+        Nodes of the sheet along x and y.
+
+    Returns
+    -------
+    Regions
+        In the order in which their names first occur.
+
+    Raises
+    ------
+    InputError
+        ``unreadable-table``, ``bad-table``, ``roi-columns``, ``roi-point``, ``roi-duplicate`` or
+        ``roi-empty``.
+    """
+    rows = files.read_tsv(path)
+    columns = tuple(rows[0]) if rows else ()
+    lacking = [name for name in COLUMNS if name not in columns]
+    unknown = [name for name in columns if name not in {*COLUMNS, *hemisphere.SHEET_COLUMNS}]
+    if rows and (lacking or unknown):
+        fault = f"lacks {', '.join(lacking)}" if lacking else f"has unknown {', '.join(unknown)}"
+        raise InputError(
+            f"{path}: {fault}; its columns are {', '.join(COLUMNS)} (and any of the sheet table)",
+            reason="roi-columns",
+        )
+    drawn = [row for row in rows if row["region"].strip() not in ("", files.MISSING)]
+    if not drawn:
+        raise InputError(f"{path}: no point belongs to a region; draw one", reason="roi-empty")
+    nodes = _nodes(path, drawn, shape)
+    names = [row["region"].strip() for row in drawn]
+    seen = Counter(zip(names, *nodes.T.tolist(), strict=True))
+    (name, x, y), times = seen.most_common(1)[0]
+    if times > 1:
+        raise InputError(
+            f"{path}: point x={x + 1}, y={y + 1} occurs {times} times in region {name}; keep one",
+            reason="roi-duplicate",
+        )
+    regions = tuple(dict.fromkeys(names))
+    member = np.zeros((len(regions), *shape), dtype=bool)
+    member[[regions.index(name) for name in names], nodes[:, 0], nodes[:, 1]] = True
+    return Regions(names=regions, member=member)
+
+
+def _nodes(
+    path: Path, rows: list[dict[str, str]], shape: tuple[int, int]
+) -> np.ndarray[tuple[int, int], np.dtype[np.intp]]:
+    """Find the nodes of the rows, (N, 2) indices."""
+    wrong = [row for row in rows if not (row["x"].isdecimal() and row["y"].isdecimal())]
+    off = [
+        row
+        for row in rows
+        if not wrong and not (1 <= int(row["x"]) <= shape[0] and 1 <= int(row["y"]) <= shape[1])
+    ]
+    if wrong or off:
+        first, count = (wrong or off)[0], len(wrong or off)
+        what = "is no pair of whole numbers" if wrong else "lies off the sheet"
+        raise InputError(
+            f"{path}: point x={first['x']}, y={first['y']} {what} ({count} in all); x runs from 1"
+            f" to {shape[0]}, y from 1 to {shape[1]}",
+            reason="roi-point",
+        )
+    return np.array([[int(row["x"]) - 1, int(row["y"]) - 1] for row in rows], dtype=np.intp)
+
+
+# Paths with placeholders, by which users say where other files of each hemisphere are.
+
+
+#: What a pattern may contain; the side is the hemisphere as FreeSurfer spells it.
+PLACEHOLDERS = ("subject", "session", "hemi", "side")
+
+_SIDES = {"L": "lh", "R": "rh"}
+_HEMIS = {side: hemi for hemi, side in _SIDES.items()}
+
+#: A session's part of a path, which goes where there are no sessions.
+_SESSION = re.compile(r"(?:^|(?<=/))ses-\{session\}/|_ses-\{session\}|\{session\}")
+
+#: What a placeholder stands for.
+_LABELS = {"subject": "[A-Za-z0-9]+", "session": "[A-Za-z0-9]+", "hemi": "[LR]", "side": "[lr]h"}
+#: Wildcards as regular expressions; the others mean the same in both.
+_WILDCARDS = {"**/": "(?:[^/]+/)*", "**": ".*", "*": "[^/]*", "?": "[^/]"}
+_WILDCARD = re.compile(r"(\*\*/|\*\*|\*|\?|\[[^\]]+\])")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Found:
+    """A file, and whose it is as far as its path says."""
+
+    path: Path
+    subject: str
+    session: str | None
+    hemi: str | None
+
+
+def check_pattern(option: str, name: str, pattern: str) -> None:
+    """Refuse placeholders that do not exist.
+
+    Parameters
+    ----------
+    option, name : str
+        What the pattern was given for, for the message.
+    pattern : str
+
+    Raises
+    ------
+    UsageError
+        Names the placeholder.
+    """
+    try:
+        unknown = fields_of(pattern) - set(PLACEHOLDERS)
+    except ValueError:
+        unknown = {pattern}
+    if unknown:
+        known = ", ".join(f"{{{field}}}" for field in PLACEHOLDERS)
+        raise UsageError(
+            f"{option} {name}: {min(unknown)!r} is not understood; placeholders are {known}",
+            reason="usage",
+        )
+
+
+def fields_of(pattern: str) -> set[str]:
+    """List the placeholders of a pattern; ``ValueError`` if braces do not match."""
+    return {field for _, field, _, _ in string.Formatter().parse(pattern) if field is not None}
+
+
+def fill(pattern: str, subject: str, session: str | None, hemi: str) -> str:
+    """Put one hemisphere's labels into a pattern.
+
+    Parameters
+    ----------
+    pattern : str
+    subject : str
+        Without ``sub-``.
+    session : str or None
+        Without ``ses-``; if there is none, the session's part of the path is left out.
+    hemi : str
+        ``L`` or ``R``.
+    """
+    text = pattern if session else _SESSION.sub("", pattern)
+    return text.format(subject=subject, session=session, hemi=hemi, side=_SIDES[hemi])
+
+
+def find(name: str, root: Path) -> list[Path]:
+    """Find the files of a name with wildcards, absolute or relative to a folder."""
+    matches = glob.glob(name, root_dir=root, recursive=True)  # noqa: PTH207 (root_dir)
+    return [root / match for match in sorted(matches)]
+
+
+def scan(pattern: str, root: Path) -> list[Found]:
+    """Find the files of all hemispheres, with sessions or without.
+
+    Parameters
+    ----------
+    pattern : str
+        Checked; needs ``{subject}``.
+    root : Path
+        What it is relative to.
+
+    Returns
+    -------
+    list of Found
+        Sorted by path.
+    """
+    found: dict[Path, Found] = {}
+    for variant in dict.fromkeys((pattern, _SESSION.sub("", pattern))):
+        expression = re.compile(_expression(variant))
+        name = "".join(
+            glob_part + ("" if field is None else "*")
+            for glob_part, field, _, _ in string.Formatter().parse(variant)
+        )
+        for path in find(name, root):
+            text = path.as_posix() if Path(variant).is_absolute() else _inside(path, root)
+            if (match := expression.fullmatch(text)) and path.is_file():
+                found.setdefault(path, _whose(path, match.groupdict()))
+    return sorted(found.values(), key=lambda one: str(one.path))
+
+
+def _inside(path: Path, root: Path) -> str:
+    return str(path)[len(str(root)) :].lstrip("/") if str(root) != "." else str(path)
+
+
+def _whose(path: Path, labels: dict[str, str]) -> Found:
+    hemi = labels.get("hemi") or _HEMIS.get(labels.get("side", ""))
+    return Found(path=path, subject=labels["subject"], session=labels.get("session"), hemi=hemi)
+
+
+def _expression(pattern: str) -> str:
+    """Regular expression with a group per placeholder; further ones of a kind must be equal."""
+    return "".join(_parts(pattern))
+
+
+def _parts(pattern: str) -> Iterator[str]:
+    seen: set[str] = set()
+    for literal, field, _, _ in string.Formatter().parse(pattern):
+        for part in _WILDCARD.split(literal):
+            is_set = part.startswith("[") and part.endswith("]")
+            yield _WILDCARDS.get(part) or (_set(part) if is_set else re.escape(part))
+        if field is not None:
+            yield f"(?P={field})" if field in seen else f"(?P<{field}>{_LABELS[field]})"
+            seen.add(field)
+
+
+def _set(part: str) -> str:
+    return f"[^{part[2:]}" if part.startswith("[!") else part
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapRequest:
+    """A volume that every hemisphere may have."""
+
+    name: str
+    pattern: str
+    """Path with placeholders, absolute or relative to the BIDS dataset; may have wildcards."""
+    sampling: str
+    interpolation: str
+
+
+def map_requests(
+    patterns: Sequence[tuple[str, str]],
+    samplings: Sequence[tuple[str | None, str]],
+    interpolations: Sequence[tuple[str | None, str]],
+) -> tuple[MapRequest, ...]:
+    """Combine and check the options about maps.
+
+    Parameters
+    ----------
+    patterns : sequence of (str, str)
+        Names and patterns.
+    samplings, interpolations : sequence of (str or None, str)
+        Choices for one name, or (None) for all that have no choice of their own.
+
+    Returns
+    -------
+    tuple of MapRequest
+
+    Raises
+    ------
+    UsageError
+        If a name occurs twice or belongs to other outputs, a placeholder is unknown, or a choice
+        is for a map that does not exist.
+    """
+    names = [name for name, _ in patterns]
+    taken = {row.desc for row in (*OUTPUTS, *EXTRA_OUTPUTS)} | {"x", "y", *(m.name for m in MAPS)}
+    for name, pattern in patterns:
+        if not name.isalnum() or not name.isascii():
+            raise UsageError(f"--map: {name!r} is not a name of letters and digits", reason="usage")
+        if name in taken or names.count(name) > 1:
+            why = "belongs to other outputs" if name in taken else "occurs twice"
+            raise UsageError(f"--map: the name {name} {why}; choose another one", reason="usage")
+        check_pattern("--map", name, pattern)
+    for option, choices in (("sampling", samplings), ("interpolation", interpolations)):
+        lost = [name for name, _ in choices if name is not None and name not in names]
+        if lost:
+            raise UsageError(f"--map-{option}: there is no --map {lost[0]}=...", reason="usage")
+    where = {None: "depth", **dict(samplings)}
+    how = {None: "linear", **dict(interpolations)}
+    return tuple(
+        MapRequest(
+            name=name,
+            pattern=pattern,
+            sampling=where.get(name, where[None]),
+            interpolation=how.get(name, how[None]),
+        )
+        for name, pattern in patterns
+    )
+
+
+def attach(
+    items: Iterable[HemisphereInput],
+    requests: Sequence[MapRequest],
+    regions: Path | None,
+    bids_dir: Path,
+) -> tuple[tuple[HemisphereInput, ...], tuple[str, ...]]:
+    """Look for the volumes of each hemisphere.
+
+    Parameters
+    ----------
+    items : iterable of HemisphereInput
+    requests : sequence of MapRequest
+    regions : Path or None
+        Table of regions drawn on the sheet, the same for all.
+    bids_dir : Path
+        What patterns are relative to.
+
+    Returns
+    -------
+    items : tuple of HemisphereInput
+        With their maps, found or not.
+    notes : tuple of str
+        One line per map: for how many hemispheres there is a file.
+    """
+    found = tuple(
+        replace(
+            item, maps=tuple(_source(item, wish, bids_dir) for wish in requests), regions=regions
+        )
+        for item in items
+    )
+    notes = []
+    for number, wish in enumerate(requests):
+        without = [item for item in found if item.maps[number].path is None]
+        line = f"map {wish.name}: {len(found) - len(without)} of {len(found)} hemispheres"
+        if without:
+            first = without[0]
+            line += (
+                f" have a file; not sub-{first.subject} hemi-{first.hemi}"
+                f" ({first.maps[number].missing})"
+            ) + (f" and {len(without) - 1} more" if len(without) > 1 else "")
+        notes.append(line)
+    return found, tuple(notes)
+
+
+def _source(item: HemisphereInput, wish: MapRequest, bids_dir: Path) -> MapSource:
+    name = fill(wish.pattern, item.subject, item.session, item.hemi)
+    matches = find(name, bids_dir)
+    missing, inside = None, not Path(wish.pattern).is_absolute()
+    if not matches:
+        missing = f"no file {name}"
+    elif len(matches) > 1:
+        missing = f"{len(matches)} files match {name}: {matches[0]}, {matches[1]}"
+    return MapSource(
+        name=wish.name,
+        sampling=wish.sampling,
+        interpolation=wish.interpolation,
+        path=None if missing else matches[0],
+        missing=missing,
+        source_path=bids_dir if inside else None,
+    )

@@ -1,0 +1,541 @@
+"""Listing folders, once each, without opening a file."""
+
+import difflib
+import json
+import os
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from hipsta_bids.errors import InputError, UsageError
+from hipsta_bids.inputs.request import HEMIS, InputRequest
+from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.protocol import Scheme
+
+#: ``sub-X``, ``sub-X_ses-Y``, and FreeSurfer's longitudinal ``sub-X_ses-Y.long.BASE``.
+_SUBJECT = re.compile(
+    r"sub-(?P<subject>[A-Za-z0-9+]+)(?:_ses-(?P<session>[A-Za-z0-9+]+))?(?P<long>\.long\..+)?"
+)
+_SESSION = re.compile(r"ses-(?P<session>[A-Za-z0-9+]+)")
+
+#: Folders below a subject or a session that can hold segmentations.
+_INNER = re.compile(r"anat|mri|final|seg\w*")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SubjectFolder:
+    """A folder that belongs to a subject, by its name."""
+
+    subject: str
+    session: str | None
+    longitudinal: bool
+    path: Path
+
+
+@dataclass(frozen=True, kw_only=True)
+class Folder:
+    """A folder and the names of the files directly in it."""
+
+    path: Path
+    names: tuple[str, ...]
+    longitudinal: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Visit:
+    """All candidate folders of one subject, or of one of its sessions."""
+
+    subject: str
+    session: str | None
+    folders: tuple[Folder, ...]
+
+
+def list_folder(path: Path) -> tuple[list[str], list[str]]:
+    """List a folder.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    folders, files : list of str
+        Sorted names; hidden ones are left out.
+
+    Raises
+    ------
+    InputError
+        ``missing-folder``, ``not-a-folder`` or ``unreadable-folder``.
+    """
+    folders: list[str] = []
+    files: list[str] = []
+    try:
+        with os.scandir(path) as entries:
+            for entry in entries:
+                if not entry.name.startswith("."):
+                    (folders if entry.is_dir() else files).append(entry.name)
+    except FileNotFoundError as error:
+        raise InputError(
+            f"{path}: no such folder; check the path", reason="missing-folder"
+        ) from error
+    except NotADirectoryError as error:
+        raise InputError(
+            f"{path}: is a file, but a folder is needed", reason="not-a-folder"
+        ) from error
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot list the folder ({error.strerror}); check its permissions",
+            reason="unreadable-folder",
+        ) from error
+    return sorted(folders), sorted(files)
+
+
+def subject_folders(root: Path) -> list[SubjectFolder]:
+    """List the subjects' folders of a dataset, sorted by name.
+
+    Parameters
+    ----------
+    root : Path
+
+    Returns
+    -------
+    list of SubjectFolder
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be listed.
+    """
+    matches = ((name, _SUBJECT.fullmatch(name)) for name in list_folder(root)[0])
+    return [
+        SubjectFolder(
+            subject=match["subject"],
+            session=match["session"],
+            longitudinal=match["long"] is not None,
+            path=root / name,
+        )
+        for name, match in matches
+        if match
+    ]
+
+
+def list_visits(folders: Iterable[SubjectFolder]) -> list[Visit]:
+    """List the candidate files of some subjects.
+
+    Parameters
+    ----------
+    folders : iterable of SubjectFolder
+
+    Returns
+    -------
+    list of Visit
+        One per subject and session; ``sub-X/ses-Y`` and ``sub-X_ses-Y`` are the same visit.
+
+    Raises
+    ------
+    InputError
+        If a folder cannot be listed.
+    """
+    found: dict[tuple[str, str | None], list[Folder]] = {}
+    for folder in folders:
+        for session, inner in _inner_folders(folder):
+            found.setdefault((folder.subject, session), []).append(inner)
+    return [
+        Visit(subject=subject, session=session, folders=tuple(inner))
+        for (subject, session), inner in found.items()
+    ]
+
+
+def _inner_folders(folder: SubjectFolder) -> Iterator[tuple[str | None, Folder]]:
+    """Walk over a subject's folder: itself, its sessions, and the folders inside both."""
+    waiting = [(folder.session, folder.path, True)]
+    while waiting:
+        session, path, outer = waiting.pop()
+        names, files = list_folder(path)
+        if files:
+            yield (
+                session,
+                Folder(path=path, names=tuple(files), longitudinal=folder.longitudinal),
+            )
+        for name in names if outer else ():
+            match = _SESSION.fullmatch(name)
+            if match and session is None:
+                waiting.append((match["session"], path / name, True))
+            elif _INNER.fullmatch(name):
+                waiting.append((session, path / name, False))
+
+
+def read_description(root: Path) -> dict[str, Any] | None:
+    """Read a dataset's ``dataset_description.json``.
+
+    Parameters
+    ----------
+    root : Path
+
+    Returns
+    -------
+    dict or None
+        None if there is none; an empty one if it cannot be understood (nothing depends on it).
+    """
+    try:
+        contents = json.loads((root / "dataset_description.json").read_text("utf-8"))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError):
+        return {}
+    return contents if isinstance(contents, dict) else {}
+
+
+def generators(description: dict[str, Any] | None) -> frozenset[str]:
+    """Name the software that a dataset says it was made with, in lower case.
+
+    Parameters
+    ----------
+    description : dict or None
+        Contents of ``dataset_description.json``.
+
+    Returns
+    -------
+    frozenset of str
+    """
+    entries = (description or {}).get("GeneratedBy")
+    if not isinstance(entries, list):
+        entries = [(description or {}).get("PipelineDescription")]  # BIDS before 1.4
+    return frozenset(
+        str(entry["Name"]).lower()
+        for entry in entries
+        if isinstance(entry, dict) and "Name" in entry
+    )
+
+
+# Which datasets to search, and in which order.
+
+
+LAYOUTS = ("freesurfer", "ashs", "hippunfold", "named")
+"""Kinds of folders that can be searched; ``named`` is any ``_hemi-?_..._dseg`` file with names."""
+
+_OURSELVES = "hipsta_bids"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """A dataset that may hold segmentations."""
+
+    name: str
+    path: Path
+    explicit: bool
+    """Given by the user, not found by default."""
+    layouts: tuple[str, ...] = LAYOUTS
+    """Kinds of segmentation to look for here."""
+    generators: frozenset[str] = frozenset()
+    """Software named in its ``dataset_description.json``."""
+
+
+def list_sources(request: InputRequest) -> tuple[Source, ...]:
+    """List the datasets to search, first come first served.
+
+    What the user names comes first (``-d``, then ``--freesurfer-dir``, ``--ashs-dir`` and
+    ``--hippunfold-dir``), then ``BIDS_DIR/derivatives``, ``BIDS_DIR/sourcedata``, and ``BIDS_DIR``
+    itself where it is a derivative dataset. Folders of these that hold no ``sub-*`` are searched
+    two levels down, and ``sourcedata`` inside of derivatives too (fMRIPrep keeps FreeSurfer's
+    folder there). Our own outputs are left out.
+
+    Parameters
+    ----------
+    request : InputRequest
+
+    Returns
+    -------
+    tuple of Source
+
+    Raises
+    ------
+    InputError
+        If ``bids_dir`` or a folder that the user gave is missing or cannot be listed.
+    """
+    sources: dict[Path, Source] = {}
+    for source in _candidates(request):
+        description = read_description(source.path)
+        made_by = generators(description)
+        key = source.path.resolve()
+        if _OURSELVES not in {name.replace("-", "_") for name in made_by} and key not in sources:
+            sources[key] = Source(
+                name=source.name,
+                path=source.path,
+                explicit=source.explicit,
+                layouts=source.layouts,
+                generators=made_by,
+            )
+    return tuple(sources.values())
+
+
+def _candidates(request: InputRequest) -> Iterator[Source]:
+    top, _ = list_folder(request.bids_dir)
+    for name, path in request.derivatives.items():
+        for root in _datasets(path, depth=1) or [path]:
+            yield Source(name=name, path=root, explicit=True)
+    options = (request.freesurfer_dir, request.ashs_dir, request.hippunfold_dir)
+    for layout, option in zip(LAYOUTS, options, strict=False):
+        if option is not None:
+            for root in _datasets(option, depth=1) or [option]:
+                yield Source(name=layout, path=root, explicit=True, layouts=(layout,))
+    for folder in ("derivatives", "sourcedata"):
+        if folder in top:
+            for root in _datasets(request.bids_dir / folder, depth=2, lenient=True):
+                yield Source(name=root.name, path=root, explicit=False)
+    # A dataset without a description may be a bare folder of subjects.
+    description = read_description(request.bids_dir)
+    derived = description is None or description.get("DatasetType") == "derivative"
+    if derived or generators(description):
+        yield Source(name=request.bids_dir.resolve().name, path=request.bids_dir, explicit=False)
+
+
+def _datasets(root: Path, *, depth: int, lenient: bool = False) -> list[Path]:
+    """Find the folders that hold ``sub-*`` folders.
+
+    ``lenient`` leaves out what cannot be listed: nobody asked for it (``sourcedata`` is often
+    closed to all but a few).
+    """
+    try:
+        folders, _ = list_folder(root)
+    except InputError:
+        if lenient:
+            return []
+        raise
+    if any(name.startswith("sub-") for name in folders):
+        inner, found, depth = [name for name in folders if name == "sourcedata"], [root], 2
+    else:
+        inner, found = folders if depth else [], []
+    for name in inner:
+        found += _datasets(root / name, depth=depth - 1, lenient=lenient)
+    return found
+
+
+# Which subjects, sessions and files are wanted: labels, and fMRIPrep's filter files.
+
+
+#: The entry of the filter file that applies to segmentations.
+_QUERY = "dseg"
+
+_Wanted = Callable[[str | None], bool]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Selection:
+    """What the user asked for, ready to be applied."""
+
+    subjects: frozenset[str] = frozenset()
+    """Empty for all, as in the next one."""
+    sessions: frozenset[str] = frozenset()
+    hemis: tuple[str, ...] = HEMIS
+    rules: Mapping[str, _Wanted] = field(default_factory=dict)
+    """By entity, in pybids's long names; from the filter file."""
+    fs_analysis: str | None = None
+    """The FreeSurfer analysis to take."""
+    scheme: Scheme | None = None
+    """The user's protocol."""
+
+    def wants_folder(self, folder: SubjectFolder) -> bool:
+        """Say whether a subject's folder has to be looked into."""
+        return (
+            (not self.subjects or folder.subject in self.subjects)
+            and (not self.sessions or folder.session is None or folder.session in self.sessions)
+            and self._passes("subject", folder.subject)
+        )
+
+    def wants_visit(self, visit: Visit) -> bool:
+        """Say whether a session of a subject is wanted."""
+        return (
+            not self.sessions or (visit.session is not None and visit.session in self.sessions)
+        ) and self._passes("session", visit.session)
+
+    def wanted_hemis(self) -> tuple[str, ...]:
+        """List the hemispheres that are wanted."""
+        return tuple(hemi for hemi in HEMIS if hemi in self.hemis and self._passes("hemi", hemi))
+
+    def wants_file(self, path: Path) -> bool:
+        """Say whether a file with BIDS entities in its name is wanted."""
+        if not self.rules:
+            return True
+        found = _parse(path)
+        return all(rule(found.get(key)) for key, rule in self.rules.items())
+
+    def _passes(self, entity: str, value: str | None) -> bool:
+        rule = self.rules.get(entity)
+        return rule is None or rule(value)
+
+
+def make_selection(request: InputRequest) -> Selection:
+    """Prepare what the user asked for.
+
+    Parameters
+    ----------
+    request : InputRequest
+
+    Returns
+    -------
+    Selection
+
+    Raises
+    ------
+    UsageError
+        ``bad-label``, ``bad-hemisphere`` or ``bad-filter``.
+    InputError
+        ``unreadable-filter``.
+    SchemeError
+        If the user's protocol is not valid.
+    """
+    wrong = [hemi for hemi in request.hemis if hemi not in HEMIS]
+    if wrong or not request.hemis:
+        raise UsageError(
+            f"--hemi {' '.join(map(str, wrong))}: choose among {', '.join(HEMIS)}",
+            reason="bad-hemisphere",
+        )
+    return Selection(
+        subjects=_labels(request.participant_labels, "sub-", "--participant-label"),
+        sessions=_labels(request.session_labels, "ses-", "--session-label"),
+        hemis=request.hemis,
+        rules=_rules(request.bids_filter_file) if request.bids_filter_file else {},
+        fs_analysis=request.fs_analysis,
+        scheme=load_scheme(request.scheme) if request.scheme else None,
+    )
+
+
+def _labels(labels: Iterable[str], prefix: str, option: str) -> frozenset[str]:
+    bare = frozenset(label.removeprefix(prefix) for label in labels)
+    wrong = sorted(label for label in bare if not re.fullmatch("[A-Za-z0-9+]+", label))
+    if wrong:
+        raise UsageError(
+            f"{option} {' '.join(wrong)}: labels consist of letters and digits "
+            f"(with or without {prefix!r})",
+            reason="bad-label",
+        )
+    return bare
+
+
+def _rules(path: Path) -> dict[str, _Wanted]:
+    """Read a filter file: ``{"dseg": {"session": "01", "space": ["T1w", "T2w"]}}``."""
+    try:
+        contents = json.loads(path.read_text("utf-8"))
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot read the filter file ({error.strerror}); check the path",
+            reason="unreadable-filter",
+        ) from error
+    except ValueError as error:
+        raise InputError(
+            f"{path}: the filter file is not JSON ({error})", reason="unreadable-filter"
+        ) from error
+    query = contents.get(_QUERY) if isinstance(contents, dict) else None
+    if not isinstance(query, dict):
+        raise UsageError(
+            f"{path}: the filter file has no entry {_QUERY!r}, which is the one for segmentations",
+            reason="bad-filter",
+        )
+    known = _entities()
+    for key in query:
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise UsageError(
+                f"{path}: {key!r} in {_QUERY!r} is not a BIDS entity{hint}", reason="bad-filter"
+            )
+    return {key: _rule(value) for key, value in query.items()}
+
+
+def _rule(value: Any) -> _Wanted:  # noqa: ANN401 (JSON)
+    """Make one entity's test; null, ``*`` and ``Query.…`` mean what they mean in fMRIPrep."""
+    if value is None or value == "Query.NONE":
+        return lambda found: found is None
+    if value in ("*", "Query.ANY"):
+        return lambda found: found is not None
+    if value == "Query.OPTIONAL":
+        return lambda _: True
+    values = value if isinstance(value, list) else [value]
+    rules = [_rule(entry) for entry in values] if isinstance(value, list) else []
+    texts = {str(entry) for entry in values}
+    return lambda found: found in texts or any(rule(found) for rule in rules)
+
+
+# pybids takes seconds to import and is needed only where a filter is given.
+@cache
+def _entities() -> dict[str, Any]:
+    from bids.layout import Config  # noqa: PLC0415 (see above)
+
+    configs = (Config.load(name) for name in ("bids", "derivatives"))
+    return {name: entity for config in configs for name, entity in config.entities.items()}
+
+
+def _parse(path: Path) -> dict[str, str]:
+    from bids.layout import parse_file_entities  # noqa: PLC0415 (see above)
+
+    found = parse_file_entities(str(path), entities=list(_entities().values()))
+    return {key: str(value) for key, value in found.items()}
+
+
+# Who is in the BIDS dataset itself, whether or not there is a segmentation.
+
+
+#: Never indexed: nothing in them says who takes part.
+_IGNORED = tuple(
+    re.compile(rf"^/{name}(/|$)")
+    for name in ("derivatives", "sourcedata", "code", "stimuli", r"\.\w+")
+)
+
+
+def list_participants(request: InputRequest) -> frozenset[str]:
+    """List the participants of the BIDS dataset.
+
+    From pybids's index where the user gave a place for it (made there on first use); otherwise from
+    the names of the folders, as indexing thousands of subjects takes minutes.
+
+    Parameters
+    ----------
+    request : InputRequest
+
+    Returns
+    -------
+    frozenset of str
+        Labels without ``sub-``.
+
+    Raises
+    ------
+    InputError
+        ``unreadable-database`` if pybids cannot use the index.
+    """
+    if request.bids_database_dir is None:
+        return frozenset(folder.subject for folder in subject_folders(request.bids_dir))
+    return _from_index(request.bids_dir, request.bids_database_dir)
+
+
+def _from_index(bids_dir: Path, database_dir: Path) -> frozenset[str]:
+    # Takes seconds to import.
+    from bids import BIDSLayout, BIDSLayoutIndexer  # noqa: PLC0415
+    from sqlalchemy.exc import SQLAlchemyError  # noqa: PLC0415 (comes with pybids)
+
+    try:
+        layout = BIDSLayout(
+            bids_dir,
+            validate=False,
+            derivatives=False,
+            database_path=database_dir,
+            indexer=BIDSLayoutIndexer(validate=False, index_metadata=False, ignore=_IGNORED),
+        )
+        made_for = Path(layout.root)
+        subjects = frozenset(layout.get_subjects())
+    except (OSError, ValueError, TypeError, SQLAlchemyError) as error:
+        first_line = str(error).partition("\n")[0]
+        raise InputError(
+            f"{database_dir}: pybids cannot use this database ({first_line}); "
+            "give an empty folder, and it will be made",
+            reason="unreadable-database",
+        ) from error
+    if made_for.resolve() != bids_dir.resolve():
+        raise InputError(
+            f"{database_dir}: this database was made for {made_for}; give an empty folder",
+            reason="unreadable-database",
+        )
+    return subjects

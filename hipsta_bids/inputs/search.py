@@ -1,0 +1,298 @@
+"""Finding the segmentations of each hemisphere.
+
+The flow: which datasets to search (``sources``), which subjects and sessions they hold (``scan``),
+which files are segmentations (one module per layout: ``freesurfer``, ``ashs``, ``hippunfold``,
+``named``), and which of several to take. No image is opened, except where ASHS's atlas can only be
+told from the labels.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from hipsta_bids.errors import NothingToDoError, UsageError
+from hipsta_bids.inputs.ashs import AtlasFinder, choose_atlas, find_ashs, sample_files
+from hipsta_bids.inputs.edits import EditedFile, attach_edits, each_once, edits_of_visit, list_edits
+from hipsta_bids.inputs.freesurfer import find_freesurfer
+from hipsta_bids.inputs.generic import find_named, forget_tables
+from hipsta_bids.inputs.hippunfold import find_hippunfold
+from hipsta_bids.inputs.request import HEMIS, HemisphereInput, InputRequest
+from hipsta_bids.inputs.scan import (
+    Selection,
+    Source,
+    Visit,
+    list_participants,
+    list_sources,
+    list_visits,
+    make_selection,
+    read_description,
+    subject_folders,
+)
+from hipsta_bids.inputs.tables import forget_folders
+from hipsta_bids.protocols.protocol import Scheme
+
+__all__ = [
+    "HEMIS",
+    "Findings",
+    "HemisphereInput",
+    "InputRequest",
+    "dataset_notes",
+    "find_hemispheres",
+    "find_inputs",
+    "list_subjects",
+    "selection_table",
+]
+
+_LOOKED_FOR = (
+    "FreeSurfer's mri/[lr]h.hippoAmygLabels*, ASHS's *_lfseg_*, HippUnfold's "
+    "*_desc-subfields*_dseg, and *_hemi-*_dseg with a table"
+)
+
+#: How many names an error message lists.
+_SHOWN = 6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Findings:
+    """What a search found."""
+
+    items: tuple[HemisphereInput, ...]
+    """Sorted by subject, session, hemisphere, protocol. Some may have a ``problem``."""
+    notes: tuple[str, ...] = ()
+    """One line for each edited file that is not used."""
+
+
+def find_hemispheres(request: InputRequest) -> tuple[HemisphereInput, ...]:
+    """Find all segmentations that are asked for: the items of :func:`find_inputs`."""
+    return find_inputs(request).items
+
+
+def find_inputs(request: InputRequest) -> Findings:
+    """Find all segmentations that are asked for, and what a person corrected in them.
+
+    Different protocols of one hemisphere (say, FreeSurfer's and ASHS's) are separate inputs. Where
+    two datasets offer the same protocol, the one that the user named comes first, then the order
+    of :func:`~hipsta_bids.bids.sources.list_sources`; usable comes before unusable.
+
+    Parameters
+    ----------
+    request : InputRequest
+
+    Returns
+    -------
+    Findings
+
+    Raises
+    ------
+    InputError
+        A folder or file that the user gave is missing or cannot be read.
+    UsageError
+        An option's value is not possible.
+    SchemeError
+        The user's protocol is not valid, or ``ashs_atlas`` is not known.
+    NothingToDoError
+        ``no-segmentation`` or ``no-match``: nothing was found, or nothing of what is asked for.
+    """
+    selection = make_selection(request)
+    option = choose_atlas(request)
+    forget_folders()
+    forget_tables()
+    sources = list_sources(request)
+    edited = list_edits(request, selection)
+    found: list[HemisphereInput] = []
+    for source in sources:
+        found += _search(source, selection, option, edited)
+    if not found:
+        raise _nothing(request, sources)
+    _check_analysis(found, request)
+    items, notes = attach_edits(_without_clashes(found, sources), each_once(edited), selection)
+    return Findings(items=items, notes=notes)
+
+
+def list_subjects(request: InputRequest) -> tuple[str, ...]:
+    """List the subjects that are asked for and have a folder in any dataset to be searched.
+
+    Takes one listing per dataset: what is in the folders is not looked at.
+
+    Parameters
+    ----------
+    request : InputRequest
+
+    Returns
+    -------
+    tuple of str
+        Sorted labels without ``sub-``.
+
+    Raises
+    ------
+    InputError, UsageError, SchemeError
+        As :func:`find_inputs`.
+    """
+    selection = make_selection(request)
+    return tuple(
+        sorted(
+            {
+                folder.subject
+                for source in list_sources(request)
+                for folder in subject_folders(source.path)
+                if selection.wants_folder(folder)
+            }
+        )
+    )
+
+
+def selection_table(items: Iterable[HemisphereInput]) -> list[dict[str, str]]:
+    """Describe what was found and why, one row per hemisphere and protocol.
+
+    Parameters
+    ----------
+    items : iterable of HemisphereInput
+
+    Returns
+    -------
+    list of dict
+        Keys ``subject``, ``session``, ``hemisphere``, ``file``, ``scheme``, ``why``, ``edited``
+        and ``passed over``; ``n/a`` where there is nothing to say.
+    """
+    return [
+        {
+            "subject": item.subject,
+            "session": item.session or "n/a",
+            "hemisphere": item.hemi,
+            "file": " + ".join(_relative(path, item.source_path) for path in item.files),
+            "scheme": item.scheme.name,
+            "why": "; ".join((f"{item.source}: {item.why}", *item.notes))
+            + (f"; NOT USABLE: {item.problem}" if item.problem else ""),
+            "edited": " + ".join(_relative(edit.path, edit.source_path) for edit in item.edits)
+            or "n/a",
+            "passed over": "; ".join(f"{name}: {why}" for name, why in item.passed_over) or "n/a",
+        }
+        for item in items
+    ]
+
+
+def dataset_notes(request: InputRequest, items: Iterable[HemisphereInput]) -> tuple[str, ...]:
+    """Say what a user should know about the dataset as a whole.
+
+    Parameters
+    ----------
+    request : InputRequest
+    items : iterable of HemisphereInput
+        What :func:`find_hemispheres` returned.
+
+    Returns
+    -------
+    tuple of str
+        One line each: a missing description, participants without any segmentation.
+    """
+    notes = []
+    if read_description(request.bids_dir) is None:
+        notes.append(
+            f"{request.bids_dir} has no dataset_description.json, which BIDS requires; going on"
+        )
+    asked = make_selection(request).subjects
+    known = asked or list_participants(request)
+    without = sorted(known - {item.subject for item in items})
+    if without:
+        notes.append(f"no segmentation found for {_count(without, 'participant')}")
+    return tuple(notes)
+
+
+def _search(
+    source: Source,
+    selection: Selection,
+    option: Scheme | None,
+    edited: list[EditedFile],
+) -> Iterator[HemisphereInput]:
+    """Search one dataset for all kinds of segmentations, and add the edited files beside them."""
+    folders = [folder for folder in subject_folders(source.path) if selection.wants_folder(folder)]
+    atlases = AtlasFinder(source.path, option, sample_files(source))
+    for visit in filter(selection.wants_visit, list_visits(folders)):
+        edited += edits_of_visit(visit, source.path, source.name, beside=True)
+        yield from _search_visit(visit, source, selection, atlases)
+
+
+def _search_visit(
+    visit: Visit,
+    source: Source,
+    selection: Selection,
+    atlases: AtlasFinder,
+) -> Iterator[HemisphereInput]:
+    if "freesurfer" in source.layouts:
+        yield from find_freesurfer(visit, source, selection)
+    if "ashs" in source.layouts:
+        yield from find_ashs(visit, source, atlases, selection)
+    if "hippunfold" in source.layouts:
+        yield from find_hippunfold(visit, source, selection)
+    if "named" in source.layouts:
+        yield from find_named(visit, source, selection)
+
+
+def _without_clashes(
+    found: list[HemisphereInput], sources: tuple[Source, ...]
+) -> tuple[HemisphereInput, ...]:
+    """Keep one input per hemisphere and protocol."""
+    order = {source.path: index for index, source in enumerate(sources)}
+    chosen: dict[tuple[str, str, str, str], HemisphereInput] = {}
+    for item in sorted(found, key=lambda item: (item.problem is not None, order[item.source_path])):
+        first = chosen.setdefault(item.key, item)
+        if first is not item:
+            reason = f"same hemisphere and protocol as in {first.source}, which comes first"
+            if item.problem is not None and first.problem is None:
+                reason = f"not usable ({item.problem.reason})"
+            other = (str(item.files[0]), reason)
+            chosen[item.key] = replace(first, passed_over=(*first.passed_over, other))
+    return tuple(chosen[key] for key in sorted(chosen))
+
+
+def _check_analysis(found: list[HemisphereInput], request: InputRequest) -> None:
+    """Refuse an analysis that no hemisphere has: it is a slip of the pen."""
+    asked = [item for item in found if item.scheme.tool == "freesurfer"]
+    missing = [
+        item.problem for item in asked if item.problem and item.problem.reason == "analysis-missing"
+    ]
+    if request.fs_analysis and missing and len(missing) == len(asked):
+        raise UsageError(
+            f"--fs-analysis {request.fs_analysis}: no hemisphere has it ({missing[0]})",
+            reason="unknown-analysis",
+        )
+
+
+def _nothing(request: InputRequest, sources: tuple[Source, ...]) -> NothingToDoError:
+    """Say what was looked for, and where."""
+    searched = ", ".join(str(source.path) for source in sources)
+    restricted = (
+        *(f"--participant-label {label}" for label in request.participant_labels[:_SHOWN]),
+        *(f"--session-label {label}" for label in request.session_labels[:_SHOWN]),
+        *(f"--hemi {hemi}" for hemi in request.hemis if request.hemis != HEMIS),
+        *([f"--bids-filter-file {request.bids_filter_file}"] if request.bids_filter_file else []),
+    )
+    if not sources:
+        return NothingToDoError(
+            f"{request.bids_dir}: no derivatives/* or sourcedata/* with sub-* folders; "
+            "name the dataset with the segmentations: -d NAME=PATH",
+            reason="no-segmentation",
+        )
+    if restricted:
+        subjects = {folder.subject for source in sources for folder in subject_folders(source.path)}
+        return NothingToDoError(
+            f"no hippocampal segmentation matches {' '.join(restricted)} in {searched} "
+            f"(which hold {_count(sorted(subjects), 'subject')}; looked for {_LOOKED_FOR})",
+            reason="no-match",
+        )
+    return NothingToDoError(
+        f"no hippocampal segmentation in {searched} (looked for {_LOOKED_FOR}); "
+        "name another dataset: -d NAME=PATH",
+        reason="no-segmentation",
+    )
+
+
+def _count(names: list[str], noun: str) -> str:
+    more = ", ..." if len(names) > _SHOWN else ""
+    plural = "" if len(names) == 1 else "s"
+    listed = f" ({', '.join(names[:_SHOWN])}{more})" if names else ""
+    return f"{len(names)} {noun}{plural}{listed}"
+
+
+def _relative(path: Path, root: Path) -> str:
+    return str(path.relative_to(root)) if path.is_relative_to(root) else str(path)

@@ -1,0 +1,1 @@
+"""File formats: text, tables, images, surfaces and meshes."""

@@ -1,0 +1,402 @@
+"""The only writer of results, and small readers of what it wrote.
+
+A file appears whole or not at all: it is written aside, flushed to the disk, then renamed over
+its final name. The same values give the same bytes.
+"""
+
+import contextlib
+import csv
+import errno
+import fcntl
+import hashlib
+import io
+import json
+import math
+import os
+import secrets
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from hipsta_bids.errors import InputError, OutputError
+
+LOGS = "logs"
+"""Folder of an output dataset that holds the run logs, and the file whose bytes are the locks."""
+
+MISSING = "n/a"
+"""How BIDS tables spell a missing value."""
+
+_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+_FORBIDDEN = {errno.EROFS, errno.EACCES, errno.EPERM}
+_TEMPORARY = ".tmp"
+
+
+def is_disk_full(error: OSError) -> bool:
+    """Say whether a system error means that no space is left (or no quota, or a size limit)."""
+    return error.errno in _FULL
+
+
+def output_error(path: Path, error: OSError) -> OutputError:
+    """Translate a system error on writing into one that a user can act on.
+
+    Parameters
+    ----------
+    path : Path
+        What could not be written.
+    error : OSError
+        What the system said.
+
+    Returns
+    -------
+    OutputError
+        With the reason ``disk-full``, ``read-only`` or ``not-writable``.
+    """
+    if is_disk_full(error):
+        return OutputError(
+            f"{path}: no space left ({error.strerror}); free some and run the same command again",
+            reason="disk-full",
+        )
+    if error.errno in _FORBIDDEN:
+        return OutputError(
+            f"{path}: not allowed to write there ({error.strerror}); choose another output folder"
+            " or change its permissions",
+            reason="read-only",
+        )
+    return OutputError(
+        f"{path}: cannot be written ({error.strerror or error}); choose another output folder",
+        reason="not-writable",
+    )
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder and its parents; one that exists already is fine.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be made.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise output_error(path, error) from error
+
+
+def check_writable(folder: Path) -> None:
+    """Make a folder if need be and prove that files can be written there.
+
+    Raises
+    ------
+    OutputError
+        If not.
+    """
+    make_folder(folder)
+    probe = _aside(folder / "write-probe")
+    try:
+        # A whole block, since an empty file can still be made on a full disk.
+        _write_through(probe, b"\0" * 4096)
+        probe.unlink(missing_ok=True)  # another run may tidy up
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            probe.unlink()
+        raise output_error(folder, error) from error
+
+
+def check_scratch(folder: Path | None = None) -> None:
+    """Prove that temporary files can be written, in a folder or where the system has them.
+
+    Raises
+    ------
+    OutputError
+        If not.
+    """
+    if folder is not None:
+        check_writable(folder)
+        return
+    try:
+        tempfile.gettempdir()
+    except FileNotFoundError as error:
+        raise OutputError(
+            "no folder for temporary files can be written; set TMPDIR to one (in a container,"
+            " mount one at /tmp)",
+            reason="no-scratch",
+        ) from error
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file atomically, making its folder if need be.
+
+    Parameters
+    ----------
+    path : Path
+        Final name; replaced if it exists.
+    content : bytes
+        All of it.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written; the earlier file, if any, is then unharmed.
+    """
+    make_folder(path.parent)
+    aside = _aside(path)
+    try:
+        try:
+            _write_through(aside, content)
+            aside.replace(path)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                aside.unlink()
+            raise
+    except OSError as error:
+        raise output_error(path, error) from error
+
+
+def _aside(path: Path) -> Path:
+    """Name a file to write into before it is renamed, that no process elsewhere has as well."""
+    return path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}{_TEMPORARY}")
+
+
+def _write_through(path: Path, content: bytes) -> None:
+    """Write and wait until the disk has it: a rename must never precede its content."""
+    with path.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def hide_home(text: str) -> str:
+    """Spell the home folder, which names a person, as ``~``."""
+    home = os.path.expanduser("~")  # noqa: PTH111  (Path.home() fails where there is none)
+    return text.replace(f"{home}/", "~/") if len(home) > 1 else text
+
+
+def remove(paths: Iterable[Path]) -> None:
+    """Remove files; those that do not exist are fine.
+
+    Raises
+    ------
+    OutputError
+        If one cannot be removed.
+    """
+    for path in paths:
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            raise output_error(path, error) from error
+
+
+def remove_leftovers(folder: Path, pattern: str) -> None:
+    """Remove what a killed run left half-written.
+
+    Parameters
+    ----------
+    folder : Path
+        Where the results are.
+    pattern : str
+        Glob pattern of the final names.
+    """
+    remove(folder.glob(f".{pattern}.*{_TEMPORARY}"))
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a UTF-8 text file atomically (see :func:`write_bytes`).
+
+    Names of files that the locale cannot spell keep their bytes.
+    """
+    write_bytes(path, text.encode(errors="surrogateescape"))
+
+
+def write_json(path: Path, value: Mapping[str, Any]) -> None:
+    """Write strict JSON atomically: NaN and infinities become ``null``, key order is kept.
+
+    Numpy scalars and arrays are written as numbers and lists.
+    """
+    text = json.dumps(plain(value), indent=2, allow_nan=False, ensure_ascii=False)
+    write_text(path, text + "\n")
+
+
+def plain(value: Any) -> Any:  # noqa: ANN401  (JSON values have no narrower common type)
+    """Reduce a value to what JSON knows: numbers, words, lists, objects, null."""
+    if hasattr(value, "tolist"):  # numpy's arrays and scalars
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple, set, frozenset)):
+        items = sorted(value) if isinstance(value, (set, frozenset)) else value
+        return [plain(item) for item in items]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if value is None or isinstance(value, (bool, int, float)):
+        return value
+    return str(value)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, unreadable, or not a JSON object.
+    """
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path}: not readable as JSON ({error}); restore or delete it",
+            reason="unreadable-json",
+        ) from error
+    if not isinstance(value, dict):
+        raise InputError(f"{path}: not a JSON object; restore or delete it", reason="bad-json")
+    return value
+
+
+def write_tsv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Write a BIDS table atomically.
+
+    Parameters
+    ----------
+    path : Path
+        Final name.
+    columns : sequence of str
+        Header.
+    rows : iterable of sequence of str
+        Cells as they shall appear; empty ones become ``n/a``; tabs and line breaks in them
+        become blanks.
+    """
+    lines = ["\t".join(columns)]
+    lines += ["\t".join(" ".join(cell.split()) or MISSING for cell in row) for row in rows]
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def read_tsv(path: Path) -> list[dict[str, str]]:
+    """Read a BIDS table as text cells.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or unreadable, a row has another length than the header, or a name
+        stands in this twice.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file; check its name", reason="no-file") from error
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"{path}: not readable as a table: no UTF-8 text; save it as that (not as Excel's"
+            " Unicode text)",
+            reason="unreadable-table",
+        ) from error
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path}: not readable as a table ({error}); restore or delete it",
+            reason="unreadable-table",
+        ) from error
+    reader = csv.reader(io.StringIO(text), delimiter="\t", quoting=csv.QUOTE_NONE)
+    header = next(reader, [])
+    rows = [row for row in reader if row]
+    if any(len(row) != len(header) for row in rows):
+        raise InputError(
+            f"{path}: rows and header differ in length; restore or delete it", reason="bad-table"
+        )
+    if twice := sorted({name for name in header if header.count(name) > 1}):
+        raise InputError(
+            f"{path}: column {twice[0]!r} stands there more than once; keep one", reason="bad-table"
+        )
+    return [dict(zip(header, row, strict=True)) for row in rows]
+
+
+def sha256_of(path: Path) -> str:
+    """Hash the content of a file.
+
+    Returns
+    -------
+    str
+        64 hexadecimal digits.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); check that it exists and is readable",
+            reason="unreadable-file",
+        ) from error
+
+
+# Turns between runs into one folder, on one machine or many.
+
+
+DATASET = "dataset"
+"""Name of the lock on the files of the whole dataset."""
+
+_FILE = ".lock"
+
+
+@contextlib.contextmanager
+def locked(root: Path, what: str) -> Iterator[bool]:
+    """Let one process at a time work on something; others wait.
+
+    A process may hold one lock at a time: with POSIX's record locks, to let go of one is to let go
+    of all that it has on the same file.
+
+    Parameters
+    ----------
+    root : Path
+        The output dataset.
+    what : str
+        Any name.
+
+    Yields
+    ------
+    bool
+        Whether there is a lock: some network file systems have none, and single runs still work.
+
+    Raises
+    ------
+    OutputError
+        If the file of the locks cannot be made.
+    """
+    folder = root / LOGS
+    make_folder(folder)
+    path = folder / _FILE
+    digest = hashlib.blake2b(what.encode(), digest_size=7).digest()
+    try:
+        handle = path.open("ab")
+    except OSError as error:
+        raise output_error(path, error) from error
+    with handle:
+        try:
+            fcntl.lockf(handle, fcntl.LOCK_EX, 1, int.from_bytes(digest, "big"))
+        except OSError:
+            yield False
+        else:
+            yield True
+
+
+def entities(name: str) -> dict[str, str]:
+    """Split a BIDS file name.
+
+    Parameters
+    ----------
+    name : str
+        Without folders.
+
+    Returns
+    -------
+    dict
+        Entities by their short key (``sub``, ``hemi``, ``desc``), in the order of the name, and
+        ``suffix`` and ``extension``. Parts without a dash, apart from the suffix, are left out.
+    """
+    stem, dot, extension = name.partition(".")
+    *parts, suffix = stem.split("_")
+    pairs = dict(part.split("-", 1) for part in parts if "-" in part)
+    return {**pairs, "suffix": suffix, "extension": dot + extension}

@@ -1,0 +1,434 @@
+"""GIFTI files of the sheet that Workbench, nilearn and nibabel load.
+
+Structure names are those of Connectome Workbench's ``StructureEnum``, which knows
+``HippocampusLeft`` and ``HippocampusRight``; the metadata keys are those of the GIFTI 1.0
+specification (Harwell et al. 2011) and of Workbench.
+"""
+
+import struct
+import tempfile
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.parsers.expat import ExpatError
+
+import meshio
+import nibabel as nib
+import numpy as np
+from nibabel.filebasedimages import ImageFileError
+from nibabel.gifti.gifti import (
+    GiftiCoordSystem,
+    GiftiDataArray,
+    GiftiImage,
+    GiftiLabel,
+    GiftiLabelTable,
+    GiftiMetaData,
+)
+from numpy.typing import NDArray
+
+from hipsta_bids.errors import InputError
+from hipsta_bids.io import files
+from hipsta_bids.io.files import entities
+from hipsta_bids.types import Coordinates, Float, Int, Mesh, TetMesh
+
+_STRUCTURE = {"L": "HippocampusLeft", "R": "HippocampusRight"}
+
+
+def sheet_triangles(nx: int, ny: int, *, flip: bool = False) -> Int:
+    """Triangulate a regular grid, two triangles per cell.
+
+    Parameters
+    ----------
+    nx, ny : int
+        Numbers of nodes along x and y; node (i, j) is vertex ``i * ny + j``.
+    flip : bool
+        Turn all triangles round.
+
+    Returns
+    -------
+    (2 (nx - 1) (ny - 1), 3) int32
+        Counterclockwise seen from the side that x cross y points to, unless flipped.
+    """
+    index = np.arange(nx * ny, dtype=np.int32).reshape(nx, ny)
+    a, b = index[:-1, :-1].ravel(), index[1:, :-1].ravel()
+    c, d = index[1:, 1:].ravel(), index[:-1, 1:].ravel()
+    triangles = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    return np.ascontiguousarray(triangles[:, ::-1] if flip else triangles)
+
+
+def surface_bytes(
+    points: Float, triangles: Int, *, hemi: str, secondary: str | None, unfolded: bool
+) -> bytes:
+    """Encode a surface.
+
+    Parameters
+    ----------
+    points : (V, 3) float64
+        Vertices in mm: scanner RAS, or the plane of the unfolded sheet.
+    triangles : (F, 3) int32
+        Outward oriented.
+    hemi : str
+        ``L`` or ``R``.
+    secondary : str or None
+        Workbench's secondary surface type, where it has one that fits.
+    unfolded : bool
+        Whether the points lie in the unfolded space, which is no scanner's.
+
+    Returns
+    -------
+    bytes
+        A ``.surf.gii`` file.
+    """
+    meta = {
+        "AnatomicalStructurePrimary": _STRUCTURE[hemi],
+        "GeometricType": "Flat" if unfolded else "Anatomical",
+    }
+    if secondary:
+        meta["AnatomicalStructureSecondary"] = secondary
+    space = "NIFTI_XFORM_UNKNOWN" if unfolded else "NIFTI_XFORM_SCANNER_ANAT"
+    vertices = GiftiDataArray(
+        points.astype(np.float32),
+        intent="NIFTI_INTENT_POINTSET",
+        datatype="NIFTI_TYPE_FLOAT32",
+        coordsys=GiftiCoordSystem(space, space, np.eye(4)),
+        meta=GiftiMetaData(meta),
+    )
+    faces = GiftiDataArray(
+        triangles.astype(np.int32),
+        intent="NIFTI_INTENT_TRIANGLE",
+        datatype="NIFTI_TYPE_INT32",
+        meta=GiftiMetaData({"TopologicalType": "Open"}),
+    )
+    return _encode([vertices, faces], hemi)
+
+
+def shape_bytes(values: Float, *, hemi: str, name: str, unit: str) -> bytes:
+    """Encode one number per vertex.
+
+    Parameters
+    ----------
+    values : (V,) float64
+        NaN where missing.
+    hemi : str
+        ``L`` or ``R``.
+    name, unit : str
+        What the map is called in viewers, and its unit.
+
+    Returns
+    -------
+    bytes
+        A ``.shape.gii`` file.
+    """
+    array = GiftiDataArray(
+        values.astype(np.float32),
+        intent="NIFTI_INTENT_SHAPE",
+        datatype="NIFTI_TYPE_FLOAT32",
+        meta=GiftiMetaData({"Name": name, "Units": unit}),
+    )
+    return _encode([array], hemi)
+
+
+def maps_bytes(values: Float, *, hemi: str, names: Sequence[str], series: bool = True) -> bytes:
+    """Encode one or several numbers per vertex, of unknown unit.
+
+    Parameters
+    ----------
+    values : (V, T) float64
+        NaN where missing.
+    hemi : str
+        ``L`` or ``R``.
+    names : sequence of str
+        What the T maps are called in viewers.
+    series : bool
+        Whether several are a series, as over time.
+
+    Returns
+    -------
+    bytes
+        A ``.shape.gii`` file, or of a series a ``.func.gii`` file.
+    """
+    kind = "NIFTI_INTENT_SHAPE" if len(names) == 1 or not series else "NIFTI_INTENT_TIME_SERIES"
+    arrays = [
+        GiftiDataArray(
+            column.astype(np.float32),
+            intent=kind,
+            datatype="NIFTI_TYPE_FLOAT32",
+            meta=GiftiMetaData({"Name": name}),
+        )
+        for name, column in zip(names, values.T, strict=True)
+    ]
+    return _encode(arrays, hemi)
+
+
+def label_bytes(
+    keys: NDArray[np.uint8], *, hemi: str, name: str, table: Mapping[int, tuple[str, str]]
+) -> bytes:
+    """Encode one label per vertex.
+
+    Parameters
+    ----------
+    keys : (V,) uint8
+        Labels; 0 is none.
+    hemi : str
+        ``L`` or ``R``.
+    name : str
+        What the map is called in viewers.
+    table : mapping of int to (str, str)
+        Name and ``#rrggbb`` color per key.
+
+    Returns
+    -------
+    bytes
+        A ``.label.gii`` file.
+    """
+    array = GiftiDataArray(
+        keys.astype(np.int32),
+        intent="NIFTI_INTENT_LABEL",
+        datatype="NIFTI_TYPE_INT32",
+        meta=GiftiMetaData({"Name": name}),
+    )
+    labels = GiftiLabelTable()
+    # Workbench calls the unlabeled key "???" and expects it to be transparent.
+    for key, (title, color) in {0: ("???", ""), **table}.items():
+        rgba = [int(color[i : i + 2], 16) / 255 for i in (1, 3, 5)] + [1.0] if color else [0.0] * 4
+        label = GiftiLabel(key, *rgba)
+        label.label = title  # type: ignore[attr-defined]  # nibabel sets it from outside, too
+        labels.labels.append(label)
+    return _encode([array], hemi, labels)
+
+
+def _encode(
+    arrays: Sequence[GiftiDataArray],
+    hemi: str,
+    labels: GiftiLabelTable | None = None,
+) -> bytes:
+    meta = GiftiMetaData({"AnatomicalStructurePrimary": _STRUCTURE[hemi]})
+    image = GiftiImage(meta=meta, darrays=list(arrays), labeltable=labels)
+    content: bytes = image.to_bytes()
+    return content
+
+
+def read_points(path: Path) -> Float:
+    """Read the vertices of a surface.
+
+    Parameters
+    ----------
+    path : Path
+        A ``.surf.gii`` file.
+
+    Returns
+    -------
+    (V, 3) float64
+        RAS mm.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    try:
+        image = GiftiImage.from_bytes(path.read_bytes())
+        points = image.agg_data("NIFTI_INTENT_POINTSET")
+        return np.asarray(points, dtype=np.float64).reshape(-1, 3)
+    except (OSError, ValueError, TypeError, ExpatError) as error:
+        raise InputError(
+            f"{path}: not readable as a surface ({error}); run the participant level again with"
+            " --force",
+            reason="unreadable-surface",
+        ) from error
+
+
+# Reads maps and surfaces that other programs wrote: GIFTI, or tables.
+
+
+#: Unit of maps that do not say theirs.
+ARBITRARY = "arbitrary"
+
+#: Units of what HippUnfold measures per vertex, by the suffix of its files.
+_UNITS = {"thickness": "mm", "surfarea": "mm^2", "gyrification": "1"}
+#: Columns of a table that say where a row is.
+_PLACES = ("x", "y", "node_x", "node_y", "vertex", "index", "point")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PointMap:
+    """One number per point."""
+
+    values: Float
+    """(points,); NaN is missing."""
+    unit: str
+    nodes: tuple[int, int] | None = None
+    """Nodes along x and y, where a table says that they are the sheet's."""
+
+
+def read_map(path: Path, name: str) -> PointMap:
+    """Read a map.
+
+    Parameters
+    ----------
+    path : Path
+        ``.gii`` with one array, or ``.tsv`` with one row per point.
+    name : str
+        Column of a table that has several.
+
+    Returns
+    -------
+    PointMap
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, or holds several maps.
+    """
+    if path.suffix == ".tsv":
+        return _from_table(path, name)
+    image = _load(path)
+    arrays = [array for array in image.darrays if array.data.dtype.kind in "fiu"]
+    arrays = [array for array in arrays if array.data.ndim == 1]
+    if len(arrays) != 1:
+        raise InputError(
+            f"{path}: holds {len(arrays)} maps; give a file with one", reason="several-maps"
+        )
+    pairs = entities(path.name)
+    unit = dict(arrays[0].meta).get("Units") or _UNITS.get(pairs["suffix"], ARBITRARY)
+    return PointMap(values=_finite(arrays[0].data), unit=str(unit))
+
+
+def _finite(values: Any) -> Float:  # noqa: ANN401  (whatever nibabel gives)
+    numbers = np.asarray(values, dtype=np.float64)
+    return np.where(np.isfinite(numbers), numbers, np.nan)
+
+
+def _from_table(path: Path, name: str) -> PointMap:
+    rows = files.read_tsv(path)
+    columns = list(rows[0]) if rows else []
+    others = [column for column in columns if column not in _PLACES]
+    column = name if name in columns else others[0] if len(others) == 1 else None
+    if column is None:
+        what = f"columns {', '.join(others)}" if others else "no column of values"
+        raise InputError(
+            f"{path}: has {what}; name the map after one of them", reason="several-maps"
+        )
+    try:
+        values = [np.nan if row[column] == files.MISSING else float(row[column]) for row in rows]
+        nodes = _nodes(rows) if {"x", "y"} <= set(columns) else None
+    except ValueError as error:
+        raise InputError(
+            f"{path}: column {column} has cells that are no numbers ({error}); mark missing ones"
+            " n/a",
+            reason="unreadable-map",
+        ) from error
+    return PointMap(values=_finite(values), unit=ARBITRARY, nodes=nodes)
+
+
+def _nodes(rows: list[dict[str, str]]) -> tuple[int, int] | None:
+    """Nodes along x and y if rows are those of a sheet, y fastest; ``None`` otherwise."""
+    x, y = (np.array([float(row[axis]) for row in rows]) for axis in "xy")
+    nx, ny = int(x.max()), int(y.max())
+    expected = np.divmod(np.arange(len(rows)), max(ny, 1))
+    regular = nx * ny == len(rows) and (x == expected[0] + 1).all() and (y == expected[1] + 1).all()
+    return (nx, ny) if regular else None
+
+
+def read_mesh(path: Path) -> Mesh:
+    """Read a surface.
+
+    Parameters
+    ----------
+    path : Path
+        ``.surf.gii``.
+
+    Returns
+    -------
+    Mesh
+
+    Raises
+    ------
+    InputError
+        If it is none.
+    """
+    image = _load(path)
+    found = [
+        image.get_arrays_from_intent(f"NIFTI_INTENT_{intent}")
+        for intent in ("POINTSET", "TRIANGLE")
+    ]
+    if any(len(arrays) != 1 for arrays in found):
+        raise InputError(
+            f"{path}: is no surface (points and triangles); give a .surf.gii file",
+            reason="unreadable-surface",
+        )
+    points, triangles = (arrays[0].data for arrays in found)
+    mesh = Mesh(
+        points=np.asarray(points, dtype=np.float64),
+        triangles=np.asarray(triangles, dtype=np.int64),
+    )
+    if mesh.triangles.min(initial=0) < 0 or mesh.triangles.max(initial=-1) >= len(mesh.points):
+        raise InputError(
+            f"{path}: has triangles between vertices that do not exist; write it again",
+            reason="unreadable-surface",
+        )
+    return mesh
+
+
+def _load(path: Path) -> GiftiImage:
+    try:
+        image = nib.load(path)
+    except (
+        OSError,
+        ValueError,
+        TypeError,
+        KeyError,
+        AttributeError,
+        ImageFileError,
+        ExpatError,
+        zlib.error,
+        struct.error,
+    ) as error:
+        first = str(error).partition("\n")[0]
+        raise InputError(
+            f"{path}: not readable as GIFTI ({first}); write it again", reason="unreadable-map"
+        ) from error
+    if not isinstance(image, GiftiImage):
+        raise InputError(
+            f"{path}: is no GIFTI file; maps are .shape.gii, .func.gii or .tsv files",
+            reason="unreadable-map",
+        )
+    return image
+
+
+# The tetrahedral mesh as a VTU file that ParaView and meshio read.
+
+
+#: Names of the harmonic coordinates as point data, in their order.
+COORDINATE_NAMES = ("medial_lateral", "posterior_anterior", "interior_exterior")
+
+
+def mesh_bytes(mesh: TetMesh, coordinates: Coordinates) -> bytes:
+    """Encode a tetrahedral mesh with its coordinates.
+
+    Parameters
+    ----------
+    mesh : TetMesh
+        Vertices in RAS mm.
+    coordinates : Coordinates
+        Three values per vertex in [-1, 1].
+
+    Returns
+    -------
+    bytes
+        A ``.vtu`` file (XML, compressed binary data).
+    """
+    data = meshio.Mesh(
+        mesh.vertices,
+        [("tetra", mesh.tetrahedra)],
+        point_data={
+            name: coordinates.values[:, axis].copy() for axis, name in enumerate(COORDINATE_NAMES)
+        },
+    )
+    # meshio writes to paths only; the result still reaches its place through one writer.
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "mesh.vtu"
+        meshio.write(path, data, file_format="vtu")
+        return path.read_bytes()

@@ -1,0 +1,1 @@
+"""One hemisphere from labels to maps, and runs over many."""

@@ -1,0 +1,331 @@
+"""Dask as the engine: the same jobs, on workers of a cluster.
+
+Each Dask worker hands its jobs to a process of its own, as the pool does on one machine, so that a
+crash or a time limit costs one job and not the worker. Where a whole worker is lost, with its
+machine or its allocation, Dask gives its jobs to others.
+"""
+
+import contextlib
+import multiprocessing
+import re
+import subprocess
+import sys
+import threading
+from collections.abc import Generator, Iterable, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from hipsta_bids import __version__
+from hipsta_bids.errors import HipstaError, UsageError
+from hipsta_bids.participant.pool import Worker, WorkerLost, WorkerPlan
+
+_PATIENCE = 60.0  # s that an idle process stays, should the run have died
+_ANSWER_TIME = 30  # s that a scheduler gets to answer
+_WINDOW = 5000  # jobs at the scheduler at a time: more than there are workers, less than it minds
+_JOB_MEMORY = "1 GB"  # of a SLURM job: a hemisphere, and Dask's own worker
+
+#: In a Dask worker: the processes that measure, for all of its threads, and those without a job.
+_WORKERS: list[Worker] = []
+_IDLE: list[Worker] = []
+_LOCK = threading.Lock()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cluster:
+    """Which workers to use."""
+
+    scheduler: str | None = None
+    """Address of a Dask scheduler, or the file that it writes."""
+    slurm: str | None = None
+    """Options of ``sbatch``, for workers of our own."""
+
+
+def check_cluster(cluster: Cluster) -> None:
+    """Check that Dask is there.
+
+    Raises
+    ------
+    UsageError
+        If it is not installed, or both kinds of workers are asked for.
+    """
+    if cluster.scheduler is not None and cluster.slurm is not None:
+        raise UsageError("give --dask-scheduler or --slurm, not both", reason="usage")
+    try:
+        # Workers that come and go are no news; what they cost is told as the fate of jobs.
+        import_module("dask").config.set({"logging.distributed": "error"})
+        import_module("distributed")
+        if cluster.slurm is not None:
+            import_module("dask_jobqueue")
+    except ModuleNotFoundError as error:
+        option = "--dask-scheduler" if cluster.slurm is None else "--slurm"
+        raise UsageError(
+            f"{option}: {error.name} is not installed; pip install 'hipsta_bids[cluster]'",
+            reason="no-dask",
+        ) from error
+
+
+def run_on_cluster(
+    cluster: Cluster, plan: WorkerPlan, jobs: Iterable[Any]
+) -> Generator[tuple[Any, Any]]:
+    """Work off jobs on a cluster; closing the generator stops what runs there.
+
+    Parameters
+    ----------
+    cluster : Cluster
+        Where.
+    plan : WorkerPlan
+        How; ``n_workers`` counts SLURM jobs.
+    jobs : iterable
+        Picklable.
+
+    Yields
+    ------
+    (job, result)
+        As :func:`~hipsta_bids.pool.run_jobs` does.
+
+    Raises
+    ------
+    UsageError
+        If there are no workers to be had, or they are not like us.
+    """
+    check_cluster(cluster)
+    with contextlib.ExitStack() as stack:
+        client = _connect(cluster, plan, stack)
+        yield from _work_off(client, plan, jobs)
+
+
+def _connect(cluster: Cluster, plan: WorkerPlan, stack: contextlib.ExitStack) -> Any:  # noqa: ANN401  (Dask is optional)
+    connect = import_module("distributed").Client
+    if cluster.slurm is not None:
+        return stack.enter_context(connect(stack.enter_context(_slurm(cluster.slurm, plan))))
+    address = str(cluster.scheduler)
+    given = {"scheduler_file": address} if Path(address).is_file() else {"address": address}
+    try:
+        return stack.enter_context(connect(**given, timeout=_ANSWER_TIME))
+    except (OSError, ValueError) as error:
+        raise UsageError(
+            f"--dask-scheduler {address}: no answer ({_one_line(error)}); give its address as"
+            " tcp://HOST:PORT, or the file that `dask scheduler --scheduler-file` writes",
+            reason="no-scheduler",
+        ) from error
+
+
+@contextlib.contextmanager
+def _slurm(options: str, plan: WorkerPlan) -> Generator[Any]:
+    """Have SLURM run workers, and end them in the end."""
+    with import_module("dask_jobqueue").SLURMCluster(
+        cores=1,
+        processes=1,
+        memory=_JOB_MEMORY,
+        python=sys.executable,
+        job_extra_directives=[options] if options.strip() else [],
+        job_directives_skip=["-t "],  # the time limit is the partition's, or in the options
+        log_directory=str(plan.log.parent),
+        scheduler_options={"dashboard_address": None},
+    ) as workers:
+        _check_script(workers.job_script())
+        # Constant: those that are lost are replaced.
+        workers.adapt(minimum_jobs=plan.n_workers, maximum_jobs=plan.n_workers)
+        yield workers
+
+
+def _check_script(script: str) -> None:
+    """Ask SLURM whether it would run a job, since Dask would try it again and again."""
+    try:
+        subprocess.run(
+            ["sbatch", "--test-only"],  # noqa: S607  (where it is differs)
+            input=script,
+            text=True,
+            capture_output=True,
+            check=True,
+        )
+    except FileNotFoundError as error:
+        raise UsageError(
+            "--slurm: there is no sbatch here; run this where jobs can be submitted",
+            reason="no-slurm",
+        ) from error
+    except subprocess.CalledProcessError as error:
+        raise UsageError(
+            f"--slurm: sbatch refuses ({' '.join(error.stderr.split())})", reason="no-slurm"
+        ) from error
+
+
+def _work_off(client: Any, plan: WorkerPlan, jobs: Iterable[Any]) -> Generator[tuple[Any, Any]]:  # noqa: ANN401  (Dask is optional)
+    queue = iter(jobs)
+    pending = {}
+    completed = import_module("distributed").as_completed()
+
+    def submit(number: int) -> None:
+        for job in islice(queue, number):
+            future = client.submit(_answer, __version__, plan, job, pure=False)
+            pending[future] = job
+            completed.add(future)
+
+    try:
+        submit(_WINDOW)
+        for future in completed:
+            job = pending.pop(future)
+            yield job, _result(future)
+            submit(1)
+    finally:
+        if pending:
+            client.cancel(list(pending))
+            # What runs already is not stopped by this.
+            client.run(_dismiss, plan, on_error="ignore")
+
+
+def _result(future: Any) -> Any:  # noqa: ANN401  (Dask is optional)
+    lost = import_module("distributed").KilledWorker
+    error = None if future.cancelled() else future.exception()
+    if future.cancelled() or isinstance(error, lost):
+        return WorkerLost(timed_out=False, exit_code=None, seconds=0.0)
+    if error is None:
+        return future.result()
+    if isinstance(error, HipstaError):
+        raise error
+    raise UsageError(
+        f"Dask's workers cannot do this job ({type(error).__name__}: {_one_line(error)}); they need"
+        f" hipsta_bids {__version__} and the same folders",
+        reason="workers-differ",
+    ) from error
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())
+
+
+def _answer(version: str, plan: WorkerPlan, job: Any) -> Any:  # noqa: ANN401  (jobs are the caller's)
+    """Run in a Dask worker: have a process of its own do the job."""
+    if version != __version__:
+        raise UsageError(
+            f"Dask's workers have hipsta_bids {__version__}, this run has {version}",
+            reason="workers-differ",
+        )
+    # Dask's workers are daemons, which may have no children, since those would outlive them. Ours
+    # do not.
+    multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]  # noqa: SLF001
+    worker = _take(plan)
+    try:
+        return worker(job)
+    finally:
+        _IDLE.append(worker)
+
+
+def _take(plan: WorkerPlan) -> Worker:
+    """Take an idle process of the same run, or a new one: several runs may share a cluster."""
+    with _LOCK:
+        for worker in _IDLE:
+            if worker.plan == plan:
+                _IDLE.remove(worker)
+                return worker
+        worker = Worker(plan, patience=_PATIENCE)
+        _WORKERS.append(worker)
+        return worker
+
+
+def _dismiss(plan: WorkerPlan) -> None:
+    """Run in a Dask worker: end what a run has left there."""
+    for worker in _WORKERS:
+        if worker.plan == plan:
+            worker.kill()
+
+
+# Equal parts of a dataset, for as many runs into one folder.
+
+
+FROM_SLURM = "slurm"
+"""Says that SLURM's array job tells which part."""
+
+_ARRAY = "SLURM_ARRAY_TASK_"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shard:
+    """One of some equal parts."""
+
+    index: int
+    """From 1."""
+    count: int
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.index <= self.count:
+            raise UsageError(
+                f"--shard {self.index}/{self.count}: parts are numbered from 1 to {self.count}",
+                reason="bad-shard",
+            )
+
+    @property
+    def name(self) -> str:
+        """For file names."""
+        return f"{self.index}of{self.count}"
+
+    def take(self, subjects: Iterable[str]) -> tuple[str, ...]:
+        """Choose this part of some subjects, in whatever order they come.
+
+        Parameters
+        ----------
+        subjects : iterable of str
+            All of them; repetitions do not count.
+
+        Returns
+        -------
+        tuple of str
+            Sorted. Over all parts each subject comes once; the sizes differ by one at most.
+        """
+        return tuple(sorted(set(subjects))[self.index - 1 :: self.count])
+
+
+def parse_shard(text: str, environment: Mapping[str, str]) -> Shard:
+    """Read ``I/N``, or take both from SLURM's array job.
+
+    Parameters
+    ----------
+    text : str
+        ``I/N`` or ``slurm``.
+    environment : mapping
+        Where SLURM says which task of an array this is.
+
+    Returns
+    -------
+    Shard
+
+    Raises
+    ------
+    UsageError
+        If the text is something else, the part does not exist, or this is no array job, or one
+        whose numbers leave gaps.
+    """
+    if text == FROM_SLURM:
+        return _from_array(environment)
+    match = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", text)
+    if match is None:
+        raise UsageError(
+            f"--shard {text}: write I/N, such as 3/100 for the third of 100 parts, or"
+            f" {FROM_SLURM} in an array job",
+            reason="bad-shard",
+        )
+    return Shard(index=int(match[1]), count=int(match[2]))
+
+
+def _from_array(environment: Mapping[str, str]) -> Shard:
+    """Find the place of this task in its array, whatever that begins with and its step."""
+    try:
+        task, first, last, count, step = (
+            int(environment[f"{_ARRAY}{name}"]) for name in ("ID", "MIN", "MAX", "COUNT", "STEP")
+        )
+    except (KeyError, ValueError):
+        raise UsageError(
+            f"--shard {FROM_SLURM}: this is no array job (sbatch --array=1-N); write I/N",
+            reason="no-array",
+        ) from None
+    if last - first != step * (count - 1):
+        # As when some tasks are run again: parts would not be those of the first time.
+        raise UsageError(
+            f"--shard {FROM_SLURM}: the array's numbers leave gaps; to run some parts of N again"
+            f" write --shard ${_ARRAY}ID/N",
+            reason="array-with-gaps",
+        )
+    return Shard(index=(task - first) // step + 1, count=count)

@@ -1,0 +1,464 @@
+"""What is to be done with one hemisphere, and what an earlier run has done with it."""
+
+import contextlib
+import hashlib
+import json
+import resource
+import sys
+import time
+import traceback
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from hipsta_bids import __version__
+from hipsta_bids.derivatives import hemisphere
+from hipsta_bids.derivatives.dataset import source_address
+from hipsta_bids.derivatives.hemisphere import ResultPlace
+from hipsta_bids.errors import GeometryError, HipstaError, InputError, OutputError, SchemeError
+from hipsta_bids.inputs.request import HemisphereInput
+from hipsta_bids.io import files
+from hipsta_bids.io.files import locked
+from hipsta_bids.participant.maps import (
+    Mapped,
+    add_signals,
+    is_complete,
+    signal_hash,
+    write_signals,
+)
+from hipsta_bids.protocols.load import for_region
+from hipsta_bids.settings import Settings
+from hipsta_bids.types import BodyMask, Status
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """All that a worker needs to know about one hemisphere."""
+
+    item: HemisphereInput
+    place: ResultPlace
+    settings: Settings
+    settings_hash: str
+    sources: tuple[tuple[str, Path], ...]
+    """Input datasets by name."""
+    write_meshes: bool
+    force: bool = False
+    """Redo it even if an earlier run has done it just so."""
+
+    @property
+    def title(self) -> str:
+        """What its messages are headed by."""
+        return f"{self.place.name.stem}_{self.place.name.protocol}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """How one hemisphere ended."""
+
+    job: Job
+    status: Status
+    reason: str | None = None
+    message: str | None = None
+    error: HipstaError | None = None
+    """Set if it failed for a foreseen reason."""
+    trace: str | None = None
+    """Set if it failed by a bug."""
+    skipped: bool = False
+    """An earlier run had done it."""
+    input_hash: str | None = None
+    thickness: float | None = None
+    """Mean over the sheet, mm."""
+    stages: dict[str, float] = field(default_factory=dict)
+    """Seconds per stage."""
+    seconds: float | None = None
+    cpu_seconds: float | None = None
+    peak_memory_mb: float | None = None
+
+
+def recorded(job: Job) -> Outcome | None:
+    """Read how a hemisphere ended, if it did with the same settings and version.
+
+    Parameters
+    ----------
+    job : Job
+        What would be done.
+
+    Returns
+    -------
+    Outcome or None
+        ``None`` too if there should be files that are not there. Whether inputs have changed since
+        then is not looked at.
+    """
+    try:
+        record = files.read_json(job.place.path("qc"))
+        status = Status(record.get("status", ""))
+    except (InputError, ValueError):
+        return None
+    same = record.get("version") == __version__ and record.get("settings_hash") == job.settings_hash
+    whole = status == Status.FAILED or (
+        all(path.exists() for path in job.place.paths(optional=job.write_meshes))
+        and is_complete(job.place, record)
+    )
+    if not (same and whole):
+        return None
+    return Outcome(
+        job=job,
+        status=status,
+        reason=record.get("reason"),
+        message=record.get("message"),
+        input_hash=record.get("input_hash"),
+        skipped=True,
+    )
+
+
+def finished(job: Job) -> Outcome | None:
+    """Recognize a hemisphere that an earlier run has done just so.
+
+    Parameters
+    ----------
+    job : Job
+        What would be done.
+
+    Returns
+    -------
+    Outcome or None
+        Its outcome if all files are there and inputs, settings and version are unchanged.
+        Failed hemispheres are always tried again: what stood in the way may be gone.
+    """
+    outcome = None if job.force else recorded(job)
+    if outcome is None or outcome.status == Status.FAILED:
+        return None
+    try:
+        digest, _ = hash_inputs(job)
+    except (InputError, SchemeError):
+        return None
+    return outcome if outcome.input_hash == digest else None
+
+
+def base_record(job: Job) -> dict[str, Any]:
+    """Begin the quality record with what is known before any input is read."""
+    item = job.item
+    sources = dict(job.sources)
+    return {
+        "version": __version__,
+        "settings_hash": job.settings_hash,
+        "input_hash": None,
+        "inputs": [{"file": source_address(path, sources)} for path in item.files],
+        "edited": [
+            {"what": edit.kind, "file": source_address(edit.path, sources)} for edit in item.edits
+        ],
+        "scheme": item.scheme.name,
+        "region": job.settings.body.region,
+        "scheme_title": item.scheme.title,
+        "chosen_because": item.why,
+        "passed_over": [
+            {"file": source_address(Path(path), sources), "reason": why}
+            for path, why in item.passed_over
+        ],
+        "notes": item.notes,
+    }
+
+
+def hash_inputs(job: Job) -> tuple[str, dict[str, list[dict[str, str]]]]:
+    """Hash the input files and how they are read.
+
+    Parameters
+    ----------
+    job : Job
+        Whose inputs.
+
+    Returns
+    -------
+    tuple of (str, dict)
+        One hash of everything that decides what is measured, besides settings and version; and
+        address and hash per file: ``inputs``, and what a person ``edited`` of them.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be read.
+    SchemeError
+        If the protocol has no labels of the region.
+    """
+    item, sources = job.item, dict(job.sources)
+    region = for_region(item.scheme, job.settings.body.region)
+    hashes = [
+        {"file": source_address(path, sources), "sha256": files.sha256_of(path)}
+        for path in item.files
+    ]
+    edited = [
+        {
+            "what": edit.kind,
+            "file": source_address(edit.path, sources),
+            "sha256": files.sha256_of(edit.path),
+        }
+        for edit in item.edits
+    ]
+    reading = [
+        [entry["sha256"] for entry in hashes],
+        # The wording of the protocols (titles, citations) does not change what is read.
+        [
+            [label.code, int(label.tissue), int(label.part)]
+            for scheme in (item.scheme, item.parts_scheme)
+            if scheme is not None
+            for label in scheme.labels
+        ],
+        [
+            [int(tissue) for tissue in group]
+            for group in (region.sheet, item.scheme.layer, item.scheme.interior)
+        ],
+        [item.scheme.unlisted, item.bilateral, item.code_offset, item.hemi],
+        sorted([entry["what"], entry["sha256"]] for entry in edited),
+        *signal_hash(item),
+    ]
+    digest = hashlib.sha256(json.dumps(reading).encode()).hexdigest()
+    return digest, {"inputs": hashes, "edited": edited}
+
+
+# What one hemisphere costs: time per stage, processor time, memory.
+
+
+_MEGABYTE = 1e6
+
+
+class CostClock:
+    """Times stages, and measures what they cost in this process since the clock was made."""
+
+    def __init__(self) -> None:
+        self._stages: dict[str, float] = {}
+        self._start = time.perf_counter()
+        self._cpu = cpu_seconds()
+        reset_peak_memory()
+
+    @contextlib.contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        """Time a stage; several times with the same name add up."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            spent = time.perf_counter() - start
+            self._stages[stage] = self._stages.get(stage, 0.0) + spent
+
+    def spent(self) -> dict[str, Any]:
+        """Give what was spent so far: seconds per stage and in all, and peak memory in MB."""
+        return {
+            "stages": dict(self._stages),
+            "seconds": time.perf_counter() - self._start,
+            "cpu_seconds": cpu_seconds() - self._cpu,
+            "peak_memory_mb": peak_memory() / _MEGABYTE,
+        }
+
+
+def cpu_seconds() -> float:
+    """Processor time of this process and its helpers, running or ended, in s."""
+    ended = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return (
+        time.process_time() + ended.ru_utime + ended.ru_stime + sum(map(_cpu_of_helper, helpers()))
+    )
+
+
+def helpers() -> list[str]:
+    """List the process numbers of running children, where the system tells."""
+    with contextlib.suppress(OSError):
+        lists = [path.read_text() for path in Path("/proc/self/task").glob("*/children")]
+        return " ".join(lists).split()
+    return []
+
+
+def reset_peak_memory(process: str = "self") -> None:
+    """Forget how much memory a process needed so far, where Linux allows it."""
+    with contextlib.suppress(OSError):
+        Path(f"/proc/{process}/clear_refs").write_text("5")
+
+
+def peak_memory(process: str = "self") -> float:
+    """Largest resident memory of a process since the last reset, in bytes.
+
+    Where there is no ``/proc``: of this process since it began, whichever was asked for.
+    """
+    with contextlib.suppress(OSError, StopIteration, ValueError):
+        lines = Path(f"/proc/{process}/status").read_text().splitlines()
+        return 1024.0 * int(next(line for line in lines if line.startswith("VmHWM")).split()[1])
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return float(peak if sys.platform == "darwin" else 1024 * peak)  # getrusage(2): bytes, or KiB
+
+
+def _cpu_of_helper(process: str) -> float:
+    """Processor time of a running process in s, 0 if it is gone."""
+    # Its main thread's alone, but in ns; TetGen has no other.
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        return int(Path(f"/proc/{process}/schedstat").read_text().split()[0]) * 1e-9
+    return 0.0
+
+
+# One hemisphere from files to files: read, measure, write. This is what workers run.
+
+
+INTERNAL = "internal-error"
+"""Reason of a failure that is a bug."""
+
+
+def warm_up() -> None:
+    """Load the libraries, so that no hemisphere's time includes it."""
+    import hipsta_bids.inputs.labels  # noqa: PLC0415  (loaded in workers only)
+    import hipsta_bids.participant.measure  # noqa: F401, PLC0415
+
+
+def run_job(job: Job) -> Outcome:
+    """Measure one hemisphere and write its results; never raises a foreseen error.
+
+    Where another run is just doing the same, it is waited for, and its results are taken.
+
+    Parameters
+    ----------
+    job : Job
+        What to do.
+
+    Returns
+    -------
+    Outcome
+        ``failed`` hemispheres leave nothing but their quality record and, if the labels tell, the
+        mask of the body.
+    """
+    try:
+        with locked(job.place.root, job.title):
+            return finished(job) or _measure(job)
+    except OutputError as error:
+        return fail(job, error)
+
+
+def _measure(job: Job) -> Outcome:
+    from hipsta_bids.inputs.labels import read_label_volume  # noqa: PLC0415  (workers only)
+    from hipsta_bids.participant.measure import find_body, measure_hemisphere  # noqa: PLC0415
+
+    clock = CostClock()
+    record = base_record(job)
+    hashed, volume = None, None
+    try:
+        with clock("read"):
+            hashed, hashes = hash_inputs(job)
+            record |= {"input_hash": hashed} | hashes
+            volume = read_label_volume(job.item, job.settings.body.region)
+        maps = measure_hemisphere(volume, job.item.hemi, job.settings, clock)
+        mapped = Mapped()
+        if job.item.maps or job.item.regions:
+            with clock("maps"):
+                maps, mapped = add_signals(job.item, maps, job.settings.maps, dict(job.sources))
+                record |= mapped.record or {}
+        with clock("write"):
+            hemisphere.write_results(
+                job.place,
+                maps,
+                for_region(job.item.scheme, job.settings.body.region),
+                record,
+                write_meshes=job.write_meshes,
+                write_more=lambda: write_signals(job.place, maps, mapped),
+            )
+    except Exception as error:  # noqa: BLE001  (one hemisphere's bug must not end the others)
+        foreseen = foresee(error, job.place.root)
+        trace = None if foreseen else traceback.format_exc()
+        body = None
+        if volume is not None and isinstance(error, GeometryError):
+            body = find_body(volume, job.settings)
+        return fail(
+            job,
+            foreseen or unforeseen(error),
+            trace=trace,
+            record=record,
+            body=body,
+            **clock.spent(),
+        )
+    status, reason, message = hemisphere.verdict(maps)
+    return Outcome(
+        job=job,
+        status=status,
+        reason=reason,
+        message=message,
+        input_hash=hashed,
+        thickness=maps.summary.get("thickness_mean"),
+        **clock.spent(),
+    )
+
+
+def fail(
+    job: Job,
+    error: HipstaError,
+    *,
+    trace: str | None = None,
+    record: dict[str, Any] | None = None,
+    body: BodyMask | None = None,
+    **spent: Any,  # noqa: ANN401  (fields of Outcome)
+) -> Outcome:
+    """Record that a hemisphere failed, and remove what it had.
+
+    Parameters
+    ----------
+    job : Job
+        Whose failure.
+    error : HipstaError
+        Why.
+    trace : str, optional
+        Traceback, if it is a bug.
+    record : dict, optional
+        What is known about its inputs.
+    body : BodyMask, optional
+        What could not be measured, for a person to correct.
+    **spent
+        Times and memory, as fields of :class:`Outcome`.
+
+    Returns
+    -------
+    Outcome
+        With the error of writing instead, if not even the record can be written.
+    """
+    record = base_record(job) if record is None else record
+    try:
+        hemisphere.write_failure(job.place, error, record, body)
+    except OutputError as worse:
+        if not isinstance(error, OutputError):
+            error = worse
+    return Outcome(
+        job=job,
+        status=Status.FAILED,
+        reason=error.reason,
+        message=str(error),
+        error=None if trace else error,
+        trace=trace,
+        input_hash=record.get("input_hash"),
+        **spent,
+    )
+
+
+def foresee(error: Exception, root: Path) -> HipstaError | None:
+    """Tell what a user can act on from a bug.
+
+    Parameters
+    ----------
+    error : Exception
+        What was raised.
+    root : Path
+        The output dataset, for messages.
+
+    Returns
+    -------
+    HipstaError or None
+        ``None`` for a bug.
+    """
+    if isinstance(error, HipstaError):
+        return error
+    if isinstance(error, MemoryError):
+        return HipstaError(
+            "out of memory; use fewer processes (--n-procs) or a machine with more",
+            reason="out-of-memory",
+        )
+    if isinstance(error, OSError) and files.is_disk_full(error):
+        return files.output_error(Path(error.filename) if error.filename else root, error)
+    return None
+
+
+def unforeseen(error: Exception) -> HipstaError:
+    """Word a bug as an error; its traceback goes to the log."""
+    what = " ".join(f"{type(error).__name__}: {error}".split())
+    return HipstaError(f"internal error ({what}); please report it with the log", reason=INTERNAL)

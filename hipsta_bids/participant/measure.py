@@ -1,0 +1,227 @@
+"""The participant level: one hemisphere from labels to maps.
+
+Reads like the methods section of Diers et al. 2023 (NeuroImage 276:120182): labels, surface,
+tetrahedra, boundaries, coordinates, sheet, measures.
+"""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import asdict, replace
+
+from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry.body import Body, check_mask, check_side, extract_body
+from hipsta_bids.geometry.boundaries import Boundaries, find_boundaries
+from hipsta_bids.geometry.catalog import (
+    Measured,
+    average_profiles,
+    measure_maps,
+    measure_sections,
+    summarize,
+)
+from hipsta_bids.geometry.checks import (
+    check_end_labels,
+    check_label_order,
+    check_ridges,
+    check_thickness,
+    check_voxels_across,
+    find_contacts,
+    name_subfields,
+)
+from hipsta_bids.geometry.fem import HarmonicSolver
+from hipsta_bids.geometry.grid import in_plane_voxel, resample_body
+from hipsta_bids.geometry.measures import bending_angle, subfield_areas, subfield_volumes
+from hipsta_bids.geometry.quality import Evidence, find_flags, quality_metrics
+from hipsta_bids.geometry.sheet import (
+    check_layers,
+    check_turned,
+    equal_volume_layers,
+    folded_fraction,
+    is_turned,
+    label_sheet,
+    sample_sheet,
+    solve_coordinates,
+    whole_body,
+)
+from hipsta_bids.geometry.surface import extract_surface, signed_volume
+from hipsta_bids.geometry.tetra import tetrahedralize
+from hipsta_bids.geometry.topology import SolidField, repair_topology, repaired_columns
+from hipsta_bids.protocols.load import for_region
+from hipsta_bids.settings import Settings
+from hipsta_bids.types import (
+    BodyMask,
+    Coordinates,
+    Flag,
+    HemisphereMaps,
+    LabelVolume,
+    Sheet,
+    Surface,
+    TetMesh,
+)
+
+Clock = Callable[[str], AbstractContextManager[None]]
+
+
+def measure_hemisphere(
+    volume: LabelVolume, hemi: str, settings: Settings, clock: Clock
+) -> HemisphereMaps:
+    """Measure thickness, curvature and shape of one hippocampal body.
+
+    Parameters
+    ----------
+    volume : LabelVolume
+    hemi : {"L", "R"}
+    settings : Settings
+    clock : callable
+        ``clock(stage)`` is a context manager that times a stage.
+
+    Returns
+    -------
+    HemisphereMaps
+
+    Raises
+    ------
+    GeometryError
+        With the reason why this hemisphere cannot be measured.
+    """
+    with clock("body"):
+        body = extract_body(volume, settings.body)
+        side = check_side(body, hemi)
+    with clock("surface"):
+        solid = repair_topology(
+            resample_body(body, settings.grid, settings.slices),
+            settings.topology,
+            name_subfields(body),
+            find_contacts(body, settings.topology),
+        )
+        surface = extract_surface(solid.field, settings.surface)
+        across = check_voxels_across(surface, body, settings.checks)
+    with clock("tetrahedra"):
+        surface, mesh, smoothed = _filled(solid, surface, settings)
+    with clock("boundaries"):
+        solver = HarmonicSolver(mesh)
+        boundaries = find_boundaries(surface, mesh, body, settings.boundaries, solver)
+    with clock("coordinates"):
+        coordinates = solve_coordinates(mesh, boundaries, solver)
+        order = check_label_order(mesh, coordinates, body, settings.checks)
+    with clock("sheet"):
+        sheet = sample_sheet(mesh, coordinates, settings.sheet)
+        bending = bending_angle(sheet, settings.measures)
+        if body.region != "body" and boundaries.side_rule == "bending":
+            boundaries = replace(boundaries, side_rule="continuity")
+        wrong = {"bending": bending < 0, "continuity": is_turned(sheet, hemi), "labels": False}
+        if wrong[boundaries.side_rule]:
+            sheet, coordinates, boundaries = _turned(sheet, coordinates, boundaries)
+            bending = -bending
+        whole = sample_sheet(mesh, coordinates, whole_body(settings.sheet))
+        subfield = label_sheet(sheet, body)
+    evidence = Evidence(
+        body=body,
+        side=side,
+        solid=solid,
+        surface=surface,
+        voxels_across=across,
+        smoothed=smoothed,
+        mesh=mesh,
+        boundaries=boundaries,
+        label_order=order,
+        sheet=sheet,
+        bending=bending,
+        folded=folded_fraction(mesh, coordinates),
+    )
+    with clock("measures"):
+        measured = Measured(
+            sheet=sheet,
+            subfield=subfield,
+            whole=whole,
+            areas=subfield_areas(whole, body),
+            volumes=subfield_volumes(mesh, body),
+            volume=signed_volume(surface.vertices, surface.triangles),
+            settings=settings,
+        )
+        doubts = check_end_labels(volume, body, settings.checks)
+        doubts += check_thickness(measured.thickness, boundaries.sheet_thickness, settings.checks)
+        doubts += check_ridges(sheet, measured.thickness, settings.checks)
+        doubts += check_turned(sheet, hemi) if body.region == "extended" else []
+        doubts += _mask_doubts(volume, body, settings)
+        repaired = repaired_columns(sheet, solid, settings.measures)
+        layers, folds = _layers(sheet, settings)
+        maps = measure_maps(measured)
+        return HemisphereMaps(
+            sheet=sheet,
+            layers=layers,
+            maps=maps,
+            profiles=average_profiles(maps, sheet),
+            sections=measure_sections(measured),
+            subfield=subfield,
+            repaired=repaired,
+            body_mask=volume.in_file(body.inside),
+            summary=summarize(measured, for_region(volume.scheme, body.region).sheet),
+            qc=quality_metrics(evidence)
+            | {"repaired_fraction": float(repaired.mean())}
+            | ({"mask_change": asdict(body.mask_change)} if body.mask_change else {}),
+            repairs=tuple(map(str, solid.repairs)),
+            flags=(*doubts, *find_flags(evidence, settings), *folds),
+            mesh=mesh,
+            coordinates=coordinates,
+        )
+
+
+def find_body(volume: LabelVolume, settings: Settings) -> BodyMask | None:
+    """Find the body of a hemisphere that cannot be measured, for a person to correct.
+
+    Parameters
+    ----------
+    volume : LabelVolume
+    settings : Settings
+
+    Returns
+    -------
+    BodyMask or None
+        None where the labels do not even tell where the body begins and ends.
+    """
+    try:
+        body = extract_body(volume, settings.body)
+    except GeometryError:
+        return None
+    return volume.in_file(body.inside)
+
+
+def _mask_doubts(volume: LabelVolume, body: Body, settings: Settings) -> list[Flag]:
+    if volume.edited_mask is None or body.mask_change is None:
+        return []
+    voxel = in_plane_voxel(body.affine)
+    return check_mask(volume.edited_mask, body.mask_change, voxel, settings.body)
+
+
+def _filled(
+    solid: SolidField, surface: Surface, settings: Settings
+) -> tuple[Surface, TetMesh, int]:
+    """Fill the surface; smooth it more where TetGen cannot, and say how often."""
+    for extra in range(settings.surface.untangle_tries):
+        try:
+            return surface, tetrahedralize(surface, settings.tetra), extra
+        except GeometryError:
+            steps = settings.surface.taubin_iterations * (2 + extra)
+            surface = extract_surface(
+                solid.field, replace(settings.surface, taubin_iterations=steps)
+            )
+    return surface, tetrahedralize(surface, settings.tetra), settings.surface.untangle_tries
+
+
+def _layers(sheet: Sheet, settings: Settings) -> tuple[Sheet, list[Flag]]:
+    """Space layers as the settings say, and flag where that cannot be."""
+    if settings.sheet.depths == "distance":
+        return sheet, []
+    layers, folded = equal_volume_layers(sheet)
+    return layers, check_layers(folded)
+
+
+def _turned(
+    sheet: Sheet, coordinates: Coordinates, boundaries: Boundaries
+) -> tuple[Sheet, Coordinates, Boundaries]:
+    """Exchange interior and exterior."""
+    return (
+        Sheet(points=sheet.points[:, :, ::-1], valid=sheet.valid),
+        Coordinates(values=coordinates.values * [1, 1, -1]),
+        replace(boundaries, interior=boundaries.exterior, exterior=boundaries.interior),
+    )

@@ -1,0 +1,239 @@
+"""Makes the pages of an output dataset, side by side, after the hemispheres are measured.
+
+A page that cannot be made costs a line in the log, never a result.
+"""
+
+import contextlib
+import logging
+import traceback
+from collections.abc import Generator, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+
+from hipsta_bids.derivatives.names import (
+    DATASET_FILES,
+    name_of_record,
+    participant_report,
+)
+from hipsta_bids.errors import HipstaError, OutputError
+from hipsta_bids.io import files
+from hipsta_bids.participant.cluster import Cluster, run_on_cluster
+from hipsta_bids.participant.pool import WorkerLost, WorkerPlan, run_jobs
+from hipsta_bids.reports.cohort import Cohort, read_cohort
+
+_TIMEOUT = 600.0  # s for one page
+_LOGGER = logging.getLogger(__name__)
+
+Visit = tuple[str, str | None]
+"""Labels of subject and session."""
+
+
+@dataclass
+class Pages:
+    """What becomes of the pages of a run."""
+
+    problems: list[str] = field(default_factory=list)
+    """A line per page that could not be made."""
+    wanted: bool = True
+    """Not where nothing can be written."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PageJob:
+    """One page."""
+
+    root: Path
+    """The output dataset."""
+    visit: Visit | None
+    """Whose page it is; ``None`` is that of the cohort."""
+
+    @property
+    def path(self) -> Path:
+        """The page's file."""
+        return self.root / (participant_report(*self.visit) if self.visit else _COHORT)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PagePlan:
+    """Where and how pages are made."""
+
+    root: Path
+    """The output dataset."""
+    n_workers: int
+    """Pages at the same time."""
+    log: Path
+    """Receives tracebacks and what libraries print."""
+    cohort: bool = True
+    """Whether the page of all is made, too."""
+    cluster: Cluster | None = None
+    """Workers elsewhere; ``None`` is this machine."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Problem:
+    """Why a page is missing or old."""
+
+    message: str
+    fatal: bool = False
+    """The others would fail just so."""
+
+
+_COHORT = DATASET_FILES["report"]
+_RECORD = "_desc-qc_metrics.json"
+_RECORDS = tuple(f"{folder}/*{_RECORD}" for folder in ("sub-*/anat", "sub-*/ses-*/anat"))
+
+
+def visits_of(root: Path) -> list[Visit]:
+    """List the visits of which there is a record.
+
+    Parameters
+    ----------
+    root : Path
+        An output dataset.
+
+    Returns
+    -------
+    list of Visit
+        Sorted.
+    """
+    found = set()
+    for pattern in _RECORDS:
+        for path in root.glob(pattern):
+            name = name_of_record(path.name)
+            if name is not None:
+                found.add((name.subject, name.session))
+    return sorted(found, key=lambda visit: (visit[0], visit[1] or ""))
+
+
+def write_reports(plan: PagePlan, visits: Iterable[Visit]) -> Iterator[Problem]:
+    """Make the pages of some visits, and that of the cohort.
+
+    Parameters
+    ----------
+    plan : PagePlan
+    visits : iterable of Visit
+        Whose pages.
+
+    Yields
+    ------
+    Problem
+        For each page that could not be made.
+    """
+    jobs = [PageJob(root=plan.root, visit=None)] if plan.cohort else []
+    jobs += [PageJob(root=plan.root, visit=visit) for visit in dict.fromkeys(visits)]
+    workers = WorkerPlan(
+        work=make_page,
+        n_workers=max(1, min(plan.n_workers, len(jobs))),
+        timeout=_TIMEOUT,
+        log=plan.log,
+        warm_up=warm_up,
+    )
+    if plan.cluster is None or not jobs:
+        found = run_jobs(workers, jobs)
+    else:
+        found = run_on_cluster(plan.cluster, workers, jobs)
+    with contextlib.closing(found) as pages:
+        for job, answer in pages:
+            problem = answer
+            if isinstance(answer, WorkerLost):
+                cause = "took too long" if answer.timed_out else f"process died: {answer.cause}"
+                problem = Problem(message=f"{job.path.name}: not made ({cause})")
+            if problem is not None:
+                _LOGGER.warning("report: %s", problem.message)
+                yield problem
+                if problem.fatal:
+                    return
+
+
+@contextlib.contextmanager
+def reports_after(plan: PagePlan, visits: Sequence[Visit], pages: Pages) -> Generator[None]:
+    """Make pages when the block ends, also by an error; not when the user stops the run.
+
+    Parameters
+    ----------
+    plan : PagePlan
+    visits : sequence of Visit
+        Pages that are up to date stay as they are.
+    pages : Pages
+        Receives a line per page that could not be made.
+    """
+    try:
+        yield
+    except Exception:
+        _try_all(plan, visits, pages.problems)
+        raise
+    if pages.wanted:
+        _try_all(plan, visits, pages.problems)
+
+
+def _try_all(plan: PagePlan, visits: Sequence[Visit], problems: list[str]) -> None:
+    root = plan.root
+    stale = [visit for visit in dict.fromkeys(visits) if not _is_current(root, visit)]
+    if not stale and (not plan.cohort or _is_newer(root / _COHORT, root, *_RECORDS)):
+        return
+    try:
+        problems += [problem.message for problem in write_reports(plan, stale)]
+    except Exception as error:  # results are worth more than pages
+        _LOGGER.exception("report")
+        problems.append(f"not made ({type(error).__name__}: {error})")
+
+
+def _is_current(root: Path, visit: Visit) -> bool:
+    """Whether a page is newer than all records that it is about."""
+    subject, session = visit
+    folder = f"sub-{subject}/{f'ses-{session}/' if session else ''}anat"
+    return _is_newer(root / participant_report(*visit), root, f"{folder}/*{_RECORD}")
+
+
+def _is_newer(page: Path, root: Path, *patterns: str) -> bool:
+    try:
+        made = page.stat().st_mtime_ns
+        records = [path for pattern in patterns for path in root.glob(pattern)]
+        return all(made >= path.stat().st_mtime_ns for path in records)
+    except OSError:
+        return False
+
+
+def warm_up() -> None:
+    """Load the libraries, so that no page's time includes it."""
+    import hipsta_bids.reports.participant  # noqa: F401, PLC0415  (loaded in workers only)
+    from hipsta_bids.reports.plotting import new_figure  # noqa: PLC0415
+
+    new_figure((1.0, 1.0), "constrained")
+
+
+def make_page(job: PageJob) -> Problem | None:
+    """Make one page; never raises.
+
+    Parameters
+    ----------
+    job : PageJob
+
+    Returns
+    -------
+    Problem or None
+        ``None`` if all went well.
+    """
+    from hipsta_bids.reports.cohort import cohort_page  # noqa: PLC0415  (workers only)
+    from hipsta_bids.reports.participant import participant_page  # noqa: PLC0415
+
+    try:
+        cohort = _cohort(job.root)
+        page = participant_page(job.root, *job.visit, cohort) if job.visit else cohort_page(cohort)
+        if page is not None:
+            files.write_text(job.path, page)
+    except OutputError as error:
+        return Problem(message=str(error), fatal=True)
+    except HipstaError as error:
+        return Problem(message=f"{job.path.name}: {error}")
+    except Exception as error:  # noqa: BLE001  (a bug in one page must not end the others)
+        traceback.print_exc()  # to the log, as everything that a worker prints
+        return Problem(message=f"{job.path.name}: not made ({type(error).__name__}: {error})")
+    return None
+
+
+@cache
+def _cohort(root: Path) -> Cohort:
+    """Read everybody's numbers once per worker."""
+    return read_cohort(root)

@@ -1,0 +1,607 @@
+"""Runs hemispheres side by side, keeps going after a failure, and keeps the books."""
+
+import contextlib
+import logging
+import math
+import time
+from collections import Counter
+from collections.abc import Callable, Generator, Iterable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from os import getpid
+from pathlib import Path
+from socket import gethostname
+
+from hipsta_bids import __version__
+from hipsta_bids.derivatives import dataset, hemisphere
+from hipsta_bids.derivatives.hemisphere import ResultPlace
+from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName
+from hipsta_bids.derivatives.status import (
+    NOT_FINISHED,
+    RECORDED,
+    STAGE_PREFIX,
+    identity,
+    read_status,
+    read_table,
+    row_key,
+    table_path,
+    update_status,
+    write_sidecar,
+)
+from hipsta_bids.errors import ExitCode, HipstaError, InputError, OutputError, SchemeError
+from hipsta_bids.inputs.request import HemisphereInput
+from hipsta_bids.io import files
+from hipsta_bids.io.files import DATASET, locked
+from hipsta_bids.participant.cluster import Cluster, Shard, run_on_cluster
+from hipsta_bids.participant.job import (
+    INTERNAL,
+    Job,
+    Outcome,
+    fail,
+    finished,
+    recorded,
+    run_job,
+    warm_up,
+)
+from hipsta_bids.participant.pages import PagePlan, Pages, reports_after
+from hipsta_bids.participant.pool import WorkerLost, WorkerPlan, run_jobs
+from hipsta_bids.protocols.protocol import Scheme
+from hipsta_bids.settings import Settings
+from hipsta_bids.types import Status
+
+# The books of a run: rows of ``status.tsv`` and a log file, right at any moment.
+
+
+_LOG_FORMAT = "%(asctime)s %(levelname)s %(message)s"
+_CHEAP_WRITE = 0.1  # s; quicker writes are never put off
+_LOGGER = logging.getLogger(__name__)
+
+
+class Books:
+    """The table and the log, written as hemispheres end.
+
+    Parameters
+    ----------
+    root : Path
+        The output dataset.
+    shard : str, optional
+        Name of the part of the dataset that this run does, which has a table of its own.
+    """
+
+    def __init__(self, root: Path, shard: str | None = None) -> None:
+        self._root, self._shard = root, shard
+        rows = read_table(root / table_path(shard))
+        self._known = {row_key(row): row.get("status") for row in rows}
+        self._pending: list[dict[str, str]] = []
+        self._next_write = 0.0
+
+    def expect(self, jobs: Sequence[Job]) -> None:
+        """Make the table right for the case that this process ends at any moment from here on.
+
+        Parameters
+        ----------
+        jobs : sequence of Job
+            What this run is going to do: recorded as not finished until it is.
+
+        Raises
+        ------
+        OutputError
+            If the table cannot be written.
+        """
+        for row in map(status_row, map(not_finished, jobs)):
+            self._pending.append(row)
+            self._known[row_key(row)] = row["status"]
+        self.close()
+
+    def enter(self, outcome: Outcome) -> None:
+        """Write one outcome to the log and to the table.
+
+        Parameters
+        ----------
+        outcome : Outcome
+            How a hemisphere ended.
+
+        Raises
+        ------
+        OutputError
+            If the table cannot be written.
+        """
+        _log(outcome)
+        row = status_row(outcome)
+        # Rows that are there already also have the times, which the quality record has not.
+        if outcome.skipped and self._known.get(row_key(row)) == row["status"]:
+            return
+        self._pending.append(row)
+        try:
+            if time.monotonic() >= self._next_write:
+                self.close()
+        except OutputError:
+            if not isinstance(outcome.error, OutputError):
+                raise
+            # The hemisphere's own error says more, and ends the run; the table keeps the row that
+            # calls it not finished.
+            self._pending = []
+
+    def close(self) -> None:
+        """Write what has not been written yet.
+
+        Raises
+        ------
+        OutputError
+            If the table cannot be written.
+        """
+        if not self._pending:
+            return
+        start = time.monotonic()
+        update_status(self._root, self._pending, shard=self._shard)
+        self._pending = []
+        cost = time.monotonic() - start
+        # Tables of many thousand rows may take a twentieth of the time, not more.
+        wait = 0.0 if cost < _CHEAP_WRITE else 20 * cost
+        self._next_write = time.monotonic() + wait
+
+
+def not_finished(job: Job) -> Outcome:
+    """Say of a hemisphere that no run has come to its end with it."""
+    error = HipstaError(
+        "the run ended before this hemisphere; run the same command again", reason=NOT_FINISHED
+    )
+    return Outcome(
+        job=job, status=Status.FAILED, reason=error.reason, message=str(error), error=error
+    )
+
+
+def _log(outcome: Outcome) -> None:
+    title = outcome.job.title
+    if outcome.skipped:
+        _LOGGER.info("%s: unchanged, skipped (%s)", title, outcome.status)
+        return
+    for edit in outcome.job.item.edits:
+        _LOGGER.info("%s: edited %s: %s", title, edit.kind, edit.path)
+    for stage, seconds in outcome.stages.items():
+        _LOGGER.info("%s: %s %.3f s", title, stage, seconds)
+    _LOGGER.info("%s: %s %s %s", title, outcome.status, outcome.reason or "", outcome.message or "")
+    if outcome.trace:
+        _LOGGER.error("%s: %s", title, outcome.trace)
+
+
+def status_row(outcome: Outcome) -> dict[str, str]:
+    """Spell one row of ``status.tsv``."""
+    measured = {
+        "seconds": outcome.seconds,
+        "cpu_seconds": outcome.cpu_seconds,
+        "peak_memory_mb": outcome.peak_memory_mb,
+        **{f"{STAGE_PREFIX}{stage}": spent for stage, spent in outcome.stages.items()},
+    }
+    return {
+        **identity(outcome.job.place.name),
+        "status": str(outcome.status),
+        "reason": outcome.reason or files.MISSING,
+        "message": outcome.message or files.MISSING,
+        "edited": "+".join(outcome.job.item.edited) or files.MISSING,
+        "version": __version__,
+        "settings_hash": outcome.job.settings_hash,
+        "input_hash": outcome.input_hash or files.MISSING,
+        **{
+            name: files.MISSING if value is None else f"{value:.3f}"
+            for name, value in measured.items()
+        },
+    }
+
+
+@contextlib.contextmanager
+def log_file(root: Path, verbosity: int, shard: str | None = None) -> Generator[Path]:
+    """Log this run to a file of its own.
+
+    Parameters
+    ----------
+    root : Path
+        The output dataset.
+    verbosity : int
+        Above 0, debugging messages too.
+    shard : str, optional
+        Name of the part of the dataset that this run does.
+
+    Yields
+    ------
+    Path
+        The file.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be made.
+    """
+    folder = root / DATASET_FILES["logs"]
+    files.make_folder(folder)
+    part = "" if shard is None else f"_shard-{shard}"
+    # Process numbers alone are not unique among the nodes of a cluster.
+    process = f"{gethostname().partition('.')[0]}-{getpid()}"
+    path = folder / f"run-{datetime.now(UTC):%Y%m%dT%H%M%S}-{process}{part}.log"
+    try:
+        handler = _QuietHandler(path, encoding="utf-8", errors="surrogateescape")
+    except OSError as error:
+        raise files.output_error(path, error) from error
+    handler.setFormatter(logging.Formatter(_LOG_FORMAT))
+    logger = logging.getLogger("hipsta_bids")
+    level = logger.level
+    logger.setLevel(logging.DEBUG if verbosity else logging.INFO)
+    logger.addHandler(handler)
+    try:
+        yield path
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(level)
+        with contextlib.suppress(OSError):
+            handler.close()
+
+
+class _QuietHandler(logging.FileHandler):
+    """Loses lines rather than the run when the disk is full; that is reported elsewhere."""
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802  (logging's name)
+        del record
+
+
+WORKER_GB = 0.6
+"""Memory that one worker may need, GB: 500 MB for a hemisphere, and its helper process."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """What never changes a result."""
+
+    n_procs: int = 1
+    """Hemispheres measured at the same time."""
+    mem_gb: float | None = None
+    """Upper limit for all workers together; ``None`` is no limit."""
+    work_dir: Path | None = None
+    """Scratch folder; ``None`` is the system's."""
+    stop_on_first_crash: bool = False
+    verbosity: int = 0
+    force: bool = False
+    """Redo hemispheres that are up to date."""
+    write_meshes: bool = False
+    timeout: float = 600.0
+    """Seconds per hemisphere."""
+    shard: Shard | None = None
+    """Which part of the dataset this is, if other runs do the others."""
+    cluster: Cluster | None = None
+    """Workers elsewhere; ``None`` is this machine."""
+    reports: bool = False
+    """Make pages to look at afterwards."""
+    command: str | None = None
+    """The command line, for the log."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunResult:
+    """What a run did."""
+
+    outcomes: tuple[Outcome, ...]
+    """Of all hemispheres that ended or were skipped."""
+    n_requested: int
+    log: Path
+    page_problems: tuple[str, ...] = ()
+    """One line per page that could not be made."""
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Hemispheres per status, skipped ones under the status that they have."""
+        return Counter(str(outcome.status) for outcome in self.outcomes)
+
+    @property
+    def exit_code(self) -> ExitCode:
+        """The gravest of what happened.
+
+        A disk that cannot be written outranks a bug, a bug outranks failed hemispheres. When
+        every hemisphere failed because of its input, the data are to blame.
+        """
+        failed = [outcome for outcome in self.outcomes if outcome.status == Status.FAILED]
+        if any(isinstance(outcome.error, OutputError) for outcome in failed):
+            return ExitCode.NOT_WRITABLE
+        if any(outcome.reason == INTERNAL for outcome in failed):
+            return ExitCode.INTERNAL
+        if not failed and len(self.outcomes) == self.n_requested:
+            return ExitCode.OK
+        if len(failed) == self.n_requested and all(
+            isinstance(outcome.error, (InputError, SchemeError)) for outcome in failed
+        ):
+            return ExitCode.BAD_DATA
+        return ExitCode.SOME_FAILED
+
+
+def run_participants(
+    items: Sequence[HemisphereInput],
+    out_dir: Path,
+    settings: Settings,
+    options: RunOptions,
+    report: Callable[[Outcome], None],
+) -> RunResult:
+    """Measure hemispheres and write the output dataset.
+
+    Parameters
+    ----------
+    items : sequence of HemisphereInput
+        What to measure.
+    out_dir : Path
+        The output dataset; made if need be.
+    settings : Settings
+        What changes results.
+    options : RunOptions
+        What does not.
+    report : callable
+        Called in this process with each outcome as it comes.
+
+    Returns
+    -------
+    RunResult
+        Failed hemispheres are in it, not raised.
+
+    Raises
+    ------
+    OutputError
+        If the output folder cannot be written, at the start or for want of space later.
+    SettingsError
+        If it holds results with other settings.
+    UsageError
+        If it is a dataset of other software.
+    """
+    jobs = prepare(items, out_dir, settings, options)
+    shard = None if options.shard is None else options.shard.name
+    with log_file(out_dir, options.verbosity, shard) as log:
+        _LOGGER.info("hipsta_bids %s, %d hemispheres", __version__, len(jobs))
+        if options.command:
+            _LOGGER.info("command: %s", options.command)
+        books = Books(out_dir, shard)
+        pages = Pages()
+        # Closed at once, whatever ends the loop, so that no worker outlives it.
+        with (
+            pages_after(jobs, out_dir, options, log, pages),
+            contextlib.closing(books),
+            contextlib.closing(_outcomes(jobs, books, options, log)) as found,
+        ):
+            outcomes = _run(found, books, options, report)
+            pages.wanted = not any(isinstance(one.error, OutputError) for one in outcomes)
+        result = RunResult(
+            outcomes=tuple(outcomes),
+            n_requested=len(jobs),
+            log=log,
+            page_problems=tuple(pages.problems),
+        )
+        _LOGGER.info("done: %s, exit code %d", dict(result.counts), result.exit_code)
+    return result
+
+
+def prepare(
+    items: Sequence[HemisphereInput], out_dir: Path, settings: Settings, options: RunOptions
+) -> list[Job]:
+    """Write what describes the dataset as a whole, and say what is to be done.
+
+    Parameters, and what is raised, are those of :func:`run_participants`.
+
+    Returns
+    -------
+    list of Job
+        One per item.
+    """
+    sources = _source_names(items)
+    dataset.check_not_foreign(out_dir)
+    files.check_writable(out_dir)
+    with locked(out_dir, DATASET) as alone:
+        if alone:
+            files.remove_leftovers(out_dir, "*")
+        digest = dataset.settle_settings(out_dir, settings)
+        dataset.write_description(out_dir, sources)
+        if options.shard is None or not (out_dir / DATASET_FILES["citation"]).exists():
+            dataset.write_citation(out_dir, settings, _schemes(items))
+        write_sidecar(out_dir)
+    return [
+        Job(
+            item=item,
+            place=ResultPlace(root=out_dir, name=hemisphere_name(item, settings)),
+            settings=settings,
+            settings_hash=digest,
+            sources=tuple(sources.items()),
+            write_meshes=options.write_meshes,
+            force=options.force,
+        )
+        for item in items
+    ]
+
+
+def _run(
+    outcomes: Iterable[Outcome],
+    books: Books,
+    options: RunOptions,
+    report: Callable[[Outcome], None],
+) -> list[Outcome]:
+    """Book and report outcomes as they come, until all are there or one ends the run."""
+    kept = []
+    for outcome in outcomes:
+        books.enter(outcome)
+        kept.append(outcome)
+        report(outcome)
+        if isinstance(outcome.error, OutputError):
+            break  # the next one would fail just so
+        if options.stop_on_first_crash and outcome.status == Status.FAILED:
+            break
+    return kept
+
+
+def pages_after(
+    jobs: Sequence[Job], out_dir: Path, options: RunOptions, log: Path, pages: Pages
+) -> AbstractContextManager[None]:
+    """Make pages when a block ends, if they are wanted; that of all if this is no part."""
+    if not options.reports:
+        return contextlib.nullcontext()
+    visits = [(job.place.name.subject, job.place.name.session) for job in jobs]
+    plan = PagePlan(
+        root=out_dir,
+        n_workers=n_workers(options, len(visits)),
+        log=log,
+        cohort=options.shard is None,
+        cluster=options.cluster,
+    )
+    return reports_after(plan, visits, pages)
+
+
+def hemisphere_name(item: HemisphereInput, settings: Settings) -> HemisphereName:
+    """Name the results of one input."""
+    return HemisphereName(
+        subject=item.subject,
+        session=item.session,
+        hemi=item.hemi,
+        seg=item.scheme.name,
+        region=settings.body.region,
+    )
+
+
+def n_workers(options: RunOptions, n_jobs: int) -> int:
+    """How many workers the limits on processes and memory allow, at least one."""
+    by_memory = math.inf if options.mem_gb is None else options.mem_gb // WORKER_GB
+    return int(max(1, min(options.n_procs, by_memory, n_jobs)))
+
+
+def _outcomes(
+    jobs: Sequence[Job], books: Books, options: RunOptions, log: Path
+) -> Generator[Outcome]:
+    """Give the outcomes of all hemispheres: first what is done already, then the others."""
+    todo = []
+    for job in jobs:
+        earlier = finished(job)
+        if earlier is None:
+            todo.append(job)
+        else:
+            yield earlier
+    books.expect(todo)
+    for job in todo:
+        if job.item.problem is not None:
+            yield fail(job, job.item.problem)
+    able = [job for job in todo if job.item.problem is None]
+    plan = _plan(options, len(able), log)
+    if options.cluster is None or not able:
+        pool = run_jobs(plan, able)
+    else:
+        pool = run_on_cluster(options.cluster, plan, able)
+    try:
+        for job, answer in pool:
+            yield _lost(job, answer, options) if isinstance(answer, WorkerLost) else answer
+    except BaseException:
+        pool.close()
+        for job in able:
+            with contextlib.suppress(OutputError):
+                _remove_unfinished(job)
+        raise
+
+
+def _remove_unfinished(job: Job) -> None:
+    """Remove what was being written: it has no quality record yet."""
+    if job.place.path("sheet").exists() and not job.place.path("qc").exists():
+        with locked(job.place.root, job.title):
+            if not job.place.path("qc").exists():  # another run may have been at it
+                hemisphere.remove_results(job.place)
+
+
+def _plan(options: RunOptions, n_jobs: int, log: Path) -> WorkerPlan:
+    scratch = () if options.work_dir is None else (("TMPDIR", str(options.work_dir)),)
+    return WorkerPlan(
+        work=run_job,
+        n_workers=n_workers(options, n_jobs),
+        timeout=options.timeout,
+        log=log,
+        warm_up=warm_up,
+        environment=scratch,
+    )
+
+
+def _lost(job: Job, loss: WorkerLost, options: RunOptions) -> Outcome:
+    """Turn the loss of a worker into a failure of its hemisphere."""
+    if loss.timed_out:
+        error = HipstaError(
+            f"not done within {options.timeout:g} s; look at the segmentation, or raise --timeout",
+            reason="timeout",
+        )
+    else:
+        error = HipstaError(
+            f"the process died ({loss.cause}); if memory ran out use fewer --n-procs, else report"
+            " it with the log",
+            reason="worker-died",
+        )
+    # Another run may have been at it, and for that one it may have gone well.
+    with locked(job.place.root, job.title):
+        return finished(job) or fail(job, error, seconds=loss.seconds)
+
+
+def _source_names(items: Sequence[HemisphereInput]) -> dict[str, Path]:
+    """Name the datasets that inputs come from."""
+    origins = [(item.source, item.source_path) for item in items]
+    origins += [(edit.source, edit.source_path) for item in items for edit in item.edits]
+    origins += [("bids", m.source_path) for item in items for m in item.maps if m.source_path]
+    return dataset.source_names(origins)
+
+
+def _schemes(items: Sequence[HemisphereInput]) -> list[Scheme]:
+    """List the protocols in use, each once."""
+    found = {}
+    for item in items:
+        for scheme in (item.scheme, item.parts_scheme):
+            if scheme is not None:
+                found[scheme.name] = scheme
+    return [found[name] for name in sorted(found)]
+
+
+# Brings together what runs side by side have done, each with a part of the dataset.
+
+
+def collect(
+    items: Sequence[HemisphereInput], out_dir: Path, settings: Settings, options: RunOptions
+) -> RunResult:
+    """Make ``status.tsv`` complete: a row for each hemisphere, from its quality record.
+
+    Nothing is measured. Times come from the tables of the runs. Pages that are missing are made,
+    and that of all hemispheres.
+
+    Parameters
+    ----------
+    items : sequence of HemisphereInput
+        All that was to be measured.
+    out_dir : Path
+        The output dataset.
+    settings : Settings
+        What changes results.
+    options : RunOptions
+        What does not.
+
+    Returns
+    -------
+    RunResult
+        As if one run had done all; hemispheres that none has finished have failed.
+
+    Raises
+    ------
+    OutputError
+        If the output folder cannot be written.
+    SettingsError
+        If it holds results with other settings.
+    UsageError
+        If it is a dataset of other software.
+    """
+    jobs = prepare(items, out_dir, settings, options)
+    outcomes = tuple(recorded(job) or not_finished(job) for job in jobs)
+    rows = {row_key(row): row for row in read_status(out_dir)}
+    for row in map(status_row, outcomes):
+        known = rows.get(row_key(row), {})
+        if any(known.get(key) != row[key] for key in RECORDED):
+            rows[row_key(row)] = row
+    update_status(out_dir, rows.values())
+    with log_file(out_dir, options.verbosity) as log:
+        pages = Pages()
+        with pages_after(jobs, out_dir, options, log, pages):
+            pass
+        result = RunResult(
+            outcomes=outcomes, n_requested=len(jobs), log=log, page_problems=tuple(pages.problems)
+        )
+        _LOGGER.info("collected: %s, exit code %d", dict(result.counts), result.exit_code)
+    return result

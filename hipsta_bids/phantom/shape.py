@@ -1,0 +1,436 @@
+"""The mid-curve of a cross-section: a plane curve given by its curvature.
+
+A plane curve is fixed by curvature against arc length (fundamental theorem of plane curves;
+do Carmo, Differential Geometry of Curves and Surfaces, section 1-5). Curvature here is a monomial
+in arc length, so tangent angles are exact and positions are integrals of smooth functions.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
+from scipy.special import erf
+
+from hipsta_bids.errors import SettingsError
+from hipsta_bids.phantom.spec import Bend, PhantomSpec
+from hipsta_bids.types import Float
+
+#: rad, direction in which the curve leaves its medial end, against the lateral direction. The
+#: subiculum slopes down a little before the sheet turns up.
+START_ANGLE = -0.35
+
+_PANELS = 400
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)  # error far below 1e-12 mm in such panels
+_SEEDS = 2000  # starting points for projection, about 0.01 mm apart
+
+
+class MidCurve:
+    """An arc-length parametrized plane curve, its centroid at the origin.
+
+    Plane coordinates are (lateral, superior) in mm; arc length runs medial to lateral. The
+    normal points to the exterior (right of the tangent), so that a positive curvature turns the
+    curve round its interior.
+
+    Parameters
+    ----------
+    bend : Bend
+        Curvature at both ends, 1/mm.
+    width : float
+        Arc length, mm.
+    """
+
+    def __init__(self, bend: Bend, width: float) -> None:
+        self.width = width
+        self._bend = bend
+        self._step = width / _PANELS
+        edges = np.linspace(0.0, width, _PANELS + 1)
+        steps = self._integrate(edges[:-1], np.full(_PANELS, self._step))
+        self._edges = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+        s, weights = gauss_panels(0.0, width, _PANELS)
+        self._edges = self._edges - weights @ self.position(s) / width
+        self._seeds = np.linspace(0.0, width, _SEEDS + 1)
+        self._tree = KDTree(self.position(self._seeds))
+
+    def curvature(self, s: Float) -> Float:
+        """Signed curvature at arc lengths ``s`` (mm), 1/mm."""
+        rise = self._bend.lateral - self._bend.medial
+        return np.asarray(self._bend.medial + rise * (s / self.width) ** self._bend.power)
+
+    def curvature_slope(self, s: Float) -> Float:
+        """Return the derivative of curvature along the curve, 1/mm2."""
+        power = self._bend.power
+        rise = self._bend.lateral - self._bend.medial
+        return np.asarray(rise * power / self.width * (s / self.width) ** (power - 1))
+
+    def angle(self, s: Float) -> Float:
+        """Tangent angle in rad, from lateral towards superior."""
+        power = self._bend.power
+        rise = self._bend.lateral - self._bend.medial
+        turned = self._bend.medial * s + rise * s / (power + 1) * (s / self.width) ** power
+        return np.asarray(START_ANGLE + turned)
+
+    def tangent(self, s: Float) -> Float:
+        """Return unit tangents (..., 2)."""
+        angle = self.angle(s)
+        return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+    def normal(self, s: Float) -> Float:
+        """Return unit normals (..., 2), interior to exterior."""
+        angle = self.angle(s)
+        return np.stack([np.sin(angle), -np.cos(angle)], axis=-1)
+
+    def position(self, s: Float) -> Float:
+        """Points (..., 2) in mm at arc lengths ``s`` within [0, width]."""
+        s = np.asarray(s, dtype=np.float64)
+        panel = np.clip((s / self._step).astype(np.int64), 0, _PANELS - 1)
+        start = np.asarray(panel * self._step, dtype=np.float64)
+        return np.asarray(self._edges[panel] + self._integrate(start, s - start))
+
+    def project(self, points: Float, *, reach: float = np.inf) -> tuple[Float, Float]:
+        """Find the nearest place on the curve.
+
+        Parameters
+        ----------
+        points : (N, 2) array
+            mm.
+        reach : float
+            mm; points farther than this from the curve are left out.
+
+        Returns
+        -------
+        s : (N,) array
+            Arc length, mm; NaN where out of reach, or beyond a flat end of the curve.
+        n : (N,) array
+            Signed distance, mm, positive on the exterior side; NaN likewise.
+        """
+        s = np.full(len(points), np.nan)
+        n = np.full(len(points), np.nan)
+        bound = reach + self._seeds[1]  # a seed may be half a step farther than the curve
+        nearest = np.asarray(self._tree.query(points, distance_upper_bound=bound)[1])
+        near = np.flatnonzero(nearest < len(self._seeds))
+        foot = self._refine(points[near], self._seeds[nearest[near]])
+        offset = points[near] - self.position(foot)
+        along = np.einsum("ij,ij->i", offset, self.tangent(foot))
+        across = np.einsum("ij,ij->i", offset, self.normal(foot))
+        before = (foot <= 0.0) & (along < 0.0)
+        after = (foot >= self.width) & (along > 0.0)
+        keep = ~(before | after) & (np.abs(across) <= reach)
+        s[near[keep]] = foot[keep]
+        n[near[keep]] = across[keep]
+        return s, n
+
+    def foot(self, points: Float) -> Float:
+        """Arc length (N,), mm, of the nearest place to points (N, 2), the ends included."""
+        nearest = np.asarray(self._tree.query(points)[1])
+        return self._refine(points, self._seeds[nearest])
+
+    def _refine(self, points: Float, s: Float) -> Float:
+        """Newton steps on (point - curve) . tangent = 0, from starts within half a seed step."""
+        for _ in range(3):
+            offset = points - self.position(s)
+            along = np.einsum("ij,ij->i", offset, self.tangent(s))
+            across = np.einsum("ij,ij->i", offset, self.normal(s))
+            slope = np.maximum(1.0 + self.curvature(s) * across, 0.1)  # 0 at centers of curvature
+            step = np.clip(along / slope, -self._seeds[1], self._seeds[1])
+            s = np.clip(s + step, 0.0, self.width)
+        return s
+
+    def _integrate(self, start: Float, steps: Float) -> Float:
+        """Displacement (..., 2) from ``start`` over ``steps`` of arc length."""
+        half = steps[..., None] / 2.0
+        at = start[..., None] + half * (1.0 + _NODES)
+        total: Float = np.einsum("...qd,q->...d", self.tangent(at), _WEIGHTS)
+        return total * half
+
+
+def gauss_panels(low: float, high: float, panels: int) -> tuple[Float, Float]:
+    """Nodes and weights (5 * panels,) of composite Gauss-Legendre quadrature on an interval."""
+    edges = np.linspace(low, high, panels + 1)
+    half = np.diff(edges)[:, None] / 2.0
+    nodes = edges[:-1, None] + half * (1.0 + _NODES)
+    return nodes.ravel(), (half * _WEIGHTS).ravel()
+
+
+# From sheet coordinates to scanner space and back.
+
+
+#: RAS mm of the middle of a left body, and its pitch in rad (anterior end down), both about as in
+#: an adult brain in scanner space.
+CENTER = (-25.0, -20.0, -15.0)
+PITCH = 0.45
+
+#: rad, largest deviation from orthogonality in a pose.
+_RIGID_TOLERANCE = 1e-6
+
+#: mm of arc length within which two places of the mid-curve are the same: above the accuracy of
+#: projection, below what a voxel can show.
+_SAME_PLACE = 0.02
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ThicknessJet:
+    """Thickness of the wall and its derivatives by arc length s and long axis w.
+
+    In mm, 1, and 1/mm.
+    """
+
+    value: Float
+    s: Float
+    w: Float
+    ss: Float
+    sw: Float
+    ww: Float
+
+    def thinned(self, depth: float, across: "Window", along: "Window") -> "ThicknessJet":
+        """Take off ``depth`` mm times the product of two windows."""
+        return ThicknessJet(
+            value=self.value - depth * across[0] * along[0],
+            s=self.s - depth * across[1] * along[0],
+            w=self.w - depth * across[0] * along[1],
+            ss=self.ss - depth * across[2] * along[0],
+            sw=self.sw - depth * across[1] * along[1],
+            ww=self.ww - depth * across[0] * along[2],
+        )
+
+
+#: Value, first and second derivative of a window.
+Window = tuple[Float, Float, Float]
+
+
+def window_jet(at: Float, limits: tuple[float, float], extent: float, edge: float) -> Window:
+    """Window that is 1 between two limits and 0 outside, with edges like error functions.
+
+    Parameters
+    ----------
+    at : array
+        mm.
+    limits : tuple of float
+        Fractions of ``extent`` at which the window is one half; beyond 0 or 1 there is no edge.
+    extent : float
+        mm.
+    edge : float
+        Scale of the edges, mm.
+
+    Returns
+    -------
+    tuple of arrays
+        The window, its slope (1/mm) and second derivative (1/mm2).
+    """
+    value, slope, second = (np.zeros(np.shape(at)) for _ in range(3))
+    for limit, sign, open_end in ((limits[0], 1.0, 0.0), (limits[1], -1.0, 1.0)):
+        if sign * (limit - open_end) <= 0.0:
+            value = value + 0.5  # far inside an edge
+            continue
+        x = (at - limit * extent) / edge
+        bell = np.exp(-(x**2)) / (np.sqrt(np.pi) * edge)
+        value = value + 0.5 * sign * erf(x)
+        slope = slope + sign * bell
+        second = second - sign * 2.0 * x / edge * bell
+    return value, slope, second
+
+
+class Body:
+    """The shape of a phantom, without labels.
+
+    Sheet coordinates are u (medial to lateral, 0 to 1), v (posterior to anterior, 0 to 1; head
+    and tail lie beyond) and n (mm from the mid-surface, positive on the exterior side).
+
+    Parameters
+    ----------
+    spec : PhantomSpec
+        What to build.
+
+    Raises
+    ------
+    SettingsError
+        If the wall folds (half the thickness reaches the radius of curvature) or its turns
+        overlap.
+    """
+
+    def __init__(self, spec: PhantomSpec) -> None:
+        self.spec = spec
+        self.curve = MidCurve(spec.section_bend, spec.width)
+        self._refuse_folds()
+        self._refuse_overlap()
+
+    def thickness(self, u: Float, v: Float) -> Float:
+        """Thickness of the wall along its mid-surface's normal, mm."""
+        return self.thickness_jet(u, v).value
+
+    def thickness_jet(self, u: Float, v: Float) -> ThicknessJet:
+        """Thickness and its derivatives; the sinusoids are added, so they have no mixed one."""
+        spec = self.spec
+        u, v = np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64))
+        u = u - spec.offset
+        amplitude = spec.thickness * spec.variation / len(spec.variation_axis)
+        by_s, by_w = 2.0 * np.pi / spec.width, 2.0 * np.pi / spec.length
+        x, y = (amplitude * (axis in spec.variation_axis) for axis in "xy")
+        a, b = 2.0 * np.pi * u, 2.0 * np.pi * v
+        jet = ThicknessJet(
+            value=spec.thickness + x * np.sin(a) + y * np.sin(b),
+            s=x * by_s * np.cos(a),
+            w=y * by_w * np.cos(b),
+            ss=-x * by_s**2 * np.sin(a),
+            sw=np.zeros(u.shape),
+            ww=-y * by_w**2 * np.sin(b),
+        )
+        for thinning in spec.thinnings:
+            across = window_jet(u * spec.width, thinning.u, spec.width, thinning.edge)
+            along = window_jet(v * spec.length, thinning.v, spec.length, thinning.edge)
+            jet = jet.thinned(thinning.depth, across, along)
+        return jet
+
+    @cached_property
+    def thickest(self) -> float:
+        """Largest thickness anywhere, mm, or a little more."""
+        grown = sum(max(0.0, -thinning.depth) for thinning in self.spec.thinnings)
+        return self.spec.thickness * (1.0 + self.spec.variation) + grown
+
+    def place(
+        self,
+        u: ArrayLike,
+        v: ArrayLike,
+        n: ArrayLike,
+        *,
+        hemi: str = "L",
+        pose: Float | None = None,
+    ) -> Float:
+        """Scanner coordinates (..., 3), RAS mm, of sheet coordinates (u, v, n).
+
+        Parameters
+        ----------
+        u, v, n : arrays that broadcast
+            Sheet coordinates; n in mm.
+        hemi : {"L", "R"}
+            Right is the mirror image of left.
+        pose : (4, 4) array, optional
+            Rigid motion applied last.
+
+        Raises
+        ------
+        SettingsError
+            If ``hemi`` is unknown or ``pose`` is not rigid.
+        """
+        across, along, off = np.broadcast_arrays(
+            *(np.asarray(x, dtype=np.float64) for x in (u, v, n))
+        )
+        s = across * self.spec.width
+        section = self.curve.position(s) + off[..., None] * self.curve.normal(s)
+        w = (along - 0.5) * self.spec.length
+        rotation, shift = placement(hemi, pose)
+        return np.asarray(self._sweep(section, w) @ rotation.T + shift)
+
+    def locate(
+        self,
+        points: Float,
+        *,
+        hemi: str = "L",
+        pose: Float | None = None,
+        reach: float = np.inf,
+    ) -> Float:
+        """Sheet coordinates (N, 3) of scanner points (N, 3): the inverse of :meth:`place`.
+
+        Rows are (u, v, n), of the nearest place on the mid-surface. They are NaN for points
+        beyond the flat ends u = 0 and u = 1, or farther than ``reach`` (mm) from the mid-surface.
+        The other parameters and errors are those of :meth:`place`.
+        """
+        rotation, shift = placement(hemi, pose)
+        section, w = self._unsweep((points - shift) @ rotation)
+        s, n = self.curve.project(section, reach=reach)
+        v = np.where(np.isnan(s), np.nan, w / self.spec.length + 0.5)
+        return np.column_stack([s / self.spec.width, v, n])
+
+    def _sweep(self, section: Float, w: Float) -> Float:
+        """Section points (..., 2) carried to arc length ``w`` of the long axis: body (..., 3).
+
+        A straight axis is the limit of no bend; sinc carries it without a special case.
+        """
+        bend, angle = self.spec.bend, w * self.spec.bend
+        medial, superior = -section[..., 0], section[..., 1]
+        rise = w * np.sin(angle / 2.0) * np.sinc(angle / (2.0 * np.pi))
+        along = w * np.sinc(angle / np.pi)
+        shrink = 1.0 - bend * medial
+        return np.stack([-(medial * np.cos(angle) + rise), superior, along * shrink], axis=-1)
+
+    def _unsweep(self, body: Float) -> tuple[Float, Float]:
+        """Inverse of :meth:`_sweep`: section points (N, 2) and arc lengths (N,) of the axis."""
+        bend = self.spec.bend
+        lateral, superior, anterior = body.T
+        if bend == 0.0:
+            return np.column_stack([lateral, superior]), anterior
+        inward = 1.0 + bend * lateral
+        w = np.arctan2(bend * anterior, inward) / bend
+        medial = (1.0 - np.hypot(inward, bend * anterior)) / bend
+        return np.column_stack([-medial, superior]), w
+
+    def _refuse_folds(self) -> None:
+        """Refuse a wall or an axis that is bent more sharply than its own extent allows."""
+        spec = self.spec
+        s = np.linspace(0.0, spec.width, 1001)
+        sharpest = np.abs(self.curve.curvature(s)).max()
+        if sharpest * self.thickest / 2.0 >= 1.0:
+            raise SettingsError(
+                f"phantom: the wall folds: half its thickness of up to {self.thickest:g} mm "
+                f"reaches the smallest radius of curvature, {1.0 / sharpest:.2f} mm; "
+                "make it thinner or bend it less",
+                reason="phantom-folds",
+            )
+        inward = np.max(-np.sign(spec.bend) * self.curve.position(s)[:, 0]) + self.thickest / 2.0
+        turned = abs(spec.bend) * (spec.length + 2.0 * spec.end_length)
+        if abs(spec.bend) * inward >= 1.0 or turned >= np.pi:
+            raise SettingsError(
+                f"phantom: the long axis bends too sharply ({spec.bend:g} 1/mm) for a cross-"
+                f"section that reaches {inward:.1f} mm towards its center and a length of "
+                f"{spec.length + 2.0 * spec.end_length:g} mm with head and tail; bend it less",
+                reason="phantom-folds",
+            )
+
+    def _refuse_overlap(self) -> None:
+        """Refuse a wall of which one turn runs into another.
+
+        Two turns overlap exactly if, from a boundary point of one, some other place of the
+        mid-curve is nearer than its own, or as near where they coincide.
+        """
+        u, v = np.meshgrid(np.linspace(0.0, 1.0, 801), np.linspace(0.0, 1.0, 5), indexing="ij")
+        half = self.thickness(u, v).ravel() / 2.0
+        s = u.ravel() * self.spec.width
+        for side in (-1.0, 1.0):
+            boundary = self.curve.position(s) + side * half[:, None] * self.curve.normal(s)
+            astray = np.abs(self.curve.foot(boundary) - s) > _SAME_PLACE
+            if astray.any():
+                raise SettingsError(
+                    f"phantom: turns of the wall overlap near u = {u.ravel()[astray][0]:.2f}; "
+                    "make it thinner, narrower or bend it less",
+                    reason="phantom-overlap",
+                )
+
+
+def placement(hemi: str, pose: Float | None) -> tuple[Float, Float]:
+    """Body to scanner: an orthogonal (3, 3) matrix and a shift (3,) in RAS mm."""
+    if hemi not in ("L", "R"):
+        raise SettingsError(
+            f"phantom: hemi {hemi!r} is unknown; choose L or R", reason="phantom-hemi"
+        )
+    cos, sin = np.cos(PITCH), np.sin(PITCH)
+    mirror = np.diag([1.0 if hemi == "L" else -1.0, 1.0, 1.0])
+    # Columns: where lateral, superior and anterior point in a left hemisphere.
+    axes = np.array([[-1.0, 0.0, 0.0], [0.0, sin, cos], [0.0, cos, -sin]])
+    rotation, shift = mirror @ axes, mirror @ np.array(CENTER)
+    if pose is not None:
+        pose = np.asarray(pose, dtype=np.float64)
+        check_rotation(pose[:3, :3])
+        rotation, shift = pose[:3, :3] @ rotation, pose[:3, :3] @ shift + pose[:3, 3]
+    return rotation, shift
+
+
+def check_rotation(matrix: Float) -> None:
+    """Refuse what is not a proper rotation (3, 3) with a SettingsError."""
+    error = np.abs(matrix @ matrix.T - np.eye(3)).max()
+    if not error < _RIGID_TOLERANCE or np.linalg.det(matrix) < 0.0:
+        raise SettingsError(
+            "phantom: the pose or grid rotation is not rigid; give a rotation matrix without "
+            "scaling or mirroring",
+            reason="phantom-pose",
+        )

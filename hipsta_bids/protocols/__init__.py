@@ -1,0 +1,1 @@
+"""Segmentation protocols: one TOML file each."""

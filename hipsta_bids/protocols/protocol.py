@@ -1,0 +1,229 @@
+"""The vocabulary that every segmentation protocol is translated into."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hipsta_bids.errors import SchemeError
+
+
+class Tissue(IntEnum):
+    """What a voxel is. Values are internal; files of other tools never use them."""
+
+    BACKGROUND = 0
+    PRESUBICULUM = 1
+    SUBICULUM = 2
+    CA1 = 3
+    CA2 = 4
+    CA2_3 = 5  # CA2 and CA3 under one label
+    CA3 = 6
+    CA4 = 7
+    DENTATE_GYRUS = 8  # also DG + CA4 (hilus) under one label
+    MOLECULAR_LAYER = 9  # SRLM: strata radiatum, lacunosum, moleculare
+    PARASUBICULUM = 10
+    HATA = 11
+    FIMBRIA = 12
+    FISSURE = 13
+    CYST = 14
+    HIPPOCAMPUS = 15  # a head or tail label without subfields
+    ENTORHINAL = 16
+    BA35 = 17
+    BA36 = 18
+    PARAHIPPOCAMPAL = 19
+    OTHER = 20  # named by the protocol, not used here (amygdala nuclei, ...)
+
+
+class Part(IntEnum):
+    """Where along the long axis a voxel lies, as far as its label says."""
+
+    UNKNOWN = 0
+    HEAD = 1
+    BODY = 2
+    TAIL = 3
+
+
+#: Order of the sheet's subfields from medial to lateral (Diers et al. 2023, section 2.1).
+MEDIAL_TO_LATERAL: tuple[Tissue, ...] = (
+    Tissue.PRESUBICULUM,
+    Tissue.SUBICULUM,
+    Tissue.CA1,
+    Tissue.CA2,
+    Tissue.CA2_3,
+    Tissue.CA3,
+)
+
+#: Cortex that the sheet goes on into beyond its medial end, from far to near. The entorhinal cortex
+#: lies before the parahippocampal cortex rather than beside it.
+FAR_TO_NEAR: tuple[Tissue, ...] = (
+    Tissue.BA36,
+    Tissue.BA35,
+    Tissue.ENTORHINAL,
+    Tissue.PARAHIPPOCAMPAL,
+    Tissue.PARASUBICULUM,
+)
+
+#: Rank along the sheet by tissue: that of the subfields is their value, which rises from medial to
+#: lateral; cortex has 0 and less, the same where it lies side by side.
+_RANKS = np.arange(max(Tissue) + 1, dtype=np.int8)
+_RANKS[list(FAR_TO_NEAR)] = (-3, -2, -1, -1, 0)
+_RANKS.flags.writeable = False
+
+
+def lateral_rank(tissue: NDArray[np.uint8]) -> NDArray[np.int8]:
+    """Rank from medial to lateral of the tissues of a sheet and of the cortex beside it.
+
+    Parameters
+    ----------
+    tissue : array of uint8, any shape
+        Values of :class:`Tissue`.
+
+    Returns
+    -------
+    array of int8, same shape
+        0 for the background.
+    """
+    return np.asarray(_RANKS[tissue])
+
+
+# Segmentation protocols as data, and the translation of their codes.
+
+
+#: Tissues outside the hippocampal formation proper: they never decide where to crop.
+OUTSIDE = frozenset(
+    {
+        Tissue.BACKGROUND,
+        Tissue.ENTORHINAL,
+        Tissue.BA35,
+        Tissue.BA36,
+        Tissue.PARAHIPPOCAMPAL,
+        Tissue.OTHER,
+    }
+)
+
+#: How many codes an error message lists before it says how many more there are.
+SHOWN = 12
+
+
+@dataclass(frozen=True, kw_only=True)
+class Label:
+    """One code of a protocol."""
+
+    code: int
+    tissue: Tissue
+    part: Part
+    name: str
+    abbreviation: str
+    color: str
+    """``#rrggbb``, for pictures and label GIFTIs."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scheme:
+    """A segmentation protocol.
+
+    ``name`` is alphanumeric: it becomes the ``seg-`` entity of output names.
+    """
+
+    name: str
+    title: str
+    citation: str
+    sheet: tuple[Tissue, ...]
+    """Tissues merged into the sheet, medial to lateral; empty where only parts are labeled."""
+    layer: tuple[Tissue, ...]
+    """Tissues whose voxels go to the nearest sheet tissue."""
+    interior: tuple[Tissue, ...]
+    """Tissues on the concave (interior) side of the sheet."""
+    labels: tuple[Label, ...]
+    tool: str = ""
+    """The software that writes these codes (``freesurfer``, ``ashs``, ``hippunfold``), if any."""
+    unlisted: str = "error"
+    """What a code that is not listed means: ``error``, or ``other`` (outside the hippocampus)."""
+    neighbors: tuple[Tissue, ...] = ()
+    """Cortex beyond the medial end of the sheet, from far to near, for the regions with cortex."""
+    right_offset: int = 0
+    """Added to right-hand codes in files that carry both hemispheres; 0 if there are none."""
+
+    @property
+    def codes(self) -> frozenset[int]:
+        """All codes of the protocol, without the background."""
+        return frozenset(label.code for label in self.labels)
+
+    def fits(self, values: frozenset[int]) -> bool:
+        """Say whether the values found in one hemisphere can come from this protocol.
+
+        Every value has to be listed, and each tissue of the sheet and at least one of its interior
+        has to occur.
+
+        Parameters
+        ----------
+        values : frozenset of int
+            The distinct codes of one hemisphere, without the background.
+
+        Returns
+        -------
+        bool
+        """
+        if not self.sheet or not values <= self.codes:
+            return False
+        found = {label.tissue for label in self.labels if label.code in values}
+        return found.issuperset(self.sheet) and not found.isdisjoint(self.interior)
+
+
+def translate(
+    codes: NDArray[np.integer], scheme: Scheme
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Translate the codes of a protocol into tissues and parts.
+
+    Parameters
+    ----------
+    codes : array of int, any shape
+        Codes of one hemisphere; 0 is background.
+    scheme : Scheme
+
+    Returns
+    -------
+    tissue, part : array of uint8, same shape
+        Values of :class:`Tissue` and :class:`Part`.
+
+    Raises
+    ------
+    SchemeError
+        ``unknown-labels`` if a code is not listed (unless ``scheme.unlisted`` is ``other``);
+        ``wrong-scheme`` if no label of the sheet occurs (of any part, for a parts-only scheme).
+    """
+    top = max(scheme.codes)
+    # One row per code, and a last one that stands for every code outside the table.
+    tissues = np.full(top + 2, Tissue.OTHER, dtype=np.uint8)
+    parts = np.full(top + 2, Part.UNKNOWN, dtype=np.uint8)
+    listed = np.zeros(top + 2, dtype=bool)
+    tissues[0], listed[0] = Tissue.BACKGROUND, True
+    for label in scheme.labels:
+        tissues[label.code], parts[label.code] = label.tissue, label.part
+        listed[label.code] = True
+
+    rows = np.where((codes >= 0) & (codes <= top), codes, top + 1).astype(np.intp)
+    occurs = np.bincount(rows.ravel(), minlength=top + 2) > 0
+    if scheme.unlisted == "error" and (occurs & ~listed).any():
+        unknown = np.unique(codes[~listed[rows]])
+        raise SchemeError(
+            f"labels {_some(unknown)} are not in the protocol {scheme.name}; if the protocol is "
+            "right, copy its TOML file, add the labels, and pass it with --scheme",
+            reason="unknown-labels",
+        )
+    wanted = np.isin(tissues, scheme.sheet) if scheme.sheet else parts != Part.UNKNOWN
+    if not (occurs & wanted).any():
+        found = np.unique(codes[codes != 0])
+        raise SchemeError(
+            f"no label of {'the sheet' if scheme.sheet else 'a part'} of {scheme.name} occurs "
+            f"(found {_some(found)}): another protocol was used",
+            reason="wrong-scheme",
+        )
+    return tissues[rows], parts[rows]
+
+
+def _some(values: NDArray[np.integer]) -> str:
+    """List the first few values."""
+    more = f" and {len(values) - SHOWN} more" if len(values) > SHOWN else ""
+    return ", ".join(str(value) for value in values[:SHOWN].tolist()) + more

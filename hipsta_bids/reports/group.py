@@ -1,0 +1,286 @@
+"""The page about one analysis: what it found and where, in whom, and how."""
+
+import base64
+import contextlib
+import io
+import logging
+import re
+import shlex
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hipsta_bids.derivatives.names import DATASET_FILES, group_report
+from hipsta_bids.errors import HipstaError
+from hipsta_bids.io import files
+from hipsta_bids.io.files import hide_home
+from hipsta_bids.reports.group_maps import classifiers, map_scenes, registration
+from hipsta_bids.reports.group_tables import (
+    GroupResults,
+    findings,
+    number_text,
+    participants,
+    peaks,
+    read_group,
+    scores,
+    spelled,
+    summaries,
+)
+from hipsta_bids.reports.maps import colors_of, picture_of_file
+from hipsta_bids.reports.page import Section, build_sections, render
+
+# The model of an analysis: in words, and as a picture of its design matrix.
+
+
+_LOGGER = logging.getLogger(__name__)
+_CELL = (24, 6)  # pixels of a cell, as wide and as high as a short table wants
+_TALLEST = 360  # pixels on the screen
+_SHADES = 64
+
+
+def design(results: GroupResults) -> Mapping[str, Any] | None:
+    """Show the design matrix, its contrasts, and what was modeled.
+
+    Parameters
+    ----------
+    results : GroupResults
+
+    Returns
+    -------
+    mapping or None
+        For the template.
+    """
+    record = results.record
+    table = results.table("design")
+    columns = [str(name) for name in record.get("columns") or ()]
+    measures = results.table("maps")
+    comparison = record.get("comparison") or {}
+    return {
+        "formula": record.get("formula"),
+        "measures": [spelled(m) for m in measures["measure"].unique()] if len(measures) else [],
+        "what": _what(comparison),
+        "references": list((record.get("references") or {}).items()),
+        "columns": columns,
+        "contrasts": [
+            {
+                "name": name,
+                "rows": [[number_text(w) for w in row] for row in np.atleast_2d(weights)],
+            }
+            for name, weights in (record.get("contrasts") or {}).items()
+        ],
+        "picture": _picture(table, columns) if len(table) else None,
+    }
+
+
+def _what(comparison: Mapping[str, Any]) -> str:
+    """Say what a row of the model is."""
+    if comparison.get("longitudinal"):
+        return (
+            "A row is a visit; a mixed model gives each participant an intercept, or a slope too."
+        )
+    if comparison.get("pair"):
+        first, second = comparison["pair"]
+        return f"A row is a participant's change from {first} to {second}."
+    return "A row is a participant."
+
+
+def _picture(table: Any, columns: list[str]) -> dict[str, Any]:  # noqa: ANN401  (of pandas)
+    from PIL import Image  # noqa: PLC0415  (slow to load)
+
+    matrix = table[columns].to_numpy(dtype=np.float64)
+    low, high = matrix.min(axis=0), matrix.max(axis=0)
+    share = np.where(high > low, (matrix - low) / np.where(high > low, high - low, 1.0), 1.0)
+    shades = (share * (_SHADES - 1)).round().astype(np.uint8)
+    image = Image.fromarray(shades, mode="P")
+    colors = colors_of("cividis", _SHADES)
+    image.putpalette([int(color[i : i + 2], 16) for color in colors.tolist() for i in (1, 3, 5)])
+    buffer = io.BytesIO()
+    image.save(buffer, format="png", optimize=True)
+    ends = [
+        number_text(a) if a == b else f"{number_text(a)} to {number_text(b)}"
+        for a, b in zip(low, high, strict=True)
+    ]
+    return {
+        "address": "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode(),
+        "height": int(min(_TALLEST, max(60, _CELL[1] * len(matrix)))),
+        "columns": list(zip(columns, ends, strict=True)),
+        "rows": len(matrix),
+        "colors": colors[::9].tolist(),
+    }
+
+
+def origin(results: GroupResults) -> Mapping[str, Any]:
+    """List what is needed to repeat the analysis."""
+    record = results.record
+    inputs = record.get("inputs") or {}
+    settings = record.get("settings") or {}
+    return {
+        "command": hide_home(shlex.join(str(part) for part in record.get("command") or ())),
+        "version": record.get("version"),
+        "inputs": inputs,
+        "datasets": [hide_home(str(path)) for path in inputs.get("datasets") or ()],
+        "settings": [
+            (f"{stage}.{name}", value)
+            for stage, part in settings.items()
+            for name, value in (part.items() if isinstance(part, Mapping) else [("", part)])
+        ],
+        "notes": record.get("notes") or [],
+    }
+
+
+_PREFIX = "group"
+
+
+def group_page(folder: Path) -> str:
+    """Make the page about one analysis from its files.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the model, ``OUT_DIR/group/<model>``.
+
+    Returns
+    -------
+    str
+        The page.
+
+    Raises
+    ------
+    InputError
+        If ``analysis.json`` cannot be read.
+    """
+    results = read_group(folder)
+    record = results.record
+    return render(
+        "group.html",
+        title=results.name,
+        folder=folder.name,
+        formula=record.get("formula"),
+        n=record.get("participants"),
+        made_by=record.get("version"),
+        cohort=(folder.parent.parent / DATASET_FILES["report"]).exists(),
+        sections=build_sections(SECTIONS, results, _PREFIX),
+    )
+
+
+def _sections_of_groups(results: GroupResults) -> Mapping[str, Any] | None:
+    """Show the average cross-sections, and maps on other surfaces, as the figures have them."""
+    path = results.folder / "figures" / "sections.svg"
+    if not path.exists():
+        return None
+    alt = "Average cross-sections of the groups, from posterior to anterior"
+    return {"picture": picture_of_file(path, alt=alt, caption="Average cross-sections")}
+
+
+def _maps(results: GroupResults) -> Mapping[str, Any] | None:
+    values = map_scenes(results)
+    if values is None:
+        return None
+    figures = results.folder / "figures"
+    pictures = [
+        picture_of_file(figures / f"{one['name']}.svg", alt=one["title"], caption=one["title"])
+        for one in values["pictures"]
+    ]
+    return {**values, "pictures": pictures}
+
+
+def _methods(results: GroupResults) -> Mapping[str, Any] | None:
+    path = results.folder / "methods.md"
+    if not path.exists():
+        return None
+    title, *blocks = _blocks(path.read_text(encoding="utf-8"))
+    return {"blocks": blocks if title["kind"] == "heading" else [title, *blocks]}
+
+
+def _blocks(text: str) -> list[dict[str, Any]]:
+    """Part the markdown of ``methods.md``: headings, lists and paragraphs; code is marked."""
+    blocks = []
+    for part in re.split(r"\n\s*\n", text.strip()):
+        lines = part.splitlines()
+        items = [re.match(r"(-|\d+\.)\s+(.*)", line) for line in lines]
+        if part.startswith("#"):
+            blocks.append({"kind": "heading", "runs": [_runs(part.lstrip("# "))]})
+        elif all(items):
+            kind = "points" if part.startswith("-") else "numbers"
+            blocks.append({"kind": kind, "runs": [_runs(item[2]) for item in items if item]})
+        else:
+            blocks.append({"kind": "paragraph", "runs": [_runs(" ".join(lines))]})
+    return blocks
+
+
+def _runs(text: str) -> list[tuple[bool, str]]:
+    """Part a text into runs, and tell which are code."""
+    return [(i % 2 == 1, run) for i, run in enumerate(text.split("`")) if run]
+
+
+#: From top to bottom.
+SECTIONS: tuple[Section[GroupResults], ...] = (
+    Section(key="found", title="What was found", template="group/found.html", build=findings),
+    Section(key="maps", title="Maps", template="group/maps.html", build=_maps),
+    Section(key="peaks", title="Clusters and peaks", template="group/peaks.html", build=peaks),
+    Section(
+        key="summaries", title="Summary measures", template="group/summaries.html", build=summaries
+    ),
+    Section(
+        key="classification",
+        title="Classification",
+        template="group/classification.html",
+        build=classifiers,
+    ),
+    Section(key="scores", title="w-scores", template="group/scores.html", build=scores),
+    Section(key="people", title="Participants", template="group/people.html", build=participants),
+    Section(key="model", title="Model", template="group/model.html", build=design),
+    Section(
+        key="registration",
+        title="Registration",
+        template="group/registration.html",
+        build=registration,
+    ),
+    Section(
+        key="sections",
+        title="Average cross-sections",
+        template="group/sections.html",
+        build=_sections_of_groups,
+    ),
+    Section(
+        key="methods", title="Methods paragraph", template="group/methods.html", build=_methods
+    ),
+    Section(key="origin", title="Origin", template="group/origin.html", build=origin),
+)
+
+
+def write_group_report(root: Path, model: str) -> str | None:
+    """Make the page about one analysis of the group level; a failure leaves no page.
+
+    Parameters
+    ----------
+    root : Path
+        The output dataset.
+    model : str
+        Name of the analysis, which is that of its folder.
+
+    Returns
+    -------
+    str or None
+        Why there is no page; ``None`` if all went well.
+    """
+    path = root / group_report(model)
+    try:
+        files.write_text(path, group_page(root / DATASET_FILES["group"] / model))
+    except Exception as error:  # results are worth more than pages
+        if not isinstance(error, HipstaError):  # a bug shows its traceback
+            _LOGGER.exception("report: %s", path.name)
+        # That of an earlier analysis would be taken for this one's.
+        with contextlib.suppress(OSError):
+            path.unlink(missing_ok=True)
+        cause = str(error) if isinstance(error, HipstaError) else f"{type(error).__name__}: {error}"
+        return f"{path.name}: not made ({cause})"
+    return None
+
+
+def group_models(root: Path) -> list[str]:
+    """List the analyses of the group level that an output dataset holds."""
+    records = (root / DATASET_FILES["group"]).glob("*/analysis.json")
+    return sorted(path.parent.name for path in records if not path.parent.name.startswith("."))

@@ -1,0 +1,496 @@
+"""Static figures by matplotlib: unfolded maps and profiles."""
+
+import base64
+import io
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from pyarrow import csv
+
+from hipsta_bids.io import files
+from hipsta_bids.reports.plotting import new_figure
+from hipsta_bids.reports.results import Hemisphere
+from hipsta_bids.types import Float, Status
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+#: Colors of the hemispheres (Okabe and Ito 2008).
+HEMISPHERE_COLORS = {"L": "#0072B2", "R": "#D55E00"}
+
+_STYLE: Any = {
+    "font.family": "sans-serif",
+    "font.size": 10,
+    "axes.titlesize": 11,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "hatch.linewidth": 0.7,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "hipsta_bids",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapKind:
+    """How a map is shown."""
+
+    column: str
+    """Of the sheet table."""
+    title: str
+    unit: str
+    colors: str
+    """Color map of matplotlib, perceptually uniform or diverging, safe for color-blind readers."""
+    centered: bool
+    """Whether the middle of the colors means zero."""
+    digits: int
+    percentiles: tuple[float, float]
+    """Values at the ends of the colors, so that a few points at the edges may saturate."""
+
+
+THICKNESS = MapKind(
+    column="thickness",
+    title="Thickness",
+    unit="mm",
+    colors="viridis",
+    centered=False,
+    digits=2,
+    percentiles=(1, 99),
+)
+CURVATURE = MapKind(
+    column="curvature",
+    title="Mean curvature",
+    unit="1/mm",
+    colors="RdBu_r",
+    centered=True,
+    digits=3,
+    percentiles=(4, 96),
+)
+MAP_KINDS = (THICKNESS, CURVATURE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Picture:
+    """A figure in a page."""
+
+    address: str
+    """Data address."""
+    alt: str
+    caption: str
+    width: int
+    """CSS pixels at which its letters have their size."""
+
+
+def scale_of(kind: MapKind, values: Sequence[Float]) -> tuple[float, float]:
+    """Choose the values at both ends of the color bar.
+
+    Parameters
+    ----------
+    kind : MapKind
+    values : sequence of float64 arrays
+        All that is shown on one scale.
+
+    Returns
+    -------
+    (float, float)
+        Percentiles of the kind; symmetric where the middle means zero.
+    """
+    every = np.concatenate([np.ravel(array) for array in values])
+    every = every[np.isfinite(every)]
+    if not len(every):
+        return -1.0, 1.0
+    low, high = (float(v) for v in np.percentile(every, kind.percentiles))
+    if kind.centered:
+        reach = max(abs(low), abs(high), 1e-6)
+        return -reach, reach
+    return low, max(high, low + 1e-6)
+
+
+def color_table(kind: MapKind, n: int = 64) -> NDArray[np.str_]:
+    """List the colors of a map as ``#rrggbb``."""
+    return colors_of(kind.colors, n)
+
+
+def colors_of(name: str, n: int = 64) -> NDArray[np.str_]:
+    """List the colors of one of matplotlib's color maps as ``#rrggbb``."""
+    from matplotlib import colormaps  # noqa: PLC0415  (slow to load)
+    from matplotlib.colors import to_hex  # noqa: PLC0415
+
+    return np.array([to_hex(color) for color in colormaps[name](np.linspace(0, 1, n))])
+
+
+def gradient_of(colors: NDArray[np.str_]) -> str:
+    """Spell a color table as a CSS gradient from left to right."""
+    stops = colors[np.linspace(0, len(colors) - 1, 9).round().astype(int)]
+    return f"linear-gradient(to right,{','.join(stops.tolist())})"
+
+
+def draw_map(kind: MapKind, hemispheres: Sequence[Hemisphere]) -> Picture:
+    """Draw one map of both hemispheres, unfolded, side by side on one color scale.
+
+    Parameters
+    ----------
+    kind : MapKind
+    hemispheres : sequence of Hemisphere
+        Measured ones.
+
+    Returns
+    -------
+    Picture
+    """
+    figure, axes = _new_figure(1, len(hemispheres), (2.6 * len(hemispheres) + 0.9, 3.1))
+    low, high = scale_of(kind, [h.sheet.columns[kind.column] for h in hemispheres])
+    image: Any = None
+    for axis, hemisphere in zip(axes[0], hemispheres, strict=True):
+        image = _draw_sheet(axis, hemisphere, kind, (low, high))
+    axes[0, 0].set_ylabel("posterior  ←  mm  →  anterior")
+    figure.colorbar(
+        image, ax=list(axes[0]), label=f"{kind.title.lower()} [{kind.unit}]", extend="both"
+    )
+    means = ", ".join(
+        f"{h.side} mean {np.nanmean(h.sheet.columns[kind.column]):.{kind.digits}f}"
+        for h in hemispheres
+    )
+    return _encode(
+        figure,
+        alt=f"{kind.title} on the unfolded sheet, {means} {kind.unit}, colors from {low:.3g} to"
+        f" {high:.3g} {kind.unit}",
+        caption=kind.title,
+    )
+
+
+def draw_profiles(
+    kind: MapKind, hemispheres: Sequence[Hemisphere], others: Mapping[str, Float]
+) -> Picture:
+    """Draw a map along x: its mean over y and the range of nine tenths of the rows.
+
+    Parameters
+    ----------
+    kind : MapKind
+    hemispheres : sequence of Hemisphere
+        Measured ones.
+    others : mapping of str to (N, Nx) float64
+        By hemisphere, mean profiles of the cohort; perhaps empty.
+
+    Returns
+    -------
+    Picture
+    """
+    figure, axes = _new_figure(1, 1, (5.6, 2.9))
+    axis = axes[0, 0]
+    bands = []
+    for hemisphere in hemispheres:
+        hemi = hemisphere.place.name.hemi
+        values = hemisphere.sheet.columns[kind.column]
+        place = np.linspace(0, 100, values.shape[0])
+        color = HEMISPHERE_COLORS[hemi]
+        low, high = np.nanpercentile(values, [5, 95], axis=1)
+        bands += [low, high]
+        axis.fill_between(place, low, high, color=color, alpha=0.18, linewidth=0)
+        axis.plot(place, np.nanmean(values, axis=1), color=color, label=hemisphere.side)
+        cohort = others.get(hemi)
+        if cohort is not None and len(cohort):
+            style = {"color": color, "linewidth": 0.9, "linestyle": (0, (2, 2))}
+            for line in np.nanpercentile(cohort, [5, 95], axis=0):
+                axis.plot(place, line, **style)
+    _mark_subfields(axis, hemispheres[0])
+    axis.set_xlim(0, 100)
+    # The columns next to the rims may lie far off; they need not squeeze the rest.
+    bottom, top = np.nanpercentile(np.concatenate(bands), [3, 97])
+    axis.set_ylim(bottom - 0.15 * (top - bottom), top + 0.2 * (top - bottom))
+    axis.set_xlabel("medial  ←  % of the width  →  lateral")
+    axis.set_ylabel(f"{kind.title.lower()} [{kind.unit}]")
+    if kind.centered:
+        axis.axhline(0, color="0.6", linewidth=0.7, zorder=0)
+    axis.legend(frameon=False, loc="upper right", ncols=2, fontsize=9)
+    sides = " and ".join(h.side for h in hemispheres)
+    return _encode(
+        figure,
+        alt=f"{kind.title} from medial to lateral, {sides}: mean over the rows of the sheet",
+        caption=f"{kind.title} along x",
+    )
+
+
+def picture_of_file(path: Path, *, alt: str, caption: str) -> Picture:
+    """Embed a drawing that was made before.
+
+    Parameters
+    ----------
+    path : Path
+        SVG file of matplotlib.
+    alt, caption : str
+    """
+    content = path.read_bytes()
+    width = re.search(rb'<svg[^>]*? width="([\d.]+)pt"', content)
+    return Picture(
+        address="data:image/svg+xml;base64," + base64.b64encode(content).decode(),
+        alt=alt,
+        caption=caption,
+        width=round(float(width[1]) / 0.75) if width else 800,
+    )
+
+
+def _new_figure(rows: int, columns: int, size: tuple[float, float]) -> tuple["Figure", Any]:
+    new_figure((1.0, 1.0), "constrained")  # loads the library with settings of its own
+    from matplotlib import rc_context  # noqa: PLC0415  (slow to load)
+
+    with rc_context(_STYLE):
+        figure = new_figure(size, "constrained")
+        return figure, figure.subplots(rows, columns, squeeze=False)
+
+
+def _encode(figure: "Figure", *, alt: str, caption: str) -> Picture:
+    from matplotlib import rc_context  # noqa: PLC0415  (slow to load)
+
+    buffer = io.BytesIO()
+    # The same results give the same bytes.
+    with rc_context(_STYLE):
+        figure.savefig(buffer, format="svg", metadata={"Date": None}, dpi=150)
+    return Picture(
+        address="data:image/svg+xml;base64," + base64.b64encode(buffer.getvalue()).decode(),
+        alt=alt,
+        caption=caption,
+        width=round(figure.get_figwidth() * 96),
+    )
+
+
+def _draw_sheet(
+    axis: "Axes", hemisphere: Hemisphere, kind: MapKind, scale: tuple[float, float]
+) -> Any:  # noqa: ANN401  (matplotlib's mappables have no common public type)
+    sheet = hemisphere.sheet
+    extent = [hemisphere.summary.get(f"extent_{a}", np.nan) for a in "xy"]
+    width, length = (
+        e if np.isfinite(e) else float(n) for e, n in zip(extent, sheet.shape, strict=True)
+    )
+    x, y = (np.linspace(0, mm, n) for mm, n in zip((width, length), sheet.shape, strict=True))
+    values = sheet.columns[kind.column].T
+    axis.set_facecolor("0.85")
+    image = axis.pcolormesh(
+        x, y, values, cmap=kind.colors, vmin=scale[0], vmax=scale[1], shading="nearest",
+        rasterized=True,
+    )  # fmt: skip
+    for where, hatch in ((sheet.repaired, "////"), (~sheet.valid, "xxxx")):
+        if where.any():
+            _hatch(axis, where, x, y, hatch)
+    _draw_borders(axis, sheet.subfield, x, y)
+    axis.set_aspect("equal")
+    axis.set_title(hemisphere.side)
+    sides = ("medial", "lateral")
+    # Seen from above: the medial sides of both hemispheres face each other.
+    if hemisphere.place.name.hemi == "L":
+        axis.invert_xaxis()
+        sides = sides[::-1]
+    axis.set_xlabel(f"{sides[0]}  ←  mm  →  {sides[1]}")
+    return image
+
+
+def _hatch(axis: "Axes", where: NDArray[np.bool_], x: Float, y: Float, hatch: str) -> None:
+    from matplotlib.collections import PolyCollection  # noqa: PLC0415  (slow to load)
+
+    x_edges, y_edges = _edges(x), _edges(y)
+    cells = [
+        [(x_edges[i], y_edges[j]), (x_edges[i + 1], y_edges[j]),
+         (x_edges[i + 1], y_edges[j + 1]), (x_edges[i], y_edges[j + 1])]
+        for i, j in np.argwhere(where)
+    ]  # fmt: skip
+    axis.add_collection(
+        PolyCollection(cells, facecolors="none", edgecolors="black", linewidths=0, hatch=hatch)
+    )
+
+
+def _edges(nodes: Float) -> Float:
+    """Place cell edges halfway between nodes."""
+    step = nodes[1] - nodes[0]
+    return np.append(nodes - step / 2, nodes[-1] + step / 2)
+
+
+def _draw_borders(axis: "Axes", names: NDArray[np.str_], x: Float, y: Float) -> None:
+    """Draw the borders between subfields along cell edges, and their names."""
+    from matplotlib.collections import LineCollection  # noqa: PLC0415  (slow to load)
+
+    x_edges, y_edges = _edges(x), _edges(y)
+    across = np.argwhere(names[1:] != names[:-1])
+    along = np.argwhere(names[:, 1:] != names[:, :-1])
+    lines = [
+        *(((x_edges[i + 1], y_edges[j]), (x_edges[i + 1], y_edges[j + 1])) for i, j in across),
+        *(((x_edges[i], y_edges[j + 1]), (x_edges[i + 1], y_edges[j + 1])) for i, j in along),
+    ]
+    axis.add_collection(LineCollection(lines, colors="white", linewidths=2.2))
+    axis.add_collection(LineCollection(lines, colors="black", linewidths=1.0))
+    for name in np.unique(names[names != ""]):
+        i, j = np.nonzero(names == name)
+        label = {"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 1.2}
+        axis.text(
+            x[i].mean(), y[j].mean(), name,
+            ha="center", va="center", rotation=90, bbox=label, fontsize=9,
+        )  # fmt: skip
+
+
+def _mark_subfields(axis: "Axes", hemisphere: Hemisphere) -> None:
+    """Name the most frequent subfield of each x above the axes, with ticks where it changes."""
+    names = hemisphere.sheet.subfield
+    usual = [max(set(row.tolist()), key=row.tolist().count) for row in names]
+    place = np.linspace(0, 100, len(usual))
+    changes = [0, *(i for i in range(1, len(usual)) if usual[i] != usual[i - 1]), len(usual)]
+    for start, stop in pairwise(changes):
+        if start:
+            axis.axvline(
+                (place[start - 1] + place[start]) / 2, color="0.8", linewidth=0.8, zorder=0
+            )
+        middle = (place[start] + place[stop - 1]) / 2
+        axis.text(
+            middle, 1.01, usual[start], ha="center", va="bottom", fontsize=9, color="0.3",
+            transform=axis.get_xaxis_transform(),
+        )  # fmt: skip
+
+
+# Many small maps in one picture, of which a browser shows a part each: hundreds at once, fast.
+
+
+_COLUMNS = 20  # tiles side by side
+_COLORS = 128  # shades; one more stands for missing values
+_MISSING = (217, 217, 217)
+_FULL_SIZE = 1500  # beyond so many, tiles have a quarter of the pixels, so that pages stay small
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sprites:
+    """All maps of one kind."""
+
+    name: str
+    title: str
+    unit: str
+    low: str
+    high: str
+    """Values at the ends of the colors."""
+    gradient: str
+    """Of the color bar, as CSS spells it."""
+    address: str
+    """Data address of the picture."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grid:
+    """Where tiles lie in the pictures."""
+
+    columns: int
+    rows: int
+    places: Mapping[int, int]
+    """Number of the tile, by row in the list of hemispheres."""
+
+
+def read_maps(hemisphere: Hemisphere) -> dict[str, Float]:
+    """Read the maps that are shown, faster than the whole sheet.
+
+    Parameters
+    ----------
+    hemisphere : Hemisphere
+        A measured one.
+
+    Returns
+    -------
+    dict of str to (Nx, Ny) float64
+        Empty if the table cannot be read.
+    """
+    names = [kind.column for kind in MAP_KINDS]
+    try:
+        table = csv.read_csv(
+            hemisphere.place.path("sheet"),
+            read_options=csv.ReadOptions(use_threads=False),
+            parse_options=csv.ParseOptions(delimiter="\t"),
+            convert_options=csv.ConvertOptions(
+                include_columns=["x", "y", *names],
+                column_types=dict.fromkeys(names, pa.float64()),
+                null_values=[files.MISSING],
+            ),
+        )
+        shape = (int(table.column("x")[-1].as_py()), int(table.column("y")[-1].as_py()))
+        return {name: table.column(name).to_numpy().reshape(shape) for name in names}
+    except (OSError, ValueError, IndexError, KeyError, pa.ArrowException):
+        return {}
+
+
+def make_sprites(
+    hemispheres: Sequence[Hemisphere], maps: Sequence[Mapping[str, Float]]
+) -> tuple[list[Sprites], Grid]:
+    """Draw the maps of all hemispheres.
+
+    Parameters
+    ----------
+    hemispheres : sequence of Hemisphere
+    maps : sequence of mapping
+        Of each, from :func:`read_maps`.
+
+    Returns
+    -------
+    list of Sprites, Grid
+        Anterior is up; the medial side of left hemispheres is on the right, as on their own page.
+    """
+    shapes = [found[MAP_KINDS[0].column].shape for found in maps if found]
+    usual = max(set(shapes), key=shapes.count) if shapes else (0, 0)
+    shown = [
+        row for row, found in enumerate(maps) if found and next(iter(found.values())).shape == usual
+    ]
+    grid = Grid(
+        columns=min(_COLUMNS, max(1, len(shown))),
+        rows=max(1, -(-len(shown) // _COLUMNS)),
+        places={row: place for place, row in enumerate(shown)},
+    )
+    step = 1 if len(shown) <= _FULL_SIZE else 2
+    mirrored = [hemispheres[row].place.name.hemi == "L" for row in shown]
+    trusted = [row for row in shown if hemispheres[row].status != Status.FLAGGED] or shown
+    sprites = []
+    for kind in MAP_KINDS if shown else ():
+        # What is flagged may be far off; it need not stretch the colors of all others.
+        scale = scale_of(kind, [maps[row][kind.column] for row in trusted])
+        tiles = [maps[row][kind.column][::step, ::step] for row in shown]
+        sprites.append(_sprites(kind, tiles, mirrored, grid, scale))
+    return sprites, grid
+
+
+def _sprites(
+    kind: MapKind,
+    maps: Sequence[Float],
+    mirrored: Sequence[bool],
+    grid: Grid,
+    scale: tuple[float, float],
+) -> Sprites:
+    low, high = scale
+    width, height = maps[0].shape
+    picture = np.full((grid.rows * height, grid.columns * width), _COLORS, dtype=np.uint8)
+    for place, (values, mirror) in enumerate(zip(maps, mirrored, strict=True)):
+        share = np.clip((values - low) / (high - low), 0, 1)
+        shade = np.where(np.isnan(values), _COLORS, np.nan_to_num(share) * (_COLORS - 1))
+        tile = shade.round().astype(np.uint8).T[::-1]
+        row, column = divmod(place, _COLUMNS)
+        place_in = np.s_[row * height : (row + 1) * height, column * width : (column + 1) * width]
+        picture[place_in] = tile[:, ::-1] if mirror else tile
+    colors = color_table(kind, _COLORS)
+    return Sprites(
+        name=kind.column,
+        title=kind.title,
+        unit=kind.unit,
+        low=f"{low:.{kind.digits}f}",
+        high=f"{high:.{kind.digits}f}",
+        gradient=gradient_of(colors),
+        address=_palette_png(picture, colors),
+    )
+
+
+def _palette_png(picture: NDArray[np.uint8], colors: NDArray[np.str_]) -> str:
+    from PIL import Image  # noqa: PLC0415  (slow to load)
+
+    image = Image.fromarray(picture, mode="P")
+    palette = [int(color[i : i + 2], 16) for color in colors.tolist() for i in (1, 3, 5)]
+    image.putpalette([*palette, *_MISSING])
+    buffer = io.BytesIO()
+    image.save(buffer, format="png", optimize=True)
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()

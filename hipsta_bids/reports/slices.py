@@ -1,0 +1,373 @@
+"""Slices and cross-sections as small SVG pictures, one per place, that wrap on narrow screens."""
+
+import base64
+import io
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hipsta_bids.io.gifti import sheet_triangles
+from hipsta_bids.reports.results import SURFACES, Hemisphere, SheetTable, Views
+from hipsta_bids.types import Float
+
+# Lines and pictures of small SVG panels: arrays to what the browser draws.
+
+
+def cut(points: Float, axis: int, level: float) -> Float:
+    """Cut a grid of points by a plane across one of their axes.
+
+    Parameters
+    ----------
+    points : (Nx, Ny, 3) float64
+    axis : int
+        The plane is where this coordinate has the value ``level``.
+    level : float
+
+    Returns
+    -------
+    (N, 2, 3) float64
+        Both ends of the line in each triangle that the plane meets.
+    """
+    triangles = points.reshape(-1, 3)[sheet_triangles(*points.shape[:2])]
+    height = triangles[:, :, axis] - level
+    above = height > 0
+    met = above.any(axis=1) & ~above.all(axis=1)
+    triangles, height, above = triangles[met], height[met], above[met]
+    # The corner that is alone on its side comes first.
+    lone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))
+    order = (lone[:, None] + np.arange(3)) % 3
+    rows = np.arange(len(order))[:, None]
+    triangles, height = triangles[rows, order], height[rows, order]
+    share = height[:, :1] / (height[:, :1] - height[:, 1:])
+    ends: Float = triangles[:, :1] + share[:, :, None] * (triangles[:, 1:] - triangles[:, :1])
+    return ends
+
+
+def outline(inside: NDArray[np.bool_]) -> Float:
+    """Find the edges between pixels inside and outside.
+
+    Parameters
+    ----------
+    inside : (I, J) bool
+
+    Returns
+    -------
+    (N, 2, 2) float64
+        Both ends of each edge, in pixels; the center of pixel (0, 0) is at (0, 0). Edges in one
+        line are joined.
+    """
+    padded = np.pad(inside, 1)
+    edges = []
+    for axis in (0, 1):
+        turned = padded if axis == 0 else padded.T
+        change = turned[1:] != turned[:-1]
+        for line in np.flatnonzero(change.any(axis=1)):
+            steps = np.flatnonzero(np.diff(np.pad(change[line].astype(np.int8), 1)))
+            for start, stop in steps.reshape(-1, 2):
+                ends = np.array([[line - 0.5, start - 1.5], [line - 0.5, stop - 1.5]])
+                edges.append(ends if axis == 0 else ends[:, ::-1])
+    return np.array(edges).reshape(-1, 2, 2)
+
+
+def path_data(lines: Float | Iterable[Float]) -> str:
+    """Spell lines of points (N, 2) each as the data of an SVG path, to a hundredth of a mm."""
+    return " ".join(
+        "M" + "L".join(f"{x:.2f} {y:.2f}" for x, y in line)
+        for line in lines
+        if np.isfinite(line).all()
+    )
+
+
+def png_address(pixels: NDArray[np.uint8]) -> str:
+    """Encode (rows, columns, 3 or 4) pixels as a data address."""
+    from PIL import Image  # noqa: PLC0415  (slow to load)
+
+    buffer = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, format="png")
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
+
+
+#: Axes of a picture (to the right, up) and across it; 0 is right, 1 anterior, 2 superior.
+_AXES = {"coronal": (0, 2, 1), "sagittal": (1, 2, 0), "axial": (0, 1, 2)}
+_LETTERS = (("L", "R"), ("P", "A"), ("I", "S"))
+
+#: Where along the body slices and cross-sections are shown.
+POSITIONS = (0.1, 0.3, 0.5, 0.7, 0.9)
+
+_PALE = 0.45  # share of the label's color; the rest is white, so that lines show on it
+_MARGIN = 3.0  # mm round the body that are shown
+_NEAR = 22.0  # mm across, of a window about a place that a message names
+_REACH = 7.0  # mm, how far the line of an end plane goes up and down
+
+
+@dataclass(frozen=True, kw_only=True)
+class Panel:
+    """One picture; lengths are mm, y runs downwards."""
+
+    window: tuple[float, float, float, float]
+    """Left, top, width and height of what is shown."""
+    caption: str
+    alt: str
+    image: str | None = None
+    """Data address of the labels' picture ..."""
+    size: tuple[float, float] = (0.0, 0.0)
+    """... and its width and height, from (0, 0) on."""
+    paths: Mapping[str, str] = field(default_factory=dict)
+    """SVG path data by CSS class."""
+    lines: tuple[tuple[str, str], ...] = ()
+    """Colored lines: path data and color."""
+    marks: tuple[tuple[float, float], ...] = ()
+    letters: tuple[str, str, str, str] | None = None
+    """What is at the left, right, lower and upper edge."""
+
+
+def slice_panels(hemisphere: Hemisphere, views: Views) -> list[Panel]:
+    """Draw five slices across the body, and one along it.
+
+    Parameters
+    ----------
+    hemisphere : Hemisphere
+    views : Views
+        Its labels and mask.
+
+    Returns
+    -------
+    list of Panel
+        From posterior to anterior, then the sagittal one.
+    """
+    centers = _centers(hemisphere, views)
+    middle = centers[len(centers) // 2]
+    across = [
+        _slice(hemisphere, views, "coronal", center, words=f"{share:.0%} from posterior")
+        for share, center in zip(POSITIONS, centers, strict=True)
+    ]
+    return [
+        *_same_windows(across),
+        _slice(hemisphere, views, "sagittal", middle, words="along the body"),
+    ]
+
+
+def place_panels(hemisphere: Hemisphere, views: Views, point: Sequence[float]) -> list[Panel]:
+    """Draw the three slices through a place that a message names.
+
+    Parameters
+    ----------
+    hemisphere : Hemisphere
+    views : Views
+        Its labels and mask.
+    point : (3,) RAS mm
+
+    Returns
+    -------
+    list of Panel
+    """
+    index = views.to_index(np.asarray(point, dtype=np.float64))
+    return [_slice(hemisphere, views, name, index, mark=True) for name in _AXES]
+
+
+def section_panels(
+    hemisphere: Hemisphere, colors: NDArray[np.str_], scale: tuple[float, float]
+) -> list[Panel]:
+    """Draw cross-sections of the sheet, with a line per column in the color of its thickness.
+
+    Parameters
+    ----------
+    hemisphere : Hemisphere
+        A measured one.
+    colors : (N,) str
+        Color table.
+    scale : (float, float)
+        Thickness at both ends of the table, mm.
+
+    Returns
+    -------
+    list of Panel
+        From posterior to anterior.
+    """
+    sheet = hemisphere.sheet
+    rows = [round(share * (sheet.shape[1] - 1)) for share in POSITIONS]
+    return _same_windows(
+        [
+            _section(sheet, row, share, colors, scale)
+            for row, share in zip(rows, POSITIONS, strict=True)
+        ]
+    )
+
+
+def _centers(hemisphere: Hemisphere, views: Views) -> list[Float]:
+    """Voxel indices of points inside the body at the positions that are shown."""
+    if hemisphere.measured:
+        middle = views.to_index(hemisphere.sheet.points["midthickness"])
+        rows = [round(share * (middle.shape[1] - 1)) for share in POSITIONS]
+        return [np.asarray(np.nanmean(middle[:, row], axis=0)) for row in rows]
+    inside = views.mask if views.mask is not None else np.isin(views.labels, list(views.names))  # type: ignore[arg-type]  # one is there
+    index = np.argwhere(inside)
+    low, high = index[:, 1].min(), index[:, 1].max()
+    levels = [round(low + share * (high - low)) for share in POSITIONS]
+    middle = index.mean(axis=0)
+    own = [index[index[:, 1] == level] for level in levels]
+    return [rows.mean(axis=0) if len(rows) else middle for rows in own]
+
+
+def _same_windows(panels: Sequence[Panel]) -> list[Panel]:
+    """Give panels windows of one size about the same centers, so that they have one scale."""
+    width, height = (max(panel.window[n] for panel in panels) for n in (2, 3))
+    return [
+        replace(
+            panel,
+            window=_window(
+                panel.window[0] + panel.window[2] / 2,
+                panel.window[1] + panel.window[3] / 2,
+                width,
+                height,
+            ),
+        )
+        for panel in panels
+    ]
+
+
+def _window(x: float, y: float, width: float, height: float) -> tuple[float, float, float, float]:
+    """Left, top, width and height of a window about a center."""
+    left, top = x - width / 2, y - height / 2
+    return round(left, 2), round(top, 2), round(width, 2), round(height, 2)
+
+
+def _slice(
+    hemisphere: Hemisphere,
+    views: Views,
+    orientation: str,
+    center: Float,
+    *,
+    words: str = "",
+    mark: bool = False,
+) -> Panel:
+    """One slice through a voxel index, about the body or, marked, about that place."""
+    right, up, across = _AXES[orientation]
+    level = int(np.clip(round(float(center[across])), 0, views.shape[across] - 1))
+    edge, top = views.voxel[[right, up]], views.shape[up] - 0.5
+
+    def flat(index: Float) -> Float:
+        """Voxel indices to mm in the picture."""
+        return np.stack(
+            [(index[..., right] + 0.5) * edge[0], (top - index[..., up]) * edge[1]], axis=-1
+        )
+
+    width, height = views.shape[right] * edge[0], views.shape[up] * edge[1]
+    shown = np.array([[0.0, 0.0], [width, height]])
+    paths = {}
+    if views.mask is not None:
+        edges = outline(_picture(views.mask, across, level, right, up))
+        index = np.zeros((*edges.shape[:2], 3))
+        index[..., right], index[..., up] = edges[..., 0], edges[..., 1]
+        lines = flat(index)
+        paths["mask"] = path_data(lines)
+        if len(lines):
+            shown = np.stack([lines.min(axis=(0, 1)), lines.max(axis=(0, 1))])
+            shown += np.array([[-_MARGIN], [_MARGIN]])
+    if hemisphere.measured:
+        for name in SURFACES:
+            index = views.to_index(hemisphere.sheet.points[name])
+            paths[name] = path_data(flat(cut(index, across, level)))
+        if orientation == "sagittal":
+            paths["plane"] = path_data(flat(_plane_lines(hemisphere, views)))
+    place = flat(np.asarray(center))
+    where = views.affine[:3, :3] @ np.asarray(center) + views.affine[:3, 3]
+    caption = (
+        f"{orientation}{', ' if words else ''}{words} ({'RAS'[across]} {where[across]:.1f} mm)"
+    )
+    middle, size = (place, (_NEAR, _NEAR)) if mark else (shown.mean(axis=0), shown[1] - shown[0])
+    return Panel(
+        window=_window(float(middle[0]), float(middle[1]), float(size[0]), float(size[1])),
+        caption=caption,
+        alt=f"{hemisphere.side} hemisphere, {caption}: labels with the outline of the body"
+        f"{' and the measured surfaces' if hemisphere.measured else ''}",
+        image=_label_image(views, across, level, right, up),
+        size=(round(float(width), 2), round(float(height), 2)),
+        paths=paths,
+        marks=(_pair(place),) if mark else (),
+        letters=(*_LETTERS[right], *_LETTERS[up]),
+    )
+
+
+def _pair(point: Float) -> tuple[float, float]:
+    return round(float(point[0]), 2), round(float(point[1]), 2)
+
+
+def _picture(
+    volume: NDArray[np.generic], across: int, level: int, right: int, up: int
+) -> NDArray[np.bool_]:
+    """One slice with its first axis to the right and its second up."""
+    plane: NDArray[np.bool_] = np.take(volume, level, axis=across)
+    return plane if right < up else plane.T
+
+
+def _plane_lines(hemisphere: Hemisphere, views: Views) -> Float:
+    """Find the end planes in a sagittal slice: both ends of each line, voxel indices."""
+    lines = []
+    middle = hemisphere.sheet.points["midthickness"]
+    for end, row in (("posterior_plane", 0), ("anterior_plane", -1)):
+        plane = hemisphere.metrics.get(end)
+        if not plane:
+            continue
+        center = np.nanmean(middle[:, row], axis=0)
+        point, normal = np.array(plane["point_ras_mm"]), np.array(plane["normal_ras"])
+        center += ((point - center) @ normal) * normal
+        along = np.cross(normal, [1.0, 0.0, 0.0])
+        along *= _REACH / np.linalg.norm(along)
+        lines.append(views.to_index(np.stack([center - along, center + along])))
+    return np.array(lines).reshape(-1, 2, 3)
+
+
+def _label_image(views: Views, across: int, level: int, right: int, up: int) -> str | None:
+    if views.labels is None:
+        return None
+    plane = _picture(views.labels, across, level, right, up)
+    pixels = np.zeros((*plane.shape, 4), dtype=np.uint8)
+    for code, name in views.names.items():
+        color = np.array([int(name.color[i : i + 2], 16) for i in (1, 3, 5)])
+        pale = np.round(_PALE * color + (1 - _PALE) * 255).astype(np.uint8)
+        pixels[plane == code] = (*pale.tolist(), 255)
+    return png_address(pixels.transpose(1, 0, 2)[::-1])
+
+
+def _section(
+    sheet: SheetTable,
+    row: int,
+    share: float,
+    colors: NDArray[np.str_],
+    scale: tuple[float, float],
+) -> Panel:
+    """One row of the sheet, seen along the body from behind."""
+    middle = sheet.points["midthickness"]
+    low, high = max(0, row - 1), min(middle.shape[1] - 1, row + 1)
+    forward = np.nanmean(middle[:, high] - middle[:, low], axis=0)
+    forward /= np.linalg.norm(forward)
+    up = np.array([0.0, 0.0, 1.0]) - forward[2] * forward
+    up /= np.linalg.norm(up)
+    right = np.cross(forward, up)
+    flat = {
+        name: np.stack([points[:, row] @ right, -(points[:, row] @ up)], axis=-1)
+        for name, points in sheet.points.items()
+    }
+    every = np.concatenate(list(flat.values()))
+    corner, far = np.nanmin(every, axis=0) - 0.7, np.nanmax(every, axis=0) + 0.7
+    flat = {name: points - corner for name, points in flat.items()}
+    thickness = sheet.columns["thickness"][:, row]
+    spread = (thickness - scale[0]) / max(scale[1] - scale[0], 1e-6)
+    chosen = np.rint(np.clip(np.nan_to_num(spread), 0, 1) * (len(colors) - 1)).astype(int)
+    ends = np.stack([flat["interior"], flat["exterior"]], axis=1)
+    lines = tuple(
+        (path_data([line]), str(colors[n]))
+        for line, n in zip(ends, chosen, strict=True)
+        if np.isfinite(line).all()
+    )
+    return Panel(
+        window=(0.0, 0.0, float(far[0] - corner[0]), float(far[1] - corner[1])),
+        caption=f"{share:.0%} from posterior, mean {np.nanmean(thickness):.2f} mm",
+        alt=f"cross-section at {share:.0%} of the body: interior, mid and exterior curve with"
+        " thickness lines",
+        paths={name: path_data([points]) for name, points in flat.items()},
+        lines=lines,
+    )

@@ -1,0 +1,391 @@
+"""Damage to labels, as segmentations show it, at known places of any hippocampal body.
+
+Places are given in sheet coordinates of the undamaged body, so that the same defect can be put
+into a phantom and into a real segmentation.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from hipsta_bids.errors import SettingsError
+from hipsta_bids.protocols.protocol import Part, Tissue
+from hipsta_bids.types import Bool, Float, LabelVolume, Sheet
+
+# A hippocampal body with known places on its sheet, whose labels can be changed.
+
+
+Place = tuple[float, float]
+"""Sheet coordinates (u, v), each from 0 to 1: medial to lateral, posterior to anterior."""
+
+#: Refinement of the sheet's grid along x, y and z, so that its points lie closer than voxels.
+_FINER = (3, 3, 2)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Defect:
+    """A damaged segmentation."""
+
+    volume: LabelVolume
+    changed: Float
+    """(N, 3) centers of the changed voxels, RAS mm (where the undamaged image has them)."""
+
+
+class Site:
+    """A body whose labels can be damaged.
+
+    Parameters
+    ----------
+    volume : LabelVolume
+        Undamaged labels.
+    sheet : Sheet
+        Measured in them; it tells where (u, v) is.
+    """
+
+    def __init__(self, volume: LabelVolume, sheet: Sheet) -> None:
+        self.volume = volume
+        self.columns = _refined(sheet.points)
+        index = np.indices(volume.tissue.shape).reshape(3, -1).T
+        points = index @ volume.affine[:3, :3].T + volume.affine[:3, 3]
+        self.points: Float = points.reshape(*volume.tissue.shape, 3)
+        owners = (*volume.scheme.sheet, *volume.scheme.layer)
+        self.wall: Bool = np.isin(volume.tissue, owners)
+        """(I, J, K) voxels that become the ribbon, anywhere along the hippocampus."""
+        ends = sheet.points[:, [0, -1]].mean(axis=(0, 2))
+        self.axis: Float = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+        """(3,) unit vector from posterior to anterior."""
+        self.length = float(np.linalg.norm(ends[1] - ends[0]))
+        """mm between the middles of the two end planes."""
+        along = (self.points - ends[0]) @ self.axis
+        self.v: Float = along / self.length
+        """(I, J, K) share of the way from the posterior to the anterior end."""
+        body = self.wall & (self.v > -0.2) & (self.v < 1.2)  # noqa: PLR2004 -- oblique ends too
+        self.voxels = np.argwhere(body)
+        """(N, 3) indices of the wall's voxels in and near the body."""
+        count = np.array(self.columns.shape[:2])
+        tree = cKDTree(self.columns.reshape(-1, 3))
+        _, nearest = tree.query(self.points[body])
+        column = np.unravel_index(nearest, self.columns.shape[:3])[:2]
+        self.sheet_place: Float = np.stack(column, axis=1) / (count - 1)
+        """(N, 2) sheet coordinates of these voxels."""
+
+    def column(self, place: Place) -> Float:
+        """Points (Nz, 3), RAS mm, of the column at a place, interior to exterior."""
+        count = np.array(self.columns.shape[:2])
+        i, j = np.rint(np.array(place) * (count - 1)).astype(int)
+        return np.asarray(self.columns[i, j])
+
+    def normal(self, place: Place) -> Float:
+        """Find the unit vector (3,) from interior to exterior."""
+        column = self.column(place)
+        return np.asarray((column[-1] - column[0]) / np.linalg.norm(column[-1] - column[0]))
+
+    def beside(self, place: Place, distance: float) -> Float:
+        """Point (3,) at a distance (mm) outside the exterior wall; inside of it if negative."""
+        return np.asarray(self.column(place)[-1] + distance * self.normal(place))
+
+    def within(self, points: Float, radius: float) -> Bool:
+        """Voxels (I, J, K) within a radius (mm) of any of (N, 3) points."""
+        low, high = points.min(axis=0) - radius, points.max(axis=0) + radius
+        box = ((self.points >= low) & (self.points <= high)).all(axis=-1)
+        found = np.zeros(box.shape, dtype=bool)
+        distance, _ = cKDTree(points).query(self.points[box])
+        found[box] = distance <= radius
+        return found
+
+    def among(self, chosen: Bool) -> Bool:
+        """Voxels (I, J, K) of the wall chosen by a mask (N,) over :attr:`voxels`."""
+        found = np.zeros(self.wall.shape, dtype=bool)
+        found[tuple(self.voxels[chosen].T)] = True
+        return found
+
+    def slab(self, place: Place, thickness: float) -> Bool:
+        """Voxels (I, J, K) of whole cross-sections, ``thickness`` mm along the axis."""
+        return np.abs(self.v - place[1]) * self.length <= thickness / 2
+
+    def erased(self, where: Bool) -> Defect:
+        """Turn voxels into background."""
+        return self.relabeled(where, Tissue.BACKGROUND, Part.UNKNOWN)
+
+    def relabeled(self, where: Bool, tissue: Tissue | None, part: Part) -> Defect:
+        """Give voxels another label; ``None`` keeps the tissue."""
+        old = self.volume
+        codes = old.tissue if tissue is None else np.where(where, np.uint8(tissue), old.tissue)
+        parts = np.where(where, np.uint8(part), old.part)
+        changed = (codes != old.tissue) | (parts != old.part)
+        return Defect(volume=replace(old, tissue=codes, part=parts), changed=self.points[changed])
+
+    def added(self, where: Bool, place: Place) -> Defect:
+        """Give voxels outside the wall the label of the wall at a place."""
+        middle = self.column(place)[len(self.columns[0, 0]) // 2]
+        nearest = np.argmin(np.linalg.norm(self.points[self.wall] - middle, axis=1))
+        tissue = Tissue(int(self.volume.tissue[self.wall][nearest]))
+        part = Part(int(self.volume.part[self.wall][nearest]))
+        return self.relabeled(where & ~self.wall, tissue, part)
+
+
+def _refined(points: Float) -> NDArray[np.float64]:
+    """Refine the sheet's grid linearly, (Nx, Ny, Nz, 3) to a denser one."""
+    nodes = [
+        np.linspace(0, n - 1, (n - 1) * by + 1)
+        for n, by in zip(points.shape[:3], _FINER, strict=True)
+    ]
+    where = np.stack(np.meshgrid(*nodes, indexing="ij"))
+    filled = np.where(np.isfinite(points), points, np.nanmean(points, axis=(0, 1), keepdims=True))
+    return np.stack(
+        [ndimage.map_coordinates(filled[..., k], where, order=1) for k in range(3)], axis=-1
+    )
+
+
+#: mm beyond either wall up to which a hole is cut, so that it opens on both sides.
+_THROUGH = 1.0
+
+
+def make_defect(site: Site, kind: str, size: float, place: Place = (0.5, 0.5)) -> Defect:
+    """Damage a segmentation.
+
+    Parameters
+    ----------
+    site : Site
+    kind : str
+        One of :data:`DEFECTS`.
+    size : float
+        mm; what it measures is in the kind's own description.
+    place : tuple of float
+        Where on the sheet, (u, v).
+
+    Raises
+    ------
+    SettingsError
+        If the kind is unknown, or makes no change at this size and place.
+    """
+    if kind not in DEFECTS:
+        raise SettingsError(
+            f"defect {kind!r} is unknown; choose one of {', '.join(DEFECTS)}", reason="defect-kind"
+        )
+    defect = DEFECTS[kind](site, size, place)
+    if not len(defect.changed):
+        raise SettingsError(
+            f"defect {kind} of size {size:g} at {place} changes no voxel: make it larger",
+            reason="defect-empty",
+        )
+    return defect
+
+
+def _hole(site: Site, size: float, place: Place) -> Defect:
+    """Open a round hole through the wall; size is its radius."""
+    column, normal = site.column(place), site.normal(place)
+    line = np.vstack(
+        [
+            column,
+            column[-1] + np.linspace(0, _THROUGH, 5)[:, None] * normal,
+            column[0] - np.linspace(0, _THROUGH, 5)[:, None] * normal,
+        ]
+    )
+    return site.erased(site.wall & site.within(line, size))
+
+
+def _cavity(site: Site, size: float, place: Place) -> Defect:
+    """Hollow the wall out; size is the radius."""
+    middle = site.column(place).mean(axis=0, keepdims=True)
+    return site.erased(site.wall & site.within(middle, size))
+
+
+def _bridge_across(site: Site, size: float, places: tuple[Place, Place]) -> Defect:
+    """Join the interior sides of two places by a bar; size is its radius."""
+    first, last = (site.column(place)[0] for place in places)
+    bar = first + np.linspace(0, 1, 101)[:, None] * (last - first)
+    return site.added(site.within(bar, size), places[0])
+
+
+def _bridge_far(site: Site, size: float, place: Place) -> Defect:
+    """Join CA3 to the subiculum; size is the bar's radius, and only v counts of the place."""
+    return _bridge_across(site, size, ((0.92, place[1]), (0.2, place[1])))
+
+
+def _bridge_near(site: Site, size: float, place: Place) -> Defect:
+    """Join two places of CA1 by a bar; size is its radius, and only v counts of the place."""
+    return _bridge_across(site, size, ((0.72, place[1]), (0.4, place[1])))
+
+
+def _island(site: Site, size: float, place: Place) -> Defect:
+    """Add a ball that touches nothing; size is its radius."""
+    middle = site.beside(place, size + 1.0)[None]
+    return site.added(site.within(middle, size), place)
+
+
+def _salt(site: Site, size: float, place: Place) -> Defect:
+    """Flip voxels at random, the wall's and those within 1.5 mm; size is their share."""
+    generator = np.random.default_rng(round(1000 * size + 100 * place[0] + 10 * place[1]))
+    spots = generator.random(site.wall.shape) < size
+    near = site.within(site.columns.reshape(-1, 3), 1.5)
+    hit = spots & near
+    added = site.added(hit, place)
+    tissue = np.where(hit & site.wall, np.uint8(Tissue.BACKGROUND), added.volume.tissue)
+    return Defect(volume=replace(added.volume, tissue=tissue), changed=site.points[hit])
+
+
+def _protrusion(site: Site, size: float, place: Place) -> Defect:
+    """Let a spike 2.5 mm long stand on the exterior wall; size is its radius."""
+    spike = np.array([site.beside(place, step) for step in np.linspace(-0.3, 2.5, 15)])
+    return site.added(site.within(spike, size), place)
+
+
+def _leak(site: Site, size: float, place: Place) -> Defect:
+    """Let the label leak out of the exterior wall as a ball; size is its radius."""
+    return site.added(site.within(site.beside(place, 0.6 * size)[None], size), place)
+
+
+def _slit(site: Site, size: float, place: Place) -> Defect:
+    """Slit the wall along 4 mm of the long axis; size is the slit's width."""
+    return site.erased(_gap_voxels(site, size, place[0]) & site.slab(place, 4.0))
+
+
+def _gap(site: Site, size: float, place: Place) -> Defect:
+    """Part two neighboring subfields from end to end; size is the gap's width."""
+    return site.erased(_gap_voxels(site, size, place[0]))
+
+
+def _gap_voxels(site: Site, width: float, u: float) -> Bool:
+    """Voxels of the wall within half a width of the columns at ``u``, and beyond both ends."""
+    row = round(u * (site.columns.shape[0] - 1))
+    cut = site.columns[row]
+    over = np.linspace(0.0, 0.5 * site.length, 20)[:, None, None] * site.axis
+    longer = [cut.reshape(-1, 3), (cut[-1] + over).reshape(-1, 3), (cut[0] - over).reshape(-1, 3)]
+    return site.wall & site.within(np.vstack(longer), 0.5 * width)
+
+
+def _missing_subfield(site: Site, size: float, place: Place) -> Defect:
+    """Erase the subfield at the place; size is of no account."""
+    del size
+    middle = site.column(place)[site.columns.shape[2] // 2]
+    own = np.isin(site.volume.tissue, site.volume.scheme.sheet)
+    nearest = np.argmin(np.linalg.norm(site.points[own] - middle, axis=1))
+    return site.erased(site.volume.tissue == site.volume.tissue[own][nearest])
+
+
+def _missing_slices(site: Site, size: float, place: Place) -> Defect:
+    """Erase all labels in the image's own slices; size is the thickness of the gap."""
+    linear = site.volume.affine[:3, :3]
+    edges = np.linalg.norm(linear, axis=0)
+    across = int(np.argmax(np.abs(site.axis @ (linear / edges))))
+    middle = site.column(place).mean(axis=0)
+    index = np.linalg.solve(linear, middle - site.volume.affine[:3, 3])[across]
+    number = np.arange(site.wall.shape[across])
+    half = max(0.5 * size / float(edges[across]), 0.5)
+    chosen = np.abs(number - index) <= half
+    shape = [1, 1, 1]
+    shape[across] = -1
+    gone = np.broadcast_to(chosen.reshape(shape), site.wall.shape)
+    return site.erased(gone & (site.volume.tissue > 0))
+
+
+def _tail_inside(site: Site, size: float, place: Place) -> Defect:
+    """Label cross-sections in the middle as tail; size is their thickness."""
+    return _part_inside(site, size, place, Part.TAIL)
+
+
+def _head_inside(site: Site, size: float, place: Place) -> Defect:
+    """Label cross-sections in the middle as head; size is their thickness."""
+    return _part_inside(site, size, place, Part.HEAD)
+
+
+def _part_inside(site: Site, size: float, place: Place, part: Part) -> Defect:
+    where = site.slab(place, size) & (site.volume.tissue > 0)
+    whole = any(
+        label.part is part and label.tissue is Tissue.HIPPOCAMPUS
+        for label in site.volume.scheme.labels
+    )
+    return site.relabeled(where, Tissue.HIPPOCAMPUS if whole else None, part)
+
+
+def _cut_short(site: Site, size: float, place: Place) -> Defect:
+    """Erase all from a cross-section on to the front; size is what stays of the body, mm."""
+    del place
+    return site.erased((site.v * site.length > size) & (site.volume.tissue > 0))
+
+
+def _notch(site: Site, size: float, place: Place) -> Defect:
+    """Erase the ribbon lateral of the place; size is the notch's length along the axis."""
+    lateral = site.among(site.sheet_place[:, 0] > place[0])
+    return site.erased(lateral & site.slab(place, size))
+
+
+def _waist(site: Site, size: float, place: Place) -> Defect:
+    """Peel voxels off the wall over 4 mm of the long axis; size is the depth on each side."""
+    depth = ndimage.distance_transform_edt(
+        site.wall, sampling=np.linalg.norm(site.volume.affine[:3, :3], axis=0)
+    )
+    return site.erased(site.wall & (depth <= size) & site.slab(place, 4.0))
+
+
+def _wrong_voxels(site: Site, size: float, place: Place) -> Defect:
+    """Stretch the voxels across the long axis, as a wrong header does; size is the factor.
+
+    The image keeps its labels; what changes is where they lie.
+    """
+    del place
+    affine = site.volume.affine.copy()
+    edges = np.linalg.norm(affine[:3, :3], axis=0)
+    along = np.abs(site.axis @ (affine[:3, :3] / edges))
+    affine[:, int(np.argmin(along))] *= size
+    return Defect(volume=replace(site.volume, affine=affine), changed=site.points[site.wall])
+
+
+def _at_border(site: Site, size: float, place: Place) -> Defect:
+    """Let the image end inside the body; size is what it loses of it, mm (0: it just touches)."""
+    del place
+    linear = site.volume.affine[:3, :3]
+    edges = np.linalg.norm(linear, axis=0)
+    across = int(np.argmin(np.abs(site.axis @ (linear / edges))))
+    last = int(site.voxels[:, across].max()) - round(size / float(edges[across]))
+    keep: list[slice] = [slice(None)] * 3
+    keep[across] = slice(0, last + 1)
+    box = tuple(keep)
+    lost = np.ones(site.wall.shape, dtype=bool)
+    lost[box] = False
+    rim = np.zeros(site.wall.shape, dtype=bool)
+    keep[across] = slice(last, last + 1)
+    rim[tuple(keep)] = True
+    return Defect(
+        volume=replace(site.volume, tissue=site.volume.tissue[box], part=site.volume.part[box]),
+        changed=site.points[(lost | rim) & site.wall],
+    )
+
+
+def _ends_flush(site: Site, size: float, place: Place) -> Defect:
+    """Erase head and tail, so that the labels end where the body does; size is of no account."""
+    del size, place
+    return site.erased(np.isin(site.volume.part, (Part.HEAD, Part.TAIL)))
+
+
+#: How each kind of damage is done. The first line of each function says what its size means.
+DEFECTS: Mapping[str, Callable[[Site, float, Place], Defect]] = MappingProxyType(
+    {
+        "hole": _hole,
+        "cavity": _cavity,
+        "bridge-ca3-subiculum": _bridge_far,
+        "bridge-ca1-ca1": _bridge_near,
+        "island": _island,
+        "salt": _salt,
+        "protrusion": _protrusion,
+        "leak": _leak,
+        "slit": _slit,
+        "gap": _gap,
+        "missing-subfield": _missing_subfield,
+        "missing-slices": _missing_slices,
+        "tail-inside": _tail_inside,
+        "head-inside": _head_inside,
+        "cut-short": _cut_short,
+        "notch": _notch,
+        "waist": _waist,
+        "wrong-voxels": _wrong_voxels,
+        "at-border": _at_border,
+        "ends-flush": _ends_flush,
+    }
+)

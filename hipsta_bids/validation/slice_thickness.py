@@ -1,0 +1,420 @@
+"""``hipsta-bids surrogate``: thickness in single slices, to cross-check that of the mesh."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hipsta_bids.derivatives import dataset, hemisphere
+from hipsta_bids.derivatives.hemisphere import ResultPlace
+from hipsta_bids.derivatives.names import HemisphereName
+from hipsta_bids.errors import (
+    ExitCode,
+    GeometryError,
+    HipstaError,
+    InputError,
+    OutputError,
+    SchemeError,
+)
+from hipsta_bids.geometry.body import extract_body
+from hipsta_bids.geometry.surrogate import (
+    SurrogateProfile,
+    agreement,
+    compare_nearby,
+    surrogate_profiles,
+)
+from hipsta_bids.inputs.labels import read_label_volume
+from hipsta_bids.inputs.request import HemisphereInput
+from hipsta_bids.inputs.search import InputRequest, find_hemispheres
+from hipsta_bids.io import files
+from hipsta_bids.participant.measure import measure_hemisphere
+from hipsta_bids.phantom import Phantom, PhantomSpec
+from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.settings import Settings
+from hipsta_bids.types import Float
+from hipsta_bids.validation.cases import Refusal, run_cases
+from hipsta_bids.validation.report import Cell, Picture, Suite, Table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+#: Columns of the table: definition and unit.
+COLUMNS: dict[str, tuple[str, str | None]] = {
+    "slice": ("where the slice is, fraction of the body's length from its posterior end", None),
+    "sampling": (
+        "proportional: where the sheet has its nodes along x; equidistant: in equal steps",
+        None,
+    ),
+    "point": ("number along the medial axis, 1 nearest to the medial rim", None),
+    "fraction": ("place on the medial axis, 0 at the medial and 1 at the lateral rim", None),
+    "distance": ("from the medial rim along the medial axis", "mm"),
+    "r": ("position on the medial axis, scanner RAS, left to right", "mm"),
+    "a": ("position on the medial axis, scanner RAS, posterior to anterior", "mm"),
+    "s": ("position on the medial axis, scanner RAS, inferior to superior", "mm"),
+    "thickness": ("distances to the closest points of the contour on both sides, added", "mm"),
+    "thickness_mesh": ("thickness of the sheet nearby, if the participant level has run", "mm"),
+}
+
+_DIGITS = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Sheet:
+    """What the participant level wrote."""
+
+    points: Float
+    """(M, 3) RAS mm."""
+    thickness: Float
+    """(M,) mm."""
+
+
+def crosscheck(
+    items: Sequence[HemisphereInput],
+    out_dir: Path,
+    settings: Settings,
+    say: Callable[[str], None],
+    complain: Callable[[str], None],
+) -> ExitCode:
+    """Measure hemispheres in single slices and write one table each.
+
+    Parameters
+    ----------
+    items : sequence of HemisphereInput
+    out_dir : Path
+        The output dataset; with results of the participant level, those are compared.
+    settings : Settings
+    say, complain : callable
+        Receive one line per hemisphere that succeeded or failed.
+
+    Returns
+    -------
+    ExitCode
+        As at the participant level: failed hemispheres do not stop the others.
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written.
+    SettingsError
+        If the folder holds results with other settings.
+    UsageError
+        If it is a dataset of other software.
+    """
+    dataset.check_not_foreign(out_dir)
+    files.check_writable(out_dir)
+    dataset.settle_settings(out_dir, settings)
+    sources = dataset.source_names((item.source, item.source_path) for item in items)
+    dataset.write_description(out_dir, sources)
+    errors = []
+    for item in items:
+        place = _place(item, out_dir)
+        files.remove([place.path("surrogate"), place.path("surrogate_sidecar")])
+        title = f"{place.name.stem}_seg-{place.name.seg}"
+        try:
+            for line in _measure(item, place, settings):
+                say(f"{title}  {line}")
+        except OutputError:
+            raise
+        except HipstaError as error:
+            errors.append(error)
+            complain(f"{title}  failed  [{error.reason}] {error}")
+    if not errors:
+        return ExitCode.OK
+    bad = all(isinstance(error, (InputError, SchemeError)) for error in errors)
+    return ExitCode.BAD_DATA if bad and len(errors) == len(items) else ExitCode.SOME_FAILED
+
+
+def _place(item: HemisphereInput, out_dir: Path) -> ResultPlace:
+    name = HemisphereName(
+        subject=item.subject, session=item.session, hemi=item.hemi, seg=item.scheme.name
+    )
+    return ResultPlace(root=out_dir, name=name)
+
+
+def _measure(item: HemisphereInput, place: ResultPlace, settings: Settings) -> Iterator[str]:
+    """Measure one hemisphere, write its table, and give a line per slice."""
+    body = extract_body(read_label_volume(item), replace(settings.body, region="body"))
+    sheet = _read_sheet(place)
+    rows: list[list[str]] = []
+    lines = []
+    for position in settings.surrogate.positions:
+        profiles = surrogate_profiles(body, position, settings.sheet, settings.surrogate)
+        mesh = [_mesh_thickness(profile, sheet, settings) for profile in profiles]
+        rows += [
+            row
+            for profile, beside in zip(profiles, mesh, strict=True)
+            for row in _rows(profile, beside)
+        ]
+        lines.append(_line(profiles[0], mesh[0]))
+    files.write_tsv(place.path("surrogate"), list(COLUMNS), rows)
+    files.write_json(
+        place.path("surrogate_sidecar"),
+        {
+            name: {"Description": text} | ({"Units": unit} if unit else {})
+            for name, (text, unit) in COLUMNS.items()
+        },
+    )
+    yield from lines
+
+
+def _read_sheet(place: ResultPlace) -> _Sheet | None:
+    """Read the sheet that the participant level measured, if it did."""
+    with suppress(InputError):
+        rows = files.read_tsv(place.path("sheet"))
+        columns = {
+            name: np.array([np.nan if row[name] == files.MISSING else row[name] for row in rows])
+            for name in ("r", "a", "s", "thickness")
+        }
+        values = {name: column.astype(np.float64) for name, column in columns.items()}
+        return _Sheet(
+            points=np.stack([values["r"], values["a"], values["s"]], axis=-1),
+            thickness=values["thickness"],
+        )
+    return None
+
+
+def _mesh_thickness(profile: SurrogateProfile, sheet: _Sheet | None, settings: Settings) -> Float:
+    if sheet is None:
+        return np.full(len(profile.points), np.nan)
+    return compare_nearby(profile.points, sheet.points, sheet.thickness, settings.surrogate.reach)
+
+
+def _rows(profile: SurrogateProfile, mesh: Float) -> Iterator[list[str]]:
+    columns = [
+        hemisphere.format_column(values, _DIGITS)
+        for values in (
+            profile.fraction,
+            profile.distance,
+            *profile.points.T,
+            profile.thickness,
+            mesh,
+        )
+    ]
+    for number, cells in enumerate(zip(*columns, strict=True), start=1):
+        yield [f"{profile.position:g}", profile.sampling, str(number), *cells]
+
+
+def _line(profile: SurrogateProfile, mesh: Float) -> str:
+    line = f"slice at {profile.position:.0%}: mean thickness {profile.thickness.mean():.3f} mm"
+    found = agreement(profile.thickness, mesh)
+    if not found.count:
+        return f"{line} (no sheet to compare with)"
+    return (
+        f"{line}, {found.difference:+.3f} mm to the sheet, r {found.correlation:.2f},"
+        f" slope {found.slope:.2f} at {found.count} points"
+    )
+
+
+# The surrogate without a mesh against the mesh: two ways to thickness that share labels only.
+
+
+POSITIONS = (0.25, 0.5, 0.75)
+"""Of the slices, fractions of the body's length."""
+
+LEAST_CORRELATION = 0.9
+"""Of surrogate and mesh, on phantoms of varying thickness."""
+
+PHANTOMS = (
+    PhantomSpec(kind="spiral", thickness=2.0, variation=0.3),
+    PhantomSpec(kind="arc", thickness=2.0, variation=0.3),
+    PhantomSpec(kind="s-shape", thickness=2.0, variation=0.3),
+    PhantomSpec(kind="tight", thickness=1.6, variation=0.3),
+    PhantomSpec(kind="spiral", thickness=1.2, variation=0.3),
+)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Compared:
+    """Thickness at the same places, by slice; all arrays (slices, N), mm."""
+
+    fraction: Float
+    """Of the medial axis, 0 at the medial rim."""
+    surrogate: Float
+    mesh: Float
+    truth: Float
+    """NaN where it is not known."""
+    equidistant: tuple[tuple[Float, Float], ...]
+    """Fraction and thickness of the other sampling, by slice."""
+    problems: tuple[str, ...]
+    """Of slices that the surrogate refused."""
+
+
+def run(full: bool, labels: Path | None = None) -> Suite:
+    """Compare on phantoms and, where there are any, on real segmentations.
+
+    Parameters
+    ----------
+    full : bool
+        All phantoms instead of one.
+    labels : Path, optional
+        A BIDS dataset with segmentations.
+
+    Returns
+    -------
+    Suite
+    """
+    bodies: list[PhantomSpec | HemisphereInput] = list(PHANTOMS if full else PHANTOMS[:1])
+    if labels is not None:
+        bodies += [
+            item for item in find_hemispheres(InputRequest(bids_dir=labels)) if not item.problem
+        ]
+    results = run_cases(compare_body, bodies)
+    shown = [(_name(b), r) for b, r in zip(bodies, results, strict=True) if isinstance(r, Compared)]
+    pictured = [*shown[:2], *shown[len(PHANTOMS if full else PHANTOMS[:1]) :][:2]]
+    return Suite(
+        name="surrogate",
+        title="Thickness without a mesh",
+        text=_TEXT.format(slices=", ".join(f"{p:.0%}" for p in POSITIONS)),
+        tables=(_table(bodies, results),),
+        pictures=(_picture(pictured),) if pictured else (),
+    )
+
+
+def compare_body(body: PhantomSpec | HemisphereInput) -> Compared:
+    """Measure one body both ways.
+
+    Raises
+    ------
+    GeometryError
+        If the mesh is refused.
+    """
+    settings = Settings()
+    phantom = Phantom(body) if isinstance(body, PhantomSpec) else None
+    if isinstance(body, PhantomSpec):
+        volume, hemi = Phantom(body).label_volume(load_scheme("freesurfer"), hemi="L"), "L"
+    else:
+        volume, hemi = read_label_volume(body), body.hemi
+    maps = measure_hemisphere(volume, hemi, settings, lambda _: nullcontext())
+    middle = maps.sheet.points[:, :, maps.sheet.middle].reshape(-1, 3)
+    merged = extract_body(volume, settings.body)
+    columns: list[tuple[Float, Float, Float, Float]] = []
+    others, problems = [], []
+    for position in POSITIONS:
+        try:
+            even, steps = surrogate_profiles(merged, position, settings.sheet, settings.surrogate)
+        except GeometryError as error:
+            problems.append(error.reason)
+            continue
+        mesh = compare_nearby(even.points, middle, maps.thickness.ravel(), settings.surrogate.reach)
+        columns.append((even.fraction, even.thickness, mesh, _truth(phantom, even.points)))
+        others.append((steps.fraction, steps.thickness))
+    stacked = np.array(columns).reshape(len(columns), 4, settings.sheet.x_nodes)
+    return Compared(
+        fraction=stacked[:, 0],
+        surrogate=stacked[:, 1],
+        mesh=stacked[:, 2],
+        truth=stacked[:, 3],
+        equidistant=tuple(others),
+        problems=tuple(problems),
+    )
+
+
+def _truth(phantom: Phantom | None, points: Float) -> Float:
+    """Look up true thickness (N,) beside points; NaN outside of the phantom's rims."""
+    if phantom is None:
+        return np.full(len(points), np.nan)
+    u, v, _ = phantom.body.locate(points).T
+    inside = np.isfinite(u)
+    found = phantom.truth(np.where(inside, u, 0.5), np.where(inside, v, 0.5))
+    return np.where(inside, found.thickness, np.nan)
+
+
+def _name(body: PhantomSpec | HemisphereInput) -> str:
+    if isinstance(body, PhantomSpec):
+        return f"{body.kind} {body.thickness:g} mm, ±{body.variation:.0%}"
+    return f"sub-{body.subject} {body.hemi} ({body.scheme.name})"
+
+
+def _table(
+    bodies: Sequence[PhantomSpec | HemisphereInput], results: Sequence[Compared | Refusal]
+) -> Table:
+    rows: list[tuple[Cell, ...]] = []
+    for body, result in zip(bodies, results, strict=True):
+        is_phantom = isinstance(body, PhantomSpec)
+        target = f"r ≥ {LEAST_CORRELATION}" if is_phantom else "n/a"
+        if isinstance(result, Refusal):
+            rows.append(
+                (_name(body), result.reason, *[None] * 6, target, False if is_phantom else None)
+            )
+            continue
+        pair = agreement(result.surrogate.ravel(), result.mesh.ravel())
+        true = agreement(result.surrogate.ravel(), result.truth.ravel())
+        met = bool(pair.correlation >= LEAST_CORRELATION) if is_phantom else None
+        rows.append(
+            (
+                _name(body),
+                "; ".join(result.problems) or f"{len(result.surrogate)} slices",
+                pair.correlation,
+                pair.slope,
+                pair.difference,
+                pair.deviation,
+                true.correlation if is_phantom else None,
+                true.slope if is_phantom else None,
+                target,
+                met,
+            )
+        )
+    return Table(
+        title="Surrogate against mesh",
+        columns=(
+            "body",
+            "slices",
+            "r",
+            "slope",
+            "difference, mm",
+            "SD, mm",
+            "r with truth",
+            "slope on truth",
+            "target",
+            "met",
+        ),
+        rows=tuple(rows),
+        notes=_NOTES,
+    )
+
+
+def _picture(shown: Sequence[tuple[str, Compared]]) -> Picture:
+    def draw(figure: "Figure") -> None:
+        axes = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
+        for axis, (name, result) in zip(axes, shown, strict=True):
+            k = len(result.surrogate) // 2
+            x = result.fraction[k]
+            if np.isfinite(result.truth[k]).any():
+                axis.plot(x, result.truth[k], color="0.6", linewidth=3, label="truth")
+            axis.plot(x, result.mesh[k], "C0-", label="mesh")
+            axis.plot(x, result.surrogate[k], "C1o", markersize=3, label="proportional")
+            axis.plot(*result.equidistant[k], "C3+", markersize=5, label="equidistant")
+            axis.set_title(name, fontsize="small")
+            axis.set_xlabel("place on the medial axis")
+        axes[0].set_ylim(bottom=0)
+        axes[0].set_ylabel("thickness, mm")
+        axes[0].legend(fontsize="small")
+
+    return Picture(
+        name="surrogate",
+        caption="Thickness from medial (0) to lateral (1) in the middle slice: of the mesh, and of"
+        " the surrogate with proportional and equidistant sampling. At the rims the closest points"
+        " lie on the rounded ends.",
+        draw=draw,
+        size=(3.0 * max(len(shown), 2), 3.2),
+    )
+
+
+_TEXT = """\
+`hipsta-bids surrogate` measures thickness in single slices from the medial axis of the labels and
+the closest points of their outline on both sides, without a mesh (here at {slices} of the body's
+length). It shares the labels with the mesh and nothing else: a thickening that both show lies in
+the labels, one that the mesh alone shows does not.
+"""
+
+_NOTES = """\
+Phantoms in voxels of 0.4 mm. At each point of the proportional sampling, the mesh's thickness is
+that of the mid-surface nearby. Slope: of the surrogate on the other, by least squares over all
+slices. The surrogate is measured in the plane of the slice: where the wall is oblique to it, as in
+real bodies, it reads more than a line straight through the wall. It repairs nothing: where labels
+touch across a fold it reads the sum of both walls, or finds a loop and refuses the slice.
+"""

@@ -1,0 +1,150 @@
+import json
+import multiprocessing
+from dataclasses import dataclass, field
+
+import pytest
+from stand_ins import make_scheme
+
+from hipsta_bids import __version__
+from hipsta_bids.derivatives import dataset
+from hipsta_bids.derivatives.names import DATASET_FILES
+from hipsta_bids.derivatives.status import COLUMNS, read_status, update_status, write_sidecar
+from hipsta_bids.errors import InputError, SettingsError, UsageError
+from hipsta_bids.settings import BodySettings, Settings
+
+
+def description(root):
+    return json.loads((root / "dataset_description.json").read_text())
+
+
+def test_description_has_what_the_standard_asks_for(tmp_path, monkeypatch):
+    monkeypatch.setenv("HIPSTA_BIDS_CONTAINER_TYPE", "docker")
+    monkeypatch.setenv("HIPSTA_BIDS_CONTAINER_TAG", "lab/hipsta_bids:1")
+    source = tmp_path / "in put"
+    source.mkdir()
+    (source / "dataset_description.json").write_text('{"DatasetDOI": "doi:10.1/x"}')
+    dataset.write_description(tmp_path / "out", {"freesurfer": source})
+    written = description(tmp_path / "out")
+    assert written["DatasetType"] == "derivative"
+    assert written["Name"]
+    assert written["BIDSVersion"]
+    (maker,) = written["GeneratedBy"]
+    assert maker["Name"] == "hipsta_bids"
+    assert maker["Version"] == __version__
+    assert maker["Container"] == {"Type": "docker", "Tag": "lab/hipsta_bids:1"}
+    assert written["SourceDatasets"] == [{"URL": source.as_uri(), "DOI": "doi:10.1/x"}]
+    assert "%20" in written["SourceDatasets"][0]["URL"]
+    assert written["DatasetLinks"] == {"freesurfer": source.as_uri()}
+    assert "*_morph.tsv" in (tmp_path / "out" / ".bidsignore").read_text().splitlines()
+
+
+def test_description_keeps_earlier_sources_and_needs_no_container(tmp_path, monkeypatch):
+    monkeypatch.delenv("HIPSTA_BIDS_CONTAINER_TYPE", raising=False)
+    for name in ("b", "a", "a"):
+        dataset.write_description(tmp_path / "out", {name: tmp_path / name})
+    urls = [entry["URL"] for entry in description(tmp_path / "out")["SourceDatasets"]]
+    assert urls == [(tmp_path / "a").as_uri(), (tmp_path / "b").as_uri()]
+    assert "Container" not in description(tmp_path / "out")["GeneratedBy"][0]
+
+
+def test_dataset_of_other_software_is_refused(tmp_path):
+    dataset.check_not_foreign(tmp_path)
+    path = tmp_path / "dataset_description.json"
+    path.write_text('{"GeneratedBy": [{"Name": "fMRIPrep"}]}')
+    with pytest.raises(UsageError, match="fMRIPrep"):
+        dataset.check_not_foreign(tmp_path)
+    path.write_text("{}")
+    with pytest.raises(UsageError, match="another kind"):
+        dataset.check_not_foreign(tmp_path)
+    dataset.write_description(tmp_path / "ours", {})
+    dataset.check_not_foreign(tmp_path / "ours")
+
+
+def test_other_settings_are_refused_by_name(tmp_path):
+    digest = dataset.settle_settings(tmp_path, Settings())
+    assert dataset.settle_settings(tmp_path, Settings()) == digest
+    other = Settings(body=BodySettings(layer_rule="nearest-label"))
+    with pytest.raises(
+        SettingsError, match=r"body\.layer_rule was nearest-sheet, now nearest-label"
+    ) as caught:
+        dataset.settle_settings(tmp_path, other)
+    assert "new output folder" in str(caught.value)
+    assert caught.value.exit_code == 64
+    (tmp_path / DATASET_FILES["settings"]).write_text("[")
+    with pytest.raises(InputError, match="JSON"):
+        dataset.settle_settings(tmp_path, Settings())
+
+
+def test_settings_of_another_version_are_refused_by_name(tmp_path):
+    @dataclass(frozen=True, kw_only=True)
+    class Newer(Settings):
+        extra: int = 3
+
+    @dataclass(frozen=True, kw_only=True)
+    class Plain:
+        body: BodySettings = field(default_factory=BodySettings)
+
+    dataset.settle_settings(tmp_path, Settings())
+    with pytest.raises(SettingsError, match="extra was not there, now 3"):
+        dataset.settle_settings(tmp_path, Newer())
+
+
+def test_sources_get_distinct_names(tmp_path):
+    a, b = tmp_path / "a", tmp_path / "b"
+    names = dataset.source_names([("free surfer", a), ("free surfer", b), ("free surfer", a)])
+    assert names == {"free-surfer": a, "free-surfer-2": b}
+    assert dataset.source_address(b / "x" / "y.mgz", names) == "bids:free-surfer-2:x/y.mgz"
+    assert dataset.source_address(tmp_path / "c", names) == str(tmp_path / "c")
+
+
+def test_citation_states_settings_and_protocols(tmp_path):
+    settings = Settings(body=BodySettings(layer_rule="nearest-label"))
+    dataset.write_citation(tmp_path, settings, [make_scheme()])
+    text = (tmp_path / "CITATION.md").read_text()
+    assert f"hipsta_bids {__version__}" in text
+    assert "the dentate gyrus and CA4 included" in text
+    assert "`body.layer_rule`: nearest-label" in text
+    for reference in ("120182", "BrainPrint", "TetGen", "10.21105/joss.01294", "Nobody N"):
+        assert reference in text
+    assert "{" not in text
+
+
+def row(subject, hemi="L", **more):
+    identity = {"subject": subject, "session": "n/a", "hemi": hemi, "seg": "x"}
+    return identity | {"status": "ok"} | more
+
+
+def test_status_rows_of_other_hemispheres_stay(tmp_path):
+    update_status(tmp_path, [row("sub-02", seconds_read="1.0"), row("sub-01")])
+    update_status(tmp_path, [row("sub-02", status="failed", seconds_mesh="2.0")])
+    rows = read_status(tmp_path)
+    assert [(r["subject"], r["status"]) for r in rows] == [("sub-01", "ok"), ("sub-02", "failed")]
+    assert list(rows[0]) == [*COLUMNS, "seconds_read", "seconds_mesh"]
+    assert rows[0]["reason"] == "n/a"
+
+
+def test_unreadable_status_is_rebuilt(tmp_path):
+    (tmp_path / "status.tsv").write_text("a\tb\n1\n")
+    update_status(tmp_path, [row("sub-01")])
+    assert len(read_status(tmp_path)) == 1
+
+
+def add_rows(folder, subject):
+    for session in range(20):
+        update_status(folder, [row(subject) | {"session": f"ses-{session}"}])
+
+
+def test_runs_side_by_side_lose_no_row(tmp_path):
+    context = multiprocessing.get_context("spawn")
+    runs = [context.Process(target=add_rows, args=(tmp_path, f"sub-{k}")) for k in range(2)]
+    for run in runs:
+        run.start()
+    for run in runs:
+        run.join()
+    assert len(read_status(tmp_path)) == 40
+
+
+def test_status_sidecar_defines_the_columns(tmp_path):
+    write_sidecar(tmp_path)
+    definitions = json.loads((tmp_path / "status.json").read_text())
+    assert set(COLUMNS) < set(definitions)

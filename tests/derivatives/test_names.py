@@ -1,0 +1,80 @@
+import json
+from fnmatch import fnmatch
+
+import pytest
+
+from hipsta_bids.derivatives.names import (
+    DATASET_FILES,
+    OUTPUTS,
+    HemisphereName,
+    ignore_patterns,
+    output_name,
+    output_path,
+)
+
+FULL = HemisphereName(subject="01", session="02", hemi="R", seg="freesurfer")
+
+
+@pytest.mark.parametrize(
+    ("key", "expected"),
+    [
+        ("sheet", "sub-01_ses-02_hemi-R_seg-freesurfer_desc-sheet_morph.tsv"),
+        ("sheet_sidecar", "sub-01_ses-02_hemi-R_seg-freesurfer_desc-sheet_morph.json"),
+        ("summary", "sub-01_ses-02_hemi-R_seg-freesurfer_desc-summary_morph.tsv"),
+        ("qc", "sub-01_ses-02_hemi-R_seg-freesurfer_desc-qc_metrics.json"),
+        ("interior_surface", "sub-01_ses-02_hemi-R_seg-freesurfer_interior.surf.gii"),
+        (
+            "midthickness_unfold",
+            "sub-01_ses-02_hemi-R_space-unfold_seg-freesurfer_midthickness.surf.gii",
+        ),
+        ("thickness", "sub-01_ses-02_hemi-R_seg-freesurfer_thickness.shape.gii"),
+        ("curvature", "sub-01_ses-02_hemi-R_seg-freesurfer_curv.shape.gii"),
+        (
+            "gaussian_curvature_interior",
+            "sub-01_ses-02_hemi-R_seg-freesurfer_desc-gaussianInterior_curv.shape.gii",
+        ),
+        ("sections", "sub-01_ses-02_hemi-R_seg-freesurfer_desc-sections_morph.tsv"),
+        ("subfields", "sub-01_ses-02_hemi-R_seg-freesurfer_dseg.label.gii"),
+        ("mesh", "sub-01_ses-02_hemi-R_seg-freesurfer_desc-tet_mesh.vtu"),
+    ],
+)
+def test_names_as_published(key, expected):
+    assert output_name(FULL, key) == expected
+    assert str(output_path(FULL, key)) == f"sub-01/ses-02/anat/{expected}"
+
+
+def test_no_session_leaves_no_trace():
+    name = HemisphereName(subject="01", session=None, hemi="L", seg="x")
+    assert str(output_path(name, "sheet")) == (
+        "sub-01/anat/sub-01_hemi-L_seg-x_desc-sheet_morph.tsv"
+    )
+
+
+def test_all_names_differ():
+    names = [output_name(FULL, output.key) for output in OUTPUTS]
+    assert len(set(names)) == len(names)
+    assert len({output.key for output in OUTPUTS}) == len(OUTPUTS)
+
+
+def test_quality_record_is_last():
+    assert OUTPUTS[-1].key == "qc"
+
+
+def test_entities_follow_the_standard():
+    schema = pytest.importorskip("bidsschematools.schema").load_schema()
+    short = [schema.objects.entities[entity].name for entity in schema.rules.entities]
+    for output in OUTPUTS:
+        entities = [
+            part.split("-")[0] for part in output_name(FULL, output.key).split("_") if "-" in part
+        ]
+        ranks = [short.index(entity) for entity in entities]
+        assert ranks == sorted(ranks), output.key
+
+
+def test_outputs_without_a_rule_are_ignored_by_validators():
+    patterns = ignore_patterns()
+    for output in OUTPUTS:
+        name = output_name(FULL, output.key)
+        assert any(fnmatch(name, pattern) for pattern in patterns) != output.in_standard, name
+    assert json.dumps(patterns).count("status.tsv") == 1
+    assert f"{DATASET_FILES['logs']}/" in patterns

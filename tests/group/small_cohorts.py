@@ -1,0 +1,91 @@
+"""Small cohorts of sheets as the participant level leaves them; nothing is measured."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+
+from hipsta_bids.derivatives import dataset
+from hipsta_bids.derivatives.hemisphere import ResultPlace, format_column
+from hipsta_bids.derivatives.names import HemisphereName
+from hipsta_bids.io import files
+from hipsta_bids.settings import Settings
+from hipsta_bids.validation.group import SimulationPlan, simulate_cohort
+
+NODES = (21, 7)
+PLAN = SimulationPlan(
+    sizes=(16, 14),
+    nodes=NODES,
+    effect=4.0,
+    center=(12.0, 3.0),
+    core=(1.0, 1.0),
+    taper=2.0,
+    shift=1.0,
+    warp_sd=(0.5, 0.25),
+)
+SETTINGS = replace(Settings(), sheet=replace(Settings().sheet, x_nodes=NODES[0], y_nodes=NODES[1]))
+COLUMNS = ["x", "y", "thickness", "curvature", "subfield"]
+GROUPS = ("CN", "AD")
+
+
+def place_of(root, subject, hemi, *, session=None, seg="demo"):
+    name = HemisphereName(subject=subject, session=session, hemi=hemi, seg=seg)
+    return ResultPlace(root=root, name=name)
+
+
+def write_hemisphere(place, thickness, curvature, *, volume=500.0, **record):
+    """Sheet, summary and quality record of one hemisphere."""
+    nx, ny = thickness.shape
+    x, y = np.divmod(np.arange(nx * ny), ny)
+    cells = [
+        [str(i + 1) for i in x],
+        [str(j + 1) for j in y],
+        format_column(thickness, 4),
+        format_column(curvature, 5),
+        ["Sub" if i < nx // 3 else "CA1" for i in x],
+    ]
+    files.write_tsv(place.path("sheet"), COLUMNS, zip(*cells, strict=True))
+    units = {"thickness": {"Units": "mm"}, "curvature": {"Units": "1/mm"}}
+    files.write_json(place.path("sheet_sidecar"), units)
+    mean = float(np.nanmean(thickness))
+    row = [f"{mean:.4f}", f"{volume:.4f}", "n/a"]
+    files.write_tsv(place.path("summary"), ["thickness_mean", "volume", "area_mid"], [row])
+    files.write_json(place.path("summary_sidecar"), {"volume": {"Units": "mm^3"}})
+    digest = json.loads((place.root / "desc-settings.json").read_text())["hash"]
+    content = {
+        "status": "ok",
+        "settings_hash": digest,
+        "version": "0.1.0",
+        "inputs": [{"file": f"bids:fs:sub-{place.name.subject}/mri/labels.mgz"}],
+        "metrics": {"filled_fraction": 0.0, "rule": "labels"},
+    }
+    files.write_json(place.path("qc"), content | record)
+
+
+def write_dataset(folder, *, session=None):
+    """A BIDS dataset and the participant level's output; the second group is thinner."""
+    data, out = folder / "bids", folder / "out"
+    out.mkdir(parents=True)
+    dataset.settle_settings(out, SETTINGS)
+    dataset.write_description(out, {"fs": folder / "fs"})
+    cohorts = {hemi: simulate_cohort(PLAN, seed) for seed, hemi in enumerate("LR")}
+    left = cohorts["L"]
+    rows = []
+    for i in range(len(left.age)):
+        subject = f"{i + 1:02d}"
+        for hemi, cohort in cohorts.items():
+            place = place_of(out, subject, hemi, session=session)
+            volume = 500 + 10 * np.sin(i) - 5 * left.group[i]
+            write_hemisphere(place, cohort.thickness[i], cohort.curvature[i], volume=volume)
+        sex = "F" if left.sex[i] else "M"
+        rows.append([f"sub-{subject}", GROUPS[int(left.group[i])], f"{left.age[i]:.1f}", sex])
+    write_participants(data, rows)
+    return data, out
+
+
+def write_participants(data, rows, columns=("participant_id", "group", "age", "sex")):
+    files.write_tsv(data / "participants.tsv", columns, rows)
+
+
+def read_participants(data):
+    return [list(row.values()) for row in files.read_tsv(data / "participants.tsv")]

@@ -1,0 +1,237 @@
+"""What the group level refuses: one line, the right code, and nothing half-written."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from small_cohorts import (
+    place_of,
+    read_participants,
+    write_dataset,
+    write_hemisphere,
+    write_participants,
+)
+
+from hipsta_bids.cli.main import main
+from hipsta_bids.derivatives.status import identity, update_status
+from hipsta_bids.io import files
+
+
+class Study(NamedTuple):
+    data: Path
+    out: Path
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("study")
+    write_dataset(folder)
+    return folder
+
+
+@pytest.fixture
+def study(written, tmp_path):
+    """A copy that may be spoiled."""
+    shutil.copytree(written, tmp_path / "study")
+    return Study(tmp_path / "study" / "bids", tmp_path / "study" / "out")
+
+
+def edit_record(place, **changes):
+    path = place.path("qc")
+    files.write_json(path, json.loads(path.read_text()) | changes)
+
+
+def no_groups(study):
+    rows = [row[:1] + row[2:] for row in read_participants(study.data)]
+    write_participants(study.data, rows, ("participant_id", "age", "sex"))
+
+
+def no_table(study):
+    (study.data / "participants.tsv").unlink()
+
+
+def twice(study):
+    rows = read_participants(study.data)
+    write_participants(study.data, [*rows, rows[0]])
+
+
+def huge_age(study):
+    rows = read_participants(study.data)
+    rows[3][2] = "1e300"
+    write_participants(study.data, rows)
+
+
+def no_age(study):
+    rows = read_participants(study.data)
+    write_participants(study.data, [[*row[:2], "n/a", row[3]] for row in rows])
+
+
+def other_people(study):
+    rows = read_participants(study.data)
+    write_participants(study.data, [[f"{row[0]}x", *row[1:]] for row in rows])
+
+
+def header_only(study):
+    write_participants(study.data, [])
+
+
+def other_encoding(study):
+    path = study.data / "participants.tsv"
+    path.write_bytes(path.read_text().replace("CN", "Contrôle").encode("latin-1"))
+
+
+def with_commas(study):
+    path = study.data / "participants.tsv"
+    path.write_text(path.read_text().replace("\t", ","))
+
+
+def column_twice(study):
+    rows = read_participants(study.data)
+    columns = ("participant_id", "group", "age", "age")
+    write_participants(study.data, rows, columns)
+
+
+def no_dataset(study):
+    shutil.rmtree(study.data)
+
+
+def text_age(study):
+    rows = read_participants(study.data)
+    rows[3][2] = "old"
+    write_participants(study.data, rows)
+
+
+def one_patient(study):
+    rows = read_participants(study.data)
+    write_participants(
+        study.data, [[row[0], "CN" if k else "AD", *row[2:]] for k, row in enumerate(rows)]
+    )
+
+
+def mixed_settings(study):
+    edit_record(place_of(study.out, "07", "R"), settings_hash="0" * 64)
+
+
+def other_grid(study):
+    path = place_of(study.out, "05", "L").path("sheet")
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join(lines[:-7]) + "\n")
+
+
+def no_sheet(study):
+    place_of(study.out, "05", "L").path("sheet").unlink()
+
+
+def unfinished(study):
+    row = identity(place_of(study.out, "99", "L").name)
+    update_status(study.out, [row | {"status": "failed", "reason": "not-finished"}])
+
+
+def second_protocol(study):
+    place = place_of(study.out, "01", "L", seg="other")
+    write_hemisphere(place, np.ones((21, 7)), np.ones((21, 7)))
+
+
+def all_failed(study):
+    for path in study.out.glob("sub-*/anat/*_metrics.json"):
+        files.write_json(path, {"status": "failed", "reason": "too-thin"})
+
+
+def no_values(study):
+    for path in study.out.glob("sub-*/anat/*hemi-L*_desc-sheet_morph.tsv"):
+        rows = [line.split("\t") for line in path.read_text().splitlines()]
+        rows[1:] = [[*row[:2], "n/a", *row[3:]] for row in rows[1:]]
+        path.write_text("\n".join("\t".join(row) for row in rows) + "\n")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "options", "code", "words"),
+    [
+        (no_groups, [], 65, "no column that tells groups"),
+        (no_table, [], 65, "no column that tells groups"),
+        (twice, [], 65, "sub-01 stand more than once"),
+        (text_age, [], 65, "sub-04"),
+        (huge_age, [], 65, "too large for rows sub-04"),
+        (no_age, ["--formula", "group + age"], 65, "missing are age (30)"),
+        (other_people, [], 65, "names none of the participants here"),
+        (header_only, [], 65, "has no rows"),
+        (other_encoding, [], 65, "no UTF-8 text"),
+        (with_commas, [], 65, "parted by tabs"),
+        (column_twice, [], 65, "'age' stands there more than once"),
+        (no_dataset, [], 65, "no such folder"),
+        (None, ["--formula", " "], 64, "--formula is empty"),
+        (None, ["--formula", "group + my age"], 65, "backticks"),
+        (None, ["--exclude", "nowhere.tsv"], 65, "no such file"),
+        (one_patient, [], 65, "AD (1)"),
+        (mixed_settings, [], 65, "sub-07_hemi-R"),
+        (other_grid, [], 65, "21 x 7 nodes"),
+        (no_sheet, [], 65, "sub-05_hemi-L"),
+        (unfinished, [], 65, "sub-99_hemi-L"),
+        (second_protocol, [], 65, "choose one by --seg"),
+        (all_failed, [], 66, "60 failed: too-thin"),
+        (no_values, [], 65, "no point of the thickness maps"),
+        (None, ["--seg", "nope"], 66, "there is demo"),
+        (None, ["--participant-label", "77"], 66, "no hemisphere as asked for"),
+        (None, ["--participant-label", "01", "02", "20", "21"], 65, "too few"),
+        (None, ["--formula", "group + aeg", "--contrast", "age"], 65, "did you mean age?"),
+        (None, ["--contrast", "group[XX]-group[CN]"], 65, "group[XX]"),
+        (None, ["--reference", "group=XX"], 65, "XX"),
+        (None, ["--formula", "group + age + I(2*age)"], 65, "combination"),
+        (None, ["--base", "volum"], 65, "did you mean volume?"),
+        (None, ["--exclude-qc", "filled_fracton > 1"], 64, "did you mean filled_fraction?"),
+        (None, ["--exclude-qc", "rule > 1"], 64, "cannot combine"),
+        (None, ["--model", "nowhere.json"], 65, "nowhere.json"),
+        (None, ["--template", "nowhere.json"], 65, "nowhere.json"),
+        (None, ["-d", "hipsta=/nowhere"], 65, "/nowhere"),
+        (None, ["--align", "fancy"], 64, "fancy"),
+        (None, ["--name", "../x"], 64, "../x"),
+    ],
+)
+def test_refused_in_one_line(study, capsys, spoil, options, code, words):  # noqa: PLR0917 -- cases
+    data, out = study
+    if spoil is not None:
+        spoil(study)
+    assert main([str(data), str(out), "group", *options]) == code
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert words in error
+    assert not list(out.glob("group/*"))
+    assert not list(out.glob("group/.*"))
+
+
+def test_failing_run_leaves_earlier_results(study):
+    data, out = study
+    kept = out / "group" / "group-age-sex" / "peaks.tsv"
+    files.write_text(kept, "earlier")
+    mixed_settings(study)
+    assert main([str(data), str(out), "group"]) == 65
+    assert kept.read_text() == "earlier"
+
+
+def test_same_subject_in_two_datasets_is_refused(written, study, tmp_path, capsys):
+    roots = [f"a={study.out}", f"b={written / 'out'}"]
+    arguments = [str(study.data), str(tmp_path / "o"), "group", "-d", *roots]
+    assert main(arguments) == 65
+    assert "different sites need different labels" in capsys.readouterr().err
+    assert not (tmp_path / "o").exists()
+
+
+def test_table_of_a_spreadsheet_is_read(study):
+    """With a byte order mark, line ends of Windows, and blanks round the labels."""
+    path = study.data / "participants.tsv"
+    text = path.read_text().replace("\n", "\r\n").replace("sub-02", "sub-02 ")
+    path.write_bytes(b"\xef\xbb\xbf" + text.encode())
+    assert main([str(study.data), str(study.out), "group", "--align", "none"]) == 0
+    left_out = (study.out / "group" / "group-age-sex" / "excluded.tsv").read_text()
+    assert left_out.count("\n") == 1
+
+
+def test_exclusions_of_nobody_are_told(study, tmp_path, capsys):
+    listed = tmp_path / "listed.tsv"
+    listed.write_text("participant_id\themi\nsub-77\tn/a\nsub-01\tL\n")
+    options = ["--align", "none", "--exclude", str(listed)]
+    assert main([str(study.data), str(study.out), "group", *options]) == 0
+    assert "not here, or not so, are sub-77" in capsys.readouterr().out

@@ -1,0 +1,295 @@
+"""Permutations, sessions and sides of the group level, from files to files."""
+
+import json
+
+import nibabel as nib
+import numpy as np
+import pandas as pd
+import pytest
+from pyarrow import parquet
+from scipy import stats
+from small_cohorts import NODES, PLAN, SETTINGS, place_of, write_dataset, write_hemisphere
+
+from hipsta_bids.cli.main import main
+from hipsta_bids.derivatives import dataset as derivative
+from hipsta_bids.group import write
+from hipsta_bids.io import files
+from hipsta_bids.reports.group import group_page
+from hipsta_bids.validation.group import simulate_cohort
+
+ALIGNED = ["--align", "none"]
+
+
+@pytest.fixture(autouse=True)
+def _no_figures(monkeypatch):
+    """Figures take longer than all else."""
+    monkeypatch.setattr(write, "draw_figures", lambda *_: iter(()))
+
+
+@pytest.fixture(scope="module")
+def quick(tmp_path_factory):
+    path = tmp_path_factory.mktemp("settings") / "group.toml"
+    path.write_text("[classification]\nrepeats = 2\nfolds = 3\n[multiplicity]\nseed = 3\n")
+    return ["--settings", str(path)]
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return write_dataset(tmp_path_factory.mktemp("one-session"))
+
+
+@pytest.fixture(scope="module")
+def sessions(tmp_path_factory):
+    """Three yearly sessions; patients' wall thins by 0.1 mm per year, that of others by 0.02."""
+    folder = tmp_path_factory.mktemp("sessions")
+    data, out = folder / "bids", folder / "out"
+    out.mkdir()
+    derivative.settle_settings(out, SETTINGS)
+    derivative.write_description(out, {"fs": folder / "fs"})
+    cohort = simulate_cohort(PLAN, 0)
+    random = np.random.default_rng(0)
+    rows = []
+    for i, patient in enumerate(cohort.group):
+        subject = f"{i + 1:02d}"
+        dates = []
+        for year, session in enumerate("123"):
+            for hemi in "LR":
+                place = place_of(out, subject, hemi, session=session)
+                noise = 0.02 * random.standard_normal(NODES)
+                wall = cohort.thickness[i] - (0.1 if patient else 0.02) * year + noise
+                bend = cohort.curvature[i] + 0.01 * random.standard_normal(NODES)
+                write_hemisphere(place, wall, bend, volume=500 - 5 * year + random.random())
+            dates.append([f"ses-{session}", f"20{10 + year}-03-0{1 + i % 9}T12:00:00"])
+        files.write_tsv(
+            data / f"sub-{subject}" / f"sub-{subject}_sessions.tsv",
+            ["session_id", "acq_time"],
+            dates,
+        )
+        sex = "F" if cohort.sex[i] else "M"
+        rows.append([f"sub-{subject}", "AD" if patient else "CN", f"{cohort.age[i]:.1f}", sex])
+    files.write_tsv(data / "participants.tsv", ["participant_id", "group", "age", "sex"], rows)
+    return data, out
+
+
+def table(path):
+    return pd.read_csv(path, sep="\t", na_values="n/a")
+
+
+def run(dataset, *options):
+    data, out = dataset
+    words = "".join(c if c.isalnum() else " " for c in " ".join(options[2:])).split()
+    name = "-".join(words)
+    assert main([str(data), str(out), "group", *options, "--name", name]) == 0
+    return out / "group" / name
+
+
+def test_permutations_are_in_the_tables_of_the_map(dataset, quick):
+    corrected = {}
+    for method in ("permutation-tfce", "permutation-max"):
+        options = [*quick, *ALIGNED, "--correction", method, "--permutations", "100"]
+        folder = run(dataset, *options)
+        found = table(folder / "hemi-L_contrast-CNAD_desc-thickness_statmap.tsv")
+        assert found.p_corrected.min() == pytest.approx(1 / 100)
+        assert (found.significant == (found.p_corrected <= 0.05)).all()
+        peak = table(folder / "peaks.tsv").query("measure == 'thickness' and hemi == 'L'").iloc[0]
+        here = found[(found.x == peak.x) & (found.y == peak.y)].iloc[0]
+        assert here.p_corrected == peak.p_corrected
+        text = (folder / "methods.md").read_text()
+        assert "100 permutations" in text
+        assert "seed 3" in text
+        corrected[method] = found
+    maximum = corrected["permutation-max"]
+    # The largest t has the smallest p: the correction is monotone.
+    order = maximum.statistic.abs().argsort()
+    assert (np.diff(maximum.p_corrected.to_numpy()[order]) <= 0).all()
+    overview = table(folder / "maps.tsv").set_index(["measure", "hemi"])
+    largest = maximum.p[maximum.significant].max()
+    assert overview.loc[("thickness", "L"), "p_cutoff"] == pytest.approx(largest)
+    again = run(dataset, *options)
+    pd.testing.assert_frame_equal(
+        maximum, table(again / "hemi-L_contrast-CNAD_desc-thickness_statmap.tsv")
+    )
+
+
+def test_pooled_family_is_no_less_strict(dataset, quick):
+    options = [*quick, *ALIGNED, "--correction", "permutation-max", "--permutations", "100"]
+    single = run(dataset, *options)
+    pooled = run(dataset, *options, "--fdr-scope", "hemispheres")
+    name = "hemi-{}_contrast-CNAD_desc-thickness_statmap.tsv"
+    for hemi in "LR":
+        one, both = (table(folder / name.format(hemi)) for folder in (single, pooled))
+        # Everybody has both hemispheres, so that both runs shuffle alike.
+        assert (both.p_corrected >= one.p_corrected).all()
+        assert (both.p_corrected > one.p_corrected).any()
+
+
+def test_blocks_are_a_column_inside_which_the_contrast_varies(dataset, quick, capsys):
+    data, out = dataset
+    options = [*quick, *ALIGNED, "--correction", "permutation-max", "--permutations", "20"]
+    folder = run(dataset, *options, "--blocks", "sex")
+    assert "within levels of sex" in (folder / "methods.md").read_text()
+    arguments = [str(data), str(out), "group", *options]
+    assert main([*arguments, "--blocks", "group"]) == 65
+    assert "does not vary inside the blocks" in capsys.readouterr().err
+    assert main([*arguments, "--blocks", "sexx"]) == 65
+    assert "did you mean sex" in capsys.readouterr().err
+
+
+def test_two_sessions_give_the_paired_t_test(sessions, quick):
+    options = [*quick, *ALIGNED, "--paired", "1", "ses-3", "--formula", "1"]
+    folder = run(sessions, *options)
+    found = table(folder / "hemi-R_contrast-Mean_desc-thickness_statmap.tsv")
+    _, out = sessions
+    maps = [
+        [
+            table(place_of(out, f"{i + 1:02d}", "R", session=session).path("sheet")).thickness
+            for i in range(sum(PLAN.sizes))
+        ]
+        for session in "13"
+    ]
+    expected = stats.ttest_rel(maps[1], maps[0])
+    # Ten digits are written.
+    np.testing.assert_allclose(found.statistic, expected.statistic, rtol=1e-8)
+    np.testing.assert_allclose(found.p, expected.pvalue, rtol=1e-8)
+    volume = table(folder / "measures.tsv").query("measure == 'volume' and hemi == 'R'").iloc[0]
+    # The difference of two uniform numbers, over 30 participants, has an SD of .08.
+    assert volume.estimate == pytest.approx(-10, abs=0.3)
+    left_out = table(folder / "excluded.tsv")
+    assert set(left_out.session_id) == {"ses-2"}
+    assert set(left_out.reason) == {"other-session"}
+
+
+def test_changes_of_groups_are_compared_between_two_sessions(sessions, quick):
+    folder = run(sessions, *quick, *ALIGNED, "--paired", "1", "2")
+    record = json.loads((folder / "analysis.json").read_text())
+    assert record["formula"] == "group + age + sex"
+    assert set(record["contrasts"]) == {"mean", "CN-AD"}
+    change = table(folder / "hemi-L_contrast-CNAD_desc-thickness_statmap.tsv")
+    # .08 mm; noise of .02 in 30 participants and four columns leaves .011 at a point.
+    assert change.estimate.mean() == pytest.approx(0.08, abs=0.003)
+    assert np.abs(change.estimate - 0.08).max() < 0.06
+    page = group_page(folder)
+    assert "could not be made" not in page
+    assert "change from ses-1 to ses-2" in page
+    assert "points larger in CN" in page
+    assert "points with a decrease" in page
+
+
+@pytest.mark.parametrize("random", ["intercept", "slope"])
+def test_longitudinal_model_finds_the_slopes(sessions, quick, random):
+    folder = run(sessions, *quick, *ALIGNED, "--longitudinal", random)
+    record = json.loads((folder / "analysis.json").read_text())
+    assert record["formula"] == "group * time + age + sex"
+    assert (record["participants"], record["rows"]) == (30, 90)
+    expected = {"TimeInCN": -0.02, "TimeInAD": -0.1, "TimeInCNAD": 0.08}
+    for contrast, slope in expected.items():
+        found = table(folder / f"hemi-L_contrast-{contrast}_desc-thickness_statmap.tsv")
+        # Noise of .02 at three sessions of 14 and 16 participants: SE .005 at a point.
+        assert found.estimate.mean() == pytest.approx(slope, abs=0.002)
+        assert found.se.mean() == pytest.approx(0.0052 if "AD" in contrast else 0.0035, rel=0.35)
+        # Sessions of a participant do not count as participants.
+        assert (found.df < 90).all()
+    text = (folder / "methods.md").read_text()
+    assert "mixed model" in text
+    assert "30 participants (90 visits)" in text
+    # Classification wants independent rows.
+    assert set(table(folder / "classification.tsv").n) == {30}
+    page = group_page(folder)
+    assert "could not be made" not in page
+    assert "30 participants with 90 visits" in page
+    assert "points larger in CN" in page
+
+
+def test_first_session_is_the_default_and_says_so(sessions, quick, capsys):
+    folder = run(sessions, *quick, *ALIGNED, "--formula", "group + age")
+    assert "60 later sessions are not in it" in capsys.readouterr().out
+    assert json.loads((folder / "analysis.json").read_text())["rows"] == 30
+
+
+def test_asymmetry_is_left_minus_right_in_the_same_model(dataset, quick):
+    folder = run(dataset, *quick, *ALIGNED, "--asymmetry")
+    _, out = dataset
+    wall = {
+        hemi: np.array(
+            [
+                table(place_of(out, f"{i + 1:02d}", hemi).path("sheet")).thickness
+                for i in range(sum(PLAN.sizes))
+            ]
+        )
+        for hemi in "LR"
+    }
+    relative = (wall["L"] - wall["R"]) / ((wall["L"] + wall["R"]) / 2)
+    found = table(folder / "contrast-Mean_desc-thicknessAsymmetry_statmap.tsv")
+    # The model's mean over all rows is the mean.
+    np.testing.assert_allclose(found.estimate, relative.mean(axis=0), rtol=1e-7)
+    assert (folder / "contrast-CNAD_desc-curvatureAsymmetry_statmap.tsv").is_file()
+    assert (folder / "contrast-CNAD_stat-t_desc-curvatureAsymmetry_statmap.shape.gii").is_file()
+    peaks = table(folder / "peaks.tsv")
+    assert set(peaks.contrast[peaks.hemi == "LR"]) == {"mean", "CN-AD"}
+    assert "(L - R) / ((L + R) / 2)" in (folder / "methods.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "message"),
+    [
+        (["--paired", "1", "9"], 65, "there is no session ses-9"),
+        (["--paired", "1", "2", "--longitudinal"], 64, "not both"),
+        (["--longitudinal", "--correction", "permutation-tfce"], 65, "cannot be exchanged"),
+        (["--correction", "permutation-max", "--permutations", "1"], 64, "at least 2"),
+        (["--longitudinal", "--formula", "age", "--contrast", "age,age"], 65, "rows"),
+    ],
+)
+def test_refusals(sessions, capsys, options, code, message):
+    data, out = sessions
+    before = sorted((out / "group").glob("*")) if (out / "group").exists() else []
+    assert main([str(data), str(out), "group", *ALIGNED, *options]) == code
+    assert message in capsys.readouterr().err
+    assert (sorted((out / "group").glob("*")) if (out / "group").exists() else []) == before
+
+
+def test_w_scores_are_those_of_a_model_without_the_participant(dataset, quick):
+    folder = run(dataset, *quick, *ALIGNED, "--normative", "group=CN")
+    _, out = dataset
+    people = table(folder / "covariates.tsv")
+    wall = np.array(
+        [
+            table(place_of(out, p.removeprefix("sub-"), "L").path("sheet")).thickness
+            for p in people.participant_id
+        ]
+    )
+    matrix = np.column_stack([np.ones(len(people)), people.age, people.sex == "M"]).astype(float)
+    healthy = (people.group == "CN").to_numpy()
+    scored = parquet.read_table(folder / "wscores.parquet").to_pandas()
+    for i in (0, len(people) - 1):  # a member of the reference group, and a patient
+        others = healthy & (np.arange(len(people)) != i)
+        beta, squares, *_ = np.linalg.lstsq(matrix[others], wall[others], rcond=None)
+        sigma = np.sqrt(squares / (others.sum() - 3))
+        expected = (wall[i] - matrix[i] @ beta) / sigma
+        own = scored[(scored.participant_id == people.participant_id[i]) & (scored.hemi == "L")]
+        np.testing.assert_allclose(own.thickness_w, expected, rtol=1e-5)  # single precision
+        image = nib.load(folder / "hemi-L_stat-w_desc-thickness_statmap.shape.gii")
+        np.testing.assert_allclose(image.darrays[i].data, expected, rtol=1e-5)
+        assert image.darrays[i].meta["Name"] == people.participant_id[i]
+        row = table(folder / "wscores.tsv").query(
+            "participant_id == @people.participant_id[@i] and hemi == 'L' and region == 'all'"
+            " and measure == 'thickness'"
+        )
+        assert row.w.item() == pytest.approx(expected.mean())
+    found = table(folder / "wscores.tsv").query("region == 'all' and measure == 'thickness'")
+    members = found[found.reference]
+    # What counts as low is one in forty of a healthy participant's points.
+    assert members.low.mean() == pytest.approx(0.025, abs=0.025)
+    assert found[~found.reference].low.mean() > members.low.mean() + 0.02
+    assert "against 16 with group CN" in (folder / "methods.md").read_text()
+
+
+def test_w_scores_say_what_is_wrong_with_their_reference(dataset, capsys):
+    data, out = dataset
+    for option, code, message in (
+        ("group=XY", 65, "there are AD, CN"),
+        ("grp=CN", 65, "did you mean group"),
+        ("CN", 64, "FACTOR=LEVEL"),
+    ):
+        arguments = [str(data), str(out), "group", *ALIGNED, "--normative", option]
+        assert main(arguments) == code
+        assert message in capsys.readouterr().err

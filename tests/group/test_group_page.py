@@ -1,0 +1,255 @@
+"""The page about an analysis: what it says, that it is whole and safe, and how it behaves."""
+
+import json
+import re
+import shutil
+import time
+
+import numpy as np
+import pandas as pd
+import pytest
+from browsing import colored, fits, one, open_browser, open_page, pixels, texts, until, watched
+from page_outline import Outline
+from selenium import webdriver
+from selenium.webdriver.common.keys import Keys
+from small_cohorts import NODES, write_dataset
+
+from hipsta_bids.cli.main import main
+from hipsta_bids.group import write
+from hipsta_bids.io import files
+from hipsta_bids.reports import group as page_module
+from hipsta_bids.reports.group import group_page, write_group_report
+from hipsta_bids.reports.page import Section
+
+MODEL = "group-age-sex"
+EVIL = "<script>document.title='owned'</script>&"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def without_pages():
+    """Let runs make pages here."""
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    """Data, output and options of an analysis with everything that a page can show."""
+    folder = tmp_path_factory.mktemp("page")
+    data, out = write_dataset(folder)
+    (folder / "group.toml").write_text("[classification]\nrepeats = 1\nfolds = 3\n")
+    excluded = folder / "exclude.tsv"
+    files.write_tsv(
+        excluded, ["participant_id", "hemi", "reason"], [["sub-30", "L", "moved <b>much</b>"]]
+    )
+    given = ["--settings", str(folder / "group.toml"), "--exclude", str(excluded)]
+    given += ["--asymmetry", "--normative", "group=CN", "--name", MODEL]
+    with pytest.MonkeyPatch.context() as patch:
+        # Figures take longer than all else, and the page draws its own.
+        patch.setattr(write, "draw_figures", lambda *_: iter(()))
+        assert main([str(data), str(out), "group", *given]) == 0
+    return data, out, given
+
+
+@pytest.fixture(scope="module")
+def out(dataset):
+    return dataset[1]
+
+
+@pytest.fixture(scope="module")
+def page(out):
+    return (out / "group" / f"{MODEL}.html").read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def copy(out, tmp_path):
+    """A copy to do harm to."""
+    return shutil.copytree(out, tmp_path / "copy")
+
+
+def table(path):
+    return pd.read_csv(path, sep="\t", na_values="n/a")
+
+
+def scenes(text):
+    return json.loads(re.search(r'id="maps">(.*?)</script>', text, re.DOTALL)[1])
+
+
+def test_the_page_is_whole_and_made_for_all_readers(page):
+    outline = Outline(page)
+    assert outline.open == []
+    assert outline.unlabeled == []
+    assert outline.headings[0] == 1
+    assert max(np.diff(outline.headings)) <= 1  # no level is left out
+    assert len(outline.ids) == len(set(outline.ids))
+    local = re.compile(rf"data:|#|{MODEL}/")
+    assert [a for a in outline.addresses if not local.match(a)] == []
+    assert not re.search(r"url\((?!data:)|@import|fetch\(|XMLHttpRequest|import\(", page)
+    assert "could not be made" not in page
+
+
+@pytest.mark.parametrize("key", [section.key for section in page_module.SECTIONS])
+def test_every_part_is_there(page, key):
+    # Average cross-sections need surfaces, which these sheets lack.
+    assert (f'id="group-{key}"' in page) == (key != "sections")
+
+
+def test_findings_are_those_of_the_tables(out, page):
+    maps = table(out / "group" / MODEL / "maps.tsv")
+    for row in maps[maps.n_significant > 0].itertuples():
+        assert f"{row.n_significant} of {row.n_tests} points survive" in page
+    assert (maps.n_significant > 0).any()
+    peaks = table(out / "group" / MODEL / "peaks.tsv")
+    first = peaks[(peaks.measure == "thickness") & (peaks.hemi == "L")].iloc[0]
+    assert f"d {first.effect_size:.3g}" in page
+    assert "points larger in CN" in page
+
+
+def test_maps_are_those_of_the_tables(out, page):
+    side = scenes(page)[0]["sides"][0]
+    assert side["shape"] == list(NODES)
+    points = table(out / "group" / MODEL / "hemi-L_contrast-CNAD_desc-thickness_statmap.tsv")
+    (test,) = side["tests"]
+    # Four digits are written.
+    np.testing.assert_allclose(test["values"]["p"], points.p, rtol=1e-3)
+    np.testing.assert_allclose(test["effect"], points.cohen_d, rtol=1e-3)
+    assert test["significant"] == points.significant.astype(int).tolist()
+    means = table(out / "group" / MODEL / "means.tsv")
+    own = means[(means.measure == "thickness") & (means.hemi == "L") & (means.group == "AD")]
+    (group,) = [one for one in side["means"] if one["group"] == "AD"]
+    np.testing.assert_allclose(group["values"], own["mean"], rtol=1e-3)
+
+
+def test_who_is_left_out_is_said_with_the_reason(page):
+    assert "sub-30" in page
+    assert "&lt;b&gt;much&lt;/b&gt;" in page
+    assert "<b>much" not in page
+
+
+def test_the_page_can_be_made_anew_from_the_folder(dataset, page, capsys):
+    data, out, _ = dataset
+    path = out / "group" / f"{MODEL}.html"
+    path.unlink()
+    assert main([str(data), str(out), "group", "--reports-only"]) == 0
+    assert path.read_text(encoding="utf-8") == page
+    assert str(path) in capsys.readouterr().out
+    assert main([str(data), str(out), "group", "--reports-only", "--name", "other"]) == 66
+    assert "no analysis of the name other" in capsys.readouterr().err
+
+
+def test_a_page_takes_less_than_ten_seconds(out):
+    before = time.process_time()
+    group_page(out / "group" / MODEL)
+    assert time.process_time() - before < 10
+
+
+def rename(path):
+    """Give a group and a column names that a page must not take for its own."""
+    text = path.read_text(encoding="utf-8")
+    path.write_text(re.sub(r"\b(AD|age)\b", rf"\1{EVIL}", text), encoding="utf-8")
+
+
+def test_users_text_is_escaped(copy):
+    folder = copy / "group" / MODEL
+    for path in (*folder.glob("*.tsv"), folder / "analysis.json", folder / "methods.md"):
+        rename(path)
+    text = group_page(folder)
+    assert "<script>document" not in text
+    assert "&lt;script&gt;document" in text
+    assert "could not be made" not in text
+    assert Outline(text).open == []
+
+
+def test_a_section_that_fails_harms_no_other(copy, monkeypatch, page):
+    def fail(_):
+        raise ZeroDivisionError("nothing there")
+
+    broken = Section(key="peaks", title="Peaks", template="group/peaks.html", build=fail)
+    sections = [broken if s.key == "peaks" else s for s in page_module.SECTIONS]
+    monkeypatch.setattr(page_module, "SECTIONS", sections)
+    text = group_page(copy / "group" / MODEL)
+    assert "ZeroDivisionError: nothing there" in text
+    assert scenes(text) == scenes(page)
+
+
+def test_a_page_that_fails_costs_a_line_and_no_results(copy):
+    (copy / "group" / MODEL / "analysis.json").write_text("{")
+    assert write_group_report(copy, MODEL).startswith(f"{MODEL}.html: not made (")
+    # That of an earlier analysis would be taken for this one's.
+    assert not (copy / "group" / f"{MODEL}.html").exists()
+    assert (copy / "group" / MODEL / "peaks.tsv").exists()
+
+
+def test_no_page_is_made_or_left_if_none_is_wanted(dataset, copy, monkeypatch):
+    data, _, given = dataset
+    monkeypatch.setattr(write, "draw_figures", lambda *_: iter(()))
+    assert main([str(data), str(copy), "group", *given, "--no-reports"]) == 0
+    assert not (copy / "group" / f"{MODEL}.html").exists()
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    with open_browser(tmp_path_factory.mktemp("browser")) as session:
+        yield session
+
+
+@pytest.fixture
+def visit(browser, out):
+    """Open the page at a width; afterwards nothing may have gone wrong or outside."""
+    with watched(browser):
+        yield lambda width=1280: open_page(browser, out / "group" / f"{MODEL}.html", width)
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_the_page_fits_its_window(visit, width):
+    assert fits(visit(width), width)
+
+
+def test_maps_are_drawn(visit):
+    browser = visit()
+    canvas = one(browser, "canvas.map")
+    browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", canvas)
+    assert colored(pixels(canvas)) > 0.8
+
+
+def test_pointing_at_a_map_tells_its_values(visit, out):
+    browser = visit()
+    canvas = one(browser, "canvas[data-kind=effect]")
+    browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", canvas)
+    assert not one(browser, "#tip").is_displayed()
+    size = canvas.size
+    corner = (size["width"] // 2 - 3, -(size["height"] // 2 - 3))
+    webdriver.ActionChains(browser).move_to_element_with_offset(canvas, *corner).perform()
+    until(lambda: one(browser, "#tip").is_displayed())
+    told = dict(zip(texts(browser, "#tip dt"), texts(browser, "#tip dd"), strict=True))
+    points = table(out / "group" / MODEL / "hemi-L_contrast-CNAD_desc-thickness_statmap.tsv")
+    point = points.iloc[-1]  # lateral and anterior
+    assert texts(browser, "#tip b") == [f"Left, node {NODES[0]}, {NODES[1]}"]
+    spelled = f"{point.cohen_d:.3g}".replace("-", "\N{MINUS SIGN}")
+    assert told["Cohen's d"] == spelled
+    assert told["Subfield"] == point.subfield
+    assert told["CN-AD"].endswith(" mm")
+    assert "corrected p" in told
+
+
+def test_arrow_keys_move_from_point_to_point(visit):
+    browser = visit()
+    canvas = one(browser, "canvas[data-kind=significance]")
+    browser.execute_script("arguments[0].focus()", canvas)
+    middle = [n // 2 + 1 for n in NODES]
+    for key, step in ((Keys.ARROW_UP, (0, 0)), (Keys.ARROW_RIGHT, (1, 0)), (Keys.ARROW_UP, (1, 1))):
+        canvas.send_keys(key)
+        node = ", ".join(str(n + move) for n, move in zip(middle, step, strict=True))
+        assert texts(browser, "#tip b") == [f"Left, node {node}"]
+    canvas.send_keys(Keys.ESCAPE)
+    assert not one(browser, "#tip").is_displayed()
+
+
+def test_users_text_is_not_run(browser, copy):
+    folder = copy / "group" / MODEL
+    for path in (*folder.glob("*.tsv"), folder / "analysis.json"):
+        rename(path)
+    hostile = copy / "group" / "hostile.html"
+    hostile.write_text(group_page(folder), encoding="utf-8")
+    with watched(browser):
+        open_page(browser, hostile)
+        assert browser.title.startswith(MODEL)
+        assert f"AD{EVIL}" in one(browser, "#group-people table").text

@@ -1,0 +1,315 @@
+"""The group level from files to files, on sheets with a planted effect."""
+
+import json
+import shutil
+
+import numpy as np
+import pandas as pd
+import pytest
+from pyarrow import parquet
+from small_cohorts import GROUPS, NODES, PLAN, place_of, write_dataset
+
+from hipsta_bids.cli.main import main
+from hipsta_bids.group import write
+from hipsta_bids.group.formula import Contrast
+from hipsta_bids.group.glm import fit_points
+from hipsta_bids.group.settings import GlmSettings
+from hipsta_bids.group.tables import COLUMNS
+from hipsta_bids.io import files
+
+MODEL = "group-age-sex"
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return write_dataset(tmp_path_factory.mktemp("group"))
+
+
+@pytest.fixture(scope="module")
+def quick(tmp_path_factory):
+    """Settings with little cross-validation, which takes most of the time."""
+    path = tmp_path_factory.mktemp("settings") / "group.toml"
+    path.write_text("[classification]\nrepeats = 2\nfolds = 3\n")
+    return ["--settings", str(path)]
+
+
+@pytest.fixture(scope="module")
+def results(dataset, quick):
+    data, out = dataset
+    assert main([str(data), str(out), "group", *quick]) == 0
+    return out / "group" / MODEL
+
+
+@pytest.fixture
+def with_figures():
+    """Marks tests that look at figures."""
+
+
+@pytest.fixture(autouse=True)
+def _quick_figures(request, monkeypatch):
+    """Figures take longer than all else; the module's own run draws them."""
+    if "with_figures" not in request.fixturenames:
+        monkeypatch.setattr(write, "draw_figures", lambda *_: iter(()))
+
+
+def table(path):
+    return pd.read_csv(path, sep="\t", na_values="n/a")
+
+
+def statmap(folder, hemi):
+    return table(folder / f"hemi-{hemi}_contrast-CNAD_desc-thickness_statmap.tsv")
+
+
+def test_planted_thinning_is_the_peak_of_both_hemispheres(results):
+    peaks = table(results / "peaks.tsv")
+    for hemi in "LR":
+        first = peaks[(peaks.measure == "thickness") & (peaks.hemi == hemi)].iloc[0]
+        assert first.contrast == "CN-AD"
+        assert first.statistic > 0
+        assert first.p_corrected < 0.05
+        # Two nodes are what registration of 30 noisy profiles on 21 nodes may be off.
+        node = (first.x + 0.9) / 1.8 * (NODES[0] - 1)
+        assert node == pytest.approx(PLAN.center[0], abs=2.0)
+
+
+def test_map_is_what_the_written_maps_and_covariates_give(results):
+    """Anybody can repeat the fit from the hand-over file alone."""
+    long = parquet.read_table(results / "maps.parquet").to_pandas()
+    people = table(results / "covariates.tsv")
+    own = long[long.hemi == "L"]
+    wide = own.pivot_table(
+        index="participant_id",
+        columns=["node_x", "node_y"],
+        values="thickness_registered",
+        observed=True,
+        dropna=False,
+    ).loc[people.participant_id]
+    matrix = np.column_stack(
+        [np.ones(len(people)), people.group == "CN", people.age, people.sex == "F"]
+    ).astype(float)
+    contrast = Contrast("CN-AD", np.array([0.0, 1, 0, 0]))
+    values = wide.to_numpy(dtype=float)
+    (test,) = fit_points(values, matrix, [contrast], GlmSettings()).tests
+    # Maps are handed over in single precision.
+    np.testing.assert_allclose(statmap(results, "L").statistic, test.statistic, rtol=1e-3)
+
+
+def test_tables_say_what_their_columns_are(results):
+    found = sorted(results.glob("*.tsv"))
+    assert {path.stem for path in found} >= {
+        "peaks",
+        "maps",
+        "measures",
+        "registration",
+        "warps",
+        "descriptives",
+        "shifts",
+        "classification",
+        "excluded",
+        "means",
+        "profiles",
+        "roc",
+        "calibration",
+        "design",
+    }
+    for path in found:
+        if path.stem in {"covariates", "design"}:
+            continue
+        columns = path.read_text().split("\n", 1)[0].split("\t")
+        described = json.loads(path.with_suffix(".json").read_text())
+        assert list(described) == columns, path.name
+        unknown = [c for c in columns if c not in COLUMNS and not c.startswith("node_")]
+        assert not unknown, path.name
+
+
+def test_maps_file_is_typed_and_has_units(results):
+    schema = parquet.read_schema(results / "maps.parquet")
+    assert schema.field("thickness").metadata[b"unit"] == b"mm"
+    assert schema.field("curvature_registered").metadata[b"unit"] == b"1/mm"
+    assert str(schema.field("thickness").type) == "float"
+    rows = parquet.read_metadata(results / "maps.parquet").num_rows
+    assert rows == 2 * sum(PLAN.sizes) * NODES[0] * NODES[1]
+
+
+def test_record_and_methods_have_the_numbers(results, dataset, quick):
+    record = json.loads((results / "analysis.json").read_text())
+    data, out = dataset
+    assert record["command"] == ["hipsta-bids", str(data), str(out), "group", *quick]
+    assert record["participants"] == sum(PLAN.sizes)
+    assert record["references"]["group"] == GROUPS[0]
+    assert record["settings"]["classification"]["repeats"] == 2
+    text = (results / "methods.md").read_text()
+    assert f"{PLAN.sizes[0]} CN, {PLAN.sizes[1]} AD" in text
+    significant = int(statmap(results, "L").significant.sum())
+    assert f"thickness, CN-AD, L: {significant} of" in text
+    model = json.loads((results / "model.json").read_text())
+    assert model["BIDSModelVersion"] == "1.0.0"
+
+
+def test_classification_and_measures_are_tables_of_the_paper(results):
+    pairs = table(results / "classification.tsv")
+    assert set(pairs.hemi) == {"L", "R", "LR"}
+    assert (pairs.base == "volume").all()
+    assert (pairs.added == "thickness_mean").all()  # the only other measure with values
+    measures = table(results / "measures.tsv")
+    volume = measures[(measures.measure == "volume") & (measures.hemi == "L")].iloc[0]
+    assert volume.estimate > 0  # 5 mm^3 were taken off patients
+    means = table(results / "descriptives.tsv")
+    assert set(means.n[means.measure == "volume"]) == set(PLAN.sizes)
+
+
+def test_frozen_template_gives_the_same_warps_to_a_part_of_the_subjects(results, dataset, quick):
+    data, out = dataset
+    some = [f"{i:02d}" for i in (*range(1, 9), *range(20, 29))]
+    arguments = [str(data), str(out), "group", *quick, "--template", str(results / "template.json")]
+    assert main([*arguments, "--name", "all"]) == 0
+    assert main([*arguments, "--name", "part", "--participant-label", *some]) == 0
+    keys = ["participant_id", "hemi"]
+    whole = table(out / "group" / "all" / "warps.tsv").set_index(keys)
+    part = table(out / "group" / "part" / "warps.tsv").set_index(keys)
+    nodes = [f"node_{i + 1}" for i in range(NODES[0])]
+    # Ten digits are written.
+    np.testing.assert_allclose(part[nodes], whole.loc[part.index, nodes], atol=1e-9)
+
+
+def test_formula_contrast_reference_and_options(dataset, quick):
+    data, out = dataset
+    code = main(
+        [
+            *(str(data), str(out), "group", *quick, "--name", "mine"),
+            *("--formula", "thickness ~ group + age", "--contrast", "slope = age"),
+            *("group[AD]-group[CN]", "--reference", "group=AD", "--align", "none"),
+            *("--fdr-scope", "hemispheres", "--base", "thickness_mean", "age"),
+        ]
+    )
+    assert code == 0
+    folder = out / "group" / "mine"
+    record = json.loads((folder / "analysis.json").read_text())
+    assert record["formula"] == "group + age"
+    assert record["references"] == {"group": "AD"}
+    assert set(record["contrasts"]) == {"slope", "group[AD]-group[CN]"}
+    assert not (folder / "template.json").exists()
+    maps = table(folder / "maps.tsv")
+    assert set(maps.n_tests) == {2 * NODES[0] * NODES[1]}
+    again = [*(str(data), str(out), "group", *quick), "--model", str(folder / "model.json")]
+    assert main([*again, "--align", "none", "--name", "again"]) == 0
+    first, second = (table(out / "group" / name / "peaks.tsv") for name in ("mine", "again"))
+    assert set(first.contrast) == set(second.contrast)
+
+
+def test_flagged_hemispheres_are_told(dataset, quick, capsys):
+    data, out = dataset
+    path = place_of(out, "02", "R").path("qc")
+    before = path.read_bytes()
+    files.write_json(path, json.loads(before) | {"status": "flagged"})
+    assert main([str(data), str(out), "group", *quick, "--name", "flagged"]) == 0
+    assert "note: 1 flagged hemispheres are in it" in capsys.readouterr().out
+    path.write_bytes(before)
+
+
+def test_left_out_hemispheres_are_listed_with_the_reason(tmp_path, quick):
+    data, out = write_dataset(tmp_path)
+    record = place_of(out, "01", "L").path("qc")
+    files.write_json(record, {"status": "failed", "reason": "too-thin", "message": "2 voxels"})
+    flagged = place_of(out, "02", "R").path("qc")
+    content = json.loads(flagged.read_text())
+    files.write_json(flagged, content | {"status": "flagged", "reason": "notch"})
+    filled = place_of(out, "03", "L").path("qc")
+    content = json.loads(filled.read_text())
+    files.write_json(filled, content | {"metrics": {"filled_fraction": 0.1, "rule": "labels"}})
+    listed = tmp_path / "listed.tsv"
+    listed.write_text("participant_id\themi\treason\nsub-04\tR\tmoved\n05\tn/a\twithdrew\n")
+    rows = [line.split("\t") for line in (data / "participants.tsv").read_text().splitlines()]
+    rows[6][2] = "n/a"  # age of sub-06
+    (data / "participants.tsv").write_text("\n".join("\t".join(row) for row in rows) + "\n")
+    arguments = [
+        str(data),
+        str(out),
+        "group",
+        *quick,
+        "--exclude-flagged",
+        "--exclude",
+        str(listed),
+    ]
+    assert main([*arguments, "--exclude-qc", "filled_fraction > 0.05 and rule == 'labels'"]) == 0
+    folder = out / "group" / MODEL
+    left_out = table(folder / "excluded.tsv")
+    found = {(r.participant_id, r.hemi, r.reason, r.message) for r in left_out.itertuples()}
+    assert ("sub-01", "L", "failed: too-thin", "2 voxels") in found
+    assert ("sub-04", "R", "listed", "moved") in found
+    assert {one[:2] for one in found if one[0] == "sub-05"} == {("sub-05", "L"), ("sub-05", "R")}
+    assert {(a, c) for a, _, c, _ in found} >= {
+        ("sub-02", "flagged: notch"),
+        ("sub-03", "quality"),
+        ("sub-06", "incomplete"),
+    }
+    n = table(folder / "hemi-L_contrast-CNAD_desc-thickness_statmap.tsv").n
+    assert set(n) == {sum(PLAN.sizes) - 4}  # without 01, 03, 05, 06
+
+
+def test_figures_are_drawn_as_pictures_and_drawings(results):
+    names = {path.stem for path in (results / "figures").glob("*.png")}
+    assert names == {
+        *(
+            f"{measure}_{what}"
+            for measure in ("thickness", "curvature")
+            for what in ("means", "contrasts")
+        ),
+        *("profiles", "warps", "roc", "calibration"),
+    }
+    for name in names:
+        drawing = (results / "figures" / f"{name}.svg").read_text()
+        # Words stay words, so that they can be searched and edited.
+        assert ">medial<" in drawing or name in {"roc", "calibration"}
+    contrasts = (results / "figures" / "thickness_contrasts.svg").read_text()
+    assert "CN-AD" in contrasts
+    assert ">CA1<" in contrasts
+
+
+@pytest.mark.usefixtures("with_figures")
+def test_same_run_gives_the_same_files(results, dataset, quick):
+    data, out = dataset
+    before = {path.name: path.read_bytes() for path in results.rglob("*") if path.is_file()}
+    assert main([str(data), str(out), "group", *quick]) == 0
+    after = {path.name: path.read_bytes() for path in results.rglob("*") if path.is_file()}
+    assert before == after
+
+
+def test_first_of_several_sessions_is_analyzed(tmp_path, quick):
+    data, out = write_dataset(tmp_path, session="1")
+    for hemi in "LR":
+        first, later = (place_of(out, "01", hemi, session=one) for one in ("1", "2"))
+        for key in ("sheet", "summary", "qc"):
+            later.path(key).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(first.path(key), later.path(key))
+    assert main([str(data), str(out), "group", *quick]) == 0
+    left_out = table(out / "group" / MODEL / "excluded.tsv")
+    kept = left_out[["participant_id", "session_id", "reason"]]
+    assert kept.to_numpy().tolist() == [["sub-01", "ses-2", "later-session"]]
+
+
+def test_means_and_design_are_those_of_maps_and_covariates(results):
+    means = table(results / "means.tsv")
+    long = parquet.read_table(results / "maps.parquet").to_pandas()
+    people = table(results / "covariates.tsv")
+    cases = people[people.group == "AD"].participant_id
+    own = long[(long.hemi == "R") & long.participant_id.isin(cases)]
+    wanted = own.groupby(["node_x", "node_y"]).thickness_registered.agg(["mean", "std"])
+    found = means[(means.hemi == "R") & (means.measure == "thickness") & (means.group == "AD")]
+    # Maps are handed over in single precision.
+    np.testing.assert_allclose(found["mean"], wanted["mean"], rtol=1e-5)
+    np.testing.assert_allclose(found["sd"], wanted["std"], rtol=1e-4)
+    design = table(results / "design.tsv")
+    assert list(design.participant_id) == list(people.participant_id)
+    np.testing.assert_array_equal(design["group[T.AD]"], people.group == "AD")
+    np.testing.assert_allclose(design["age"], people.age)
+
+
+def test_curves_are_those_of_the_classifiers(results):
+    curves, areas = table(results / "roc.tsv"), table(results / "classification.tsv")
+    for row in areas.itertuples():
+        same = (curves.hemi == row.hemi) & (curves.added == row.added)
+        for which, area in (("base", row.auc_base), ("full", row.auc_full)):
+            one = curves[same & (curves.classifier == which)]
+            under = np.trapezoid(one.true_positives, one.false_positives)
+            assert under == pytest.approx(area, abs=1e-9)

@@ -1,0 +1,168 @@
+"""Other programs' maps: whose they are, what they hold, and the surface that they lie on."""
+
+import numpy as np
+import pytest
+from hippunfold_like import PATTERNS, flat_surface, names, write_map, write_surface
+
+from hipsta_bids.errors import InputError, NothingToDoError, UsageError
+from hipsta_bids.group.surfaces import find_maps, map_patterns, read_maps
+from hipsta_bids.io import files
+from hipsta_bids.io.gifti import read_map, read_mesh
+
+POINTS, TRIANGLES = flat_surface(50)
+GRID = (4, 3)
+
+
+def anybody(*_):
+    return True
+
+
+@pytest.fixture(params=[1, 2])
+def version(request):
+    return request.param
+
+
+def write_subject(root, subject, version, values, hemi="L", **which):
+    path, surface = names(root / "hippunfold", subject, hemi, version=version, **which)
+    write_map(path, values)
+    write_surface(surface, POINTS, TRIANGLES)
+    return path
+
+
+def find_and_read(root, pattern, *, surfaces=(), known=(), wanted=anybody):
+    (request,) = map_patterns([("hipp", pattern)], surfaces, ())
+    return read_maps(find_maps(request, root, known, wanted), GRID, with_sheets=True)
+
+
+def test_maps_of_hippunfold_with_the_surface_beside(tmp_path, version):
+    values = np.linspace(0.5, 2, 50)
+    for subject in ("02", "01"):
+        write_subject(tmp_path, subject, version, values * int(subject))
+    write_subject(tmp_path, "01", version, values, measure="gyrification")  # another map
+    write_subject(tmp_path, "02", version, np.where(values < 1, np.nan, values), hemi="R")
+    sides = find_and_read(tmp_path, PATTERNS[version])
+    assert sides["L"].visits == (("01", None), ("02", None))
+    # Single precision is what the files hold.
+    np.testing.assert_allclose(sides["L"].data, [values, 2 * values], rtol=1e-6)
+    np.testing.assert_allclose(sides["L"].mesh.points, POINTS, rtol=1e-6)
+    assert sides["L"].mesh.triangles.shape == TRIANGLES.shape
+    assert sides["L"].unit == "mm"
+    assert np.isnan(sides["R"].data[0]).sum() == (values < 1).sum()
+
+
+def test_sessions_of_the_sheets_decide(tmp_path):
+    pattern = "hippunfold/sub-{subject}/ses-{session}/surf/*_hemi-{hemi}_*_thickness.shape.gii"
+    for session in ("a", "b"):
+        write_subject(tmp_path, "01", 1, POINTS[:, 0], session=session)
+    write_subject(tmp_path, "02", 1, POINTS[:, 0])
+    sides = find_and_read(tmp_path, pattern)
+    assert sides["L"].visits == (("01", "a"), ("01", "b"), ("02", None))
+    known = [("01", "b"), ("02", "x"), ("02", "y")]
+    sides = find_and_read(tmp_path, pattern, known=known)
+    # The second participant's file tells no session: it holds for all.
+    assert sides["L"].visits == (("01", "b"), ("02", "x"), ("02", "y"))
+    sides = find_and_read(tmp_path, pattern, wanted=lambda subject, *_: subject == "02")
+    assert sides["L"].visits == (("02", None),)
+
+
+def test_table_of_the_sheets_grid_needs_no_surface(tmp_path):
+    x, y = np.divmod(np.arange(12), 3)
+    rows = [
+        [str(i + 1), str(j + 1), "n/a" if i == 0 else f"{i + j}"] for i, j in zip(x, y, strict=True)
+    ]
+    files.write_tsv(tmp_path / "sub-1_hemi-R_desc-T2_map.tsv", ["x", "y", "T2"], rows)
+    side = find_and_read(tmp_path, "sub-{subject}_hemi-{hemi}_desc-T2_map.tsv")["R"]
+    assert side.mesh is None
+    assert side.nodes == GRID
+    np.testing.assert_array_equal(side.data[0], np.where(x == 0, np.nan, x + y))
+
+
+def test_named_surface_and_its_refusals(tmp_path):
+    write_map(tmp_path / "sub-1_lh.shape.gii", POINTS[:, 1])
+    write_surface(tmp_path / "flat_hemi-L.surf.gii", POINTS, TRIANGLES)
+    write_surface(tmp_path / "small.surf.gii", *flat_surface(20))
+    pattern = "sub-{subject}_{side}.shape.gii"
+    for surfaces in ([(None, "flat_hemi-{hemi}.surf.gii")], [("hipp", f"{tmp_path}/flat*")]):
+        side = find_and_read(tmp_path, pattern, surfaces=surfaces)["L"]
+        assert side.nodes == (50, 1)
+    with pytest.raises(InputError, match="has 20 vertices, the maps hipp of hemisphere L have 50"):
+        find_and_read(tmp_path, pattern, surfaces=[(None, "small.surf.gii")])
+    with pytest.raises(InputError, match=r"no file none\.surf\.gii"):
+        find_and_read(tmp_path, pattern, surfaces=[(None, "none.surf.gii")])
+    with pytest.raises(InputError, match="no surface of 50 vertices lies beside"):
+        find_and_read(tmp_path, pattern)
+    with pytest.raises(InputError, match="is no surface"):
+        read_mesh(tmp_path / "sub-1_lh.shape.gii")
+
+
+def test_maps_of_different_densities_are_refused(tmp_path):
+    for subject, count in (("1", 50), ("2", 50), ("3", 40)):
+        write_map(tmp_path / f"sub-{subject}_hemi-L.shape.gii", np.zeros(count))
+    with pytest.raises(InputError, match=r"2 with 50 .*; 1 with 40 \(.*sub-3_hemi-L") as caught:
+        find_and_read(tmp_path, "sub-{subject}_hemi-{hemi}.shape.gii")
+    assert caught.value.reason == "mixed-grids"
+
+
+def test_several_files_or_none(tmp_path):
+    for name in ("sub-1_hemi-L_a.shape.gii", "sub-1_hemi-L_b.shape.gii"):
+        write_map(tmp_path / name, np.zeros(12))
+    with pytest.raises(InputError, match="are both for sub-1 hemi-L"):
+        find_and_read(tmp_path, "sub-{subject}_hemi-{hemi}_*.gii")
+    with pytest.raises(NothingToDoError, match="no file matches"):
+        find_and_read(tmp_path, "sub-{subject}_hemi-{hemi}_c.gii")
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "not readable as GIFTI"),
+        (b"<?xml version='1.0'?><GIFTI", "not readable as GIFTI"),
+        (b"not xml at all", "not readable as GIFTI"),
+    ],
+)
+def test_damaged_files_are_refused(tmp_path, content, words):
+    path = tmp_path / "x.shape.gii"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=words):
+        read_map(path, "x")
+
+
+def test_half_a_file_is_refused(tmp_path):
+    path = tmp_path / "x.shape.gii"
+    write_map(path, np.arange(1000.0))
+    path.write_bytes(path.read_bytes()[:1500])
+    with pytest.raises(InputError, match="not readable as GIFTI"):
+        read_map(path, "x")
+
+
+def test_files_of_several_maps_are_refused_unless_a_column_has_the_name(tmp_path):
+    write_map(tmp_path / "x.func.gii", np.zeros(5), np.ones(5))
+    with pytest.raises(InputError, match="holds 2 maps"):
+        read_map(tmp_path / "x.func.gii", "a")
+    files.write_tsv(tmp_path / "x.tsv", ["a", "b"], [["1", "2"], ["3", "inf"]])
+    assert read_map(tmp_path / "x.tsv", "a").values.tolist() == [1, 3]
+    np.testing.assert_array_equal(read_map(tmp_path / "x.tsv", "b").values, [2, np.nan])
+    with pytest.raises(InputError, match="has columns a, b"):
+        read_map(tmp_path / "x.tsv", "c")
+    files.write_tsv(tmp_path / "y.tsv", ["a"], [["much"]])
+    with pytest.raises(InputError, match="no numbers"):
+        read_map(tmp_path / "y.tsv", "a")
+
+
+@pytest.mark.parametrize(
+    ("patterns", "surfaces", "words"),
+    [
+        ([("a b", "{subject}{hemi}")], [], "letters and digits"),
+        ([("a", "{subject}{hemi}"), ("a", "{subject}{hemi}")], [], "occurs twice"),
+        ([("thickness", "{subject}{hemi}")], [], "belongs to the sheets"),
+        ([("a", "{hemi}")], [], "needs {subject}"),
+        ([("a", "{subject}")], [], "and {hemi} or {side}"),
+        ([("a", "{subject}{hem}")], [], "placeholders are"),
+        ([("a", "{subject}{hemi}")], [("b", "x")], "no --maps b"),
+        ([("a", "{subject}{hemi}")], [(None, "{x}")], "placeholders are"),
+    ],
+)
+def test_options_that_cannot_be_meant(patterns, surfaces, words):
+    with pytest.raises(UsageError) as caught:
+        map_patterns(patterns, surfaces, ("thickness",))
+    assert words in str(caught.value)

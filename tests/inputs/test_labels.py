@@ -1,0 +1,322 @@
+import nibabel as nib
+import numpy as np
+import pytest
+from input_cases import AFFINE, save
+
+from hipsta_bids.errors import InputError, SchemeError
+from hipsta_bids.inputs.labels import MARGIN, label_values, read_label_volume
+from hipsta_bids.inputs.request import HemisphereInput
+from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.protocol import Part, Tissue
+
+SHAPE = (60, 50, 40)
+BLOCK = (slice(20, 30), slice(22, 28), slice(15, 20))
+
+
+def make_item(*files, scheme="hippunfold", **options):
+    return HemisphereInput(
+        subject="01",
+        session=None,
+        hemi=options.pop("hemi", "L"),
+        scheme=load_scheme(scheme),
+        files=files,
+        source="test",
+        source_path=files[0].parent,
+        why="test",
+        **options,
+    )
+
+
+def make_labels(dtype=np.int16, code=2):
+    data = np.zeros(SHAPE, dtype=dtype)
+    data[BLOCK] = code
+    data[20, 22, 15] = 1
+    return data
+
+
+def world(volume, tissue):
+    """Centers of all voxels of a tissue in RAS mm, sorted."""
+    index = np.argwhere(volume.tissue == tissue)
+    points = nib.affines.apply_affine(volume.affine, index)
+    return points[np.lexsort(points.T)]
+
+
+@pytest.mark.parametrize("name", ["a.nii", "a.nii.gz", "a.mgz", "a.mgh"])
+def test_cropping_keeps_every_label_where_it_was(tmp_path, name):
+    data = make_labels()
+    volume = read_label_volume(make_item(save(tmp_path / name, data)))
+    expected = nib.affines.apply_affine(AFFINE, np.argwhere(data == 2))
+    # Single precision in the headers of both formats: 1e-5 mm at these distances.
+    np.testing.assert_allclose(
+        world(volume, Tissue.CA1), expected[np.lexsort(expected.T)], atol=1e-4
+    )
+    assert volume.tissue.dtype == np.uint8
+    assert volume.scheme.name == "hippunfold"
+
+
+def test_the_margin_is_five_millimeters_as_far_as_the_image_goes(tmp_path):
+    volume = read_label_volume(make_item(save(tmp_path / "a.nii", make_labels())))
+    # 10 voxels of 0.5 mm on each side of 10, 6 and 5 voxels.
+    assert int(MARGIN / 0.5) == 10
+    assert volume.tissue.shape == (30, 26, 25)
+    data = np.zeros(SHAPE, np.int16)
+    data[:3, :3, :3] = 1
+    at_border = read_label_volume(make_item(save(tmp_path / "b.nii", data)))
+    assert at_border.tissue.shape == (13, 13, 13)
+
+
+def test_cortical_labels_do_not_widen_the_crop(tmp_path):
+    data = make_labels(code=1)  # CA1 of ABC-3T
+    data[20, 22, 15] = 8
+    alone = read_label_volume(make_item(save(tmp_path / "a.nii", data), scheme="ashsABC3T"))
+    data[0, 0, 0] = 9  # entorhinal
+    with_cortex = read_label_volume(make_item(save(tmp_path / "b.nii", data), scheme="ashsABC3T"))
+    assert with_cortex.tissue.shape == alone.tissue.shape
+    np.testing.assert_array_equal(with_cortex.affine, alone.affine)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int32, np.float32, np.float64])
+def test_types_and_whole_floats_give_the_same_labels(tmp_path, dtype):
+    expected = read_label_volume(make_item(save(tmp_path / "a.nii", make_labels())))
+    volume = read_label_volume(make_item(save(tmp_path / "b.nii.gz", make_labels(dtype))))
+    np.testing.assert_array_equal(volume.tissue, expected.tissue)
+
+
+def test_scaled_integers_are_read_by_their_scaled_values(tmp_path):
+    image = nib.Nifti1Image(make_labels() * 2, AFFINE)
+    image.header.set_slope_inter(0.5, 0)
+    raw = (make_labels() * 2).tobytes(order="F")
+    path = tmp_path / "a.nii"
+    with path.open("wb") as stream:
+        image.header.set_data_offset(352)
+        image.header.write_to(stream)
+        stream.write(b"\0" * (352 - stream.tell()) + raw)
+    assert label_values(path) == {1, 2}
+
+
+def test_a_trailing_axis_of_one_is_no_fourth_dimension(tmp_path):
+    volume = read_label_volume(make_item(save(tmp_path / "a.nii", make_labels()[..., None])))
+    assert volume.tissue.ndim == 3
+
+
+def test_parts_come_from_the_second_file(tmp_path):
+    subfields = np.zeros(SHAPE, np.int32)
+    parts = np.zeros(SHAPE, np.int32)
+    subfields[BLOCK] = 206
+    subfields[20, 22, 15] = 226
+    parts[BLOCK] = 231
+    parts[25:, :, :] = np.where(subfields[25:] > 0, 232, 0)
+    parts[20, 22, 15] = 226
+    parts[19, 22, 15] = 232  # nothing in the file with subfields
+    item = make_item(
+        save(tmp_path / "a.mgz", subfields),
+        save(tmp_path / "b.mgz", parts),
+        scheme="freesurferCA",
+        parts_scheme=load_scheme("freesurferHBT"),
+    )
+    volume = read_label_volume(item)
+    counted = dict(zip(*np.unique(volume.part[volume.tissue > 0], return_counts=True), strict=True))
+    assert counted == {Part.HEAD: 150, Part.BODY: 149, Part.TAIL: 1}
+    assert not volume.part[volume.tissue == Tissue.BACKGROUND].any()
+    assert (volume.tissue == Tissue.CA1).sum() == 299
+
+
+@pytest.mark.parametrize("other", ["shape", "affine"])
+def test_files_on_different_grids_are_not_combined(tmp_path, other):
+    parts = np.where(make_labels() > 0, 231, 0).astype(np.int32)
+    subfields = np.where(make_labels() > 0, 206, 0).astype(np.int32)
+    shifted = AFFINE.copy()
+    if other == "shape":
+        parts = parts[:-1]
+    else:
+        shifted[0, 3] += 0.1
+    item = make_item(
+        save(tmp_path / "a.mgz", subfields),
+        save(tmp_path / "b.mgz", parts, shifted),
+        scheme="freesurferCA",
+        parts_scheme=load_scheme("freesurferHBT"),
+    )
+    with pytest.raises(InputError, match=r"b\.mgz: its grid differs from that of a\.mgz") as caught:
+        read_label_volume(item)
+    assert caught.value.reason == "grid-mismatch"
+
+
+def test_one_hemisphere_is_taken_from_a_file_of_both(tmp_path):
+    data = np.zeros(SHAPE, np.uint8)
+    data[5:8, 5:8, 5:8] = 1
+    data[40:44, 5:8, 5:8] = 101
+    data[40, 5, 5] = 108
+    path = save(tmp_path / "a.nii", data)
+    left = read_label_volume(make_item(path, scheme="ashsABC3T", bilateral=True))
+    right = read_label_volume(
+        make_item(path, scheme="ashsABC3T", bilateral=True, code_offset=100, hemi="R")
+    )
+    assert (left.tissue == Tissue.CA1).sum() == 27
+    assert not (left.tissue == Tissue.SUBICULUM).any()
+    assert (right.tissue == Tissue.CA1).sum() == 35
+    assert (right.tissue == Tissue.SUBICULUM).sum() == 1
+    data[data > 100] = 0
+    item = make_item(
+        save(tmp_path / "b.nii", data),
+        scheme="ashsABC3T",
+        bilateral=True,
+        code_offset=100,
+        hemi="R",
+    )
+    with pytest.raises(InputError, match="no labels of hemisphere R") as caught:
+        read_label_volume(item)
+    assert caught.value.reason == "empty-labels"
+
+
+def test_a_problem_found_earlier_is_raised(tmp_path):
+    problem = SchemeError("which atlas?", reason="ambiguous-atlas")
+    with pytest.raises(SchemeError, match="which atlas") as caught:
+        read_label_volume(make_item(tmp_path / "a.nii", problem=problem))
+    assert caught.value is problem
+
+
+def truncated(path, size):
+    save(path, make_labels())
+    path.write_bytes(path.read_bytes()[:size])
+
+
+def corrupt(path):
+    save(path, make_labels())
+    path.write_bytes(path.read_bytes()[:-40] + b"\xff" * 40)
+
+
+def with_nan(path):
+    data = make_labels(np.float32)
+    data[0, 0, 0] = np.nan
+    save(path, data)
+
+
+#: How to make one bad file of each kind.
+BROKEN = {
+    "text.nii.gz": lambda path: path.write_text("not an image", encoding="utf-8"),
+    "text.nii": lambda path: path.write_text("not an image " * 100, encoding="utf-8"),
+    "text.mgh": lambda path: path.write_text("not an image " * 100, encoding="utf-8"),
+    "nothing.nii": lambda path: path.touch(),
+    "absent.nii": lambda _: None,
+    "folder.nii": lambda path: path.mkdir(),
+    "truncated.nii.gz": lambda path: truncated(path, 500),
+    "truncated.nii": lambda path: truncated(path, 20000),
+    "truncated.mgh": lambda path: truncated(path, 20000),
+    "truncated.mgz": lambda path: truncated(path, 200),
+    "corrupt.nii.gz": corrupt,
+    "4d.nii": lambda path: save(path, np.stack([make_labels()] * 2, axis=-1)),
+    "2d.nii": lambda path: save(path, make_labels()[20]),
+    "interpolated.nii": lambda path: save(path, make_labels(np.float32) * np.float32(0.75)),
+    "nan.nii": with_nan,
+    "huge.nii": lambda path: save(path, make_labels(np.float64, code=1e12)),
+    "complex.nii": lambda path: save(path, make_labels(np.complex64)),
+    "empty.nii.gz": lambda path: save(path, np.zeros(SHAPE, np.int16)),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "reason", "message"),
+    [
+        *((name, "unreadable-image", "copy or make the file again") for name in list(BROKEN)[:11]),
+        ("4d.nii", "not-3d", "60 x 50 x 40 x 2"),
+        ("2d.nii", "not-3d", "50 x 40"),
+        ("interpolated.nii", "non-integer-labels", "nearest neighbor"),
+        ("nan.nii", "non-integer-labels", "not whole numbers"),
+        ("huge.nii", "non-integer-labels", "not whole numbers"),
+        ("complex.nii", "non-integer-labels", "not whole numbers"),
+        ("empty.nii.gz", "empty-labels", "all labels are zero"),
+    ],
+)
+def test_a_bad_file_is_refused_in_one_line(tmp_path, name, reason, message):
+    path = tmp_path / name
+    BROKEN[name](path)
+    with pytest.raises(InputError, match=message) as caught:
+        read_label_volume(make_item(path))
+    assert caught.value.reason == reason
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)
+
+
+def test_nifti_2_and_big_endian_files_are_read(tmp_path):
+    nib.save(nib.Nifti2Image(make_labels(), AFFINE), tmp_path / "two.nii.gz")
+    header = nib.Nifti1Header(endianness=">")
+    nib.save(nib.Nifti1Image(make_labels().astype(">i2"), AFFINE, header), tmp_path / "big.nii")
+    assert label_values(tmp_path / "two.nii.gz") == label_values(tmp_path / "big.nii") == {1, 2}
+
+
+def with_affine(path, change):
+    """Write an image whose sform is changed behind nibabel's back, which checks on writing."""
+    image = nib.Nifti1Image(make_labels(), AFFINE)
+    image.header.set_sform(change(AFFINE.copy()), code=1)
+    image.header.set_qform(np.eye(4), code=0)
+    with path.open("wb") as stream:
+        image.header.set_data_offset(352)
+        image.header.write_to(stream)
+        stream.write(b"\0" * (352 - stream.tell()) + make_labels().tobytes(order="F"))
+    return path
+
+
+def nan_affine(affine):
+    affine[1, 1] = np.nan
+    return affine
+
+
+def flat_affine(affine):
+    affine[:3, 2] = affine[:3, 1]
+    return affine
+
+
+@pytest.mark.parametrize(
+    ("change", "reason", "message"),
+    [
+        (nan_affine, "bad-affine", "NaN or infinity"),
+        (flat_affine, "bad-affine", "singular"),
+        (lambda affine: affine * 0, "bad-affine", "singular"),
+        (lambda affine: affine @ np.diag([20, 1, 1, 1]), "bad-voxel-size", "10 x 0.5 x 0.5 mm"),
+        (lambda affine: affine @ np.diag([1, 1, 0.05, 1]), "bad-voxel-size", "x 0.025 mm"),
+    ],
+)
+def test_impossible_affines_are_refused(tmp_path, change, reason, message):
+    with pytest.raises(InputError, match=message) as caught:
+        read_label_volume(make_item(with_affine(tmp_path / "a.nii", change)))
+    assert caught.value.reason == reason
+
+
+def test_nifti_without_orientation_is_refused(tmp_path):
+    image = nib.Nifti1Image(make_labels(), AFFINE)
+    image.set_sform(AFFINE, code=0)
+    image.set_qform(AFFINE, code=0)
+    nib.save(image, tmp_path / "a.nii")
+    with pytest.raises(InputError, match="neither an sform nor a qform") as caught:
+        read_label_volume(make_item(tmp_path / "a.nii"))
+    assert caught.value.reason == "bad-affine"
+
+
+def test_qform_alone_is_enough(tmp_path):
+    image = nib.Nifti1Image(make_labels(), None)
+    image.set_qform(AFFINE, code=1)
+    image.set_sform(None, code=0)
+    nib.save(image, tmp_path / "a.nii")
+    volume = read_label_volume(make_item(tmp_path / "a.nii"))
+    # The quaternion is stored in single precision.
+    np.testing.assert_allclose(volume.affine[:3, :3], AFFINE[:3, :3], atol=1e-5)
+
+
+def test_labels_of_another_protocol_name_those_that_fit(tmp_path):
+    data = np.zeros(SHAPE, np.int32)
+    data[20:25, 20, 20] = [204, 205, 206, 208, 209]
+    path = save(tmp_path / "a.mgz", data)
+    with pytest.raises(
+        SchemeError, match=r"a\.mgz: .*the labels fit freesurferCA and freesurferFS60"
+    ) as caught:
+        read_label_volume(make_item(path, scheme="freesurfer"))
+    assert caught.value.reason == "wrong-scheme"
+    with pytest.raises(SchemeError, match="labels 204, 205, 206, 208, 209 are not in") as caught:
+        read_label_volume(make_item(path, scheme="ashsPMC"))
+    assert caught.value.reason == "unknown-labels"
+
+
+def test_label_values_lists_what_occurs(tmp_path):
+    assert label_values(save(tmp_path / "a.mgz", make_labels(np.int32))) == {1, 2}
+    with pytest.raises(InputError, match="all labels are zero"):
+        label_values(save(tmp_path / "b.nii", np.zeros(SHAPE, np.uint8)))

@@ -1,0 +1,415 @@
+"""The search as a whole: which datasets, which subjects, which of several, and what is said."""
+
+import json
+import pickle
+import sys
+from pathlib import Path
+
+import pytest
+from input_cases import by_key, describe, find, save_values, touch
+
+from hipsta_bids.errors import InputError, NothingToDoError, SchemeError, UsageError
+from hipsta_bids.inputs import scan
+from hipsta_bids.inputs.search import (
+    HemisphereInput,
+    InputRequest,
+    dataset_notes,
+    find_hemispheres,
+    selection_table,
+)
+
+LEFT, RIGHT = (f"mri/{side}h.hippoAmygLabels-T1.v22.mgz" for side in "lr")
+CROP = "hemi-L_space-cropT1w_desc-subfields_dseg.nii.gz"
+
+
+def freesurfer(root, *subjects):
+    for subject in subjects:
+        touch(root / subject, LEFT, RIGHT)
+    return root
+
+
+def subjects(items):
+    return [item.subject for item in items]
+
+
+# Which datasets
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        "derivatives/freesurfer",
+        "derivatives/anything",
+        "derivatives",
+        "derivatives/run-2/freesurfer",
+        "derivatives/fmriprep/sourcedata/freesurfer",
+        "sourcedata/freesurfer",
+        ".",
+    ],
+)
+def test_default_places(tmp_path, place):
+    freesurfer(tmp_path / place, "sub-01")
+    touch(tmp_path / "derivatives" / "fmriprep" / "sub-01" / "anat", "sub-01_T1w.nii.gz")
+    assert subjects(find(tmp_path)) == ["01", "01"]
+
+
+def test_a_bids_dir_is_searched_itself_only_if_it_is_a_derivative(tmp_path):
+    freesurfer(tmp_path, "sub-01")
+    describe(tmp_path, kind="raw")
+    with pytest.raises(NothingToDoError, match=r"no derivatives/\* or sourcedata/\*"):
+        find(tmp_path)
+    describe(tmp_path, kind="derivative")
+    assert len(find(tmp_path)) == 2
+
+
+@pytest.mark.parametrize("name", ["hipsta_bids", "hipsta-bids", "Hipsta_BIDS"])
+def test_our_own_outputs_are_not_inputs(tmp_path, name):
+    own = tmp_path / "derivatives" / "out"
+    freesurfer(own, "sub-01")
+    describe(own, name)
+    freesurfer(tmp_path / "derivatives" / "fs", "sub-02")
+    assert set(subjects(find(tmp_path))) == {"02"}
+
+
+def test_older_and_broken_descriptions_do_no_harm(tmp_path):
+    root = freesurfer(tmp_path / "derivatives" / "fs", "sub-01")
+    for text in ('{"PipelineDescription": {"Name": "x"}}', "not json", "[1]", '{"GeneratedBy": 3}'):
+        (root / "dataset_description.json").write_text(text, encoding="utf-8")
+        assert len(find(tmp_path)) == 2
+
+
+def test_named_datasets_and_convenience_options(tmp_path):
+    (tmp_path / "bids").mkdir()
+    fs = freesurfer(tmp_path / "a", "sub-01")
+    ashs = tmp_path / "b"
+    touch(ashs / "sub-01" / "final", "x_left_lfseg_heur.nii.gz")
+    hippunfold = tmp_path / "c"
+    touch(hippunfold / "sub-01" / "anat", f"sub-01_{CROP}")
+    options = {"ashs_atlas": "PMC", "hemis": ("L",)}
+    by_option = find(
+        tmp_path / "bids",
+        freesurfer_dir=fs,
+        ashs_dir=ashs,
+        hippunfold_dir=hippunfold,
+        **options,
+    )
+    names = {"one": fs, "two": ashs, "three": hippunfold}
+    by_name = find(tmp_path / "bids", derivatives=names, **options)
+    assert [item.scheme.name for item in by_option] == ["ashsPMC", "freesurfer", "hippunfold"]
+    assert [item.source for item in by_option] == ["ashs", "freesurfer", "hippunfold"]
+    assert [item.source for item in by_name] == ["two", "one", "three"]
+    assert [item.files for item in by_name] == [item.files for item in by_option]
+
+
+def test_a_convenience_option_finds_its_own_kind_only(tmp_path):
+    (tmp_path / "bids").mkdir()
+    fs = freesurfer(tmp_path / "a", "sub-01")
+    with pytest.raises(NothingToDoError, match="no hippocampal segmentation"):
+        find(tmp_path / "bids", ashs_dir=fs)
+
+
+def test_a_dataset_given_twice_is_searched_once(tmp_path):
+    fs = freesurfer(tmp_path / "derivatives" / "fs", "sub-01")
+    link = tmp_path / "link"
+    link.symlink_to(fs)
+    items = find(tmp_path, derivatives={"again": fs, "link": link}, freesurfer_dir=fs)
+    assert [item.source for item in items] == ["again", "again"]
+    assert all(item.passed_over == () for item in items)
+
+
+@pytest.mark.parametrize("option", ["bids_dir", "derivatives", "freesurfer_dir"])
+@pytest.mark.parametrize(
+    ("kind", "reason"), [("missing", "missing-folder"), ("file", "not-a-folder")]
+)
+def test_folders_that_the_user_gave_have_to_exist(tmp_path, option, kind, reason):
+    bad = tmp_path / "bad"
+    if kind == "file":
+        bad.touch()
+    options = {"bids_dir": tmp_path / "bids"}
+    options["bids_dir"].mkdir()
+    options[option] = {"x": bad} if option == "derivatives" else bad
+    with pytest.raises(InputError, match=str(bad)) as caught:
+        find(**options)
+    assert caught.value.reason == reason
+
+
+def test_a_folder_that_cannot_be_listed(tmp_path, monkeypatch):
+    freesurfer(tmp_path / "derivatives" / "fs", "sub-01")
+    closed = tmp_path / "sourcedata"
+    closed.mkdir()
+    real = scan.os.scandir
+
+    def scandir(path):
+        if Path(path) == closed:
+            raise PermissionError(13, "Permission denied")
+        return real(path)
+
+    monkeypatch.setattr(scan.os, "scandir", scandir)
+    # By default nobody asked for it; named by the user, it has to be readable.
+    assert len(find(tmp_path)) == 2
+    with pytest.raises(InputError, match=r"cannot list the folder.*Permission denied") as caught:
+        find(tmp_path, derivatives={"x": closed})
+    assert caught.value.reason == "unreadable-folder"
+
+
+# Which subjects, sessions, hemispheres and files
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({}, ["01", "01", "02", "02", "10", "10"]),
+        ({"participant_labels": ("sub-01", "10")}, ["01", "01", "10", "10"]),
+        ({"participant_labels": ("02", "99")}, ["02", "02"]),
+        ({"hemis": ("R",)}, ["01", "02", "10"]),
+        ({"session_labels": ("ses-a",)}, ["10", "10"]),
+    ],
+)
+def test_labels_restrict_the_search(tmp_path, options, expected):
+    freesurfer(tmp_path / "derivatives" / "fs", "sub-01", "sub-02", "sub-10_ses-a")
+    assert subjects(find(tmp_path, **options)) == expected
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"participant_labels": ("99",)}, r"--participant-label 99 .* 2 subjects \(01, 02\)"),
+        ({"session_labels": ("b",)}, "--session-label b"),
+    ],
+)
+def test_labels_that_match_nothing(tmp_path, options, message):
+    freesurfer(tmp_path / "derivatives" / "fs", "sub-01", "sub-02")
+    with pytest.raises(NothingToDoError, match=message) as caught:
+        find(tmp_path, **options)
+    assert caught.value.reason == "no-match"
+    assert "\n" not in str(caught.value)
+
+
+def test_a_dataset_without_segmentations_says_what_was_looked_for(tmp_path):
+    touch(tmp_path / "derivatives" / "fs" / "sub-01" / "mri", "aseg.mgz")
+    with pytest.raises(NothingToDoError, match=r"derivatives/fs.*looked for FreeSurfer's") as e:
+        find(tmp_path)
+    assert e.value.reason == "no-segmentation"
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"participant_labels": ("sub_01",)}, "bad-label"),
+        ({"session_labels": ("",)}, "bad-label"),
+        ({"hemis": ("left",)}, "bad-hemisphere"),
+        ({"hemis": ()}, "bad-hemisphere"),
+    ],
+)
+def test_impossible_labels_are_usage_errors(tmp_path, options, reason):
+    freesurfer(tmp_path / "derivatives" / "fs", "sub-01")
+    with pytest.raises(UsageError, match="--") as caught:
+        find(tmp_path, **options)
+    assert caught.value.reason == reason
+
+
+def filtered(root, query, **options):
+    path = root / "filter.json"
+    path.write_text(json.dumps(query), encoding="utf-8")
+    return find(root, bids_filter_file=path, **options)
+
+
+@pytest.mark.parametrize(
+    ("query", "expected"),
+    [
+        ({"session": "pre"}, ["pre_space-cropT1w", "pre_space-cropT1w"]),
+        ({"session": ["pre", "post"], "hemi": "L"}, ["post_space-cropT1w", "pre_space-cropT1w"]),
+        ({"space": "T2w", "hemi": "R"}, ["post_acq-hi_space-T2w", "pre_space-T2w"]),
+        ({"space": "T2w", "acquisition": None}, ["pre_space-T2w", "pre_space-T2w"]),
+        ({"space": "T2w", "acquisition": "*"}, ["post_acq-hi_space-T2w"] * 2),
+        ({"space": "T2w", "acquisition": "Query.NONE", "hemi": "L"}, ["pre_space-T2w"]),
+        (
+            {"acquisition": [None, "hi"], "space": "T2w", "session": "post"},
+            ["post_acq-hi_space-T2w"] * 2,
+        ),
+        ({"acquisition": "Query.OPTIONAL", "session": "pre"}, ["pre_space-cropT1w"] * 2),
+        ({"subject": "01", "session": "post", "datatype": "anat"}, ["post_space-cropT1w"] * 2),
+    ],
+)
+def test_a_filter_file_selects_as_in_fmriprep(tmp_path, query, expected):
+    folder = tmp_path / "derivatives" / "hippunfold" / "sub-01"
+    for session, acquisition in (("pre", ""), ("post", "acq-hi_")):
+        for hemi in "LR":
+            stem = f"sub-01_ses-{session}_%shemi-{hemi}_space-%s_desc-subfields_dseg.nii.gz"
+            anat = folder / f"ses-{session}" / "anat"
+            touch(anat, stem % ("", "cropT1w"), stem % (acquisition, "T2w"))
+    items = filtered(tmp_path, {"dseg": query, "t1w": {"run": 1}})
+    names = [
+        item.files[0].name.removeprefix("sub-01_ses-").replace(f"_hemi-{item.hemi}", "")
+        for item in items
+    ]
+    assert names == [f"{name}_desc-subfields_dseg.nii.gz" for name in expected]
+
+
+def test_for_folders_without_entities_subject_and_session_are_filtered(tmp_path):
+    freesurfer(tmp_path / "derivatives" / "fs", "sub-01_ses-a", "sub-01_ses-b", "sub-02_ses-a")
+    items = filtered(tmp_path, {"dseg": {"session": "a", "subject": "02", "space": "T1w"}})
+    assert [item.key[:3] for item in items] == [("02", "a", "L"), ("02", "a", "R")]
+
+
+@pytest.mark.parametrize(
+    ("text", "error", "message"),
+    [
+        ('{"bold": {}}', UsageError, "no entry 'dseg'"),
+        ('{"dseg": {"sesion": "a"}}', UsageError, "did you mean 'session'"),
+        ("[]", UsageError, "no entry 'dseg'"),
+        ("{", InputError, "not JSON"),
+        (None, InputError, "cannot read the filter file"),
+    ],
+)
+def test_a_bad_filter_file(tmp_path, text, error, message):
+    freesurfer(tmp_path / "derivatives" / "fs", "sub-01")
+    path = tmp_path / "filter.json"
+    if text is not None:
+        path.write_text(text, encoding="utf-8")
+    with pytest.raises(error, match=message):
+        find(tmp_path, bids_filter_file=path)
+
+
+def test_pybids_is_not_imported_without_need(tmp_path, monkeypatch):
+    freesurfer(tmp_path / "derivatives" / "fs", "sub-01")
+    monkeypatch.setitem(sys.modules, "bids", None)  # importing it fails from here on
+    request = InputRequest(bids_dir=tmp_path)
+    dataset_notes(request, find_hemispheres(request))
+
+
+# Which of several
+
+
+def test_different_protocols_of_a_hemisphere_are_separate_inputs(tmp_path):
+    freesurfer(tmp_path / "derivatives" / "fs", "sub-01")
+    save_values(
+        tmp_path / "derivatives" / "ashs" / "sub-01" / "x_left_lfseg_heur.nii.gz",
+        [1, 2, 3, 4, 5, 8],
+    )
+    found = by_key(find(tmp_path))
+    assert set(found) == {
+        ("01", "", "L", "ashsABC3T"),
+        ("01", "", "L", "freesurfer"),
+        ("01", "", "R", "freesurfer"),
+    }
+
+
+def test_the_users_dataset_comes_before_default_places(tmp_path):
+    freesurfer(tmp_path / "derivatives" / "aa", "sub-01")
+    freesurfer(tmp_path / "derivatives" / "bb", "sub-01")
+    freesurfer(tmp_path / "sourcedata" / "aa", "sub-01")
+    mine = freesurfer(tmp_path / "mine", "sub-01")
+    other = freesurfer(tmp_path / "other", "sub-01")
+    left, _ = find(tmp_path, derivatives={"mine": mine}, freesurfer_dir=other)
+    assert left.source == "mine"
+    passed = [name for name, _ in left.passed_over]
+    assert passed == [
+        str(root / "sub-01" / LEFT)
+        for root in (
+            other,
+            tmp_path / "derivatives" / "aa",
+            tmp_path / "derivatives" / "bb",
+            tmp_path / "sourcedata" / "aa",
+        )
+    ]
+    assert all("which comes first" in reason for _, reason in left.passed_over)
+
+
+def test_usable_comes_before_unusable(tmp_path):
+    mine = tmp_path / "mine"
+    touch(mine / "sub-01" / "mri", "lh.hippoAmygLabels-T1.v22.HBT.mgz")
+    freesurfer(tmp_path / "derivatives" / "fs", "sub-01")
+    left, _ = find(tmp_path, derivatives={"mine": mine})
+    assert left.source == "fs"
+    assert left.passed_over[0][1] == "not usable (no-subfields)"
+
+
+def test_a_users_protocol_is_checked_even_if_nothing_needs_it(tmp_path):
+    freesurfer(tmp_path / "derivatives" / "fs", "sub-01")
+    with pytest.raises(SchemeError, match="cannot read the protocol"):
+        find(tmp_path, scheme=tmp_path / "absent.toml")
+
+
+# What is said
+
+
+def test_the_table_for_a_dry_run(tmp_path):
+    touch(
+        tmp_path / "derivatives" / "fs" / "sub-01_ses-a" / "mri",
+        *(f"lh.hippoAmygLabels{kind}.mgz" for kind in (".CA", ".HBT", ".CA.FSvoxelSpace")),
+    )
+    touch(tmp_path / "derivatives" / "fs" / "sub-02" / "mri", "lh.hippoAmygLabels.HBT.mgz")
+    first, second = selection_table(find(tmp_path))
+    assert first == {
+        "subject": "01",
+        "session": "a",
+        "hemisphere": "L",
+        "file": (
+            "sub-01_ses-a/mri/lh.hippoAmygLabels.CA.mgz + "
+            "sub-01_ses-a/mri/lh.hippoAmygLabels.HBT.mgz"
+        ),
+        "scheme": "freesurferCA",
+        "why": "fs: subfields from .CA, head/body/tail from .HBT, analysis unnamed",
+        "edited": "n/a",
+        "passed over": (
+            "lh.hippoAmygLabels.CA.FSvoxelSpace.mgz: resampled to 1 mm; a finer file exists"
+        ),
+    }
+    assert list(second) == list(first)
+    assert (second["session"], second["passed over"]) == ("n/a", "n/a")
+    assert "NOT USABLE" in second["why"]
+
+
+def test_notes_name_participants_without_segmentation(tmp_path):
+    freesurfer(tmp_path / "derivatives" / "fs", "sub-01", "sub-02")
+    touch(tmp_path, "sub-01/anat/sub-01_T1w.nii.gz", "sub-09/ses-1/anat/sub-09_ses-1_T1w.nii.gz")
+    request = InputRequest(bids_dir=tmp_path)
+    no_description, missing = dataset_notes(request, find_hemispheres(request))
+    assert "no dataset_description.json" in no_description
+    assert missing == "no segmentation found for 1 participant (09)"
+    describe(tmp_path, kind="raw")
+    request = InputRequest(bids_dir=tmp_path, participant_labels=("01", "sub-77"))
+    assert dataset_notes(request, find_hemispheres(request)) == (
+        "no segmentation found for 1 participant (77)",
+    )
+
+
+def test_a_pybids_database_is_made_and_used(tmp_path):
+    bids_dir, database = tmp_path / "bids", tmp_path / "database"
+    describe(bids_dir, kind="raw")
+    freesurfer(bids_dir / "derivatives" / "fs", "sub-01")
+    touch(bids_dir, "sub-09/ses-1/anat/sub-09_ses-1_T1w.nii.gz")
+    request = InputRequest(bids_dir=bids_dir, bids_database_dir=database)
+    items = find_hemispheres(request)
+    for _ in range(2):
+        assert dataset_notes(request, items) == ("no segmentation found for 1 participant (09)",)
+        assert list(database.iterdir())
+    other = InputRequest(bids_dir=tmp_path, bids_database_dir=database)
+    with pytest.raises(InputError, match="was made for") as caught:
+        dataset_notes(other, items)
+    assert caught.value.reason == "unreadable-database"
+    next(database.iterdir()).write_text("garbage", encoding="utf-8")
+    with pytest.raises(InputError, match="cannot use this database"):
+        dataset_notes(request, items)
+
+
+def test_inputs_survive_pickling(tmp_path):
+    touch(tmp_path / "derivatives" / "fs" / "sub-01" / "mri", "lh.hippoAmygLabels.HBT.mgz")
+    (item,) = find(tmp_path)
+    copy = pickle.loads(pickle.dumps(item))  # noqa: S301 (made on this line)
+    assert isinstance(copy, HemisphereInput)
+    assert (copy.key, copy.files, copy.scheme) == (item.key, item.files, item.scheme)
+    assert str(copy.problem) == str(item.problem)
+
+
+def test_large_trees_are_listed_once_per_folder(tmp_path, monkeypatch):
+    freesurfer(tmp_path / "derivatives" / "fs", *(f"sub-{index:03d}" for index in range(50)))
+    for index in range(50):
+        touch(tmp_path / "derivatives" / "fs" / f"sub-{index:03d}", "surf/lh.white", "label/x/y")
+    listed = []
+    real = scan.os.scandir
+    monkeypatch.setattr(scan.os, "scandir", lambda path: listed.append(str(path)) or real(path))
+    assert len(find(tmp_path)) == 100
+    folders = [path for path in listed if "sub-" in path]
+    assert len(folders) == len(set(folders)) == 100  # each subject and its mri

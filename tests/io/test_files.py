@@ -1,0 +1,160 @@
+import errno
+import json
+import os
+import resource
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hipsta_bids.errors import InputError, OutputError
+from hipsta_bids.io import files
+
+
+def test_written_file_replaces_and_leaves_nothing_aside(tmp_path):
+    path = tmp_path / "a" / "b.txt"
+    files.write_text(path, "one")
+    files.write_text(path, "two")
+    assert path.read_text() == "two"
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_failed_write_keeps_the_earlier_file(tmp_path, monkeypatch):
+    path = tmp_path / "b.txt"
+    files.write_text(path, "one")
+
+    def no_space(_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", no_space)
+    with pytest.raises(OutputError, match="no space left") as caught:
+        files.write_text(path, "two")
+    assert caught.value.reason == "disk-full"
+    assert caught.value.exit_code == 73
+    assert path.read_text() == "one"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_interrupted_write_leaves_nothing_aside(tmp_path, monkeypatch):
+    def interrupt(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "fsync", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        files.write_text(tmp_path / "b.txt", "two")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture
+def file_size_limit():
+    """The kernel's own refusal to write more than 1 kB into any file."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1024, before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    signal.signal(signal.SIGXFSZ, handler)
+
+
+@pytest.mark.usefixtures("file_size_limit")
+def test_writability_is_proven_by_a_block(tmp_path):
+    with pytest.raises(OutputError, match="no space left"):
+        files.check_writable(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("number", "reason"),
+    [
+        (errno.ENOSPC, "disk-full"),
+        (errno.EDQUOT, "disk-full"),
+        (errno.EROFS, "read-only"),
+        (errno.EACCES, "read-only"),
+        (errno.EIO, "not-writable"),
+    ],
+)
+def test_system_errors_get_a_reason(number, reason):
+    assert files.output_error(Path("x"), OSError(number, "text")).reason == reason
+
+
+def test_file_in_place_of_a_folder_is_not_writable(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="cannot be written"):
+        files.check_writable(tmp_path / "file" / "out")
+
+
+def test_json_is_strict_and_knows_numpy(tmp_path):
+    path = tmp_path / "a.json"
+    files.write_json(
+        path,
+        {
+            "nan": np.float64("nan"),
+            "infinite": float("inf"),
+            "array": np.array([[1.5, np.nan]]),
+            "count": np.int32(3),
+            "flag": np.bool_(True),
+            "path": Path("a/b"),
+            "tuple": (1, None),
+        },
+    )
+    assert "NaN" not in path.read_text()
+    assert json.loads(path.read_text()) == {
+        "nan": None,
+        "infinite": None,
+        "array": [[1.5, None]],
+        "count": 3,
+        "flag": True,
+        "path": "a/b",
+        "tuple": [1, None],
+    }
+    assert files.read_json(path)["count"] == 3
+
+
+@pytest.mark.parametrize("content", ["{", "[1]"])
+def test_bad_json_is_named(tmp_path, content):
+    path = tmp_path / "a.json"
+    path.write_text(content)
+    with pytest.raises(InputError, match=r"a\.json"):
+        files.read_json(path)
+
+
+def test_table_round_trip_keeps_rows_whole(tmp_path):
+    path = tmp_path / "a.tsv"
+    files.write_tsv(path, ["a", "b"], [["1", "x\ty\nz"], ["", "n/a"]])
+    assert path.read_text() == "a\tb\n1\tx y z\nn/a\tn/a\n"
+    assert files.read_tsv(path) == [{"a": "1", "b": "x y z"}, {"a": "n/a", "b": "n/a"}]
+
+
+def test_broken_table_is_named(tmp_path):
+    path = tmp_path / "a.tsv"
+    path.write_text("a\tb\n1\n")
+    with pytest.raises(InputError, match="differ in length"):
+        files.read_tsv(path)
+    with pytest.raises(InputError, match="no such file"):
+        files.read_tsv(tmp_path / "missing.tsv")
+
+
+def test_hash_is_sha256(tmp_path):
+    (tmp_path / "abc").write_text("abc")
+    # FIPS 180-2, appendix B.1
+    assert files.sha256_of(tmp_path / "abc") == (
+        "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    )
+    with pytest.raises(InputError, match="cannot be read"):
+        files.sha256_of(tmp_path / "missing")
+
+
+def test_leftovers_of_a_killed_run_are_removed_but_no_others(tmp_path):
+    for name in (".s_seg-a_x.tsv.12.tmp", ".s_seg-b_x.tsv.12.tmp", "s_seg-a_x.tsv"):
+        (tmp_path / name).write_text("")
+    files.remove_leftovers(tmp_path, "s_*seg-a_*")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        ".s_seg-b_x.tsv.12.tmp",
+        "s_seg-a_x.tsv",
+    ]
+
+
+def test_names_that_the_locale_cannot_spell_keep_their_bytes(tmp_path):
+    name = "ıİß".encode().decode("ascii", errors="surrogateescape")  # as in LC_ALL=C
+    files.write_text(tmp_path / "text", name)
+    assert (tmp_path / "text").read_text(encoding="utf-8") == "ıİß"

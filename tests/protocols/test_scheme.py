@@ -1,0 +1,283 @@
+import io
+import tokenize
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hipsta_bids.errors import SchemeError
+from hipsta_bids.protocols.load import load_scheme, scheme_names, scheme_table
+from hipsta_bids.protocols.protocol import MEDIAL_TO_LATERAL, Part, Tissue, translate
+
+PACKAGE = Path(__file__).parents[2] / "hipsta_bids"
+
+#: The codes that the protocols' authors publish, by tissue and part (the user's list).
+PUBLISHED = {
+    "freesurfer": {
+        (233, Tissue.PRESUBICULUM, Part.HEAD),
+        (234, Tissue.PRESUBICULUM, Part.BODY),
+        (235, Tissue.SUBICULUM, Part.HEAD),
+        (236, Tissue.SUBICULUM, Part.BODY),
+        (237, Tissue.CA1, Part.HEAD),
+        (238, Tissue.CA1, Part.BODY),
+        (239, Tissue.CA2_3, Part.HEAD),
+        (240, Tissue.CA2_3, Part.BODY),
+        (241, Tissue.CA4, Part.HEAD),
+        (242, Tissue.CA4, Part.BODY),
+        (243, Tissue.DENTATE_GYRUS, Part.HEAD),
+        (244, Tissue.DENTATE_GYRUS, Part.BODY),
+        (245, Tissue.MOLECULAR_LAYER, Part.HEAD),
+        (246, Tissue.MOLECULAR_LAYER, Part.BODY),
+        (226, Tissue.HIPPOCAMPUS, Part.TAIL),
+        (211, Tissue.HATA, Part.HEAD),
+        (203, Tissue.PARASUBICULUM, Part.HEAD),
+        (212, Tissue.FIMBRIA, Part.BODY),
+        (215, Tissue.FISSURE, Part.UNKNOWN),
+        (7001, Tissue.OTHER, Part.UNKNOWN),
+    },
+    "freesurferFS60": {
+        (204, Tissue.PRESUBICULUM, Part.UNKNOWN),
+        (205, Tissue.SUBICULUM, Part.UNKNOWN),
+        (206, Tissue.CA1, Part.UNKNOWN),
+        (208, Tissue.CA2_3, Part.UNKNOWN),
+        (209, Tissue.CA4, Part.UNKNOWN),
+        (210, Tissue.DENTATE_GYRUS, Part.UNKNOWN),
+        (214, Tissue.MOLECULAR_LAYER, Part.UNKNOWN),
+        (226, Tissue.HIPPOCAMPUS, Part.TAIL),
+    },
+    "freesurferCA": {
+        (204, Tissue.PRESUBICULUM, Part.UNKNOWN),
+        (205, Tissue.SUBICULUM, Part.UNKNOWN),
+        (206, Tissue.CA1, Part.UNKNOWN),
+        (208, Tissue.CA2_3, Part.UNKNOWN),
+        (209, Tissue.DENTATE_GYRUS, Part.UNKNOWN),
+        (226, Tissue.HIPPOCAMPUS, Part.TAIL),
+    },
+    "freesurferHBT": {
+        (231, Tissue.HIPPOCAMPUS, Part.BODY),
+        (232, Tissue.HIPPOCAMPUS, Part.HEAD),
+        (226, Tissue.HIPPOCAMPUS, Part.TAIL),
+    },
+    "ashsABC3T": {
+        (1, Tissue.CA1, Part.UNKNOWN),
+        (2, Tissue.CA2, Part.UNKNOWN),
+        (3, Tissue.DENTATE_GYRUS, Part.UNKNOWN),
+        (4, Tissue.CA3, Part.UNKNOWN),
+        (5, Tissue.HIPPOCAMPUS, Part.TAIL),
+        (8, Tissue.SUBICULUM, Part.UNKNOWN),
+        (9, Tissue.ENTORHINAL, Part.UNKNOWN),
+        (10, Tissue.BA35, Part.UNKNOWN),
+        (11, Tissue.BA36, Part.UNKNOWN),
+        (12, Tissue.PARAHIPPOCAMPAL, Part.UNKNOWN),
+        (20, Tissue.HIPPOCAMPUS, Part.HEAD),
+    },
+    "ashsPMC": {
+        (1, Tissue.CA1, Part.UNKNOWN),
+        (2, Tissue.CA2, Part.UNKNOWN),
+        (3, Tissue.DENTATE_GYRUS, Part.UNKNOWN),
+        (4, Tissue.CA3, Part.UNKNOWN),
+        (8, Tissue.SUBICULUM, Part.UNKNOWN),
+        (10, Tissue.ENTORHINAL, Part.UNKNOWN),
+        (11, Tissue.BA35, Part.UNKNOWN),
+        (12, Tissue.BA36, Part.UNKNOWN),
+        (13, Tissue.PARAHIPPOCAMPAL, Part.UNKNOWN),
+    },
+    "ashsUtrecht7T": {
+        (1, Tissue.ENTORHINAL, Part.UNKNOWN),
+        (2, Tissue.SUBICULUM, Part.UNKNOWN),
+        (3, Tissue.CA1, Part.UNKNOWN),
+        (4, Tissue.CA2, Part.UNKNOWN),
+        (5, Tissue.DENTATE_GYRUS, Part.UNKNOWN),
+        (6, Tissue.CA3, Part.UNKNOWN),
+        (7, Tissue.CYST, Part.UNKNOWN),
+        (8, Tissue.HIPPOCAMPUS, Part.TAIL),
+    },
+    "hippunfold": {
+        (1, Tissue.SUBICULUM, Part.UNKNOWN),
+        (2, Tissue.CA1, Part.UNKNOWN),
+        (3, Tissue.CA2, Part.UNKNOWN),
+        (4, Tissue.CA3, Part.UNKNOWN),
+        (5, Tissue.CA4, Part.UNKNOWN),
+        (6, Tissue.DENTATE_GYRUS, Part.UNKNOWN),
+        (7, Tissue.MOLECULAR_LAYER, Part.UNKNOWN),
+        (8, Tissue.CYST, Part.UNKNOWN),
+    },
+}
+
+MINIMAL = """
+name = "mine"
+title = "Mine"
+citation = "None"
+sheet = ["subiculum", "CA1"]
+layer = []
+interior = ["dentate_gyrus"]
+labels = [
+  { code = 1, tissue = "subiculum", name = "s", abbreviation = "S", color = "#000001" },
+  { code = 2, tissue = "CA1", part = "body", name = "c", abbreviation = "C", color = "#0000AA" },
+  { code = 3, tissue = "dentate_gyrus", name = "d", abbreviation = "D", color = "#000003" },
+]
+"""
+
+
+def write(tmp_path, text):
+    path = tmp_path / "mine.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("name", scheme_names())
+def test_every_bundled_protocol_loads_with_its_published_codes(name):
+    scheme = load_scheme(name)
+    found = {(label.code, label.tissue, label.part) for label in scheme.labels}
+    assert scheme.name == name
+    assert found >= PUBLISHED[name]
+    assert scheme.citation
+    assert scheme.sheet == tuple(tissue for tissue in MEDIAL_TO_LATERAL if tissue in scheme.sheet)
+
+
+def test_all_published_protocols_are_bundled():
+    assert set(scheme_names()) == set(PUBLISHED)
+    assert [row["name"] for row in scheme_table()] == list(scheme_names())
+    assert all(row["title"] and int(row["labels"]) for row in scheme_table())
+
+
+def test_freesurfer_lists_every_amygdala_nucleus():
+    others = {lb.code for lb in load_scheme("freesurfer").labels if lb.tissue is Tissue.OTHER}
+    assert others == set(range(7001, 7021))
+
+
+def test_no_code_of_a_label_appears_in_the_package_outside_of_protocol_files():
+    # Codes from 200 on are distinctive enough to be searched for as numbers.
+    codes = {code for name in scheme_names() for code in load_scheme(name).codes if code >= 200}
+    hits = [
+        f"{path.name}:{token.start[0]}: {token.line.strip()}"
+        for folder in ("schemes", "bids", "geometry")
+        for path in (PACKAGE / folder).glob("*.py")
+        for token in tokenize.generate_tokens(io.StringIO(path.read_text("utf-8")).readline)
+        if token.type == tokenize.NUMBER and token.string in map(str, codes)
+    ]
+    assert hits == []
+
+
+def test_a_users_file_loads_and_fills_in_defaults(tmp_path):
+    scheme = load_scheme(write(tmp_path, MINIMAL))
+    assert (scheme.unlisted, scheme.right_offset, scheme.tool) == ("error", 0, "")
+    assert [label.part for label in scheme.labels] == [Part.UNKNOWN, Part.BODY, Part.UNKNOWN]
+    assert scheme.labels[1].color == "#0000aa"
+    assert load_scheme(str(tmp_path / "mine.toml")) == scheme
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('title = "Mine"', 'titel = "Mine"', r"unknown key 'titel' \(did you mean 'title'\?\)"),
+        ('title = "Mine"', "", "key 'title' is missing"),
+        ('title = "Mine"', "title = 3", "title has to be of type str"),
+        ('name = "mine"', 'name = "my-own"', "letters and digits"),
+        ("code = 2", "code = 1", "code 1 is listed twice"),
+        ("code = 2", "code = true", "code has to be of type int"),
+        ("code = 2", "code = 0", "codes are positive"),
+        ("code = 2", "kode = 2", "unknown key 'kode'"),
+        ('tissue = "CA1"', 'tissue = "CA9"', r"unknown tissue 'CA9' \(did you mean 'ca"),
+        ('part = "body"', 'part = "bodi"', r"unknown part 'bodi' \(did you mean 'body'\?\)"),
+        ('color = "#0000AA"', 'color = "blue"', "color 'blue' is not of the form #rrggbb"),
+        ('sheet = ["subiculum", "CA1"]', 'sheet = ["CA1", "subiculum"]', "medial to lateral"),
+        ('sheet = ["subiculum", "CA1"]', 'sheet = ["CA1", "CA3"]', "no label has tissue CA3"),
+        ('sheet = ["subiculum", "CA1"]', 'sheet = ["dentate_gyrus"]', "medial to lateral"),
+        ('sheet = ["subiculum", "CA1"]', "sheet = []", "given without a sheet"),
+        ("layer = []", 'layer = ["CA1"]', "in both sheet and layer"),
+        ('interior = ["dentate_gyrus"]', 'interior = ["CA1"]', "in both sheet and interior"),
+        ("layer = []", 'layer = []\nunlisted = "ignore"', "'error' or 'other'"),
+        ("layer = []", "layer = []\nright_offset = 2", "exceed every code"),
+        ("labels = [", "labels = [ 7,", "label 7 is not a table"),
+    ],
+)
+def test_a_mistake_in_a_file_is_named(tmp_path, old, new, message):
+    assert old in MINIMAL
+    path = write(tmp_path, MINIMAL.replace(old, new))
+    with pytest.raises(SchemeError, match=message) as caught:
+        load_scheme(path)
+    assert caught.value.reason == "invalid-scheme"
+    assert str(path) in str(caught.value)
+
+
+def test_a_file_with_neither_sheet_nor_parts_is_refused(tmp_path):
+    text = MINIMAL.replace('["subiculum", "CA1"]', "[]").replace('["dentate_gyrus"]', "[]")
+    with pytest.raises(SchemeError, match="neither a sheet nor a label with a part"):
+        load_scheme(write(tmp_path, text.replace('part = "body", ', "")))
+
+
+def test_a_file_that_is_missing_or_not_toml(tmp_path):
+    with pytest.raises(SchemeError, match="cannot read the protocol") as caught:
+        load_scheme(tmp_path / "absent.toml")
+    assert caught.value.reason == "unreadable-scheme"
+    with pytest.raises(SchemeError, match="not a TOML file"):
+        load_scheme(write(tmp_path, "name = "))
+
+
+def test_an_unknown_name_suggests_the_nearest():
+    with pytest.raises(SchemeError, match="did you mean 'hippunfold'") as caught:
+        load_scheme("hipunfold")
+    assert caught.value.reason == "unknown-scheme"
+
+
+def test_translate_follows_the_table():
+    codes = np.array([[[0, 236, 237], [245, 226, 7003]]], dtype=">i4")
+    tissue, part = translate(codes, load_scheme("freesurfer"))
+    assert tissue.dtype == part.dtype == np.uint8
+    assert tissue.tolist() == [
+        [
+            [Tissue.BACKGROUND, Tissue.SUBICULUM, Tissue.CA1],
+            [Tissue.MOLECULAR_LAYER, Tissue.HIPPOCAMPUS, Tissue.OTHER],
+        ]
+    ]
+    assert part.tolist() == [[[0, Part.BODY, Part.HEAD], [Part.HEAD, Part.TAIL, 0]]]
+
+
+def test_translate_takes_unlisted_codes_as_the_protocol_says():
+    freesurfer = load_scheme("freesurfer")  # unlisted = "other"
+    tissue, _ = translate(np.array([238, 219, 90000, -1]), freesurfer)
+    assert tissue.tolist() == [Tissue.CA1, Tissue.OTHER, Tissue.OTHER, Tissue.OTHER]
+    with pytest.raises(
+        SchemeError, match=r"labels -4, 9, 300 are not in the protocol hippunfold"
+    ) as e:
+        translate(np.array([1, 2, 9, 300, -4, 9]), load_scheme("hippunfold"))
+    assert e.value.reason == "unknown-labels"
+
+
+def test_translate_works_for_small_unsigned_types():
+    tissue, _ = translate(np.array([1, 2, 20, 0], dtype=np.uint8), load_scheme("ashsABC3T"))
+    assert tissue.tolist() == [Tissue.CA1, Tissue.CA2, Tissue.HIPPOCAMPUS, Tissue.BACKGROUND]
+
+
+def test_translate_refuses_labels_of_another_protocol():
+    full = np.array([0, 236, 238, 240, 226])
+    with pytest.raises(SchemeError, match="no label of the sheet of freesurferCA occurs") as caught:
+        translate(full, load_scheme("freesurferCA"))
+    assert caught.value.reason == "wrong-scheme"
+    with pytest.raises(SchemeError, match="no label of a part of freesurferHBT occurs"):
+        translate(np.array([0, 236]), load_scheme("freesurferHBT"))
+
+
+def test_a_long_list_of_unknown_labels_is_cut():
+    with pytest.raises(SchemeError, match=r"109, 110, 111 and 38 more are not") as caught:
+        translate(np.arange(100, 150), load_scheme("hippunfold"))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("values", "fitting"),
+    [
+        ({1, 2, 3, 4, 5, 8, 20}, {"ashsABC3T"}),
+        ({1, 2, 3, 4, 5, 8}, {"ashsABC3T", "hippunfold"}),
+        ({1, 2, 3, 4, 8}, {"ashsABC3T", "ashsPMC"}),
+        ({1, 2, 3, 4, 8, 10, 11, 12}, {"ashsABC3T", "ashsPMC"}),
+        ({1, 2, 3, 4, 8, 10, 11, 12, 13}, {"ashsPMC"}),
+        ({1, 2, 3, 4, 5, 6, 7, 8}, {"ashsUtrecht7T", "hippunfold"}),
+        ({205, 206, 208, 204, 209}, {"freesurferCA", "freesurferFS60"}),
+        ({1, 2}, set()),
+        (set(), set()),
+    ],
+)
+def test_fits_tells_protocols_by_their_values(values, fitting):
+    assert {n for n in scheme_names() if load_scheme(n).fits(frozenset(values))} == fitting

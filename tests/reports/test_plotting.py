@@ -1,0 +1,44 @@
+"""Figures where there is no screen and no home."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+DRAW = """
+import os
+from hipsta_bids.reports.plotting import new_figure
+before = dict(os.environ)
+new_figure((2, 2), "constrained").savefig("figure.png")
+assert dict(os.environ) == before
+"""
+
+
+@pytest.mark.parametrize(
+    "surroundings",
+    [
+        {"HOME": "/proc/nobody"},  # where nobody can make folders, not even root
+        {"MPLCONFIGDIR": "/proc/nobody"},
+        {"MPLBACKEND": "no-such-backend"},
+        {"MATPLOTLIBRC": "/proc/version"},  # a file, and not one of preferences
+    ],
+    ids=str,
+)
+def test_drawing_minds_no_surroundings(tmp_path, surroundings):
+    aside = tmp_path / "aside"
+    aside.mkdir()
+    environment = {"PYTHONPATH": str(ROOT), "TMPDIR": str(aside)} | surroundings
+    run = subprocess.run(
+        [sys.executable, "-c", DRAW],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.stderr == ""
+    assert run.returncode == 0
+    assert (tmp_path / "figure.png").read_bytes().startswith(b"\x89PNG")
+    assert not list(aside.iterdir())
