@@ -131,7 +131,7 @@ def benchmark(items: Sequence[HemisphereInput], spacings: Sequence[float], repea
 
 def name(item: HemisphereInput) -> str:
     """Name a hemisphere as its outputs are named."""
-    return f"sub-{item.subject} {item.hemi} {item.scheme.name}"
+    return f"sub-{item.subject} {item.hemi} {item.protocol.name}"
 
 
 def report(spacing: float, costs: dict[str, Cost | None]) -> Any:  # noqa: ANN401  (JSON)

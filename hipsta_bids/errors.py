@@ -80,7 +80,7 @@ class SettingsError(UsageError):
     """A setting is unknown or out of range."""
 
 
-class SchemeError(HipstaError):
+class ProtocolError(HipstaError):
     """A segmentation protocol file is wrong, or does not fit the labels."""
 
 

@@ -539,29 +539,7 @@ def read_settings(path: Path | None, kind: type[T]) -> T:
 
 
 def settings_from(values: Mapping[str, Any], kind: type[T], *, where: str, prefix: str = "") -> T:
-    """Build a settings dataclass from nested tables.
-
-    Parameters
-    ----------
-    values : mapping
-        What a TOML file says.
-    kind : type
-        A dataclass.
-    where : str
-        File name for messages.
-    prefix : str
-        Name of the table, with its final dot.
-
-    Returns
-    -------
-    kind
-        With defaults for what ``values`` leaves out.
-
-    Raises
-    ------
-    SettingsError
-        If a key is unknown (with the nearest known one) or a value has the wrong type or range.
-    """
+    """Build a settings dataclass from nested tables."""
     hints = get_type_hints(kind)
     names = [entry.name for entry in dataclasses.fields(kind)]  # type: ignore[arg-type]  # any dataclass
     chosen = {}
@@ -648,54 +626,19 @@ def _describe(choices: tuple[Any, ...]) -> str:
 
 
 def resolve(settings: Any) -> dict[str, Any]:  # noqa: ANN401  (any dataclass)
-    """Turn settings into nested dictionaries of plain values, every default filled in.
-
-    Parameters
-    ----------
-    settings : dataclass instance
-        All settings.
-
-    Returns
-    -------
-    dict
-        Ready for JSON.
-    """
+    """Turn settings into nested dictionaries of plain values, every default filled in."""
     resolved: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(settings)))
     return resolved
 
 
 def settings_hash(settings: Any) -> str:  # noqa: ANN401  (any dataclass)
-    """Hash the resolved settings.
-
-    Parameters
-    ----------
-    settings : dataclass instance
-        All settings.
-
-    Returns
-    -------
-    str
-        SHA-256, 64 hexadecimal digits; independent of the order of fields.
-    """
+    """Hash the resolved settings."""
     canonical = json.dumps(resolve(settings), sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()
 
 
 def flatten(resolved: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Name each leaf of resolved settings by its dotted path.
-
-    Parameters
-    ----------
-    resolved : mapping
-        From :func:`resolve`.
-    prefix : str
-        Put before each name.
-
-    Returns
-    -------
-    dict
-        ``{"body.layer_rule": ...}``.
-    """
+    """Name each leaf of resolved settings by its dotted path."""
     flat: dict[str, Any] = {}
     for key, value in resolved.items():
         if isinstance(value, Mapping):
@@ -706,18 +649,7 @@ def flatten(resolved: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def settings_toml(settings: Any) -> str:  # noqa: ANN401  (any dataclass)
-    """Write settings as TOML, each with its meaning as a comment.
-
-    Parameters
-    ----------
-    settings : dataclass instance
-        All settings.
-
-    Returns
-    -------
-    str
-        A file that :func:`load_settings` reads back to the same settings.
-    """
+    """Write settings as TOML, each with its meaning as a comment."""
     return "\n".join(_toml_lines(settings, "")).strip() + "\n"
 
 
@@ -751,18 +683,7 @@ def _comment(text: str) -> list[str]:
 
 
 def field_meanings(kind: type) -> dict[str, str]:
-    """Read the docstrings that follow the fields of a dataclass in its source.
-
-    Parameters
-    ----------
-    kind : type
-        A dataclass.
-
-    Returns
-    -------
-    dict of str to str
-        Meaning per entry that has one.
-    """
+    """Read the docstrings that follow the fields of a dataclass in its source."""
     (tree,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
     meanings: dict[str, str] = {}
     name = None

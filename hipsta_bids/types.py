@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hipsta_bids.protocols.protocol import Scheme
+from hipsta_bids.protocols.protocol import Protocol
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int32]
@@ -66,12 +66,12 @@ class LabelVolume:
     """A segmentation in the package's own vocabulary."""
 
     tissue: NDArray[np.uint8]
-    """(I, J, K), values of :class:`~hipsta_bids.schemes.Tissue`."""
+    """(I, J, K), values of :class:`~hipsta_bids.protocols.Tissue`."""
     part: NDArray[np.uint8]
-    """(I, J, K), values of :class:`~hipsta_bids.schemes.Part`."""
+    """(I, J, K), values of :class:`~hipsta_bids.protocols.Part`."""
     affine: Float
     """(4, 4), voxel index to RAS mm."""
-    scheme: Scheme
+    protocol: Protocol
     edited_mask: EditedMask | None = None
     """What takes the place of the labels between the end planes, if anything."""
     start: tuple[int, int, int] = (0, 0, 0)

@@ -13,7 +13,7 @@ from hipsta_bids.derivatives.status import identity, read_status, row_key
 from hipsta_bids.io import files
 from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.phantom import Phantom, PhantomSpec
-from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import HemisphereMaps, LabelVolume
@@ -43,10 +43,10 @@ class Case:
 
 
 @cache
-def measured(spec, *, scheme="freesurfer", hemi="L", settings=None, voxel=0.4):
+def measured(spec, *, protocol="freesurfer", hemi="L", settings=None, voxel=0.4):
     """Draw and measure once for all tests (specifications and settings are hashable)."""
     phantom = Phantom(spec)
-    volume = phantom.label_volume(load_scheme(scheme), hemi=hemi, voxel_size=(voxel,) * 3)
+    volume = phantom.label_volume(load_protocol(protocol), hemi=hemi, voxel_size=(voxel,) * 3)
     maps = measure(volume, hemi, settings)
     return Case(phantom=phantom, volume=volume, maps=maps, hemi=hemi)
 
@@ -80,7 +80,7 @@ class Damage:
         self.u, self.v, self.n = np.moveaxis(
             self.body.locate(points, reach=6.0).reshape(shape), -1, 0
         )
-        self.sheet = np.isin(self.volume.tissue, self.volume.scheme.sheet)
+        self.sheet = np.isin(self.volume.tissue, self.volume.protocol.sheet)
 
     def ball(self, place, radius):
         """Voxels within a radius (mm) of a place (u, v, n)."""

@@ -15,7 +15,7 @@ from hipsta_bids.errors import GeometryError, InputError
 from hipsta_bids.geometry.catalog import MAPS, SECTIONS, average_profiles
 from hipsta_bids.inputs.request import HemisphereInput
 from hipsta_bids.participant.job import run_job
-from hipsta_bids.protocols.protocol import Label, Part, Scheme, Tissue
+from hipsta_bids.protocols.protocol import Label, Part, Protocol, Tissue
 from hipsta_bids.types import BodyMask, Coordinates, Flag, HemisphereMaps, Sheet, TetMesh
 
 NX, NY, NZ = 5, 4, 3
@@ -37,7 +37,7 @@ def make_scheme(name="demo"):
         for k, tissue in enumerate(TISSUES)
         for part in (Part.HEAD, Part.BODY)
     ]
-    return Scheme(
+    return Protocol(
         name=name,
         title="Protocol of the tests",
         citation="Nobody N. A protocol. 2020.",
@@ -112,7 +112,7 @@ def make_input(folder, subject="01", *, hemi="L", act="ok", problem=None, sessio
         subject=subject,
         session=session,
         hemi=hemi,
-        scheme=make_scheme(),
+        protocol=make_scheme(),
         files=(path,),
         source="tests",
         source_path=folder,

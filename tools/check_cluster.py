@@ -22,11 +22,11 @@ from checks import (
     break_one,
     demand,
     demand_equal,
+    echo,
     hipsta,
     outputs,
     phantoms,
     reasons,
-    say,
     status,
 )
 
@@ -224,13 +224,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
             for line in run(str(options.start_slurm), str(work / "slurm")).splitlines():
                 name, _, value = line.removeprefix("export ").partition("=")
                 os.environ[name] = value
-        say(run("sinfo", "--version").strip())
+        echo(run("sinfo", "--version").strip())
         try:
             check_all(work, options.n_subjects)
         finally:
             if not running:
                 run(str(options.start_slurm), "--stop", str(work / "slurm"), code=None)
-    say("all well")
+    echo("all well")
 
 
 def check_all(work: Path, n_subjects: int) -> None:

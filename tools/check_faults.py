@@ -22,10 +22,10 @@ from checks import (
     COMMAND,
     demand,
     demand_equal,
+    echo,
     hipsta,
     outputs,
     phantoms,
-    say,
     status,
 )
 
@@ -94,7 +94,7 @@ def check_kills(work: Path, data: Path, reference: dict[str, bytes], n_kills: in
         demand_equal(out, reference, f"kill {number} ({victim}), then run again")
         demand(not list(out.rglob("*.tmp")), f"kill {number}: nothing left aside")
         shutil.rmtree(out)
-    say(f"killed: {killed}")
+    echo(f"killed: {killed}")
 
 
 def worker_of(pid: int, generator: random.Random) -> int | None:
@@ -114,7 +114,7 @@ def check_full_disk(work: Path, data: Path, reference: dict[str, bytes]) -> None
     needed = sum(-(-len(content) // _PAGE) * _PAGE for content in reference.values())
     mount = ["mount", "-t", "tmpfs", "-o", f"size={needed * 6 // 10}", "tmpfs", str(disk)]
     if subprocess.run(mount, capture_output=True, check=False).returncode:  # noqa: S603  (ours)
-        say("SKIPPED: full disk (mounting takes root)")
+        echo("SKIPPED: full disk (mounting takes root)")
         return
     try:
         out = disk / "out"
@@ -245,7 +245,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         check_lost_input(work, data, reference)
         check_places(work, data, reference)
         check_kills(work, data, reference, options.kills)
-    say("all well")
+    echo("all well")
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ _START = time.monotonic()
 _COSTS = ("seconds", "cpu_seconds", "peak_memory")
 
 
-def say(text: str) -> None:
+def echo(text: str) -> None:
     """Print a line with the time since the start."""
     sys.stdout.write(f"[{time.monotonic() - _START:4.0f} s] {text}\n")
     sys.stdout.flush()
@@ -26,7 +26,7 @@ def demand(claim: bool, text: str) -> None:
     """Say that something holds, or end with exit code 1."""
     if not claim:
         sys.exit(f"FAILED: {text}")
-    say(f"ok: {text}")
+    echo(f"ok: {text}")
 
 
 def hipsta(

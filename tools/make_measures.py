@@ -25,7 +25,7 @@ from PIL import Image
 from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY, Column
 from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.phantom import Phantom, PhantomSpec
-from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.settings import Settings
 from hipsta_bids.validation.accuracy import Comparison
 from hipsta_bids.validation.report import Cell, Picture, Table, markdown, render
@@ -67,10 +67,10 @@ SIZES = Path(__file__).with_name("real_sizes.json")
 
 def make_example(spec: PhantomSpec) -> Example:
     """Draw a left phantom in voxels of 0.4 mm and measure it with default settings."""
-    phantom, scheme = Phantom(spec), load_scheme("freesurfer")
-    volume = phantom.label_volume(scheme)
+    phantom, protocol = Phantom(spec), load_protocol("freesurfer")
+    volume = phantom.label_volume(protocol)
     maps = measure_hemisphere(volume, "L", Settings(), lambda _: nullcontext())
-    return Example(phantom=phantom, maps=maps, scheme=scheme)
+    return Example(phantom=phantom, maps=maps, protocol=protocol)
 
 
 def write(out: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from hipsta_bids.geometry.sheet import sample_sheet, whole_body
 from hipsta_bids.phantom import Phantom
 from hipsta_bids.phantom.shape import placement
-from hipsta_bids.protocols.protocol import Scheme
+from hipsta_bids.protocols.protocol import Protocol
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Float, HemisphereMaps, Sheet
 from hipsta_bids.validation.accuracy import (
@@ -26,7 +26,7 @@ class Example:
 
     phantom: Phantom
     maps: HemisphereMaps
-    scheme: Scheme
+    protocol: Protocol
 
     @cached_property
     def measured(self) -> dict[str, dict[str, Comparison]]:
@@ -35,7 +35,7 @@ class Example:
             "sheet": compare_maps(self.phantom, self.maps),
             "sections": compare_sections(self.phantom, self.maps),
             "summary": compare_summary(self.phantom, self.maps),
-            "subfields": compare_subfields(self.phantom, self.maps, self.scheme),
+            "subfields": compare_subfields(self.phantom, self.maps, self.protocol),
         }
         return {name: {one.name: one for one in rows} for name, rows in tables.items()}
 

@@ -257,7 +257,7 @@ def _off_middle(example: Example, points: Float, depths: str) -> tuple[float, fl
 def draw_subfields(figure: Figure, example: Example) -> None:
     """Draw the sheet by subfield, and the numbers of each."""
     sheet, text = figure.subplots(1, 2, width_ratios=(1.1, 1))
-    tissues = list(example.phantom.subfield_summary(example.scheme))
+    tissues = list(example.phantom.subfield_summary(example.protocol))
     colors = ListedColormap(SUBFIELDS[: len(tissues)])
     norm = BoundaryNorm(np.arange(len(tissues) + 1) - 0.5, colors.N)
     index = np.searchsorted(tissues, example.maps.subfield)

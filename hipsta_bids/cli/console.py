@@ -12,33 +12,25 @@ if TYPE_CHECKING:
     from hipsta_bids.participant.run import RunResult
 
 
-def say(text: str) -> None:
+def echo(text: str) -> None:
     """Print a line of results."""
     sys.stdout.write(f"{text}\n")
     sys.stdout.flush()
 
 
-def complain(text: str) -> None:
+def warn(text: str) -> None:
     """Print one line about what went wrong."""
     sys.stderr.write(" ".join(text.split()) + "\n")
     sys.stderr.flush()
 
 
-def say_start(level: str, bids_dir: Path) -> None:
+def echo_start(level: str, bids_dir: Path) -> None:
     """Say at once what runs: finding the inputs can take a while."""
-    say(f"hipsta_bids {__version__}, {level} level of {bids_dir}")
+    echo(f"hipsta_bids {__version__}, {level} level of {bids_dir}")
 
 
 class Progress:
-    """One line per hemisphere, and a bar below them where there is a terminal.
-
-    Parameters
-    ----------
-    total : int
-        Number of hemispheres.
-    verbosity : int
-        Above 0, unchanged hemispheres get a line too.
-    """
+    """One line per hemisphere, and a bar below them where there is a terminal."""
 
     def __init__(self, total: int, verbosity: int) -> None:
         self._verbosity = verbosity
@@ -54,11 +46,11 @@ class Progress:
         if self._bar is not None:
             self._bar.clear()
         if outcome.status == "failed":
-            complain(summary_line(outcome))
+            warn(summary_line(outcome))
             if outcome.trace and self._verbosity:
                 sys.stderr.write(outcome.trace)
         elif not outcome.skipped or self._verbosity:
-            say(summary_line(outcome))
+            echo(summary_line(outcome))
         if self._bar is not None:
             self._bar.update()
 
@@ -87,27 +79,27 @@ def summary_line(outcome: "Outcome") -> str:
     return "  ".join(parts)
 
 
-def say_result(result: "RunResult", out_dir: Path) -> None:
+def echo_result(result: "RunResult", out_dir: Path) -> None:
     """Say where the outputs are and how many hemispheres ended how."""
     counts = ", ".join(f"{n} {status}" for status, n in sorted(result.counts.items()))
     missing = result.n_requested - len(result.outcomes)
     counts += f", {missing} not run" if missing else ""
     skipped = sum(outcome.skipped for outcome in result.outcomes)
     unchanged = f" ({skipped} unchanged, skipped)" if skipped else ""
-    say(f"{result.n_requested} hemispheres: {counts}{unchanged}")
-    say(f"maps: {out_dir}")
-    say(f"table of all hemispheres: {out_dir / 'status.tsv'}")
+    echo(f"{result.n_requested} hemispheres: {counts}{unchanged}")
+    echo(f"maps: {out_dir}")
+    echo(f"table of all hemispheres: {out_dir / 'status.tsv'}")
     page = out_dir / "report.html"
     if page.exists():
-        say(f"report: {page}")
+        echo(f"report: {page}")
     for problem in result.page_problems:
-        complain(f"warning: report: {problem}")
-    say(f"log: {result.log}")
+        warn(f"warning: report: {problem}")
+    echo(f"log: {result.log}")
 
 
-def say_table(rows: Sequence[Mapping[str, str]]) -> None:
+def echo_table(rows: Sequence[Mapping[str, str]]) -> None:
     """Print rows as aligned columns; a column that is empty throughout is left out."""
     columns = [c for c in (rows[0] if rows else ()) if any(row[c] for row in rows)]
     widths = {c: max(len(c), *(len(row[c]) for row in rows)) for c in columns}
     for row in [{c: c for c in columns}, *rows]:
-        say("  ".join(row[c].ljust(widths[c]) for c in columns).rstrip())
+        echo("  ".join(row[c].ljust(widths[c]) for c in columns).rstrip())

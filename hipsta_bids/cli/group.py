@@ -30,13 +30,7 @@ exit codes: 0 done; 64 wrong use; 65 the data do not allow it; 66 no hemispheres
 
 
 def group_parser() -> Parser:
-    """Describe ``hipsta-bids BIDS_DIR OUT_DIR group``.
-
-    Returns
-    -------
-    Parser
-        Raises :class:`UsageError` on wrong use.
-    """
+    """Describe ``hipsta-bids BIDS_DIR OUT_DIR group``."""
     parser = Parser(
         prog="hipsta-bids BIDS_DIR OUT_DIR group",
         usage="hipsta-bids BIDS_DIR OUT_DIR group [options]",
@@ -317,18 +311,7 @@ def is_group_level(arguments: Sequence[str]) -> bool:
 
 
 def run_group_level(arguments: Sequence[str]) -> ExitCode:
-    """Run the group level.
-
-    Parameters
-    ----------
-    arguments : sequence of str
-        Those of the command line.
-
-    Raises
-    ------
-    HipstaError
-        If use, inputs or output folder are wrong.
-    """
+    """Run the group level."""
     parsed = group_parser().parse_args(arguments)
     if parsed.model is not None and (parsed.formula or parsed.contrast):
         raise UsageError("give --model, or --formula and --contrast", reason="usage")
@@ -337,9 +320,9 @@ def run_group_level(arguments: Sequence[str]) -> ExitCode:
     # Thousands of tiny fits: threads of the linear algebra would only get in each other's way.
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
-    from hipsta_bids.cli.console import complain, say, say_start  # noqa: PLC0415  (start-up time)
+    from hipsta_bids.cli.console import echo, echo_start, warn  # noqa: PLC0415  (start-up time)
 
-    say_start(LEVEL, parsed.bids_dir)
+    echo_start(LEVEL, parsed.bids_dir)
     from hipsta_bids.group.run import run_group  # noqa: PLC0415  (heavy)
     from hipsta_bids.io.files import check_scratch  # noqa: PLC0415  (heavy)
 
@@ -347,12 +330,12 @@ def run_group_level(arguments: Sequence[str]) -> ExitCode:
     settings = _settings(parsed)
     result = run_group(_options(parsed, arguments), settings)
     for note in result.notes:
-        say(f"note: {note}")
-    say(f"{result.n_participants} participants in the model, {result.n_excluded} left out")
-    say(f"results: {result.folder}")
-    say(f"what was done and found: {result.page or result.folder / 'methods.md'}")
+        echo(f"note: {note}")
+    echo(f"{result.n_participants} participants in the model, {result.n_excluded} left out")
+    echo(f"results: {result.folder}")
+    echo(f"what was done and found: {result.page or result.folder / 'methods.md'}")
     if result.problem is not None:
-        complain(f"report: {result.problem}")
+        warn(f"report: {result.problem}")
     return ExitCode.OK
 
 

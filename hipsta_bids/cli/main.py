@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import FrameType
 
-from hipsta_bids.cli.console import complain, say, say_table
+from hipsta_bids.cli.console import echo, echo_table, warn
 from hipsta_bids.cli.group import is_group_level, run_group_level
 from hipsta_bids.cli.participant import (
     LEVELS,
@@ -31,30 +31,19 @@ class _TerminatedError(BaseException):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Parameters
-    ----------
-    argv : sequence of str, optional
-        Arguments without the program's name; those of this process by default.
-
-    Returns
-    -------
-    int
-        An :class:`ExitCode`, or 128 plus the number of the signal that stopped the run.
-    """
+    """Run the command line."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
         with _terminable():
             return int(_dispatch(arguments))
     except HipstaError as error:
-        complain(f"hipsta-bids: {error}")
+        warn(f"hipsta-bids: {error}")
         return int(error.exit_code)
     except KeyboardInterrupt:
-        complain("hipsta-bids: stopped by Ctrl-C; run the same command again to complete")
+        warn("hipsta-bids: stopped by Ctrl-C; run the same command again to complete")
         return _SIGNALED + signal.SIGINT
     except _TerminatedError:
-        complain("hipsta-bids: stopped by SIGTERM; run the same command again to complete")
+        warn("hipsta-bids: stopped by SIGTERM; run the same command again to complete")
         return _SIGNALED + signal.SIGTERM
     except BrokenPipeError:
         # The reader of the output is gone (as in `| head`); do not fail again at exit.
@@ -62,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _SIGNALED + signal.SIGPIPE
     except Exception:  # noqa: BLE001  (any other exception is a bug: show it whole)
         traceback.print_exc()
-        complain("hipsta-bids: internal error; please report it with the lines above")
+        warn("hipsta-bids: internal error; please report it with the lines above")
         return int(ExitCode.INTERNAL)
 
 
@@ -87,7 +76,7 @@ def _terminable() -> Iterator[None]:
 def _dispatch(arguments: list[str]) -> ExitCode:
     """Tell the other commands from the BIDS App, whose dataset may have any name."""
     commands: dict[str, Callable[[list[str]], ExitCode]] = {
-        "schemes": _schemes,
+        "schemes": _protocols,
         "settings": _settings,
         "demo-data": _demo_data,
         "demo": _demo,
@@ -110,7 +99,7 @@ def _descriptor() -> ExitCode:
     """Print what the command line looks like, for platforms."""
     from importlib.resources import files  # noqa: PLC0415  (start-up time)
 
-    say((files("hipsta_bids.cli") / "descriptor.json").read_text(encoding="utf-8").rstrip())
+    echo((files("hipsta_bids.cli") / "descriptor.json").read_text(encoding="utf-8").rstrip())
     return ExitCode.OK
 
 
@@ -125,11 +114,11 @@ def _one_folder(arguments: list[str], command: str) -> Path:
     return Path(arguments[0])
 
 
-def _schemes(arguments: list[str]) -> ExitCode:
+def _protocols(arguments: list[str]) -> ExitCode:
     _no_arguments(arguments, "schemes")
-    from hipsta_bids.protocols.load import scheme_table  # noqa: PLC0415  (heavy)
+    from hipsta_bids.protocols.load import protocol_table  # noqa: PLC0415  (heavy)
 
-    say_table(scheme_table())
+    echo_table(protocol_table())
     return ExitCode.OK
 
 
@@ -139,7 +128,7 @@ def _settings(arguments: list[str]) -> ExitCode:
     from hipsta_bids.group.settings import GroupSettings  # noqa: PLC0415  (start-up time)
     from hipsta_bids.settings import Settings, settings_toml  # noqa: PLC0415  (start-up time)
 
-    say(settings_toml(GroupSettings() if group else Settings()).rstrip())
+    echo(settings_toml(GroupSettings() if group else Settings()).rstrip())
     return ExitCode.OK
 
 
@@ -148,7 +137,7 @@ def _demo_data(arguments: list[str]) -> ExitCode:
     from hipsta_bids.cli.phantom import write_demo_data  # noqa: PLC0415  (heavy)
 
     write_demo_data(folder)
-    say(f"demo dataset: {folder}")
+    echo(f"demo dataset: {folder}")
     return ExitCode.OK
 
 
@@ -161,7 +150,7 @@ def _demo(arguments: list[str]) -> ExitCode:
     write_demo_data(data)
     code = run_participant_level(build_parser().parse_args([str(data), str(out), "participant"]))
     for line in compare_with_truth(data, out):
-        say(line)
+        echo(line)
     return code
 
 
@@ -184,7 +173,7 @@ def _phantom(arguments: list[str]) -> ExitCode:
         cortex=options.cortex,
     )
     write_cohort(options.out, plan, layout=options.layout, voxel_size=tuple(options.voxel_size))
-    say(f"synthetic dataset of {plan.n_subjects} subjects: {options.out}")
+    echo(f"synthetic dataset of {plan.n_subjects} subjects: {options.out}")
     return ExitCode.OK
 
 
@@ -206,12 +195,12 @@ def _surrogate(arguments: list[str]) -> ExitCode:
     request = input_request(options)
     found = find_inputs(request)
     for note in (*dataset_notes(request, found.items), *found.notes):
-        say(f"note: {note}")
+        echo(f"note: {note}")
     if options.dry_run:
-        say_table(selection_table(found.items))
+        echo_table(selection_table(found.items))
         return ExitCode.OK
     check_output_is_no_input(options.output_dir, found.items)
-    return crosscheck(found.items, options.output_dir, settings, say, complain)
+    return crosscheck(found.items, options.output_dir, settings, echo, warn)
 
 
 def _validate(arguments: list[str]) -> ExitCode:
@@ -222,9 +211,9 @@ def _validate(arguments: list[str]) -> ExitCode:
     from hipsta_bids.validation.report import PAGE, validate  # noqa: PLC0415  (heavy)
 
     missed = validate(
-        options.out, full=options.full, names=options.suite, labels=options.labels, report=say
+        options.out, full=options.full, names=options.suite, labels=options.labels, report=echo
     )
-    say(f"targets missed: {missed}; report: {options.out / PAGE}")
+    echo(f"targets missed: {missed}; report: {options.out / PAGE}")
     return ExitCode.OK
 
 

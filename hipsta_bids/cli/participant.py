@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from hipsta_bids import __version__
-from hipsta_bids.cli.console import Progress, complain, say, say_result, say_start, say_table
+from hipsta_bids.cli.console import Progress, echo, echo_result, echo_start, echo_table, warn
 from hipsta_bids.errors import EXIT_MEANINGS, ExitCode, NothingToDoError, UsageError
 from hipsta_bids.participant.cluster import Shard, parse_shard
 from hipsta_bids.participant.pool import pin_threads
@@ -66,13 +66,7 @@ def join_slurm(arguments: Sequence[str]) -> list[str]:
 
 
 def build_parser() -> Parser:
-    """Describe the participant level's command line.
-
-    Returns
-    -------
-    Parser
-        Raises :class:`UsageError` on wrong use.
-    """
+    """Describe the participant level's command line."""
     parser = Parser(
         prog="hipsta-bids",
         description="BIDS App: hippocampal thickness, curvature and shape maps from subfield"
@@ -441,24 +435,7 @@ def _processors() -> int:
 
 
 def rebuild_reports(options: "Namespace") -> ExitCode:
-    """Make the pages of all visits that are asked for, and that of the cohort.
-
-    Parameters
-    ----------
-    options : Namespace
-        Of the participant level.
-
-    Returns
-    -------
-    ExitCode
-
-    Raises
-    ------
-    NothingToDoError
-        If the output dataset has no results of these visits.
-    OutputError
-        If it cannot be written.
-    """
+    """Make the pages of all visits that are asked for, and that of the cohort."""
     from hipsta_bids.derivatives.names import DATASET_FILES  # noqa: PLC0415
     from hipsta_bids.io.files import check_writable  # noqa: PLC0415  (start-up time)
     from hipsta_bids.participant.pages import PagePlan, visits_of, write_reports  # noqa: PLC0415  (heavy)
@@ -481,34 +458,15 @@ def rebuild_reports(options: "Namespace") -> ExitCode:
         plan = PagePlan(root=root, n_workers=options.n_procs, log=log)
         problems = list(write_reports(plan, visits))
     for problem in problems:
-        complain(f"report: {problem.message}")
-    say(f"reports of {len(visits)} visits: {root / DATASET_FILES['report']}")
+        warn(f"report: {problem.message}")
+    echo(f"reports of {len(visits)} visits: {root / DATASET_FILES['report']}")
     if any(problem.fatal for problem in problems):
         return ExitCode.NOT_WRITABLE
     return ExitCode.INTERNAL if problems else ExitCode.OK
 
 
 def rebuild_group_reports(root: Path, name: str | None) -> ExitCode:
-    """Make the pages of analyses of the group level.
-
-    Parameters
-    ----------
-    root : Path
-        The output dataset.
-    name : str or None
-        Of one analysis; else all.
-
-    Returns
-    -------
-    ExitCode
-
-    Raises
-    ------
-    NothingToDoError
-        If there is no such analysis.
-    OutputError
-        If it cannot be written.
-    """
+    """Make the pages of analyses of the group level."""
     from hipsta_bids.derivatives.names import group_report  # noqa: PLC0415
     from hipsta_bids.io.files import check_writable  # noqa: PLC0415  (start-up time)
     from hipsta_bids.reports.group import group_models, write_group_report  # noqa: PLC0415  (heavy)
@@ -524,9 +482,9 @@ def rebuild_group_reports(root: Path, name: str | None) -> ExitCode:
     problems = [write_group_report(root, model) for model in models]
     for model, problem in zip(models, problems, strict=True):
         if problem is None:
-            say(f"report: {root / group_report(model)}")
+            echo(f"report: {root / group_report(model)}")
         else:
-            complain(f"report: {problem}")
+            warn(f"report: {problem}")
     return ExitCode.INTERNAL if any(problems) else ExitCode.OK
 
 
@@ -541,24 +499,7 @@ def command_line(arguments: Sequence[str]) -> str:
 
 
 def run_participant_level(options: "Namespace", command: str | None = None) -> ExitCode:
-    """Measure, collect or list hemispheres, as a parsed command line says.
-
-    Parameters
-    ----------
-    options : Namespace
-        Of :func:`~hipsta_bids.parser.build_parser`.
-    command : str, optional
-        The command line, for the record.
-
-    Returns
-    -------
-    ExitCode
-
-    Raises
-    ------
-    HipstaError
-        With its own exit code, if nothing can be begun.
-    """
+    """Measure, collect or list hemispheres, as a parsed command line says."""
     pin_threads()
     from hipsta_bids.settings import load_settings  # noqa: PLC0415  (start-up time)
 
@@ -569,27 +510,27 @@ def run_participant_level(options: "Namespace", command: str | None = None) -> E
         return rebuild_reports(options)
     settings = _with_region(load_settings(options.settings), options.region)
     request = input_request(options)
-    say_start(options.analysis_level, options.bids_dir)
+    echo_start(options.analysis_level, options.bids_dir)
     from hipsta_bids.inputs.maps import attach, map_requests  # noqa: PLC0415  (heavy)
     from hipsta_bids.inputs.search import dataset_notes, selection_table  # noqa: PLC0415  (heavy)
 
     wishes = map_requests(options.map, options.map_sampling, options.map_interpolation)
     found = _find(request, options.shard)
     if found is None:
-        say(f"part {options.shard.name} of the dataset has nothing to process")
+        echo(f"part {options.shard.name} of the dataset has nothing to process")
         return ExitCode.OK
     items, map_notes = attach(found.items, wishes, options.roi, options.bids_dir)
     for note in (*dataset_notes(request, items), *found.notes, *map_notes):
-        say(f"note: {note}")
+        echo(f"note: {note}")
     if options.dry_run:
-        say_table(selection_table(items))
+        echo_table(selection_table(items))
         return ExitCode.OK
     check_output_is_no_input(options.output_dir, items)
     if options.analysis_level == COLLECT:
         from hipsta_bids.participant.run import collect  # noqa: PLC0415  (heavy)
 
         result = collect(items, options.output_dir, settings, _run_options(options, command))
-        say_result(result, options.output_dir)
+        echo_result(result, options.output_dir)
         return result.exit_code
     from hipsta_bids.participant.run import run_participants  # noqa: PLC0415  (heavy)
 
@@ -600,7 +541,7 @@ def run_participant_level(options: "Namespace", command: str | None = None) -> E
         )
     finally:
         progress.close()
-    say_result(result, options.output_dir)
+    echo_result(result, options.output_dir)
     return result.exit_code
 
 
@@ -662,7 +603,7 @@ def input_request(options: "Namespace") -> "InputRequest":
         hemis=tuple(dict.fromkeys(options.hemi)),
         fs_analysis=options.fs_analysis,
         ashs_atlas=options.ashs_atlas,
-        scheme=options.scheme,
+        protocol=options.scheme,
         edited_dir=options.edited_dir,
         output_dir=options.output_dir,
         bids_filter_file=options.bids_filter_file,

@@ -24,13 +24,7 @@ what is written:
 
 
 def phantom_parser() -> Parser:
-    """Describe ``hipsta-bids phantom``.
-
-    Returns
-    -------
-    Parser
-        Raises :class:`UsageError` on wrong use.
-    """
+    """Describe ``hipsta-bids phantom``."""
     parser = Parser(
         prog="hipsta-bids phantom",
         description="write a synthetic BIDS dataset of hippocampal bodies with known truth",
@@ -98,13 +92,7 @@ def phantom_parser() -> Parser:
 
 
 def surrogate_parser() -> Parser:
-    """Describe ``hipsta-bids surrogate``.
-
-    Returns
-    -------
-    Parser
-        Raises :class:`UsageError` on wrong use.
-    """
+    """Describe ``hipsta-bids surrogate``."""
     parser = Parser(
         prog="hipsta-bids surrogate",
         description="measure thickness in single slices, without a mesh, and compare it with the"
@@ -126,13 +114,7 @@ def surrogate_parser() -> Parser:
 
 
 def validate_parser() -> Parser:
-    """Describe ``hipsta-bids validate``.
-
-    Returns
-    -------
-    Parser
-        Raises :class:`UsageError` on wrong use.
-    """
+    """Describe ``hipsta-bids validate``."""
     parser = Parser(
         prog="hipsta-bids validate",
         description="measure phantoms with known truth; write tables and figures",
@@ -172,44 +154,13 @@ _PROTOCOL = "freesurfer"  # the layout that the demo dataset has
 
 
 def write_demo_data(folder: Path) -> None:
-    """Write the demo dataset, never into a folder that holds something else.
-
-    Parameters
-    ----------
-    folder : Path
-        New, empty, or an earlier demo dataset.
-
-    Raises
-    ------
-    UsageError
-        If the folder holds anything else.
-    OutputError
-        If it cannot be written.
-    """
+    """Write the demo dataset, never into a folder that holds something else."""
     refuse_taken(folder, "a demo dataset")
     write_demo_dataset(folder)
 
 
 def compare_with_truth(data: Path, out: Path) -> Iterator[str]:
-    """Set measured beside true mean thickness.
-
-    Parameters
-    ----------
-    data : Path
-        The demo dataset.
-    out : Path
-        Results of the participant level on it.
-
-    Yields
-    ------
-    str
-        One line per hemisphere.
-
-    Raises
-    ------
-    InputError
-        If the table of true values or a summary cannot be read.
-    """
+    """Set measured beside true mean thickness."""
     ended = {row_key(row): row for row in read_status(out)}
     for row in files.read_tsv(data / TRUTH_TABLE):
         name = HemisphereName(

@@ -10,7 +10,7 @@ from hipsta_bids import __version__
 from hipsta_bids.derivatives.names import DATASET_FILES, ignore_patterns
 from hipsta_bids.errors import InputError, SettingsError, UsageError
 from hipsta_bids.io import files
-from hipsta_bids.protocols.protocol import Scheme
+from hipsta_bids.protocols.protocol import Protocol
 from hipsta_bids.settings import BodySettings, Settings, flatten, resolve, settings_hash
 
 NAME = "hipsta_bids"
@@ -24,21 +24,8 @@ CONTAINER_VARIABLES = {
 }
 
 
-def check_not_foreign(root: Path) -> None:
-    """Refuse to write into a dataset that another program made.
-
-    Parameters
-    ----------
-    root : Path
-        The output folder; it need not exist.
-
-    Raises
-    ------
-    UsageError
-        If its description names other software.
-    InputError
-        If its description cannot be read.
-    """
+def check_own_dataset(root: Path) -> None:
+    """Refuse to write into a dataset that another program made."""
     path = root / DATASET_FILES["description"]
     if not path.exists():
         return
@@ -66,27 +53,6 @@ def settle_settings(root: Path, settings: Settings) -> str:
 
     One folder holds results of one set of settings only: maps made with different ones must
     not be pooled, so this holds for every run, ``--force`` or not.
-
-    Parameters
-    ----------
-    root : Path
-        The output dataset.
-    settings : Settings
-        Those of this run.
-
-    Returns
-    -------
-    str
-        Their hash.
-
-    Raises
-    ------
-    SettingsError
-        If the folder has results with other settings; the message names them.
-    OutputError
-        If the file cannot be written.
-    InputError
-        If an earlier file cannot be read.
     """
     path = root / DATASET_FILES["settings"]
     digest, resolved = shared_settings(settings)
@@ -126,20 +92,6 @@ def write_description(root: Path, sources: Mapping[str, Path]) -> None:
     """Write ``dataset_description.json`` and ``.bidsignore``.
 
     Sources of earlier runs into the same folder are kept.
-
-    Parameters
-    ----------
-    root : Path
-        The output dataset.
-    sources : mapping of str to Path
-        Input datasets by the names used in the quality records' ``bids:<name>:`` addresses.
-
-    Raises
-    ------
-    OutputError
-        If a file cannot be written.
-    InputError
-        If an earlier description cannot be read.
     """
     path = root / DATASET_FILES["description"]
     earlier = files.read_json(path) if path.exists() else {}
@@ -183,18 +135,7 @@ def _source(folder: Path) -> dict[str, str]:
 
 
 def source_names(folders: Iterable[tuple[str, Path]]) -> dict[str, Path]:
-    """Give each source dataset a name of its own.
-
-    Parameters
-    ----------
-    folders : iterable of (str, Path)
-        Wished name and folder; folders may repeat.
-
-    Returns
-    -------
-    dict of str to Path
-        Letters, digits, ``-`` and ``_`` only; numbered where two folders wish the same name.
-    """
+    """Give each source dataset a name of its own."""
     names: dict[str, Path] = {}
     for wish, folder in dict.fromkeys(folders):
         base = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "-" for c in wish)
@@ -206,44 +147,16 @@ def source_names(folders: Iterable[tuple[str, Path]]) -> dict[str, Path]:
 
 
 def source_address(path: Path, sources: Mapping[str, Path]) -> str:
-    """Spell an input file as a BIDS address, ``bids:<dataset>:<path in it>``.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    sources : mapping of str to Path
-        Datasets by name.
-
-    Returns
-    -------
-    str
-        The plain path if the file is in none of them.
-    """
+    """Spell an input file as a BIDS address, ``bids:<dataset>:<path in it>``."""
     for name, folder in sources.items():
         if path.is_relative_to(folder):
             return f"bids:{name}:{path.relative_to(folder).as_posix()}"
     return str(path)
 
 
-def write_citation(root: Path, settings: Settings, schemes: Sequence[Scheme]) -> None:
-    """Write ``CITATION.md``: a methods paragraph with this run's settings, and the references.
-
-    Parameters
-    ----------
-    root : Path
-        The output dataset.
-    settings : Settings
-        Those of this run.
-    schemes : sequence of Scheme
-        Segmentation protocols in use.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be written.
-    """
-    files.write_text(root / DATASET_FILES["citation"], citation_text(settings, schemes))
+def write_citation(root: Path, settings: Settings, protocols: Sequence[Protocol]) -> None:
+    """Write ``CITATION.md``: a methods paragraph with this run's settings, and the references."""
+    files.write_text(root / DATASET_FILES["citation"], citation_text(settings, protocols))
 
 
 # Wording of ``CITATION.md``: a methods paragraph that says what was done, with references.
@@ -281,26 +194,13 @@ REFERENCES: dict[str, str] = {
 }
 
 
-def citation_text(settings: Settings, schemes: Sequence[Scheme]) -> str:
-    """Word the methods paragraph.
-
-    Parameters
-    ----------
-    settings : Settings
-        Those in use.
-    schemes : sequence of Scheme
-        Segmentation protocols in use.
-
-    Returns
-    -------
-    str
-        Markdown.
-    """
+def citation_text(settings: Settings, protocols: Sequence[Protocol]) -> str:
+    """Word the methods paragraph."""
     entries = list(REFERENCES.values())
-    entries += [scheme.citation for scheme in schemes if scheme.citation not in entries]
+    entries += [protocol.citation for protocol in protocols if protocol.citation not in entries]
     number = {entry: i for i, entry in enumerate(entries, start=1)}
     cite = {key: f"[{number[entry]}]" for key, entry in REFERENCES.items()}
-    protocols = ", ".join(f"{s.title} [{number[s.citation]}]" for s in schemes) or "none"
+    titles = ", ".join(f"{s.title} [{number[s.citation]}]" for s in protocols) or "none"
     lines = [
         "# Methods",
         "",
@@ -309,7 +209,7 @@ def citation_text(settings: Settings, schemes: Sequence[Scheme]) -> str:
         (
             f"Hippocampal thickness and curvature were measured with hipsta_bids {__version__},"
             f" an implementation of the method of Diers et al. {cite['method']}."
-            f" Segmentations were found with PyBIDS {cite['pybids']} and follow: {protocols}."
+            f" Segmentations were found with PyBIDS {cite['pybids']} and follow: {titles}."
             " The subfields of the hippocampal body from presubiculum to CA3 were merged into one"
             " sheet; the molecular layer, where labeled,"
             f" {_LAYER_RULES.get(settings.body.layer_rule, settings.body.layer_rule)}."

@@ -22,7 +22,7 @@ from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY, 
 from hipsta_bids.geometry.sheet import is_left_handed, layer_depth
 from hipsta_bids.io import files, gifti
 from hipsta_bids.io.volumes import mask_bytes
-from hipsta_bids.protocols.protocol import Label, Part, Scheme, Tissue
+from hipsta_bids.protocols.protocol import Label, Part, Protocol, Tissue
 from hipsta_bids.types import BodyMask, Bool, Float, HemisphereMaps, Sheet, Status
 
 # The tables of one hemisphere and their sidecars: columns, units, definitions, formats.
@@ -71,22 +71,11 @@ MEASURED_REGION = (
 _MILLIMETER_DIGITS = 4
 
 
-def sheet_labels(scheme: Scheme) -> dict[Tissue, Label]:
-    """Choose one label per sheet tissue: that of the body, since the sheet is the body's.
-
-    Parameters
-    ----------
-    scheme : Scheme
-        Protocol of the segmentation.
-
-    Returns
-    -------
-    dict of Tissue to Label
-        In medial-to-lateral order.
-    """
-    preferred = sorted(scheme.labels, key=lambda label: label.part != Part.BODY)
+def sheet_labels(protocol: Protocol) -> dict[Tissue, Label]:
+    """Choose one label per sheet tissue: that of the body, since the sheet is the body's."""
+    preferred = sorted(protocol.labels, key=lambda label: label.part != Part.BODY)
     found: dict[Tissue, Label] = {}
-    for tissue in scheme.sheet:
+    for tissue in protocol.sheet:
         match = next((label for label in preferred if label.tissue == tissue), None)
         if match is not None:
             found[tissue] = match
@@ -96,44 +85,19 @@ def sheet_labels(scheme: Scheme) -> dict[Tissue, Label]:
 def format_column(values: Float, digits: int) -> list[str]:
     """Format numbers with a fixed number of decimals, so that equal values give equal bytes.
 
-    Parameters
-    ----------
-    values : float64
-        Any shape; taken in C order.
-    digits : int
-        Decimals.
-
-    Returns
-    -------
-    list of str
-        ``n/a`` for NaN; never a negative zero.
+    Returns ````n/a```` for NaN.
     """
     rounded = np.round(values.ravel(), digits) + 0.0  # turns -0.0 into 0.0
     return [f"{v:.{digits}f}" if np.isfinite(v) else files.MISSING for v in rounded.tolist()]
 
 
-def write_sheet(table: Path, sidecar: Path, maps: HemisphereMaps, scheme: Scheme) -> None:
-    """Write the sheet table, one row per sheet point, y fastest, and its sidecar.
-
-    Parameters
-    ----------
-    table, sidecar : Path
-        The ``.tsv`` and ``.json`` files.
-    maps : HemisphereMaps
-        What was measured.
-    scheme : Scheme
-        Protocol of the segmentation, for the names of the subfields.
-
-    Raises
-    ------
-    OutputError
-        If a file cannot be written.
-    """
+def write_sheet(table: Path, sidecar: Path, maps: HemisphereMaps, protocol: Protocol) -> None:
+    """Write the sheet table, one row per sheet point, y fastest, and its sidecar."""
     points = maps.sheet.points
     nx, ny, nz = points.shape[:3]
     x, y = np.divmod(np.arange(nx * ny), ny)
     middle = points[:, :, nz // 2].reshape(-1, 3)
-    labels = sheet_labels(scheme)
+    labels = sheet_labels(protocol)
     short = {int(tissue): label.abbreviation for tissue, label in labels.items()}
     columns = {
         "x": [str(i) for i in (x + 1).tolist()],
@@ -162,20 +126,7 @@ def write_sheet(table: Path, sidecar: Path, maps: HemisphereMaps, scheme: Scheme
 
 
 def write_summary(table: Path, sidecar: Path, summary: Mapping[str, float]) -> None:
-    """Write the summary table, one row, and its sidecar.
-
-    Parameters
-    ----------
-    table, sidecar : Path
-        The ``.tsv`` and ``.json`` files.
-    summary : mapping of str to float
-        One number per column; a column of :data:`SUMMARY_COLUMNS` without one is ``n/a``.
-
-    Raises
-    ------
-    OutputError
-        If a file cannot be written.
-    """
+    """Write the summary table, one row, and its sidecar."""
     definitions = {row.name: _measure(row) for row in SUMMARY}
     digits = {row.name: row.digits for row in SUMMARY}
     definitions |= {name: _subfield_definition(name) for name in summary if name not in definitions}
@@ -191,20 +142,7 @@ def write_summary(table: Path, sidecar: Path, summary: Mapping[str, float]) -> N
 
 
 def write_profile(table: Path, sidecar: Path, maps: HemisphereMaps) -> None:
-    """Write the profile table, first along x and then along y, and its sidecar.
-
-    Parameters
-    ----------
-    table, sidecar : Path
-        The ``.tsv`` and ``.json`` files.
-    maps : HemisphereMaps
-        What was measured.
-
-    Raises
-    ------
-    OutputError
-        If a file cannot be written.
-    """
+    """Write the profile table, first along x and then along y, and its sidecar."""
     rows: list[tuple[str, ...]] = []
     for axis, profile in maps.profiles.items():
         columns = _formatted(MAPS, profile)
@@ -229,20 +167,7 @@ def write_profile(table: Path, sidecar: Path, maps: HemisphereMaps) -> None:
 
 
 def write_sections(table: Path, sidecar: Path, sections: Mapping[str, Float]) -> None:
-    """Write the table of cross-sections, from posterior to anterior, and its sidecar.
-
-    Parameters
-    ----------
-    table, sidecar : Path
-        The ``.tsv`` and ``.json`` files.
-    sections : mapping of str to (Ny,) float64
-        What was measured, by the names in the catalog.
-
-    Raises
-    ------
-    OutputError
-        If a file cannot be written.
-    """
+    """Write the table of cross-sections, from posterior to anterior, and its sidecar."""
     columns = _formatted(SECTIONS, sections)
     nodes = [str(k + 1) for k in range(len(columns[SECTIONS[0].name]))]
     files.write_tsv(table, list(SECTION_COLUMNS), zip(nodes, *columns.values(), strict=True))
@@ -253,20 +178,7 @@ def write_sections(table: Path, sidecar: Path, sections: Mapping[str, Float]) ->
 
 
 def write_layers(table: Path, sidecar: Path, layers: Sheet) -> None:
-    """Write all points of the three-dimensional grid, layers fastest, and the table's sidecar.
-
-    Parameters
-    ----------
-    table, sidecar : Path
-        The ``.tsv`` and ``.json`` files.
-    layers : Sheet
-        The points, layer by layer.
-
-    Raises
-    ------
-    OutputError
-        If a file cannot be written.
-    """
+    """Write all points of the three-dimensional grid, layers fastest, and the table's sidecar."""
     depth = layer_depth(layers)
     length = np.where(depth[:, :, -1:] > 0, depth[:, :, -1:], np.nan)
     x, y, layer = (index.ravel() + 1 for index in np.indices(depth.shape))
@@ -348,13 +260,7 @@ class ResultPlace:
 
 
 def remove_results(place: ResultPlace) -> None:
-    """Remove every file of one hemisphere, whole or half-written.
-
-    Raises
-    ------
-    OutputError
-        If one cannot be removed.
-    """
+    """Remove every file of one hemisphere, whole or half-written."""
     files.remove([*reversed(place.paths(optional=True)), *place.extra_paths()])
     folder = place.path("qc").parent
     if folder.is_dir():
@@ -364,40 +270,19 @@ def remove_results(place: ResultPlace) -> None:
 def write_results(
     place: ResultPlace,
     maps: HemisphereMaps,
-    scheme: Scheme,
+    protocol: Protocol,
     record: Mapping[str, Any],
     *,
     write_meshes: bool,
     write_more: Callable[[], None] = lambda: None,
 ) -> None:
-    """Write all files of one hemisphere; earlier ones are removed first.
-
-    Parameters
-    ----------
-    place : ResultPlace
-        Where.
-    maps : HemisphereMaps
-        What was measured.
-    scheme : Scheme
-        Protocol of the segmentation: names and colors of the subfields.
-    record : mapping
-        What the quality record says besides the measures (inputs, hashes, version, ...).
-    write_meshes : bool
-        Whether to add the tetrahedral mesh.
-    write_more : callable, optional
-        Writes what else there is to write, before the record.
-
-    Raises
-    ------
-    OutputError
-        If a file cannot be written.
-    """
+    """Write all files of one hemisphere; earlier ones are removed first."""
     remove_results(place)
-    write_sheet(place.path("sheet"), place.path("sheet_sidecar"), maps, scheme)
+    write_sheet(place.path("sheet"), place.path("sheet_sidecar"), maps, protocol)
     write_summary(place.path("summary"), place.path("summary_sidecar"), maps.summary)
     write_profile(place.path("profile"), place.path("profile_sidecar"), maps)
     write_sections(place.path("sections"), place.path("sections_sidecar"), maps.sections)
-    for key, content in gifti_files(maps, scheme, place.name.hemi):
+    for key, content in gifti_files(maps, protocol, place.name.hemi):
         files.write_bytes(place.path(key), content)
     files.write_bytes(place.path("body_mask"), mask_bytes(maps.body_mask))
     if write_meshes:
@@ -429,24 +314,7 @@ def write_failure(
     record: Mapping[str, Any],
     body: BodyMask | None = None,
 ) -> None:
-    """Leave nothing of a failed hemisphere but its quality record, and its body to be corrected.
-
-    Parameters
-    ----------
-    place : ResultPlace
-        Where.
-    error : HipstaError
-        Why it failed.
-    record : mapping
-        Inputs, hashes, version, as far as known.
-    body : BodyMask, optional
-        What could not be measured, if known.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be written.
-    """
+    """Leave nothing of a failed hemisphere but its quality record, and its body to be corrected."""
     remove_results(place)
     if body is not None:
         files.write_bytes(place.path("body_mask"), mask_bytes(body))
@@ -455,19 +323,7 @@ def write_failure(
 
 
 def verdict(maps: HemisphereMaps) -> tuple[Status, str | None, str | None]:
-    """Sum up how a measured hemisphere ended.
-
-    Parameters
-    ----------
-    maps : HemisphereMaps
-        What was measured.
-
-    Returns
-    -------
-    tuple of (Status, str or None, str or None)
-        Status; machine-readable reason, several joined by ``+``; and message, about the flags if
-        there are any, else about the repairs. ``None`` if there is nothing to say.
-    """
+    """Sum up how a measured hemisphere ended."""
     notes = [flag.message for flag in maps.flags] or list(maps.repairs)
     reasons = list(dict.fromkeys(flag.reason for flag in maps.flags))
     if maps.repairs:
@@ -475,26 +331,12 @@ def verdict(maps: HemisphereMaps) -> tuple[Status, str | None, str | None]:
     return maps.status, "+".join(reasons) or None, "; ".join(notes) or None
 
 
-def gifti_files(maps: HemisphereMaps, scheme: Scheme, hemi: str) -> Iterator[tuple[str, bytes]]:
+def gifti_files(maps: HemisphereMaps, protocol: Protocol, hemi: str) -> Iterator[tuple[str, bytes]]:
     """Encode the surfaces and the maps on them.
 
     Vertices are the sheet's columns, y fastest, as the rows of the sheet table are. Surfaces
     need finite vertices: a column without a position gets that of its nearest neighbor on the
     grid, while the maps keep their NaN.
-
-    Parameters
-    ----------
-    maps : HemisphereMaps
-        What was measured.
-    scheme : Scheme
-        Names and colors of the subfields.
-    hemi : str
-        ``L`` or ``R``.
-
-    Yields
-    ------
-    (str, bytes)
-        Key in the output table, and the file.
     """
     points = maps.sheet.points
     nx, ny = points.shape[:2]
@@ -526,7 +368,7 @@ def gifti_files(maps: HemisphereMaps, scheme: Scheme, hemi: str) -> Iterator[tup
         values = maps.maps[row.name].ravel()
         yield row.name, gifti.shape_bytes(values, hemi=hemi, name=row.name, unit=row.unit)
     table = {
-        int(tissue): (label.name, label.color) for tissue, label in sheet_labels(scheme).items()
+        int(tissue): (label.name, label.color) for tissue, label in sheet_labels(protocol).items()
     }
     yield (
         "subfields",
@@ -537,19 +379,7 @@ def gifti_files(maps: HemisphereMaps, scheme: Scheme, hemi: str) -> Iterator[tup
 def unfolded_points(maps: HemisphereMaps, surface: str) -> Float:
     """Lay one surface of the sheet flat.
 
-    Parameters
-    ----------
-    maps : HemisphereMaps
-        What was measured.
-    surface : str
-        ``interior``, ``midthickness`` or ``exterior``.
-
-    Returns
-    -------
-    (Nx, Ny, 3) float64
-        x from medial to lateral and y from posterior to anterior, centered on 0, node spacing
-        such that the rectangle is as wide and as long as the sheet is on average; z is minus or
-        plus half the mean thickness on the interior and exterior surface. All in mm.
+    Returns All in mm.
     """
     nx, ny = maps.sheet.points.shape[:2]
     extents = [maps.summary.get(f"extent_{axis}", np.nan) for axis in "xyz"]
@@ -563,15 +393,7 @@ def unfolded_points(maps: HemisphereMaps, surface: str) -> Float:
 def fill_from_nearest(points: Float) -> Float:
     """Give each undefined grid node the position of the nearest defined one.
 
-    Parameters
-    ----------
-    points : (Nx, Ny, 3) float64
-        NaN where undefined.
-
-    Returns
-    -------
-    (Nx, Ny, 3) float64
-        Finite, unless no node was defined.
+    ``points`` NaN where undefined.
     """
     undefined: Bool = np.asarray(np.isnan(points).any(axis=-1))
     if not undefined.any() or undefined.all():

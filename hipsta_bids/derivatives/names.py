@@ -283,22 +283,7 @@ _BY_KEY = {output.key: output for output in (*OUTPUTS, *EXTRA_OUTPUTS)}
 
 
 def output_name(name: HemisphereName, key: str, desc: str | None = None) -> str:
-    """Spell the file name of one output.
-
-    Parameters
-    ----------
-    name : HemisphereName
-        Whose result it is.
-    key : str
-        A key of :data:`OUTPUTS` or :data:`EXTRA_OUTPUTS`.
-    desc : str, optional
-        What takes the place of the table's ``desc``: the user's name for a map.
-
-    Returns
-    -------
-    str
-        File name with its extension.
-    """
+    """Spell the file name of one output."""
     output = _BY_KEY[key]
     entities = [
         name.stem,
@@ -331,18 +316,7 @@ def output_path(name: HemisphereName, key: str, desc: str | None = None) -> Pure
 
 
 def name_of_record(file_name: str) -> HemisphereName | None:
-    """Tell whose quality record a file is, the reverse of :func:`output_name`.
-
-    Parameters
-    ----------
-    file_name : str
-        Without folders.
-
-    Returns
-    -------
-    HemisphereName or None
-        ``None`` for any other file.
-    """
+    """Tell whose quality record a file is, the reverse of :func:`output_name`."""
     match = _RECORD.fullmatch(file_name)
     if match is None:
         return None
@@ -361,13 +335,7 @@ def group_report(model: str) -> str:
 
 
 def ignore_patterns() -> tuple[str, ...]:
-    """List the patterns of ``.bidsignore``: each output that BIDS 1.11 has no rule for.
-
-    Returns
-    -------
-    tuple of str
-        In the form of ``.gitignore``.
-    """
+    """List the patterns of ``.bidsignore``: each output that BIDS 1.11 has no rule for."""
     dataset = [DATASET_FILES[key] for key in ("settings", "citation", "status", "status_sidecar")]
     patterns = dict.fromkeys(
         f"*_{output.suffix}{output.extension}"

@@ -75,17 +75,6 @@ def read_status(root: Path) -> list[dict[str, str]]:
 
     Where several have a row of the same hemisphere, the one is taken that its quality record
     bears out.
-
-    Parameters
-    ----------
-    root : Path
-        The output dataset.
-
-    Returns
-    -------
-    list of dict
-        Sorted. Empty if there is no table yet, or not a readable one: it is rebuilt as hemispheres
-        end.
     """
     shards = sorted((root / DATASET_FILES["logs"]).glob(_SHARD_TABLE))
     found: dict[tuple[str, ...], list[dict[str, str]]] = {}
@@ -146,20 +135,6 @@ def update_status(root: Path, rows: Iterable[Row], *, shard: str | None = None) 
     """Replace or add rows; those of other hemispheres stay.
 
     Safe for several runs at a time into the same folder, as on a cluster.
-
-    Parameters
-    ----------
-    root : Path
-        The output dataset.
-    rows : iterable of mapping
-        Cells by column.
-    shard : str, optional
-        Name of the part of the dataset whose table it is.
-
-    Raises
-    ------
-    OutputError
-        If the table cannot be written; the earlier one is then unharmed.
     """
     path = root / table_path(shard)
     with locked(root, DATASET if shard is None else path.name):
@@ -178,13 +153,7 @@ def update_status(root: Path, rows: Iterable[Row], *, shard: str | None = None) 
 
 
 def write_sidecar(root: Path) -> None:
-    """Write ``status.json``, which says what the columns are.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be written.
-    """
+    """Write ``status.json``, which says what the columns are."""
     described = {name: {"Description": text} for name, text in COLUMNS.items()}
     described[f"{STAGE_PREFIX}*"] = {"Description": "elapsed time of one stage, s"}
     files.write_json(root / DATASET_FILES["status_sidecar"], described)

@@ -23,29 +23,8 @@ from hipsta_bids.types import Bool, EditedMask, Flag, Float, LabelVolume
 def join_cortex(
     volume: LabelVolume, hippocampal: NDArray[np.uint8], region: str
 ) -> NDArray[np.uint8]:
-    """Add the neighboring cortex to the hippocampal sheet, or take it alone.
-
-    Parameters
-    ----------
-    volume : LabelVolume
-    hippocampal : (I, J, K) uint8
-        Tissue of the hippocampal sheet; 0 elsewhere.
-    region : {"extended", "entorhinal"}
-
-    Returns
-    -------
-    (I, J, K) uint8
-        Tissue of the region's sheet; 0 elsewhere.
-
-    Raises
-    ------
-    SchemeError
-        ``no-cortex-labels`` if the protocol has no neighboring cortex.
-    GeometryError
-        ``no-cortex-labels`` if nothing has these labels, ``edited-mask-region`` if there is an
-        edited mask, which is one of the body.
-    """
-    kinds = [t for t in for_region(volume.scheme, region).sheet if t in volume.scheme.neighbors]
+    """Add the neighboring cortex to the hippocampal sheet, or take it alone."""
+    kinds = [t for t in for_region(volume.protocol, region).sheet if t in volume.protocol.neighbors]
     if volume.edited_mask is not None:
         raise GeometryError(
             f"region {region}: an edited mask is about the body, not about the cortex beside it; "
@@ -68,18 +47,7 @@ def check_reach(
 ) -> None:
     """Refuse cortex that does not reach from one end plane to the other.
 
-    Parameters
-    ----------
-    points : (N, 3) array
-        The region between the end planes, RAS mm.
-    tissue : (N,) array of uint8
-    ends : EndPlanes
-    settings : BodySettings
-
-    Raises
-    ------
-    GeometryError
-        ``cortex-incomplete``.
+    ``points`` The region between the end planes, RAS mm.
     """
     cortex = tissue > Tissue.HIPPOCAMPUS
     below = ends.height(points[cortex], "posterior")
@@ -132,21 +100,6 @@ def fill_slits(
     A voxel without any label lies in a gap if the sheet is on both sides of it in several
     directions. A gap opens on both sides of the sheet if it goes through it, and on one if it is a
     crevice between two folds: only the first kind is filled, with the nearest labels.
-
-    Parameters
-    ----------
-    tissue : (I, J, K) array of uint8
-        Tissue of the sheet, 0 elsewhere.
-    inside : (I, J, K) array of bool
-        Voxels of the sheet between the end planes.
-    unlabeled : (I, J, K) array of bool
-        Voxels without any label.
-    affine : (4, 4) array
-    settings : BodySettings
-
-    Returns
-    -------
-    Slits
     """
     around = box_around(np.argwhere(inside))
     sheet = np.pad(tissue[around] > 0, 1)
@@ -236,27 +189,6 @@ def apply_mask(
     Voxels outside of the mask lose their label, and voxels of the mask without a sheet label get
     that of the nearest voxel of the mask that has one. Beyond the end planes nothing changes: head
     and tail are those of the labels.
-
-    Parameters
-    ----------
-    volume : LabelVolume
-    tissue : (I, J, K) uint8
-        Its sheet tissue; 0 elsewhere.
-    mask : EditedMask
-    ends : EndPlanes
-
-    Returns
-    -------
-    volume : LabelVolume
-        What the labels would be, had they been corrected themselves.
-    tissue : (I, J, K) uint8
-        Its sheet tissue.
-    change : MaskChange
-
-    Raises
-    ------
-    GeometryError
-        ``edited-mask-elsewhere`` if no labeled voxel of the body lies in the mask.
     """
     affine = volume.affine
     index = np.argwhere(mask.inside | (tissue > 0))
@@ -292,18 +224,7 @@ def check_mask(
 ) -> list[Flag]:
     """Flag an edited mask that is coarser than the labels, or differs very much from them.
 
-    Parameters
-    ----------
-    mask : EditedMask
-    change : MaskChange
-    voxel : float
-        Edge of the labels' voxels in plane, mm.
-    settings : BodySettings
-
-    Returns
-    -------
-    list of Flag
-        Empty if the mask is as it should be.
+    ``voxel`` Edge of the labels' voxels in plane, mm.
     """
     flags = []
     if mask.voxel > settings.max_mask_ratio * voxel:
@@ -381,29 +302,13 @@ class Body:
 def extract_body(volume: LabelVolume, settings: BodySettings) -> Body:
     """Merge the sheet's subfields and find where the body begins and ends.
 
-    Parameters
-    ----------
-    volume : LabelVolume
-    settings : BodySettings
-
-    Returns
-    -------
-    Body
-
-    Raises
-    ------
-    GeometryError
-        ``no-sheet-labels``, ``body-too-short`` or what :func:`find_end_planes` raises.
-
-    Notes
-    -----
     Merging and the molecular-layer rule: Diers et al. 2023, section 2.1.
     """
     tissue, layer_voxels = _give_away_layer(volume, settings.layer_rule)
     if not tissue.any():
         raise GeometryError(
             "no voxel of the sheet's subfields "
-            f"({', '.join(t.name for t in volume.scheme.sheet)}): check the scheme",
+            f"({', '.join(t.name for t in volume.protocol.sheet)}): check the protocol",
             reason="no-sheet-labels",
         )
     ends = find_end_planes(volume, tissue, settings)
@@ -432,7 +337,7 @@ def extract_body(volume: LabelVolume, settings: BodySettings) -> Body:
         tissue=slits.tissue,
         hippocampal=hippocampal,
         region=region,
-        interior=np.isin(volume.tissue, volume.scheme.interior),
+        interior=np.isin(volume.tissue, volume.protocol.interior),
         affine=volume.affine,
         ends=ends,
         layer_voxels=layer_voxels,
@@ -449,21 +354,7 @@ def check_side(body: Body, hemi: str) -> float:
     In subjects that lie feet first or on their side it may not; then the handedness decides, which
     no rotation changes.
 
-    Parameters
-    ----------
-    body : Body
-    hemi : {"L", "R"}
-
-    Returns
-    -------
-    float
-        How far the medial subfields lie medially of the lateral ones, mm.
-
-    Raises
-    ------
-    GeometryError
-        ``left-right-swapped`` if they lie on the far side by more than 1 mm, and the body is not
-        of the handedness that the file claims.
+    Returns How far the medial subfields lie medially of the lateral ones, mm.
     """
     inside, points = body.inside, body.inside_points()[1]
     if body.region != "body":
@@ -507,14 +398,14 @@ def _has_handedness(body: Body, subiculum: Float, ca1: Float, hemi: str) -> bool
 
 def _give_away_layer(volume: LabelVolume, rule: str) -> tuple[NDArray[np.uint8], int]:
     """Give each molecular-layer voxel to the nearest subfield (distances in mm)."""
-    scheme = volume.scheme
-    tissue = np.where(np.isin(volume.tissue, scheme.sheet), volume.tissue, 0).astype(np.uint8)
-    layer = np.isin(volume.tissue, scheme.layer)
+    protocol = volume.protocol
+    tissue = np.where(np.isin(volume.tissue, protocol.sheet), volume.tissue, 0).astype(np.uint8)
+    layer = np.isin(volume.tissue, protocol.layer)
     if not layer.any() or not tissue.any():
         return tissue, 0
     takers = tissue.copy()
     if rule == "nearest-label":
-        rivals = [t for t in scheme.interior if t not in scheme.layer]
+        rivals = [t for t in protocol.interior if t not in protocol.layer]
         takers[np.isin(volume.tissue, rivals)] = Tissue.OTHER
     rim = _touching(takers > 0)
     _, nearest = cKDTree(_millimetres(rim, volume.affine)).query(_millimetres(layer, volume.affine))

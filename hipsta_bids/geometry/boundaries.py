@@ -33,12 +33,8 @@ def rim_paths(
     Distances run inside the volume and mostly across the long axis, as steps along it are
     stretched. The first ones start from the sheet's most lateral labels.
 
-    Returns
-    -------
-    paths : two (N,) arrays of int
-        Medial and lateral path, vertices of the wall.
-    depths : two (V,) arrays
-        How much nearer than the rim of their slice the wall's vertices are to the opposite rim, mm.
+    Returns How much nearer than the rim of their slice the wall's vertices are to the opposite rim,
+    mm.
     """
     edges = unique_edges(mesh.tetrahedra)
     steps = np.diff(mesh.vertices[edges], axis=1)[:, 0]
@@ -168,23 +164,7 @@ def facing_strips(
     the sheet, where it does not depend on where exactly the curves lie. The middle lines of the
     strips replace the curves, and the same is done again.
 
-    Parameters
-    ----------
-    wall : Wall
-    solver : HarmonicSolver
-        Of the mesh.
-    curves : two (N, 3) arrays
-        Medial and lateral, or the other way round, RAS mm.
-    thickness : float
-        Of the sheet, mm.
-    settings : BoundarySettings
-
-    Returns
-    -------
-    strips : two (V,) arrays of bool
-        Vertices of the wall.
-    curves : two (N, 3) arrays
-        Their middle lines.
+    ``curves`` Medial and lateral, or the other way round, RAS mm; ``thickness`` Of the sheet, mm.
     """
     mesh = solver.mesh
     finder = _Finder(wall, mesh, thickness, settings)
@@ -222,21 +202,7 @@ class _Finder:
         self._centers = cKDTree(mesh.vertices[mesh.tetrahedra].mean(axis=1))
 
     def strip(self, starts: Float, inward: Float, line: Bool, limit: Bool) -> Bool:
-        """Vertices (V,) within a limit that face away from the sheet, with a line among them.
-
-        Parameters
-        ----------
-        starts : (N, 3) array
-            Points of the rim.
-        inward : (T, 3) array
-            From this rim into the sheet, in each tetrahedron.
-        line, limit : (V,) arrays of bool
-            Vertices that belong to the strip, and those that may.
-
-        Returns
-        -------
-        (V,) array of bool
-        """
+        """Vertices (V,) within a limit that face away from the sheet, with a line among them."""
         away = -self._direction_at_rim(starts, inward)
         close = np.flatnonzero(limit)
         count = min(self._settings.rim_neighbors, len(starts))
@@ -314,25 +280,6 @@ def find_boundaries(
     The zero lines of the first curvature-aware anisotropic Laplace-Beltrami eigenfunction of the
     wall are the medial and lateral boundary (Diers et al. 2023, section 2.1.3). An independent
     answer comes from the first eigenfunction of the volume: along the sheet's rims it is extreme.
-
-    Parameters
-    ----------
-    surface : Surface
-    mesh : TetMesh
-        Its first vertices are those of the surface.
-    body : Body
-    settings : BoundarySettings
-    solver : HarmonicSolver, optional
-        Of this mesh, if there is one already.
-
-    Returns
-    -------
-    Boundaries
-
-    Raises
-    ------
-    GeometryError
-        ``boundaries`` if neither rule gives two curves from end to end that separate the sides.
     """
     wall = Wall(surface, body, settings)
     thickness = mean_wall_thickness(surface)

@@ -107,11 +107,8 @@ class Measured:
 def average_profiles(maps: Mapping[str, Float], sheet: Sheet) -> dict[str, dict[str, Float]]:
     """Average maps along one axis of the sheet, over the area of columns measured directly.
 
-    Returns
-    -------
-    dict
-        ``x``: (Nx,) values by name, averaged over y; ``y``: (Ny,) values, averaged over x. NaN
-        where a line has no such column.
+    Returns ````x````: (Nx,) values by name, averaged over y; ````y````: (Ny,) values, averaged over
+    x. NaN where a line has no such column.
     """
     weights = column_area(sheet) * sheet.valid
     profiles = {}
@@ -463,16 +460,7 @@ PER_SUBFIELD: tuple[SubfieldMeasure, ...] = (
 def summarize(measured: Measured, tissues: tuple[Tissue, ...]) -> dict[str, float]:
     """Compute one number per measure for the whole body, and per subfield.
 
-    Parameters
-    ----------
-    measured : Measured
-    tissues : tuple of Tissue
-        The subfields of the protocol; absent ones are NaN.
-
-    Returns
-    -------
-    dict
-        By the names in ``SUMMARY`` and ``PER_SUBFIELD``.
+    ``tissues`` absent ones are NaN.
     """
     return {row.name: row.compute(measured) for row in SUMMARY} | {
         f"{row.name}_{tissue.name}": row.compute(measured, tissue)

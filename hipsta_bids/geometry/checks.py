@@ -20,25 +20,7 @@ from hipsta_bids.types import Bool, Coordinates, Flag, Float, LabelVolume, Sheet
 
 
 def check_voxels_across(surface: Surface, body: Body, settings: CheckSettings) -> float:
-    """Refuse a sheet that is too thin for its voxels.
-
-    Parameters
-    ----------
-    surface : Surface
-    body : Body
-    settings : CheckSettings
-
-    Returns
-    -------
-    float
-        In-plane voxels across the sheet, whose thickness is taken as 2 volume / wall area. Where
-        the longest edge of the voxels lies across the long axis, it is what counts.
-
-    Raises
-    ------
-    GeometryError
-        ``sheet-too-thin``.
-    """
+    """Refuse a sheet that is too thin for its voxels."""
     thickness, voxel = mean_wall_thickness(surface), _voxel_across(body, settings)
     across = thickness / voxel
     if across < settings.min_voxels_across:
@@ -55,15 +37,7 @@ def check_label_order(
 ) -> float:
     """Refuse coordinates that do not follow the medial-to-lateral order of the subfields.
 
-    Returns
-    -------
-    float
-        Spearman correlation of x with the labels' rank over voxels; NaN with one subfield.
-
-    Raises
-    ------
-    GeometryError
-        ``label-order``.
+    Returns NaN with one subfield.
     """
     index, points = body.inside_points()
     thin = slice(None, None, max(len(points) // 5000, 1))  # some thousand voxels are plenty
@@ -78,7 +52,7 @@ def check_label_order(
     if not order >= settings.min_label_order or _swapped(medians, rank, kinds):
         raise GeometryError(
             f"the subfields do not follow each other from medial to lateral (rank correlation "
-            f"{order:.2f}): check that the scheme fits the labels",
+            f"{order:.2f}): check that the protocol fits the labels",
             reason="label-order",
         )
     return order
@@ -102,20 +76,7 @@ def _rank_correlation(x: Float, y: NDArray[np.int8]) -> float:
 def check_thickness(thickness: Float, expected: float, settings: CheckSettings) -> list[Flag]:
     """Compare the mean thickness with 2 volume / area of the two sides.
 
-    Parameters
-    ----------
-    thickness : (Nx, Ny) array, mm
-    expected : float
-        mm
-
-    Returns
-    -------
-    list of Flag
-
-    Raises
-    ------
-    GeometryError
-        ``thickness-implausible``.
+    ``expected`` mm.
     """
     mean = float(np.nanmean(thickness))
     ratio = abs(mean / expected - 1)
@@ -164,14 +125,7 @@ def name_place(points: Float, body: Body) -> str:
 
 
 def check_image(body: Body, settings: CheckSettings) -> list[Flag]:
-    """Flag images whose voxels or borders do not suit the body.
-
-    Returns
-    -------
-    list of Flag
-        ``slices-along-axis`` where the longest edge of the voxels lies across the long axis,
-        ``image-border`` where the body reaches the border of the image.
-    """
+    """Flag images whose voxels or borders do not suit the body."""
     edges = np.linalg.norm(body.affine[:3, :3], axis=0)
     flags = []
     if _sliced_lengthwise(body, settings):
@@ -212,13 +166,7 @@ def _voxel_across(body: Body, settings: CheckSettings) -> float:
 
 
 def check_end_labels(volume: LabelVolume, body: Body, settings: CheckSettings) -> list[Flag]:
-    """Flag head or tail labels in the middle of the body, and ends beyond which nothing is labeled.
-
-    Returns
-    -------
-    list of Flag
-        ``end-labels-inside``, ``labels-end``.
-    """
+    """Flag head or tail labels amid the body, and ends beyond which nothing is labeled."""
     labeled = np.isin(volume.part, (Part.HEAD, Part.TAIL)) & (volume.tissue > 0)
     points = np.argwhere(labeled) @ volume.affine[:3, :3].T + volume.affine[:3, 3]
     depth = np.minimum(body.ends.height(points, "posterior"), -body.ends.height(points, "anterior"))
@@ -269,15 +217,7 @@ _FACES = ndimage.generate_binary_structure(3, 1)
 
 
 def check_labels(body: Body, settings: CheckSettings) -> list[Flag]:
-    """Flag labels with noise, or with a gap of about one voxel through the sheet.
-
-    Returns
-    -------
-    list of Flag
-        ``noisy-labels`` where many single voxels inside the sheet lack its label, ``thin-gap``
-        where a layer of voxels without a label lies between labeled ones, ``loose-part`` where a
-        large part of the sheet touches the rest by edges of voxels at most.
-    """
+    """Flag labels with noise, or with a gap of about one voxel through the sheet."""
     index, _ = body.inside_points()
     around = box_around(index)
     low = low_corner(around)
@@ -354,20 +294,6 @@ def check_cross_sections(
     Each cross-section is compared with those at a distance on both sides. What both lack, or have
     of the interior labels instead, is judged by how far it stands out from the same body's other
     cross-sections: a bent ribbon moves sideways everywhere, a leak is in one place.
-
-    Parameters
-    ----------
-    field : Field
-        After the repair of its topology.
-    body : Body
-    settings : CheckSettings
-    cuts : (A, B, W) array of bool, optional
-        Nodes at which bridges were cut: their stubs are known, and nothing that is added.
-
-    Returns
-    -------
-    list of Flag
-        ``section-notch``, ``section-bump``, ``section-intrusion``.
     """
     solid, interior = field.values > 0, _interior_nodes(field, body)
     strange = np.ones_like(solid)
@@ -442,13 +368,7 @@ class _Oddest:
 
 
 def check_rows(sheet: Sheet, settings: CheckSettings) -> list[Flag]:
-    """Flag a sheet whose medial-to-lateral length jumps from row to row, or dips.
-
-    Returns
-    -------
-    list of Flag
-        ``extent-jump``, or ``extent-dip`` where rows are narrower than some on both sides.
-    """
+    """Flag a sheet whose medial-to-lateral length jumps from row to row, or dips."""
     middle = sheet.points[:, :, sheet.middle]
     lengths = np.linalg.norm(np.diff(middle, axis=0), axis=-1).sum(axis=0)
     jumps = np.abs(np.diff(lengths)) / np.minimum(lengths[1:], lengths[:-1])
@@ -477,17 +397,7 @@ def check_ridges(sheet: Sheet, thickness: Float, settings: CheckSettings) -> lis
     Labels that leaked, or that a bar or a dent has changed, show in few cross-sections; thickness
     of a whole sheet changes more slowly along the axis.
 
-    Parameters
-    ----------
-    sheet : Sheet
-    thickness : (Nx, Ny) array
-        mm
-    settings : CheckSettings
-
-    Returns
-    -------
-    list of Flag
-        ``thickness-ridge``, ``thickness-groove``.
+    ``thickness`` mm.
     """
     middle = sheet.points[:, :, sheet.middle]
     flags = []

@@ -48,21 +48,7 @@ def euler_number(mask: Bool) -> int:
 
 
 def grow(start: Bool, allowed: Bool, field: NDArray[np.float32], levels: int) -> Bool:
-    """Grow a set inside ``allowed`` by simple points, highest field value first.
-
-    Parameters
-    ----------
-    start, allowed : (A, B, C) arrays of bool
-        The outermost layer of voxels must be free in both.
-    field : (A, B, C) array
-    levels : int
-        The values are ordered in this many steps of equal count.
-
-    Returns
-    -------
-    (A, B, C) array of bool
-        Same topology as ``start``; no voxel of ``allowed`` can be added any more.
-    """
+    """Grow a set inside ``allowed`` by simple points, highest field value first."""
     state = start.copy()
     free = allowed & ~start
     if free.any():
@@ -85,17 +71,7 @@ def shrink(start: Bool, kept: Bool, field: NDArray[np.float32], levels: int) -> 
 
 
 def are_simple(neighbors: Bool) -> Bool:
-    """Whether voxels are simple.
-
-    Parameters
-    ----------
-    neighbors : (N, 26) array of bool
-        Which of their neighbors are object, in the order of ``NEIGHBORS``.
-
-    Returns
-    -------
-    (N,) array of bool
-    """
+    """Whether voxels are simple."""
     packed = np.packbits(neighbors, axis=1, bitorder="little")
     bits = np.ascontiguousarray(packed).view("<u4")[:, 0]
     table = _table()

@@ -40,26 +40,7 @@ def automatic_range(
 ) -> dict[End, tuple[float, str]]:
     """Find the ends of the body that have no labels by the rule of Diers et al. 2023, section 2.1.
 
-    Parameters
-    ----------
-    volume : LabelVolume
-    sheet : (I, J, K) array of uint8
-        Sheet tissue after the layer was given away.
-    axis : (3,) array
-        Unit vector along which slices are counted.
-    known : dict
-        Point, normal and rule of the ends that have labels.
-    settings : BodySettings
-
-    Returns
-    -------
-    dict
-        Level along the axis, mm, and rule of each end.
-
-    Raises
-    ------
-    GeometryError
-        ``no-body`` where no slice fulfils the rule.
+    Returns Level along the axis, mm, and rule of each end.
     """
     index = np.argwhere(sheet > 0)
     along = (index @ volume.affine[:3, :3].T + volume.affine[:3, 3]) @ axis
@@ -218,22 +199,6 @@ def find_end_planes(
     From labels where the segmentation has them; otherwise by the rule of Diers et al. 2023
     (section 2.1): the most anterior slice with CA2 or CA3, and the most posterior one with CA1 and
     CA2 or CA3, counted along the hippocampus's own long axis.
-
-    Parameters
-    ----------
-    volume : LabelVolume
-    sheet : (I, J, K) array of uint8
-        Sheet tissue after the layer was given away.
-    settings : BodySettings
-
-    Returns
-    -------
-    EndPlanes
-
-    Raises
-    ------
-    GeometryError
-        ``no-body`` where no slice fulfils the rule, ``ends-crossed`` where the planes meet.
     """
     hippocampal = (
         (volume.tissue > 0)
@@ -355,18 +320,8 @@ def _long_axis(points: Float, parts: NDArray[np.uint8]) -> Float:
 def _separating_plane(below: Float, above: Float, axis: Float, reach: float) -> tuple[Float, Float]:
     """Plane between two label classes by ridge-penalised logistic regression near the interface.
 
-    Parameters
-    ----------
-    below, above : (N, 3), (M, 3) arrays
-        Voxel centers posterior and anterior of the interface, mm.
-    axis : (3,) array
-    reach : float
-        Voxels within this distance of the interface count, mm.
-
-    Returns
-    -------
-    point, normal : (3,) arrays
-        The normal points to ``above``.
+    ``below, above`` Voxel centers posterior and anterior of the interface, mm; ``reach`` Voxels
+    within this distance of the interface count, mm.
     """
     low, high = below @ axis, above @ axis
     # The classes overlap along the axis where the interface is tilted: start at the balance point.

@@ -23,14 +23,7 @@ _GROUPS = 2.0  # times the root of the number of unknowns: a step's two levels c
 def compact_groups(points: Float) -> NDArray[np.intp]:
     """Part points into compact groups of equal size by halving along the longest side.
 
-    Parameters
-    ----------
-    points : (N, 3) array
-
-    Returns
-    -------
-    (N,) array of int
-        Numbers of the groups from 0; their number is a power of two near 2 sqrt(N).
+    Returns their number is a power of two near 2 sqrt(N).
     """
     levels = round(math.log2(_GROUPS * math.sqrt(len(points))))
     size = -(-len(points) // 2**levels) * 2**levels
@@ -56,29 +49,6 @@ def solve_two_level(
 ) -> Float:
     """Solve a symmetric positive definite system on some of the unknowns.
 
-    Parameters
-    ----------
-    matrix : (N, N) sparse array
-    right : (N,) array
-    free : (N,) array of bool
-        The unknowns; the other rows and columns are left out.
-    groups : (N,) array of int
-        Of :func:`compact_groups`.
-    guess : (N,) array, optional
-        To start from; it changes the time and not the accuracy.
-
-    Returns
-    -------
-    (N,) array
-        0 where not free.
-
-    Raises
-    ------
-    GeometryError
-        ``laplace`` if there is no finite solution.
-
-    Notes
-    -----
     Conjugate gradients (Hestenes & Stiefel 1952, J Res Natl Bur Stand 49:409-436) with two levels
     added up, as in Nicolaides 1987 (SIAM J Numer Anal 24:355-365): the diagonal, and the system for
     functions that are constant on each group, which carries information across the body in one
@@ -150,19 +120,6 @@ def _coarse_inverse(matrix: sparse.csr_array, free: Bool, groups: NDArray[np.int
 def stiffness(vertices: Float, tetrahedra: Int, tensor: Float | None = None) -> sparse.csc_array:
     """Stiffness matrix of linear elements.
 
-    Parameters
-    ----------
-    vertices : (V, 3) array, mm
-    tetrahedra : (T, 4) array, positive volume
-    tensor : (3, 3) array, optional
-        Constant symmetric diffusion tensor; identity if missing.
-
-    Returns
-    -------
-    (V, V) sparse array, symmetric positive semi-definite
-
-    Notes
-    -----
     Entries are the integrals of grad(i) . D grad(j) of the hat functions (Reuter et al. 2006,
     Computer-Aided Design 38:342-366, for the Laplace case). The same matrix as LaPy's, made in
     one step for all elements.
@@ -183,21 +140,6 @@ def triangle_stiffness(
 ) -> sparse.csc_array:
     """Stiffness matrix of linear elements on a surface, slowed along one direction.
 
-    Parameters
-    ----------
-    vertices : (V, 3) array, mm
-    triangles : (F, 3) array
-    directions : (F, 3) array
-        Unit vectors in the triangles' planes.
-    diffusion : (F,) array
-        Diffusion along ``directions``; across them it is 1.
-
-    Returns
-    -------
-    (V, V) sparse array, symmetric positive semi-definite
-
-    Notes
-    -----
     The operator of Andreux et al. 2014 (ECCV workshops, LNCS 8928:299-312), as in LaPy's
     anisotropic solver, whose weights are exponentials of curvature only.
     """
@@ -233,29 +175,7 @@ def solve_dirichlet(
     groups: NDArray[np.intp] | None = None,
     guess: Float | None = None,
 ) -> Float:
-    """Harmonic function with given values at some vertices and free boundary elsewhere.
-
-    Parameters
-    ----------
-    matrix : (V, V) sparse array
-        Stiffness.
-    fixed : (N,) array of int
-    values : (N,) array
-    groups : (V,) array of int, optional
-        Of :func:`~hipsta_bids.geometry.two_level.compact_groups`: solve by iteration, which pays
-        where thousands of vertices are free; missing: by factorization.
-    guess : (V,) array, optional
-        A similar function, from which iteration starts.
-
-    Returns
-    -------
-    (V,) array
-
-    Raises
-    ------
-    GeometryError
-        ``laplace`` if there is no finite solution.
-    """
+    """Harmonic function with given values at some vertices and free boundary elsewhere."""
     count = matrix.shape[0]
     free = np.ones(count, dtype=bool)
     free[fixed] = False
@@ -286,26 +206,7 @@ class HarmonicSolver:
     def between(
         self, first: Int, second: Int, *, few: bool = False, guess: Float | None = None
     ) -> Float:
-        """Solve Laplace's equation between two sets of vertices, without flux elsewhere.
-
-        Parameters
-        ----------
-        first, second : arrays of int
-            Vertices where the function is -1 and 1.
-        few : bool
-            Few vertices are left between them, so that a factorization is faster.
-        guess : (V,) array, optional
-            A similar function: it saves time.
-
-        Returns
-        -------
-        (V,) array
-
-        Raises
-        ------
-        GeometryError
-            ``laplace`` if there is no finite solution.
-        """
+        """Solve Laplace's equation between two sets of vertices, without flux elsewhere."""
         return solve_dirichlet(
             self._matrix,
             np.concatenate([first, second]),

@@ -89,24 +89,7 @@ class Field:
 
 
 def resample_body(body: Body, settings: GridSettings, slices: SliceSettings) -> Field:
-    """Sample the body's mask on a wedge grid and smooth it.
-
-    Parameters
-    ----------
-    body : Body
-    settings : GridSettings
-    slices : SliceSettings
-        Used where slices are thick.
-
-    Returns
-    -------
-    Field
-
-    Raises
-    ------
-    GeometryError
-        ``ends-crossed`` where the end planes meet inside the body.
-    """
+    """Sample the body's mask on a wedge grid and smooth it."""
     grid = _fit_grid(body, settings)
     parted = None
     if has_thick_slices(body.affine, slices):
@@ -241,11 +224,7 @@ def _directions_across(body: Body, flat: Float) -> Float:
 
     The first follows the edge of the voxels that points most to lateral.
 
-    Parameters
-    ----------
-    body : Body
-    flat : (N, 3) array
-        The body's points without their part along the axis, mm.
+    ``flat`` The body's points without their part along the axis, mm.
     """
     axis = body.ends.axis
     edges = body.affine[:3, :3].T

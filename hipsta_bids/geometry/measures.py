@@ -22,24 +22,6 @@ def differentiate(values: Float, window: int, degree: int, times: int, axis: int
     The derivative at a node is that of the polynomial fitted to the window around it; within half
     a window of either end, to the first or last window.
 
-    Parameters
-    ----------
-    values : array
-    window : int
-        Nodes per window, odd, no more than the axis has.
-    degree : int
-        Of the polynomials, less than ``window``.
-    times : int
-        Order of the derivative; 0 smooths.
-    axis : int
-
-    Returns
-    -------
-    array
-        Of the shape of ``values``; per node distance to the power of ``times``.
-
-    Notes
-    -----
     Savitzky & Golay 1964, Anal Chem 36:1627-1639. The same as SciPy's ``savgol_filter``, to which
     a test compares it; importing that takes longer than measuring half a hemisphere, and 36 MB.
     """
@@ -78,19 +60,6 @@ def mean_curvature(sheet: Sheet, level: int, settings: MeasureSettings) -> Float
     Positive where the layer curls round its interior side, as on a cylinder whose axis lies on the
     interior side: there it is half of 1 / radius.
 
-    Parameters
-    ----------
-    sheet : Sheet
-    level : int
-        Number of the layer along z.
-    settings : MeasureSettings
-
-    Returns
-    -------
-    (Nx, Ny) array
-
-    Notes
-    -----
     From the first and second fundamental form of local polynomials (do Carmo 1976, Differential
     Geometry of Curves and Surfaces, section 3.3; smoothing differentiation by Savitzky & Golay
     1964, Anal Chem 36:1627-1639).
@@ -106,19 +75,6 @@ def gaussian_curvature(sheet: Sheet, level: int, settings: MeasureSettings) -> F
     Zero where the layer could be laid flat without stretching; positive where it is a bowl or a
     dome, negative where it is a saddle. It does not depend on which side is interior.
 
-    Parameters
-    ----------
-    sheet : Sheet
-    level : int
-        Number of the layer along z.
-    settings : MeasureSettings
-
-    Returns
-    -------
-    (Nx, Ny) array
-
-    Notes
-    -----
     As in :func:`mean_curvature`, but with longer windows along y: noise in the small curvature
     along the axis is multiplied by the large one across it.
     """
@@ -221,21 +177,7 @@ def extent_y(whole: Sheet) -> Float:
 
 
 def wall_length(whole: Sheet, level: int, settings: MeasureSettings) -> Float:
-    """Length of each line of a wall from rim to rim, (Ny,), mm.
-
-    Parameters
-    ----------
-    whole : Sheet
-        From rim to rim.
-    level : int
-        0 for the interior and -1 for the exterior wall.
-    settings : MeasureSettings
-
-    Returns
-    -------
-    (Ny,) array
-        One length per cross-section.
-    """
+    """Length of each line of a wall from rim to rim, (Ny,), mm."""
     steps, middle = _steps(whole, level, 0), _steps(whole, whole.middle, 0)
     return np.asarray(_continued(steps, middle, settings).sum(axis=0))
 
@@ -316,17 +258,7 @@ class CrossSections:
 def cut_sections(whole: Sheet, thickness: Float, settings: MeasureSettings) -> CrossSections:
     """Measure the cross-sections of a body.
 
-    Parameters
-    ----------
-    whole : Sheet
-        From rim to rim and wall to wall.
-    thickness : (Ny,) array
-        Mean of each section, mm.
-    settings : MeasureSettings
-
-    Returns
-    -------
-    CrossSections
+    ``thickness`` Mean of each section, mm.
     """
     middle = whole.points[:, :, whole.middle]
     steps = np.linalg.norm(np.diff(middle, axis=1), axis=-1).mean(axis=0)
@@ -381,19 +313,7 @@ def labels_at(points: Float, body: Body) -> NDArray[np.uint8]:
 
 
 def subfield_areas(whole: Sheet, body: Body) -> dict[Tissue, float]:
-    """Area of the mid-surface in each subfield that it has, mm2.
-
-    Parameters
-    ----------
-    whole : Sheet
-        From rim to rim and end to end.
-    body : Body
-
-    Returns
-    -------
-    dict
-        The areas add up to that of the mid-surface.
-    """
+    """Area of the mid-surface in each subfield that it has, mm2."""
     at = (np.arange(_PLACES) + 0.5) / _PLACES
     inner = whole.points[:, :, 1:-1]  # walls lie beside the voxels as often as in them
     along_x = _between(inner[:-1], inner[1:], at)

@@ -55,24 +55,6 @@ def sample_on_sheet(
 ) -> SampledMap:
     """Read a volume on the mid-surface or averaged over the depth of the sheet.
 
-    Parameters
-    ----------
-    volume : ScalarVolume
-    sheet : Sheet
-    settings : MapSettings
-    sampling : {"depth", "mid"}
-        ``depth`` gives the mean over each column from wall to wall (trapezoidal rule), or, with
-        ``nearest``, the value that most of the column has, so that labels remain labels.
-    interpolation : {"linear", "nearest"}
-        Trilinear between the centers of voxels, or the value of the voxel that holds the point.
-
-    Returns
-    -------
-    SampledMap
-        A value is missing where less than ``min_known`` of what it is made of is known.
-
-    Notes
-    -----
     The field of view ends at the outer faces of the outermost voxels; from their centers outward
     the value is that of the voxel.
     """
@@ -196,21 +178,8 @@ def summarize_regions(
 ) -> RegionStatistics:
     """Sum up maps in regions.
 
-    Parameters
-    ----------
-    regions : Regions
-    sheet : Sheet
-    maps : mapping of str to (Nx, Ny) float64
-        Numbers, NaN where missing.
-    labels : mapping of str to (Nx, Ny) float64
-        Labels, NaN where missing.
+    ``maps`` Numbers, NaN where missing; ``labels`` Labels, NaN where missing.
 
-    Returns
-    -------
-    RegionStatistics
-
-    Notes
-    -----
     Each quadrilateral of the grid belongs to its corners in quarters.
     """
     member = regions.member & sheet.valid

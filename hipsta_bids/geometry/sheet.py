@@ -20,22 +20,6 @@ def sample_sheet(mesh: TetMesh, coordinates: Coordinates, settings: SheetSetting
 
     Each tetrahedron is also one in coordinate space; a grid node inside it lies at the same
     barycentric place in the body.
-
-    Parameters
-    ----------
-    mesh : TetMesh
-    coordinates : Coordinates
-    settings : SheetSettings
-
-    Returns
-    -------
-    Sheet
-        Columns with a node in no tetrahedron are filled from their neighbors and not valid.
-
-    Raises
-    ------
-    GeometryError
-        ``sheet-incomplete`` if more than ``max_filled`` of the columns cannot be measured.
     """
     axes = sheet_levels(settings)
     points = _invert(mesh, coordinates.values, axes)
@@ -85,15 +69,7 @@ def is_left_handed(points: Float) -> bool:
 
     The two hemispheres are mirror images, so that one of them always is.
 
-    Parameters
-    ----------
-    points : (Nx, Ny, Nz, 3) float64
-        Sheet points in mm, NaN where undefined.
-
-    Returns
-    -------
-    bool
-        Whether triangles have to be flipped for their normals to point to the exterior.
+    ``points`` Sheet points in mm, NaN where undefined.
     """
     middle = points[:, :, points.shape[2] // 2]
     along_x = middle[1:, :-1] - middle[:-1, :-1]
@@ -111,15 +87,6 @@ def is_turned(sheet: Sheet, hemi: str) -> bool:
     and the hippocampus round the dentate gyrus. But medial to lateral, posterior to anterior and
     interior to exterior are a right-handed system on the left and a left-handed one on the right,
     all along the sheet and however it bends.
-
-    Parameters
-    ----------
-    sheet : Sheet
-    hemi : {"L", "R"}
-
-    Returns
-    -------
-    bool
     """
     return is_left_handed(sheet.points) == (hemi == "L")
 
@@ -244,22 +211,6 @@ def solve_coordinates(
 
     Each function is -1 on the first boundary (medial, posterior, interior), 1 on the second, and
     has no flux through the rest of the surface (Diers et al. 2023, section 2.1.4).
-
-    Parameters
-    ----------
-    mesh : TetMesh
-    boundaries : Boundaries
-    solver : HarmonicSolver, optional
-        Of this mesh, if there is one already.
-
-    Returns
-    -------
-    Coordinates
-
-    Raises
-    ------
-    GeometryError
-        ``laplace`` if a problem has no finite solution.
     """
     solver = solver or HarmonicSolver(mesh)
     values = (
@@ -276,20 +227,6 @@ def solve_coordinates(
 def equal_volume_layers(sheet: Sheet) -> tuple[Sheet, Bool]:
     """Move the points along their columns so that the same volume lies between any two layers.
 
-    Parameters
-    ----------
-    sheet : Sheet
-        Its points at equal distances along each column.
-
-    Returns
-    -------
-    layers : Sheet
-        Both walls stay; columns in which layers fold keep equal distances.
-    folded : (Nx, Ny) array of bool
-        Where layers fold, so that there is no such depth.
-
-    Notes
-    -----
     The area of a column grows linearly between two layers, so the volume below a depth is a
     quadratic function of it, and inverted exactly.
     """
@@ -314,13 +251,7 @@ def equal_volume_layers(sheet: Sheet) -> tuple[Sheet, Bool]:
 
 
 def check_layers(folded: Bool) -> list[Flag]:
-    """Flag a sheet whose layers fold, so that some columns have no equal-volume depths.
-
-    Returns
-    -------
-    list of Flag
-        ``layers-fold``.
-    """
+    """Flag a sheet whose layers fold, so that some columns have no equal-volume depths."""
     if not folded.any():
         return []
     x, y = np.argwhere(folded)[0] + 1

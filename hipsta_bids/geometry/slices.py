@@ -29,21 +29,9 @@ Image = NDArray[np.float32]
 def outline_slice(tissue: NDArray[np.uint8], pixel: float, settings: SliceSettings) -> Image:
     """Find the signed distance from the ribbon's outline in a slice.
 
-    Parameters
-    ----------
-    tissue : (I, J) array of uint8
-        Sheet tissue at the pixels of the segmentation.
-    pixel : float
-        Edge of a pixel, mm.
-    settings : SliceSettings
+    ``pixel`` Edge of a pixel, mm. Returns mm at finer pixels, positive inside, between minus and
+    plus ````reach````.
 
-    Returns
-    -------
-    (upsampling I, upsampling J) array of float32
-        mm at finer pixels, positive inside, between minus and plus ``reach``.
-
-    Notes
-    -----
     Across a straight edge, a mask smoothed by a Gaussian is the normal distribution function of the
     distance over sigma. Its inverse finds the outline between pixels; whole pixels put it off by
     up to half of one, which the smoothing of the working grid cannot undo along the slice.
@@ -67,18 +55,7 @@ def part_distance(
 ) -> Image:
     """Find the signed distance from some subfields of a slice, to the pixel.
 
-    Parameters
-    ----------
-    tissue : (I, J) array of uint8
-    kinds : collection of Tissue
-    pixel : float
-        Edge of a pixel, mm.
-    settings : SliceSettings
-
-    Returns
-    -------
-    (upsampling I, upsampling J) array of float32
-        As :func:`outline_slice`.
+    ``pixel`` Edge of a pixel, mm.
     """
     fine = np.kron(np.isin(tissue, tuple(kinds)), np.ones((settings.upsampling,) * 2, dtype=bool))
     distance = _signed_distance(fine, pixel / settings.upsampling)
@@ -97,7 +74,7 @@ def _signed_distance(mask: Bool, pixel: float) -> Float:
 def _join(
     distance: Float, ranks: NDArray[np.intp], labeled: Bool, pixel: float, settings: SliceSettings
 ) -> Float:
-    """Bridge near fragments of a slice to the largest, drop crumbs, fill holes.
+    """Bridge near fragments of a slice to the largest, drop fragments, fill holes.
 
     A large piece farther away is left alone: whether it belongs to the ribbon (it may turn into
     the uncus) is seen in three dimensions only.
@@ -115,8 +92,8 @@ def _join(
         # not to the part that happens to lie across the sulcus.
         jump = np.abs(ranks - ranks[tuple(nearest)]) > settings.max_rank_jump
         cost = gap + np.where(jump & labeled, settings.reach, 0)
-        crumbs = (sizes < settings.crumb_area)[pieces]
-        cost[(pieces == 0) | main | ((cost > settings.max_gap) & ~crumbs)] = np.inf
+        fragments = (sizes < settings.crumb_area)[pieces]
+        cost[(pieces == 0) | main | ((cost > settings.max_gap) & ~fragments)] = np.inf
         end = np.array(np.unravel_index(np.argmin(cost), cost.shape))
         nearest_cost = cost[tuple(end)]
         if not np.isfinite(nearest_cost):
@@ -155,22 +132,9 @@ _LEVELS = (2, 1)  # sizes of pixels, those of the segmentation last
 def register_slices(outlines: Stack, pixel: float, settings: SliceSettings) -> Stack:
     """Register each slice to the next, both sides alike.
 
-    Parameters
-    ----------
-    outlines : (N, I, J) array of float32
-        Signed distances at fine pixels, mm.
-    pixel : float
-        Edge of a pixel of the segmentation, ``upsampling`` times that of a fine one, mm. The
-        registration works with them: fine ones would cost much and tell no more.
-    settings : SliceSettings
+    ``outlines`` Signed distances at fine pixels, mm; ``pixel`` Edge of a pixel of the segmentation,
+    ````upsampling```` times that of a fine one, mm.
 
-    Returns
-    -------
-    (2, N - 1, I / upsampling, J / upsampling) array of float32
-        Displacement u in fine pixels with first(x - u / 2) = second(x + u / 2).
-
-    Notes
-    -----
     Lucas & Kanade 1981, IJCAI:674-679, with a Gaussian window, from coarse to fine, all slices
     at once. Halfway between both slices, no direction is preferred, and one displacement serves
     both.
@@ -261,17 +225,7 @@ class SliceStack:
     def blend(self, level: Stack, where: Stack) -> Stack:
         """Find the signed distance from the outline of the shape at any level.
 
-        Parameters
-        ----------
-        level : (N,) array of float32
-            Slice numbers, not necessarily whole.
-        where : (2, N) array of float32
-            Fine pixels.
-
-        Returns
-        -------
-        (N,) array of float32
-            mm, within the plane of the slices, positive inside.
+        Returns mm, within the plane of the slices, positive inside.
         """
         last = len(self.outlines) - 1
         level = level + (self.settings.extrapolation - 1) * (level - np.clip(level, 0, last))
@@ -315,18 +269,7 @@ def has_thick_slices(affine: Float, settings: SliceSettings) -> bool:
 def sample_slices(body: Body, points: Float, settings: SliceSettings) -> Stack:
     """Sample the body's mask between and beyond its thick slices.
 
-    Parameters
-    ----------
-    body : Body
-        Its image has one axis with long voxel edges.
-    points : (N, 3) array
-        RAS mm.
-    settings : SliceSettings
-
-    Returns
-    -------
-    (N,) array of float32
-        From 0 outside to 1 inside, with a ramp of ``edge`` on each side of the outline.
+    ``points`` RAS mm.
     """
     edges = np.linalg.norm(body.affine[:3, :3], axis=0)
     through = int(np.argmax(edges))

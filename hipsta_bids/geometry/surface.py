@@ -16,23 +16,6 @@ def extract_surface(field: Field, settings: SurfaceSettings) -> Surface:
     Beyond the end planes the field counts as strongly negative, so that marching cubes puts the
     caps into the end planes and their vertices are known.
 
-    Parameters
-    ----------
-    field : Field
-        Its positive part is one solid piece without tunnels.
-    settings : SurfaceSettings
-
-    Returns
-    -------
-    Surface
-
-    Raises
-    ------
-    GeometryError
-        ``surface-topology`` if the surface is not one sphere.
-
-    Notes
-    -----
     Smoothing: Taubin 1995, SIGGRAPH '95:351-358.
     """
     outside = -1e4 * float(np.abs(field.values).max())

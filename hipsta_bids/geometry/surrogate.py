@@ -63,27 +63,7 @@ class Slice:
 def surrogate_profiles(
     body: Body, position: float, sheet: SheetSettings, settings: SurrogateSettings
 ) -> tuple[SurrogateProfile, SurrogateProfile]:
-    """Measure thickness along the medial axis of one slice.
-
-    Parameters
-    ----------
-    body : Body
-    position : float
-        Fraction of the body's length from its posterior end, as the sheet's y.
-    sheet : SheetSettings
-        The proportional points lie where the sheet's nodes along x are.
-    settings : SurrogateSettings
-
-    Returns
-    -------
-    proportional, equidistant : SurrogateProfile
-
-    Raises
-    ------
-    GeometryError
-        ``surrogate-empty`` where the slice has no labels, ``surrogate-loop`` where the ribbon
-        closes on itself, ``surrogate-short`` where the medial axis is no line.
-    """
+    """Measure thickness along the medial axis of one slice."""
     cut = draw_slice(body, position, settings)
     axis = _from_medial(body, cut, _medial_axis(cut, position, settings))
     sides = _sides(cut, axis)
@@ -116,22 +96,6 @@ def draw_slice(body: Body, position: float, settings: SurrogateSettings) -> Slic
     """Draw the merged labels where a plane between the end planes cuts them.
 
     The plane turns from the posterior to the anterior end plane as it moves along the body.
-
-    Parameters
-    ----------
-    body : Body
-    position : float
-        As in :func:`surrogate_profiles`.
-    settings : SurrogateSettings
-
-    Returns
-    -------
-    Slice
-
-    Raises
-    ------
-    GeometryError
-        ``surrogate-empty`` or ``surrogate-loop``.
     """
     ends, (_, points) = body.ends, body.inside_points()
     normal = (1 - position) * ends.posterior_normal + position * ends.anterior_normal
@@ -292,22 +256,8 @@ class Agreement:
 def compare_nearby(points: Float, surface: Float, values: Float, reach: float) -> Float:
     """Look up values of a surface near points.
 
-    Parameters
-    ----------
-    points : (N, 3) float64
-        RAS mm.
-    surface : (M, 3) float64
-        RAS mm, NaN where undefined.
-    values : (M,) float64
-        NaN where missing.
-    reach : float
-        mm.
-
-    Returns
-    -------
-    (N,) float64
-        Mean of the four nearest, weighted by the inverse of their distance; NaN where the nearest
-        lies farther away than ``reach``.
+    ``points`` RAS mm; ``surface`` RAS mm, NaN where undefined; ``values`` NaN where missing;
+    ``reach`` mm. Returns NaN where the nearest lies farther away than ````reach````.
     """
     known = np.isfinite(surface).all(axis=-1) & np.isfinite(values)
     if not known.any():

@@ -39,19 +39,7 @@ class TetgenClient:
     ) -> tuple[Float, NDArray[Any]] | str:
         """Tetrahedralize one closed surface.
 
-        Parameters
-        ----------
-        vertices : (V, 3) array
-        triangles : (F, 3) array
-        options : dict
-            Keywords of TetGen.
-        timeout : float
-            s
-
-        Returns
-        -------
-        tuple or str
-            Vertices (V, 3) and tetrahedra (T, 4), or why there are none.
+        Returns Vertices (V, 3) and tetrahedra (T, 4), or why there are none.
         """
         reply = self._ask((vertices, triangles, options), timeout)
         return reply if isinstance(reply, str) else (reply[0], reply[1])

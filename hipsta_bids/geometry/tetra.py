@@ -14,22 +14,6 @@ _CLIENT = TetgenClient()
 def tetrahedralize(surface: Surface, settings: TetraSettings) -> TetMesh:
     """Fill a surface with tetrahedra; its vertices come first and stay in place.
 
-    Parameters
-    ----------
-    surface : Surface
-    settings : TetraSettings
-
-    Returns
-    -------
-    TetMesh
-
-    Raises
-    ------
-    GeometryError
-        ``tetrahedralization`` if TetGen fails, crashes or takes too long.
-
-    Notes
-    -----
     TetGen: Si 2015, ACM Trans Math Softw 41:11. ``nobisect`` keeps the surface as it is, so that
     boundary sets found on the surface are valid in the volume.
     """

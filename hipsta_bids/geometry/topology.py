@@ -135,25 +135,6 @@ def repair_topology(
     inside by simple points stops at the membranes that cut every tunnel; shrinking from outside
     stops at those that fill it. The cheaper membrane of each tunnel is applied. (The two-sided
     use of homotopic growing follows Kriegeskorte & Goebel 2001, NeuroImage 14:329-346.)
-
-    Parameters
-    ----------
-    field : Field
-    settings : TopologySettings
-    locate : callable, optional
-        Names the subfields at points, for messages.
-    contact : callable, optional
-        Whether two turns of the sheet touch at points, by their labels: a cut there is welcome.
-
-    Returns
-    -------
-    SolidField
-
-    Raises
-    ------
-    GeometryError
-        ``sheet-too-thin``, ``body-interrupted``, ``body-split``, or ``topology`` where no repair
-        is found.
     """
     values = field.values
     before = values > 0
@@ -218,7 +199,7 @@ def _before_smoothing(field: Field) -> list[Edit]:
 def _through_pieces(state: Bool) -> tuple[NDArray[Any], int, NDArray[Any]]:
     """Pieces of the body, their number, and which of them reach from plate to plate.
 
-    The largest comes first. The plates are left out of the count, or a crumb that touches one of
+    The largest comes first. The plates are left out of the count, or a fragment that touches one of
     them would count as connected.
     """
     pieces, count = ndimage.label(state[INNER], structure=FACES)
@@ -250,7 +231,7 @@ def _refuse_strips(
     place = _place(field.grid.to_ras(center[None])[0], names)
     raise GeometryError(
         f"a gap parts the sheet into {len(through)} strips from end to end, at {place}: "
-        "fill it in the labels, or check that the scheme fits them",
+        "fill it in the labels, or check that the protocol fits them",
         reason="body-split",
     )
 
@@ -369,18 +350,6 @@ def repaired_columns(sheet: Sheet, solid: SolidField, settings: MeasureSettings)
     A column stands for the part of the sheet up to halfway to its neighbors, so that a repair
     between two columns is not lost. A cut bridge leaves its two stumps standing: what is nearest
     to either face of the cut is marked, too. Pieces that were removed leave no mark.
-
-    Parameters
-    ----------
-    sheet : Sheet
-    solid : SolidField
-        Knows the grid nodes whose side was changed.
-    settings : MeasureSettings
-
-    Returns
-    -------
-    (Nx, Ny) bool
-        False where a column is undefined.
     """
     marked = np.zeros(sheet.valid.shape, dtype=bool)
     if not solid.touched.any():
@@ -441,18 +410,7 @@ def _changed_nodes(
 def _cells(points: Float, columns: NDArray[np.intp], parts: NDArray[np.intp]) -> Float:
     """Interpolate round columns, up to halfway to their neighbors.
 
-    Parameters
-    ----------
-    points : (Nx, Ny, Nz, 3) float64
-    columns : (C, 2) int
-        Numbers along x and y.
-    parts : (2,) int
-        Steps from half before to half behind a column, along x and y.
-
-    Returns
-    -------
-    (C, steps, Nz, 3) float64
-        NaN where a neighbor is undefined.
+    Returns NaN where a neighbor is undefined.
     """
     steps = [np.linspace(-0.5, 0.5, int(n) + 1) for n in parts]
     offsets = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 2)

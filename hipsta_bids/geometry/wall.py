@@ -21,24 +21,6 @@ _TINY = 1e-8  # of unit vectors
 def least_curvature(vertices: Float, triangles: Int, smoothing: int) -> tuple[Float, Float]:
     """Least of the two principal curvatures per triangle, and its direction.
 
-    Parameters
-    ----------
-    vertices : (V, 3) array, mm
-    triangles : (F, 3) array
-        Of one orientation; every edge belongs to one or two of them.
-    smoothing : int
-        Steps in which the tensor of each vertex becomes the mean of its neighbors'.
-
-    Returns
-    -------
-    directions : (F, 3) array
-        Unit vectors in the triangles' planes.
-    curvature : (F,) array
-        Angle per edge, rad, where edges have unit mean length; negative where outward triangles
-        are convex.
-
-    Notes
-    -----
     The curvature tensor of Cohen-Steiner & Morvan 2003 (SoCG '03:312-321) by the formulas of
     Alliez et al. 2003 (ACM Trans Graph 22:485-493), step by step as LaPy's
     ``TriaMesh.curvature_tria``, to which tests compare it. LaPy spends most of the time on finding
@@ -208,11 +190,11 @@ class Wall:
         return grown
 
     def sides(self, strips: Bool) -> tuple[Bool, Bool] | None:
-        """Find the two large pieces of the wall without the strips; crumbs belong to neither."""
+        """Find the two large pieces of the wall without the strips; fragments belong to neither."""
         piece = self._pieces(~strips)
         size = np.bincount(piece, weights=~strips)
         first, second = np.argsort(size)[::-1][:2]
-        # Each side makes up most of a half; a leak leaves one piece and crumbs.
+        # Each side makes up most of a half; a leak leaves one piece and fragments.
         if size[second] < 0.2 * size[first]:
             return None
         sides = (~strips & (piece == first), ~strips & (piece == second))

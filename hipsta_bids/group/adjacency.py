@@ -41,18 +41,7 @@ def _structure(neighbors: int) -> BoolArray:
 def enhance(statistic: FloatArray, settings: MultiplicitySettings) -> FloatArray:
     """Threshold-free cluster enhancement (Smith and Nichols 2009).
 
-    Parameters
-    ----------
-    statistic : ndarray, shape (maps, x, y)
-        Signed; regions of either sign are enhanced apart. NaN is outside.
-    settings : MultiplicitySettings
-        Exponents, step of the height, and neighbors.
-
-    Returns
-    -------
-    ndarray, shape (maps, x, y)
-        Sum over heights h of ``extent(h) ** E * h ** H * step``, extents in points, with the
-        sign of the statistic; zero outside.
+    ``statistic`` NaN is outside.
     """
     values = np.nan_to_num(statistic, nan=0.0)
     return _enhance(np.maximum(values, 0), settings) - _enhance(np.maximum(-values, 0), settings)
@@ -75,19 +64,7 @@ def _enhance(values: FloatArray, settings: MultiplicitySettings) -> FloatArray:
 def find_clusters(
     significant: BoolArray, statistic: FloatArray, subfield: NDArray[np.str_], neighbors: int
 ) -> list[Cluster]:
-    """Find connected regions of one sign, largest first.
-
-    Parameters
-    ----------
-    significant : ndarray of bool, shape (x, y)
-        Points that survive.
-    statistic : ndarray, shape (x, y)
-        Signed for t; the sign separates regions.
-    subfield : ndarray of str, shape (x, y)
-        Name of the subfield at each point.
-    neighbors : int
-        4 or 8.
-    """
+    """Find connected regions of one sign, largest first."""
     clusters = []
     for sign in (1, -1):
         mask = significant & (sign * statistic > 0)
@@ -107,34 +84,13 @@ def find_clusters(
 
 
 def mesh_edges(triangles: IntArray) -> IntArray:
-    """List the edges of a mesh, each once.
-
-    Parameters
-    ----------
-    triangles : ndarray of int, shape (triangles, 3)
-
-    Returns
-    -------
-    ndarray of int, shape (edges, 2)
-    """
+    """List the edges of a mesh, each once."""
     pairs = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     return np.asarray(np.unique(np.sort(pairs, axis=1), axis=0), dtype=np.int64)
 
 
 def label_mesh(mask: BoolArray, edges: IntArray) -> tuple[IntArray, int]:
-    """Find the connected regions of a mask, numbered from 1; 0 is outside.
-
-    Parameters
-    ----------
-    mask : ndarray of bool, shape (points,)
-    edges : ndarray of int, shape (edges, 2)
-
-    Returns
-    -------
-    ndarray of int, shape (points,)
-    int
-        How many.
-    """
+    """Find the connected regions of a mask, numbered from 1; 0 is outside."""
     inside = np.flatnonzero(mask)
     place = np.cumsum(mask) - 1
     own = place[edges[mask[edges].all(axis=1)]]
@@ -151,18 +107,7 @@ def enhance_on_mesh(
 ) -> FloatArray:
     """Threshold-free cluster enhancement; see :func:`~hipsta_bids.group.sheet_graph.enhance`.
 
-    Parameters
-    ----------
-    statistic : ndarray, shape (maps, points)
-        Signed; NaN is outside.
-    edges : ndarray of int, shape (edges, 2)
-    settings : MultiplicitySettings
-        Exponents and step of the height.
-
-    Returns
-    -------
-    ndarray, shape (maps, points)
-        Extents are numbers of vertices.
+    ``statistic`` NaN is outside.
     """
     values = np.nan_to_num(statistic, nan=0.0)
     return np.stack(
@@ -190,18 +135,7 @@ def _enhance_mesh(
 def find_mesh_clusters(
     significant: BoolArray, statistic: FloatArray, subfield: NDArray[np.str_], edges: IntArray
 ) -> list[Cluster]:
-    """Find connected regions of one sign, largest first.
-
-    Parameters
-    ----------
-    significant : ndarray of bool, shape (points, 1)
-        Points that survive.
-    statistic : ndarray, shape (points, 1)
-        Signed for t; the sign separates regions.
-    subfield : ndarray of str, shape (points, 1)
-        Name of the subfield at each point.
-    edges : ndarray of int, shape (edges, 2)
-    """
+    """Find connected regions of one sign, largest first."""
     clusters = []
     for sign in (1, -1):
         mask = (significant & (sign * statistic > 0))[:, 0]

@@ -188,26 +188,7 @@ def analyze_cohort(
 
 
 def analyze_points(cohort: Cohort, analysis: Analysis, settings: GroupSettings) -> Analysis:
-    """Fit the model of an analysis to further maps, which are not registered.
-
-    Parameters
-    ----------
-    cohort : Cohort
-        Maps whose points correspond, of the same visits.
-    analysis : Analysis
-        Of the sheets, or of covariates alone.
-    settings : GroupSettings
-
-    Returns
-    -------
-    Analysis
-        The same model, fitted to these maps alone.
-
-    Raises
-    ------
-    ModelError
-        If it cannot be fitted to them.
-    """
+    """Fit the model of an analysis to further maps, which are not registered."""
     maps = tuple(dict.fromkeys(name for side in cohort.sides.values() for name in side.maps))
     compared = compare_sessions(cohort, analysis.comparison)
     fitted = _fit_sides(compared, maps, analysis.row_model, analysis.comparison, settings)

@@ -45,17 +45,7 @@ class AreaDifference:
 
 
 def delong(score: FloatArray, case: BoolArray, confidence: float) -> Area:
-    """Area under the curve with its interval (DeLong, DeLong and Clarke-Pearson 1988).
-
-    Parameters
-    ----------
-    score : ndarray, shape (subjects,)
-        Higher for cases.
-    case : ndarray of bool, shape (subjects,)
-        Which subjects are cases; both kinds must occur.
-    confidence : float
-        Two-sided coverage of the normal interval.
-    """
+    """Area under the curve with its interval (DeLong, DeLong and Clarke-Pearson 1988)."""
     areas, covariance = _components(np.atleast_2d(score), case)
     area, se = float(areas[0]), float(np.sqrt(covariance[0, 0]))
     reach = float(stats.norm.ppf((1 + confidence) / 2)) * se
@@ -63,20 +53,7 @@ def delong(score: FloatArray, case: BoolArray, confidence: float) -> Area:
 
 
 def roc_curve(score: FloatArray, case: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Shares of controls and of cases at or above each score, from none to all.
-
-    Parameters
-    ----------
-    score : ndarray, shape (subjects,)
-        Higher for cases.
-    case : ndarray of bool, shape (subjects,)
-        Which subjects are cases; both kinds must occur.
-
-    Returns
-    -------
-    ndarray, ndarray
-        One minus specificity, and sensitivity, at each cut.
-    """
+    """Shares of controls and of cases at or above each score, from none to all."""
     cuts = np.concatenate([[np.inf], np.unique(score)[::-1]])
     controls, cases = np.sort(score[~case]), np.sort(score[case])
     above = [1 - np.searchsorted(part, cuts) / len(part) for part in (controls, cases)]
@@ -91,15 +68,7 @@ def area_under(score: FloatArray, case: BoolArray) -> float:
 
 
 def delong_difference(first: FloatArray, second: FloatArray, case: BoolArray) -> AreaDifference:
-    """Compare two areas of the same subjects (DeLong, DeLong and Clarke-Pearson 1988).
-
-    Parameters
-    ----------
-    first, second : ndarray, shape (subjects,)
-        Scores that were not fitted to these subjects by nested models.
-    case : ndarray of bool, shape (subjects,)
-        Which subjects are cases.
-    """
+    """Compare two areas of the same subjects (DeLong, DeLong and Clarke-Pearson 1988)."""
     areas, covariance = _components(np.stack([first, second]), case)
     weights = np.array([1.0, -1.0])
     difference = float(weights @ areas)
@@ -190,22 +159,6 @@ def compare_models(
     The likelihood-ratio test is the only test between the two. If a model separates the groups,
     both are fitted by Firth's method, and the test is that of the penalized likelihood (Heinze
     and Schemper 2002).
-
-    Parameters
-    ----------
-    base : ndarray, shape (subjects, columns)
-        Design of the base model, with its intercept.
-    added : ndarray, shape (subjects, columns)
-        Measures that come on top.
-    case : ndarray of bool, shape (subjects,)
-        Which subjects are cases.
-    settings : ClassificationSettings
-        Limits, folds and iterations.
-
-    Raises
-    ------
-    ModelError
-        If values are missing, a group is too small, or columns depend on each other.
     """
     full = np.column_stack([base, added])
     _check(full, case)
@@ -271,15 +224,6 @@ def cross_validate(
     """Area under the curve by repeated stratified cross-validation.
 
     Separation is looked for, and answered by Firth's method, in each training set anew.
-
-    Parameters
-    ----------
-    matrix : ndarray, shape (subjects, columns)
-        Design.
-    case : ndarray of bool, shape (subjects,)
-        Which subjects are cases.
-    settings : ClassificationSettings
-        Folds, repeats and seed.
     """
     folds = min(settings.folds, int(case.sum()), int((~case).sum()))
     splits = RepeatedStratifiedKFold(
@@ -310,17 +254,7 @@ def _predict(
 
 
 def calibrate(score: FloatArray, case: BoolArray, settings: ClassificationSettings) -> Calibration:
-    """Compare predicted chances with what happened.
-
-    Parameters
-    ----------
-    score : ndarray, shape (subjects,)
-        Predicted log odds.
-    case : ndarray of bool, shape (subjects,)
-        Which subjects are cases.
-    settings : ClassificationSettings
-        Number of groups in the table.
-    """
+    """Compare predicted chances with what happened."""
     line = np.column_stack([np.ones(len(score)), score])
     slope = np.nan
     if np.ptp(score) > 0:
@@ -373,23 +307,7 @@ def compare_pairs(
 ) -> list[PairComparison]:
     """Compare the two models in each pair of groups, on the same complete subjects.
 
-    Parameters
-    ----------
-    groups : ndarray of str, shape (subjects,)
-        Group of each.
-    base : ndarray, shape (subjects, columns)
-        Measures and covariates of the base model, without an intercept; NaN is missing.
-    added : ndarray, shape (subjects, columns)
-        Measures that come on top.
-    settings : ClassificationSettings
-        Limits, folds and iterations.
-    order : sequence of str
-        Groups, from least to most affected: the later one of a pair are the cases.
-
-    Raises
-    ------
-    ModelError
-        If a group is unknown, or a pair cannot be compared; names the pair.
+    ``base`` NaN is missing.
     """
     if unknown := sorted(set(order) - set(groups.tolist())):
         raise ModelError(

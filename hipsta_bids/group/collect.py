@@ -34,13 +34,7 @@ _SHOWN = 4
 
 
 def read_exclusions(path: Path | None) -> list[dict[str, str]]:
-    """Read the user's table of participants, or single sessions and hemispheres, to leave out.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read, or names no participants.
-    """
+    """Read the user's table of participants, or single sessions and hemispheres, to leave out."""
     if path is None:
         return []
     rows = files.read_tsv(path)
@@ -99,19 +93,7 @@ _ARITHMETIC: Mapping[type[ast.operator], Callable[[Any, Any], Any]] = {
 
 
 class QualityCondition:
-    """A condition under which a hemisphere is left out.
-
-    Parameters
-    ----------
-    text : str
-        Comparisons of metrics with numbers or quoted words, joined by ``and``, ``or``, ``not``;
-        ``+ - * /`` and parentheses.
-
-    Raises
-    ------
-    UsageError
-        If it cannot be read.
-    """
+    """A condition under which a hemisphere is left out."""
 
     def __init__(self, text: str) -> None:
         self.text = text
@@ -121,18 +103,7 @@ class QualityCondition:
             raise self._refusal("cannot be read; write it as filled_fraction > 0.01") from error
 
     def holds(self, metrics: Mapping[str, Any]) -> bool:
-        """Evaluate the condition.
-
-        Parameters
-        ----------
-        metrics : mapping
-            Numbers and words by name. Comparisons with a missing number are false.
-
-        Raises
-        ------
-        UsageError
-            If a metric is unknown, or numbers are compared with words.
-        """
+        """Evaluate the condition."""
         return bool(self._value(self._tree, metrics))
 
     def _value(self, node: ast.expr, metrics: Mapping[str, Any]) -> Any:  # noqa: ANN401 -- of the metric
@@ -247,24 +218,7 @@ class Collection:
 
 
 def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collection:
-    """Find all complete hemispheres of one protocol, made with the same settings.
-
-    Parameters
-    ----------
-    request : GroupRequest
-    may_lack : bool
-        Whether it is fine that nobody has been measured yet; then the settings are the default.
-
-    Raises
-    ------
-    InputError
-        Several protocols or settings, an unfinished run, a hemisphere in two datasets, or a file
-        that cannot be read.
-    NothingToDoError
-        Nothing, or nothing of what is asked for, is there.
-    UsageError
-        The quality condition cannot be evaluated.
-    """
+    """Find all complete hemispheres of one protocol, made with the same settings."""
     for folder in request.segmentations:
         if not folder.is_dir():
             raise InputError(f"{folder}: no such folder; check --segmentations", reason="no-folder")
@@ -313,22 +267,7 @@ def _nothing() -> Collection:
 
 
 def wanted_by(request: GroupRequest) -> Callable[[str, str | None, str], bool]:
-    """Tell whether a hemisphere is asked for, and not in the table of exclusions.
-
-    Parameters
-    ----------
-    request : GroupRequest
-
-    Returns
-    -------
-    callable
-        Takes subject, session and hemisphere, labels without prefixes.
-
-    Raises
-    ------
-    InputError
-        If the table cannot be read.
-    """
+    """Tell whether a hemisphere is asked for, and not in the table of exclusions."""
     unwanted = read_exclusions(request.exclude_table)
 
     def is_wanted(subject: str, session: str | None, hemi: str) -> bool:
@@ -508,22 +447,7 @@ _MEASURES_SHOWN = 12
 def choose_measures(
     wanted: Sequence[str], records: Sequence[SheetRecord], others: Sequence[str] = ()
 ) -> Measures:
-    """Tell maps from summary measures.
-
-    Parameters
-    ----------
-    wanted : sequence of str
-        Names; none for the default.
-    records : sequence of SheetRecord
-        Hemispheres, to see what was measured and sampled.
-    others : sequence of str, optional
-        Maps that do not come from the sheets.
-
-    Raises
-    ------
-    InputError
-        If a name is neither.
-    """
+    """Tell maps from summary measures."""
     own = DEFAULT if records else ()
     if not wanted:
         return Measures(maps=(*own, *others))
@@ -548,13 +472,7 @@ def choose_measures(
 
 
 def check_summaries(measures: Measures, sides: Mapping[str, SideMaps]) -> None:
-    """Refuse summary measures that no hemisphere has.
-
-    Raises
-    ------
-    InputError
-        Names the first.
-    """
+    """Refuse summary measures that no hemisphere has."""
     known = sorted({str(name) for side in sides.values() for name in side.summary.columns})
     for name in measures.summaries or ():
         if name not in known:
@@ -621,24 +539,7 @@ def read_sheets(
     maps: Sequence[str],
     visits: Sequence[Visit] | None = None,
 ) -> Measured:
-    """Read all sheets and summaries.
-
-    Parameters
-    ----------
-    records : sequence of SheetRecord
-        Sorted by subject and session.
-    settings : mapping
-        Resolved settings of the participant level: number of nodes, extent of the grid.
-    maps : sequence of str
-        Columns of the sheet tables, or names of sampled maps. Curvature is read in any case.
-    visits : sequence of (str, str or None), optional
-        Subjects and sessions of the rows, if there are more than those of the sheets.
-
-    Raises
-    ------
-    InputError
-        If a table is missing, cannot be read, or has another grid than the settings say.
-    """
+    """Read all sheets and summaries."""
     grid = settings["sheet"]
     shape = (int(grid["x_nodes"]), int(grid["y_nodes"]))
     visits = visits_of(records) if visits is None else visits

@@ -22,17 +22,7 @@ def paired_difference(
 ) -> FloatArray:
     """Change from the first to the second session, to be tested by the linear model.
 
-    Parameters
-    ----------
-    first, second : ndarray, shape (participants, points)
-        NaN is missing.
-    years : ndarray, shape (participants,), optional
-        Time between the sessions; then the change is per year.
-
-    Raises
-    ------
-    ModelError
-        If a time is not positive; names the rows.
+    ``first, second`` NaN is missing.
     """
     change: FloatArray = second - first
     if years is None:
@@ -48,15 +38,7 @@ def paired_difference(
 
 
 def asymmetry(left: FloatArray, right: FloatArray, *, relative: bool) -> FloatArray:
-    """Left minus right, on sheets whose axes mean the same on both sides.
-
-    Parameters
-    ----------
-    left, right : ndarray
-        Maps of the same shape.
-    relative : bool
-        Over the mean of both sides (for measures that are positive); else in the maps' unit.
-    """
+    """Left minus right, on sheets whose axes mean the same on both sides."""
     difference: FloatArray = left - right
     if relative:
         mean = (left + right) / 2
@@ -103,26 +85,7 @@ class Comparison:
 
 
 def choose_visits(cohort: Cohort, comparison: Comparison) -> tuple[Cohort, Mapping[str, str]]:
-    """Keep the visits that are compared.
-
-    Parameters
-    ----------
-    cohort : Cohort
-        All visits, sorted by participant and session.
-    comparison : Comparison
-        Which sessions.
-
-    Returns
-    -------
-    Cohort
-    mapping of str to str
-        Why visits were left out, by their names.
-
-    Raises
-    ------
-    ModelError
-        If a session of the pair is unknown, or nobody has both.
-    """
+    """Keep the visits that are compared."""
     table = cohort.table
     if comparison.longitudinal:
         return cohort, {}
@@ -154,15 +117,7 @@ def _check_sessions(table: pd.DataFrame, pair: Sequence[str]) -> None:
 
 
 def modeled_table(table: pd.DataFrame, comparison: Comparison) -> pd.DataFrame:
-    """Rows of the model: visits, or participants with the covariates of the first of two sessions.
-
-    Parameters
-    ----------
-    table : DataFrame
-        Visits that were chosen.
-    comparison : Comparison
-        As for them.
-    """
+    """Rows of the model: visits, or participants with the covariates of their first session."""
     if comparison.pair is None:
         return table
     first = table[table[SESSION] == comparison.pair[0]]
@@ -170,25 +125,7 @@ def modeled_table(table: pd.DataFrame, comparison: Comparison) -> pd.DataFrame:
 
 
 def compare_sessions(cohort: Cohort, comparison: Comparison) -> Cohort:
-    """Take differences of two sessions, if that is what is compared.
-
-    Parameters
-    ----------
-    cohort : Cohort
-        Registered maps of the visits that were chosen.
-    comparison : Comparison
-        As for them.
-
-    Returns
-    -------
-    Cohort
-        Its rows are those of :func:`modeled_table`. Differences of summaries are taken too.
-
-    Raises
-    ------
-    ModelError
-        If no hemisphere was measured in both sessions.
-    """
+    """Take differences of two sessions, if that is what is compared."""
     if comparison.pair is None:
         return cohort
     table = modeled_table(cohort.table, comparison)
@@ -230,22 +167,7 @@ def asymmetry_name(measure: str) -> str:
 
 
 def asymmetry_maps(cohort: Cohort, measures: Sequence[str], relative: Sequence[str]) -> SideMaps:
-    """Left minus right at each point, of those who have both.
-
-    Parameters
-    ----------
-    cohort : Cohort
-        Registered maps.
-    measures : sequence of str
-        Which of them.
-    relative : sequence of str
-        Measures whose difference is taken relative to the mean of both sides.
-
-    Raises
-    ------
-    ModelError
-        If nobody has both hemispheres.
-    """
+    """Left minus right at each point, of those who have both."""
     if set(cohort.sides) != set(BOTH):
         raise ModelError(
             f"asymmetry: hemisphere {', '.join(cohort.sides)} only; both are needed",

@@ -18,20 +18,7 @@ from hipsta_bids.io import files
 
 
 def locate_sources(sources: Sequence[str], roots: Sequence[Path]) -> list[Path | None]:
-    """Resolve addresses of segmentations.
-
-    Parameters
-    ----------
-    sources : sequence of str
-        ``bids:<dataset>:<path in it>``, or a plain path.
-    roots : sequence of Path
-        Output dataset that each is from; its description knows where the datasets are.
-
-    Returns
-    -------
-    list of Path or None
-        ``None`` where the address names no known dataset. Files may be gone.
-    """
+    """Resolve addresses of segmentations."""
     links: dict[Path, Mapping[str, str]] = {}
     result = []
     for source, root in zip(sources, roots, strict=True):
@@ -42,20 +29,7 @@ def locate_sources(sources: Sequence[str], roots: Sequence[Path]) -> list[Path |
 
 
 def relocate(source: str, folders: Sequence[Path]) -> str:
-    """Find a segmentation in folders where it may be now.
-
-    Parameters
-    ----------
-    source : str
-        ``bids:<dataset>:<path in it>``, or a plain path.
-    folders : sequence of Path
-        Datasets that may hold it, in order of preference.
-
-    Returns
-    -------
-    str
-        Its plain path there; the address as it was if none of them has the subject.
-    """
+    """Find a segmentation in folders where it may be now."""
     if not source.startswith("bids:"):
         return source
     inside = PurePosixPath(source.split(":", 2)[2])
@@ -82,26 +56,6 @@ def read_covariates(visits: pd.DataFrame, bids_dir: Path, extra: Sequence[Path])
 
     In this order: ``participants.tsv``, ``sessions.tsv`` of the participants, ``phenotype/*.tsv``,
     and the user's own tables. A later table fills or replaces columns of the same name.
-
-    Parameters
-    ----------
-    visits : DataFrame
-        Participant and session, one row per visit.
-    bids_dir : Path
-        The BIDS dataset.
-    extra : sequence of Path
-        Tables with ``participant_id`` and perhaps ``session_id``.
-
-    Returns
-    -------
-    DataFrame
-        The visits with all covariates; ``None`` where there is none.
-
-    Raises
-    ------
-    InputError
-        If the dataset does not exist, a table cannot be read, has no ``participant_id`` or names
-        somebody twice, or ``participants.tsv`` is about others.
     """
     joined = visits.copy()
     main = bids_dir / "participants.tsv"
@@ -200,17 +154,7 @@ def read_icv(sources: Sequence[str], roots: Sequence[Path]) -> list[float | None
     FreeSurfer's ``stats/aseg.stats`` (EstimatedTotalIntraCranialVol) beside the ``mri`` folder, or
     ASHS's ``*_icv.txt`` beside or above the segmentation.
 
-    Parameters
-    ----------
-    sources : sequence of str
-        Address of a segmentation of each visit, ``bids:<dataset>:<path>``.
-    roots : sequence of Path
-        Dataset whose description knows that name, per visit.
-
-    Returns
-    -------
-    list of float or None
-        mm^3.
+    Returns mm^3.
     """
     paths = locate_sources(sources, roots)
     return [None if path is None else _icv_beside(path) for path in paths]
@@ -264,18 +208,6 @@ def add_time(table: pd.DataFrame, settings: GroupSettings) -> VisitTime:
     ``acq_time``, in years since the participant's first session; else age, likewise. If age
     varies between sessions, the age at the first one is added, since the other would take part of
     the change.
-
-    Parameters
-    ----------
-    table : DataFrame
-        Visits with covariates.
-    settings : GroupSettings
-        Names of columns.
-
-    Raises
-    ------
-    ModelError
-        If dates cannot be read.
     """
     covariates = tuple(settings.model.covariates)
     by_name = {str(column).casefold(): str(column) for column in table.columns}

@@ -49,34 +49,16 @@ class SideMaps:
         return self.subfield.shape[1], self.subfield.shape[2]
 
     def only(self, measures: Sequence[str]) -> "SideMaps":
-        """Keep some maps.
-
-        Parameters
-        ----------
-        measures : sequence of str
-            Which.
-        """
+        """Keep some maps."""
         return replace(self, maps={name: self.maps[name] for name in measures})
 
     def with_summary(self, columns: pd.DataFrame) -> "SideMaps":
-        """Add summary measures.
-
-        Parameters
-        ----------
-        columns : DataFrame
-            One row per sheet, in their order.
-        """
+        """Add summary measures."""
         joined = pd.concat([self.summary, columns.set_axis(self.summary.index)], axis=1)
         return replace(self, summary=joined)
 
     def take(self, keep: NDArray[np.bool_]) -> "SideMaps":
-        """Keep some rows of the cohort's table, which are numbered anew.
-
-        Parameters
-        ----------
-        keep : ndarray of bool, shape (rows of the table,)
-            Which.
-        """
+        """Keep some rows of the cohort's table, which are numbered anew."""
         own = keep[self.rows]
         return replace(
             self,

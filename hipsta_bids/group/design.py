@@ -47,25 +47,7 @@ class Design:
 def build_design(
     table: pd.DataFrame, model: ModelSpec, settings: DesignSettings, references: Mapping[str, str]
 ) -> Design:
-    """Make the design matrix of a model, or say what keeps it from being fitted.
-
-    Parameters
-    ----------
-    table : DataFrame
-        One row per observation; the index names the rows in messages. Text is a factor.
-    model : ModelSpec
-        Formula and contrasts.
-    settings : DesignSettings
-        What is too little.
-    references : mapping of str to str
-        Reference levels; else the first level in the order of the alphabet.
-
-    Raises
-    ------
-    ModelError
-        Unknown variable or level, text among numbers, one level only, levels or all together
-        with too few rows, constant or dependent columns; with the rows or columns concerned.
-    """
+    """Make the design matrix of a model, or say what keeps it from being fitted."""
     formula = _read_formula(model.formula)
     names = sorted(str(name) for name in formula.required_variables)
     check_names(names, table.columns)

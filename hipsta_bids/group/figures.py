@@ -67,7 +67,7 @@ def side_name(hemi: str) -> str:
     return {"L": "left", "R": "right"}.get(hemi, "left minus right")
 
 
-def spelled(measure: str) -> str:
+def display_name(measure: str) -> str:
     """Spell a measure with spaces."""
     return measure.replace("_", " ")
 
@@ -160,7 +160,7 @@ def _models(
 ) -> Iterator[tuple[str, str, ClassifierResult]]:
     added = next(measure for _, measure, other in analysis.pairs if other is pair)
     yield COLORS[0], "base", pair.comparison.base
-    yield COLORS[1], f"with {spelled(added)}", pair.comparison.full
+    yield COLORS[1], f"with {display_name(added)}", pair.comparison.full
 
 
 def _finish(axis: "Axes", labels: tuple[str, str], title: str, place: _Place) -> None:
@@ -188,10 +188,11 @@ def draw_profiles(cohort: Cohort, analysis: Analysis) -> "Figure":
                 for color, (group, own) in zip(repeat_colors(), members.items(), strict=False):
                     _band(axis, cohort.x, values[own], group, color)
                 axis.set_title(
-                    f"{spelled(measure)}, {side_name(hemi)},\n{when} registration", fontsize=TITLE
+                    f"{display_name(measure)}, {side_name(hemi)},\n{when} registration",
+                    fontsize=TITLE,
                 )
                 _finish_curve(
-                    axis, cohort, f"{spelled(measure)} [{cohort.units.get(measure, '1')}]"
+                    axis, cohort, f"{display_name(measure)} [{cohort.units.get(measure, '1')}]"
                 )
             pair[1].sharey(pair[0])
     axes[0, 0].legend(fontsize=LABEL, title="mean, 2 SE", title_fontsize=LABEL)
@@ -246,18 +247,6 @@ def draw_mesh(
     A flat surface is drawn in its own coordinates. HippUnfold's runs from anterior to posterior
     along x and from the subiculum to the dentate gyrus along y, so that x goes down and y to the
     right, as on a sheet. A folded surface is seen along its thinnest direction.
-
-    Parameters
-    ----------
-    axis : Axes
-    mesh : Mesh
-        Surface.
-    values : ndarray
-        One number per vertex; triangles are drawn where all three are known.
-    colors : str
-        Color map.
-    limits : (float, float)
-        Values at its ends.
     """
     plane, triangles, words = _laid_out(mesh)
     flat = values.reshape(-1)
@@ -350,19 +339,7 @@ def _where(place: float) -> str:
 def _plane(middle: Float, node: int, *, left: bool) -> Float:
     """Two directions across the long axis: to lateral, and to superior.
 
-    Parameters
-    ----------
-    middle : ndarray, shape (x, y, 3)
-        Mean middle surface, RAS mm.
-    node : int
-        Along y.
-    left : bool
-        Whether lateral is to the left.
-
-    Returns
-    -------
-    ndarray, shape (2, 3)
-        Orthonormal rows.
+    ``middle`` Mean middle surface, RAS mm.
     """
     centers = np.nanmean(middle, axis=0)
     along = centers[min(node + 2, len(centers) - 1)] - centers[max(node - 2, 0)]
@@ -426,7 +403,7 @@ def draw_means(cohort: Cohort, analysis: Analysis, measure: str) -> "Figure":
             )
     change = " change of" if analysis.comparison.pair else ""
     unit = cohort.units.get(measure, "1")
-    _bar(figure, images[0], axes, f"mean{change} {spelled(measure)} [{unit}]")
+    _bar(figure, images[0], axes, f"mean{change} {display_name(measure)} [{unit}]")
     return figure
 
 
@@ -545,21 +522,7 @@ def _borders(axis: "Axes", cohort: Cohort, one: FittedMaps) -> None:
 def draw_figures(
     cohort: Cohort, analysis: Analysis, shapes: Mapping[str, AverageShape]
 ) -> Iterator[Drawing]:
-    """Draw all figures of one model.
-
-    Parameters
-    ----------
-    cohort : Cohort
-        What was analyzed.
-    analysis : Analysis
-        Results.
-    shapes : mapping of str to AverageShape
-        By hemisphere; those whose surfaces are known.
-
-    Yields
-    ------
-    Drawing
-    """
+    """Draw all figures of one model."""
     for measure in dict.fromkeys(m for one in analysis.fitted.values() for m in one.fits):
         yield encode(f"{measure}_means", draw_means(cohort, analysis, measure))
         if any(one.fits[measure].tests for one in analysis.fitted.values() if measure in one.fits):

@@ -37,21 +37,7 @@ class RowModel:
     ) -> PointwiseFit:
         """Fit some rows of the design at each point.
 
-        Parameters
-        ----------
-        values : ndarray, shape (rows, points)
-            NaN is missing.
-        rows : ndarray of int, shape (rows,)
-            Which rows of the design these are.
-        contrasts : tuple of Contrast
-            Hypotheses.
-        settings : GroupSettings
-            Of the linear and of the mixed model.
-
-        Raises
-        ------
-        ModelError
-            If the model cannot be fitted to these rows.
+        ``values`` NaN is missing.
         """
         matrix = self.design.matrix[rows]
         if self.participants is None:
@@ -71,24 +57,7 @@ class RowModel:
 def longitudinal_model(
     design: Design, table: pd.DataFrame, time: str | None, settings: GroupSettings
 ) -> RowModel:
-    """Tell a mixed model whose visit is whose.
-
-    Parameters
-    ----------
-    design : Design
-        One row per visit.
-    table : DataFrame
-        All visits.
-    time : str or None
-        Column of the time of visits, as numbers.
-    settings : GroupSettings
-        Random intercepts or slopes.
-
-    Raises
-    ------
-    ModelError
-        If variances are to differ, or slopes are asked for without a time.
-    """
+    """Tell a mixed model whose visit is whose."""
     if settings.glm.covariance != "ordinary":
         raise ModelError(
             "longitudinal model: it assumes equal variances; set glm.covariance to ordinary",
@@ -111,13 +80,7 @@ def longitudinal_model(
 
 
 def with_mean(design: Design) -> tuple[Contrast, ...]:
-    """Contrasts of a design, with that of the model's mean over all rows in front.
-
-    Parameters
-    ----------
-    design : Design
-        Of differences, whose mean is of interest.
-    """
+    """Contrasts of a design, with that of the model's mean over all rows in front."""
     mean = Contrast(MEAN, design.matrix.mean(axis=0))
     same = [
         one
@@ -180,26 +143,7 @@ def fit_maps(
     *,
     contrasts: tuple[Contrast, ...] | None = None,
 ) -> FittedMaps:
-    """Fit a model at each point of all maps of a hemisphere.
-
-    Parameters
-    ----------
-    hemi : str
-        For messages.
-    side : SideMaps
-        Registered maps, or differences.
-    model : RowModel
-        Design.
-    settings : GroupSettings
-        Of the model.
-    contrasts : tuple of Contrast, optional
-        What is tested; else the contrasts of the design.
-
-    Raises
-    ------
-    ModelError
-        If the model cannot be fitted, or no point has enough values.
-    """
+    """Fit a model at each point of all maps of a hemisphere."""
     _, used, rows = np.intersect1d(
         side.rows, model.design.rows, assume_unique=True, return_indices=True
     )
@@ -233,20 +177,7 @@ def _values(maps: Float, used: Int) -> Float:
 
 
 def most_frequent(labels: NDArray[np.int8], count: int) -> Int:
-    """Most frequent label at each point.
-
-    Parameters
-    ----------
-    labels : ndarray of int, shape (sheets, x, y)
-        -1 is missing.
-    count : int
-        Labels are below this.
-
-    Returns
-    -------
-    ndarray of int, shape (x, y)
-        -1 where there is none.
-    """
+    """Most frequent label at each point."""
     if not count:
         return np.full(labels.shape[1:], -1, dtype=np.int64)
     votes = np.stack([(labels == label).sum(axis=0) for label in range(count)])

@@ -49,23 +49,7 @@ class ModelSpec:
 
 
 def model_from_shortcut(formula: str, contrasts: Sequence[str], name: str) -> dict[str, Any]:
-    """Write the BIDS Stats Model that says the same as a formula and contrasts.
-
-    Parameters
-    ----------
-    formula : str
-        Such as ``thickness ~ group + age``.
-    contrasts : sequence of str
-        Such as ``group[CU]-group[DAT]``, ``0.5*a+0.5*b``; rows of an F test are parted by
-        commas; ``name=...`` in front gives a name. Without any, each column is tested.
-    name : str
-        Of the model.
-
-    Raises
-    ------
-    ModelError
-        If a contrast cannot be read.
-    """
+    """Write the BIDS Stats Model that says the same as a formula and contrasts."""
     node: dict[str, Any] = {
         "Level": "Dataset",
         "Name": name,
@@ -82,16 +66,8 @@ def model_from_shortcut(formula: str, contrasts: Sequence[str], name: str) -> di
 def parse_model(document: Mapping[str, Any]) -> ModelSpec:
     """Read a BIDS Stats Model.
 
-    Parameters
-    ----------
-    document : mapping
-        The JSON object. One node at dataset level, type ``glm``, with ``Model.X`` (1, names of
-        columns, and ``a*b`` or ``a:b``) or ``Model.Formula``.
-
-    Raises
-    ------
-    ModelError
-        If it is no such model, or asks for what is not supported.
+    ``document`` One node at dataset level, type ````glm````, with ````Model.X```` (1, names of
+    columns, and ````a*b```` or ````a:b````) or ````Model.Formula````.
     """
     nodes = document.get("Nodes")
     if not isinstance(nodes, list) or len(nodes) != 1 or not isinstance(nodes[0], Mapping):
@@ -120,22 +96,7 @@ def parse_model(document: Mapping[str, Any]) -> ModelSpec:
 
 
 def left_side(formula: str) -> tuple[str, ...]:
-    """Names on the left of the tilde, as in ``thickness + curvature ~ group``.
-
-    Parameters
-    ----------
-    formula : str
-
-    Returns
-    -------
-    tuple of str
-        Empty if there is no left-hand side.
-
-    Raises
-    ------
-    ModelError
-        If it is not a sum of names.
-    """
+    """Names on the left of the tilde, as in ``thickness + curvature ~ group``."""
     left, tilde, right = formula.partition("~")
     if not tilde or not left.strip():
         return ()
@@ -150,13 +111,7 @@ def left_side(formula: str) -> tuple[str, ...]:
 
 
 def parse_expression(text: str) -> dict[str, float]:
-    """Read a linear combination, such as ``0.5*a + 0.5*b - group[CU]``.
-
-    Raises
-    ------
-    ModelError
-        If it is none.
-    """
+    """Read a linear combination, such as ``0.5*a + 0.5*b - group[CU]``."""
     weights: dict[str, float] = {}
     position = 0
     while position < len(text.rstrip()):
@@ -246,13 +201,7 @@ _NAMED = 8
 
 
 def check_unique(table: pd.DataFrame, keys: list[str]) -> None:
-    """Refuse a table in which a participant (or session) stands twice.
-
-    Raises
-    ------
-    ModelError
-        Names those that do.
-    """
+    """Refuse a table in which a participant (or session) stands twice."""
     twice = table.loc[table.duplicated(keys), keys].astype(str).agg(" ".join, axis=1)
     if len(twice):
         raise ModelError(
@@ -274,13 +223,7 @@ def check_names(names: Iterable[str], columns: pd.Index) -> None:
 
 
 def typed(values: pd.Series, settings: DesignSettings) -> pd.Series:
-    """Return numbers as floats, text as text, and what is missing as missing.
-
-    Raises
-    ------
-    ModelError
-        If a few texts stand among numbers, or numbers are too large; names their rows.
-    """
+    """Return numbers as floats, text as text, and what is missing as missing."""
     if pd.api.types.is_bool_dtype(values):
         return values.map({True: "yes", False: "no"}).astype(object)
     if pd.api.types.is_numeric_dtype(values):
@@ -321,13 +264,7 @@ def rows_by_lack(used: pd.DataFrame, complete: NDArray[np.bool_]) -> dict[str, t
 
 
 def check_left(used: pd.DataFrame, dropped: Mapping[str, tuple[str, ...]]) -> None:
-    """Refuse a model that leaves no row; says what the rows lack.
-
-    Raises
-    ------
-    ModelError
-        With the number of rows per variable.
-    """
+    """Refuse a model that leaves no row; says what the rows lack."""
     if not len(used):
         lack = ", ".join(f"{name} ({len(rows)})" for name, rows in dropped.items())
         why = f"; missing are {lack}" if lack else ""
@@ -337,18 +274,7 @@ def check_left(used: pd.DataFrame, dropped: Mapping[str, tuple[str, ...]]) -> No
 def set_levels(
     used: pd.DataFrame, references: Mapping[str, str], settings: DesignSettings
 ) -> dict[str, list[str]]:
-    """Make factors of text columns in place.
-
-    Returns
-    -------
-    dict
-        Levels of each factor, the reference first.
-
-    Raises
-    ------
-    ModelError
-        If a column does not vary, a level is unknown or has too few rows.
-    """
+    """Make factors of text columns in place."""
     chosen = {}
     for column in used.columns:
         name = str(column)

@@ -27,18 +27,8 @@ _FARTHEST, _WIDEST = 9990.0, 20.0
 def t_limits(t: FloatArray, df: FloatArray, confidence: float) -> tuple[FloatArray, FloatArray]:
     """Limits of the non-centrality of a t statistic.
 
-    Parameters
-    ----------
-    t, df : ndarray
-        Statistics and degrees of freedom, of one shape.
-    confidence : float
-        Two-sided coverage.
-
-    Returns
-    -------
-    low, high : ndarray
-        Non-centralities at which the statistic is the upper, or lower, ``(1 - confidence) / 2``
-        quantile (Steiger 2004). Times ``se / sigma`` they are limits of Cohen's d.
+    ``t, df`` Statistics and degrees of freedom, of one shape. Returns Non-centralities at which the
+    statistic is the upper, or lower, ````(1 - confidence) / 2```` quantile (Steiger 2004).
     """
     tail = (1 - confidence) / 2
 
@@ -56,20 +46,8 @@ def f_limits(
 ) -> tuple[FloatArray, FloatArray]:
     """Limits of the non-centrality of an F statistic.
 
-    Parameters
-    ----------
-    f, df2 : ndarray
-        Statistics and denominator degrees of freedom, of one shape.
-    df1 : int
-        Numerator degrees of freedom.
-    confidence : float
-        Two-sided coverage.
-
-    Returns
-    -------
-    low, high : ndarray
-        As in :func:`t_limits`; zero where even no effect would give a smaller statistic too
-        seldom. ``limit / (limit + df2)`` is a limit of partial eta squared.
+    ``f, df2`` Statistics and denominator degrees of freedom, of one shape; ``df1`` Numerator
+    degrees of freedom.
     """
     tail = (1 - confidence) / 2
     first = float(df1)
@@ -175,25 +153,7 @@ def fit_points(
 ) -> PointwiseFit:
     """Fit the same linear model to each column of a table, with values missing anywhere.
 
-    Parameters
-    ----------
-    maps : ndarray, shape (subjects, points)
-        NaN is missing; each point is fitted to the subjects that it has.
-    matrix : ndarray, shape (subjects, columns)
-        Design, of full column rank.
-    contrasts : sequence of Contrast
-        Hypotheses.
-    settings : GlmSettings
-        Covariance of the coefficients, limits, and when a point is left out.
-
-    Returns
-    -------
-    PointwiseFit
-
-    Raises
-    ------
-    ModelError
-        If the shapes do not match or the design lacks rank.
+    ``maps`` NaN is missing.
     """
     _check(maps, matrix, contrasts)
     basis, triangle = np.linalg.qr(matrix)
@@ -254,14 +214,7 @@ def fit_block(maps: FloatArray, basis: FloatArray, settings: GlmSettings) -> Poi
     There the equations of a complete point are the identity, and those of others stay well
     conditioned unless the missing subjects really carried a column.
 
-    Parameters
-    ----------
-    maps : ndarray, shape (subjects, points)
-        NaN is missing.
-    basis : ndarray, shape (subjects, columns)
-        Orthonormal columns.
-    settings : GlmSettings
-        Covariance, and when a point is left out.
+    ``maps`` NaN is missing.
     """
     present = np.isfinite(maps)
     values = np.where(present, maps, 0.0)

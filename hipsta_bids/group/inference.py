@@ -55,17 +55,7 @@ def fdr_two_stage(p: FloatArray, alpha: float) -> Discoveries:
     The first stage, at ``alpha / (1 + alpha)``, estimates how many null hypotheses are true; the
     second allows for that many only.
 
-    Parameters
-    ----------
-    p : ndarray
-        Of any shape; NaN is no test.
-    alpha : float
-        False discovery rate.
-
-    Returns
-    -------
-    Discoveries
-        With the adjusted p-values of statsmodels' ``fdr_tsbky``.
+    ``p`` NaN is no test.
     """
     return _discoveries(p, alpha, "fdr_tsbky")
 
@@ -85,15 +75,7 @@ class MapKey:
 
 
 def families(maps: Iterable[MapKey], scope: str) -> list[list[MapKey]]:
-    """Group maps whose points are tested together.
-
-    Parameters
-    ----------
-    maps : iterable of MapKey
-        All maps.
-    scope : str
-        ``map`` or ``hemispheres``.
-    """
+    """Group maps whose points are tested together."""
     found: dict[tuple[str, ...], list[MapKey]] = {}
     for key in maps:
         family = (key.measure, key.contrast, *(() if scope == "hemispheres" else (key.hemi,)))
@@ -106,17 +88,7 @@ def discover(
 ) -> dict[MapKey, Discoveries]:
     """Control the false discovery rate of several maps, in families.
 
-    Parameters
-    ----------
-    maps : mapping of MapKey to ndarray
-        p-values of any shape; NaN is no test.
-    settings : MultiplicitySettings
-        Method, level, and what is one family.
-
-    Returns
-    -------
-    dict
-        In pooled families cut-off and counts are those of the family.
+    ``maps`` NaN is no test.
     """
     method = fdr_benjamini_hochberg if settings.method == "bh" else fdr_two_stage
     found = {}
@@ -155,15 +127,7 @@ def adjusted_at_any_level(p: FloatArray) -> FloatArray:
     tests if the k-th smallest Benjamini-Hochberg value q is at most b, the second stage test i if
     q_i (m - k) / m is; so the answer is the least over k of the larger of the two.
 
-    Parameters
-    ----------
-    p : ndarray
-        Of any shape; NaN is no test.
-
-    Returns
-    -------
-    ndarray
-        In the shape of ``p``; at most 1.
+    ``p`` NaN is no test.
     """
     result = np.full(p.shape, np.nan)
     valid = np.isfinite(p)
@@ -195,24 +159,7 @@ PERMUTATIONS = ("permutation-tfce", "permutation-max")
 def correct(
     fitted: Mapping[str, FittedMaps], model: RowModel, table: pd.DataFrame, settings: GroupSettings
 ) -> dict[MapKey, Discoveries]:
-    """Tell which points survive, in families.
-
-    Parameters
-    ----------
-    fitted : mapping of str to FittedMaps
-        By hemisphere.
-    model : RowModel
-        That was fitted.
-    table : DataFrame
-        Rows of the model, with the column of blocks.
-    settings : GroupSettings
-        Method, level, family, permutations.
-
-    Raises
-    ------
-    ModelError
-        If permutations do not go with the model, or blocks are unknown or missing.
-    """
+    """Tell which points survive, in families."""
     how = settings.multiplicity
     tests = {
         MapKey(measure, test.contrast.name, hemi): test
@@ -235,13 +182,7 @@ def correct(
 
 
 def check_permutations(model: RowModel, settings: GroupSettings) -> None:
-    """Refuse permutations where rows cannot be exchanged.
-
-    Raises
-    ------
-    ModelError
-        For mixed models, and for unequal variances.
-    """
+    """Refuse permutations where rows cannot be exchanged."""
     if settings.multiplicity.method not in PERMUTATIONS:
         return
     if model.participants is not None:

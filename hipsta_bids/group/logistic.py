@@ -43,13 +43,6 @@ def is_separated(matrix: FloatArray, case: BoolArray) -> bool:
 
     Then maximum-likelihood estimates are infinite (Albert and Anderson 1984). Found exactly, by
     a linear program (Konis 2007): the largest sum of margins under which none is negative.
-
-    Parameters
-    ----------
-    matrix : ndarray, shape (subjects, columns)
-        Design.
-    case : ndarray of bool, shape (subjects,)
-        Which group a subject is in.
     """
     scale = np.abs(matrix).max(axis=0)
     margins = np.where(case, 1.0, -1.0)[:, None] * matrix / np.where(scale > 0, scale, 1.0)
@@ -69,25 +62,10 @@ def fit_logistic(
 ) -> LogisticFit:
     """Fit a logistic regression by Newton's method.
 
-    Parameters
-    ----------
-    matrix : ndarray, shape (subjects, columns)
-        Design, of full column rank.
-    case : ndarray of bool, shape (subjects,)
-        Outcome.
-    settings : ClassificationSettings
-        When to stop.
-    firth : bool
-        Penalize the likelihood by the square root of the information's determinant, Jeffreys'
-        prior (Firth 1993): finite under separation, and less biased.
-    free : ndarray of bool, shape (columns,), optional
-        Coefficients that are estimated; the others stay zero but count in the penalty, as the
-        penalized likelihood-ratio test needs it (Heinze and Schemper 2002).
-
-    Raises
-    ------
-    ModelError
-        If the iterations do not converge, as under separation without ``firth``.
+    ``firth`` Penalize the likelihood by the square root of the information's determinant, Jeffreys'
+    prior (Firth 1993): finite under separation, and less biased; ``free`` the others stay zero but
+    count in the penalty, as the penalized likelihood-ratio test needs it (Heinze and Schemper
+    2002).
     """
     spread = matrix.std(axis=0)
     scale = np.where(spread > 0, spread, np.maximum(np.abs(matrix).max(axis=0), 1e-300))

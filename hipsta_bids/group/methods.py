@@ -58,26 +58,7 @@ def methods_text(
     n_out: int,
     others: Sequence[str] = (),
 ) -> str:
-    """Word what was done and what came out.
-
-    Parameters
-    ----------
-    cohort : Cohort
-        What was analyzed.
-    analysis : Analysis
-        Results.
-    settings : GroupSettings
-        Those in use.
-    n_out : int
-        Hemispheres and visits that were left out.
-    others : sequence of str, optional
-        Names of other programs' maps, which were not registered.
-
-    Returns
-    -------
-    str
-        Markdown.
-    """
+    """Word what was done and what came out."""
     cited: list[str] = []
 
     def cite(key: str) -> str:

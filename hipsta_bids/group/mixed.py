@@ -124,14 +124,7 @@ class Sums:
 def collect_sums(maps: FloatArray, basis: FloatArray, participants: IntArray) -> Sums:
     """Sum over sessions and participants.
 
-    Parameters
-    ----------
-    maps : ndarray, shape (sessions, points)
-        NaN is missing.
-    basis : ndarray, shape (sessions, columns)
-        Design, orthonormal.
-    participants : ndarray of int, shape (sessions,)
-        Numbers from 0.
+    ``maps`` NaN is missing.
     """
     present = np.isfinite(maps)
     weight = present.astype(np.float64)
@@ -191,11 +184,7 @@ def best_ratio(sums: Sums, settings: LongitudinalSettings) -> FloatArray:
 def curvature(sums: Sums, state: State) -> tuple[FloatArray, FloatArray]:
     """Hessian of minus twice the restricted likelihood at the optimum.
 
-    Returns
-    -------
-    mixed, second : ndarray, shape (points,)
-        For log residual variance and ratio, and twice for the ratio. Twice for the log variance
-        it is the residual degrees of freedom.
+    Returns Twice for the log variance it is the residual degrees of freedom.
     """
     variance = state.residual / (sums.n - sums.squares.shape[1])
     return (
@@ -265,25 +254,7 @@ def fit_mixed(
     (Kuznetsova et al. 2017); where no variance between participants is found they are those of
     the linear model.
 
-    Parameters
-    ----------
-    maps : ndarray, shape (sessions, points)
-        NaN is missing; each point is fitted to the sessions that it has.
-    matrix : ndarray, shape (sessions, columns)
-        Design, of full column rank.
-    participants : sequence of str, length (sessions,)
-        Whose session it is.
-    contrasts : sequence of Contrast
-        Of one row each.
-    settings : LongitudinalSettings
-        Search and limits.
-    times : ndarray, shape (sessions,), optional
-        For random slopes, in any unit; the fixed slope is the business of the design.
-
-    Raises
-    ------
-    ModelError
-        If shapes differ, a contrast has several rows, or nobody has two sessions.
+    ``maps`` NaN is missing.
     """
     numbers = _check(maps, matrix, participants, contrasts)
     if times is not None and np.bincount(numbers).max() < _SLOPE_SESSIONS:

@@ -43,27 +43,7 @@ class Groups:
 def find_groups(
     table: pd.DataFrame, settings: GroupSettings, reference: str | None = None
 ) -> Groups | None:
-    """Find the column of groups and their reference level.
-
-    Parameters
-    ----------
-    table : DataFrame
-        Covariates.
-    settings : GroupSettings
-        Names of such columns and of reference levels.
-    reference : str, optional
-        The user's choice of level.
-
-    Returns
-    -------
-    Groups or None
-        ``None`` if no column of these names holds at least two levels.
-
-    Raises
-    ------
-    ModelError
-        If nobody has the reference level.
-    """
+    """Find the column of groups and their reference level."""
     by_name = {str(column).casefold(): str(column) for column in table.columns}
     for wanted in settings.model.group_columns:
         column = by_name.get(wanted.casefold())
@@ -103,36 +83,14 @@ def default_formula(
     covariates: Sequence[str] | None = None,
     time: str | None = None,
 ) -> str:
-    """Spell the right-hand side: the groups, and each covariate that varies.
-
-    Parameters
-    ----------
-    table : DataFrame
-        Covariates.
-    groups : Groups or None
-        From :func:`find_groups`.
-    settings : GroupSettings
-        What is a number.
-    covariates : sequence of str, optional
-        Their names; else those of the settings.
-    time : str, optional
-        Column of the time of visits, which may go by differently in groups.
-    """
+    """Spell the right-hand side: the groups, and each covariate that varies."""
     first = " * ".join(name for name in (groups.column if groups else None, time) if name)
     names = settings.model.covariates if covariates is None else covariates
     return " + ".join([first or "1", *_varying(table, names, settings)])
 
 
 def default_contrasts(groups: Groups | None, time: str | None) -> list[str]:
-    """Contrasts of the default model: groups, changes over time in each, and their differences.
-
-    Parameters
-    ----------
-    groups : Groups or None
-        From :func:`find_groups`.
-    time : str or None
-        Column of the time of visits.
-    """
+    """Contrasts of the default model: groups, changes over time in each, and their differences."""
     if groups is None:
         return [time] if time else []
     found = groups.contrasts()
@@ -168,26 +126,7 @@ class ModelRequest:
 
 
 def wanted_measures(request: ModelRequest, listed: tuple[str, ...]) -> tuple[str, ...]:
-    """Names of the measures that are asked for, by option or on the left of a formula.
-
-    Parameters
-    ----------
-    request : ModelRequest
-    listed : tuple of str
-        Those of the option.
-
-    Returns
-    -------
-    tuple of str
-        Empty for the default.
-
-    Raises
-    ------
-    UsageError
-        If both ask for different ones.
-    ModelError
-        If the left-hand side cannot be read.
-    """
+    """Names of the measures that are asked for, by option or on the left of a formula."""
     if request.file is not None:
         left = parse_model(files.read_json(request.file)).measures
     else:
@@ -204,13 +143,7 @@ def wanted_measures(request: ModelRequest, listed: tuple[str, ...]) -> tuple[str
 def choose_references(
     request: ModelRequest, table: pd.DataFrame, settings: GroupSettings
 ) -> tuple[dict[str, str], Groups | None]:
-    """Take reference levels that the user gave; that of the groups reorders them.
-
-    Raises
-    ------
-    ModelError
-        If nobody has the reference level of the groups.
-    """
+    """Take reference levels that the user gave; that of the groups reorders them."""
     references = dict(request.references)
     groups = find_groups(table, settings)
     if groups is not None and groups.column in references:
@@ -227,28 +160,7 @@ def model_document(
     comparison: Comparison | None = None,
     visits: VisitTime | None = None,
 ) -> Mapping[str, Any]:
-    """Give the model as a BIDS Stats Model.
-
-    Parameters
-    ----------
-    request : ModelRequest
-    table : DataFrame
-        Covariates.
-    groups : Groups or None
-        From :func:`choose_references`.
-    settings : GroupSettings
-    comparison : Comparison, optional
-        Changes and asymmetries can be tested without groups.
-    visits : VisitTime, optional
-        Of a longitudinal model: its default has time, and its products with groups.
-
-    Raises
-    ------
-    UsageError
-        If two models are asked for.
-    ModelError
-        If none is, and the table does not allow for the default one.
-    """
+    """Give the model as a BIDS Stats Model."""
     if request.file is not None:
         if request.formula or request.contrasts:
             raise UsageError("give --model or --formula, not both", reason="usage")

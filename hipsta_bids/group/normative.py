@@ -44,26 +44,7 @@ def w_scores(
     fitted without them (from their leverage, so that nothing is fitted again). Their scores
     thus mean the same as those of everybody else.
 
-    Parameters
-    ----------
-    maps : ndarray, shape (subjects, points)
-        NaN is missing.
-    matrix : ndarray, shape (subjects, columns)
-        Covariates, with an intercept, and without the group.
-    reference : ndarray of bool, shape (subjects,)
-        Who belongs to the reference group.
-    settings : GlmSettings
-        When a point is left out.
-
-    Returns
-    -------
-    NormativeScores
-
-    Raises
-    ------
-    ModelError
-        If the reference group is too small for the covariates or lacks one of them, or the
-        settings ask for unequal variances.
+    ``maps`` NaN is missing.
     """
     if settings.covariance != "ordinary":
         raise ModelError(
@@ -177,28 +158,7 @@ def score_cohort(
     measures: Measures,
     references: Mapping[str, str],
 ) -> Scores:
-    """Score everybody who has the covariates of a model, whatever their group.
-
-    Parameters
-    ----------
-    cohort : Cohort
-        One row per participant, with registered maps or changes.
-    model : ModelSpec
-        Its terms without the factor are the covariates.
-    normative : (str, str)
-        Factor and level of the reference group.
-    settings : GroupSettings
-        Of the linear model; points count as low or high at its level of confidence.
-    measures : Measures
-        Maps and summaries to score.
-    references : mapping of str to str
-        Reference levels of factors.
-
-    Raises
-    ------
-    ModelError
-        If factor or level are unknown, or the reference group is too small for the covariates.
-    """
+    """Score everybody who has the covariates of a model, whatever their group."""
     factor, level = normative
     formula = _without(model.formula, factor)
     known = {str(name) for name in Formula(formula).required_variables}

@@ -96,23 +96,9 @@ def frame_of(cohort: Cohort, one: FittedMaps) -> Frame:
 def peak_table(test: PointTest, found: Discoveries, frame: Frame, neighbors: int) -> pd.DataFrame:
     """List the peak of each significant cluster; of the whole map if there is none.
 
-    Parameters
-    ----------
-    test : PointTest
-        One contrast; points in the order of the sheet, x slower than y.
-    found : Discoveries
-        Which points survive.
-    frame : SheetFrame or MeshFrame
-        Where they lie.
-    neighbors : int
-        4 or 8, for clusters.
-
-    Returns
-    -------
-    DataFrame
-        One row per cluster, largest extent first: contrast, kind of statistic, place, subfield,
-        statistic, df, p, corrected p, effect size (Cohen's d for t, else partial eta squared) with
-        limits, extent in points and the share of each subfield. Empty if nothing was tested.
+    Returns One row per cluster, largest extent first: contrast, kind of statistic, place, subfield,
+    statistic, df, p, corrected p, effect size (Cohen's d for t, else partial eta squared) with
+    limits, extent in points and the share of each subfield.
     """
     statistic = test.statistic.reshape(frame.shape)
     rejected = found.rejected.reshape(frame.shape)

@@ -73,29 +73,6 @@ def permute(
 
     Missing values count as what the covariates predict, which shrinks an effect; degrees of
     freedom are those of the subjects present.
-
-    Parameters
-    ----------
-    parts : sequence of PermutationPart
-        One family.
-    contrast : Contrast
-        One row is tested two-sidedly.
-    shape : (int, int)
-        Nodes of the sheet along x and y.
-    settings : MultiplicitySettings
-        Number and seed of permutations, and cluster enhancement.
-    blocks : ndarray of int, shape (all subjects,), optional
-        Subjects are shuffled within a block only (as sites).
-
-    Returns
-    -------
-    list of PermutationTest
-        Of each part.
-
-    Raises
-    ------
-    ModelError
-        If the sheet does not have the maps' number of points, or shuffling changes nothing.
     """
     runs = [_Part.build(part, contrast, shape, settings, blocks) for part in parts]
     random = np.random.default_rng(settings.seed)

@@ -83,16 +83,7 @@ def collect_slope_sums(
 ) -> SlopeSums:
     """Sum over each participant's sessions.
 
-    Parameters
-    ----------
-    maps : ndarray, shape (sessions, points)
-        NaN is missing.
-    basis : ndarray, shape (sessions, columns)
-        Design, orthonormal.
-    participants : ndarray of int, shape (sessions,)
-        Numbers from 0.
-    times : ndarray, shape (sessions,)
-        Of mean 0 and standard deviation 1.
+    ``maps`` NaN is missing.
     """
     present = np.isfinite(maps)
     weight = present.astype(np.float64)
@@ -124,15 +115,7 @@ def collect_slope_sums(
 
 
 def solve_slopes(sums: SlopeSums, triangles: FloatArray) -> SlopeState:
-    """Fit with one triangle (intercept, covariance, slope) per point.
-
-    Parameters
-    ----------
-    sums : SlopeSums
-        Of the data.
-    triangles : ndarray, shape (points, 3)
-        L[0, 0], L[1, 0] and L[1, 1].
-    """
+    """Fit with one triangle (intercept, covariance, slope) per point."""
     a, b, c = triangles.T[:, :, None]
     n, s, q = sums.moments
     first = 1 + a**2 * n + 2 * a * b * s + b**2 * q

@@ -25,9 +25,9 @@ from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Measures
 from hipsta_bids.group.model import ModelRequest, wanted_measures
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.surfaces import (
-    ForeignCohorts,
+    ExternalCohorts,
     MapPattern,
-    add_foreign,
+    add_external,
     find_all,
     map_patterns,
     taken_names,
@@ -89,19 +89,7 @@ class GroupInputs:
 
 
 def read_inputs(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
-    """Find and read sheets, other maps, volumes and covariates.
-
-    Parameters
-    ----------
-    options : GroupOptions
-    settings : GroupSettings
-        Names of columns.
-
-    Raises
-    ------
-    HipstaError
-        If something is missing, or cannot be read.
-    """
+    """Find and read sheets, other maps, volumes and covariates."""
     check_volumes(options.volumes)
     found = collect_sheets(options.sheets, may_lack=bool(options.maps))
     taken = taken_names(with_sheets=bool(found.records))
@@ -148,7 +136,7 @@ def _read_maps(
     found: Collection,
     requests: Sequence[MapPattern],
     measures: Measures,
-) -> ForeignCohorts:
+) -> ExternalCohorts:
     """Read the maps that are asked for, of the sheets and of other programs."""
     asked = [one for one in requests if one.name in measures.maps]
     files_of, visits = find_all(
@@ -157,7 +145,7 @@ def _read_maps(
     names = {one.name for one in requests}
     own = [name for name in measures.maps if name not in names]
     measured = read_sheets(found.records, found.settings, own, visits)
-    return add_foreign(measured, files_of, visits)
+    return add_external(measured, files_of, visits)
 
 
 def _other_visits(

@@ -82,18 +82,6 @@ def register(profiles: FloatArray, settings: RegistrationSettings) -> Registrati
     standard deviation, since the algorithm is not free of scale. Unlike R, the mean warp is
     kept at identity (setting ``center``). ``penalized`` has finer warps with a normal prior on
     the logarithms of local stretch, whose variance is estimated along with the rest.
-
-    Parameters
-    ----------
-    profiles : ndarray, shape (subjects, nodes)
-        Curvature along x, without missing values.
-    settings : RegistrationSettings
-        Method and its numbers.
-
-    Raises
-    ------
-    ModelError
-        If there are too few profiles, or values are missing or all the same.
     """
     if settings.align == "none":
         return _finish(profiles, _identity(profiles), None, settings, 0, converged=True)
@@ -139,22 +127,7 @@ def register(profiles: FloatArray, settings: RegistrationSettings) -> Registrati
 def register_to(
     profiles: FloatArray, template: Template, settings: RegistrationSettings
 ) -> Registration:
-    """Register profiles to a template that does not change; each subject is on its own.
-
-    Parameters
-    ----------
-    profiles : ndarray, shape (subjects, nodes)
-        In the unit of those that made the template.
-    template : Template
-        From :func:`register`.
-    settings : RegistrationSettings
-        Those with which the template was made.
-
-    Raises
-    ------
-    ModelError
-        If the template was made in another way, or values are missing.
-    """
+    """Register profiles to a template that does not change; each subject is on its own."""
     if template.align != settings.align:
         raise ModelError(
             f"registration: the template was made with align {template.align}, not"
@@ -268,17 +241,7 @@ class GroupShift:
 def mean_profiles(maps: FloatArray, settings: RegistrationSettings) -> FloatArray:
     """Profiles along x: means over y, with gaps filled linearly.
 
-    Parameters
-    ----------
-    maps : ndarray, shape (subjects, x, y)
-        Curvature, NaN where missing.
-    settings : RegistrationSettings
-        How much may be missing.
-
-    Raises
-    ------
-    ModelError
-        If too much of a profile is missing; names the rows.
+    ``maps`` Curvature, NaN where missing.
     """
     present = np.isfinite(maps)
     counts = present.sum(axis=2)
@@ -302,15 +265,7 @@ def mean_profiles(maps: FloatArray, settings: RegistrationSettings) -> FloatArra
 def shift_by_group(
     registration: Registration, groups: Sequence[str] | NDArray[np.str_]
 ) -> Mapping[str, GroupShift]:
-    """Mean displacement of each group along x (figure A5 of the paper).
-
-    Parameters
-    ----------
-    registration : Registration
-        Of all subjects.
-    groups : sequence of str, length (subjects,)
-        Group of each.
-    """
+    """Mean displacement of each group along x (figure A5 of the paper)."""
     names = np.asarray(groups)
     nodes = registration.warps.shape[1]
     shift = (registration.warps - np.linspace(0, 1, nodes)) * (nodes - 1)

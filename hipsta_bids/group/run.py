@@ -134,7 +134,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
     HipstaError
         If inputs, model or output folder do not allow it.
     """
-    dataset.check_not_foreign(options.out_dir)
+    dataset.check_own_dataset(options.out_dir)
     read = read_inputs(options, settings)
     cohort = read.cohort
     references, groups = choose_references(options.model, cohort.table, settings)

@@ -47,18 +47,7 @@ def average_shape(
     Each middle surface is turned and moved to the mean of all, which is made anew until it stays
     (Gower 1975); nothing is scaled or mirrored. The walls go along.
 
-    Parameters
-    ----------
-    layers : ndarray, shape (sheets, 3, x, y, 3)
-        Interior, middle and exterior surface in mm; NaN is missing.
-    warps : ndarray, shape (sheets, x)
-        Registered coordinate of each node.
-    groups : sequence of str, length (sheets,)
-        Group of each.
-    order : sequence of str
-        Groups to average; those who are in none count for the mean of all.
-    settings : ShapeSettings
-        When the mean has settled.
+    ``layers`` Interior, middle and exterior surface in mm; NaN is missing.
     """
     n, _, nx, ny, _ = layers.shape
     # Along x, so that all other axes count as one.
@@ -80,21 +69,7 @@ def average_shape(
 def align_rigidly(points: Float, settings: ShapeSettings) -> tuple[Float, Float, Float]:
     """Turn and move shapes so that they lie on their mean.
 
-    Parameters
-    ----------
-    points : ndarray, shape (shapes, points, 3)
-        Corresponding points; NaN is missing.
-    settings : ShapeSettings
-        When the mean has settled.
-
-    Returns
-    -------
-    turns : ndarray, shape (shapes, 3, 3)
-        Rotations, which are the identity on average: the mean keeps the shapes' orientation.
-    centers : ndarray, shape (shapes, 3)
-        To be taken off before.
-    center : ndarray, shape (3,)
-        To be added after: the mean of the centers.
+    ``points`` NaN is missing.
     """
     present: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=2))
     common = present.all(axis=0)
@@ -147,19 +122,7 @@ def read_layer_surfaces(
 ) -> tuple[list[int], Float]:
     """Read interior, middle and exterior surfaces of those sheets that have all of them.
 
-    Parameters
-    ----------
-    places : sequence of ResultPlace
-        Hemispheres.
-    shape : (int, int)
-        Nodes of the sheet along x and y.
-
-    Returns
-    -------
-    list of int
-        Places of those read, in the sequence.
-    ndarray, shape (sheets, 3, x, y, 3)
-        mm, in the space of each scan.
+    Returns mm, in the space of each scan.
     """
     found, layers = [], []
     for i, place in enumerate(places):
@@ -182,24 +145,7 @@ _MIDTHICKNESS = LAYERS.index("midthickness")
 def average_shapes(
     records: Sequence[SheetRecord], cohort: Cohort, analysis: Analysis, settings: GroupSettings
 ) -> dict[str, AverageShape]:
-    """Average the surfaces of each hemisphere, of the first visit of each participant.
-
-    Parameters
-    ----------
-    records : sequence of SheetRecord
-        Where the sheets are.
-    cohort : Cohort
-        Visits that were analyzed.
-    analysis : Analysis
-        Warps and groups.
-    settings : GroupSettings
-        How many are read at most; they are spread evenly over all.
-
-    Returns
-    -------
-    dict
-        By hemisphere; without those whose surfaces are missing.
-    """
+    """Average the surfaces of each hemisphere, of the first visit of each participant."""
     place_of = {
         (f"sub-{r.place.name.subject}", r.place.name.session or "", r.place.name.hemi): r.place
         for r in records
@@ -237,20 +183,7 @@ def average_shapes(
 
 
 def write_shapes(folder: Path, shapes: Mapping[str, AverageShape]) -> None:
-    """Write the average middle surfaces, on which maps of statistics can be drawn.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the model.
-    shapes : mapping of str to AverageShape
-        By hemisphere.
-
-    Raises
-    ------
-    OutputError
-        If a file cannot be written.
-    """
+    """Write the average middle surfaces, on which maps of statistics can be drawn."""
     for hemi, shape in shapes.items():
         points = fill_from_nearest(shape.mean[_MIDTHICKNESS])
         flip = is_left_handed(np.moveaxis(shape.mean, 0, 2))

@@ -33,19 +33,7 @@ class MeasureFit:
 def summary_values(cohort: Cohort, hemi: str, only: Sequence[str] | None = None) -> pd.DataFrame:
     """Summary measures by visit.
 
-    Parameters
-    ----------
-    cohort : Cohort
-        Sheets and summaries.
-    hemi : str
-        ``L``, ``R``, or ``LR`` for the mean of both, where both are there.
-    only : sequence of str, optional
-        Names of measures; else all.
-
-    Returns
-    -------
-    DataFrame
-        One row per visit of the cohort's table, NaN where missing.
+    Returns One row per visit of the cohort's table, NaN where missing.
     """
     if hemi == BOTH:
         left, right = (summary_values(cohort, side, only) for side in BOTH)
@@ -73,32 +61,7 @@ def fit_summaries(
     icv: str | None,
     rows_of: Callable[[Design], RowModel] = RowModel,
 ) -> tuple[list[MeasureFit], list[str]]:
-    """Fit the model of the maps to all summary measures; to volumes with intracranial volume too.
-
-    Parameters
-    ----------
-    cohort : Cohort
-        Summaries and covariates.
-    model : ModelSpec
-        That of the maps.
-    design : Design
-        Its design.
-    settings : GroupSettings
-        When a fit is refused.
-    only : sequence of str or None
-        Names of measures; ``None`` for all.
-    references : mapping of str to str
-        Reference levels.
-    icv : str or None
-        Column of intracranial volume.
-    rows_of : callable
-        Tells of a design whether its rows are independent.
-
-    Returns
-    -------
-    list of MeasureFit, list of str
-        And what could not be fitted, one line each.
-    """
+    """Fit the model of the maps to all summary measures; volumes also with intracranial volume."""
     fits: list[MeasureFit] = []
     notes: list[str] = []
     for hemi in hemispheres(cohort):
@@ -152,27 +115,7 @@ def _same_names(larger: Design, design: Design) -> tuple[Contrast, ...]:
 def classify_groups(
     cohort: Cohort, groups: Groups, settings: GroupSettings
 ) -> tuple[list[tuple[str, str, PairComparison]], list[str]]:
-    """Compare each pair of groups by base measures, and by each further measure on top.
-
-    Parameters
-    ----------
-    cohort : Cohort
-        Summaries and covariates.
-    groups : Groups
-        Column and order.
-    settings : GroupSettings
-        Base, added measures, limits and folds.
-
-    Returns
-    -------
-    list of (str, str, PairComparison), list of str
-        Hemisphere, added measure and result; and what could not be compared, one line each.
-
-    Raises
-    ------
-    ModelError
-        If a base measure or covariate is unknown.
-    """
+    """Compare each pair of groups by base measures, and by each further measure on top."""
     names = cohort.table[groups.column].astype(object)
     labels = names.where(names.notna(), "").astype(str).to_numpy(dtype=np.str_)
     results: list[tuple[str, str, PairComparison]] = []

@@ -30,7 +30,7 @@ class MapPattern:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ForeignSide:
+class ExternalSide:
     """One map of one hemisphere."""
 
     visits: tuple[Visit, ...]
@@ -44,7 +44,7 @@ class ForeignSide:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ForeignFiles:
+class ExternalFiles:
     """The files of one map."""
 
     request: MapPattern
@@ -66,24 +66,7 @@ def map_patterns(
 ) -> tuple[MapPattern, ...]:
     """Combine and check the options about maps.
 
-    Parameters
-    ----------
-    patterns : sequence of (str, str)
-        Names and patterns.
-    surfaces : sequence of (str or None, str)
-        Surfaces for one name, or (None) for all that have none of their own.
-    taken : sequence of str
-        Names that have another meaning.
-
-    Returns
-    -------
-    tuple of MapPattern
-
-    Raises
-    ------
-    UsageError
-        If a name occurs twice or is taken, a placeholder is unknown or lacking, or a surface is
-        for a map that does not exist.
+    ``surfaces`` Surfaces for one name, or (None) for all that have none of their own.
     """
     names = [name for name, _ in patterns]
     for name, pattern in patterns:
@@ -125,31 +108,8 @@ def find_maps(
     root: Path,
     known: Iterable[Visit],
     is_wanted: Callable[[str, str | None, str], bool],
-) -> ForeignFiles:
-    """Look for the files of one map.
-
-    Parameters
-    ----------
-    request : MapPattern
-    root : Path
-        What patterns are relative to.
-    known : iterable of (str, str or None)
-        Visits that there are anyway. A participant of these has no others; a file without
-        session is for all of them.
-    is_wanted : callable
-        Takes subject, session and hemisphere.
-
-    Returns
-    -------
-    ForeignFiles
-
-    Raises
-    ------
-    InputError
-        If several files are for the same hemisphere.
-    NothingToDoError
-        If there are no files.
-    """
+) -> ExternalFiles:
+    """Look for the files of one map."""
     sessions: dict[str, list[str | None]] = {}
     for subject, session in known:
         sessions.setdefault(subject, []).append(session)
@@ -172,7 +132,7 @@ def find_maps(
             f"--maps {request.name}: no file matches {request.pattern} (in {root})",
             reason="no-maps",
         )
-    return ForeignFiles(
+    return ExternalFiles(
         request=request, root=root, files={hemi: found[hemi] for hemi in "LR" if hemi in found}
     )
 
@@ -188,34 +148,15 @@ def _sessions(one: Found, known: Mapping[str, Sequence[str | None]]) -> Sequence
 
 
 def read_maps(
-    found: ForeignFiles, grid: tuple[int, int], *, with_sheets: bool
-) -> dict[str, ForeignSide]:
-    """Read one map of all hemispheres.
-
-    Parameters
-    ----------
-    found : ForeignFiles
-    grid : (int, int)
-        Nodes along x and y of the sheets.
-    with_sheets : bool
-        Whether there are any; if not, tables with nodes may have another grid.
-
-    Returns
-    -------
-    dict of str to ForeignSide
-        By hemisphere.
-
-    Raises
-    ------
-    InputError
-        If a file cannot be read, maps have different numbers of points, or no surface fits.
-    """
+    found: ExternalFiles, grid: tuple[int, int], *, with_sheets: bool
+) -> dict[str, ExternalSide]:
+    """Read one map of all hemispheres."""
     return {hemi: _read_side(found, hemi, grid, with_sheets=with_sheets) for hemi in found.files}
 
 
 def _read_side(
-    found: ForeignFiles, hemi: str, grid: tuple[int, int], *, with_sheets: bool
-) -> ForeignSide:
+    found: ExternalFiles, hemi: str, grid: tuple[int, int], *, with_sheets: bool
+) -> ExternalSide:
     paths = found.files[hemi]
     visits = tuple(sorted(paths, key=lambda visit: (visit[0], visit[1] or "")))
     maps = [read_map(paths[visit], found.request.name) for visit in visits]
@@ -231,7 +172,7 @@ def _read_side(
             " --maps-surface",
             reason="no-surface",
         )
-    return ForeignSide(
+    return ExternalSide(
         visits=visits,
         data=np.stack([one.values for one in maps]),  # noqa: PD011  (no table)
         unit=first.unit,
@@ -252,7 +193,7 @@ def _refuse_mixed(name: str, hemi: str, paths: Sequence[Path], maps: Sequence[Po
         )
 
 
-def _mesh(found: ForeignFiles, hemi: str, points: int) -> Mesh | None:
+def _mesh(found: ExternalFiles, hemi: str, points: int) -> Mesh | None:
     """Read the surface that the user named, or else that beside the first map that has one."""
     paths = found.files[hemi]
     if found.request.surface is not None:
@@ -265,7 +206,7 @@ def _mesh(found: ForeignFiles, hemi: str, points: int) -> Mesh | None:
     return None
 
 
-def _named_surface(found: ForeignFiles, hemi: str, points: int) -> Mesh:
+def _named_surface(found: ExternalFiles, hemi: str, points: int) -> Mesh:
     request = found.request
     pattern = request.surface or ""
     names = dict.fromkeys(
@@ -306,19 +247,7 @@ def _belongs(own: Mapping[str, str], surface: Mapping[str, str]) -> bool:
 
 
 def rows_of(visits: Sequence[Visit], keys: Sequence[Visit]) -> tuple[Int, Int]:
-    """Match visits to rows of the covariates.
-
-    Parameters
-    ----------
-    visits : sequence of (str, str or None)
-    keys : sequence of (str, str or None)
-        Visits of the rows.
-
-    Returns
-    -------
-    rows, places : ndarray of int
-        Rows, rising, and the places of their visits.
-    """
+    """Match visits to rows of the covariates."""
     row_of = {visit: row for row, visit in enumerate(keys)}
     rows = np.array([row_of[visit] for visit in visits], dtype=np.int64)
     places = np.argsort(rows)
@@ -329,7 +258,7 @@ def rows_of(visits: Sequence[Visit], keys: Sequence[Visit]) -> tuple[Int, Int]:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ForeignCohorts:
+class ExternalCohorts:
     """Maps of other programs."""
 
     measured: Measured
@@ -346,54 +275,19 @@ def find_all(
     root: Path,
     known: Sequence[Visit],
     is_wanted: Callable[[str, str | None, str], bool],
-) -> tuple[list[ForeignFiles], list[Visit]]:
-    """Find the files of all maps, and who has them or a sheet.
-
-    Parameters
-    ----------
-    requests : sequence of MapPattern
-    root : Path
-        What patterns are relative to.
-    known : sequence of (str, str or None)
-        Visits with sheets.
-    is_wanted : callable
-        Takes subject, session and hemisphere.
-
-    Returns
-    -------
-    list of ForeignFiles
-    list of (str, str or None)
-        All visits, sorted.
-
-    Raises
-    ------
-    HipstaError
-        If there are no files of a map, or several for a hemisphere.
-    """
+) -> tuple[list[ExternalFiles], list[Visit]]:
+    """Find the files of all maps, and who has them or a sheet."""
     found = [find_maps(request, root, known, is_wanted) for request in requests]
     visits: set[Visit] = set(known).union(*(one.visits for one in found))
     return found, sorted(visits, key=lambda visit: (visit[0], visit[1] or ""))
 
 
-def add_foreign(
-    measured: Measured, found: Iterable[ForeignFiles], visits: Sequence[Visit]
-) -> ForeignCohorts:
+def add_external(
+    measured: Measured, found: Iterable[ExternalFiles], visits: Sequence[Visit]
+) -> ExternalCohorts:
     """Read other programs' maps, and put those on the grid of the sheets to the sheets.
 
     Without sheets, maps on the grid take their place if there is a curvature to register them by.
-
-    Parameters
-    ----------
-    measured : Measured
-        Sheets, perhaps none.
-    found : iterable of ForeignFiles
-    visits : sequence of (str, str or None)
-        Rows of the covariates.
-
-    Raises
-    ------
-    InputError
-        If a file cannot be read, maps have different numbers of points, or no surface fits.
     """
     grid = len(measured.x), len(measured.y)
     maps = {
@@ -424,7 +318,7 @@ def add_foreign(
     }
     if others:
         notes.append(f"maps {', '.join(others)}: not registered, their points are to correspond")
-    return ForeignCohorts(
+    return ExternalCohorts(
         measured=replace(measured, sides=sides),
         others=others,
         names=tuple(flat),
@@ -432,7 +326,7 @@ def add_foreign(
     )
 
 
-def _nodes(sides: Mapping[str, ForeignSide]) -> tuple[int, int]:
+def _nodes(sides: Mapping[str, ExternalSide]) -> tuple[int, int]:
     return next(iter(sides.values())).nodes
 
 
@@ -445,14 +339,14 @@ def _on_grid(measured: Measured, nodes: tuple[int, int]) -> Measured:
     return replace(measured, x=x, y=y)
 
 
-def _found_note(name: str, sides: Mapping[str, ForeignSide], n_visits: int) -> str:
+def _found_note(name: str, sides: Mapping[str, ExternalSide], n_visits: int) -> str:
     counts = ", ".join(f"{len(side.visits)} {hemi}" for hemi, side in sides.items())
     points = ", ".join(str(side.data.shape[1]) for side in sides.values())
     return f"maps {name}: {counts} of {n_visits} visits, {points} points"
 
 
 def _aligned(
-    side: ForeignSide,
+    side: ExternalSide,
     rows: Int,
     visits: Sequence[Visit],
 ) -> Float:
@@ -469,7 +363,7 @@ def _aligned(
 def _with_maps(
     side: SideMaps,
     hemi: str,
-    maps: Mapping[str, Mapping[str, ForeignSide]],
+    maps: Mapping[str, Mapping[str, ExternalSide]],
     visits: Sequence[Visit],
 ) -> SideMaps:
     """Add maps of the same grid to those of the sheets; they are registered with them."""
@@ -482,7 +376,7 @@ def _with_maps(
 
 
 def _as_sheets(
-    maps: Mapping[str, Mapping[str, ForeignSide]], visits: Sequence[Visit]
+    maps: Mapping[str, Mapping[str, ExternalSide]], visits: Sequence[Visit]
 ) -> dict[str, SideMaps]:
     """Sheets of those who have a curvature map."""
     result = {}
@@ -503,7 +397,7 @@ def _empty(rows: Int, nodes: tuple[int, int]) -> SideMaps:
 
 
 def _cohort(
-    measured: Measured, name: str, sides: Mapping[str, ForeignSide], visits: Sequence[Visit]
+    measured: Measured, name: str, sides: Mapping[str, ExternalSide], visits: Sequence[Visit]
 ) -> Cohort:
     own = {}
     if all(side.mesh is None for side in sides.values()):

@@ -116,19 +116,7 @@ COLUMNS: Mapping[str, str] = {
 
 
 def figure_tables(cohort: Cohort, analysis: Analysis) -> Iterator[ResultTable]:
-    """Give the tables behind the figures of one model.
-
-    Parameters
-    ----------
-    cohort : Cohort
-        What was analyzed.
-    analysis : Analysis
-        Results.
-
-    Yields
-    ------
-    ResultTable
-    """
+    """Give the tables behind the figures of one model."""
     if analysis.fitted:
         yield ResultTable(name="means", rows=mean_table(cohort, analysis))
     if analysis.sides:
@@ -139,20 +127,7 @@ def figure_tables(cohort: Cohort, analysis: Analysis) -> Iterator[ResultTable]:
 
 
 def mean_table(cohort: Cohort, analysis: Analysis) -> pd.DataFrame:
-    """Means and standard deviations of groups at each point of the maps that were fitted.
-
-    Parameters
-    ----------
-    cohort : Cohort
-        Gives coordinates and units.
-    analysis : Analysis
-        Results.
-
-    Returns
-    -------
-    DataFrame
-        One row per measure, hemisphere, group and point.
-    """
+    """Means and standard deviations of groups at each point of the maps that were fitted."""
     parts = []
     for hemi, one in analysis.fitted.items():
         frame = frame_of(cohort, one)
@@ -252,21 +227,7 @@ def _calibration(analysis: Analysis) -> pd.DataFrame:
 def result_tables(
     cohort: Cohort, analysis: Analysis, settings: GroupSettings
 ) -> Iterator[ResultTable]:
-    """Give all tables of one model.
-
-    Parameters
-    ----------
-    cohort : Cohort
-        What was analyzed.
-    analysis : Analysis
-        Results.
-    settings : GroupSettings
-        Level of the false discovery rate, neighbors, base model.
-
-    Yields
-    ------
-    ResultTable
-    """
+    """Give all tables of one model."""
     if analysis.fitted:
         yield ResultTable(name="peaks", rows=_peaks(cohort, analysis, settings))
     if analysis.found:
@@ -291,19 +252,7 @@ def result_tables(
 def point_tables(
     name: str, cohort: Cohort, analysis: Analysis, settings: GroupSettings
 ) -> Iterator[ResultTable]:
-    """Give the tables of maps that lie on a surface of their own.
-
-    Parameters
-    ----------
-    name : str
-        Of the maps.
-    cohort, analysis, settings
-        As for :func:`result_tables`.
-
-    Yields
-    ------
-    ResultTable
-    """
+    """Give the tables of maps that lie on a surface of their own."""
     yield ResultTable(name=f"{name}_peaks", rows=_peaks(cohort, analysis, settings))
     if analysis.scores is not None:
         yield ResultTable(name=f"{name}_wscores", rows=analysis.scores.table)

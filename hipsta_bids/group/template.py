@@ -107,24 +107,6 @@ def fit_template(
 
     Probabilistic principal components with spline coefficients (Tipping and Bishop 1999; Wrobel
     et al. 2018), all subjects at once.
-
-    Parameters
-    ----------
-    profiles : ndarray, shape (subjects, nodes)
-        In units of their standard deviation.
-    warps : ndarray, shape (subjects, nodes)
-        Registered coordinate of each node, 0..1.
-    splines, components : int
-        Size of the template.
-    settings : RegistrationSettings
-        When to stop.
-
-    Returns
-    -------
-    template : Template
-        With scale 1 and no penalty.
-    coefficients : ndarray, shape (subjects, splines)
-        Each subject's own template: the mean and its components.
     """
     knots = inner_knots(warps, splines)
     moments = _Moments.collect(profiles, warps, knots)
@@ -146,19 +128,7 @@ def fit_template(
 
 
 def subject_curves(template: Template, profiles: FloatArray, warps: FloatArray) -> FloatArray:
-    """Each subject's own template, given one that is not to change.
-
-    Parameters
-    ----------
-    template : Template
-        Mean and components.
-    profiles, warps : ndarray, shape (subjects, nodes)
-        Profiles in the template's scale, and their present warps.
-
-    Returns
-    -------
-    ndarray, shape (subjects, splines)
-    """
+    """Each subject's own template, given one that is not to change."""
     moments = _Moments.collect(profiles, warps, template.knots)
     scores = _expect(moments, template.mean, template.components, template.noise)
     return template.mean + scores.mean @ template.components.T
@@ -217,12 +187,7 @@ _INFINITE = "warp_variance"
 
 
 def templates_to_json(templates: Mapping[str, Template]) -> dict[str, Any]:
-    """Spell templates by hemisphere.
-
-    Parameters
-    ----------
-    templates : mapping of str to Template
-    """
+    """Spell templates by hemisphere."""
     entries = {}
     for hemi, template in templates.items():
         entry = {
@@ -236,20 +201,7 @@ def templates_to_json(templates: Mapping[str, Template]) -> dict[str, Any]:
 
 
 def templates_from_json(content: Mapping[str, Any], where: str) -> dict[str, Template]:
-    """Read templates by hemisphere.
-
-    Parameters
-    ----------
-    content : mapping
-        From :func:`templates_to_json`.
-    where : str
-        File, for messages.
-
-    Raises
-    ------
-    ModelError
-        If it is no such object.
-    """
+    """Read templates by hemisphere."""
     try:
         found = {}
         for hemi, entry in content["Hemispheres"].items():

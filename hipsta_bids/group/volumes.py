@@ -45,18 +45,7 @@ class VolumeTable:
 
 
 def table_beside(segmentation: Path) -> tuple[str, Path] | None:
-    """Find the table that belongs to a segmentation.
-
-    Parameters
-    ----------
-    segmentation : Path
-        The participant level's input.
-
-    Returns
-    -------
-    (str, Path) or None
-        Program and file, if it exists.
-    """
+    """Find the table that belongs to a segmentation."""
     for name, beside in _BESIDE.items():
         path = beside(segmentation)
         if path is not None and path.is_file():
@@ -88,19 +77,7 @@ _BESIDE: Mapping[str, Callable[[Path], Path | None]] = {
 def read_volumes(path: Path) -> Volumes:
     """Read one table, in whichever form it is.
 
-    Parameters
-    ----------
-    path : Path
-
-    Returns
-    -------
-    mapping of str to mapping of str to float
-        mm^3 by hemisphere (``L``, ``R``) and structure.
-
-    Raises
-    ------
-    InputError
-        If it is not such a table.
+    Returns mm^3 by hemisphere (````L````, ````R````) and structure.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -150,25 +127,7 @@ def join_volumes(
 ) -> tuple[dict[str, pd.DataFrame], list[str]]:
     """Read tables into one measure per structure.
 
-    Parameters
-    ----------
-    tables : iterable of VolumeTable
-    visits : Index
-        Rows of the covariates.
-    strict : sequence of str, optional
-        Names whose tables must be readable; others are left out with a note.
-
-    Returns
-    -------
-    dict of str to DataFrame
-        By hemisphere: rows are visits, columns ``volume_<name>_<structure>``; NaN is missing.
-    list of str
-        What was left out, one line each.
-
-    Raises
-    ------
-    InputError
-        If a table that must be readable is not, or two give the same structure of one hemisphere.
+    Returns NaN is missing.
     """
     cells: dict[str, dict[str, dict[str, float]]] = {}
     origin: dict[tuple[str, str, str], Path] = {}
@@ -204,18 +163,7 @@ def join_volumes(
 
 
 def check_volumes(patterns: Sequence[tuple[str, str]]) -> None:
-    """Refuse wrong names and patterns of volume tables.
-
-    Parameters
-    ----------
-    patterns : sequence of (str, str)
-        Names and patterns.
-
-    Raises
-    ------
-    UsageError
-        If a name is none or occurs twice, or a placeholder is unknown or lacking.
-    """
+    """Refuse wrong names and patterns of volume tables."""
     names = [name for name, _ in patterns]
     for name, pattern in patterns:
         if not (name.isalnum() and name.isascii()) or names.count(name) > 1:
@@ -232,33 +180,7 @@ def add_volumes(
     patterns: Sequence[tuple[str, str]],
     root: Path,
 ) -> tuple[Measured, list[str]]:
-    """Add the volumes found beside the segmentations, and those that the user names.
-
-    Parameters
-    ----------
-    measured : Measured
-    records : sequence of SheetRecord
-        Hemispheres of the sheets, which say where their segmentations are.
-    patterns : sequence of (str, str)
-        Names and patterns of further tables, checked. A name that a program would have replaces
-        what lies beside.
-    root : Path
-        What patterns are relative to.
-
-    Returns
-    -------
-    Measured
-        Summaries have one column more per structure, ``volume_<name>_<structure>``.
-    list of str
-        What was found and what was left out, one line each.
-
-    Raises
-    ------
-    InputError
-        If a table that the user names cannot be read, or two are for the same hemisphere.
-    NothingToDoError
-        If no file matches a pattern.
-    """
+    """Add the volumes found beside the segmentations, and those that the user names."""
     named = [name for name, _ in patterns]
     tables = [table for table in _beside(records) if table.name not in named]
     for name, pattern in patterns:

@@ -160,23 +160,6 @@ def fit_warps(
 
     Minimizes half the sum of squared differences, plus half the penalty times the squared
     parameters (the logarithms of local stretch, in the mean).
-
-    Parameters
-    ----------
-    profiles : ndarray, shape (subjects, nodes)
-        In the unit of the curves.
-    knots : ndarray
-        Inner knots of the curves.
-    coefficients : ndarray, shape (subjects, splines)
-        Each subject's curve.
-    basis : WarpBasis
-        Warps that are possible.
-    parameters : ndarray, shape (subjects, steps)
-        Where to start.
-    penalty : float
-        Variance of the noise over that of the parameters; 0 for none.
-    settings : RegistrationSettings
-        When to stop.
     """
     problem = _Problem(knots, basis, penalty, settings)
     fits = [
@@ -193,16 +176,7 @@ def fit_warps(
 def warp_values(maps: FloatArray, warps: FloatArray) -> FloatArray:
     """Carry maps of values to registered coordinates, linearly.
 
-    Parameters
-    ----------
-    maps : ndarray, shape (subjects, x, y)
-        NaN is missing, and makes missing what would need it.
-    warps : ndarray, shape (subjects, x)
-        Registered coordinate of each node, 0..1, rising.
-
-    Returns
-    -------
-    ndarray, shape (subjects, x, y)
+    ``maps`` NaN is missing, and makes missing what would need it.
     """
     carried = np.empty(maps.shape)
     for block in _blocks(len(maps)):
@@ -217,15 +191,7 @@ def warp_values(maps: FloatArray, warps: FloatArray) -> FloatArray:
 
 
 def warp_labels(labels: IntArray, warps: FloatArray) -> IntArray:
-    """Carry maps of labels to registered coordinates, from the nearest node.
-
-    Parameters
-    ----------
-    labels : ndarray of int, shape (subjects, x, y)
-        Any integers.
-    warps : ndarray, shape (subjects, x)
-        As in :func:`warp_values`.
-    """
+    """Carry maps of labels to registered coordinates, from the nearest node."""
     left, weight = _sources(warps)
     rows = np.arange(len(labels))[:, None]
     return np.asarray(labels[rows, left + (weight >= 0.5)])  # noqa: PLR2004 -- nearest

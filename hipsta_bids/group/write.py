@@ -40,25 +40,7 @@ GROUP_FOLDER = DATASET_FILES["group"]
 
 @contextlib.contextmanager
 def model_folder(root: Path, name: str) -> Iterator[Path]:
-    """Give a folder to write into, which takes its name when all went well.
-
-    Parameters
-    ----------
-    root : Path
-        The output dataset.
-    name : str
-        Of the model; earlier results of this name are replaced.
-
-    Yields
-    ------
-    Path
-        Where to write meanwhile.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be written.
-    """
+    """Give a folder to write into, which takes its name when all went well."""
     parent = root / GROUP_FOLDER
     aside = parent / f".{name}.{os.getpid()}.tmp"
     files.make_folder(parent)
@@ -87,22 +69,7 @@ def _take_place(aside: Path, final: Path) -> None:
 
 
 def write_result_table(folder: Path, table: ResultTable, meanings: Mapping[str, str]) -> None:
-    """Write a table and its sidecar.
-
-    Parameters
-    ----------
-    folder : Path
-        Where.
-    table : ResultTable
-        Booleans become ``true`` and ``false``, missing values ``n/a``.
-    meanings : mapping of str to str
-        Meaning of each column; columns ``node_<i>`` are the registered coordinates of nodes.
-
-    Raises
-    ------
-    OutputError
-        If a file cannot be written.
-    """
+    """Write a table and its sidecar."""
     columns = [str(name) for name in table.rows.columns]
     cells = [_cells(table.rows[name]) for name in table.rows.columns]
     files.write_tsv(folder / f"{table.name}.tsv", columns, zip(*cells, strict=True))
@@ -134,17 +101,7 @@ def write_plain_table(path: Path, table: pd.DataFrame) -> None:
 
 
 def write_sheet_surface(path: Path, x: Float, y: Float, hemi: str) -> None:
-    """Write the unfolded sheet, on which maps of statistics can be drawn.
-
-    Parameters
-    ----------
-    path : Path
-        The ``.surf.gii`` file.
-    x, y : ndarray
-        Sheet coordinates of the nodes, medial to lateral and posterior to anterior.
-    hemi : str
-        ``L`` or ``R``.
-    """
+    """Write the unfolded sheet, on which maps of statistics can be drawn."""
     flat = np.zeros((len(x) * len(y), 3))
     flat[:, 0], flat[:, 1] = np.repeat(x, len(y)), np.tile(y, len(x))
     triangles = gifti.sheet_triangles(len(x), len(y))
@@ -168,24 +125,7 @@ def write_score_maps(
     x: Float,
     y: Float,
 ) -> None:
-    """Write scores at all points as one Parquet file: a row per participant, hemisphere and node.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    table : DataFrame
-        Participants.
-    sides : mapping
-        By hemisphere: rows of the table, and (sheets, points) scores by measure.
-    x, y : ndarray
-        Sheet coordinates of the nodes.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be written.
-    """
+    """Write scores at all points as one Parquet file: one row per participant, side and node."""
     measures = list(next(iter(sides.values()))[1])
     word = pa.dictionary(pa.int32(), pa.string())
     schema = pa.schema(
@@ -249,24 +189,7 @@ def write_maps(
     registered: Mapping[str, SideMaps],
     others: Mapping[str, Cohort],
 ) -> None:
-    """Write all maps: one row per visit, hemisphere and point.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    cohort : Cohort
-        Original maps of the sheets.
-    registered : mapping of str to SideMaps
-        The same after registration, by hemisphere; perhaps none.
-    others : mapping of str to Cohort
-        Maps with points of their own, by name.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be written.
-    """
+    """Write all maps: one row per visit, hemisphere and point."""
     schema = _schema(cohort, registered, others)
     try:
         with parquet.ParquetWriter(path, schema, compression="zstd") as writer:
@@ -393,27 +316,7 @@ def write_results(
     *,
     others: Mapping[str, tuple[Cohort, Analysis]],
 ) -> None:
-    """Write tables, maps and text.
-
-    Parameters
-    ----------
-    folder : Path
-        Where; see :func:`~hipsta_bids.bids.group_outputs.model_folder`.
-    cohort : Cohort
-        What was analyzed.
-    analysis : Analysis
-        Results.
-    settings : GroupSettings
-    exclusions : sequence of Exclusion
-        Who was left out.
-    others : mapping of str to (Cohort, Analysis)
-        Maps that lie on surfaces of their own, by name.
-
-    Raises
-    ------
-    OutputError
-        If a file cannot be written.
-    """
+    """Write tables, maps and text."""
     for table in result_tables(cohort, analysis, settings):
         write_result_table(folder, table, COLUMNS)
     for name, other in others.items():

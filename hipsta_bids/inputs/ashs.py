@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from hipsta_bids.errors import HipstaError, InputError, SchemeError
+from hipsta_bids.errors import HipstaError, InputError, ProtocolError
 from hipsta_bids.inputs.labels import label_values
 from hipsta_bids.inputs.request import HemisphereInput, InputRequest
 from hipsta_bids.inputs.scan import Selection, Source, Visit, list_visits, subject_folders
 from hipsta_bids.inputs.tables import find_table, read_table
-from hipsta_bids.protocols.load import agrees, load_scheme, scheme_from_names, scheme_names
-from hipsta_bids.protocols.protocol import Scheme
+from hipsta_bids.protocols.load import agrees, load_protocol, protocol_from_names, protocol_names
+from hipsta_bids.protocols.protocol import Protocol
 
 # Which atlas an ASHS segmentation was made with: the same numbers mean different tissues.
 
@@ -25,7 +25,7 @@ from hipsta_bids.protocols.protocol import Scheme
 _TOOL = "ashs"
 
 #: Stands in where the atlas is not known: the hemisphere fails, but has a name in the outputs.
-_UNKNOWN = Scheme(
+_UNKNOWN = Protocol(
     name=_TOOL,
     title="ASHS, atlas not identified",
     citation="",
@@ -39,34 +39,22 @@ _UNKNOWN = Scheme(
 _Sample = Callable[[], list[tuple[Path, str, bool]]]
 
 
-def ashs_schemes() -> tuple[Scheme, ...]:
+def ashs_protocols() -> tuple[Protocol, ...]:
     """List the bundled protocols of ASHS's atlases."""
-    return tuple(scheme for name in scheme_names() if (scheme := load_scheme(name)).tool == _TOOL)
+    return tuple(
+        protocol for name in protocol_names() if (protocol := load_protocol(name)).tool == _TOOL
+    )
 
 
-def choose_atlas(request: InputRequest) -> Scheme | None:
-    """Take the atlas from ``--ashs-atlas``, if it is given.
-
-    Parameters
-    ----------
-    request : InputRequest
-
-    Returns
-    -------
-    Scheme or None
-
-    Raises
-    ------
-    SchemeError
-        If the atlas is not known, or its file not valid.
-    """
+def choose_atlas(request: InputRequest) -> Protocol | None:
+    """Take the atlas from ``--ashs-atlas``, if it is given."""
     if request.ashs_atlas is None:
         return None
     key = _plain(request.ashs_atlas)
-    for scheme in ashs_schemes():
-        if key in {_plain(scheme.name), _plain(scheme.name).removeprefix(_TOOL)}:
-            return scheme
-    return load_scheme(request.ashs_atlas)
+    for protocol in ashs_protocols():
+        if key in {_plain(protocol.name), _plain(protocol.name).removeprefix(_TOOL)}:
+            return protocol
+    return load_protocol(request.ashs_atlas)
 
 
 class AtlasFinder:
@@ -75,43 +63,19 @@ class AtlasFinder:
     In this order: the option; a label table beside or above the file; the values, if only one
     atlas has such values; and, as one dataset is made with one atlas, the values of a sample of the
     dataset's files, if all of them that fit one atlas only fit the same one.
-
-    Parameters
-    ----------
-    root : Path
-        The dataset.
-    option : Scheme or None
-        As :func:`choose_atlas` returns it.
-    sample : function
-        Lists files of the dataset: path, hemisphere, and whether the file carries both.
     """
 
-    def __init__(self, root: Path, option: Scheme | None, sample: _Sample) -> None:
+    def __init__(self, root: Path, option: Protocol | None, sample: _Sample) -> None:
         self._root = root
         self._option = option
         self._sample = sample
         self._values: dict[tuple[Path, str], frozenset[int]] = {}
-        self._tables: dict[Path, Scheme] = {}
+        self._tables: dict[Path, Protocol] = {}
 
     def identify(
         self, path: Path, hemi: str, *, bilateral: bool
-    ) -> tuple[Scheme, str, HipstaError | None]:
-        """Identify one file's atlas.
-
-        Parameters
-        ----------
-        path : Path
-        hemi : str
-        bilateral : bool
-            The file carries both hemispheres.
-
-        Returns
-        -------
-        scheme : Scheme
-        why : str
-        problem : HipstaError or None
-            Set if the atlas is not certain; the protocol is then a placeholder.
-        """
+    ) -> tuple[Protocol, str, HipstaError | None]:
+        """Identify one file's atlas."""
         if self._option is not None:
             return self._option, "atlas from --ashs-atlas", None
         try:
@@ -119,21 +83,21 @@ class AtlasFinder:
             if table is not None:
                 return self._from_table(table), f"atlas from {table.name}", None
             return *self._from_values(path, hemi, bilateral=bilateral), None
-        except (SchemeError, InputError) as problem:
+        except (ProtocolError, InputError) as problem:
             return _UNKNOWN, "atlas not identified", problem
 
-    def _from_table(self, path: Path) -> Scheme:
+    def _from_table(self, path: Path) -> Protocol:
         if path not in self._tables:
             rows = read_table(path)
-            fitting = [scheme for scheme in ashs_schemes() if agrees(scheme, rows)]
+            fitting = [protocol for protocol in ashs_protocols() if agrees(protocol, rows)]
             self._tables[path] = (
                 fitting[0]
                 if len(fitting) == 1
-                else scheme_from_names(rows, name="ashsCustom", origin=path.name)
+                else protocol_from_names(rows, name="ashsCustom", origin=path.name)
             )
         return self._tables[path]
 
-    def _from_values(self, path: Path, hemi: str, *, bilateral: bool) -> tuple[Scheme, str]:
+    def _from_values(self, path: Path, hemi: str, *, bilateral: bool) -> tuple[Protocol, str]:
         shared = self._shared
         if shared is not None and (path, hemi) not in self._values:
             # Not opened here; reading it later will fail if its values do not fit.
@@ -146,22 +110,22 @@ class AtlasFinder:
             return shared[0], f"its labels fit {_names(fitting)}, {others}"
         values = ", ".join(map(str, sorted(self._read(path, hemi, bilateral=bilateral))))
         if fitting:
-            raise SchemeError(
+            raise ProtocolError(
                 f"{path}: labels {values} fit {_names(fitting)}; "
                 "say which atlas was used with --ashs-atlas",
                 reason="ambiguous-atlas",
             )
-        raise SchemeError(
+        raise ProtocolError(
             f"{path}: labels {values} fit no bundled ASHS atlas "
-            f"({_names(list(ashs_schemes()))}); describe them in a TOML file and give it to "
+            f"({_names(list(ashs_protocols()))}); describe them in a TOML file and give it to "
             "--ashs-atlas",
             reason="unknown-atlas",
         )
 
     @cached_property
-    def _shared(self) -> tuple[Scheme, int] | None:
+    def _shared(self) -> tuple[Protocol, int] | None:
         """The atlas of the dataset and how many files of a sample prove it."""
-        proofs: list[Scheme] = []
+        proofs: list[Protocol] = []
         for path, hemi, bilateral in self._sample():
             try:
                 fitting = self._fitting(path, hemi, bilateral=bilateral)
@@ -171,16 +135,16 @@ class AtlasFinder:
                 proofs += fitting
         return (proofs[0], len(proofs)) if len(set(proofs)) == 1 else None
 
-    def _fitting(self, path: Path, hemi: str, *, bilateral: bool) -> list[Scheme]:
+    def _fitting(self, path: Path, hemi: str, *, bilateral: bool) -> list[Protocol]:
         values = self._read(path, hemi, bilateral=bilateral)
-        return [scheme for scheme in ashs_schemes() if scheme.fits(values)]
+        return [protocol for protocol in ashs_protocols() if protocol.fits(values)]
 
     def _read(self, path: Path, hemi: str, *, bilateral: bool) -> frozenset[int]:
         """Read the codes of one hemisphere, in the range of the left one."""
         if (path, hemi) not in self._values:
             values = label_values(path)
             if bilateral:
-                (offset,) = {scheme.right_offset for scheme in ashs_schemes()}
+                (offset,) = {protocol.right_offset for protocol in ashs_protocols()}
                 own = (v for v in values if (v > offset) == (hemi == "R"))
                 values = frozenset(v - offset if hemi == "R" else v for v in own)
             self._values[path, hemi] = values
@@ -195,8 +159,8 @@ def _others(count: int) -> str:
     return f"{count} other file{'' if count == 1 else 's'} of the dataset"
 
 
-def _names(schemes: list[Scheme]) -> str:
-    return " and ".join(scheme.name for scheme in schemes)
+def _names(protocols: list[Protocol]) -> str:
+    return " and ".join(protocol.name for protocol in protocols)
 
 
 _NAME = re.compile(r"(?P<stem>.*?)_?lfseg_(?P<kind>corr_usegray|corr_nogray|heur)\.nii(?:\.gz)?")
@@ -226,17 +190,7 @@ class _File:
 
 
 def volume_table(path: Path) -> Path | None:
-    """Name the table of volumes that was written with a segmentation.
-
-    Parameters
-    ----------
-    path : Path
-
-    Returns
-    -------
-    Path or None
-        In the same folder, there or not; ``None`` if the file is not ASHS's.
-    """
+    """Name the table of volumes that was written with a segmentation."""
     match = _NAME.fullmatch(path.name)
     return None if match is None else path.with_name(f"{match['stem']}_{match['kind']}_volumes.txt")
 
@@ -244,21 +198,7 @@ def volume_table(path: Path) -> Path | None:
 def find_ashs(
     visit: Visit, source: Source, atlases: AtlasFinder, selection: Selection
 ) -> Iterator[HemisphereInput]:
-    """Find ASHS's segmentations of one visit.
-
-    Parameters
-    ----------
-    visit : Visit
-    source : Source
-    atlases : AtlasFinder
-        Identifies the atlas.
-    selection : Selection
-
-    Yields
-    ------
-    HemisphereInput
-        With ``problem`` set where several files are equally good, or the atlas is not certain.
-    """
+    """Find ASHS's segmentations of one visit."""
     everything = sorted(_files(visit), key=lambda file: (file.rank, str(file.path)))
     for hemi in selection.wanted_hemis():
         files = [file for file in everything if file.hemi in (hemi, None)]
@@ -266,7 +206,7 @@ def find_ashs(
             continue
         chosen = files[0]
         rivals = [file.path.name for file in files if file.rank == chosen.rank]
-        scheme, why, problem = atlases.identify(chosen.path, hemi, bilateral=chosen.hemi is None)
+        protocol, why, problem = atlases.identify(chosen.path, hemi, bilateral=chosen.hemi is None)
         if len(rivals) > 1:
             problem = InputError(
                 f"{chosen.path.parent}: {' and '.join(rivals)} are equally good; "
@@ -278,30 +218,20 @@ def find_ashs(
             subject=visit.subject,
             session=visit.session,
             hemi=hemi,
-            scheme=scheme,
+            protocol=protocol,
             files=(chosen.path,),
             bilateral=bilateral,
-            code_offset=scheme.right_offset if bilateral and hemi == "R" else 0,
+            code_offset=protocol.right_offset if bilateral and hemi == "R" else 0,
             source=source.name,
             source_path=source.path,
             why=f"{chosen.kind}{', both hemispheres in one file' if bilateral else ''}; {why}",
             passed_over=tuple(_passed_over(files)),
-            problem=problem or _without_offset(scheme, chosen),
+            problem=problem or _without_offset(protocol, chosen),
         )
 
 
 def sample_files(source: Source) -> Callable[[], list[tuple[Path, str, bool]]]:
-    """Prepare a sample of a dataset's segmentations, the same whoever is processed.
-
-    Parameters
-    ----------
-    source : Source
-
-    Returns
-    -------
-    function
-        Lists path, hemisphere, and whether the file carries both.
-    """
+    """Prepare a sample of a dataset's segmentations, the same whoever is processed."""
 
     def sample() -> list[tuple[Path, str, bool]]:
         folders = subject_folders(source.path)
@@ -346,12 +276,12 @@ def _passed_over(files: list[_File]) -> Iterator[tuple[str, str]]:
         yield file.path.name, reason
 
 
-def _without_offset(scheme: Scheme, file: _File) -> HipstaError | None:
+def _without_offset(protocol: Protocol, file: _File) -> HipstaError | None:
     """Say what is wrong with a file of both hemispheres whose protocol knows no offset."""
-    if file.hemi is not None or scheme.right_offset:
+    if file.hemi is not None or protocol.right_offset:
         return None
     return InputError(
-        f"{file.path}: neither left nor right is in its name, and the protocol {scheme.name} "
+        f"{file.path}: neither left nor right is in its name, and the protocol {protocol.name} "
         "does not say how the hemispheres differ; set right_offset in its TOML file",
         reason="unknown-hemisphere",
     )

@@ -15,7 +15,7 @@ from hipsta_bids.inputs.request import Edit, HemisphereInput, InputRequest
 from hipsta_bids.inputs.scan import Selection, Visit, list_visits, subject_folders
 from hipsta_bids.inputs.tables import read_table
 from hipsta_bids.io.files import entities
-from hipsta_bids.protocols.load import scheme_from_names
+from hipsta_bids.protocols.load import protocol_from_names
 
 #: Names under which ``--edited-dir`` and the output dataset appear in addresses.
 _EDITED, _OUTPUT = "edited", "output"
@@ -55,22 +55,7 @@ def is_edited(name: str) -> bool:
 
 
 def edits_of_visit(visit: Visit, root: Path, source: str, *, beside: bool) -> Iterator[EditedFile]:
-    """List the edited files in the folders of one visit.
-
-    Parameters
-    ----------
-    visit : Visit
-    root : Path
-        The dataset.
-    source : str
-        Its name.
-    beside : bool
-        Whether it is a dataset of segmentations.
-
-    Yields
-    ------
-    EditedFile
-    """
+    """List the edited files in the folders of one visit."""
     for folder in visit.folders:
         for name in filter(is_edited, folder.names):
             kind = _KINDS[entities(name)["suffix"]]
@@ -79,23 +64,7 @@ def edits_of_visit(visit: Visit, root: Path, source: str, *, beside: bool) -> It
 
 
 def list_edits(request: InputRequest, selection: Selection) -> list[EditedFile]:
-    """List the edited files of ``--edited-dir`` and of the output dataset.
-
-    Parameters
-    ----------
-    request : InputRequest
-    selection : Selection
-        Subjects and sessions that are not wanted are left out.
-
-    Returns
-    -------
-    list of EditedFile
-
-    Raises
-    ------
-    InputError
-        If the folder that the user gave is missing or cannot be listed.
-    """
+    """List the edited files of ``--edited-dir`` and of the output dataset."""
     found = []
     if request.edited_dir is not None:
         found += _edits_of_dataset(request.edited_dir, _EDITED, selection)
@@ -123,22 +92,7 @@ def each_once(edited: Iterable[EditedFile]) -> list[EditedFile]:
 def attach_edits(
     items: Iterable[HemisphereInput], edited: Iterable[EditedFile], selection: Selection
 ) -> tuple[tuple[HemisphereInput, ...], tuple[str, ...]]:
-    """Give each hemisphere the files that correct it.
-
-    Parameters
-    ----------
-    items : iterable of HemisphereInput
-    edited : iterable of EditedFile
-    selection : Selection
-        Files of hemispheres that are not wanted are passed over in silence.
-
-    Returns
-    -------
-    items : tuple of HemisphereInput
-        With a ``problem`` where it is not clear which file corrects what.
-    notes : tuple of str
-        One line for each file that corrects nothing.
-    """
+    """Give each hemisphere the files that correct it."""
     found = list(items)
     corrections: dict[int, list[EditedFile]] = {}
     notes = []
@@ -152,10 +106,10 @@ def attach_edits(
         if not matching:
             notes.append(f"{file.edit.path}: edited file not used: {_why_not(file, found)}")
         elif len(matching) > 1:
-            names = " and ".join(found[n].scheme.name for n in matching)
+            names = " and ".join(found[n].protocol.name for n in matching)
             problem = InputError(
                 f"{file.edit.path}: corrects the labels of {names}; say in its name which ones, "
-                f"as in _seg-{found[matching[0]].scheme.name}_desc-edited_",
+                f"as in _seg-{found[matching[0]].protocol.name}_desc-edited_",
                 reason="edit-ambiguous",
             )
             for n in matching:
@@ -170,7 +124,7 @@ def _corrects(file: EditedFile, item: HemisphereInput) -> bool:
     return (
         _misnamed(file) is None
         and (file.subject, file.session, names["hemi"]) == (item.subject, item.session, item.hemi)
-        and names.get("seg", item.scheme.name) == item.scheme.name
+        and names.get("seg", item.protocol.name) == item.protocol.name
         and (not file.beside or file.edit.path.parent in {path.parent for path in item.files})
     )
 
@@ -200,10 +154,10 @@ def _why_not(file: EditedFile, items: list[HemisphereInput]) -> str:
     ]
     if not rivals:
         return f"no labels of {whose} are processed"
-    schemes = {item.scheme.name for item in rivals}
-    if file.names.get("seg", rivals[0].scheme.name) not in schemes:
+    protocols = {item.protocol.name for item in rivals}
+    if file.names.get("seg", rivals[0].protocol.name) not in protocols:
         return (
-            f"its name says seg-{file.names['seg']}, but {whose} has seg-{', seg-'.join(schemes)}"
+            f"its name says seg-{file.names['seg']}, but {whose} has seg-{', seg-'.join(protocols)}"
         )
     return (
         f"it does not lie beside the labels of {whose} ({rivals[0].files[0].parent}); move it "
@@ -235,15 +189,17 @@ def _described(item: HemisphereInput) -> HemisphereInput:
     if not table.exists():
         return item
     try:
-        scheme = scheme_from_names(read_table(table), name=item.scheme.name, origin=table.name)
+        protocol = protocol_from_names(
+            read_table(table), name=item.protocol.name, origin=table.name
+        )
     except HipstaError as error:
         return replace(item, problem=item.problem or error)
     # The citation is that of the protocol; a table has none.
-    scheme = replace(scheme, title=item.scheme.title, citation=item.scheme.citation)
+    protocol = replace(protocol, title=item.protocol.title, citation=item.protocol.citation)
     return replace(
         item,
-        scheme=scheme,
-        parts_scheme=None,
+        protocol=protocol,
+        parts_protocol=None,
         files=item.files[:1],
         bilateral=False,
         code_offset=0,

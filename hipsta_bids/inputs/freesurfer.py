@@ -13,7 +13,7 @@ from pathlib import Path
 from hipsta_bids.errors import HipstaError, InputError
 from hipsta_bids.inputs.request import HemisphereInput
 from hipsta_bids.inputs.scan import Selection, Source, Visit
-from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.load import load_protocol
 
 _NAME = re.compile(
     r"(?P<hemi>[lr])h\.(?P<base>hippoAmygLabels|hippoSfLabels)(?P<analysis>(?:[-.].+?)??)"
@@ -70,18 +70,7 @@ class Analysis:
 
 
 def parse_analysis(text: str, *, longitudinal: bool = False) -> Analysis:
-    """Understand a suffix such as ``-T1-T2.v21`` or ``.long``, or a user's spelling of it.
-
-    Parameters
-    ----------
-    text : str
-    longitudinal : bool
-        The subject's folder is a longitudinal one, whatever the suffix says.
-
-    Returns
-    -------
-    Analysis
-    """
+    """Understand a suffix such as ``-T1-T2.v21`` or ``.long``, or a user's spelling of it."""
     words = [word for word in re.split(r"[-.]", text) if word and word != _UNNAMED]
     versions = [int(word[1:]) for word in words if re.fullmatch(r"v\d+", word)]
     return Analysis(
@@ -113,19 +102,7 @@ class _Run:
 
 
 def volume_table(path: Path) -> Path | None:
-    """Name the table of volumes that was written with a segmentation.
-
-    Parameters
-    ----------
-    path : Path
-        A file of any hierarchy.
-
-    Returns
-    -------
-    Path or None
-        Of the same analysis, in the same folder, there or not; ``None`` if the file is not
-        FreeSurfer's.
-    """
+    """Name the table of volumes that was written with a segmentation."""
     match = _NAME.fullmatch(path.name)
     if match is None:
         return None
@@ -140,17 +117,6 @@ def find_freesurfer(
     Taken are the files that are not resampled, of the preferred analysis (see
     :attr:`Analysis.rank`), in the full hierarchy; else ``.FS60`` or ``.CA``, combined with
     ``.HBT`` where that exists.
-
-    Parameters
-    ----------
-    visit : Visit
-    source : Source
-    selection : Selection
-        ``fs_analysis`` restricts the choice.
-
-    Yields
-    ------
-    HemisphereInput
     """
     for hemi in selection.wanted_hemis():
         runs = _runs(visit, hemi)
@@ -162,18 +128,18 @@ def find_freesurfer(
         chosen = usable[0] if usable else None
         problem = None if chosen else _problem(runs, matching, selection.fs_analysis)
         run = chosen or runs[0]
-        subfields, parts, scheme = run.way or (next(iter(run.files)), None, "freesurfer")
+        subfields, parts, protocol = run.way or (next(iter(run.files)), None, "freesurfer")
         files = tuple(run.files[name] for name in (subfields, parts) if name)
         if run.old and run.way:
-            scheme = "freesurferFS60"
+            protocol = "freesurferFS60"
         coarse = "only .FSvoxelSpace exists: labels resampled to 1 mm lose thin layers"
         yield HemisphereInput(
             subject=visit.subject,
             session=visit.session,
             hemi=hemi,
-            scheme=load_scheme(scheme),
+            protocol=load_protocol(protocol),
             files=files,
-            parts_scheme=load_scheme("freesurferHBT") if parts else None,
+            parts_protocol=load_protocol("freesurferHBT") if parts else None,
             source=source.name,
             source_path=source.path,
             why=_why(run, subfields, parts, selection.fs_analysis),

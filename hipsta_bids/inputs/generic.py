@@ -6,15 +6,15 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-from hipsta_bids.errors import HipstaError, InputError, SchemeError
+from hipsta_bids.errors import HipstaError, InputError, ProtocolError
 from hipsta_bids.inputs.edits import is_edited
 from hipsta_bids.inputs.hippunfold import is_hippunfold
 from hipsta_bids.inputs.request import HemisphereInput
 from hipsta_bids.inputs.scan import Selection, Source, Visit
 from hipsta_bids.inputs.tables import find_table, read_table
 from hipsta_bids.io.files import entities
-from hipsta_bids.protocols.load import scheme_from_names
-from hipsta_bids.protocols.protocol import Scheme
+from hipsta_bids.protocols.load import protocol_from_names
+from hipsta_bids.protocols.protocol import Protocol
 
 _IMAGES = {".nii.gz", ".nii", ".mgz", ".mgh"}
 
@@ -26,7 +26,7 @@ _OWN_SPACE = re.compile(r"|T1w|T2w|orig|scanner|individual|crop\w*")
 class _File:
     path: Path
     space: str
-    scheme: Scheme | None
+    protocol: Protocol | None
     """None where nothing says what the codes are."""
     origin: str
     """Where the protocol comes from."""
@@ -38,7 +38,7 @@ class _File:
         """Described, in the subject's space, cropped or in no named space, fewest entities."""
         coarse = bool(self.space) and not self.space.startswith("crop")
         template = not _OWN_SPACE.fullmatch(self.space)
-        return self.scheme is None, template, coarse, self.path.name.count("_"), self.path.name
+        return self.protocol is None, template, coarse, self.path.name.count("_"), self.path.name
 
 
 def find_named(visit: Visit, source: Source, selection: Selection) -> Iterator[HemisphereInput]:
@@ -46,23 +46,12 @@ def find_named(visit: Visit, source: Source, selection: Selection) -> Iterator[H
 
     Files whose table names no subiculum and CA1 are of something else, and are left out; so are
     files without any table in datasets that the user did not name.
-
-    Parameters
-    ----------
-    visit : Visit
-    source : Source
-    selection : Selection
-        ``scheme``, if given, describes all of these files.
-
-    Yields
-    ------
-    HemisphereInput
     """
     for hemi in selection.wanted_hemis():
         files = _files(visit, hemi, source, selection)
         groups: dict[str, list[_File]] = {}
         for file in sorted(files, key=lambda file: file.rank):
-            groups.setdefault(file.scheme.name if file.scheme else "", []).append(file)
+            groups.setdefault(file.protocol.name if file.protocol else "", []).append(file)
         for name, group in groups.items():
             # A file that nothing describes matters only if there is no other.
             if name or (source.explicit and len(groups) == 1):
@@ -83,11 +72,11 @@ def _choose(files: list[_File], visit: Visit, hemi: str, source: Source) -> Hemi
         subject=visit.subject,
         session=visit.session,
         hemi=hemi,
-        scheme=chosen.scheme or _placeholder(chosen.path),
+        protocol=chosen.protocol or _placeholder(chosen.path),
         files=(chosen.path,),
         source=source.name,
         source_path=source.path,
-        why=f"labels named by {chosen.origin}" if chosen.scheme else "labels not described",
+        why=f"labels named by {chosen.origin}" if chosen.protocol else "labels not described",
         passed_over=tuple((file.path.name, order) for file in files[1:]),
         problem=problem,
     )
@@ -116,38 +105,38 @@ def _describe(
 ) -> _File | None:
     """Find out what a file's labels mean; None if they are not the hippocampus's."""
     space = pairs.get("space", "")
-    if selection.scheme is not None:
-        return _File(path=path, space=space, scheme=selection.scheme, origin="--scheme")
+    if selection.protocol is not None:
+        return _File(path=path, space=space, protocol=selection.protocol, origin="--scheme")
     table = find_table(path, source.path)
     problem: HipstaError
     if table is None:
-        problem = SchemeError(
+        problem = ProtocolError(
             f"{path}: no _dseg.tsv says what its labels are; add one, "
             "or describe them in a TOML file and pass it with --scheme",
             reason="undescribed-labels",
         )
-        return _File(path=path, space=space, scheme=None, origin="", problem=problem)
+        return _File(path=path, space=space, protocol=None, origin="", problem=problem)
     try:
-        scheme = _scheme(table, _scheme_name(pairs, source))
-    except (InputError, SchemeError) as error:
+        protocol = _protocol(table, _protocol_name(pairs, source))
+    except (InputError, ProtocolError) as error:
         if error.reason == "unclear-names":
             return None
-        return _File(path=path, space=space, scheme=None, origin=table.name, problem=error)
-    return _File(path=path, space=space, scheme=scheme, origin=table.name)
+        return _File(path=path, space=space, protocol=None, origin=table.name, problem=error)
+    return _File(path=path, space=space, protocol=protocol, origin=table.name)
 
 
 # One table at the top of a dataset describes all of its files.
 @lru_cache(maxsize=64)
-def _scheme(table: Path, name: str) -> Scheme:
-    return scheme_from_names(read_table(table), name=name, origin=table.name)
+def _protocol(table: Path, name: str) -> Protocol:
+    return protocol_from_names(read_table(table), name=name, origin=table.name)
 
 
 def forget_tables() -> None:
     """Read tables anew from now on."""
-    _scheme.cache_clear()
+    _protocol.cache_clear()
 
 
-def _scheme_name(pairs: dict[str, str], source: Source) -> str:
+def _protocol_name(pairs: dict[str, str], source: Source) -> str:
     """Name a protocol after the file's atlas, or else its dataset."""
     for text in (pairs.get("atlas"), pairs.get("seg"), source.name):
         plain = re.sub("[^A-Za-z0-9]", "", text or "")
@@ -156,8 +145,8 @@ def _scheme_name(pairs: dict[str, str], source: Source) -> str:
     return "labels"
 
 
-def _placeholder(path: Path) -> Scheme:
-    return Scheme(
+def _placeholder(path: Path) -> Protocol:
+    return Protocol(
         name="unknown",
         title=f"Labels of {path.name}, not described",
         citation="",

@@ -7,11 +7,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from hipsta_bids.errors import HipstaError, InputError, SchemeError
+from hipsta_bids.errors import HipstaError, InputError, ProtocolError
 from hipsta_bids.inputs.request import HemisphereInput
 from hipsta_bids.inputs.scan import Selection, Source, Visit
 from hipsta_bids.io.files import entities
-from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.load import load_protocol
 
 #: Atlases with the bundled protocol's codes, best first; None is version 0, which had one atlas.
 _ATLASES = ("multihist7", "bigbrain", None)
@@ -42,19 +42,7 @@ class _File:
 
 
 def is_hippunfold(name: str, source: Source) -> bool:
-    """Say whether a file is HippUnfold's segmentation of hippocampal subfields.
-
-    Parameters
-    ----------
-    name : str
-        Of the file.
-    source : Source
-        Its dataset; if that says that other software made it, the file is not HippUnfold's.
-
-    Returns
-    -------
-    bool
-    """
+    """Say whether a file is HippUnfold's segmentation of hippocampal subfields."""
     if "desc-subfields" not in name or "_hemi-" not in name:
         return False
     if source.generators and "hippunfold" not in source.generators:
@@ -75,17 +63,6 @@ def find_hippunfold(
 
     ``space-crop*`` comes first (the finest grid in the subject's own space), then the image's own
     grid. Files in coronal-oblique and template spaces may be scaled, and are not used.
-
-    Parameters
-    ----------
-    visit : Visit
-    source : Source
-    selection : Selection
-        ``scheme`` applies to atlases other than multihist7 and bigbrain.
-
-    Yields
-    ------
-    HemisphereInput
     """
     for hemi in selection.wanted_hemis():
         files = sorted(_files(visit, hemi, source, selection), key=lambda file: file.rank)
@@ -93,13 +70,13 @@ def find_hippunfold(
             continue
         chosen = files[0]
         known = chosen.atlas in _ATLASES
-        users = None if known else selection.scheme
+        users = None if known else selection.protocol
         note = "labels on the image's own grid, which may be coarse; no space-crop* file exists"
         yield HemisphereInput(
             subject=visit.subject,
             session=visit.session,
             hemi=hemi,
-            scheme=users or load_scheme("hippunfold"),
+            protocol=users or load_protocol("hippunfold"),
             files=(chosen.path,),
             source=source.name,
             source_path=source.path,
@@ -139,7 +116,7 @@ def _problem(file: _File, *, known: bool) -> HipstaError | None:
             reason="template-space",
         )
     if not known:
-        return SchemeError(
+        return ProtocolError(
             f"{file.path}: no bundled protocol for HippUnfold's atlas {file.atlas}; "
             "describe its labels in a TOML file and pass it with --scheme",
             reason="unknown-atlas",

@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from hipsta_bids.errors import InputError, SchemeError
+from hipsta_bids.errors import InputError, ProtocolError
 from hipsta_bids.geometry.grid import in_plane_voxel
 from hipsta_bids.inputs.request import HemisphereInput
 from hipsta_bids.io.volumes import read_voxels
-from hipsta_bids.protocols.load import for_region, load_scheme, scheme_names
-from hipsta_bids.protocols.protocol import OUTSIDE, Part, Scheme, Tissue, translate
+from hipsta_bids.protocols.load import for_region, load_protocol, protocol_names
+from hipsta_bids.protocols.protocol import OUTSIDE, Part, Protocol, Tissue, translate
 from hipsta_bids.types import Bool, EditedMask, Float, LabelVolume
 
 # Body masks: what a person corrected, brought to the grid of the labels, and what is written.
@@ -28,25 +28,7 @@ def sample_mask(
 ) -> EditedMask:
     """Bring an edited mask to the grid of the labels.
 
-    Parameters
-    ----------
-    data : (L, M, N) array
-        Of zeros and one other value.
-    own, affine : (4, 4) float64
-        Of the mask and of the labels, voxel index to RAS mm.
-    shape : tuple of int
-        Of the labels.
-    path : Path
-        For messages.
-
-    Returns
-    -------
-    EditedMask
-
-    Raises
-    ------
-    InputError
-        ``edited-mask-not-binary`` or ``edited-mask-empty``.
+    ``own, affine`` Of the mask and of the labels, voxel index to RAS mm.
     """
     values = np.unique(data)
     if len(values) > 2 or not np.isfinite(values).all() or (len(values) == 2 and 0 not in values):  # noqa: PLR2004 (two)
@@ -79,17 +61,7 @@ def sample_nearest(
 ) -> NDArray[Any]:
     """Take labels at the nearest voxels of another grid; 0 outside of it.
 
-    Parameters
-    ----------
-    data : (L, M, N) array
-    own, affine : (4, 4) float64
-        Of the labels, and of the grid that is wanted, voxel index to RAS mm.
-    shape : tuple of int
-        Of the grid that is wanted.
-
-    Returns
-    -------
-    array of that shape
+    ``own, affine`` Of the labels, and of the grid that is wanted, voxel index to RAS mm.
     """
     to_own = np.linalg.inv(own) @ affine
     sampled: NDArray[Any] = ndimage.affine_transform(
@@ -101,18 +73,7 @@ def sample_nearest(
 def within(mask: Bool, affine: Float, box: tuple[slice, ...], own: Float) -> float:
     """Tell which share of a mask lies in a box of another grid.
 
-    Parameters
-    ----------
-    mask : (I, J, K) bool
-    affine, own : (4, 4) float64
-        Of the mask, and of the grid of the box, voxel index to RAS mm.
-    box : tuple of slice
-        Range of indices along each axis.
-
-    Returns
-    -------
-    float
-        0 for an empty mask.
+    ``affine, own`` Of the mask, and of the grid of the box, voxel index to RAS mm.
     """
     to_own = np.linalg.inv(own) @ affine
     index = np.argwhere(mask) @ to_own[:3, :3].T + to_own[:3, 3]
@@ -164,12 +125,12 @@ def read_label_volume(item: HemisphereInput, region: str = "body") -> LabelVolum
         ``unreadable-image``, ``not-3d``, ``bad-affine``, ``bad-voxel-size``,
         ``non-integer-labels``, ``empty-labels``, ``grid-mismatch``, or, of edited files,
         ``edited-elsewhere`` or what :func:`~hipsta_bids.bids.masks.sample_mask` raises.
-    SchemeError
+    ProtocolError
         ``unknown-labels`` or ``wrong-scheme``; ``no-cortex-labels`` if the protocol has none.
     """
     if item.problem is not None:
         raise item.problem
-    sheet = for_region(item.scheme, region).sheet
+    sheet = for_region(item.protocol, region).sheet
     labels, mask = item.edit("labels"), item.edit("mask")
     path = labels.path if labels else item.files[0]
     data, affine = read_voxels(path)
@@ -178,10 +139,12 @@ def read_label_volume(item: HemisphereInput, region: str = "body") -> LabelVolum
     codes = _one_hemisphere(_integers(data[box], path), item, path)
     shape = data.shape
     del data
-    tissue, part = _translate(codes, item.scheme, path)
+    tissue, part = _translate(codes, item.protocol, path)
     for other in item.files[1:]:
         more = _beside(other, path, shape, affine, edited=labels is not None)
-        _, parts = _translate(_integers(more[box], other), item.parts_scheme or item.scheme, other)
+        _, parts = _translate(
+            _integers(more[box], other), item.parts_protocol or item.protocol, other
+        )
         part = np.where(parts == Part.UNKNOWN, part, parts)
     part = np.where(tissue == Tissue.BACKGROUND, np.uint8(Part.UNKNOWN), part)
     hippocampal = ~np.isin(tissue, tuple(OUTSIDE.difference(sheet)))
@@ -194,7 +157,7 @@ def read_label_volume(item: HemisphereInput, region: str = "body") -> LabelVolum
         tissue=tissue[inner],
         part=part[inner],
         affine=cropped,
-        scheme=item.scheme,
+        protocol=item.protocol,
         edited_mask=(
             sample_mask(*read_voxels(mask.path), cropped, tissue[inner].shape, mask.path)
             if mask
@@ -241,21 +204,7 @@ def _check_same_place(
 
 
 def label_values(path: Path) -> frozenset[int]:
-    """List the distinct codes of a segmentation, without the background.
-
-    Parameters
-    ----------
-    path : Path
-
-    Returns
-    -------
-    frozenset of int
-
-    Raises
-    ------
-    InputError
-        As :func:`read_label_volume`.
-    """
+    """List the distinct codes of a segmentation, without the background."""
     data, _ = read_voxels(path)
     values = np.unique(_integers(data[data != 0], path))
     if not values.size:
@@ -309,7 +258,7 @@ def _one_hemisphere(
     """Keep one hemisphere's labels of a file that carries both, without the offset."""
     if not item.bilateral:
         return codes
-    offset = item.scheme.right_offset
+    offset = item.protocol.right_offset
     own = codes > offset if item.code_offset else (codes > 0) & (codes < offset)
     if not own.any():
         raise InputError(
@@ -320,16 +269,16 @@ def _one_hemisphere(
 
 
 def _translate(
-    codes: NDArray[np.integer[Any]], scheme: Scheme, path: Path
+    codes: NDArray[np.integer[Any]], protocol: Protocol, path: Path
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Translate codes; on failure name the file and the protocols that would fit."""
     try:
-        return translate(codes, scheme)
-    except SchemeError as error:
+        return translate(codes, protocol)
+    except ProtocolError as error:
         values = frozenset(np.unique(codes[codes != 0]).tolist())
-        fitting = [name for name in scheme_names() if load_scheme(name).fits(values)]
+        fitting = [name for name in protocol_names() if load_protocol(name).fits(values)]
         hint = f"; the labels fit {' and '.join(fitting)}" if fitting else ""
-        raise SchemeError(f"{path}: {error}{hint}", reason=error.reason) from error
+        raise ProtocolError(f"{path}: {error}{hint}", reason=error.reason) from error
 
 
 def _shift(affine: NDArray[np.float64], start: NDArray[np.int64]) -> NDArray[np.float64]:

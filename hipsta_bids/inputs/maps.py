@@ -28,25 +28,8 @@ COLUMNS = ("x", "y", "region")
 def read_regions(path: Path, shape: tuple[int, int]) -> Regions:
     """Read regions drawn on the sheet.
 
-    Parameters
-    ----------
-    path : Path
-        TSV with the columns ``x``, ``y`` (node numbers, from 1, as in the sheet table) and
-        ``region``; rows whose region is ``n/a`` or empty belong to none. Other columns of the sheet
-        table may be there too and are not looked at. A point may belong to several regions.
-    shape : tuple of int
-        Nodes of the sheet along x and y.
-
-    Returns
-    -------
-    Regions
-        In the order in which their names first occur.
-
-    Raises
-    ------
-    InputError
-        ``unreadable-table``, ``bad-table``, ``roi-columns``, ``roi-point``, ``roi-duplicate`` or
-        ``roi-empty``.
+    ``path`` TSV with the columns ````x````, ````y```` (node numbers, from 1, as in the sheet table)
+    and ````region````.
     """
     rows = files.read_tsv(path)
     columns = tuple(rows[0]) if rows else ()
@@ -127,19 +110,7 @@ class Found:
 
 
 def check_pattern(option: str, name: str, pattern: str) -> None:
-    """Refuse placeholders that do not exist.
-
-    Parameters
-    ----------
-    option, name : str
-        What the pattern was given for, for the message.
-    pattern : str
-
-    Raises
-    ------
-    UsageError
-        Names the placeholder.
-    """
+    """Refuse placeholders that do not exist."""
     try:
         unknown = fields_of(pattern) - set(PLACEHOLDERS)
     except ValueError:
@@ -158,18 +129,7 @@ def fields_of(pattern: str) -> set[str]:
 
 
 def fill(pattern: str, subject: str, session: str | None, hemi: str) -> str:
-    """Put one hemisphere's labels into a pattern.
-
-    Parameters
-    ----------
-    pattern : str
-    subject : str
-        Without ``sub-``.
-    session : str or None
-        Without ``ses-``; if there is none, the session's part of the path is left out.
-    hemi : str
-        ``L`` or ``R``.
-    """
+    """Put one hemisphere's labels into a pattern."""
     text = pattern if session else _SESSION.sub("", pattern)
     return text.format(subject=subject, session=session, hemi=hemi, side=_SIDES[hemi])
 
@@ -181,20 +141,7 @@ def find(name: str, root: Path) -> list[Path]:
 
 
 def scan(pattern: str, root: Path) -> list[Found]:
-    """Find the files of all hemispheres, with sessions or without.
-
-    Parameters
-    ----------
-    pattern : str
-        Checked; needs ``{subject}``.
-    root : Path
-        What it is relative to.
-
-    Returns
-    -------
-    list of Found
-        Sorted by path.
-    """
+    """Find the files of all hemispheres, with sessions or without."""
     found: dict[Path, Found] = {}
     for variant in dict.fromkeys((pattern, _SESSION.sub("", pattern))):
         expression = re.compile(_expression(variant))
@@ -256,22 +203,8 @@ def map_requests(
 ) -> tuple[MapRequest, ...]:
     """Combine and check the options about maps.
 
-    Parameters
-    ----------
-    patterns : sequence of (str, str)
-        Names and patterns.
-    samplings, interpolations : sequence of (str or None, str)
-        Choices for one name, or (None) for all that have no choice of their own.
-
-    Returns
-    -------
-    tuple of MapRequest
-
-    Raises
-    ------
-    UsageError
-        If a name occurs twice or belongs to other outputs, a placeholder is unknown, or a choice
-        is for a map that does not exist.
+    ``samplings, interpolations`` Choices for one name, or (None) for all that have no choice of
+    their own.
     """
     names = [name for name, _ in patterns]
     taken = {row.desc for row in (*OUTPUTS, *EXTRA_OUTPUTS)} | {"x", "y", *(m.name for m in MAPS)}
@@ -305,24 +238,7 @@ def attach(
     regions: Path | None,
     bids_dir: Path,
 ) -> tuple[tuple[HemisphereInput, ...], tuple[str, ...]]:
-    """Look for the volumes of each hemisphere.
-
-    Parameters
-    ----------
-    items : iterable of HemisphereInput
-    requests : sequence of MapRequest
-    regions : Path or None
-        Table of regions drawn on the sheet, the same for all.
-    bids_dir : Path
-        What patterns are relative to.
-
-    Returns
-    -------
-    items : tuple of HemisphereInput
-        With their maps, found or not.
-    notes : tuple of str
-        One line per map: for how many hemispheres there is a file.
-    """
+    """Look for the volumes of each hemisphere."""
     found = tuple(
         replace(
             item, maps=tuple(_source(item, wish, bids_dir) for wish in requests), regions=regions

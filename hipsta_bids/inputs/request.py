@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from hipsta_bids.errors import HipstaError
-from hipsta_bids.protocols.protocol import Scheme
+from hipsta_bids.protocols.protocol import Protocol
 
 #: Hemispheres as BIDS spells them.
 HEMIS = ("L", "R")
@@ -30,7 +30,7 @@ class InputRequest:
     """The FreeSurfer analysis to take, such as ``T1`` or ``T1-T2.v21``."""
     ashs_atlas: str | None = None
     """Name of a bundled ASHS protocol (with or without ``ashs``), or a protocol file."""
-    scheme: Path | None = None
+    protocol: Path | None = None
     """The user's protocol file, for labels that no bundled protocol describes (for ASHS's, see
     ``ashs_atlas``)."""
     edited_dir: Path | None = None
@@ -81,14 +81,14 @@ class HemisphereInput:
     """Without ``ses-``; None where the dataset has no sessions."""
     hemi: str
     """``L`` or ``R``."""
-    scheme: Scheme
+    protocol: Protocol
     files: tuple[Path, ...]
     """The file with subfields and, if parts come from another file, that one."""
-    parts_scheme: Scheme | None = None
+    parts_protocol: Protocol | None = None
     """The protocol of the second file."""
     bilateral: bool = False
     """The file carries both hemispheres, the right-hand codes shifted by
-    ``scheme.right_offset``."""
+    ``protocol.right_offset``."""
     code_offset: int = 0
     """To be subtracted from the codes of this hemisphere."""
     source: str
@@ -121,4 +121,4 @@ class HemisphereInput:
     @property
     def key(self) -> tuple[str, str, str, str]:
         """What the names of the outputs consist of: two inputs may not share it."""
-        return self.subject, self.session or "", self.hemi, self.scheme.name
+        return self.subject, self.session or "", self.hemi, self.protocol.name

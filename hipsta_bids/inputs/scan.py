@@ -12,8 +12,8 @@ from typing import Any
 
 from hipsta_bids.errors import InputError, UsageError
 from hipsta_bids.inputs.request import HEMIS, InputRequest
-from hipsta_bids.protocols.load import load_scheme
-from hipsta_bids.protocols.protocol import Scheme
+from hipsta_bids.protocols.load import load_protocol
+from hipsta_bids.protocols.protocol import Protocol
 
 #: ``sub-X``, ``sub-X_ses-Y``, and FreeSurfer's longitudinal ``sub-X_ses-Y.long.BASE``.
 _SUBJECT = re.compile(
@@ -54,22 +54,7 @@ class Visit:
 
 
 def list_folder(path: Path) -> tuple[list[str], list[str]]:
-    """List a folder.
-
-    Parameters
-    ----------
-    path : Path
-
-    Returns
-    -------
-    folders, files : list of str
-        Sorted names; hidden ones are left out.
-
-    Raises
-    ------
-    InputError
-        ``missing-folder``, ``not-a-folder`` or ``unreadable-folder``.
-    """
+    """List a folder."""
     folders: list[str] = []
     files: list[str] = []
     try:
@@ -94,21 +79,7 @@ def list_folder(path: Path) -> tuple[list[str], list[str]]:
 
 
 def subject_folders(root: Path) -> list[SubjectFolder]:
-    """List the subjects' folders of a dataset, sorted by name.
-
-    Parameters
-    ----------
-    root : Path
-
-    Returns
-    -------
-    list of SubjectFolder
-
-    Raises
-    ------
-    InputError
-        If the folder cannot be listed.
-    """
+    """List the subjects' folders of a dataset, sorted by name."""
     matches = ((name, _SUBJECT.fullmatch(name)) for name in list_folder(root)[0])
     return [
         SubjectFolder(
@@ -123,22 +94,7 @@ def subject_folders(root: Path) -> list[SubjectFolder]:
 
 
 def list_visits(folders: Iterable[SubjectFolder]) -> list[Visit]:
-    """List the candidate files of some subjects.
-
-    Parameters
-    ----------
-    folders : iterable of SubjectFolder
-
-    Returns
-    -------
-    list of Visit
-        One per subject and session; ``sub-X/ses-Y`` and ``sub-X_ses-Y`` are the same visit.
-
-    Raises
-    ------
-    InputError
-        If a folder cannot be listed.
-    """
+    """List the candidate files of some subjects."""
     found: dict[tuple[str, str | None], list[Folder]] = {}
     for folder in folders:
         for session, inner in _inner_folders(folder):
@@ -171,14 +127,7 @@ def _inner_folders(folder: SubjectFolder) -> Iterator[tuple[str | None, Folder]]
 def read_description(root: Path) -> dict[str, Any] | None:
     """Read a dataset's ``dataset_description.json``.
 
-    Parameters
-    ----------
-    root : Path
-
-    Returns
-    -------
-    dict or None
-        None if there is none; an empty one if it cannot be understood (nothing depends on it).
+    Returns an empty one if it cannot be understood (nothing depends on it).
     """
     try:
         contents = json.loads((root / "dataset_description.json").read_text("utf-8"))
@@ -190,17 +139,7 @@ def read_description(root: Path) -> dict[str, Any] | None:
 
 
 def generators(description: dict[str, Any] | None) -> frozenset[str]:
-    """Name the software that a dataset says it was made with, in lower case.
-
-    Parameters
-    ----------
-    description : dict or None
-        Contents of ``dataset_description.json``.
-
-    Returns
-    -------
-    frozenset of str
-    """
+    """Name the software that a dataset says it was made with, in lower case."""
     entries = (description or {}).get("GeneratedBy")
     if not isinstance(entries, list):
         entries = [(description or {}).get("PipelineDescription")]  # BIDS before 1.4
@@ -242,19 +181,6 @@ def list_sources(request: InputRequest) -> tuple[Source, ...]:
     itself where it is a derivative dataset. Folders of these that hold no ``sub-*`` are searched
     two levels down, and ``sourcedata`` inside of derivatives too (fMRIPrep keeps FreeSurfer's
     folder there). Our own outputs are left out.
-
-    Parameters
-    ----------
-    request : InputRequest
-
-    Returns
-    -------
-    tuple of Source
-
-    Raises
-    ------
-    InputError
-        If ``bids_dir`` or a folder that the user gave is missing or cannot be listed.
     """
     sources: dict[Path, Source] = {}
     for source in _candidates(request):
@@ -335,7 +261,7 @@ class Selection:
     """By entity, in pybids's long names; from the filter file."""
     fs_analysis: str | None = None
     """The FreeSurfer analysis to take."""
-    scheme: Scheme | None = None
+    protocol: Protocol | None = None
     """The user's protocol."""
 
     def wants_folder(self, folder: SubjectFolder) -> bool:
@@ -369,25 +295,7 @@ class Selection:
 
 
 def make_selection(request: InputRequest) -> Selection:
-    """Prepare what the user asked for.
-
-    Parameters
-    ----------
-    request : InputRequest
-
-    Returns
-    -------
-    Selection
-
-    Raises
-    ------
-    UsageError
-        ``bad-label``, ``bad-hemisphere`` or ``bad-filter``.
-    InputError
-        ``unreadable-filter``.
-    SchemeError
-        If the user's protocol is not valid.
-    """
+    """Prepare what the user asked for."""
     wrong = [hemi for hemi in request.hemis if hemi not in HEMIS]
     if wrong or not request.hemis:
         raise UsageError(
@@ -400,7 +308,7 @@ def make_selection(request: InputRequest) -> Selection:
         hemis=request.hemis,
         rules=_rules(request.bids_filter_file) if request.bids_filter_file else {},
         fs_analysis=request.fs_analysis,
-        scheme=load_scheme(request.scheme) if request.scheme else None,
+        protocol=load_protocol(request.protocol) if request.protocol else None,
     )
 
 
@@ -491,20 +399,6 @@ def list_participants(request: InputRequest) -> frozenset[str]:
 
     From pybids's index where the user gave a place for it (made there on first use); otherwise from
     the names of the folders, as indexing thousands of subjects takes minutes.
-
-    Parameters
-    ----------
-    request : InputRequest
-
-    Returns
-    -------
-    frozenset of str
-        Labels without ``sub-``.
-
-    Raises
-    ------
-    InputError
-        ``unreadable-database`` if pybids cannot use the index.
     """
     if request.bids_database_dir is None:
         return frozenset(folder.subject for folder in subject_folders(request.bids_dir))

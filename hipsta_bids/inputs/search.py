@@ -29,7 +29,7 @@ from hipsta_bids.inputs.scan import (
     subject_folders,
 )
 from hipsta_bids.inputs.tables import forget_folders
-from hipsta_bids.protocols.protocol import Scheme
+from hipsta_bids.protocols.protocol import Protocol
 
 __all__ = [
     "HEMIS",
@@ -73,25 +73,6 @@ def find_inputs(request: InputRequest) -> Findings:
     Different protocols of one hemisphere (say, FreeSurfer's and ASHS's) are separate inputs. Where
     two datasets offer the same protocol, the one that the user named comes first, then the order
     of :func:`~hipsta_bids.bids.sources.list_sources`; usable comes before unusable.
-
-    Parameters
-    ----------
-    request : InputRequest
-
-    Returns
-    -------
-    Findings
-
-    Raises
-    ------
-    InputError
-        A folder or file that the user gave is missing or cannot be read.
-    UsageError
-        An option's value is not possible.
-    SchemeError
-        The user's protocol is not valid, or ``ashs_atlas`` is not known.
-    NothingToDoError
-        ``no-segmentation`` or ``no-match``: nothing was found, or nothing of what is asked for.
     """
     selection = make_selection(request)
     option = choose_atlas(request)
@@ -113,20 +94,6 @@ def list_subjects(request: InputRequest) -> tuple[str, ...]:
     """List the subjects that are asked for and have a folder in any dataset to be searched.
 
     Takes one listing per dataset: what is in the folders is not looked at.
-
-    Parameters
-    ----------
-    request : InputRequest
-
-    Returns
-    -------
-    tuple of str
-        Sorted labels without ``sub-``.
-
-    Raises
-    ------
-    InputError, UsageError, SchemeError
-        As :func:`find_inputs`.
     """
     selection = make_selection(request)
     return tuple(
@@ -142,25 +109,14 @@ def list_subjects(request: InputRequest) -> tuple[str, ...]:
 
 
 def selection_table(items: Iterable[HemisphereInput]) -> list[dict[str, str]]:
-    """Describe what was found and why, one row per hemisphere and protocol.
-
-    Parameters
-    ----------
-    items : iterable of HemisphereInput
-
-    Returns
-    -------
-    list of dict
-        Keys ``subject``, ``session``, ``hemisphere``, ``file``, ``scheme``, ``why``, ``edited``
-        and ``passed over``; ``n/a`` where there is nothing to say.
-    """
+    """Describe what was found and why, one row per hemisphere and protocol."""
     return [
         {
             "subject": item.subject,
             "session": item.session or "n/a",
             "hemisphere": item.hemi,
             "file": " + ".join(_relative(path, item.source_path) for path in item.files),
-            "scheme": item.scheme.name,
+            "scheme": item.protocol.name,
             "why": "; ".join((f"{item.source}: {item.why}", *item.notes))
             + (f"; NOT USABLE: {item.problem}" if item.problem else ""),
             "edited": " + ".join(_relative(edit.path, edit.source_path) for edit in item.edits)
@@ -172,19 +128,7 @@ def selection_table(items: Iterable[HemisphereInput]) -> list[dict[str, str]]:
 
 
 def dataset_notes(request: InputRequest, items: Iterable[HemisphereInput]) -> tuple[str, ...]:
-    """Say what a user should know about the dataset as a whole.
-
-    Parameters
-    ----------
-    request : InputRequest
-    items : iterable of HemisphereInput
-        What :func:`find_hemispheres` returned.
-
-    Returns
-    -------
-    tuple of str
-        One line each: a missing description, participants without any segmentation.
-    """
+    """Say what a user should know about the dataset as a whole."""
     notes = []
     if read_description(request.bids_dir) is None:
         notes.append(
@@ -201,7 +145,7 @@ def dataset_notes(request: InputRequest, items: Iterable[HemisphereInput]) -> tu
 def _search(
     source: Source,
     selection: Selection,
-    option: Scheme | None,
+    option: Protocol | None,
     edited: list[EditedFile],
 ) -> Iterator[HemisphereInput]:
     """Search one dataset for all kinds of segmentations, and add the edited files beside them."""
@@ -247,7 +191,7 @@ def _without_clashes(
 
 def _check_analysis(found: list[HemisphereInput], request: InputRequest) -> None:
     """Refuse an analysis that no hemisphere has: it is a slip of the pen."""
-    asked = [item for item in found if item.scheme.tool == "freesurfer"]
+    asked = [item for item in found if item.protocol.tool == "freesurfer"]
     missing = [
         item.problem for item in asked if item.problem and item.problem.reason == "analysis-missing"
     ]

@@ -22,17 +22,7 @@ _SNAP_NAME = "snaplabels.txt"
 def find_table(image: Path, root: Path) -> Path | None:
     """Find the label table that applies to an image.
 
-    Parameters
-    ----------
-    image : Path
-    root : Path
-        The dataset: the search goes up to here.
-
-    Returns
-    -------
-    Path or None
-        In the nearest folder that has one: a ``_dseg.tsv`` whose entities all occur in the image's
-        name (BIDS's inheritance principle; the most specific one), or a ``snaplabels.txt``.
+    Returns.
     """
     own = entities(image.name)
     for folder in (image.parent, *image.parent.parents):
@@ -52,23 +42,7 @@ def find_table(image: Path, root: Path) -> Path | None:
 
 
 def read_table(path: Path) -> tuple[NamedCode, ...]:
-    """Read a label table.
-
-    Parameters
-    ----------
-    path : Path
-        ``snaplabels.txt``, or a TSV with the columns ``index`` and ``name`` (and ``abbreviation``,
-        ``color``), as in BIDS 1.9, section "Common image-derived labels".
-
-    Returns
-    -------
-    tuple of NamedCode
-
-    Raises
-    ------
-    InputError
-        ``unreadable-table`` if the file cannot be read or understood.
-    """
+    """Read a label table."""
     try:
         text = path.read_text("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:

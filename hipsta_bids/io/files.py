@@ -38,20 +38,7 @@ def is_disk_full(error: OSError) -> bool:
 
 
 def output_error(path: Path, error: OSError) -> OutputError:
-    """Translate a system error on writing into one that a user can act on.
-
-    Parameters
-    ----------
-    path : Path
-        What could not be written.
-    error : OSError
-        What the system said.
-
-    Returns
-    -------
-    OutputError
-        With the reason ``disk-full``, ``read-only`` or ``not-writable``.
-    """
+    """Translate a system error on writing into one that a user can act on."""
     if is_disk_full(error):
         return OutputError(
             f"{path}: no space left ({error.strerror}); free some and run the same command again",
@@ -70,13 +57,7 @@ def output_error(path: Path, error: OSError) -> OutputError:
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder and its parents; one that exists already is fine.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be made.
-    """
+    """Make a folder and its parents; one that exists already is fine."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -84,13 +65,7 @@ def make_folder(path: Path) -> None:
 
 
 def check_writable(folder: Path) -> None:
-    """Make a folder if need be and prove that files can be written there.
-
-    Raises
-    ------
-    OutputError
-        If not.
-    """
+    """Make a folder if need be and prove that files can be written there."""
     make_folder(folder)
     probe = _aside(folder / "write-probe")
     try:
@@ -104,13 +79,7 @@ def check_writable(folder: Path) -> None:
 
 
 def check_scratch(folder: Path | None = None) -> None:
-    """Prove that temporary files can be written, in a folder or where the system has them.
-
-    Raises
-    ------
-    OutputError
-        If not.
-    """
+    """Prove that temporary files can be written, in a folder or where the system has them."""
     if folder is not None:
         check_writable(folder)
         return
@@ -125,20 +94,7 @@ def check_scratch(folder: Path | None = None) -> None:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file atomically, making its folder if need be.
-
-    Parameters
-    ----------
-    path : Path
-        Final name; replaced if it exists.
-    content : bytes
-        All of it.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be written; the earlier file, if any, is then unharmed.
-    """
+    """Write a file atomically, making its folder if need be."""
     make_folder(path.parent)
     aside = _aside(path)
     try:
@@ -173,13 +129,7 @@ def hide_home(text: str) -> str:
 
 
 def remove(paths: Iterable[Path]) -> None:
-    """Remove files; those that do not exist are fine.
-
-    Raises
-    ------
-    OutputError
-        If one cannot be removed.
-    """
+    """Remove files; those that do not exist are fine."""
     for path in paths:
         try:
             path.unlink(missing_ok=True)
@@ -188,15 +138,7 @@ def remove(paths: Iterable[Path]) -> None:
 
 
 def remove_leftovers(folder: Path, pattern: str) -> None:
-    """Remove what a killed run left half-written.
-
-    Parameters
-    ----------
-    folder : Path
-        Where the results are.
-    pattern : str
-        Glob pattern of the final names.
-    """
+    """Remove what a killed run left half-written."""
     remove(folder.glob(f".{pattern}.*{_TEMPORARY}"))
 
 
@@ -234,13 +176,7 @@ def plain(value: Any) -> Any:  # noqa: ANN401  (JSON values have no narrower com
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, unreadable, or not a JSON object.
-    """
+    """Read a JSON object."""
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -254,32 +190,14 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def write_tsv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Write a BIDS table atomically.
-
-    Parameters
-    ----------
-    path : Path
-        Final name.
-    columns : sequence of str
-        Header.
-    rows : iterable of sequence of str
-        Cells as they shall appear; empty ones become ``n/a``; tabs and line breaks in them
-        become blanks.
-    """
+    """Write a BIDS table atomically."""
     lines = ["\t".join(columns)]
     lines += ["\t".join(" ".join(cell.split()) or MISSING for cell in row) for row in rows]
     write_text(path, "\n".join(lines) + "\n")
 
 
 def read_tsv(path: Path) -> list[dict[str, str]]:
-    """Read a BIDS table as text cells.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or unreadable, a row has another length than the header, or a name
-        stands in this twice.
-    """
+    """Read a BIDS table as text cells."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError as error:
@@ -310,18 +228,7 @@ def read_tsv(path: Path) -> list[dict[str, str]]:
 
 
 def sha256_of(path: Path) -> str:
-    """Hash the content of a file.
-
-    Returns
-    -------
-    str
-        64 hexadecimal digits.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read.
-    """
+    """Hash the content of a file."""
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
@@ -347,23 +254,6 @@ def locked(root: Path, what: str) -> Iterator[bool]:
 
     A process may hold one lock at a time: with POSIX's record locks, to let go of one is to let go
     of all that it has on the same file.
-
-    Parameters
-    ----------
-    root : Path
-        The output dataset.
-    what : str
-        Any name.
-
-    Yields
-    ------
-    bool
-        Whether there is a lock: some network file systems have none, and single runs still work.
-
-    Raises
-    ------
-    OutputError
-        If the file of the locks cannot be made.
     """
     folder = root / LOGS
     make_folder(folder)
@@ -383,19 +273,7 @@ def locked(root: Path, what: str) -> Iterator[bool]:
 
 
 def entities(name: str) -> dict[str, str]:
-    """Split a BIDS file name.
-
-    Parameters
-    ----------
-    name : str
-        Without folders.
-
-    Returns
-    -------
-    dict
-        Entities by their short key (``sub``, ``hemi``, ``desc``), in the order of the name, and
-        ``suffix`` and ``extension``. Parts without a dash, apart from the suffix, are left out.
-    """
+    """Split a BIDS file name."""
     stem, dot, extension = name.partition(".")
     *parts, suffix = stem.split("_")
     pairs = dict(part.split("-", 1) for part in parts if "-" in part)

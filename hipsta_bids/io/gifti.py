@@ -37,20 +37,7 @@ _STRUCTURE = {"L": "HippocampusLeft", "R": "HippocampusRight"}
 
 
 def sheet_triangles(nx: int, ny: int, *, flip: bool = False) -> Int:
-    """Triangulate a regular grid, two triangles per cell.
-
-    Parameters
-    ----------
-    nx, ny : int
-        Numbers of nodes along x and y; node (i, j) is vertex ``i * ny + j``.
-    flip : bool
-        Turn all triangles round.
-
-    Returns
-    -------
-    (2 (nx - 1) (ny - 1), 3) int32
-        Counterclockwise seen from the side that x cross y points to, unless flipped.
-    """
+    """Triangulate a regular grid, two triangles per cell."""
     index = np.arange(nx * ny, dtype=np.int32).reshape(nx, ny)
     a, b = index[:-1, :-1].ravel(), index[1:, :-1].ravel()
     c, d = index[1:, 1:].ravel(), index[:-1, 1:].ravel()
@@ -63,23 +50,7 @@ def surface_bytes(
 ) -> bytes:
     """Encode a surface.
 
-    Parameters
-    ----------
-    points : (V, 3) float64
-        Vertices in mm: scanner RAS, or the plane of the unfolded sheet.
-    triangles : (F, 3) int32
-        Outward oriented.
-    hemi : str
-        ``L`` or ``R``.
-    secondary : str or None
-        Workbench's secondary surface type, where it has one that fits.
-    unfolded : bool
-        Whether the points lie in the unfolded space, which is no scanner's.
-
-    Returns
-    -------
-    bytes
-        A ``.surf.gii`` file.
+    ``points`` Vertices in mm: scanner RAS, or the plane of the unfolded sheet.
     """
     meta = {
         "AnatomicalStructurePrimary": _STRUCTURE[hemi],
@@ -107,19 +78,7 @@ def surface_bytes(
 def shape_bytes(values: Float, *, hemi: str, name: str, unit: str) -> bytes:
     """Encode one number per vertex.
 
-    Parameters
-    ----------
-    values : (V,) float64
-        NaN where missing.
-    hemi : str
-        ``L`` or ``R``.
-    name, unit : str
-        What the map is called in viewers, and its unit.
-
-    Returns
-    -------
-    bytes
-        A ``.shape.gii`` file.
+    ``values`` NaN where missing.
     """
     array = GiftiDataArray(
         values.astype(np.float32),
@@ -133,21 +92,7 @@ def shape_bytes(values: Float, *, hemi: str, name: str, unit: str) -> bytes:
 def maps_bytes(values: Float, *, hemi: str, names: Sequence[str], series: bool = True) -> bytes:
     """Encode one or several numbers per vertex, of unknown unit.
 
-    Parameters
-    ----------
-    values : (V, T) float64
-        NaN where missing.
-    hemi : str
-        ``L`` or ``R``.
-    names : sequence of str
-        What the T maps are called in viewers.
-    series : bool
-        Whether several are a series, as over time.
-
-    Returns
-    -------
-    bytes
-        A ``.shape.gii`` file, or of a series a ``.func.gii`` file.
+    ``values`` NaN where missing.
     """
     kind = "NIFTI_INTENT_SHAPE" if len(names) == 1 or not series else "NIFTI_INTENT_TIME_SERIES"
     arrays = [
@@ -165,24 +110,7 @@ def maps_bytes(values: Float, *, hemi: str, names: Sequence[str], series: bool =
 def label_bytes(
     keys: NDArray[np.uint8], *, hemi: str, name: str, table: Mapping[int, tuple[str, str]]
 ) -> bytes:
-    """Encode one label per vertex.
-
-    Parameters
-    ----------
-    keys : (V,) uint8
-        Labels; 0 is none.
-    hemi : str
-        ``L`` or ``R``.
-    name : str
-        What the map is called in viewers.
-    table : mapping of int to (str, str)
-        Name and ``#rrggbb`` color per key.
-
-    Returns
-    -------
-    bytes
-        A ``.label.gii`` file.
-    """
+    """Encode one label per vertex."""
     array = GiftiDataArray(
         keys.astype(np.int32),
         intent="NIFTI_INTENT_LABEL",
@@ -213,20 +141,7 @@ def _encode(
 def read_points(path: Path) -> Float:
     """Read the vertices of a surface.
 
-    Parameters
-    ----------
-    path : Path
-        A ``.surf.gii`` file.
-
-    Returns
-    -------
-    (V, 3) float64
-        RAS mm.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read.
+    Returns RAS mm.
     """
     try:
         image = GiftiImage.from_bytes(path.read_bytes())
@@ -264,24 +179,7 @@ class PointMap:
 
 
 def read_map(path: Path, name: str) -> PointMap:
-    """Read a map.
-
-    Parameters
-    ----------
-    path : Path
-        ``.gii`` with one array, or ``.tsv`` with one row per point.
-    name : str
-        Column of a table that has several.
-
-    Returns
-    -------
-    PointMap
-
-    Raises
-    ------
-    InputError
-        If it cannot be read, or holds several maps.
-    """
+    """Read a map."""
     if path.suffix == ".tsv":
         return _from_table(path, name)
     image = _load(path)
@@ -333,22 +231,7 @@ def _nodes(rows: list[dict[str, str]]) -> tuple[int, int] | None:
 
 
 def read_mesh(path: Path) -> Mesh:
-    """Read a surface.
-
-    Parameters
-    ----------
-    path : Path
-        ``.surf.gii``.
-
-    Returns
-    -------
-    Mesh
-
-    Raises
-    ------
-    InputError
-        If it is none.
-    """
+    """Read a surface."""
     image = _load(path)
     found = [
         image.get_arrays_from_intent(f"NIFTI_INTENT_{intent}")
@@ -408,17 +291,7 @@ COORDINATE_NAMES = ("medial_lateral", "posterior_anterior", "interior_exterior")
 def mesh_bytes(mesh: TetMesh, coordinates: Coordinates) -> bytes:
     """Encode a tetrahedral mesh with its coordinates.
 
-    Parameters
-    ----------
-    mesh : TetMesh
-        Vertices in RAS mm.
-    coordinates : Coordinates
-        Three values per vertex in [-1, 1].
-
-    Returns
-    -------
-    bytes
-        A ``.vtu`` file (XML, compressed binary data).
+    ``mesh`` Vertices in RAS mm. Returns A ````.vtu```` file (XML, compressed binary data).
     """
     data = meshio.Mesh(
         mesh.vertices,

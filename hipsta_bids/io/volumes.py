@@ -44,21 +44,7 @@ _SPACE = 3
 def read_voxels(path: Path) -> tuple[NDArray[Any], Float]:
     """Read a 3-D image of labels or a mask.
 
-    Parameters
-    ----------
-    path : Path
-
-    Returns
-    -------
-    data : (I, J, K) array
-        In the type on disk, scaled if the header says so.
-    affine : (4, 4) float64
-        Voxel index to RAS mm.
-
-    Raises
-    ------
-    InputError
-        ``unreadable-image``, ``not-3d``, ``bad-affine`` or ``bad-voxel-size``.
+    Returns Voxel index to RAS mm.
     """
     with _opened(path) as image:
         data = np.asanyarray(image.dataobj)
@@ -78,22 +64,7 @@ def read_voxels(path: Path) -> tuple[NDArray[Any], Float]:
 def read_scalars(path: Path, points: Float) -> ScalarVolume:
     """Read what an image holds round some points.
 
-    Parameters
-    ----------
-    path : Path
-        NIfTI or MGZ with one number per voxel, or several (the fourth axis).
-    points : (N, 3) float64
-        RAS mm; only the box of voxels round them is kept in memory.
-
-    Returns
-    -------
-    ScalarVolume
-
-    Raises
-    ------
-    InputError
-        ``unreadable-image``, ``not-scalar``, ``too-many-axes``, ``empty-image``, ``bad-affine`` or
-        ``bad-voxel-size``.
+    ``points`` RAS mm.
     """
     with _opened(path) as image:
         _check_scalar(image, path)
@@ -214,17 +185,7 @@ def _check_affine(
 
 
 def mask_bytes(mask: BodyMask) -> bytes:
-    """Encode a mask as a compressed NIfTI image.
-
-    Parameters
-    ----------
-    mask : BodyMask
-
-    Returns
-    -------
-    bytes
-        The same for the same mask: without a time stamp.
-    """
+    """Encode a mask as a compressed NIfTI image."""
     image: Any = nib.Nifti1Image(mask.inside.astype(np.uint8), mask.affine)
     image.set_sform(mask.affine, code=1)
     # Some viewers read the qform only.

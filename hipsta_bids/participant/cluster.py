@@ -44,13 +44,7 @@ class Cluster:
 
 
 def check_cluster(cluster: Cluster) -> None:
-    """Check that Dask is there.
-
-    Raises
-    ------
-    UsageError
-        If it is not installed, or both kinds of workers are asked for.
-    """
+    """Check that Dask is there."""
     if cluster.scheduler is not None and cluster.slurm is not None:
         raise UsageError("give --dask-scheduler or --slurm, not both", reason="usage")
     try:
@@ -70,27 +64,7 @@ def check_cluster(cluster: Cluster) -> None:
 def run_on_cluster(
     cluster: Cluster, plan: WorkerPlan, jobs: Iterable[Any]
 ) -> Generator[tuple[Any, Any]]:
-    """Work off jobs on a cluster; closing the generator stops what runs there.
-
-    Parameters
-    ----------
-    cluster : Cluster
-        Where.
-    plan : WorkerPlan
-        How; ``n_workers`` counts SLURM jobs.
-    jobs : iterable
-        Picklable.
-
-    Yields
-    ------
-    (job, result)
-        As :func:`~hipsta_bids.pool.run_jobs` does.
-
-    Raises
-    ------
-    UsageError
-        If there are no workers to be had, or they are not like us.
-    """
+    """Work off jobs on a cluster; closing the generator stops what runs there."""
     check_cluster(cluster)
     with contextlib.ExitStack() as stack:
         client = _connect(cluster, plan, stack)
@@ -263,41 +237,12 @@ class Shard:
         return f"{self.index}of{self.count}"
 
     def take(self, subjects: Iterable[str]) -> tuple[str, ...]:
-        """Choose this part of some subjects, in whatever order they come.
-
-        Parameters
-        ----------
-        subjects : iterable of str
-            All of them; repetitions do not count.
-
-        Returns
-        -------
-        tuple of str
-            Sorted. Over all parts each subject comes once; the sizes differ by one at most.
-        """
+        """Choose this part of some subjects, in whatever order they come."""
         return tuple(sorted(set(subjects))[self.index - 1 :: self.count])
 
 
 def parse_shard(text: str, environment: Mapping[str, str]) -> Shard:
-    """Read ``I/N``, or take both from SLURM's array job.
-
-    Parameters
-    ----------
-    text : str
-        ``I/N`` or ``slurm``.
-    environment : mapping
-        Where SLURM says which task of an array this is.
-
-    Returns
-    -------
-    Shard
-
-    Raises
-    ------
-    UsageError
-        If the text is something else, the part does not exist, or this is no array job, or one
-        whose numbers leave gaps.
-    """
+    """Read ``I/N``, or take both from SLURM's array job."""
     if text == FROM_SLURM:
         return _from_array(environment)
     match = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", text)

@@ -16,7 +16,7 @@ from hipsta_bids import __version__
 from hipsta_bids.derivatives import hemisphere
 from hipsta_bids.derivatives.dataset import source_address
 from hipsta_bids.derivatives.hemisphere import ResultPlace
-from hipsta_bids.errors import GeometryError, HipstaError, InputError, OutputError, SchemeError
+from hipsta_bids.errors import GeometryError, HipstaError, InputError, OutputError, ProtocolError
 from hipsta_bids.inputs.request import HemisphereInput
 from hipsta_bids.io import files
 from hipsta_bids.io.files import locked
@@ -77,19 +77,7 @@ class Outcome:
 
 
 def recorded(job: Job) -> Outcome | None:
-    """Read how a hemisphere ended, if it did with the same settings and version.
-
-    Parameters
-    ----------
-    job : Job
-        What would be done.
-
-    Returns
-    -------
-    Outcome or None
-        ``None`` too if there should be files that are not there. Whether inputs have changed since
-        then is not looked at.
-    """
+    """Read how a hemisphere ended, if it did with the same settings and version."""
     try:
         record = files.read_json(job.place.path("qc"))
         status = Status(record.get("status", ""))
@@ -113,25 +101,13 @@ def recorded(job: Job) -> Outcome | None:
 
 
 def finished(job: Job) -> Outcome | None:
-    """Recognize a hemisphere that an earlier run has done just so.
-
-    Parameters
-    ----------
-    job : Job
-        What would be done.
-
-    Returns
-    -------
-    Outcome or None
-        Its outcome if all files are there and inputs, settings and version are unchanged.
-        Failed hemispheres are always tried again: what stood in the way may be gone.
-    """
+    """Recognize a hemisphere that an earlier run has done just so."""
     outcome = None if job.force else recorded(job)
     if outcome is None or outcome.status == Status.FAILED:
         return None
     try:
         digest, _ = hash_inputs(job)
-    except (InputError, SchemeError):
+    except (InputError, ProtocolError):
         return None
     return outcome if outcome.input_hash == digest else None
 
@@ -148,9 +124,9 @@ def base_record(job: Job) -> dict[str, Any]:
         "edited": [
             {"what": edit.kind, "file": source_address(edit.path, sources)} for edit in item.edits
         ],
-        "scheme": item.scheme.name,
+        "scheme": item.protocol.name,
         "region": job.settings.body.region,
-        "scheme_title": item.scheme.title,
+        "scheme_title": item.protocol.title,
         "chosen_because": item.why,
         "passed_over": [
             {"file": source_address(Path(path), sources), "reason": why}
@@ -161,28 +137,9 @@ def base_record(job: Job) -> dict[str, Any]:
 
 
 def hash_inputs(job: Job) -> tuple[str, dict[str, list[dict[str, str]]]]:
-    """Hash the input files and how they are read.
-
-    Parameters
-    ----------
-    job : Job
-        Whose inputs.
-
-    Returns
-    -------
-    tuple of (str, dict)
-        One hash of everything that decides what is measured, besides settings and version; and
-        address and hash per file: ``inputs``, and what a person ``edited`` of them.
-
-    Raises
-    ------
-    InputError
-        If a file cannot be read.
-    SchemeError
-        If the protocol has no labels of the region.
-    """
+    """Hash the input files and how they are read."""
     item, sources = job.item, dict(job.sources)
-    region = for_region(item.scheme, job.settings.body.region)
+    region = for_region(item.protocol, job.settings.body.region)
     hashes = [
         {"file": source_address(path, sources), "sha256": files.sha256_of(path)}
         for path in item.files
@@ -200,15 +157,15 @@ def hash_inputs(job: Job) -> tuple[str, dict[str, list[dict[str, str]]]]:
         # The wording of the protocols (titles, citations) does not change what is read.
         [
             [label.code, int(label.tissue), int(label.part)]
-            for scheme in (item.scheme, item.parts_scheme)
-            if scheme is not None
-            for label in scheme.labels
+            for protocol in (item.protocol, item.parts_protocol)
+            if protocol is not None
+            for label in protocol.labels
         ],
         [
             [int(tissue) for tissue in group]
-            for group in (region.sheet, item.scheme.layer, item.scheme.interior)
+            for group in (region.sheet, item.protocol.layer, item.protocol.interior)
         ],
-        [item.scheme.unlisted, item.bilateral, item.code_offset, item.hemi],
+        [item.protocol.unlisted, item.bilateral, item.code_offset, item.hemi],
         sorted([entry["what"], entry["sha256"]] for entry in edited),
         *signal_hash(item),
     ]
@@ -310,17 +267,6 @@ def run_job(job: Job) -> Outcome:
     """Measure one hemisphere and write its results; never raises a foreseen error.
 
     Where another run is just doing the same, it is waited for, and its results are taken.
-
-    Parameters
-    ----------
-    job : Job
-        What to do.
-
-    Returns
-    -------
-    Outcome
-        ``failed`` hemispheres leave nothing but their quality record and, if the labels tell, the
-        mask of the body.
     """
     try:
         with locked(job.place.root, job.title):
@@ -351,7 +297,7 @@ def _measure(job: Job) -> Outcome:
             hemisphere.write_results(
                 job.place,
                 maps,
-                for_region(job.item.scheme, job.settings.body.region),
+                for_region(job.item.protocol, job.settings.body.region),
                 record,
                 write_meshes=job.write_meshes,
                 write_more=lambda: write_signals(job.place, maps, mapped),
@@ -391,28 +337,7 @@ def fail(
     body: BodyMask | None = None,
     **spent: Any,  # noqa: ANN401  (fields of Outcome)
 ) -> Outcome:
-    """Record that a hemisphere failed, and remove what it had.
-
-    Parameters
-    ----------
-    job : Job
-        Whose failure.
-    error : HipstaError
-        Why.
-    trace : str, optional
-        Traceback, if it is a bug.
-    record : dict, optional
-        What is known about its inputs.
-    body : BodyMask, optional
-        What could not be measured, for a person to correct.
-    **spent
-        Times and memory, as fields of :class:`Outcome`.
-
-    Returns
-    -------
-    Outcome
-        With the error of writing instead, if not even the record can be written.
-    """
+    """Record that a hemisphere failed, and remove what it had."""
     record = base_record(job) if record is None else record
     try:
         hemisphere.write_failure(job.place, error, record, body)
@@ -432,20 +357,7 @@ def fail(
 
 
 def foresee(error: Exception, root: Path) -> HipstaError | None:
-    """Tell what a user can act on from a bug.
-
-    Parameters
-    ----------
-    error : Exception
-        What was raised.
-    root : Path
-        The output dataset, for messages.
-
-    Returns
-    -------
-    HipstaError or None
-        ``None`` for a bug.
-    """
+    """Tell what a user can act on from a bug."""
     if isinstance(error, HipstaError):
         return error
     if isinstance(error, MemoryError):

@@ -37,21 +37,7 @@ def column_names(name: str, count: int) -> list[str]:
 def write_map(
     place: ResultPlace, source: MapSource, sampled: SampledMap, about: Mapping[str, object]
 ) -> None:
-    """Write one map: table, sidecar and GIFTI.
-
-    Parameters
-    ----------
-    place : ResultPlace
-    source : MapSource
-    sampled : SampledMap
-    about : mapping
-        What the sidecar says of the map as a whole.
-
-    Raises
-    ------
-    OutputError
-        If a file cannot be written.
-    """
+    """Write one map: table, sidecar and GIFTI."""
     nx, ny, count = sampled.values.shape
     flat = sampled.values.reshape(nx * ny, count)
     x, y = np.divmod(np.arange(nx * ny), ny)
@@ -87,21 +73,7 @@ _REGION_DIGITS = 6
 def write_regions(
     table: Path, sidecar: Path, regions: Regions, found: RegionStatistics, units: Mapping[str, str]
 ) -> None:
-    """Write one row per region, and the sidecar.
-
-    Parameters
-    ----------
-    table, sidecar : Path
-    regions : Regions
-    found : RegionStatistics
-    units : mapping of str to str
-        Unit of each map that has a known one.
-
-    Raises
-    ------
-    OutputError
-        If a file cannot be written.
-    """
+    """Write one row per region, and the sidecar."""
     definitions: dict[str, dict[str, object]] = {
         "region": {"Description": "region, as the user named it"},
         "n_points": {"Description": "sheet points in the region"},
@@ -153,17 +125,7 @@ class Mapped:
 
 
 def signal_hash(item: HemisphereInput) -> list[object]:
-    """Tell what decides about maps and regions: their files' contents and how they are read.
-
-    Parameters
-    ----------
-    item : HemisphereInput
-
-    Returns
-    -------
-    list
-        Empty if there are neither.
-    """
+    """Tell what decides about maps and regions: their files' contents and how they are read."""
     maps = [
         [source.name, source.sampling, source.interpolation, _content(source.path)]
         for source in item.maps
@@ -181,22 +143,7 @@ def _content(path: Path | None) -> str | None:
 def add_signals(
     item: HemisphereInput, maps: HemisphereMaps, settings: MapSettings, sources: Mapping[str, Path]
 ) -> tuple[HemisphereMaps, Mapped]:
-    """Sample a hemisphere's volumes on its sheet, and read the regions.
-
-    Parameters
-    ----------
-    item : HemisphereInput
-    maps : HemisphereMaps
-    settings : MapSettings
-    sources : mapping of str to Path
-        Input datasets by name.
-
-    Returns
-    -------
-    maps : HemisphereMaps
-        With flags for what could not be used or lies outside.
-    mapped : Mapped
-    """
+    """Sample a hemisphere's volumes on its sheet, and read the regions."""
     done = []
     flags = []
     entries: list[dict[str, Any]] = []
@@ -223,19 +170,7 @@ def add_signals(
 
 
 def write_signals(place: ResultPlace, maps: HemisphereMaps, mapped: Mapped) -> None:
-    """Write the tables and GIFTI files of what was sampled.
-
-    Parameters
-    ----------
-    place : ResultPlace
-    maps : HemisphereMaps
-    mapped : Mapped
-
-    Raises
-    ------
-    OutputError
-        If a file cannot be written.
-    """
+    """Write the tables and GIFTI files of what was sampled."""
     numbers: dict[str, Float] = {name: maps.maps[name] for name in SHAPE_MAPS}
     labels: dict[str, Float] = {}
     entries = {entry["name"]: entry for entry in (mapped.record or {}).get("maps", ())}

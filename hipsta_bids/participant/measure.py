@@ -155,7 +155,7 @@ def measure_hemisphere(
             subfield=subfield,
             repaired=repaired,
             body_mask=volume.in_file(body.inside),
-            summary=summarize(measured, for_region(volume.scheme, body.region).sheet),
+            summary=summarize(measured, for_region(volume.protocol, body.region).sheet),
             qc=quality_metrics(evidence)
             | {"repaired_fraction": float(repaired.mean())}
             | ({"mask_change": asdict(body.mask_change)} if body.mask_change else {}),
@@ -167,18 +167,7 @@ def measure_hemisphere(
 
 
 def find_body(volume: LabelVolume, settings: Settings) -> BodyMask | None:
-    """Find the body of a hemisphere that cannot be measured, for a person to correct.
-
-    Parameters
-    ----------
-    volume : LabelVolume
-    settings : Settings
-
-    Returns
-    -------
-    BodyMask or None
-        None where the labels do not even tell where the body begins and ends.
-    """
+    """Find the body of a hemisphere that cannot be measured, for a person to correct."""
     try:
         body = extract_body(volume, settings.body)
     except GeometryError:

@@ -85,18 +85,7 @@ _RECORDS = tuple(f"{folder}/*{_RECORD}" for folder in ("sub-*/anat", "sub-*/ses-
 
 
 def visits_of(root: Path) -> list[Visit]:
-    """List the visits of which there is a record.
-
-    Parameters
-    ----------
-    root : Path
-        An output dataset.
-
-    Returns
-    -------
-    list of Visit
-        Sorted.
-    """
+    """List the visits of which there is a record."""
     found = set()
     for pattern in _RECORDS:
         for path in root.glob(pattern):
@@ -107,19 +96,7 @@ def visits_of(root: Path) -> list[Visit]:
 
 
 def write_reports(plan: PagePlan, visits: Iterable[Visit]) -> Iterator[Problem]:
-    """Make the pages of some visits, and that of the cohort.
-
-    Parameters
-    ----------
-    plan : PagePlan
-    visits : iterable of Visit
-        Whose pages.
-
-    Yields
-    ------
-    Problem
-        For each page that could not be made.
-    """
+    """Make the pages of some visits, and that of the cohort."""
     jobs = [PageJob(root=plan.root, visit=None)] if plan.cohort else []
     jobs += [PageJob(root=plan.root, visit=visit) for visit in dict.fromkeys(visits)]
     workers = WorkerPlan(
@@ -148,16 +125,7 @@ def write_reports(plan: PagePlan, visits: Iterable[Visit]) -> Iterator[Problem]:
 
 @contextlib.contextmanager
 def reports_after(plan: PagePlan, visits: Sequence[Visit], pages: Pages) -> Generator[None]:
-    """Make pages when the block ends, also by an error; not when the user stops the run.
-
-    Parameters
-    ----------
-    plan : PagePlan
-    visits : sequence of Visit
-        Pages that are up to date stay as they are.
-    pages : Pages
-        Receives a line per page that could not be made.
-    """
+    """Make pages when the block ends, also by an error; not when the user stops the run."""
     try:
         yield
     except Exception:
@@ -204,17 +172,7 @@ def warm_up() -> None:
 
 
 def make_page(job: PageJob) -> Problem | None:
-    """Make one page; never raises.
-
-    Parameters
-    ----------
-    job : PageJob
-
-    Returns
-    -------
-    Problem or None
-        ``None`` if all went well.
-    """
+    """Make one page; never raises."""
     from hipsta_bids.reports.cohort import cohort_page  # noqa: PLC0415  (workers only)
     from hipsta_bids.reports.participant import participant_page  # noqa: PLC0415
 

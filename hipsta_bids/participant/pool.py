@@ -104,26 +104,7 @@ class _Slot:
 
 
 def run_jobs(plan: WorkerPlan, jobs: Iterable[Any]) -> Generator[tuple[Any, Any]]:
-    """Work off jobs in parallel; closing the generator stops all workers.
-
-    Parameters
-    ----------
-    plan : WorkerPlan
-        How.
-    jobs : iterable
-        Picklable; taken as workers become free.
-
-    Yields
-    ------
-    (job, result)
-        In order of completion; the result is a :class:`WorkerLost` if the worker did not
-        give one.
-
-    Raises
-    ------
-    RuntimeError
-        If workers do not even start.
-    """
+    """Work off jobs in parallel; closing the generator stops all workers."""
     queue: Iterator[Any] = iter(jobs)
     waiting = next(queue, None)
     slots: list[_Slot] = []
@@ -155,15 +136,7 @@ def run_jobs(plan: WorkerPlan, jobs: Iterable[Any]) -> Generator[tuple[Any, Any]
 
 
 class Worker:
-    """One worker process, for callers that hand out jobs themselves; replaced when it dies.
-
-    Parameters
-    ----------
-    plan : WorkerPlan
-        How it runs.
-    patience : float
-        Seconds that it waits for a job before it ends.
-    """
+    """One worker process, for callers that hand out jobs themselves; replaced when it dies."""
 
     def __init__(self, plan: WorkerPlan, *, patience: float) -> None:
         self.plan = plan
@@ -171,18 +144,7 @@ class Worker:
         self._slot: _Slot | None = None
 
     def __call__(self, job: Any) -> Any:  # noqa: ANN401  (jobs are the caller's)
-        """Do one job.
-
-        Returns
-        -------
-        object
-            What the job gives, or a :class:`WorkerLost`.
-
-        Raises
-        ------
-        RuntimeError
-            If the process does not even start.
-        """
+        """Do one job."""
         slot = self._ready()
         _give(slot, job)
         answer = self._heard(slot)

@@ -29,7 +29,7 @@ from hipsta_bids.derivatives.status import (
     update_status,
     write_sidecar,
 )
-from hipsta_bids.errors import ExitCode, HipstaError, InputError, OutputError, SchemeError
+from hipsta_bids.errors import ExitCode, HipstaError, InputError, OutputError, ProtocolError
 from hipsta_bids.inputs.request import HemisphereInput
 from hipsta_bids.io import files
 from hipsta_bids.io.files import DATASET, locked
@@ -46,7 +46,7 @@ from hipsta_bids.participant.job import (
 )
 from hipsta_bids.participant.pages import PagePlan, Pages, reports_after
 from hipsta_bids.participant.pool import WorkerLost, WorkerPlan, run_jobs
-from hipsta_bids.protocols.protocol import Scheme
+from hipsta_bids.protocols.protocol import Protocol
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Status
 
@@ -59,15 +59,7 @@ _LOGGER = logging.getLogger(__name__)
 
 
 class Books:
-    """The table and the log, written as hemispheres end.
-
-    Parameters
-    ----------
-    root : Path
-        The output dataset.
-    shard : str, optional
-        Name of the part of the dataset that this run does, which has a table of its own.
-    """
+    """The table and the log, written as hemispheres end."""
 
     def __init__(self, root: Path, shard: str | None = None) -> None:
         self._root, self._shard = root, shard
@@ -77,36 +69,14 @@ class Books:
         self._next_write = 0.0
 
     def expect(self, jobs: Sequence[Job]) -> None:
-        """Make the table right for the case that this process ends at any moment from here on.
-
-        Parameters
-        ----------
-        jobs : sequence of Job
-            What this run is going to do: recorded as not finished until it is.
-
-        Raises
-        ------
-        OutputError
-            If the table cannot be written.
-        """
+        """Make the table right for the case that this process ends at any moment from here on."""
         for row in map(status_row, map(not_finished, jobs)):
             self._pending.append(row)
             self._known[row_key(row)] = row["status"]
         self.close()
 
     def enter(self, outcome: Outcome) -> None:
-        """Write one outcome to the log and to the table.
-
-        Parameters
-        ----------
-        outcome : Outcome
-            How a hemisphere ended.
-
-        Raises
-        ------
-        OutputError
-            If the table cannot be written.
-        """
+        """Write one outcome to the log and to the table."""
         _log(outcome)
         row = status_row(outcome)
         # Rows that are there already also have the times, which the quality record has not.
@@ -124,13 +94,7 @@ class Books:
             self._pending = []
 
     def close(self) -> None:
-        """Write what has not been written yet.
-
-        Raises
-        ------
-        OutputError
-            If the table cannot be written.
-        """
+        """Write what has not been written yet."""
         if not self._pending:
             return
         start = time.monotonic()
@@ -192,27 +156,7 @@ def status_row(outcome: Outcome) -> dict[str, str]:
 
 @contextlib.contextmanager
 def log_file(root: Path, verbosity: int, shard: str | None = None) -> Generator[Path]:
-    """Log this run to a file of its own.
-
-    Parameters
-    ----------
-    root : Path
-        The output dataset.
-    verbosity : int
-        Above 0, debugging messages too.
-    shard : str, optional
-        Name of the part of the dataset that this run does.
-
-    Yields
-    ------
-    Path
-        The file.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be made.
-    """
+    """Log this run to a file of its own."""
     folder = root / DATASET_FILES["logs"]
     files.make_folder(folder)
     part = "" if shard is None else f"_shard-{shard}"
@@ -306,7 +250,7 @@ class RunResult:
         if not failed and len(self.outcomes) == self.n_requested:
             return ExitCode.OK
         if len(failed) == self.n_requested and all(
-            isinstance(outcome.error, (InputError, SchemeError)) for outcome in failed
+            isinstance(outcome.error, (InputError, ProtocolError)) for outcome in failed
         ):
             return ExitCode.BAD_DATA
         return ExitCode.SOME_FAILED
@@ -380,14 +324,9 @@ def prepare(
     """Write what describes the dataset as a whole, and say what is to be done.
 
     Parameters, and what is raised, are those of :func:`run_participants`.
-
-    Returns
-    -------
-    list of Job
-        One per item.
     """
     sources = _source_names(items)
-    dataset.check_not_foreign(out_dir)
+    dataset.check_own_dataset(out_dir)
     files.check_writable(out_dir)
     with locked(out_dir, DATASET) as alone:
         if alone:
@@ -395,7 +334,7 @@ def prepare(
         digest = dataset.settle_settings(out_dir, settings)
         dataset.write_description(out_dir, sources)
         if options.shard is None or not (out_dir / DATASET_FILES["citation"]).exists():
-            dataset.write_citation(out_dir, settings, _schemes(items))
+            dataset.write_citation(out_dir, settings, _protocols(items))
         write_sidecar(out_dir)
     return [
         Job(
@@ -453,7 +392,7 @@ def hemisphere_name(item: HemisphereInput, settings: Settings) -> HemisphereName
         subject=item.subject,
         session=item.session,
         hemi=item.hemi,
-        seg=item.scheme.name,
+        seg=item.protocol.name,
         region=settings.body.region,
     )
 
@@ -542,13 +481,13 @@ def _source_names(items: Sequence[HemisphereInput]) -> dict[str, Path]:
     return dataset.source_names(origins)
 
 
-def _schemes(items: Sequence[HemisphereInput]) -> list[Scheme]:
+def _protocols(items: Sequence[HemisphereInput]) -> list[Protocol]:
     """List the protocols in use, each once."""
     found = {}
     for item in items:
-        for scheme in (item.scheme, item.parts_scheme):
-            if scheme is not None:
-                found[scheme.name] = scheme
+        for protocol in (item.protocol, item.parts_protocol):
+            if protocol is not None:
+                found[protocol.name] = protocol
     return [found[name] for name in sorted(found)]
 
 
@@ -562,31 +501,6 @@ def collect(
 
     Nothing is measured. Times come from the tables of the runs. Pages that are missing are made,
     and that of all hemispheres.
-
-    Parameters
-    ----------
-    items : sequence of HemisphereInput
-        All that was to be measured.
-    out_dir : Path
-        The output dataset.
-    settings : Settings
-        What changes results.
-    options : RunOptions
-        What does not.
-
-    Returns
-    -------
-    RunResult
-        As if one run had done all; hemispheres that none has finished have failed.
-
-    Raises
-    ------
-    OutputError
-        If the output folder cannot be written.
-    SettingsError
-        If it holds results with other settings.
-    UsageError
-        If it is a dataset of other software.
     """
     jobs = prepare(items, out_dir, settings, options)
     outcomes = tuple(recorded(job) or not_finished(job) for job in jobs)

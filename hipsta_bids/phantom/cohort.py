@@ -134,11 +134,6 @@ def make_cohort(plan: CohortPlan) -> list[Subject]:
     """Draw subjects; the same plan gives the same cohort.
 
     Each subject has a generator of its own, so that more subjects leave the first ones alone.
-
-    Raises
-    ------
-    SettingsError
-        If a phantom is impossible, such as a wall thinned to nothing.
     """
     return [_make_subject(plan, number) for number in range(plan.n_subjects)]
 
@@ -240,25 +235,7 @@ def write_cohort(
 ) -> None:
     """Write a cohort as a BIDS dataset with segmentations, participants and all truth.
 
-    Parameters
-    ----------
-    out : Path
-        New or empty folder, or an earlier dataset of phantoms.
-    plan : CohortPlan
-        Who is in it.
-    layout : str
-        One of ``LAYOUTS``; cortex needs one whose protocol has labels for it.
-    voxel_size : tuple of float
-        mm along the image's axes, which point left, inferior and anterior.
-
-    Raises
-    ------
-    UsageError
-        If the folder holds something else.
-    SettingsError
-        If the layout is unknown or a phantom impossible.
-    OutputError
-        If a file cannot be written.
+    ``voxel_size`` mm along the image's axes, which point left, inferior and anterior.
     """
     refuse_taken(out)
     subjects = make_cohort(plan)

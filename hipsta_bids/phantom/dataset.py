@@ -17,7 +17,7 @@ from hipsta_bids.io import files
 from hipsta_bids.phantom.labels import encode
 from hipsta_bids.phantom.phantom import Phantom
 from hipsta_bids.phantom.spec import PhantomSpec
-from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.types import Float, LabelVolume
 
 #: Name of the table of true values, at the top of the dataset.
@@ -48,7 +48,7 @@ TRUTH_COLUMNS: Mapping[str, tuple[str, str | None]] = MappingProxyType(
 class Layout:
     """How a tool names and encodes its segmentations."""
 
-    scheme: str
+    protocol: str
     """Bundled protocol."""
     path: str
     """Of one hemisphere, below the tool's folder."""
@@ -60,17 +60,17 @@ class Layout:
 LAYOUTS: Mapping[str, Layout] = MappingProxyType(
     {
         "freesurfer": Layout(
-            scheme="freesurfer",
+            protocol="freesurfer",
             path="{subject}/mri/{side}.hippoAmygLabels-T1.v22.mgz",
             sides={"L": "lh", "R": "rh"},
         ),
         "ashs": Layout(
-            scheme="ashsABC3T",
+            protocol="ashsABC3T",
             path="{subject}/final/{subject}_{side}_lfseg_corr_usegray.nii.gz",
             sides={"L": "left", "R": "right"},
         ),
         "ashsPMC": Layout(
-            scheme="ashsPMC",
+            protocol="ashsPMC",
             path="{subject}/final/{subject}_{side}_lfseg_corr_usegray.nii.gz",
             sides={"L": "left", "R": "right"},
         ),
@@ -114,26 +114,6 @@ def write_dataset(
     """Write phantoms as a BIDS dataset with derivatives and a table of the truth.
 
     The same input gives the same bytes. Existing files of the same name are replaced.
-
-    Parameters
-    ----------
-    out : Path
-        Top folder; made if need be.
-    hemispheres : sequence of Hemisphere
-        What to write.
-    layouts : sequence of str
-        Any of ``LAYOUTS``; each gets its own folder in ``derivatives``.
-    voxel_size, axes, supersample
-        See :meth:`Phantom.label_volume`.
-    participants : Participants, optional
-        Covariates; by default subjects have names only.
-
-    Raises
-    ------
-    SettingsError
-        If a layout is unknown or a phantom impossible.
-    OutputError
-        If a file cannot be written.
     """
     unknown = [name for name in layouts if name not in LAYOUTS]
     if unknown:
@@ -150,7 +130,7 @@ def write_dataset(
         for name in layouts:
             layout = LAYOUTS[name]
             volume = phantom.label_volume(
-                load_scheme(layout.scheme),
+                load_protocol(layout.protocol),
                 hemi=item.hemi,
                 pose=item.pose,
                 voxel_size=voxel_size,
@@ -165,18 +145,7 @@ def write_dataset(
 
 
 def write_demo_dataset(out: Path) -> None:
-    """Write a dataset of two subjects in FreeSurfer's layout: four shapes, 1.6 to 2.2 mm thick.
-
-    Parameters
-    ----------
-    out : Path
-        Top folder; made if need be. The truth is in ``phantom_truth.tsv`` there.
-
-    Raises
-    ------
-    OutputError
-        If a file cannot be written.
-    """
+    """Write a dataset of two subjects in FreeSurfer's layout: four shapes, 1.6 to 2.2 mm thick."""
     shapes = {
         ("demo1", "L"): PhantomSpec(kind="spiral", thickness=1.6),
         ("demo1", "R"): PhantomSpec(kind="spiral", thickness=2.0, variation=0.2),
@@ -197,15 +166,7 @@ def write_demo_dataset(out: Path) -> None:
 
 
 def refuse_taken(out: Path, what: str = "phantoms") -> None:
-    """Refuse a folder that holds something other than phantoms.
-
-    Raises
-    ------
-    UsageError
-        Likewise.
-    OutputError
-        If it cannot be looked into.
-    """
+    """Refuse a folder that holds something other than phantoms."""
     try:
         taken = out.exists() and any(out.iterdir())
     except OSError as error:
@@ -228,8 +189,8 @@ def rigid_motion(degrees: tuple[float, float, float], shift: tuple[float, float,
 
 def _refuse_without_cortex(layouts: Sequence[str]) -> None:
     for name in layouts:
-        if not load_scheme(LAYOUTS[name].scheme).neighbors:
-            able = [key for key, row in LAYOUTS.items() if load_scheme(row.scheme).neighbors]
+        if not load_protocol(LAYOUTS[name].protocol).neighbors:
+            able = [key for key, row in LAYOUTS.items() if load_protocol(row.protocol).neighbors]
             raise SettingsError(
                 f"phantom: the protocol of layout {name} has no labels for cortex; choose from"
                 f" {', '.join(able)}",

@@ -7,10 +7,10 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from hipsta_bids.errors import SchemeError, SettingsError
+from hipsta_bids.errors import ProtocolError, SettingsError
 from hipsta_bids.phantom.shape import Body, check_rotation
 from hipsta_bids.phantom.spec import PhantomSpec
-from hipsta_bids.protocols.protocol import Label, Part, Scheme, Tissue
+from hipsta_bids.protocols.protocol import Label, Part, Protocol, Tissue
 from hipsta_bids.types import Bool, Float, Int, LabelVolume
 
 # The voxel grid that a phantom is drawn on.
@@ -37,23 +37,9 @@ def make_grid(
     The lattice is fixed in space (a voxel center lies at the origin of RAS), so that moving the
     phantom by part of a voxel changes its voxels.
 
-    Parameters
-    ----------
-    points : (N, 3) array
-        RAS mm, to be covered.
-    voxel_size : tuple of float
-        mm along the three voxel axes.
-    axes : str
-        Where the voxel axes point, such as ``RAS`` or ``LIA``.
-    rotation : (3, 3) array, optional
-        Turns the grid, for oblique slices.
-    border : float
-        mm of background to add on every side.
-
-    Raises
-    ------
-    SettingsError
-        If the axes, the voxel size or the rotation make no sense.
+    ``points`` RAS mm, to be covered; ``voxel_size`` mm along the three voxel axes; ``axes`` Where
+    the voxel axes point, such as ````RAS```` or ````LIA````; ``border`` mm of background to add on
+    every side.
     """
     if not all(size > 0.0 for size in voxel_size):
         raise SettingsError(
@@ -130,46 +116,19 @@ _CHUNK = 400_000  # points located at once: about 200 MB of temporary arrays
 def draw(
     body: Body,
     grid: Grid,
-    scheme: Scheme,
+    protocol: Protocol,
     *,
     hemi: str,
     pose: Float | None,
     supersample: int | tuple[int, int, int],
 ) -> NDArray[np.intp]:
-    """Label every voxel.
-
-    Parameters
-    ----------
-    body : Body
-        The shape.
-    grid : Grid
-        Where to draw it.
-    scheme : Scheme
-        Protocol whose labels to use.
-    hemi, pose
-        See :meth:`Body.place`.
-    supersample : int or tuple of int
-        1 labels a voxel by its center; more takes the most frequent label among so many points
-        along each voxel axis.
-
-    Returns
-    -------
-    (I, J, K) array
-        Positions in ``scheme.labels``, plus 1; 0 is background.
-
-    Raises
-    ------
-    SettingsError
-        If there is nothing to sample.
-    SchemeError
-        If the protocol has no label for a tissue of the sheet.
-    """
+    """Label every voxel."""
     counts = np.broadcast_to(np.asarray(supersample, dtype=int), 3)
     if (counts < 1).any():
         raise SettingsError(
             f"phantom: supersample must be 1 or more, not {supersample}", reason="phantom-setting"
         )
-    table = _label_table(scheme)
+    table = _label_table(protocol)
     index = np.indices(grid.shape).reshape(3, -1).T.astype(np.float64)
     codes = np.concatenate(
         [table[_regions(body, part, grid, hemi, pose)] for part in _chunks(index, 1)]
@@ -181,7 +140,7 @@ def draw(
             _majority(
                 table[_regions(body, (part[:, None] + offsets).reshape(-1, 3), grid, hemi, pose)],
                 per_voxel=len(offsets),
-                kinds=len(scheme.labels) + 1,
+                kinds=len(protocol.labels) + 1,
             )
             for part in _chunks(mixed, len(offsets))
         ]
@@ -196,12 +155,12 @@ def subfield_at(u: Float) -> NDArray[np.uint8]:
     return np.asarray(tissues[np.searchsorted(starts[1:], u, side="right")])
 
 
-def subfield_spans(scheme: Scheme) -> dict[Tissue, tuple[float, float]]:
+def subfield_spans(protocol: Protocol) -> dict[Tissue, tuple[float, float]]:
     """Range of the hippocampal part of the sheet that a protocol gives each of its subfields."""
     ends = [start for _, start in SUBFIELD_STARTS[1:]] + [1.0]
     spans: dict[Tissue, tuple[float, float]] = {}
     for (tissue, start), end in zip(SUBFIELD_STARTS, ends, strict=True):
-        label = label_for(scheme, tissue, Part.BODY)
+        label = label_for(protocol, tissue, Part.BODY)
         if label is not None:
             spans[label.tissue] = (spans.get(label.tissue, (start,))[0], end)
     return spans
@@ -227,13 +186,13 @@ def _along(spec: PhantomSpec, u: Float) -> tuple[Float, Float]:
     return (u - share) / (1.0 - share), u / share
 
 
-def label_for(scheme: Scheme, tissue: Tissue, part: Part) -> Label | None:
+def label_for(protocol: Protocol, tissue: Tissue, part: Part) -> Label | None:
     """Label that a protocol gives a tissue of a part; None if it leaves it out.
 
     First the tissue (or its stand-in) in this part, then a label for the whole part, then the
     tissue wherever it is.
     """
-    by_meaning = {(label.tissue, label.part): label for label in reversed(scheme.labels)}
+    by_meaning = {(label.tissue, label.part): label for label in reversed(protocol.labels)}
     tissues = (tissue, *_STAND_INS.get(tissue, ()))
     wanted = [(choice, part) for choice in tissues]
     if tissue not in CORTEX:
@@ -247,20 +206,15 @@ def encode(volume: LabelVolume) -> NDArray[np.int32]:
     """Codes (I, J, K) of a label volume in its own protocol, to write it as that tool would.
 
     Where several labels mean the same tissue of the same part, the first one is written.
-
-    Raises
-    ------
-    SchemeError
-        If a voxel's tissue and part have no label in the protocol.
     """
     table = np.zeros((max(Tissue) + 1, max(Part) + 1), dtype=np.int32)
-    for label in reversed(volume.scheme.labels):
+    for label in reversed(volume.protocol.labels):
         table[label.tissue, label.part] = label.code
     codes = table[volume.tissue, volume.part]
     if np.any((codes == 0) & (volume.tissue != Tissue.BACKGROUND)):
-        raise SchemeError(
-            f"scheme {volume.scheme.name} has no code for some tissues of this volume; "
-            "write it in the scheme it was made with",
+        raise ProtocolError(
+            f"protocol {volume.protocol.name} has no code for some tissues of this volume; "
+            "write it in the protocol it was made with",
             reason="phantom-scheme",
         )
     return codes
@@ -273,21 +227,21 @@ _SHEET = len(SUBFIELD_STARTS)
 _PER_PART = 2 * _SHEET + 2 + len(CORTEX)
 
 
-def _label_table(scheme: Scheme) -> NDArray[np.intp]:
-    """Position in ``scheme.labels`` plus 1 for each region number."""
+def _label_table(protocol: Protocol) -> NDArray[np.intp]:
+    """Position in ``protocol.labels`` plus 1 for each region number."""
     table = [0]
-    position = {id(label): i + 1 for i, label in enumerate(scheme.labels)}
+    position = {id(label): i + 1 for i, label in enumerate(protocol.labels)}
     for part in _PARTS:
-        sheet = [label_for(scheme, tissue, part) for tissue, _ in SUBFIELD_STARTS]
-        layer = label_for(scheme, Tissue.MOLECULAR_LAYER, part)
-        inner = [label_for(scheme, tissue, part) for tissue in (Tissue.DENTATE_GYRUS, Tissue.CA4)]
+        sheet = [label_for(protocol, tissue, part) for tissue, _ in SUBFIELD_STARTS]
+        layer = label_for(protocol, Tissue.MOLECULAR_LAYER, part)
+        inner = [label_for(protocol, tissue, part) for tissue in (Tissue.DENTATE_GYRUS, Tissue.CA4)]
         if part is Part.BODY and None in sheet:
-            raise SchemeError(
-                f"phantom: scheme {scheme.name} has no label for some subfield of the sheet; "
-                "choose another scheme",
+            raise ProtocolError(
+                f"phantom: protocol {protocol.name} has no label for some subfield of the sheet; "
+                "choose another protocol",
                 reason="phantom-scheme",
             )
-        cortex = [label_for(scheme, tissue, part) for tissue in CORTEX]
+        cortex = [label_for(protocol, tissue, part) for tissue in CORTEX]
         layers = [None if own is None else layer or own for own in sheet]
         table += [
             position[id(x)] if x is not None else 0 for x in (*sheet, *layers, *inner, *cortex)

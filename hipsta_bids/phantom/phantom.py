@@ -14,23 +14,12 @@ from hipsta_bids.phantom.truth import (
     mean_curvature,
     summarize,
 )
-from hipsta_bids.protocols.protocol import Scheme, Tissue
+from hipsta_bids.protocols.protocol import Protocol, Tissue
 from hipsta_bids.types import Float, LabelVolume
 
 
 class Phantom:
-    """An analytic hippocampal body with exact truth.
-
-    Parameters
-    ----------
-    spec : PhantomSpec
-        What to build.
-
-    Raises
-    ------
-    SettingsError
-        If the wall folds or its turns overlap.
-    """
+    """An analytic hippocampal body with exact truth."""
 
     def __init__(self, spec: PhantomSpec) -> None:
         self.spec = spec
@@ -38,7 +27,7 @@ class Phantom:
 
     def label_volume(
         self,
-        scheme: Scheme,
+        protocol: Protocol,
         *,
         hemi: str = "L",
         voxel_size: tuple[float, float, float] = (0.4, 0.4, 0.4),
@@ -50,33 +39,9 @@ class Phantom:
     ) -> LabelVolume:
         """Draw the phantom as a segmentation in the package's vocabulary.
 
-        Parameters
-        ----------
-        scheme : Scheme
-            Protocol whose labels to use. Where it has no head or tail labels, CA2 and CA3 end
-            with the body.
-        hemi : {"L", "R"}
-            Right is the mirror image of left.
-        voxel_size : tuple of float
-            mm along the three voxel axes.
-        pose : (4, 4) array, optional
-            Rigid motion of the phantom in RAS mm.
-        axes : str
-            Where the voxel axes point, such as ``RAS`` or ``LIA``.
-        grid_rotation : (3, 3) array, optional
-            Turns the grid, for oblique slices.
-        supersample : int or tuple of int
-            1 labels a voxel by its center; more takes the most frequent label among so many
-            points along each voxel axis.
-        border : float
-            mm of background on every side.
-
-        Raises
-        ------
-        SettingsError
-            If a parameter makes no sense.
-        SchemeError
-            If the protocol has no label for a tissue of the sheet.
+        ``voxel_size`` mm along the three voxel axes; ``pose`` Rigid motion of the phantom in RAS
+        mm; ``axes`` Where the voxel axes point, such as ````RAS```` or ````LIA````; ``border`` mm
+        of background on every side.
         """
         grid = make_grid(
             self._outline(hemi, pose),
@@ -85,31 +50,17 @@ class Phantom:
             rotation=grid_rotation,
             border=border,
         )
-        labels = draw(self.body, grid, scheme, hemi=hemi, pose=pose, supersample=supersample)
-        tissue = np.array([0, *(label.tissue for label in scheme.labels)], dtype=np.uint8)
-        part = np.array([0, *(label.part for label in scheme.labels)], dtype=np.uint8)
+        labels = draw(self.body, grid, protocol, hemi=hemi, pose=pose, supersample=supersample)
+        tissue = np.array([0, *(label.tissue for label in protocol.labels)], dtype=np.uint8)
+        part = np.array([0, *(label.part for label in protocol.labels)], dtype=np.uint8)
         return LabelVolume(
-            tissue=tissue[labels], part=part[labels], affine=grid.affine, scheme=scheme
+            tissue=tissue[labels], part=part[labels], affine=grid.affine, protocol=protocol
         )
 
     def truth(
         self, u: ArrayLike, v: ArrayLike, *, hemi: str = "L", pose: Float | None = None
     ) -> PhantomTruth:
-        """Tell what a perfect method would measure.
-
-        Parameters
-        ----------
-        u, v : arrays that broadcast
-            Positions on the sheet, each from 0 to 1: medial to lateral in equal arc length of
-            the mid-curve, posterior to anterior.
-        hemi, pose
-            As in :meth:`label_volume`; they move the points and nothing else.
-
-        Raises
-        ------
-        SettingsError
-            If ``hemi`` is unknown or ``pose`` is not rigid.
-        """
+        """Tell what a perfect method would measure."""
         x, y = np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64))
         bent = {name: mean_curvature(self.body, x, y, at=at) for name, at in SURFACES.items()}
         domed = {name: gaussian_curvature(self.body, x, y, at=at) for name, at in SURFACES.items()}
@@ -135,37 +86,14 @@ class Phantom:
         return ("body", "extended", "entorhinal") if self.spec.cortex else ("body",)
 
     def region_summary(self, region: str) -> dict[str, float]:
-        """Tell what a perfect method would measure in a region as a whole.
-
-        Parameters
-        ----------
-        region : str
-            ``body`` (the hippocampal subfields), ``extended`` (with the cortex, which is the whole
-            wall) or ``entorhinal`` (the cortex alone).
-
-        Returns
-        -------
-        dict
-            See :func:`~hipsta_bids.phantom.truth.summarize`.
-        """
+        """Tell what a perfect method would measure in a region as a whole."""
         border = self.spec.cortex_share
         border += self.spec.offset if border else 0.0
         spans = {"body": (border, 1.0), "extended": (0.0, 1.0), "entorhinal": (0.0, border)}
         return summarize(self.body, span=spans[region])
 
-    def subfield_summary(self, scheme: Scheme) -> dict[Tissue, dict[str, float]]:
-        """Tell what a perfect method would measure in each subfield that a protocol draws.
-
-        Parameters
-        ----------
-        scheme : Scheme
-            Its subfields are those of the hippocampus.
-
-        Returns
-        -------
-        dict
-            See :func:`~hipsta_bids.phantom.truth.summarize`.
-        """
+    def subfield_summary(self, protocol: Protocol) -> dict[Tissue, dict[str, float]]:
+        """Tell what a perfect method would measure in each subfield that a protocol draws."""
         share, shift = self.spec.cortex_share, self.spec.offset
         return {
             tissue: summarize(
@@ -175,7 +103,7 @@ class Phantom:
                     share + (1.0 - share) * end + (shift if end < 1.0 else 0.0),
                 ),
             )
-            for tissue, (start, end) in subfield_spans(scheme).items()
+            for tissue, (start, end) in subfield_spans(protocol).items()
         }
 
     def _outline(self, hemi: str, pose: Float | None) -> Float:

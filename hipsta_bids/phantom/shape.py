@@ -33,12 +33,7 @@ class MidCurve:
     normal points to the exterior (right of the tangent), so that a positive curvature turns the
     curve round its interior.
 
-    Parameters
-    ----------
-    bend : Bend
-        Curvature at both ends, 1/mm.
-    width : float
-        Arc length, mm.
+    ``bend`` Curvature at both ends, 1/mm; ``width`` Arc length, mm.
     """
 
     def __init__(self, bend: Bend, width: float) -> None:
@@ -91,19 +86,9 @@ class MidCurve:
     def project(self, points: Float, *, reach: float = np.inf) -> tuple[Float, Float]:
         """Find the nearest place on the curve.
 
-        Parameters
-        ----------
-        points : (N, 2) array
-            mm.
-        reach : float
-            mm; points farther than this from the curve are left out.
-
-        Returns
-        -------
-        s : (N,) array
-            Arc length, mm; NaN where out of reach, or beyond a flat end of the curve.
-        n : (N,) array
-            Signed distance, mm, positive on the exterior side; NaN likewise.
+        ``points`` mm; ``reach`` mm. Returns Arc length, mm; NaN where out of reach, or beyond a
+        flat end of the curve. Returns Signed distance, mm, positive on the exterior side; NaN
+        likewise.
         """
         s = np.full(len(points), np.nan)
         n = np.full(len(points), np.nan)
@@ -202,21 +187,8 @@ Window = tuple[Float, Float, Float]
 def window_jet(at: Float, limits: tuple[float, float], extent: float, edge: float) -> Window:
     """Window that is 1 between two limits and 0 outside, with edges like error functions.
 
-    Parameters
-    ----------
-    at : array
-        mm.
-    limits : tuple of float
-        Fractions of ``extent`` at which the window is one half; beyond 0 or 1 there is no edge.
-    extent : float
-        mm.
-    edge : float
-        Scale of the edges, mm.
-
-    Returns
-    -------
-    tuple of arrays
-        The window, its slope (1/mm) and second derivative (1/mm2).
+    ``at`` mm; ``extent`` mm; ``edge`` Scale of the edges, mm. Returns The window, its slope (1/mm)
+    and second derivative (1/mm2).
     """
     value, slope, second = (np.zeros(np.shape(at)) for _ in range(3))
     for limit, sign, open_end in ((limits[0], 1.0, 0.0), (limits[1], -1.0, 1.0)):
@@ -236,17 +208,6 @@ class Body:
 
     Sheet coordinates are u (medial to lateral, 0 to 1), v (posterior to anterior, 0 to 1; head
     and tail lie beyond) and n (mm from the mid-surface, positive on the exterior side).
-
-    Parameters
-    ----------
-    spec : PhantomSpec
-        What to build.
-
-    Raises
-    ------
-    SettingsError
-        If the wall folds (half the thickness reaches the radius of curvature) or its turns
-        overlap.
     """
 
     def __init__(self, spec: PhantomSpec) -> None:
@@ -299,19 +260,7 @@ class Body:
     ) -> Float:
         """Scanner coordinates (..., 3), RAS mm, of sheet coordinates (u, v, n).
 
-        Parameters
-        ----------
-        u, v, n : arrays that broadcast
-            Sheet coordinates; n in mm.
-        hemi : {"L", "R"}
-            Right is the mirror image of left.
-        pose : (4, 4) array, optional
-            Rigid motion applied last.
-
-        Raises
-        ------
-        SettingsError
-            If ``hemi`` is unknown or ``pose`` is not rigid.
+        ``u, v, n`` n in mm.
         """
         across, along, off = np.broadcast_arrays(
             *(np.asarray(x, dtype=np.float64) for x in (u, v, n))

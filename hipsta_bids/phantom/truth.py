@@ -44,7 +44,7 @@ class PhantomTruth:
     extent_y: Float
     """Length of the line v from 0 to 1, mm."""
     subfield: NDArray[np.uint8]
-    """Values of :class:`~hipsta_bids.schemes.Tissue`, in the finest division."""
+    """Values of :class:`~hipsta_bids.protocols.Tissue`, in the finest division."""
     summary: Mapping[str, float]
     """The whole wall, see :func:`summarize`."""
 
@@ -88,17 +88,7 @@ def gaussian_curvature(body: Body, u: Float, v: Float, *, at: float) -> Float:
 def cut_sections(body: Body, v: Float) -> dict[str, Float]:
     """Measure the cross-sections at positions v along the axis.
 
-    Parameters
-    ----------
-    body : Body
-        The shape.
-    v : (N,) array
-        From 0 to 1.
-
-    Returns
-    -------
-    dict of (N,) arrays
-        As in the output's table of cross-sections, mm and mm2. Lines are those of constant v.
+    Returns As in the output's table of cross-sections, mm and mm2.
     """
     u, weights = gauss_panels(0.0, 1.0, _PANELS_U)
     u, v = u[:, None], np.asarray(v, np.float64)[None, :]
@@ -126,20 +116,10 @@ def cut_sections(body: Body, v: Float) -> dict[str, Float]:
 def summarize(body: Body, *, span: tuple[float, float] = (0.0, 1.0)) -> dict[str, float]:
     """Measure the body, or the part of it between two positions u.
 
-    Parameters
-    ----------
-    body : Body
-        The shape.
-    span : tuple of float
-        Range of u, such as a subfield's.
-
-    Returns
-    -------
-    dict
-        ``thickness_mean`` (mm, over the mid-surface), ``extent_x``, ``extent_y``, ``extent_z``
-        (mm: arc length of the mid-curve, length along v averaged over u, mean thickness),
-        ``volume`` (mm3), ``area_interior``, ``area_mid`` and ``area_exterior`` (mm2), and for the
-        whole body what :func:`summarize_ratios` adds.
+    Returns ````thickness_mean```` (mm, over the mid-surface), ````extent_x````, ````extent_y````,
+    ````extent_z```` (mm: arc length of the mid-curve, length along v averaged over u, mean
+    thickness), ````volume```` (mm3), ````area_interior````, ````area_mid```` and
+    ````area_exterior```` (mm2), and for the whole body what :func:``summarize_ratios`` adds.
     """
     u, weights_u = gauss_panels(*span, _PANELS_U)
     v, weights_v = gauss_panels(0.0, 1.0, _PANELS_V)
@@ -171,18 +151,9 @@ def summarize(body: Body, *, span: tuple[float, float] = (0.0, 1.0)) -> dict[str
 def summarize_ratios(body: Body, summary: Mapping[str, float]) -> dict[str, float]:
     """Average cross-sections over the whole body, and relate its sizes.
 
-    Parameters
-    ----------
-    body : Body
-        The shape.
-    summary : mapping
-        Its areas (mm2) and volume (mm3).
-
-    Returns
-    -------
-    dict
-        ``area_ratio``, ``surface_volume_ratio`` (1/mm), and means of what :func:`cut_sections`
-        gives over the body's length.
+    ``summary`` Its areas (mm2) and volume (mm3). Returns ````area_ratio````,
+    ````surface_volume_ratio```` (1/mm), and means of what :func:``cut_sections`` gives over the
+    body's length.
     """
     v, weights_v = gauss_panels(0.0, 1.0, _PANELS_V)
     sections = cut_sections(body, v)

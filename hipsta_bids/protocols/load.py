@@ -10,13 +10,13 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, TypeVar
 
-from hipsta_bids.errors import SchemeError
+from hipsta_bids.errors import ProtocolError
 from hipsta_bids.protocols.protocol import (
     FAR_TO_NEAR,
     MEDIAL_TO_LATERAL,
     Label,
     Part,
-    Scheme,
+    Protocol,
     Tissue,
 )
 
@@ -37,117 +37,79 @@ _OPTIONAL_LABEL_KEYS = {"part": str}
 
 
 @cache
-def scheme_names() -> tuple[str, ...]:
+def protocol_names() -> tuple[str, ...]:
     """List the names of the bundled protocols, in alphabetical order."""
     files = resources.files("hipsta_bids.protocols").iterdir()
     return tuple(sorted(f.name.removesuffix(".toml") for f in files if f.name.endswith(".toml")))
 
 
-def load_scheme(name_or_path: str | Path) -> Scheme:
-    """Load a bundled protocol by name, or a user's protocol file.
-
-    Parameters
-    ----------
-    name_or_path : str or Path
-        A name of :func:`scheme_names`, or the path of a TOML file (a ``Path``, or a string that
-        ends in ``.toml``).
-
-    Returns
-    -------
-    Scheme
-
-    Raises
-    ------
-    SchemeError
-        ``unknown-scheme`` (with the nearest name), ``unreadable-scheme`` or ``invalid-scheme``.
-    """
+def load_protocol(name_or_path: str | Path) -> Protocol:
+    """Load a bundled protocol by name, or a user's protocol file."""
     if isinstance(name_or_path, Path) or name_or_path.endswith(".toml"):
         return _load_file(Path(name_or_path))
-    if name_or_path not in scheme_names():
-        raise SchemeError(
-            f"no protocol is called {name_or_path!r}{_did_you_mean(name_or_path, scheme_names())}; "
-            f"bundled: {', '.join(scheme_names())} (a file's name has to end in .toml)",
+    if name_or_path not in protocol_names():
+        raise ProtocolError(
+            f"no protocol is called {name_or_path!r}"
+            f"{_did_you_mean(name_or_path, protocol_names())}; "
+            f"bundled: {', '.join(protocol_names())} (a file's name has to end in .toml)",
             reason="unknown-scheme",
         )
     return _load_bundled(name_or_path)
 
 
-def scheme_table() -> list[dict[str, str]]:
-    """Describe each bundled protocol in one row.
-
-    Returns
-    -------
-    list of dict
-        Keys ``name``, ``tool``, ``title``, ``sheet`` (tissues from medial to lateral),
-        ``neighbors`` (cortex beyond the medial end), ``labels`` (how many), ``parts`` (of head,
-        body, tail: those that have labels) and ``citation``.
-    """
+def protocol_table() -> list[dict[str, str]]:
+    """Describe each bundled protocol in one row."""
     rows = []
-    for name in scheme_names():
-        scheme = load_scheme(name)
-        parts = sorted({label.part for label in scheme.labels} - {Part.UNKNOWN})
+    for name in protocol_names():
+        protocol = load_protocol(name)
+        parts = sorted({label.part for label in protocol.labels} - {Part.UNKNOWN})
         rows.append(
             {
                 "name": name,
-                "tool": scheme.tool,
-                "title": scheme.title,
-                "sheet": ", ".join(tissue.name for tissue in scheme.sheet),
-                "neighbors": ", ".join(tissue.name for tissue in scheme.neighbors) or "none",
-                "labels": str(len(scheme.labels)),
+                "tool": protocol.tool,
+                "title": protocol.title,
+                "sheet": ", ".join(tissue.name for tissue in protocol.sheet),
+                "neighbors": ", ".join(tissue.name for tissue in protocol.neighbors) or "none",
+                "labels": str(len(protocol.labels)),
                 "parts": ", ".join(part.name.lower() for part in parts),
-                "citation": scheme.citation,
+                "citation": protocol.citation,
             }
         )
     return rows
 
 
 @cache
-def _load_bundled(name: str) -> Scheme:
+def _load_bundled(name: str) -> Protocol:
     text = resources.files("hipsta_bids.protocols").joinpath(f"{name}.toml").read_text("utf-8")
-    scheme = parse_scheme(tomllib.loads(text), origin=f"{name}.toml")
-    if scheme.name != name:
-        raise _invalid(f"{name}.toml", f"its name is {scheme.name!r}; name and file have to agree")
-    return scheme
+    protocol = parse_protocol(tomllib.loads(text), origin=f"{name}.toml")
+    if protocol.name != name:
+        raise _invalid(
+            f"{name}.toml", f"its name is {protocol.name!r}; name and file have to agree"
+        )
+    return protocol
 
 
-def _load_file(path: Path) -> Scheme:
+def _load_file(path: Path) -> Protocol:
     try:
         table = tomllib.loads(path.read_text("utf-8"))
     except OSError as error:
-        raise SchemeError(
+        raise ProtocolError(
             f"{path}: cannot read the protocol ({error.strerror}); check the path",
             reason="unreadable-scheme",
         ) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SchemeError(
+        raise ProtocolError(
             f"{path}: not a TOML file ({error}); start from a bundled protocol",
             reason="unreadable-scheme",
         ) from error
-    return parse_scheme(table, origin=str(path))
+    return parse_protocol(table, origin=str(path))
 
 
-def parse_scheme(table: Mapping[str, Any], *, origin: str) -> Scheme:
-    """Check the contents of a protocol file.
-
-    Parameters
-    ----------
-    table : mapping
-        The parsed TOML file.
-    origin : str
-        Where it comes from, for error messages.
-
-    Returns
-    -------
-    Scheme
-
-    Raises
-    ------
-    SchemeError
-        ``invalid-scheme``, naming the key or label.
-    """
+def parse_protocol(table: Mapping[str, Any], *, origin: str) -> Protocol:
+    """Check the contents of a protocol file."""
     _check_keys(table, _KEYS, _OPTIONAL_KEYS, origin)
     labels = tuple(_parse_label(entry, origin) for entry in table["labels"])
-    scheme = Scheme(
+    protocol = Protocol(
         name=table["name"],
         title=table["title"],
         citation=table["citation"],
@@ -160,51 +122,41 @@ def parse_scheme(table: Mapping[str, Any], *, origin: str) -> Scheme:
         right_offset=table.get("right_offset", 0),
         neighbors=_tissues(table, "neighbors", origin) if "neighbors" in table else (),
     )
-    check_scheme(scheme, origin=origin)
-    return scheme
+    check_protocol(protocol, origin=origin)
+    return protocol
 
 
-def check_scheme(scheme: Scheme, *, origin: str) -> None:
-    """Check that the parts of a protocol agree with each other.
-
-    Parameters
-    ----------
-    scheme : Scheme
-    origin : str
-        Where it comes from, for error messages.
-
-    Raises
-    ------
-    SchemeError
-        ``invalid-scheme``, naming the first thing that is wrong.
-    """
-    codes = [label.code for label in scheme.labels]
+def check_protocol(protocol: Protocol, *, origin: str) -> None:
+    """Check that the parts of a protocol agree with each other."""
+    codes = [label.code for label in protocol.labels]
     twice = sorted({code for code in codes if codes.count(code) > 1})
-    used = {label.tissue for label in scheme.labels}
-    named = (*scheme.sheet, *scheme.layer, *scheme.interior, *scheme.neighbors)
+    used = {label.tissue for label in protocol.labels}
+    named = (*protocol.sheet, *protocol.layer, *protocol.interior, *protocol.neighbors)
     absent = [tissue.name for tissue in dict.fromkeys(named) if tissue not in used]
-    order = tuple(tissue for tissue in MEDIAL_TO_LATERAL if tissue in scheme.sheet)
-    beside = tuple(tissue for tissue in FAR_TO_NEAR if tissue in scheme.neighbors)
+    order = tuple(tissue for tissue in MEDIAL_TO_LATERAL if tissue in protocol.sheet)
+    beside = tuple(tissue for tissue in FAR_TO_NEAR if tissue in protocol.neighbors)
     problems = {
-        f"name {scheme.name!r} has to consist of letters and digits": not re.fullmatch(
-            "[A-Za-z0-9]+", scheme.name
+        f"name {protocol.name!r} has to consist of letters and digits": not re.fullmatch(
+            "[A-Za-z0-9]+", protocol.name
         ),
         "there are no labels": not codes,
         f"code {', '.join(map(str, twice))} is listed twice": bool(twice),
-        "unlisted has to be 'error' or 'other'": scheme.unlisted not in {"error", "other"},
+        "unlisted has to be 'error' or 'other'": protocol.unlisted not in {"error", "other"},
         "right_offset has to exceed every code": bool(codes)
-        and scheme.right_offset != 0
-        and scheme.right_offset <= max(codes),
+        and protocol.right_offset != 0
+        and protocol.right_offset <= max(codes),
         f"no label has tissue {', '.join(absent)}": bool(absent),
         "sheet has to list each tissue once, medial to lateral, out of "
-        + ", ".join(t.name for t in MEDIAL_TO_LATERAL): scheme.sheet != order,
+        + ", ".join(t.name for t in MEDIAL_TO_LATERAL): protocol.sheet != order,
         "neighbors has to list each tissue once, far to near, out of "
-        + ", ".join(t.name for t in FAR_TO_NEAR): scheme.neighbors != beside,
-        "a tissue is in both sheet and layer": not set(scheme.sheet).isdisjoint(scheme.layer),
-        "a tissue is in both sheet and interior": not set(scheme.sheet).isdisjoint(scheme.interior),
-        "layer, interior or neighbors is given without a sheet": not scheme.sheet and bool(named),
-        "there is neither a sheet nor a label with a part": not scheme.sheet
-        and all(label.part is Part.UNKNOWN for label in scheme.labels),
+        + ", ".join(t.name for t in FAR_TO_NEAR): protocol.neighbors != beside,
+        "a tissue is in both sheet and layer": not set(protocol.sheet).isdisjoint(protocol.layer),
+        "a tissue is in both sheet and interior": not set(protocol.sheet).isdisjoint(
+            protocol.interior
+        ),
+        "layer, interior or neighbors is given without a sheet": not protocol.sheet and bool(named),
+        "there is neither a sheet nor a label with a part": not protocol.sheet
+        and all(label.part is Part.UNKNOWN for label in protocol.labels),
     }
     for problem, wrong in problems.items():
         if wrong:
@@ -266,8 +218,8 @@ def _did_you_mean(name: str, names: Iterable[str]) -> str:
     return f" (did you mean {near[0]!r}?)" if near else ""
 
 
-def _invalid(where: str, problem: str) -> SchemeError:
-    return SchemeError(f"{where}: {problem}", reason="invalid-scheme")
+def _invalid(where: str, problem: str) -> ProtocolError:
+    return ProtocolError(f"{where}: {problem}", reason="invalid-scheme")
 
 
 # Protocols described by names instead of numbers: label tables that come with a dataset.
@@ -331,18 +283,7 @@ class NamedCode:
 
 
 def identify_tissue(name: str) -> tuple[Tissue, Part]:
-    """Understand a label's name.
-
-    Parameters
-    ----------
-    name : str
-        For example ``Left-CA1-head``, ``hippocampal_tail``, ``CA2/3`` or ``dentate_gyrus``.
-
-    Returns
-    -------
-    tissue, part
-        ``Tissue.OTHER`` for a name that is not known.
-    """
+    """Understand a label's name."""
     words = re.findall("[a-z0-9]+", name.lower())
     part = next((_PARTS[word] for word in words if word in _PARTS), Part.UNKNOWN)
     rest = "".join(word for word in words if word not in _FILLERS and word not in _PARTS)
@@ -353,27 +294,8 @@ def identify_tissue(name: str) -> tuple[Tissue, Part]:
     return Tissue.OTHER, part
 
 
-def scheme_from_names(rows: Iterable[NamedCode], *, name: str, origin: str) -> Scheme:
-    """Make a protocol from a label table.
-
-    Parameters
-    ----------
-    rows : iterable of NamedCode
-    name : str
-        The protocol's name; alphanumeric.
-    origin : str
-        Where the table comes from, for the title and for error messages.
-
-    Returns
-    -------
-    Scheme
-
-    Raises
-    ------
-    SchemeError
-        ``unclear-names`` if the table names no subiculum or no CA1; ``invalid-scheme`` if a code
-        is listed twice.
-    """
+def protocol_from_names(rows: Iterable[NamedCode], *, name: str, origin: str) -> Protocol:
+    """Make a protocol from a label table."""
     labels = tuple(
         label
         for index, row in enumerate(rows)
@@ -381,13 +303,13 @@ def scheme_from_names(rows: Iterable[NamedCode], *, name: str, origin: str) -> S
     )
     tissues = {label.tissue for label in labels}
     if not tissues >= {Tissue.SUBICULUM, Tissue.CA1}:
-        raise SchemeError(
+        raise ProtocolError(
             f"{origin}: its names do not include a subiculum and a CA1; "
             "describe the labels in a TOML file and pass it with --scheme",
             reason="unclear-names",
         )
     inside = (Tissue.DENTATE_GYRUS, Tissue.CA4, Tissue.MOLECULAR_LAYER)
-    scheme = Scheme(
+    protocol = Protocol(
         name=name,
         title=f"Labels named in {origin}",
         citation="",
@@ -397,23 +319,23 @@ def scheme_from_names(rows: Iterable[NamedCode], *, name: str, origin: str) -> S
         labels=labels,
         neighbors=tuple(t for t in FAR_TO_NEAR if t in tissues and t in _NEIGHBORS),
     )
-    check_scheme(scheme, origin=origin)
-    return scheme
+    check_protocol(protocol, origin=origin)
+    return protocol
 
 
-def agrees(scheme: Scheme, rows: Iterable[NamedCode]) -> bool:
+def agrees(protocol: Protocol, rows: Iterable[NamedCode]) -> bool:
     """Say whether a label table describes a given protocol.
 
     The table has to list every label of the sheet and its interior, and each code that it lists
     has to mean the same tissue in the protocol. Codes whose names say nothing may be missing there.
     """
     table = {row.code: _label(row, 0).tissue for row in rows if row.code > 0}
-    protocol = {label.code: label.tissue for label in scheme.labels}
-    needed = {*scheme.sheet, *scheme.interior}
-    complete = all(code in table for code, tissue in protocol.items() if tissue in needed)
+    known = {label.code: label.tissue for label in protocol.labels}
+    needed = {*protocol.sheet, *protocol.interior}
+    complete = all(code in table for code, tissue in known.items() if tissue in needed)
     silent = {Tissue.OTHER, Tissue.BACKGROUND}
     return complete and all(
-        protocol.get(code, tissue if tissue in silent else None) is tissue
+        known.get(code, tissue if tissue in silent else None) is tissue
         for code, tissue in table.items()
     )
 
@@ -437,36 +359,17 @@ def _label(row: NamedCode, index: int) -> Label:
 # What is measured: the hippocampal body, with the cortex beside it, or that cortex alone.
 
 
-def for_region(scheme: Scheme, region: str) -> Scheme:
-    """Give a protocol the sheet of a region.
-
-    Parameters
-    ----------
-    scheme : Scheme
-    region : str
-        ``body``, ``extended`` (the body and the neighboring cortex) or ``entorhinal`` (that cortex
-        alone).
-
-    Returns
-    -------
-    Scheme
-        Its ``sheet`` is that of the region; all else stays.
-
-    Raises
-    ------
-    SchemeError
-        ``no-cortex-labels`` if the protocol has no neighboring cortex; the message says which
-        bundled ones have.
-    """
+def for_region(protocol: Protocol, region: str) -> Protocol:
+    """Give a protocol the sheet of a region."""
     if region == "body":
-        return scheme
-    if not scheme.neighbors:
-        able = [name for name in scheme_names() if load_scheme(name).neighbors]
-        raise SchemeError(
-            f"region {region}: the protocol {scheme.name} has no labels of neighboring cortex; "
+        return protocol
+    if not protocol.neighbors:
+        able = [name for name in protocol_names() if load_protocol(name).neighbors]
+        raise ProtocolError(
+            f"region {region}: the protocol {protocol.name} has no labels of neighboring cortex; "
             f"{', '.join(able)} have; measure the body, or list them as neighbors in a protocol "
             "file for --scheme",
             reason="no-cortex-labels",
         )
-    hippocampal = scheme.sheet if region == "extended" else ()
-    return replace(scheme, sheet=(*scheme.neighbors, *hippocampal))
+    hippocampal = protocol.sheet if region == "extended" else ()
+    return replace(protocol, sheet=(*protocol.neighbors, *hippocampal))

@@ -6,7 +6,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from hipsta_bids.errors import SchemeError
+from hipsta_bids.errors import ProtocolError
 
 
 class Tissue(IntEnum):
@@ -72,18 +72,7 @@ _RANKS.flags.writeable = False
 
 
 def lateral_rank(tissue: NDArray[np.uint8]) -> NDArray[np.int8]:
-    """Rank from medial to lateral of the tissues of a sheet and of the cortex beside it.
-
-    Parameters
-    ----------
-    tissue : array of uint8, any shape
-        Values of :class:`Tissue`.
-
-    Returns
-    -------
-    array of int8, same shape
-        0 for the background.
-    """
+    """Rank from medial to lateral of the tissues of a sheet and of the cortex beside it."""
     return np.asarray(_RANKS[tissue])
 
 
@@ -120,7 +109,7 @@ class Label:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scheme:
+class Protocol:
     """A segmentation protocol.
 
     ``name`` is alphanumeric: it becomes the ``seg-`` entity of output names.
@@ -155,15 +144,6 @@ class Scheme:
 
         Every value has to be listed, and each tissue of the sheet and at least one of its interior
         has to occur.
-
-        Parameters
-        ----------
-        values : frozenset of int
-            The distinct codes of one hemisphere, without the background.
-
-        Returns
-        -------
-        bool
         """
         if not self.sheet or not values <= self.codes:
             return False
@@ -172,51 +152,33 @@ class Scheme:
 
 
 def translate(
-    codes: NDArray[np.integer], scheme: Scheme
+    codes: NDArray[np.integer], protocol: Protocol
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Translate the codes of a protocol into tissues and parts.
-
-    Parameters
-    ----------
-    codes : array of int, any shape
-        Codes of one hemisphere; 0 is background.
-    scheme : Scheme
-
-    Returns
-    -------
-    tissue, part : array of uint8, same shape
-        Values of :class:`Tissue` and :class:`Part`.
-
-    Raises
-    ------
-    SchemeError
-        ``unknown-labels`` if a code is not listed (unless ``scheme.unlisted`` is ``other``);
-        ``wrong-scheme`` if no label of the sheet occurs (of any part, for a parts-only scheme).
-    """
-    top = max(scheme.codes)
+    """Translate the codes of a protocol into tissues and parts."""
+    top = max(protocol.codes)
     # One row per code, and a last one that stands for every code outside the table.
     tissues = np.full(top + 2, Tissue.OTHER, dtype=np.uint8)
     parts = np.full(top + 2, Part.UNKNOWN, dtype=np.uint8)
     listed = np.zeros(top + 2, dtype=bool)
     tissues[0], listed[0] = Tissue.BACKGROUND, True
-    for label in scheme.labels:
+    for label in protocol.labels:
         tissues[label.code], parts[label.code] = label.tissue, label.part
         listed[label.code] = True
 
     rows = np.where((codes >= 0) & (codes <= top), codes, top + 1).astype(np.intp)
     occurs = np.bincount(rows.ravel(), minlength=top + 2) > 0
-    if scheme.unlisted == "error" and (occurs & ~listed).any():
+    if protocol.unlisted == "error" and (occurs & ~listed).any():
         unknown = np.unique(codes[~listed[rows]])
-        raise SchemeError(
-            f"labels {_some(unknown)} are not in the protocol {scheme.name}; if the protocol is "
+        raise ProtocolError(
+            f"labels {_some(unknown)} are not in the protocol {protocol.name}; if the protocol is "
             "right, copy its TOML file, add the labels, and pass it with --scheme",
             reason="unknown-labels",
         )
-    wanted = np.isin(tissues, scheme.sheet) if scheme.sheet else parts != Part.UNKNOWN
+    wanted = np.isin(tissues, protocol.sheet) if protocol.sheet else parts != Part.UNKNOWN
     if not (occurs & wanted).any():
         found = np.unique(codes[codes != 0])
-        raise SchemeError(
-            f"no label of {'the sheet' if scheme.sheet else 'a part'} of {scheme.name} occurs "
+        raise ProtocolError(
+            f"no label of {'the sheet' if protocol.sheet else 'a part'} of {protocol.name} occurs "
             f"(found {_some(found)}): another protocol was used",
             reason="wrong-scheme",
         )

@@ -120,18 +120,7 @@ def title_of(name: HemisphereName) -> str:
 
 
 def read_cohort(root: Path) -> Cohort:
-    """Read the numbers of all hemispheres.
-
-    Parameters
-    ----------
-    root : Path
-        The output dataset.
-
-    Returns
-    -------
-    Cohort
-        Hemispheres whose summary cannot be read are left out.
-    """
+    """Read the numbers of all hemispheres."""
     try:
         settings = files.read_json(root / DATASET_FILES["settings"]).get("settings") or {}
     except InputError:
@@ -194,15 +183,7 @@ class Distance:
 def robust_scores(values: Float) -> Float:
     """Robust z-scores: distance from the median over the scaled median absolute deviation.
 
-    Parameters
-    ----------
-    values : (N, ...) float64
-        NaN where missing.
-
-    Returns
-    -------
-    (N, ...) float64
-        NaN where missing, 0 where nothing varies.
+    ``values`` NaN where missing. Returns NaN where missing, 0 where nothing varies.
     """
     away = values - np.nanmedian(values, axis=0)
     spread = _MAD_TO_SD * np.nanmedian(np.abs(away), axis=0)
@@ -210,20 +191,7 @@ def robust_scores(values: Float) -> Float:
 
 
 def distances(cohort: Cohort, thickness: Mapping[str, Float]) -> dict[str, Distance]:
-    """Measure how far each hemisphere stands from those of its kind.
-
-    Parameters
-    ----------
-    cohort : Cohort
-    thickness : mapping of str to (Nx, Ny) float64
-        Thickness maps by title of the hemisphere, in which shapes are compared point by point.
-
-    Returns
-    -------
-    dict of str to Distance
-        By title of the hemisphere, of measured ones in cohorts of at least
-        :data:`SMALLEST_COMPARED`.
-    """
+    """Measure how far each hemisphere stands from those of its kind."""
     found = {}
     for members in _kinds(cohort):
         if len(members) < SMALLEST_COMPARED:
@@ -283,17 +251,7 @@ _QUALITY = {
 
 
 def cohort_page(cohort: Cohort) -> str | None:
-    """Make the page about all hemispheres of an output dataset.
-
-    Parameters
-    ----------
-    cohort : Cohort
-
-    Returns
-    -------
-    str or None
-        The page; ``None`` if there is no hemisphere.
-    """
+    """Make the page about all hemispheres of an output dataset."""
     hemispheres = cohort.hemispheres
     if not hemispheres:
         return None

@@ -19,13 +19,13 @@ from hipsta_bids.io.files import hide_home
 from hipsta_bids.reports.group_maps import classifiers, map_scenes, registration
 from hipsta_bids.reports.group_tables import (
     GroupResults,
+    display_name,
     findings,
     number_text,
     participants,
     peaks,
     read_group,
     scores,
-    spelled,
     summaries,
 )
 from hipsta_bids.reports.maps import colors_of, picture_of_file
@@ -41,17 +41,7 @@ _SHADES = 64
 
 
 def design(results: GroupResults) -> Mapping[str, Any] | None:
-    """Show the design matrix, its contrasts, and what was modeled.
-
-    Parameters
-    ----------
-    results : GroupResults
-
-    Returns
-    -------
-    mapping or None
-        For the template.
-    """
+    """Show the design matrix, its contrasts, and what was modeled."""
     record = results.record
     table = results.table("design")
     columns = [str(name) for name in record.get("columns") or ()]
@@ -59,7 +49,9 @@ def design(results: GroupResults) -> Mapping[str, Any] | None:
     comparison = record.get("comparison") or {}
     return {
         "formula": record.get("formula"),
-        "measures": [spelled(m) for m in measures["measure"].unique()] if len(measures) else [],
+        "measures": [display_name(m) for m in measures["measure"].unique()]
+        if len(measures)
+        else [],
         "what": _what(comparison),
         "references": list((record.get("references") or {}).items()),
         "columns": columns,
@@ -134,23 +126,7 @@ _PREFIX = "group"
 
 
 def group_page(folder: Path) -> str:
-    """Make the page about one analysis from its files.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the model, ``OUT_DIR/group/<model>``.
-
-    Returns
-    -------
-    str
-        The page.
-
-    Raises
-    ------
-    InputError
-        If ``analysis.json`` cannot be read.
-    """
+    """Make the page about one analysis from its files."""
     results = read_group(folder)
     record = results.record
     return render(
@@ -252,20 +228,7 @@ SECTIONS: tuple[Section[GroupResults], ...] = (
 
 
 def write_group_report(root: Path, model: str) -> str | None:
-    """Make the page about one analysis of the group level; a failure leaves no page.
-
-    Parameters
-    ----------
-    root : Path
-        The output dataset.
-    model : str
-        Name of the analysis, which is that of its folder.
-
-    Returns
-    -------
-    str or None
-        Why there is no page; ``None`` if all went well.
-    """
+    """Make the page about one analysis of the group level; a failure leaves no page."""
     path = root / group_report(model)
     try:
         files.write_text(path, group_page(root / DATASET_FILES["group"] / model))

@@ -13,9 +13,9 @@ from hipsta_bids.reports.group_tables import (
     SIDES,
     GroupResults,
     classification,
+    display_name,
     number_text,
     records,
-    spelled,
     summary_side,
     unit_of,
     with_unit,
@@ -31,17 +31,7 @@ _EFFECT_NAMES = {"t": "Cohen's d", "F": "partial eta squared"}
 
 
 def map_scenes(results: GroupResults) -> Mapping[str, Any] | None:
-    """Collect the maps of all measures on regular grids.
-
-    Parameters
-    ----------
-    results : GroupResults
-
-    Returns
-    -------
-    mapping or None
-        What the template lists and ``group.js`` draws; ``None`` if nothing was mapped.
-    """
+    """Collect the maps of all measures on regular grids."""
     maps = results.table("maps")
     if not len(maps):
         return None
@@ -65,7 +55,7 @@ def _pictures(results: GroupResults, measure: str) -> Iterator[dict[str, str]]:
     for kind, title in titles.items():
         path = results.folder / "figures" / f"{measure}_{kind}.svg"
         if path.exists():
-            yield {"name": path.stem, "title": f"{spelled(measure).capitalize()}: {title}"}
+            yield {"name": path.stem, "title": f"{display_name(measure).capitalize()}: {title}"}
 
 
 def _block(
@@ -85,7 +75,7 @@ def _block(
         "sides": [_rounded(side) for side in sides],
     }
     block = {
-        "title": spelled(measure).capitalize(),
+        "title": display_name(measure).capitalize(),
         "means": list(_mean_panels(measure, unit, sides)),
         "contrasts": [
             {"name": name, "panels": list(_contrast_panels(measure, name, sides))}
@@ -224,7 +214,7 @@ def _mean_panels(
                 "index": j,
                 "title": f"{group['group']}, {side['title']}",
                 "note": f"n = {group['n']}",
-                "alt": f"Mean {spelled(measure)} of {group['group']}, {side['title']}: {span}",
+                "alt": f"Mean {display_name(measure)} of {group['group']}, {side['title']}: {span}",
             }
 
 
@@ -249,7 +239,7 @@ def _contrast_panels(
                     "index": j,
                     "title": f"{side['title'].capitalize()}, {what}",
                     "note": count if kind == "significance" else "",
-                    "alt": f"{what.capitalize()} of {contrast} on {spelled(measure)},"
+                    "alt": f"{what.capitalize()} of {contrast} on {display_name(measure)},"
                     f" {side['title']}: {said}",
                 }
 
@@ -293,23 +283,7 @@ class Axis:
 def chart(
     title: str, alt: str, lines: Sequence[Line], x: Axis, y: Axis, *, diagonal: bool = False
 ) -> dict[str, Any]:
-    """Lay out a chart for the template.
-
-    Parameters
-    ----------
-    title : str
-    alt : str
-        What it shows, for those who do not see it.
-    lines : sequence of Line
-    x, y : Axis
-    diagonal : bool
-        Whether y = x is drawn.
-
-    Returns
-    -------
-    dict
-        For the macro ``chart``.
-    """
+    """Lay out a chart for the template."""
     limits_x = x.limits or _limits([line.x for line in lines])
     reached = [line.y + side * (0 if line.reach is None else line.reach)
                for line in lines for side in (-1, 1)]  # fmt: skip
@@ -410,17 +384,7 @@ _MOST_WARPS = 300  # that are drawn, so that pages of large studies stay small
 
 
 def registration(results: GroupResults) -> Mapping[str, Any] | None:
-    """Show what registration has done: profiles before and after, and warps.
-
-    Parameters
-    ----------
-    results : GroupResults
-
-    Returns
-    -------
-    mapping or None
-        For the template; ``None`` without sheets.
-    """
+    """Show what registration has done: profiles before and after, and warps."""
     table = results.table("registration")
     if not len(table):
         return None
@@ -477,10 +441,12 @@ def _profiles(results: GroupResults) -> Iterator[dict[str, Any]]:
         low, high = (rows["mean"] - reach).min(), (rows["mean"] + reach).max()
         spare = 0.05 * (high - low)
         unit = unit_of(str(rows["unit"].iloc[0]))
-        label = spelled(str(measure)) + (f" [{unit}]" if unit else "")
+        label = display_name(str(measure)) + (f" [{unit}]" if unit else "")
         for registered, own in rows.groupby("registered"):
             when = "after" if registered else "before"
-            title = f"{spelled(str(measure)).capitalize()}, {SIDES.get(str(hemi), hemi)}, {when}"
+            title = (
+                f"{display_name(str(measure)).capitalize()}, {SIDES.get(str(hemi), hemi)}, {when}"
+            )
             yield chart(
                 title,
                 f"{title} registration: means of groups from medial to lateral",
@@ -533,17 +499,7 @@ def _some(rows: Float) -> Float:
 
 
 def classifiers(results: GroupResults) -> Mapping[str, Any] | None:
-    """Show how well groups are told apart: table, ROC curves and calibration.
-
-    Parameters
-    ----------
-    results : GroupResults
-
-    Returns
-    -------
-    mapping or None
-        For the template; ``None`` if no pair was compared.
-    """
+    """Show how well groups are told apart: table, ROC curves and calibration."""
     rows = classification(results)
     if not rows:
         return None
@@ -585,7 +541,7 @@ def _pairs(
         ["control", "case", "hemi", "added"], sort=False
     ):
         side = summary_side(str(hemi), str(added))
-        what = f"{control} against {case}, {side}, {spelled(str(added))}"
+        what = f"{control} against {case}, {side}, {display_name(str(added))}"
         lines = []
         for i, name in enumerate(("base", "full")):
             own = rows[rows["classifier"] == name]

@@ -48,13 +48,7 @@ class GroupResults:
         return tuple(str(level) for level in (self.record.get("groups") or {}).get("levels", ()))
 
     def table(self, name: str) -> pd.DataFrame:
-        """Read a table; empty if there is none.
-
-        Parameters
-        ----------
-        name : str
-            File name without ``.tsv``.
-        """
+        """Read a table; empty if there is none."""
         if name not in self._tables:
             path = self.folder / f"{name}.tsv"
             self._tables[name] = (
@@ -79,18 +73,7 @@ class GroupResults:
 
 
 def read_group(folder: Path) -> GroupResults:
-    """Read what an analysis says of itself.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the model.
-
-    Raises
-    ------
-    InputError
-        If ``analysis.json`` cannot be read.
-    """
+    """Read what an analysis says of itself."""
     return GroupResults(folder=folder, record=files.read_json(folder / "analysis.json"))
 
 
@@ -99,7 +82,7 @@ def records(table: pd.DataFrame) -> list[dict[str, Any]]:
     return [dict(zip(map(str, table.columns), row, strict=True)) for row in table.to_numpy(object)]
 
 
-def spelled(measure: str) -> str:
+def display_name(measure: str) -> str:
     """Spell a measure with spaces."""
     return measure.replace("_", " ")
 
@@ -139,18 +122,7 @@ def p_text(p: float) -> str:
 
 
 def direction(results: GroupResults, contrast: str, hemi: str, sign: float) -> str:
-    """Say what a contrast above or below zero means.
-
-    Parameters
-    ----------
-    results : GroupResults
-    contrast : str
-        Its name.
-    hemi : str
-        ``L``, ``R`` or ``LR``.
-    sign : float
-        Of the estimate.
-    """
+    """Say what a contrast above or below zero means."""
     comparison = results.record.get("comparison") or {}
     if contrast == "mean" and hemi == BOTH:
         return "larger on the left" if sign > 0 else "larger on the right"
@@ -173,17 +145,7 @@ _ALPHA = 0.05  # of tests that are not corrected, for a word only
 
 
 def findings(results: GroupResults) -> Mapping[str, Any] | None:
-    """Say per measure and contrast what survived.
-
-    Parameters
-    ----------
-    results : GroupResults
-
-    Returns
-    -------
-    mapping or None
-        For the template.
-    """
+    """Say per measure and contrast what survived."""
     maps = results.table("maps")
     cards = []
     if len(maps):
@@ -191,7 +153,7 @@ def findings(results: GroupResults) -> Mapping[str, Any] | None:
             sides = [_side(results, row) for row in records(rows)]
             cards.append(
                 {
-                    "title": f"{spelled(str(measure)).capitalize()}, {contrast}",
+                    "title": f"{display_name(str(measure)).capitalize()}, {contrast}",
                     "found": any(side["found"] for side in sides),
                     "sides": sides,
                 }
@@ -311,7 +273,7 @@ def _summaries(results: GroupResults) -> Iterator[str]:
     for (contrast, measure), rows in table.groupby(["contrast", "measure"], sort=False):
         own = rows[rows["p"] < _ALPHA]
         if len(own):
-            yield f"{spelled(str(measure))}, {contrast}: " + "; ".join(
+            yield f"{display_name(str(measure))}, {contrast}: " + "; ".join(
                 f"{summary_side(row['hemi'], str(measure))} {effect_name(row['effect'])}"
                 f" {number_text(row['effect_size'])}, p {p_text(row['p'])}"
                 for row in records(own)
@@ -333,7 +295,7 @@ def _classification(results: GroupResults) -> Iterator[str]:
             yield (
                 f"{row['control']} against {row['case']},"
                 f" {summary_side(row['hemi'], row['added'])}:"
-                f" {spelled(row['added'])} adds to {row['base']} (p {p_text(row['p'])});"
+                f" {display_name(row['added'])} adds to {row['base']} (p {p_text(row['p'])});"
                 f" cross-validated area {row['auc_base_cv']:.2f} to {row['auc_full_cv']:.2f}"
             )
 
@@ -357,7 +319,7 @@ def peaks(results: GroupResults) -> Mapping[str, Any] | None:
         rows.append(
             {
                 "number": int(number) if row["extent"] > 0 else "",
-                "measure": spelled(row["measure"]),
+                "measure": display_name(row["measure"]),
                 "contrast": row["contrast"],
                 "side": SIDES.get(row["hemi"], row["hemi"]),
                 "place": place_words(row),
@@ -441,7 +403,7 @@ def summaries(results: GroupResults) -> Mapping[str, Any] | None:
             continue
         rows.append(
             {
-                "measure": spelled(row["measure"]),
+                "measure": display_name(row["measure"]),
                 "unit": unit_of(row["unit"]),
                 "side": summary_side(row["hemi"], row["measure"]),
                 "contrast": row["contrast"],
@@ -469,8 +431,8 @@ def classification(results: GroupResults) -> Sequence[dict[str, Any]]:
         {
             "pair": f"{row['control']} against {row['case']}",
             "side": summary_side(row["hemi"], row["added"]),
-            "base": " + ".join(spelled(name) for name in row["base"].split(" + ")),
-            "added": spelled(row["added"]),
+            "base": " + ".join(display_name(name) for name in row["base"].split(" + ")),
+            "added": display_name(row["added"]),
             "n": f"{row['n']} ({row['n_cases']} {row['case']})",
             "areas": [
                 f"{row[f'auc_{m}']:.2f} ({row[f'auc_{m}_low']:.2f} to {row[f'auc_{m}_high']:.2f})"
@@ -512,7 +474,7 @@ def _score_rows(table: pd.DataFrame) -> Iterator[dict[str, Any]]:
             spread = f"{number_text(w.mean())} ({number_text(w.std())})"
             cells.append(f"{spread}; {beyond} of {len(w)}" if len(w) else "")
         yield {
-            "measure": spelled(str(measure)),
+            "measure": display_name(str(measure)),
             "side": summary_side(str(hemi), str(measure)),
             "cells": cells,
         }
@@ -525,7 +487,7 @@ def _apart(table: pd.DataFrame) -> Iterator[dict[str, str]]:
         session = row["session_id"] if isinstance(row["session_id"], str) else ""
         yield {
             "who": f"{row['participant_id']} {session}".strip(),
-            "measure": spelled(row["measure"]),
+            "measure": display_name(row["measure"]),
             "side": summary_side(row["hemi"], row["measure"]),
             "w": number_text(row["w"]),
         }

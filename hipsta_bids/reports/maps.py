@@ -90,19 +90,7 @@ class Picture:
 
 
 def scale_of(kind: MapKind, values: Sequence[Float]) -> tuple[float, float]:
-    """Choose the values at both ends of the color bar.
-
-    Parameters
-    ----------
-    kind : MapKind
-    values : sequence of float64 arrays
-        All that is shown on one scale.
-
-    Returns
-    -------
-    (float, float)
-        Percentiles of the kind; symmetric where the middle means zero.
-    """
+    """Choose the values at both ends of the color bar."""
     every = np.concatenate([np.ravel(array) for array in values])
     every = every[np.isfinite(every)]
     if not len(every):
@@ -134,18 +122,7 @@ def gradient_of(colors: NDArray[np.str_]) -> str:
 
 
 def draw_map(kind: MapKind, hemispheres: Sequence[Hemisphere]) -> Picture:
-    """Draw one map of both hemispheres, unfolded, side by side on one color scale.
-
-    Parameters
-    ----------
-    kind : MapKind
-    hemispheres : sequence of Hemisphere
-        Measured ones.
-
-    Returns
-    -------
-    Picture
-    """
+    """Draw one map of both hemispheres, unfolded, side by side on one color scale."""
     figure, axes = _new_figure(1, len(hemispheres), (2.6 * len(hemispheres) + 0.9, 3.1))
     low, high = scale_of(kind, [h.sheet.columns[kind.column] for h in hemispheres])
     image: Any = None
@@ -170,20 +147,7 @@ def draw_map(kind: MapKind, hemispheres: Sequence[Hemisphere]) -> Picture:
 def draw_profiles(
     kind: MapKind, hemispheres: Sequence[Hemisphere], others: Mapping[str, Float]
 ) -> Picture:
-    """Draw a map along x: its mean over y and the range of nine tenths of the rows.
-
-    Parameters
-    ----------
-    kind : MapKind
-    hemispheres : sequence of Hemisphere
-        Measured ones.
-    others : mapping of str to (N, Nx) float64
-        By hemisphere, mean profiles of the cohort; perhaps empty.
-
-    Returns
-    -------
-    Picture
-    """
+    """Draw a map along x: its mean over y and the range of nine tenths of the rows."""
     figure, axes = _new_figure(1, 1, (5.6, 2.9))
     axis = axes[0, 0]
     bands = []
@@ -220,14 +184,7 @@ def draw_profiles(
 
 
 def picture_of_file(path: Path, *, alt: str, caption: str) -> Picture:
-    """Embed a drawing that was made before.
-
-    Parameters
-    ----------
-    path : Path
-        SVG file of matplotlib.
-    alt, caption : str
-    """
+    """Embed a drawing that was made before."""
     content = path.read_bytes()
     width = re.search(rb'<svg[^>]*? width="([\d.]+)pt"', content)
     return Picture(
@@ -388,18 +345,7 @@ class Grid:
 
 
 def read_maps(hemisphere: Hemisphere) -> dict[str, Float]:
-    """Read the maps that are shown, faster than the whole sheet.
-
-    Parameters
-    ----------
-    hemisphere : Hemisphere
-        A measured one.
-
-    Returns
-    -------
-    dict of str to (Nx, Ny) float64
-        Empty if the table cannot be read.
-    """
+    """Read the maps that are shown, faster than the whole sheet."""
     names = [kind.column for kind in MAP_KINDS]
     try:
         table = csv.read_csv(
@@ -421,19 +367,7 @@ def read_maps(hemisphere: Hemisphere) -> dict[str, Float]:
 def make_sprites(
     hemispheres: Sequence[Hemisphere], maps: Sequence[Mapping[str, Float]]
 ) -> tuple[list[Sprites], Grid]:
-    """Draw the maps of all hemispheres.
-
-    Parameters
-    ----------
-    hemispheres : sequence of Hemisphere
-    maps : sequence of mapping
-        Of each, from :func:`read_maps`.
-
-    Returns
-    -------
-    list of Sprites, Grid
-        Anterior is up; the medial side of left hemispheres is on the right, as on their own page.
-    """
+    """Draw the maps of all hemispheres."""
     shapes = [found[MAP_KINDS[0].column].shape for found in maps if found]
     usual = max(set(shapes), key=shapes.count) if shapes else (0, 0)
     shown = [

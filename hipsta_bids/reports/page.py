@@ -44,20 +44,7 @@ class Content:
 def build_sections(
     sections: Iterable[Section[_Topic]], topic: _Topic, prefix: str
 ) -> list[Content]:
-    """Build sections; one that fails says so in the page and in the log, and harms no other.
-
-    Parameters
-    ----------
-    sections : iterable of Section
-    topic : object
-        What they are about.
-    prefix : str
-        Of the anchors, which have to be unique in a page.
-
-    Returns
-    -------
-    list of Content
-    """
+    """Build sections; one that fails says so in the page and in the log, and harms no other."""
     built = []
     for section in sections:
         try:
@@ -78,20 +65,7 @@ def build_sections(
 
 
 def render(template: str, **values: Any) -> str:  # noqa: ANN401  (what the template shows)
-    """Fill a page's template.
-
-    Parameters
-    ----------
-    template : str
-        File in ``templates/``.
-    **values
-        What it shows. All text is escaped.
-
-    Returns
-    -------
-    str
-        The page.
-    """
+    """Fill a page's template."""
     return _environment().get_template(template).render(version=__version__, **values)
 
 

@@ -186,22 +186,7 @@ _PLACES_SHOWN = 4
 
 
 def participant_page(root: Path, subject: str, session: str | None, cohort: Cohort) -> str | None:
-    """Make the page about one visit.
-
-    Parameters
-    ----------
-    root : Path
-        The output dataset.
-    subject, session : str
-        Labels without ``sub-`` and ``ses-``; the session may be ``None``.
-    cohort : Cohort
-        Everybody, to compare with.
-
-    Returns
-    -------
-    str or None
-        The page; ``None`` if there is no record of any hemisphere.
-    """
+    """Make the page about one visit."""
     kinds: dict[tuple[str, str], list[Hemisphere]] = {}
     for hemisphere in find_results(root, subject, session):
         name = hemisphere.place.name

@@ -18,19 +18,7 @@ _PREFERENCES = ("MPLBACKEND", "MATPLOTLIBRC")
 
 
 def new_figure(size: tuple[float, float], layout: Literal["constrained", "compressed"]) -> "Figure":
-    """Return an empty figure; it needs no screen and no home folder.
-
-    Parameters
-    ----------
-    size : (float, float)
-        Width and height, inches.
-    layout : {"constrained", "compressed"}
-        Layout engine of matplotlib.
-
-    Returns
-    -------
-    Figure
-    """
+    """Return an empty figure; it needs no screen and no home folder."""
     with contextlib.nullcontext() if "matplotlib" in sys.modules else _own_settings():
         from matplotlib.figure import Figure  # noqa: PLC0415  (slow to load)
 

@@ -17,8 +17,8 @@ from hipsta_bids.derivatives.names import DATASET_FILES, name_of_record
 from hipsta_bids.errors import HipstaError, InputError
 from hipsta_bids.io import files, gifti
 from hipsta_bids.io.volumes import read_voxels
-from hipsta_bids.protocols.load import load_scheme, scheme_names
-from hipsta_bids.protocols.protocol import Scheme
+from hipsta_bids.protocols.load import load_protocol, protocol_names
+from hipsta_bids.protocols.protocol import Protocol
 from hipsta_bids.types import Bool, Float, Status
 
 SURFACES = ("interior", "midthickness", "exterior")
@@ -120,13 +120,7 @@ class Hemisphere:
 
     @cached_property
     def sheet(self) -> SheetTable:
-        """Its sheet.
-
-        Raises
-        ------
-        InputError
-            If a file is missing or cannot be read.
-        """
+        """Its sheet."""
         rows = files.read_tsv(self.place.path("sheet"))
         try:
             return _sheet(rows, self.place)
@@ -146,21 +140,7 @@ class Hemisphere:
 def find_results(
     root: Path, subject: str | None = None, session: str | None = None
 ) -> Iterator[Hemisphere]:
-    """Find the hemispheres of an output dataset.
-
-    Parameters
-    ----------
-    root : Path
-        The output dataset.
-    subject, session : str, optional
-        Labels of one visit; without subject, all visits.
-
-    Yields
-    ------
-    Hemisphere
-        Sorted by subject, session, protocol, region and hemisphere. Records that cannot be read
-        are left out: the next run writes them anew.
-    """
+    """Find the hemispheres of an output dataset."""
     if subject is None:
         folders = ["sub-*/anat", "sub-*/ses-*/anat"]
     else:
@@ -186,13 +166,7 @@ def _order(place: ResultPlace) -> tuple[str, ...]:
 
 
 def read_summary(place: ResultPlace) -> dict[str, float]:
-    """Read the summary's row of numbers.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read.
-    """
+    """Read the summary's row of numbers."""
     rows = files.read_tsv(place.path("summary"))
     return {name: number_of(cell) for name, cell in rows[0].items()} if rows else {}
 
@@ -292,17 +266,7 @@ class Views:
 
 
 def read_views(hemisphere: Hemisphere) -> Views | None:
-    """Read what slices are drawn from.
-
-    Parameters
-    ----------
-    hemisphere : Hemisphere
-
-    Returns
-    -------
-    Views or None
-        ``None`` where there are neither labels nor a mask.
-    """
+    """Read what slices are drawn from."""
     mask = _read_mask(hemisphere)
     labels, missing = _read_labels(hemisphere)
     if labels is None and mask is None:
@@ -326,17 +290,7 @@ def read_views(hemisphere: Hemisphere) -> Views | None:
 
 
 def input_path(hemisphere: Hemisphere) -> Path | None:
-    """Find the file with the labels that were measured.
-
-    Parameters
-    ----------
-    hemisphere : Hemisphere
-
-    Returns
-    -------
-    Path or None
-        ``None`` if the record does not tell.
-    """
+    """Find the file with the labels that were measured."""
     record = hemisphere.record
     edited = [e for e in record.get("edited") or [] if e.get("what") == "labels"]
     entries = edited or record.get("inputs") or []
@@ -380,12 +334,12 @@ def _names(hemisphere: Hemisphere, data: NDArray[np.generic] | None) -> dict[int
     if data is None:
         return {}
     codes = [int(code) for code in np.unique(data) if code != 0]
-    scheme = _scheme(str(hemisphere.record.get("scheme", "")))
-    if scheme is None:
+    protocol = _protocol(str(hemisphere.record.get("scheme", "")))
+    if protocol is None:
         colors = {code: _COLORS[n % len(_COLORS)] for n, code in enumerate(codes)}
         return {code: LabelName(name=f"label {code}", color=colors[code]) for code in codes}
-    known = {label.code: label for label in scheme.labels}
-    offset = scheme.right_offset if hemisphere.place.name.hemi == "R" else 0
+    known = {label.code: label for label in protocol.labels}
+    offset = protocol.right_offset if hemisphere.place.name.hemi == "R" else 0
     # Files of one hemisphere may have the left codes on both sides.
     shift = offset if any(code - offset in known for code in codes) else 0
     return {
@@ -395,9 +349,9 @@ def _names(hemisphere: Hemisphere, data: NDArray[np.generic] | None) -> dict[int
     }
 
 
-def _scheme(name: str) -> Scheme | None:
+def _protocol(name: str) -> Protocol | None:
     try:
-        return load_scheme(name) if name in scheme_names() else None
+        return load_protocol(name) if name in protocol_names() else None
     except HipstaError:
         return None
 

@@ -16,20 +16,7 @@ from hipsta_bids.types import Float
 
 
 def cut(points: Float, axis: int, level: float) -> Float:
-    """Cut a grid of points by a plane across one of their axes.
-
-    Parameters
-    ----------
-    points : (Nx, Ny, 3) float64
-    axis : int
-        The plane is where this coordinate has the value ``level``.
-    level : float
-
-    Returns
-    -------
-    (N, 2, 3) float64
-        Both ends of the line in each triangle that the plane meets.
-    """
+    """Cut a grid of points by a plane across one of their axes."""
     triangles = points.reshape(-1, 3)[sheet_triangles(*points.shape[:2])]
     height = triangles[:, :, axis] - level
     above = height > 0
@@ -48,15 +35,7 @@ def cut(points: Float, axis: int, level: float) -> Float:
 def outline(inside: NDArray[np.bool_]) -> Float:
     """Find the edges between pixels inside and outside.
 
-    Parameters
-    ----------
-    inside : (I, J) bool
-
-    Returns
-    -------
-    (N, 2, 2) float64
-        Both ends of each edge, in pixels; the center of pixel (0, 0) is at (0, 0). Edges in one
-        line are joined.
+    Returns the center of pixel (0, 0) is at (0, 0).
     """
     padded = np.pad(inside, 1)
     edges = []
@@ -124,19 +103,7 @@ class Panel:
 
 
 def slice_panels(hemisphere: Hemisphere, views: Views) -> list[Panel]:
-    """Draw five slices across the body, and one along it.
-
-    Parameters
-    ----------
-    hemisphere : Hemisphere
-    views : Views
-        Its labels and mask.
-
-    Returns
-    -------
-    list of Panel
-        From posterior to anterior, then the sagittal one.
-    """
+    """Draw five slices across the body, and one along it."""
     centers = _centers(hemisphere, views)
     middle = centers[len(centers) // 2]
     across = [
@@ -150,19 +117,7 @@ def slice_panels(hemisphere: Hemisphere, views: Views) -> list[Panel]:
 
 
 def place_panels(hemisphere: Hemisphere, views: Views, point: Sequence[float]) -> list[Panel]:
-    """Draw the three slices through a place that a message names.
-
-    Parameters
-    ----------
-    hemisphere : Hemisphere
-    views : Views
-        Its labels and mask.
-    point : (3,) RAS mm
-
-    Returns
-    -------
-    list of Panel
-    """
+    """Draw the three slices through a place that a message names."""
     index = views.to_index(np.asarray(point, dtype=np.float64))
     return [_slice(hemisphere, views, name, index, mark=True) for name in _AXES]
 
@@ -172,19 +127,7 @@ def section_panels(
 ) -> list[Panel]:
     """Draw cross-sections of the sheet, with a line per column in the color of its thickness.
 
-    Parameters
-    ----------
-    hemisphere : Hemisphere
-        A measured one.
-    colors : (N,) str
-        Color table.
-    scale : (float, float)
-        Thickness at both ends of the table, mm.
-
-    Returns
-    -------
-    list of Panel
-        From posterior to anterior.
+    ``scale`` Thickness at both ends of the table, mm.
     """
     sheet = hemisphere.sheet
     rows = [round(share * (sheet.shape[1] - 1)) for share in POSITIONS]

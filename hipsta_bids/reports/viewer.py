@@ -18,22 +18,7 @@ _SUBFIELD_COLORS = ("#E69F00", "#56B4E9", "#009E73", "#CC79A7", "#F0E442", "#007
 
 
 def scene_of(hemisphere: Hemisphere, views: Views | None, names: Sequence[str]) -> dict[str, Any]:
-    """Collect the scene of one hemisphere.
-
-    Parameters
-    ----------
-    hemisphere : Hemisphere
-    views : Views, optional
-        Its labels and mask: the body of a failed hemisphere is drawn from the mask.
-    names : sequence of str
-        Subfields of all scenes of the page.
-
-    Returns
-    -------
-    dict
-        JSON-serializable: surfaces and maps of a measured hemisphere, else the body if known;
-        places that messages name.
-    """
+    """Collect the scene of one hemisphere."""
     scene: dict[str, Any] = {
         "side": hemisphere.side,
         "hemi": hemisphere.place.name.hemi,
@@ -52,18 +37,7 @@ def scene_of(hemisphere: Hemisphere, views: Views | None, names: Sequence[str]) 
 
 
 def scales_of(hemispheres: Sequence[Hemisphere]) -> dict[str, Any]:
-    """Collect the color scales that all scenes of a page share.
-
-    Parameters
-    ----------
-    hemispheres : sequence of Hemisphere
-        Measured ones.
-
-    Returns
-    -------
-    dict
-        By column of the sheet table: title, unit, ends and colors.
-    """
+    """Collect the color scales that all scenes of a page share."""
     scales: dict[str, Any] = {}
     for kind in MAP_KINDS:
         low, high = scale_of(kind, [h.sheet.columns[kind.column] for h in hemispheres])

@@ -110,17 +110,7 @@ class Usual:
 def usual_ranges(thickness: float, settings: Mapping[str, Any]) -> tuple[Usual, ...]:
     """List the quality numbers that a page shows.
 
-    Parameters
-    ----------
-    thickness : float
-        Mean over the sheet, mm, to which some limits are relative.
-    settings : mapping
-        Resolved settings of the results, by stage; beyond their limits a hemisphere is flagged or
-        refused.
-
-    Returns
-    -------
-    tuple of Usual
+    ``thickness`` Mean over the sheet, mm, to which some limits are relative.
     """
     usual = asdict(Settings())
     stages = {name: usual[name] | dict(settings.get(name) or {}) for name in usual}

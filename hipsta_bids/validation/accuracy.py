@@ -10,7 +10,7 @@ from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY
 from hipsta_bids.geometry.measures import away_from_edges, column_area
 from hipsta_bids.phantom import Phantom, PhantomSpec, PhantomTruth
 from hipsta_bids.phantom.truth import cut_sections
-from hipsta_bids.protocols.protocol import Scheme
+from hipsta_bids.protocols.protocol import Protocol
 from hipsta_bids.settings import MeasureSettings
 from hipsta_bids.types import Float, HemisphereMaps
 from hipsta_bids.validation.cases import (
@@ -114,17 +114,7 @@ SECTION_SIZES = (
 
 
 def run(full: bool) -> Suite:
-    """Measure every row in several poses.
-
-    Parameters
-    ----------
-    full : bool
-        Twelve poses a row instead of four.
-
-    Returns
-    -------
-    Suite
-    """
+    """Measure every row in several poses."""
     poses = POSES_FULL if full else POSES_QUICK
     cases = [case for number, row in enumerate(ROWS) for case in _poses(number, row, poses)]
     results = run_cases(measure_case, cases)
@@ -463,13 +453,13 @@ def compare_summary(phantom: Phantom, maps: HemisphereMaps, *, hemi: str = "L") 
 
 
 def compare_subfields(
-    phantom: Phantom, maps: HemisphereMaps, scheme: Scheme, *, hemi: str = "L"
+    phantom: Phantom, maps: HemisphereMaps, protocol: Protocol, *, hemi: str = "L"
 ) -> list[Comparison]:
     """Set the numbers of each subfield beside the truth."""
     thickness = _truth_at_nodes(phantom, maps, hemi).thickness
     area = column_area(maps.sheet)
     rows = []
-    for tissue, truth in phantom.subfield_summary(scheme).items():
+    for tissue, truth in phantom.subfield_summary(protocol).items():
         inside = area * (maps.subfield == tissue)
         for row in PER_SUBFIELD:
             name = f"{row.name}_{tissue.name}"

@@ -19,7 +19,7 @@ from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.participant.pool import WorkerLost, WorkerPlan, run_jobs
 from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.phantom.shape import PITCH
-from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.settings import GridSettings, Settings
 from hipsta_bids.types import Float, HemisphereMaps, LabelVolume
 
@@ -80,15 +80,7 @@ def without_edges(values: Float) -> Float:
 
 
 def measure_case(case: Case) -> Measured:
-    """Draw a phantom, measure it with default settings, and look up the truth.
-
-    Raises
-    ------
-    GeometryError
-        If the package refuses the hemisphere.
-    SettingsError
-        If the phantom is impossible.
-    """
+    """Draw a phantom, measure it with default settings, and look up the truth."""
     phantom = Phantom(case.spec)
     volume = draw(phantom, case)
     hemi = "R" if case.mirrored else case.hemi
@@ -102,7 +94,7 @@ def measure_case(case: Case) -> Measured:
 def draw(phantom: Phantom, case: Case) -> LabelVolume:
     """Draw a case in FreeSurfer's labels."""
     volume = phantom.label_volume(
-        load_scheme("freesurfer"),
+        load_protocol("freesurfer"),
         hemi=case.hemi,
         voxel_size=case.voxel_size,
         pose=case.pose,
@@ -147,20 +139,7 @@ def along_slices(
 ) -> tuple[Float, Float]:
     """Choose a pose, and a voxel grid whose third axis is the body's long axis, as scans have.
 
-    Parameters
-    ----------
-    generator : numpy.random.Generator
-    tilt : float
-        Degrees by which slices miss the perpendicular, about a random axis within them.
-    degrees : float
-        The grid is turned within the slices by up to so much.
-
-    Returns
-    -------
-    pose : (4, 4) array
-        Shift by up to 2 mm along each axis, no turn.
-    grid_rotation : (3, 3) array
-        For voxel axes of which the third points to anterior.
+    Returns Shift by up to 2 mm along each axis, no turn.
     """
     to_body = Rotation.from_euler("x", -PITCH)  # anterior to the long axis, which points down
     within = Rotation.from_euler("y", generator.uniform(-degrees, degrees), degrees=True)
@@ -202,7 +181,7 @@ def fine_segmentations(labels: Path, largest: float) -> list[HemisphereInput]:
 def load_body(body: ValidationBody, voxel: float) -> tuple[LabelVolume, str]:
     """Labels of a body and its hemisphere; phantoms are drawn in voxels of ``voxel`` mm."""
     if isinstance(body, PhantomSpec):
-        volume = Phantom(body).label_volume(load_scheme("freesurfer"), voxel_size=(voxel,) * 3)
+        volume = Phantom(body).label_volume(load_protocol("freesurfer"), voxel_size=(voxel,) * 3)
         return volume, "L"
     return read_label_volume(body), body.hemi
 
@@ -242,22 +221,7 @@ class Refusal:
 def run_cases(
     work: Callable[[Any], Any], cases: Sequence[Any], *, timeout: float = 60.0
 ) -> list[Any]:
-    """Work off cases in parallel, one processor each.
-
-    Parameters
-    ----------
-    work : callable
-        Importable function of one case; case and result have to be picklable.
-    cases : sequence
-        What to work off.
-    timeout : float
-        s per case.
-
-    Returns
-    -------
-    list
-        Results in the order of the cases, a :class:`Refusal` where there is none.
-    """
+    """Work off cases in parallel, one processor each."""
     results: list[Any] = [None] * len(cases)
     with tempfile.TemporaryDirectory() as folder:
         plan = WorkerPlan(
@@ -310,22 +274,8 @@ def reslice(
 ) -> LabelVolume:
     """Take the labels at the centers of the voxels of another grid.
 
-    Parameters
-    ----------
-    volume : LabelVolume
-    axis : (3,) array
-        Unit vector across the slices, RAS.
-    voxel_size : tuple of float
-        Pixel, pixel, distance of slices, mm.
-    offset : float
-        Shift along the slices' normal as a fraction of their distance.
-    tilt : float
-        Degrees by which the slices miss the perpendicular to ``axis``.
-
-    Returns
-    -------
-    LabelVolume
-        Covers the whole volume; background beyond it.
+    ``axis`` Unit vector across the slices, RAS; ``voxel_size`` Pixel, pixel, distance of slices,
+    mm.
     """
     aside = np.cross(axis, [0.0, 0.0, 1.0])
     aside /= np.linalg.norm(aside)
@@ -349,5 +299,8 @@ def reslice(
     tissue[inside] = volume.tissue[tuple(nearest[:, inside])]
     part[inside] = volume.part[tuple(nearest[:, inside])]
     return LabelVolume(
-        tissue=tissue.reshape(shape), part=part.reshape(shape), affine=affine, scheme=volume.scheme
+        tissue=tissue.reshape(shape),
+        part=part.reshape(shape),
+        affine=affine,
+        protocol=volume.protocol,
     )

@@ -54,17 +54,7 @@ Key = tuple[str, str]
 
 
 def run(full: bool) -> Suite:
-    """Measure the same phantoms in ever smaller voxels.
-
-    Parameters
-    ----------
-    full : bool
-        Two phantoms in eight poses instead of one in two.
-
-    Returns
-    -------
-    Suite
-    """
+    """Measure the same phantoms in ever smaller voxels."""
     poses = POSES_FULL if full else POSES_QUICK
     names = list(SPECS) if full else list(SPECS)[:1]
     keys = [(name, grid) for name in names for grid in GRIDS]
@@ -89,10 +79,7 @@ def run(full: bool) -> Suite:
 def rate(sizes: Sequence[float], errors: Sequence[float]) -> tuple[float, float]:
     """Fit ``error = constant * size ** rate`` by least squares in the logarithms.
 
-    Returns
-    -------
-    rate, standard_error : float
-        The standard error is NaN for two sizes.
+    Returns The standard error is NaN for two sizes.
     """
     x, y = np.log(sizes), np.log(errors)
     design = np.column_stack([x, np.ones_like(x)])
@@ -216,17 +203,7 @@ MAX_SILENT_ERROR = 0.15
 
 
 def run_limits(full: bool) -> Suite:
-    """Measure ever thinner sheets in ever larger voxels.
-
-    Parameters
-    ----------
-    full : bool
-        Sixteen pairs of thickness and voxel size instead of four.
-
-    Returns
-    -------
-    Suite
-    """
+    """Measure ever thinner sheets in ever larger voxels."""
     cases = _cases(full=full)
     return Suite(
         name="limits",

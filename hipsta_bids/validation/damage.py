@@ -37,15 +37,7 @@ class Defect:
 
 
 class Site:
-    """A body whose labels can be damaged.
-
-    Parameters
-    ----------
-    volume : LabelVolume
-        Undamaged labels.
-    sheet : Sheet
-        Measured in them; it tells where (u, v) is.
-    """
+    """A body whose labels can be damaged."""
 
     def __init__(self, volume: LabelVolume, sheet: Sheet) -> None:
         self.volume = volume
@@ -53,7 +45,7 @@ class Site:
         index = np.indices(volume.tissue.shape).reshape(3, -1).T
         points = index @ volume.affine[:3, :3].T + volume.affine[:3, 3]
         self.points: Float = points.reshape(*volume.tissue.shape, 3)
-        owners = (*volume.scheme.sheet, *volume.scheme.layer)
+        owners = (*volume.protocol.sheet, *volume.protocol.layer)
         self.wall: Bool = np.isin(volume.tissue, owners)
         """(I, J, K) voxels that become the ribbon, anywhere along the hippocampus."""
         ends = sheet.points[:, [0, -1]].mean(axis=(0, 2))
@@ -149,20 +141,7 @@ _THROUGH = 1.0
 def make_defect(site: Site, kind: str, size: float, place: Place = (0.5, 0.5)) -> Defect:
     """Damage a segmentation.
 
-    Parameters
-    ----------
-    site : Site
-    kind : str
-        One of :data:`DEFECTS`.
-    size : float
-        mm; what it measures is in the kind's own description.
-    place : tuple of float
-        Where on the sheet, (u, v).
-
-    Raises
-    ------
-    SettingsError
-        If the kind is unknown, or makes no change at this size and place.
+    ``size`` mm.
     """
     if kind not in DEFECTS:
         raise SettingsError(
@@ -264,7 +243,7 @@ def _missing_subfield(site: Site, size: float, place: Place) -> Defect:
     """Erase the subfield at the place; size is of no account."""
     del size
     middle = site.column(place)[site.columns.shape[2] // 2]
-    own = np.isin(site.volume.tissue, site.volume.scheme.sheet)
+    own = np.isin(site.volume.tissue, site.volume.protocol.sheet)
     nearest = np.argmin(np.linalg.norm(site.points[own] - middle, axis=1))
     return site.erased(site.volume.tissue == site.volume.tissue[own][nearest])
 
@@ -299,7 +278,7 @@ def _part_inside(site: Site, size: float, place: Place, part: Part) -> Defect:
     where = site.slab(place, size) & (site.volume.tissue > 0)
     whole = any(
         label.part is part and label.tissue is Tissue.HIPPOCAMPUS
-        for label in site.volume.scheme.labels
+        for label in site.volume.protocol.labels
     )
     return site.relabeled(where, Tissue.HIPPOCAMPUS if whole else None, part)
 

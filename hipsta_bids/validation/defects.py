@@ -130,19 +130,7 @@ class Damage:
 
 
 def run(full: bool, labels: Path | None = None) -> Suite:
-    """Damage bodies in many ways and measure them.
-
-    Parameters
-    ----------
-    full : bool
-        Every case on both phantoms instead of every third on one.
-    labels : Path, optional
-        A BIDS dataset with segmentations in fine voxels, of which every second is damaged too.
-
-    Returns
-    -------
-    Suite
-    """
+    """Damage bodies in many ways and measure them."""
     bodies: list[ValidationBody] = list(SPECS if full else SPECS[:1])
     if labels is not None:
         bodies += fine_segmentations(labels, VOXEL)[::2]
@@ -163,13 +151,7 @@ def run(full: bool, labels: Path | None = None) -> Suite:
 
 
 def measure_trial(trial: Trial) -> Damage:
-    """Measure one damaged phantom and compare it with the undamaged one.
-
-    Raises
-    ------
-    GeometryError
-        If the package refuses the damaged labels.
-    """
+    """Measure one damaged phantom and compare it with the undamaged one."""
     site, hemi, reference = _undamaged(trial.body)
     defect = make_defect(site, trial.kind, trial.size, trial.place)
     return compare(measure_body(defect.volume, hemi), reference, defect.changed)
@@ -178,15 +160,7 @@ def measure_trial(trial: Trial) -> Damage:
 def compare(maps: HemisphereMaps, reference: HemisphereMaps, changed: Float) -> Damage:
     """Compare the maps of damaged labels with those of the undamaged ones.
 
-    Parameters
-    ----------
-    maps, reference : HemisphereMaps
-    changed : (N, 3) array
-        Centers of the changed voxels, RAS mm.
-
-    Returns
-    -------
-    Damage
+    ``changed`` Centers of the changed voxels, RAS mm.
     """
     points = reference.sheet.points
     distance = np.asarray(cKDTree(changed).query(points.reshape(-1, 3))[0])

@@ -111,15 +111,7 @@ class SimulationResult:
 
 
 def simulate_cohort(plan: SimulationPlan, seed: int) -> SimulatedCohort:
-    """Draw one cohort.
-
-    Parameters
-    ----------
-    plan : SimulationPlan
-        Sizes and effects.
-    seed : int
-        The same seed gives the same cohort, with the same noise whatever the effect.
-    """
+    """Draw one cohort."""
     random = np.random.default_rng(seed)
     n, (x_nodes, y_nodes) = sum(plan.sizes), plan.nodes
     group = np.arange(n) >= plan.sizes[0]
@@ -250,22 +242,7 @@ class CorrectionResult:
 def simulate_corrections(
     plan: SimulationPlan, settings: GroupSettings, seeds: Sequence[int]
 ) -> Mapping[str, CorrectionResult]:
-    """Analyze cohorts with and without an effect by each correction.
-
-    Parameters
-    ----------
-    plan : SimulationPlan
-        Cohorts with the effect; without it, they have the same noise.
-    settings : GroupSettings
-        Level, and number of permutations.
-    seeds : sequence of int
-        One per cohort.
-
-    Returns
-    -------
-    mapping of str to CorrectionResult
-        By the name of the correction.
-    """
+    """Analyze cohorts with and without an effect by each correction."""
     found: dict[str, list[tuple[Bool, Bool]]] = {method: [] for method in CORRECTIONS}
     affected = []
     for seed in seeds:
@@ -343,17 +320,7 @@ _METHODS = {
 
 
 def run(full: bool) -> Suite:
-    """Analyze cohorts with a thinner region and a shift, and with the shift alone.
-
-    Parameters
-    ----------
-    full : bool
-        Forty cohorts of each kind instead of four.
-
-    Returns
-    -------
-    Suite
-    """
+    """Analyze cohorts with a thinner region and a shift, and with the shift alone."""
     plan, seeds = SimulationPlan(), range(COHORTS if full else FEW_COHORTS)
     settings = GroupSettings()
     rows: list[tuple[Cell, ...]] = []

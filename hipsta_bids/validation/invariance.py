@@ -63,17 +63,7 @@ class Motions:
 
 
 def run(full: bool) -> Suite:
-    """Measure one phantom in many positions, and pairs of equal voxels in different form.
-
-    Parameters
-    ----------
-    full : bool
-        20 motions and 4 pairs instead of 6 and 1.
-
-    Returns
-    -------
-    Suite
-    """
+    """Measure one phantom in many positions, and pairs of equal voxels in different form."""
     count = MOTIONS_FULL if full else MOTIONS_QUICK
     pairs = PAIRS_FULL if full else PAIRS_QUICK
     kinds = {"any rotation": random_motion, "up to 25° about each axis": any_pose}
@@ -283,16 +273,7 @@ class Outcome:
 def run_slices(full: bool, labels: Path | None = None) -> Suite:
     """Reslice bodies and measure them.
 
-    Parameters
-    ----------
-    full : bool
-        All slice distances, offsets and phantoms instead of one each.
-    labels : Path, optional
-        A BIDS dataset with segmentations in voxels of about 0.3 mm to be resliced too.
-
-    Returns
-    -------
-    Suite
+    ``labels`` A BIDS dataset with segmentations in voxels of about 0.3 mm to be resliced too.
     """
     steps = tuple(TARGETS) if full else (2.0,)
     ways = [(offset, 0.0) for offset in (OFFSETS if full else OFFSETS[:1])] + [(OFFSETS[1], TILT)]
@@ -315,13 +296,7 @@ def run_slices(full: bool, labels: Path | None = None) -> Suite:
 
 
 def measure_trial(trial: Trial) -> Outcome:
-    """Reslice a body, measure it and compare.
-
-    Raises
-    ------
-    GeometryError
-        If the package refuses the slices.
-    """
+    """Reslice a body, measure it and compare."""
     volume, hemi, reference = _full(trial.body)
     axis = extract_body(volume, Settings().body).ends.axis
     size = (PIXEL, PIXEL, trial.step)
@@ -332,15 +307,7 @@ def measure_trial(trial: Trial) -> Outcome:
 def compare(maps: HemisphereMaps, reference: HemisphereMaps, step: float) -> Outcome:
     """Set a map beside the one at full resolution, node by node.
 
-    Parameters
-    ----------
-    maps, reference : HemisphereMaps
-    step : float
-        Distance of slices, mm.
-
-    Returns
-    -------
-    Outcome
+    ``step`` Distance of slices, mm.
     """
     both = np.isfinite(maps.thickness) & np.isfinite(reference.thickness)
     pair = maps.thickness[both], reference.thickness[both]

@@ -100,21 +100,7 @@ class Suite:
 
 
 def run_suite(name: str, *, full: bool, labels: Path | None = None) -> Suite:
-    """Run one suite.
-
-    Parameters
-    ----------
-    name : str
-        One of ``SUITES``.
-    full : bool
-        All cases instead of a quick selection.
-    labels : Path, optional
-        A BIDS dataset with real segmentations, for the suites that can use them.
-
-    Returns
-    -------
-    Suite
-    """
+    """Run one suite."""
     module, function = SUITES[name].split(":")
     run: Callable[..., Suite] = getattr(import_module(f"hipsta_bids.validation.{module}"), function)
     return run(full, labels) if name in WITH_LABELS else run(full)
@@ -136,33 +122,7 @@ def validate(
     labels: Path | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> int:
-    """Run suites and write their report.
-
-    Parameters
-    ----------
-    out : Path
-        Folder for ``validation.md`` and ``images/validation-*.png``; made if need be.
-    full : bool
-        All cases instead of a quick selection.
-    names : sequence of str
-        Suites to run; all if empty.
-    labels : Path, optional
-        A BIDS dataset with real segmentations, for the suites that can use them.
-    report : callable
-        Receives one line per suite as it ends.
-
-    Returns
-    -------
-    int
-        Number of targets that were missed.
-
-    Raises
-    ------
-    UsageError
-        If a suite is unknown.
-    OutputError
-        If a file cannot be written.
-    """
+    """Run suites and write their report."""
     unknown = [name for name in names if name not in SUITES]
     if unknown:
         raise UsageError(

@@ -17,7 +17,7 @@ from hipsta_bids.errors import (
     HipstaError,
     InputError,
     OutputError,
-    SchemeError,
+    ProtocolError,
 )
 from hipsta_bids.geometry.body import extract_body
 from hipsta_bids.geometry.surrogate import (
@@ -32,7 +32,7 @@ from hipsta_bids.inputs.search import InputRequest, find_hemispheres
 from hipsta_bids.io import files
 from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.phantom import Phantom, PhantomSpec
-from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Float
 from hipsta_bids.validation.cases import Refusal, run_cases
@@ -76,35 +76,11 @@ def crosscheck(
     items: Sequence[HemisphereInput],
     out_dir: Path,
     settings: Settings,
-    say: Callable[[str], None],
-    complain: Callable[[str], None],
+    echo: Callable[[str], None],
+    warn: Callable[[str], None],
 ) -> ExitCode:
-    """Measure hemispheres in single slices and write one table each.
-
-    Parameters
-    ----------
-    items : sequence of HemisphereInput
-    out_dir : Path
-        The output dataset; with results of the participant level, those are compared.
-    settings : Settings
-    say, complain : callable
-        Receive one line per hemisphere that succeeded or failed.
-
-    Returns
-    -------
-    ExitCode
-        As at the participant level: failed hemispheres do not stop the others.
-
-    Raises
-    ------
-    OutputError
-        If a file cannot be written.
-    SettingsError
-        If the folder holds results with other settings.
-    UsageError
-        If it is a dataset of other software.
-    """
-    dataset.check_not_foreign(out_dir)
+    """Measure hemispheres in single slices and write one table each."""
+    dataset.check_own_dataset(out_dir)
     files.check_writable(out_dir)
     dataset.settle_settings(out_dir, settings)
     sources = dataset.source_names((item.source, item.source_path) for item in items)
@@ -116,21 +92,21 @@ def crosscheck(
         title = f"{place.name.stem}_seg-{place.name.seg}"
         try:
             for line in _measure(item, place, settings):
-                say(f"{title}  {line}")
+                echo(f"{title}  {line}")
         except OutputError:
             raise
         except HipstaError as error:
             errors.append(error)
-            complain(f"{title}  failed  [{error.reason}] {error}")
+            warn(f"{title}  failed  [{error.reason}] {error}")
     if not errors:
         return ExitCode.OK
-    bad = all(isinstance(error, (InputError, SchemeError)) for error in errors)
+    bad = all(isinstance(error, (InputError, ProtocolError)) for error in errors)
     return ExitCode.BAD_DATA if bad and len(errors) == len(items) else ExitCode.SOME_FAILED
 
 
 def _place(item: HemisphereInput, out_dir: Path) -> ResultPlace:
     name = HemisphereName(
-        subject=item.subject, session=item.session, hemi=item.hemi, seg=item.scheme.name
+        subject=item.subject, session=item.session, hemi=item.hemi, seg=item.protocol.name
     )
     return ResultPlace(root=out_dir, name=name)
 
@@ -244,19 +220,7 @@ class Compared:
 
 
 def run(full: bool, labels: Path | None = None) -> Suite:
-    """Compare on phantoms and, where there are any, on real segmentations.
-
-    Parameters
-    ----------
-    full : bool
-        All phantoms instead of one.
-    labels : Path, optional
-        A BIDS dataset with segmentations.
-
-    Returns
-    -------
-    Suite
-    """
+    """Compare on phantoms and, where there are any, on real segmentations."""
     bodies: list[PhantomSpec | HemisphereInput] = list(PHANTOMS if full else PHANTOMS[:1])
     if labels is not None:
         bodies += [
@@ -275,17 +239,11 @@ def run(full: bool, labels: Path | None = None) -> Suite:
 
 
 def compare_body(body: PhantomSpec | HemisphereInput) -> Compared:
-    """Measure one body both ways.
-
-    Raises
-    ------
-    GeometryError
-        If the mesh is refused.
-    """
+    """Measure one body both ways."""
     settings = Settings()
     phantom = Phantom(body) if isinstance(body, PhantomSpec) else None
     if isinstance(body, PhantomSpec):
-        volume, hemi = Phantom(body).label_volume(load_scheme("freesurfer"), hemi="L"), "L"
+        volume, hemi = Phantom(body).label_volume(load_protocol("freesurfer"), hemi="L"), "L"
     else:
         volume, hemi = read_label_volume(body), body.hemi
     maps = measure_hemisphere(volume, hemi, settings, lambda _: nullcontext())
@@ -326,7 +284,7 @@ def _truth(phantom: Phantom | None, points: Float) -> Float:
 def _name(body: PhantomSpec | HemisphereInput) -> str:
     if isinstance(body, PhantomSpec):
         return f"{body.kind} {body.thickness:g} mm, ±{body.variation:.0%}"
-    return f"sub-{body.subject} {body.hemi} ({body.scheme.name})"
+    return f"sub-{body.subject} {body.hemi} ({body.protocol.name})"
 
 
 def _table(

@@ -110,7 +110,7 @@ def test_everything_reaches_its_place(seen, tmp_path):
         hemis=("R",),
         fs_analysis="T1",
         ashs_atlas="ashsPMC",
-        scheme=Path("s.toml"),
+        protocol=Path("s.toml"),
         edited_dir=Path("e"),
         output_dir=tmp_path / "out",
         bids_filter_file=Path("j"),
@@ -173,7 +173,7 @@ def test_spellings_of_other_bids_apps(alias, field, value):
         ("in out participant --forc", "unrecognized arguments: --forc"),
         ("in in participant", "the output folder is the BIDS dataset itself"),
         ("in out participant --settings none.toml", "settings cannot be read"),
-        ("schemes x", "schemes takes no arguments"),
+        ("protocols x", "protocols takes no arguments"),
         ("settings x", "settings takes no arguments"),
         ("demo", "demo takes one folder"),
         ("demo-data a b", "demo-data takes one folder"),
@@ -323,7 +323,7 @@ def test_reader_that_goes_away_is_no_bug(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
         "import sys\nfrom hipsta_bids.cli.main import main\n"
-        "sys.stdin.readline()\nsys.exit(main(['schemes']))"
+        "sys.stdin.readline()\nsys.exit(main(['protocols']))"
     )
     reading, writing = os.pipe()
     with subprocess.Popen(

@@ -48,16 +48,16 @@ def test_description_keeps_earlier_sources_and_needs_no_container(tmp_path, monk
 
 
 def test_dataset_of_other_software_is_refused(tmp_path):
-    dataset.check_not_foreign(tmp_path)
+    dataset.check_own_dataset(tmp_path)
     path = tmp_path / "dataset_description.json"
     path.write_text('{"GeneratedBy": [{"Name": "fMRIPrep"}]}')
     with pytest.raises(UsageError, match="fMRIPrep"):
-        dataset.check_not_foreign(tmp_path)
+        dataset.check_own_dataset(tmp_path)
     path.write_text("{}")
     with pytest.raises(UsageError, match="another kind"):
-        dataset.check_not_foreign(tmp_path)
+        dataset.check_own_dataset(tmp_path)
     dataset.write_description(tmp_path / "ours", {})
-    dataset.check_not_foreign(tmp_path / "ours")
+    dataset.check_own_dataset(tmp_path / "ours")
 
 
 def test_other_settings_are_refused_by_name(tmp_path):

@@ -15,7 +15,7 @@ from hipsta_bids.geometry.surface import extract_surface
 from hipsta_bids.geometry.tetra import tetrahedralize
 from hipsta_bids.geometry.topology import SolidField, repair_topology
 from hipsta_bids.phantom import Phantom, PhantomSpec
-from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Coordinates, LabelVolume, Sheet, Surface, TetMesh
 
@@ -36,10 +36,10 @@ class Case:
     sheet: Sheet
 
 
-def solve_case(phantom, *, scheme="freesurfer", settings=None, **drawing):
+def solve_case(phantom, *, protocol="freesurfer", settings=None, **drawing):
     """Run the stages of the participant level one after the other."""
     chosen = settings or Settings()
-    volume = phantom.label_volume(load_scheme(scheme), **drawing)
+    volume = phantom.label_volume(load_protocol(protocol), **drawing)
     body = extract_body(volume, chosen.body)
     field = resampled(body, chosen)
     solid = repair_topology(field, chosen.topology)

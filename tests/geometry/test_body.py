@@ -10,12 +10,12 @@ from scipy import ndimage
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import _give_away_layer, check_side, extract_body
-from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import BodySettings
 from hipsta_bids.types import LabelVolume
 
-FREESURFER = load_scheme("freesurfer")
+FREESURFER = load_protocol("freesurfer")
 
 
 def volume_of(tissue, voxel=(1.0, 1.0, 1.0)):
@@ -24,7 +24,7 @@ def volume_of(tissue, voxel=(1.0, 1.0, 1.0)):
         tissue=tissue,
         part=np.full(tissue.shape, Part.BODY),
         affine=np.diag([*voxel, 1.0]),
-        scheme=FREESURFER,
+        protocol=FREESURFER,
     )
 
 
@@ -176,6 +176,6 @@ def test_handedness_decides_where_the_subject_lies_otherwise(degrees, claimed):
 def test_the_side_is_unknown_without_ca1(arc):
     tissue = np.where(arc.volume.tissue == Tissue.CA1, Tissue.SUBICULUM, arc.volume.tissue)
     volume = LabelVolume(
-        tissue=tissue, part=arc.volume.part, affine=arc.volume.affine, scheme=FREESURFER
+        tissue=tissue, part=arc.volume.part, affine=arc.volume.affine, protocol=FREESURFER
     )
     assert np.isnan(check_side(extract_body(volume, BodySettings()), "R"))

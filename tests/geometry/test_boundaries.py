@@ -90,7 +90,7 @@ def test_sets_are_apart_and_cover_the_wall(case):
     wall = np.unique(case.surface.triangles[lateral_triangles(case.surface)])
     covered = np.unique(np.concatenate([b.medial, b.lateral, b.interior, b.exterior]))
     assert np.isin(covered, wall).all()
-    assert len(covered) > 0.99 * len(wall)  # crumbs beside the strips belong to no side
+    assert len(covered) > 0.99 * len(wall)  # fragments beside the strips belong to no side
 
 
 def test_sides_share_edges_with_the_strips(case):

@@ -21,7 +21,7 @@ from hipsta_bids.geometry.checks import (
 from hipsta_bids.geometry.measures import measure_thickness
 from hipsta_bids.geometry.surface import extract_surface
 from hipsta_bids.geometry.topology import repair_topology
-from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import CheckSettings, Settings
 from hipsta_bids.types import Coordinates
@@ -31,7 +31,7 @@ CHECKS, ALL = CheckSettings(), Settings()
 
 def surface_of(kind, voxel, thickness):
     phantom = short_phantom(kind=kind, curvature=None, thickness=thickness, length=10.0, width=20.0)
-    volume = phantom.label_volume(load_scheme("freesurfer"), voxel_size=(voxel,) * 3)
+    volume = phantom.label_volume(load_protocol("freesurfer"), voxel_size=(voxel,) * 3)
     body = extract_body(volume, ALL.body)
     solid = repair_topology(resampled(body), ALL.topology)
     return extract_surface(solid.field, ALL.surface), body
@@ -107,7 +107,7 @@ def test_any_subset_in_order_passes(kinds):
 @pytest.mark.parametrize("kinds", WRONG_ORDERS)
 def test_swapped_subfields_are_refused(kinds):
     """Though the correlation of most of them is above the limit."""
-    with pytest.raises(GeometryError, match="check that the scheme fits the labels"):
+    with pytest.raises(GeometryError, match="check that the protocol fits the labels"):
         check_label_order(*striped_body(kinds), CHECKS)
 
 

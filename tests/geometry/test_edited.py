@@ -10,7 +10,7 @@ from scipy import ndimage
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import MaskChange, check_mask, extract_body
 from hipsta_bids.participant.measure import find_body
-from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import BodySettings, Settings
 from hipsta_bids.types import EditedMask
@@ -18,8 +18,8 @@ from hipsta_bids.types import EditedMask
 SETTINGS = BodySettings()
 
 
-def drawn(scheme="freesurfer", **options):
-    return short_phantom().label_volume(load_scheme(scheme), **options)
+def drawn(protocol="freesurfer", **options):
+    return short_phantom().label_volume(load_protocol(protocol), **options)
 
 
 def corrected(volume, inside, voxel=0.4):
@@ -41,9 +41,9 @@ def body(volume):
     ("scheme", "voxels"),
     [("freesurfer", (0.4, 0.4, 0.4)), ("hippunfold", (0.4, 0.4, 0.4)), ("ashsPMC", (0.4, 2, 0.4))],
 )
-def test_a_mask_that_changes_nothing_changes_nothing(scheme, voxels):
+def test_a_mask_that_changes_nothing_changes_nothing(protocol, voxels):
     """Whether head and tail have labels, and in thick slices."""
-    volume = drawn(scheme, voxel_size=voxels)
+    volume = drawn(protocol, voxel_size=voxels)
     before = extract_body(volume, SETTINGS)
     after = corrected(volume, before.inside)
     for name in ("tissue", "inside", "interior"):

@@ -8,12 +8,12 @@ from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry import ends as ends_mod
 from hipsta_bids.geometry.body import extract_body
 from hipsta_bids.geometry.ends import find_end_planes
-from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import BodySettings
 from hipsta_bids.types import LabelVolume
 
-FREESURFER, HIPPUNFOLD = load_scheme("freesurfer"), load_scheme("hippunfold")
+FREESURFER, HIPPUNFOLD = load_protocol("freesurfer"), load_protocol("hippunfold")
 BODY = BodySettings()
 
 
@@ -32,7 +32,7 @@ def rod(tail_normal, head_normal, *, voxel=(0.4, 0.4, 0.4), half_body=8.2, pose=
         tissue=np.full(shape, Tissue.CA1),
         part=part.reshape(shape),
         affine=affine if pose is None else pose @ affine,
-        scheme=FREESURFER,
+        protocol=FREESURFER,
     )
 
 
@@ -78,7 +78,7 @@ def test_planes_move_with_the_volume():
 def test_normals_and_axis_point_from_tail_to_head():
     volume = rod([0.0, 1.0, 0.0], [0.0, 1.0, 0.0])
     backward = LabelVolume(
-        tissue=volume.tissue, part=volume.part[:, ::-1], affine=volume.affine, scheme=FREESURFER
+        tissue=volume.tissue, part=volume.part[:, ::-1], affine=volume.affine, protocol=FREESURFER
     )
     assert ends_of(volume).axis[1] > 0.99  # the axis itself, but for rounding
     assert ends_of(backward).axis[1] < -0.99
@@ -104,9 +104,9 @@ def test_phantom_ends_are_where_they_were_drawn(case):
 
 @pytest.mark.parametrize("scheme", ["ashsPMC", "hippunfold"])
 @pytest.mark.parametrize("slice_mm", [0.4, 1.0])
-def test_rule_of_the_paper_finds_the_body_without_head_and_tail_labels(scheme, slice_mm):
+def test_rule_of_the_paper_finds_the_body_without_head_and_tail_labels(protocol, slice_mm):
     phantom = short_phantom(length=14.0)
-    volume = phantom.label_volume(load_scheme(scheme), voxel_size=(0.4, slice_mm, 0.4))
+    volume = phantom.label_volume(load_protocol(protocol), voxel_size=(0.4, slice_mm, 0.4))
     body = extract_body(volume, BODY)
     assert "labels" not in (body.ends.posterior_rule, body.ends.anterior_rule)
     u = np.linspace(0.1, 0.9, 9)
@@ -137,7 +137,7 @@ def without(volume, part):
         tissue=volume.tissue,
         part=np.where(volume.part == part, Part.BODY, volume.part),
         affine=volume.affine,
-        scheme=volume.scheme,
+        protocol=volume.protocol,
     )
 
 
@@ -158,7 +158,7 @@ def test_few_head_voxels_count_as_none(arc):
     part = arc.volume.part.copy()
     part[tuple(head[49:].T)] = Part.BODY
     volume = LabelVolume(
-        tissue=arc.volume.tissue, part=part, affine=arc.volume.affine, scheme=FREESURFER
+        tissue=arc.volume.tissue, part=part, affine=arc.volume.affine, protocol=FREESURFER
     )
     assert extract_body(volume, BODY).ends.anterior_rule != "labels"
 
@@ -177,7 +177,7 @@ def sheet_with_head(*, twofold):
         tissue=tissue,
         part=np.zeros(shape),
         affine=np.diag([0.5, 0.5, 0.5, 1.0]),
-        scheme=HIPPUNFOLD,
+        protocol=HIPPUNFOLD,
     )
 
 
@@ -196,7 +196,7 @@ def test_body_stops_before_the_bend_of_the_tail_too():
         tissue=volume.tissue[:, ::-1],
         part=volume.part,
         affine=volume.affine,
-        scheme=HIPPUNFOLD,
+        protocol=HIPPUNFOLD,
     )
     # CA1 beside CA2 everywhere, so that only the second layer tells the tail from the body.
     ends = ends_of(turned)
@@ -210,7 +210,7 @@ def test_a_plain_rod_has_no_head_to_stop_at():
     tissue = volume.tissue.copy()
     tissue[:, :, :12] = 0
     ends = ends_of(
-        LabelVolume(tissue=tissue, part=volume.part, affine=volume.affine, scheme=HIPPUNFOLD)
+        LabelVolume(tissue=tissue, part=volume.part, affine=volume.affine, protocol=HIPPUNFOLD)
     )
     assert ends.anterior_rule == "subfields"
     far = np.array([[9.5, 31.5, 6.75]])
@@ -222,7 +222,7 @@ def test_no_slice_with_ca1_and_ca2_is_refused():
     tissue = np.where(volume.tissue == Tissue.CA2, Tissue.CA1, volume.tissue)
     with pytest.raises(GeometryError, match="no slice across the long axis has both") as caught:
         ends_of(
-            LabelVolume(tissue=tissue, part=volume.part, affine=volume.affine, scheme=HIPPUNFOLD)
+            LabelVolume(tissue=tissue, part=volume.part, affine=volume.affine, protocol=HIPPUNFOLD)
         )
     assert caught.value.reason == "no-body"
 
@@ -241,7 +241,9 @@ def test_stray_end_labels_do_not_move_the_planes():
     plain = rod([0.0, 1.0, 0.0], [0.0, 1.0, 0.0])
     part = plain.part.copy()
     part[:, 41:46] = Part.TAIL
-    stray = LabelVolume(tissue=plain.tissue, part=part, affine=plain.affine, scheme=plain.scheme)
+    stray = LabelVolume(
+        tissue=plain.tissue, part=part, affine=plain.affine, protocol=plain.protocol
+    )
     before, after = ends_of(plain), ends_of(stray)
     np.testing.assert_allclose(after.posterior_normal, before.posterior_normal, atol=1e-6)
     np.testing.assert_allclose(after.posterior_point, before.posterior_point, atol=1e-6)
@@ -256,7 +258,7 @@ def test_a_body_cut_short_keeps_its_axis():
         tissue=whole.tissue[:, kept],
         part=whole.part[:, kept],
         affine=whole.affine,
-        scheme=HIPPUNFOLD,
+        protocol=HIPPUNFOLD,
     )
     assert ends_mod._long_axis(*labeled(short))[1] > 0.99  # the axis itself, but for rounding
 
@@ -302,7 +304,7 @@ def test_cross_sections_that_have_a_part_of_the_labels_only_are_left_out(slope):
         tissue=tissue,
         part=np.zeros(tissue.shape),
         affine=np.diag([0.5, 0.5, 0.5, 1.0]),
-        scheme=HIPPUNFOLD,
+        protocol=HIPPUNFOLD,
     )
     ends = ends_of(volume)
     assert (ends.posterior_rule, ends.anterior_rule) == ("subfields", "subfields")

@@ -8,7 +8,7 @@ from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body, check_reach, extract_body, join_cortex
 from hipsta_bids.geometry.ends import EndPlanes
 from hipsta_bids.geometry.sheet import check_turned, is_turned
-from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import BodySettings
 from hipsta_bids.types import LabelVolume, Sheet
@@ -31,13 +31,13 @@ def line(*tissues):
     return np.array(tissues, dtype=np.uint8).reshape(-1, 1, 1)
 
 
-def volume(*tissues, scheme="ashsPMC"):
+def volume(*tissues, protocol="ashsPMC"):
     tissue = line(*tissues)
     return LabelVolume(
         tissue=tissue,
         part=np.zeros_like(tissue),
         affine=np.eye(4),
-        scheme=load_scheme(scheme),
+        protocol=load_protocol(protocol),
     )
 
 
@@ -66,7 +66,7 @@ def test_missing_cortex_is_named():
         join_cortex(volume(SUB, CA1), line(SUB, CA1), "extended")
     assert caught.value.reason == "no-cortex-labels"
     with pytest.raises(GeometryError, match="no voxel is labeled ENTORHINAL;"):
-        join_cortex(volume(SUB, CA1, scheme="ashsUtrecht7T"), line(SUB, CA1), "extended")
+        join_cortex(volume(SUB, CA1, protocol="ashsUtrecht7T"), line(SUB, CA1), "extended")
 
 
 @pytest.mark.parametrize(("levels", "enough"), [(10, True), (9, True), (8, False), (1, False)])

@@ -17,7 +17,7 @@ SETTINGS = Settings()
 
 @pytest.fixture
 def evidence(arc):
-    """Nothing to complain about."""
+    """Nothing to warn about."""
     return Evidence(
         body=arc.body,
         side=5.0,

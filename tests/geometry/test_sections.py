@@ -11,7 +11,7 @@ from hipsta_bids.geometry.body import Body, extract_body
 from hipsta_bids.geometry.checks import check_cross_sections, check_ridges, check_rows
 from hipsta_bids.geometry.grid import Field
 from hipsta_bids.phantom import Phantom
-from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.settings import BodySettings, CheckSettings
 from hipsta_bids.types import Sheet
 
@@ -31,7 +31,7 @@ class Ribbon:
 def ribbon():
     """An arc, 16 mm long: a defect of some millimetres is an exception on it."""
     phantom = short_phantom(length=16.0)
-    body = extract_body(phantom.label_volume(load_scheme("freesurfer")), BodySettings())
+    body = extract_body(phantom.label_volume(load_protocol("freesurfer")), BodySettings())
     return Ribbon(phantom=phantom, body=body, field=resampled(body))
 
 

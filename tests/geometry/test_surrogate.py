@@ -10,7 +10,7 @@ from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import extract_body
 from hipsta_bids.geometry.surrogate import agreement, compare_nearby, draw_slice, surrogate_profiles
 from hipsta_bids.phantom import Phantom, PhantomSpec
-from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.settings import Settings
 
 SETTINGS = Settings()
@@ -21,7 +21,7 @@ VOXEL = 0.4
 def drawn(spec, hemi="L"):
     """A phantom and its body."""
     phantom = Phantom(spec)
-    volume = phantom.label_volume(load_scheme("freesurfer"), hemi=hemi)
+    volume = phantom.label_volume(load_protocol("freesurfer"), hemi=hemi)
     return phantom, extract_body(volume, SETTINGS.body)
 
 

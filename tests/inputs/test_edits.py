@@ -196,11 +196,11 @@ def test_a_table_beside_edited_labels_says_what_they_are(data):
     table = folder / "sub-01_hemi-L_desc-edited_dseg.tsv"
     table.write_text("index\tname\n1\tsubiculum\n2\tCA1\n3\tDG\n")
     items, _ = search(data)
-    scheme = items[LEFT].scheme
-    assert scheme.name == "freesurfer"
-    assert "Iglesias" in scheme.citation
+    protocol = items[LEFT].protocol
+    assert protocol.name == "freesurfer"
+    assert "Iglesias" in protocol.citation
     assert any(table.name in note for note in items[LEFT].notes)
-    assert {label.code: label.tissue for label in scheme.labels} == {
+    assert {label.code: label.tissue for label in protocol.labels} == {
         1: Tissue.SUBICULUM,
         2: Tissue.CA1,
         3: Tissue.DENTATE_GYRUS,

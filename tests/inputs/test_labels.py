@@ -3,22 +3,22 @@ import numpy as np
 import pytest
 from input_cases import AFFINE, save
 
-from hipsta_bids.errors import InputError, SchemeError
+from hipsta_bids.errors import InputError, ProtocolError
 from hipsta_bids.inputs.labels import MARGIN, label_values, read_label_volume
 from hipsta_bids.inputs.request import HemisphereInput
-from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Part, Tissue
 
 SHAPE = (60, 50, 40)
 BLOCK = (slice(20, 30), slice(22, 28), slice(15, 20))
 
 
-def make_item(*files, scheme="hippunfold", **options):
+def make_item(*files, protocol="hippunfold", **options):
     return HemisphereInput(
         subject="01",
         session=None,
         hemi=options.pop("hemi", "L"),
-        scheme=load_scheme(scheme),
+        protocol=load_protocol(protocol),
         files=files,
         source="test",
         source_path=files[0].parent,
@@ -51,7 +51,7 @@ def test_cropping_keeps_every_label_where_it_was(tmp_path, name):
         world(volume, Tissue.CA1), expected[np.lexsort(expected.T)], atol=1e-4
     )
     assert volume.tissue.dtype == np.uint8
-    assert volume.scheme.name == "hippunfold"
+    assert volume.protocol.name == "hippunfold"
 
 
 def test_the_margin_is_five_millimeters_as_far_as_the_image_goes(tmp_path):
@@ -68,9 +68,9 @@ def test_the_margin_is_five_millimeters_as_far_as_the_image_goes(tmp_path):
 def test_cortical_labels_do_not_widen_the_crop(tmp_path):
     data = make_labels(code=1)  # CA1 of ABC-3T
     data[20, 22, 15] = 8
-    alone = read_label_volume(make_item(save(tmp_path / "a.nii", data), scheme="ashsABC3T"))
+    alone = read_label_volume(make_item(save(tmp_path / "a.nii", data), protocol="ashsABC3T"))
     data[0, 0, 0] = 9  # entorhinal
-    with_cortex = read_label_volume(make_item(save(tmp_path / "b.nii", data), scheme="ashsABC3T"))
+    with_cortex = read_label_volume(make_item(save(tmp_path / "b.nii", data), protocol="ashsABC3T"))
     assert with_cortex.tissue.shape == alone.tissue.shape
     np.testing.assert_array_equal(with_cortex.affine, alone.affine)
 
@@ -111,8 +111,8 @@ def test_parts_come_from_the_second_file(tmp_path):
     item = make_item(
         save(tmp_path / "a.mgz", subfields),
         save(tmp_path / "b.mgz", parts),
-        scheme="freesurferCA",
-        parts_scheme=load_scheme("freesurferHBT"),
+        protocol="freesurferCA",
+        parts_protocol=load_protocol("freesurferHBT"),
     )
     volume = read_label_volume(item)
     counted = dict(zip(*np.unique(volume.part[volume.tissue > 0], return_counts=True), strict=True))
@@ -133,8 +133,8 @@ def test_files_on_different_grids_are_not_combined(tmp_path, other):
     item = make_item(
         save(tmp_path / "a.mgz", subfields),
         save(tmp_path / "b.mgz", parts, shifted),
-        scheme="freesurferCA",
-        parts_scheme=load_scheme("freesurferHBT"),
+        protocol="freesurferCA",
+        parts_protocol=load_protocol("freesurferHBT"),
     )
     with pytest.raises(InputError, match=r"b\.mgz: its grid differs from that of a\.mgz") as caught:
         read_label_volume(item)
@@ -147,9 +147,9 @@ def test_one_hemisphere_is_taken_from_a_file_of_both(tmp_path):
     data[40:44, 5:8, 5:8] = 101
     data[40, 5, 5] = 108
     path = save(tmp_path / "a.nii", data)
-    left = read_label_volume(make_item(path, scheme="ashsABC3T", bilateral=True))
+    left = read_label_volume(make_item(path, protocol="ashsABC3T", bilateral=True))
     right = read_label_volume(
-        make_item(path, scheme="ashsABC3T", bilateral=True, code_offset=100, hemi="R")
+        make_item(path, protocol="ashsABC3T", bilateral=True, code_offset=100, hemi="R")
     )
     assert (left.tissue == Tissue.CA1).sum() == 27
     assert not (left.tissue == Tissue.SUBICULUM).any()
@@ -158,7 +158,7 @@ def test_one_hemisphere_is_taken_from_a_file_of_both(tmp_path):
     data[data > 100] = 0
     item = make_item(
         save(tmp_path / "b.nii", data),
-        scheme="ashsABC3T",
+        protocol="ashsABC3T",
         bilateral=True,
         code_offset=100,
         hemi="R",
@@ -169,8 +169,8 @@ def test_one_hemisphere_is_taken_from_a_file_of_both(tmp_path):
 
 
 def test_a_problem_found_earlier_is_raised(tmp_path):
-    problem = SchemeError("which atlas?", reason="ambiguous-atlas")
-    with pytest.raises(SchemeError, match="which atlas") as caught:
+    problem = ProtocolError("which atlas?", reason="ambiguous-atlas")
+    with pytest.raises(ProtocolError, match="which atlas") as caught:
         read_label_volume(make_item(tmp_path / "a.nii", problem=problem))
     assert caught.value is problem
 
@@ -307,12 +307,12 @@ def test_labels_of_another_protocol_name_those_that_fit(tmp_path):
     data[20:25, 20, 20] = [204, 205, 206, 208, 209]
     path = save(tmp_path / "a.mgz", data)
     with pytest.raises(
-        SchemeError, match=r"a\.mgz: .*the labels fit freesurferCA and freesurferFS60"
+        ProtocolError, match=r"a\.mgz: .*the labels fit freesurferCA and freesurferFS60"
     ) as caught:
-        read_label_volume(make_item(path, scheme="freesurfer"))
+        read_label_volume(make_item(path, protocol="freesurfer"))
     assert caught.value.reason == "wrong-scheme"
-    with pytest.raises(SchemeError, match="labels 204, 205, 206, 208, 209 are not in") as caught:
-        read_label_volume(make_item(path, scheme="ashsPMC"))
+    with pytest.raises(ProtocolError, match="labels 204, 205, 206, 208, 209 are not in") as caught:
+        read_label_volume(make_item(path, protocol="ashsPMC"))
     assert caught.value.reason == "unknown-labels"
 
 

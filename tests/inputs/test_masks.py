@@ -9,7 +9,7 @@ from hipsta_bids.errors import HipstaError
 from hipsta_bids.inputs.labels import read_label_volume
 from hipsta_bids.inputs.request import Edit, HemisphereInput
 from hipsta_bids.io.volumes import mask_bytes
-from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.types import BodyMask
 
@@ -24,12 +24,12 @@ def block(code=1, dtype=np.int16):
     return data
 
 
-def make_item(*files, edits=(), scheme="hippunfold", **options):
+def make_item(*files, edits=(), protocol="hippunfold", **options):
     return HemisphereInput(
         subject="01",
         session=None,
         hemi="L",
-        scheme=load_scheme(scheme),
+        protocol=load_protocol(protocol),
         files=files,
         source="test",
         source_path=files[0].parent,
@@ -135,8 +135,8 @@ def test_edited_labels_on_another_grid_keep_the_parts_of_the_second_file(tmp_pat
     item = make_item(
         save(tmp_path / "a.mgz", subfields),
         save(tmp_path / "b.mgz", parts),
-        scheme="freesurferCA",
-        parts_scheme=load_scheme("freesurferHBT"),
+        protocol="freesurferCA",
+        parts_protocol=load_protocol("freesurferHBT"),
     )
     before = read_label_volume(item)
     doubled = subfields.repeat(2, axis=0).repeat(2, axis=1).repeat(2, axis=2)
@@ -144,8 +144,8 @@ def test_edited_labels_on_another_grid_keep_the_parts_of_the_second_file(tmp_pat
     after = read_label_volume(
         make_item(
             *item.files,
-            scheme="freesurferCA",
-            parts_scheme=item.parts_scheme,
+            protocol="freesurferCA",
+            parts_protocol=item.parts_protocol,
             edits=[("labels", path)],
         )
     )

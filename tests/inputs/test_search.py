@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from input_cases import by_key, describe, find, save_values, touch
 
-from hipsta_bids.errors import InputError, NothingToDoError, SchemeError, UsageError
+from hipsta_bids.errors import InputError, NothingToDoError, ProtocolError, UsageError
 from hipsta_bids.inputs import scan
 from hipsta_bids.inputs.search import (
     HemisphereInput,
@@ -95,7 +95,7 @@ def test_named_datasets_and_convenience_options(tmp_path):
     )
     names = {"one": fs, "two": ashs, "three": hippunfold}
     by_name = find(tmp_path / "bids", derivatives=names, **options)
-    assert [item.scheme.name for item in by_option] == ["ashsPMC", "freesurfer", "hippunfold"]
+    assert [item.protocol.name for item in by_option] == ["ashsPMC", "freesurfer", "hippunfold"]
     assert [item.source for item in by_option] == ["ashs", "freesurfer", "hippunfold"]
     assert [item.source for item in by_name] == ["two", "one", "three"]
     assert [item.files for item in by_name] == [item.files for item in by_option]
@@ -327,8 +327,8 @@ def test_usable_comes_before_unusable(tmp_path):
 
 def test_a_users_protocol_is_checked_even_if_nothing_needs_it(tmp_path):
     freesurfer(tmp_path / "derivatives" / "fs", "sub-01")
-    with pytest.raises(SchemeError, match="cannot read the protocol"):
-        find(tmp_path, scheme=tmp_path / "absent.toml")
+    with pytest.raises(ProtocolError, match="cannot read the protocol"):
+        find(tmp_path, protocol=tmp_path / "absent.toml")
 
 
 # What is said
@@ -399,7 +399,7 @@ def test_inputs_survive_pickling(tmp_path):
     (item,) = find(tmp_path)
     copy = pickle.loads(pickle.dumps(item))  # noqa: S301 (made on this line)
     assert isinstance(copy, HemisphereInput)
-    assert (copy.key, copy.files, copy.scheme) == (item.key, item.files, item.scheme)
+    assert (copy.key, copy.files, copy.protocol) == (item.key, item.files, item.protocol)
     assert str(copy.problem) == str(item.problem)
 
 

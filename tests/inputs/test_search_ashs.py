@@ -1,7 +1,7 @@
 import pytest
 from input_cases import by_key, describe, find, save_values, touch
 
-from hipsta_bids.errors import SchemeError
+from hipsta_bids.errors import ProtocolError
 from hipsta_bids.inputs import ashs
 
 GRAY = "lfseg_corr_usegray.nii.gz"
@@ -92,23 +92,23 @@ def test_files_that_are_equally_good_are_not_chosen_between(tmp_path):
 def test_the_option_decides_and_nothing_is_opened(tmp_path, name):
     touch(folder(tmp_path), f"x_left_{GRAY}")  # empty: opening it would be a problem
     item = only(tmp_path, ashs_atlas=name)
-    assert item.scheme.name == "ashsUtrecht7T"
+    assert item.protocol.name == "ashsUtrecht7T"
     assert "--ashs-atlas" in item.why
 
 
 def test_an_unknown_atlas_is_refused(tmp_path):
     left(tmp_path)
-    with pytest.raises(SchemeError, match=r"no protocol is called 'ashsABC3'.*mean 'ashsABC3T'"):
+    with pytest.raises(ProtocolError, match=r"no protocol is called 'ashsABC3'.*mean 'ashsABC3T'"):
         find(tmp_path, ashs_atlas="ashsABC3")
 
 
 @pytest.mark.parametrize(
     ("values", "scheme"), [(ABC, "ashsABC3T"), (PMC, "ashsPMC"), (UTRECHT, "ashsUtrecht7T")]
 )
-def test_values_decide_if_one_atlas_only_fits(tmp_path, values, scheme):
+def test_values_decide_if_one_atlas_only_fits(tmp_path, values, protocol):
     left(tmp_path, values=values)
     item = only(tmp_path)
-    assert item.scheme.name == scheme
+    assert item.protocol.name == protocol
     assert item.problem is None
     assert "only this atlas has such labels" in item.why
 
@@ -122,7 +122,7 @@ def test_ambiguous_values_are_never_guessed(tmp_path):
         f"{path}: labels 1, 2, 3, 4, 8 fit ashsABC3T and ashsPMC; "
         "say which atlas was used with --ashs-atlas"
     )
-    assert item.scheme.name == "ashs"
+    assert item.protocol.name == "ashs"
 
 
 def test_values_that_fit_no_atlas(tmp_path):
@@ -137,7 +137,7 @@ def test_the_atlas_carries_over_within_a_dataset(tmp_path):
     left(tmp_path, "sub-01", ABC)
     left(tmp_path, "sub-02", BOTH)
     first, second = find(tmp_path)
-    assert first.scheme.name == second.scheme.name == "ashsABC3T"
+    assert first.protocol.name == second.protocol.name == "ashsABC3T"
     assert "1 other file of the dataset only this one" in second.why
     # Also when the other one is not asked for: the choice may not depend on the selection.
     alone = only(tmp_path, participant_labels=("02",))
@@ -149,10 +149,10 @@ def test_the_atlas_does_not_carry_over_where_files_disagree_or_it_does_not_fit(t
     left(tmp_path, "sub-02", BOTH)
     left(tmp_path, "sub-03", PMC)
     found = {item.subject: item for item in find(tmp_path)}
-    assert found["01"].scheme.name == "ashsABC3T"
+    assert found["01"].protocol.name == "ashsABC3T"
     assert found["02"].problem is not None
     assert found["02"].problem.reason == "ambiguous-atlas"
-    assert found["03"].scheme.name == "ashsPMC"
+    assert found["03"].protocol.name == "ashsPMC"
 
 
 def test_the_atlas_does_not_carry_over_between_datasets(tmp_path):
@@ -169,7 +169,7 @@ def test_a_large_dataset_is_sampled_not_read(tmp_path, monkeypatch):
     monkeypatch.setattr(ashs, "label_values", lambda path: opened.append(path) or frozenset(ABC))
     items = find(tmp_path)
     assert len(items) == 40
-    assert {item.scheme.name for item in items} == {"ashsABC3T"}
+    assert {item.protocol.name for item in items} == {"ashsABC3T"}
     assert 0 < len(opened) <= 16
     assert "8 other files of the dataset" in items[1].why
 
@@ -183,7 +183,7 @@ def test_an_unreadable_file_is_its_own_problem(tmp_path):
     left(tmp_path, "sub-01", ABC)
     first, second = find(tmp_path)
     assert first.problem is None
-    assert second.scheme.name == "ashsABC3T"
+    assert second.protocol.name == "ashsABC3T"
 
 
 @pytest.mark.parametrize("place", ["sub-01/final", "sub-01", ".", "snap"])
@@ -193,7 +193,7 @@ def test_snaplabels_beside_or_above_the_file_decides(tmp_path, place):
     table.parent.mkdir(exist_ok=True)
     table.write_text(SNAP, encoding="utf-8")
     item = only(tmp_path)
-    assert item.scheme.name == "ashsPMC"
+    assert item.protocol.name == "ashsPMC"
     assert "snaplabels.txt" in item.why
 
 
@@ -201,7 +201,7 @@ def test_a_dseg_table_decides(tmp_path):
     left(tmp_path)
     rows = ["index\tname", "1\tCA1", "2\tCA2", "3\tDG", "4\tCA3", "8\tSUB", "9\tERC"]
     (tmp_path / "derivatives" / "ashs" / "dseg.tsv").write_text("\n".join(rows), encoding="utf-8")
-    assert only(tmp_path).scheme.name == "ashsABC3T"
+    assert only(tmp_path).protocol.name == "ashsABC3T"
 
 
 def test_a_table_of_another_atlas_makes_its_own_protocol(tmp_path):
@@ -209,8 +209,8 @@ def test_a_table_of_another_atlas_makes_its_own_protocol(tmp_path):
     text = '1 255 0 0 1 1 1 "subiculum"\n2 0 255 0 1 1 1 "CA1"\n3 0 0 255 1 1 1 "CA2/3"\n'
     (folder(tmp_path) / "snaplabels.txt").write_text(text, encoding="utf-8")
     item = only(tmp_path)
-    assert item.scheme.name == "ashsCustom"
-    assert [label.color for label in item.scheme.labels] == ["#ff0000", "#00ff00", "#0000ff"]
+    assert item.protocol.name == "ashsCustom"
+    assert [label.color for label in item.protocol.labels] == ["#ff0000", "#00ff00", "#0000ff"]
 
 
 def test_a_table_without_labels_is_a_problem_not_a_guess(tmp_path):
@@ -224,8 +224,8 @@ def test_a_table_without_labels_is_a_problem_not_a_guess(tmp_path):
 def test_a_users_protocol_describes_other_atlases(tmp_path):
     describe(tmp_path / "derivatives" / "ashs", "ashs")
     left(tmp_path, values=[1, 2])
-    scheme = tmp_path / "mine.toml"
-    scheme.write_text(
+    protocol = tmp_path / "mine.toml"
+    protocol.write_text(
         'name = "mine"\ntitle = "t"\ncitation = "c"\nsheet = ["subiculum", "CA1"]\nlayer = []\n'
         "interior = []\nlabels = [\n"
         '{ code = 1, tissue = "CA1", name = "a", abbreviation = "a", color = "#000000" },\n'
@@ -234,11 +234,11 @@ def test_a_users_protocol_describes_other_atlases(tmp_path):
         encoding="utf-8",
     )
     # --scheme is for files without a protocol of their own; ASHS's have an option of their own.
-    assert only(tmp_path, scheme=scheme).problem is not None
-    assert only(tmp_path, ashs_atlas=str(scheme)).scheme.name == "mine"
+    assert only(tmp_path, protocol=protocol).problem is not None
+    assert only(tmp_path, ashs_atlas=str(protocol)).protocol.name == "mine"
     # It says nothing of how to tell the hemispheres apart.
     save_values(folder(tmp_path, "sub-02") / f"x_{GRAY}", [1, 2])
     problems = [
-        item.problem for item in find(tmp_path, ashs_atlas=str(scheme)) if item.subject == "02"
+        item.problem for item in find(tmp_path, ashs_atlas=str(protocol)) if item.subject == "02"
     ]
     assert [problem.reason for problem in problems] == ["unknown-hemisphere"] * 2

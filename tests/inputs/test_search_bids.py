@@ -81,9 +81,9 @@ def test_other_atlases_need_the_users_protocol(tmp_path):
     item = only(tmp_path)
     assert item.problem is not None
     assert item.problem.reason == "unknown-atlas"
-    item = only(tmp_path, scheme=write_scheme(tmp_path))
+    item = only(tmp_path, protocol=write_scheme(tmp_path))
     assert item.problem is None
-    assert item.scheme.name == "mine"
+    assert item.protocol.name == "mine"
 
 
 def test_the_folder_that_version_1_makes_inside_its_output_is_found(tmp_path):
@@ -131,10 +131,10 @@ def lab(root, *names, table="dseg.tsv", text=TABLE):
 def test_a_table_beside_or_above_names_the_labels(tmp_path, table):
     lab(tmp_path, "hemi-L_desc-hipp_dseg.nii.gz", table=table)
     item = only(tmp_path)
-    assert item.scheme.name == "mylab"
-    assert [label.abbreviation for label in item.scheme.labels] == ["Sub", "CA1", "CA3"]
-    assert item.scheme.labels[0].color == "#112233"
-    assert item.scheme.sheet == tuple(label.tissue for label in item.scheme.labels)
+    assert item.protocol.name == "mylab"
+    assert [label.abbreviation for label in item.protocol.labels] == ["Sub", "CA1", "CA3"]
+    assert item.protocol.labels[0].color == "#112233"
+    assert item.protocol.sheet == tuple(label.tissue for label in item.protocol.labels)
     assert table.rpartition("/")[2] in item.why
 
 
@@ -144,8 +144,8 @@ def test_the_most_specific_table_that_applies_is_taken(tmp_path):
     (dataset / "atlas-new_dseg.tsv").write_text(swapped, encoding="utf-8")
     (dataset / "atlas-old_desc-hipp_dseg.tsv").write_text(TABLE, encoding="utf-8")
     item = only(tmp_path)
-    assert item.scheme.name == "new"
-    assert item.scheme.codes == {9, 2, 3}
+    assert item.protocol.name == "new"
+    assert item.protocol.codes == {9, 2, 3}
 
 
 def test_files_of_other_structures_are_left_out(tmp_path):
@@ -180,9 +180,9 @@ def test_without_a_table_only_a_named_dataset_counts(tmp_path):
     assert left.problem is not None
     assert left.problem.reason == "undescribed-labels"
     assert "--scheme" in str(right.problem)
-    described, _ = find(tmp_path, scheme=write_scheme(tmp_path))
+    described, _ = find(tmp_path, protocol=write_scheme(tmp_path))
     assert described.problem is None
-    assert described.scheme.name == "mine"
+    assert described.protocol.name == "mine"
 
 
 def test_a_broken_table_is_a_problem_of_its_files(tmp_path):
@@ -195,13 +195,13 @@ def test_a_broken_table_is_a_problem_of_its_files(tmp_path):
 
 def test_desc_subfields_of_other_software_is_not_hippunfold(tmp_path):
     dataset = lab(tmp_path, "hemi-L_desc-subfields_dseg.nii.gz")
-    assert only(tmp_path).scheme.name == "hippunfold"
+    assert only(tmp_path).protocol.name == "hippunfold"
     describe(dataset, "OurTool")
-    assert only(tmp_path).scheme.name == "mylab"
+    assert only(tmp_path).protocol.name == "mylab"
 
 
 def test_tables_are_read_anew_in_each_search(tmp_path):
     dataset = lab(tmp_path, "hemi-L_dseg.nii.gz")
-    assert only(tmp_path).scheme.codes == {1, 2, 3}
+    assert only(tmp_path).protocol.codes == {1, 2, 3}
     (dataset / "dseg.tsv").write_text(TABLE.replace("\n3\t", "\n4\t"), encoding="utf-8")
-    assert only(tmp_path).scheme.codes == {1, 2, 4}
+    assert only(tmp_path).protocol.codes == {1, 2, 4}

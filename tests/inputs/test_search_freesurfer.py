@@ -44,14 +44,14 @@ def test_the_full_hierarchy_is_found_under_every_suffix(tmp_path, stem):
     found = by_key(find(tmp_path))
     assert set(found) == {("01", "", hemi, "freesurfer") for hemi in "LR"}
     assert names(found["01", "", "R", "freesurfer"]) == [f"rh.{stem}"]
-    assert found["01", "", "R", "freesurfer"].parts_scheme is None
+    assert found["01", "", "R", "freesurfer"].parts_protocol is None
 
 
 def test_the_full_hierarchy_comes_before_all_others(tmp_path):
     others = [f"{FULL}{kind}.mgz" for kind in (".CA", ".FS60", ".HBT", ".FSvoxelSpace")]
     item = one(tmp_path, f"{FULL}.mgz", *others, f"{FULL}.CA.FSvoxelSpace.mgz")
     assert names(item) == [f"lh.{FULL}.mgz"]
-    assert item.scheme.name == "freesurfer"
+    assert item.protocol.name == "freesurfer"
     reasons = dict(item.passed_over)
     assert set(reasons) == {f"lh.{name}" for name in [*others, f"{FULL}.CA.FSvoxelSpace.mgz"]}
     assert "less detail" in reasons[f"lh.{FULL}.CA.mgz"]
@@ -69,17 +69,17 @@ def test_the_full_hierarchy_comes_before_all_others(tmp_path):
         ([".FS60", ".CA"], [".FS60"], "freesurferFS60"),
     ],
 )
-def test_subfields_and_parts_are_combined(tmp_path, kinds, taken, scheme):
+def test_subfields_and_parts_are_combined(tmp_path, kinds, taken, protocol):
     item = one(tmp_path, *(f"{FULL}{kind}.mgz" for kind in kinds))
     assert names(item) == [f"lh.{FULL}{kind}.mgz" for kind in taken]
-    assert item.scheme.name == scheme
+    assert item.protocol.name == protocol
     expected = "freesurferHBT" if ".HBT" in taken else None
-    assert (item.parts_scheme.name if item.parts_scheme else None) == expected
+    assert (item.parts_protocol.name if item.parts_protocol else None) == expected
 
 
 def test_without_a_suffix_hierarchies_are_told_apart_too(tmp_path):
     item = one(tmp_path, "hippoAmygLabels.CA.mgz", "hippoAmygLabels.HBT.mgz")
-    assert item.scheme.name == "freesurferCA"
+    assert item.protocol.name == "freesurferCA"
     assert len(item.files) == 2
 
 
@@ -95,10 +95,10 @@ def test_the_resampled_file_is_taken_only_if_there_is_no_other(tmp_path):
 def test_freesurfer_6(tmp_path):
     item = one(tmp_path, "hippoSfLabels-T1.v10.mgz", "hippoSfLabels-T1.v10.FSvoxelSpace.mgz")
     assert names(item) == ["lh.hippoSfLabels-T1.v10.mgz"]
-    assert item.scheme.name == "freesurferFS60"
+    assert item.protocol.name == "freesurferFS60"
     assert "FreeSurfer 6.0" in item.why
     newer = one(tmp_path, f"{FULL}.mgz")
-    assert newer.scheme.name == "freesurfer"
+    assert newer.protocol.name == "freesurfer"
     assert any("hippoSfLabels" in name for name, _ in newer.passed_over)
 
 

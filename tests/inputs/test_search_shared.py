@@ -44,11 +44,11 @@ def test_the_third_brains_atlas_is_known_from_the_others(found):
     (alone,) = find(
         DATA, ashs_dir=DATA / "derivatives" / "ashs", participant_labels=("03",), hemis=("L",)
     )[:1]
-    assert alone.scheme.name == "ashsABC3T"
+    assert alone.protocol.name == "ashsABC3T"
 
 
 def test_all_twelve_can_be_read(found):
-    for (subject, _, _, scheme), item in found.items():
+    for (subject, _, _, protocol), item in found.items():
         volume = read_label_volume(item)
         tissues = set(np.unique(volume.tissue).tolist())
         parts = set(np.unique(volume.part).tolist()) - {Part.UNKNOWN}
@@ -56,7 +56,7 @@ def test_all_twelve_can_be_read(found):
         # The README of the data says which ASHS files have head and tail labels.
         with_parts = {"01": {Part.HEAD, Part.TAIL}, "02": {Part.TAIL}, "03": set()}
         every = {Part.HEAD, Part.BODY, Part.TAIL}
-        assert parts == (with_parts[subject] if scheme == "ashsABC3T" else every)
+        assert parts == (with_parts[subject] if protocol == "ashsABC3T" else every)
 
 
 def test_freesurfer_hierarchies_of_one_brain_agree(found):
@@ -71,8 +71,8 @@ def test_freesurfer_hierarchies_of_one_brain_agree(found):
             subject="01",
             session=None,
             hemi="L",
-            scheme=other.scheme,
-            parts_scheme=other.parts_scheme,
+            protocol=other.protocol,
+            parts_protocol=other.parts_protocol,
             files=(folder / f"{stem}.CA.mgz", folder / f"{stem}.HBT.mgz"),
             source=item.source,
             source_path=item.source_path,

@@ -11,9 +11,9 @@ from hipsta_bids.errors import GeometryError
 from hipsta_bids.inputs.labels import read_label_volume
 from hipsta_bids.inputs.request import HemisphereInput
 from hipsta_bids.phantom import Phantom, encode, rigid_motion
-from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.load import load_protocol
 
-SCHEME = load_scheme("freesurfer")
+SCHEME = load_protocol("freesurfer")
 SPEC = spiral()
 
 #: Promised for any change of the input's form, mm.
@@ -26,7 +26,7 @@ def read(path):
             subject="01",
             session=None,
             hemi="L",
-            scheme=SCHEME,
+            protocol=SCHEME,
             files=(path,),
             source="tests",
             source_path=path.parent,

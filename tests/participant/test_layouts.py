@@ -8,7 +8,7 @@ from measured_phantoms import results
 from hipsta_bids.cli import main
 from hipsta_bids.errors import ExitCode
 from hipsta_bids.phantom import Phantom, PhantomSpec, encode
-from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Part, Tissue
 
 PHANTOM = Phantom(PhantomSpec(kind="spiral", thickness=1.8, length=9.0))
@@ -90,8 +90,8 @@ CA_CODES = {
 }
 
 
-def draw(scheme, hemi="L", axes="RAS"):
-    return PHANTOM.label_volume(load_scheme(scheme), hemi=hemi, axes=axes)
+def draw(protocol, hemi="L", axes="RAS"):
+    return PHANTOM.label_volume(load_protocol(protocol), hemi=hemi, axes=axes)
 
 
 def recode(volume, codes):
@@ -100,8 +100,8 @@ def recode(volume, codes):
     return table[volume.tissue]
 
 
-def put(path, scheme, hemi="L", axes="RAS"):
-    volume = draw(scheme, hemi, axes)
+def put(path, protocol, hemi="L", axes="RAS"):
+    volume = draw(protocol, hemi, axes)
     save(path, encode(volume).astype(np.int16), volume.affine)
 
 
@@ -122,7 +122,7 @@ def write_ashs(root):
     put(root / "ashs-pmc" / "sub-pmc" / "final" / f"id_left_{GRAY}", "ashsPMC")
     (root / "ashs-pmc" / "snaplabels.txt").write_text(SNAP, encoding="utf-8")
     put(root / "ashs-utrecht" / "sub-utrecht" / f"id_left_{GRAY}", "ashsUtrecht7T")
-    rows = [f"{label.code}\t{label.name}" for label in load_scheme("ashsUtrecht7T").labels]
+    rows = [f"{label.code}\t{label.name}" for label in load_protocol("ashsUtrecht7T").labels]
     table = "\n".join(["index\tname", *rows])
     (root / "ashs-utrecht" / "dseg.tsv").write_text(table, encoding="utf-8")
     save(root / "ashs-both" / "sub-both" / "final" / f"id_{GRAY}", *both_hemispheres())
@@ -180,8 +180,8 @@ def out(tmp_path_factory):
 
 @pytest.mark.parametrize("expected", EXPECTED, ids=lambda row: "-".join(row[:3]))
 def test_thickness_and_ends_in_every_layout(out, expected):
-    subject, hemi, scheme, posterior, anterior = expected
-    found = results(out, subject, hemi, scheme)
+    subject, hemi, protocol, posterior, anterior = expected
+    found = results(out, subject, hemi, protocol)
     assert found.row["status"] == "ok", found.row["message"]
     # An eighth of the 0.4 mm voxels, as promised for the demonstration.
     truth = PHANTOM.truth(0.5, 0.5).summary
@@ -208,12 +208,12 @@ def test_both_hemispheres_of_one_file_mirror_each_other(out):
 
 
 def test_a_users_protocol(tmp_path):
-    scheme = tmp_path / "inhouse.toml"
-    scheme.write_text(SCHEME, encoding="utf-8")
+    protocol = tmp_path / "inhouse.toml"
+    protocol.write_text(SCHEME, encoding="utf-8")
     describe(tmp_path / "bids", kind="raw")
     write_lab(tmp_path / "labels", "")
     arguments = [str(tmp_path / "bids"), str(tmp_path / "out"), "participant"]
-    options = ["-d", f"mine={tmp_path / 'labels'}", "--scheme", str(scheme)]
+    options = ["-d", f"mine={tmp_path / 'labels'}", "--scheme", str(protocol)]
     assert main.main([*arguments, *options]) == ExitCode.OK
     found = results(tmp_path / "out", "lab", "L", "inhouse")
     assert found.row["status"] == "ok"

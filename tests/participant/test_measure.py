@@ -124,7 +124,7 @@ def test_summary_numbers_are_those_of_the_phantom(case):
 
 def test_subfields_add_up_to_the_whole(case):
     summary = case.maps.summary
-    tissues = [tissue.name for tissue in case.volume.scheme.sheet]
+    tissues = [tissue.name for tissue in case.volume.protocol.sheet]
     for size, whole in (("area", "area_mid"), ("volume", "volume")):
         parts = sum(summary[f"{size}_{name}"] for name in tissues)
         assert parts == pytest.approx(summary[whole], rel=1e-9), size  # the same pieces
@@ -304,7 +304,7 @@ def test_a_body_that_is_too_short_is_refused(damage):
 
 def test_labels_without_a_sheet_are_refused(damage):
     volume = damage.relabel(damage.sheet, Tissue.DENTATE_GYRUS)
-    refused(volume, "no-sheet-labels", "check the scheme")
+    refused(volume, "no-sheet-labels", "check the protocol")
 
 
 def test_a_tail_label_across_the_middle_is_refused(damage):
@@ -324,10 +324,10 @@ def test_subfields_in_the_wrong_order_are_refused(damage):
         tissue=np.where(tissue == Tissue.CA2_3, np.uint8(Tissue.CA1), volume.tissue),
         part=volume.part,
         affine=volume.affine,
-        scheme=volume.scheme,
+        protocol=volume.protocol,
     )
     # The subiculum borders on CA2/3 as where two turns touch, so that the sheet is parted there.
-    refused(volume, "body-split", "check that the scheme fits")
+    refused(volume, "body-split", "check that the protocol fits")
 
 
 def test_too_few_voxels_across_are_refused(plain):

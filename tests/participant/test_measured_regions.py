@@ -12,10 +12,10 @@ from hipsta_bids.cli import main
 from hipsta_bids.cli.participant import REGIONS
 from hipsta_bids.derivatives.names import HemisphereName, output_path
 from hipsta_bids.derivatives.status import read_status
-from hipsta_bids.errors import ExitCode, GeometryError, SchemeError
+from hipsta_bids.errors import ExitCode, GeometryError, ProtocolError
 from hipsta_bids.io import files
 from hipsta_bids.phantom import Hemisphere, Phantom, PhantomSpec, rigid_motion, write_dataset
-from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import BodySettings, Settings
 from hipsta_bids.types import EditedMask
@@ -31,8 +31,8 @@ def in_region(region, **changes):
     return Settings(body=BodySettings(region=region, **changes))
 
 
-def draw(spec, scheme="ashsPMC", hemi="L", **options):
-    return Phantom(spec).label_volume(load_scheme(scheme), hemi=hemi, **options)
+def draw(spec, protocol="ashsPMC", hemi="L", **options):
+    return Phantom(spec).label_volume(load_protocol(protocol), hemi=hemi, **options)
 
 
 def run(bids, out, *options):
@@ -81,7 +81,7 @@ def test_subfields_of_every_region(out):
         assert set(sheet.subfield) == names
         assert {c for c in found(out, "L", region).summary if c.startswith("volume_")} == {
             f"volume_{label.tissue.name}"
-            for label in load_scheme("ashsABC3T").labels
+            for label in load_protocol("ashsABC3T").labels
             if label.abbreviation in names
         }
     assert found(out, "L", "extended").sheet.subfield.iloc[0] == "BA35"
@@ -135,7 +135,7 @@ def test_maps_and_drawn_regions_on_other_regions(bids, tmp_path):
         # Four decimals of each coordinate, seven digits of single precision.
         wanted = sheet[["r", "a", "s"]] @ [1.5, -2.0, 0.7]
         np.testing.assert_allclose(values["field"], wanted, atol=1e-3)
-        codes = {label.abbreviation: label.code for label in load_scheme("ashsABC3T").labels}
+        codes = {label.abbreviation: label.code for label in load_protocol("ashsABC3T").labels}
         # Points beside the labels' voxels see background; the sheet's subfield is the nearest.
         assert (values["copy"] == sheet.subfield.map(codes)).mean() > 0.9
         (row,) = files.read_tsv(done.path("roi"))
@@ -272,13 +272,13 @@ def test_cortex_has_to_reach_from_end_to_end():
     with pytest.raises(GeometryError) as caught:
         measure(bare, "L", in_region("extended"))
     assert caught.value.reason == "no-cortex-labels"
-    with pytest.raises(SchemeError):
+    with pytest.raises(ProtocolError):
         measure(draw(S_SHAPE, "freesurfer"), "L", in_region("extended"))
 
 
 def test_edited_masks_are_about_the_body():
     volume = draw(S_SHAPE)
-    mask = EditedMask(inside=np.isin(volume.tissue, volume.scheme.sheet), voxel=0.4)
+    mask = EditedMask(inside=np.isin(volume.tissue, volume.protocol.sheet), voxel=0.4)
     with pytest.raises(GeometryError, match="edit the labels instead") as caught:
         measure(replace(volume, edited_mask=mask), "L", in_region("extended"))
     assert caught.value.reason == "edited-mask-region"

@@ -101,8 +101,8 @@ def test_every_number_of_the_summary_is_that_of_the_phantom(case):
 
 
 def test_every_number_of_the_subfields_is_that_of_the_phantom(case):
-    compared = compare_subfields(case.phantom, case.maps, case.volume.scheme, hemi=case.hemi)
-    tissues = [tissue.name for tissue in case.volume.scheme.sheet if tissue.name != "CA2"]
+    compared = compare_subfields(case.phantom, case.maps, case.volume.protocol, hemi=case.hemi)
+    tissues = [tissue.name for tissue in case.volume.protocol.sheet if tissue.name != "CA2"]
     expected = {f"{row.name}_{name}" for row in PER_SUBFIELD for name in tissues}
     assert {one.name for one in compared} == expected
     spec = case.phantom.spec

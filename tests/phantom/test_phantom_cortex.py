@@ -6,11 +6,11 @@ import pytest
 from hipsta_bids.errors import SettingsError
 from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.phantom.labels import CORTEX, subfield_at
-from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Part, Tissue
 
 SPEC = PhantomSpec(kind="s-shape", width=30.0, curvature=(-0.15, 0.3), cortex=10.0, length=8.0)
-PMC = load_scheme("ashsPMC")
+PMC = load_protocol("ashsPMC")
 
 
 def test_cortex_takes_its_share_of_the_mid_curve():
@@ -62,7 +62,7 @@ def test_volumes_of_the_regions():
 
 
 def test_cortex_goes_on_beside_head_and_tail_as_cortex():
-    volume = Phantom(SPEC).label_volume(load_scheme("ashsABC3T"))
+    volume = Phantom(SPEC).label_volume(load_protocol("ashsABC3T"))
     cortex = np.isin(volume.tissue, CORTEX)
     assert (volume.part[cortex] == Part.UNKNOWN).all()
     points = np.argwhere(cortex) @ volume.affine[:3, :3].T + volume.affine[:3, 3]
@@ -74,7 +74,7 @@ def test_cortex_goes_on_beside_head_and_tail_as_cortex():
 
 def test_a_protocol_draws_the_cortex_that_it_has():
     kinds = [
-        set(np.unique(Phantom(SPEC).label_volume(load_scheme(name)).tissue)) & set(Tissue)
+        set(np.unique(Phantom(SPEC).label_volume(load_protocol(name)).tissue)) & set(Tissue)
         for name in ("ashsUtrecht7T", "freesurfer")
     ]
     assert kinds[0] & set(CORTEX) == {Tissue.ENTORHINAL}

@@ -21,7 +21,7 @@ from hipsta_bids.phantom import (
     write_demo_dataset,
 )
 from hipsta_bids.phantom.dataset import LAYOUTS
-from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Part, Tissue, translate
 
 SMALL = PhantomSpec(length=8.0, end_length=2.0)
@@ -73,9 +73,9 @@ def test_demo_is_found_and_read_as_freesurfer(demo):
     rows = files.read_tsv(demo / TRUTH_TABLE)
     for item, row in zip(items, rows, strict=True):
         assert item.problem is None
-        assert item.scheme.name == "freesurfer"
+        assert item.protocol.name == "freesurfer"
         volume = read_label_volume(item)
-        wall = np.isin(volume.tissue, (*item.scheme.sheet, *item.scheme.layer))
+        wall = np.isin(volume.tissue, (*item.protocol.sheet, *item.protocol.layer))
         size = abs(np.linalg.det(volume.affine[:3, :3]))
         counted = (wall & (volume.part == Part.BODY)).sum() * size
         # Some 5,000 voxels at the surface, half a voxel each, at random: 0.3 %.
@@ -103,12 +103,14 @@ def test_layout_holds_what_was_drawn(tmp_path, name):
     layout = LAYOUTS[name]
     path = layout.path.format(subject="sub-07", side=layout.sides["R"])
     image = nib.load(tmp_path / "derivatives" / name / path)
-    scheme = load_scheme(layout.scheme)
-    drawn = Phantom(SMALL).label_volume(scheme, hemi="R", pose=pose, voxel_size=COARSE, axes="LIA")
+    protocol = load_protocol(layout.protocol)
+    drawn = Phantom(SMALL).label_volume(
+        protocol, hemi="R", pose=pose, voxel_size=COARSE, axes="LIA"
+    )
     assert nib.aff2axcodes(image.affine) == ("L", "I", "A")
     # mm: headers hold single precision, 1e-7 of positions below 100 mm.
     np.testing.assert_allclose(image.affine, drawn.affine, atol=2e-5)
-    tissue, part = translate(np.asarray(image.dataobj), scheme)
+    tissue, part = translate(np.asarray(image.dataobj), protocol)
     np.testing.assert_array_equal(tissue, drawn.tissue)
     np.testing.assert_array_equal(part, drawn.part)
 
@@ -117,7 +119,7 @@ def test_ashs_layout_is_found_and_its_atlas_told_by_its_labels(tmp_path):
     items = [Hemisphere(subject="07", hemi=hemi, spec=SMALL) for hemi in "LR"]
     write_dataset(tmp_path, items, layouts=["ashs"], voxel_size=COARSE)
     found = find_hemispheres(InputRequest(bids_dir=tmp_path))
-    assert [(item.hemi, item.scheme.name) for item in found] == [
+    assert [(item.hemi, item.protocol.name) for item in found] == [
         ("L", "ashsABC3T"),
         ("R", "ashsABC3T"),
     ]

@@ -5,17 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hipsta_bids.errors import SchemeError, SettingsError
+from hipsta_bids.errors import ProtocolError, SettingsError
 from hipsta_bids.phantom import KINDS, Phantom, PhantomSpec, encode, rigid_motion
 from hipsta_bids.phantom.labels import label_for, subfield_at
-from hipsta_bids.protocols.load import load_scheme, scheme_names
+from hipsta_bids.protocols.load import load_protocol, protocol_names
 from hipsta_bids.protocols.protocol import Part, Tissue, translate
 from hipsta_bids.types import LabelVolume
 
 SMALL = PhantomSpec(length=8.0, end_length=2.0)
 COARSE = (0.6, 0.6, 0.6)
-FREESURFER = load_scheme("freesurfer")
-SHEET_SCHEMES = [name for name in scheme_names() if load_scheme(name).sheet]
+FREESURFER = load_protocol("freesurfer")
+SHEET_SCHEMES = [name for name in protocol_names() if load_protocol(name).sheet]
 
 
 @pytest.fixture(scope="module")
@@ -38,21 +38,21 @@ def assert_same_voxels(volume, other):
         np.testing.assert_array_equal(a, b)
 
 
-@pytest.mark.parametrize("name", scheme_names())
+@pytest.mark.parametrize("name", protocol_names())
 def test_codes_translate_to_the_volume(phantom, name):
-    scheme = load_scheme(name)
-    volume = phantom.label_volume(scheme, voxel_size=COARSE)
-    tissue, part = translate(encode(volume), scheme)
+    protocol = load_protocol(name)
+    volume = phantom.label_volume(protocol, voxel_size=COARSE)
+    tissue, part = translate(encode(volume), protocol)
     np.testing.assert_array_equal(tissue, volume.tissue)
     np.testing.assert_array_equal(part, volume.part)
 
 
 @pytest.mark.parametrize("name", SHEET_SCHEMES)
 def test_each_protocol_shows_its_whole_sheet_and_an_interior(phantom, name):
-    scheme = load_scheme(name)
-    found = set(np.unique(phantom.label_volume(scheme, voxel_size=COARSE).tissue))
-    assert found >= set(scheme.sheet)
-    assert found & set(scheme.interior)
+    protocol = load_protocol(name)
+    found = set(np.unique(phantom.label_volume(protocol, voxel_size=COARSE).tissue))
+    assert found >= set(protocol.sheet)
+    assert found & set(protocol.interior)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -106,7 +106,7 @@ def test_right_hemisphere_is_the_mirror_image(phantom):
     left, right = (phantom.label_volume(FREESURFER, voxel_size=COARSE, hemi=hemi) for hemi in "LR")
     flipped = np.diag([-1.0, 1.0, 1.0, 1.0]) @ right.affine
     mirrored = LabelVolume(
-        tissue=right.tissue, part=right.part, affine=flipped, scheme=right.scheme
+        tissue=right.tissue, part=right.part, affine=flipped, protocol=right.protocol
     )
     assert_same_voxels(mirrored, left)
 
@@ -189,16 +189,16 @@ def test_molecular_layer_is_the_inner_part_of_the_same_wall():
 
 
 def test_protocol_without_molecular_layer_keeps_the_subfields():
-    scheme = load_scheme("ashsPMC")
+    protocol = load_protocol("ashsPMC")
     bare, layered = Phantom(SMALL), Phantom(replace(SMALL, layer_thickness=0.5))
     assert_same_voxels(
-        layered.label_volume(scheme, voxel_size=COARSE),
-        bare.label_volume(scheme, voxel_size=COARSE),
+        layered.label_volume(protocol, voxel_size=COARSE),
+        bare.label_volume(protocol, voxel_size=COARSE),
     )
 
 
 def test_without_head_and_tail_labels_ca2_and_ca3_end_with_the_body(phantom):
-    volume = phantom.label_volume(load_scheme("ashsPMC"), voxel_size=COARSE)
+    volume = phantom.label_volume(load_protocol("ashsPMC"), voxel_size=COARSE)
     points, tissue, _ = voxels(volume)
     v = phantom.body.locate(points)[:, 1]
     lateral = np.isin(tissue, [Tissue.CA2, Tissue.CA3])
@@ -212,7 +212,7 @@ def test_a_label_for_the_tissue_and_part_comes_first():
     assert label_for(FREESURFER, Tissue.CA1, Part.HEAD).part is Part.HEAD
     assert label_for(FREESURFER, Tissue.CA1, Part.TAIL).tissue is Tissue.HIPPOCAMPUS
     assert label_for(FREESURFER, Tissue.CA2, Part.BODY).tissue is Tissue.CA2_3
-    assert label_for(load_scheme("ashsPMC"), Tissue.CA3, Part.HEAD) is None
+    assert label_for(load_protocol("ashsPMC"), Tissue.CA3, Part.HEAD) is None
 
 
 @pytest.mark.parametrize(
@@ -234,12 +234,12 @@ def test_senseless_grids_are_refused(phantom, options, message):
 
 def test_protocol_with_too_few_subfields_is_refused(phantom):
     few = tuple(label for label in FREESURFER.labels if label.tissue is not Tissue.CA1)
-    with pytest.raises(SchemeError, match="no label for some subfield"):
+    with pytest.raises(ProtocolError, match="no label for some subfield"):
         phantom.label_volume(replace(FREESURFER, labels=few), voxel_size=COARSE)
 
 
 def test_a_volume_is_not_written_in_a_protocol_that_cannot_say_it(phantom):
     volume = phantom.label_volume(FREESURFER, voxel_size=COARSE)
-    other = replace(volume, scheme=load_scheme("ashsPMC"))
-    with pytest.raises(SchemeError, match="scheme ashsPMC has no code for some tissues"):
+    other = replace(volume, protocol=load_protocol("ashsPMC"))
+    with pytest.raises(ProtocolError, match="protocol ashsPMC has no code for some tissues"):
         encode(other)

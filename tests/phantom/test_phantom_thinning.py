@@ -8,7 +8,7 @@ from hipsta_bids.errors import SettingsError
 from hipsta_bids.phantom import Phantom, PhantomSpec, Thinning
 from hipsta_bids.phantom.shape import Body, window_jet
 from hipsta_bids.phantom.truth import SURFACES, mean_curvature
-from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Tissue
 
 REGION = Thinning(depth=0.4, u=(0.35, 0.75), v=(0.5, 1.0))
@@ -85,11 +85,11 @@ def test_offset_moves_the_pattern_and_the_subfields_but_not_the_shape():
 
 @pytest.mark.parametrize("offset", [-0.1, 0.1])
 def test_a_shifted_phantom_is_drawn_whole(offset):
-    scheme = load_scheme("freesurfer")
+    protocol = load_protocol("freesurfer")
 
     def drawn(spec):
-        volume = Phantom(spec).label_volume(scheme, voxel_size=(0.5, 0.5, 0.5))
-        return volume, np.isin(volume.tissue, scheme.sheet)
+        volume = Phantom(spec).label_volume(protocol, voxel_size=(0.5, 0.5, 0.5))
+        return volume, np.isin(volume.tissue, protocol.sheet)
 
     volume, wall = drawn(PhantomSpec(length=6.0, end_length=1.0, offset=offset))
     plain, same = drawn(PhantomSpec(length=6.0, end_length=1.0))

@@ -15,7 +15,7 @@ from hipsta_bids.phantom.truth import (
     mean_curvature,
     summarize,
 )
-from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Tissue
 
 EXACT = 1e-9  # relative: quadrature of smooth functions and rounding
@@ -201,9 +201,9 @@ def test_subfield_of_each_position():
 @pytest.mark.parametrize("kind", KINDS)
 def test_volume_equals_counted_voxels(kind):
     phantom = Phantom(PhantomSpec(kind=kind, bend=0.02, variation=0.3, length=8.0, end_length=0.5))
-    scheme = load_scheme("freesurfer")
-    volume = phantom.label_volume(scheme, voxel_size=(0.25, 0.25, 0.25), border=0.3)
-    body = np.isin(volume.tissue, scheme.sheet) & (volume.part == 2)
+    protocol = load_protocol("freesurfer")
+    volume = phantom.label_volume(protocol, voxel_size=(0.25, 0.25, 0.25), border=0.3)
+    body = np.isin(volume.tissue, protocol.sheet) & (volume.part == 2)
     # Some 10,000 voxels at the surface, each off by half a voxel at most, at random: 0.2 %.
     assert body.sum() * 0.25**3 == pytest.approx(
         phantom.truth(0.5, 0.5).summary["volume"], rel=4e-3
@@ -214,9 +214,9 @@ def test_thickness_equals_that_of_rays_through_fine_voxels():
     size = 0.1
     spec = PhantomSpec(width=8.0, curvature=(0.0, 0.4), length=3.0, end_length=0.5, variation=0.3)
     phantom = Phantom(spec)
-    scheme = load_scheme("freesurfer")
-    volume = phantom.label_volume(scheme, voxel_size=(size, size, size), border=0.6)
-    wall = np.isin(volume.tissue, scheme.sheet)
+    protocol = load_protocol("freesurfer")
+    volume = phantom.label_volume(protocol, voxel_size=(size, size, size), border=0.6)
+    wall = np.isin(volume.tissue, protocol.sheet)
     u, v = np.meshgrid(np.linspace(0.1, 0.9, 9), np.linspace(0.1, 0.9, 9), indexing="ij")
     truth = phantom.truth(u, v)
     # Rays along normals found from the mid-surface's points alone.

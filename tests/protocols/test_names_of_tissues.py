@@ -1,13 +1,13 @@
 import pytest
 
-from hipsta_bids.errors import SchemeError
+from hipsta_bids.errors import ProtocolError
 from hipsta_bids.protocols.load import (
     NamedCode,
     agrees,
     identify_tissue,
-    load_scheme,
-    scheme_from_names,
-    scheme_names,
+    load_protocol,
+    protocol_from_names,
+    protocol_names,
 )
 from hipsta_bids.protocols.protocol import Part, Tissue
 
@@ -39,10 +39,10 @@ def test_names_are_understood(name, tissue, part):
     assert identify_tissue(name) == (tissue, part)
 
 
-@pytest.mark.parametrize("name", scheme_names())
+@pytest.mark.parametrize("name", protocol_names())
 def test_the_names_in_bundled_protocols_are_understood(name):
     # CA3 is the name that FreeSurfer gives to CA2 and CA3 together; nothing in it says so.
-    for label in load_scheme(name).labels:
+    for label in load_protocol(name).labels:
         if (label.name.startswith("CA3") and name.startswith("freesurfer")) or label.code > 7000:
             continue
         assert identify_tissue(label.name)[0] is label.tissue, label.name
@@ -53,16 +53,16 @@ def rows(*names):
 
 
 def test_a_table_makes_a_protocol():
-    scheme = scheme_from_names(
+    protocol = protocol_from_names(
         rows("Clear Label", "CA1", "subiculum", "DG", "SRLM", "amygdala"),
         name="mine",
         origin="table.tsv",
     )
-    assert scheme.sheet == (Tissue.SUBICULUM, Tissue.CA1)
-    assert scheme.layer == (Tissue.MOLECULAR_LAYER,)
-    assert scheme.interior == (Tissue.DENTATE_GYRUS, Tissue.MOLECULAR_LAYER)
-    assert scheme.codes == {1, 2, 3, 4, 5}
-    assert "table.tsv" in scheme.title
+    assert protocol.sheet == (Tissue.SUBICULUM, Tissue.CA1)
+    assert protocol.layer == (Tissue.MOLECULAR_LAYER,)
+    assert protocol.interior == (Tissue.DENTATE_GYRUS, Tissue.MOLECULAR_LAYER)
+    assert protocol.codes == {1, 2, 3, 4, 5}
+    assert "table.tsv" in protocol.title
 
 
 def test_abbreviations_and_colors_are_used():
@@ -70,22 +70,22 @@ def test_abbreviations_and_colors_are_used():
         NamedCode(code=1, name="field one", abbreviation="CA1", color="#ABCDEF"),
         NamedCode(code=2, name="Subiculum", color="red"),
     ]
-    first, second = scheme_from_names(table, name="mine", origin="t").labels
+    first, second = protocol_from_names(table, name="mine", origin="t").labels
     assert (first.tissue, first.abbreviation, first.color) == (Tissue.CA1, "CA1", "#abcdef")
     assert second.abbreviation == "Subiculum"
     assert second.color.startswith("#")
 
 
 def test_tables_without_subfields_and_with_repeated_codes_are_refused():
-    with pytest.raises(SchemeError, match="do not include a subiculum and a CA1") as caught:
-        scheme_from_names(rows("", "thalamus", "CA1"), name="mine", origin="t")
+    with pytest.raises(ProtocolError, match="do not include a subiculum and a CA1") as caught:
+        protocol_from_names(rows("", "thalamus", "CA1"), name="mine", origin="t")
     assert caught.value.reason == "unclear-names"
-    with pytest.raises(SchemeError, match="code 1, 2 is listed twice"):
-        scheme_from_names(rows("", "CA1", "subiculum") * 2, name="mine", origin="t")
+    with pytest.raises(ProtocolError, match="code 1, 2 is listed twice"):
+        protocol_from_names(rows("", "CA1", "subiculum") * 2, name="mine", origin="t")
 
 
 def test_agrees_compares_meanings_not_spellings():
-    abc, pmc = load_scheme("ashsABC3T"), load_scheme("ashsPMC")
+    abc, pmc = load_protocol("ashsABC3T"), load_protocol("ashsPMC")
     names = {1: "CA1", 2: "CA2", 3: "DG", 4: "CA3", 8: "SUB"}
     common = [NamedCode(code=code, name=name) for code, name in names.items()]
     assert agrees(abc, common)

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hipsta_bids.errors import SchemeError
-from hipsta_bids.protocols.load import load_scheme, scheme_names, scheme_table
+from hipsta_bids.errors import ProtocolError
+from hipsta_bids.protocols.load import load_protocol, protocol_names, protocol_table
 from hipsta_bids.protocols.protocol import MEDIAL_TO_LATERAL, Part, Tissue, translate
 
 PACKAGE = Path(__file__).parents[2] / "hipsta_bids"
@@ -125,30 +125,32 @@ def write(tmp_path, text):
     return path
 
 
-@pytest.mark.parametrize("name", scheme_names())
+@pytest.mark.parametrize("name", protocol_names())
 def test_every_bundled_protocol_loads_with_its_published_codes(name):
-    scheme = load_scheme(name)
-    found = {(label.code, label.tissue, label.part) for label in scheme.labels}
-    assert scheme.name == name
+    protocol = load_protocol(name)
+    found = {(label.code, label.tissue, label.part) for label in protocol.labels}
+    assert protocol.name == name
     assert found >= PUBLISHED[name]
-    assert scheme.citation
-    assert scheme.sheet == tuple(tissue for tissue in MEDIAL_TO_LATERAL if tissue in scheme.sheet)
+    assert protocol.citation
+    assert protocol.sheet == tuple(
+        tissue for tissue in MEDIAL_TO_LATERAL if tissue in protocol.sheet
+    )
 
 
 def test_all_published_protocols_are_bundled():
-    assert set(scheme_names()) == set(PUBLISHED)
-    assert [row["name"] for row in scheme_table()] == list(scheme_names())
-    assert all(row["title"] and int(row["labels"]) for row in scheme_table())
+    assert set(protocol_names()) == set(PUBLISHED)
+    assert [row["name"] for row in protocol_table()] == list(protocol_names())
+    assert all(row["title"] and int(row["labels"]) for row in protocol_table())
 
 
 def test_freesurfer_lists_every_amygdala_nucleus():
-    others = {lb.code for lb in load_scheme("freesurfer").labels if lb.tissue is Tissue.OTHER}
+    others = {lb.code for lb in load_protocol("freesurfer").labels if lb.tissue is Tissue.OTHER}
     assert others == set(range(7001, 7021))
 
 
 def test_no_code_of_a_label_appears_in_the_package_outside_of_protocol_files():
     # Codes from 200 on are distinctive enough to be searched for as numbers.
-    codes = {code for name in scheme_names() for code in load_scheme(name).codes if code >= 200}
+    codes = {code for name in protocol_names() for code in load_protocol(name).codes if code >= 200}
     hits = [
         f"{path.name}:{token.start[0]}: {token.line.strip()}"
         for folder in ("schemes", "bids", "geometry")
@@ -160,11 +162,11 @@ def test_no_code_of_a_label_appears_in_the_package_outside_of_protocol_files():
 
 
 def test_a_users_file_loads_and_fills_in_defaults(tmp_path):
-    scheme = load_scheme(write(tmp_path, MINIMAL))
-    assert (scheme.unlisted, scheme.right_offset, scheme.tool) == ("error", 0, "")
-    assert [label.part for label in scheme.labels] == [Part.UNKNOWN, Part.BODY, Part.UNKNOWN]
-    assert scheme.labels[1].color == "#0000aa"
-    assert load_scheme(str(tmp_path / "mine.toml")) == scheme
+    protocol = load_protocol(write(tmp_path, MINIMAL))
+    assert (protocol.unlisted, protocol.right_offset, protocol.tool) == ("error", 0, "")
+    assert [label.part for label in protocol.labels] == [Part.UNKNOWN, Part.BODY, Part.UNKNOWN]
+    assert protocol.labels[1].color == "#0000aa"
+    assert load_protocol(str(tmp_path / "mine.toml")) == protocol
 
 
 @pytest.mark.parametrize(
@@ -195,35 +197,35 @@ def test_a_users_file_loads_and_fills_in_defaults(tmp_path):
 def test_a_mistake_in_a_file_is_named(tmp_path, old, new, message):
     assert old in MINIMAL
     path = write(tmp_path, MINIMAL.replace(old, new))
-    with pytest.raises(SchemeError, match=message) as caught:
-        load_scheme(path)
+    with pytest.raises(ProtocolError, match=message) as caught:
+        load_protocol(path)
     assert caught.value.reason == "invalid-scheme"
     assert str(path) in str(caught.value)
 
 
 def test_a_file_with_neither_sheet_nor_parts_is_refused(tmp_path):
     text = MINIMAL.replace('["subiculum", "CA1"]', "[]").replace('["dentate_gyrus"]', "[]")
-    with pytest.raises(SchemeError, match="neither a sheet nor a label with a part"):
-        load_scheme(write(tmp_path, text.replace('part = "body", ', "")))
+    with pytest.raises(ProtocolError, match="neither a sheet nor a label with a part"):
+        load_protocol(write(tmp_path, text.replace('part = "body", ', "")))
 
 
 def test_a_file_that_is_missing_or_not_toml(tmp_path):
-    with pytest.raises(SchemeError, match="cannot read the protocol") as caught:
-        load_scheme(tmp_path / "absent.toml")
+    with pytest.raises(ProtocolError, match="cannot read the protocol") as caught:
+        load_protocol(tmp_path / "absent.toml")
     assert caught.value.reason == "unreadable-scheme"
-    with pytest.raises(SchemeError, match="not a TOML file"):
-        load_scheme(write(tmp_path, "name = "))
+    with pytest.raises(ProtocolError, match="not a TOML file"):
+        load_protocol(write(tmp_path, "name = "))
 
 
 def test_an_unknown_name_suggests_the_nearest():
-    with pytest.raises(SchemeError, match="did you mean 'hippunfold'") as caught:
-        load_scheme("hipunfold")
+    with pytest.raises(ProtocolError, match="did you mean 'hippunfold'") as caught:
+        load_protocol("hipunfold")
     assert caught.value.reason == "unknown-scheme"
 
 
 def test_translate_follows_the_table():
     codes = np.array([[[0, 236, 237], [245, 226, 7003]]], dtype=">i4")
-    tissue, part = translate(codes, load_scheme("freesurfer"))
+    tissue, part = translate(codes, load_protocol("freesurfer"))
     assert tissue.dtype == part.dtype == np.uint8
     assert tissue.tolist() == [
         [
@@ -235,33 +237,35 @@ def test_translate_follows_the_table():
 
 
 def test_translate_takes_unlisted_codes_as_the_protocol_says():
-    freesurfer = load_scheme("freesurfer")  # unlisted = "other"
+    freesurfer = load_protocol("freesurfer")  # unlisted = "other"
     tissue, _ = translate(np.array([238, 219, 90000, -1]), freesurfer)
     assert tissue.tolist() == [Tissue.CA1, Tissue.OTHER, Tissue.OTHER, Tissue.OTHER]
     with pytest.raises(
-        SchemeError, match=r"labels -4, 9, 300 are not in the protocol hippunfold"
+        ProtocolError, match=r"labels -4, 9, 300 are not in the protocol hippunfold"
     ) as e:
-        translate(np.array([1, 2, 9, 300, -4, 9]), load_scheme("hippunfold"))
+        translate(np.array([1, 2, 9, 300, -4, 9]), load_protocol("hippunfold"))
     assert e.value.reason == "unknown-labels"
 
 
 def test_translate_works_for_small_unsigned_types():
-    tissue, _ = translate(np.array([1, 2, 20, 0], dtype=np.uint8), load_scheme("ashsABC3T"))
+    tissue, _ = translate(np.array([1, 2, 20, 0], dtype=np.uint8), load_protocol("ashsABC3T"))
     assert tissue.tolist() == [Tissue.CA1, Tissue.CA2, Tissue.HIPPOCAMPUS, Tissue.BACKGROUND]
 
 
 def test_translate_refuses_labels_of_another_protocol():
     full = np.array([0, 236, 238, 240, 226])
-    with pytest.raises(SchemeError, match="no label of the sheet of freesurferCA occurs") as caught:
-        translate(full, load_scheme("freesurferCA"))
+    with pytest.raises(
+        ProtocolError, match="no label of the sheet of freesurferCA occurs"
+    ) as caught:
+        translate(full, load_protocol("freesurferCA"))
     assert caught.value.reason == "wrong-scheme"
-    with pytest.raises(SchemeError, match="no label of a part of freesurferHBT occurs"):
-        translate(np.array([0, 236]), load_scheme("freesurferHBT"))
+    with pytest.raises(ProtocolError, match="no label of a part of freesurferHBT occurs"):
+        translate(np.array([0, 236]), load_protocol("freesurferHBT"))
 
 
 def test_a_long_list_of_unknown_labels_is_cut():
-    with pytest.raises(SchemeError, match=r"109, 110, 111 and 38 more are not") as caught:
-        translate(np.arange(100, 150), load_scheme("hippunfold"))
+    with pytest.raises(ProtocolError, match=r"109, 110, 111 and 38 more are not") as caught:
+        translate(np.arange(100, 150), load_protocol("hippunfold"))
     assert "\n" not in str(caught.value)
 
 
@@ -280,4 +284,4 @@ def test_a_long_list_of_unknown_labels_is_cut():
     ],
 )
 def test_fits_tells_protocols_by_their_values(values, fitting):
-    assert {n for n in scheme_names() if load_scheme(n).fits(frozenset(values))} == fitting
+    assert {n for n in protocol_names() if load_protocol(n).fits(frozenset(values))} == fitting

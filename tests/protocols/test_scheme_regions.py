@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from hipsta_bids.cli.participant import REGIONS
-from hipsta_bids.errors import SchemeError
+from hipsta_bids.errors import ProtocolError
 from hipsta_bids.protocols.load import (
     NamedCode,
     for_region,
-    load_scheme,
-    parse_scheme,
-    scheme_from_names,
-    scheme_names,
+    load_protocol,
+    parse_protocol,
+    protocol_from_names,
+    protocol_names,
 )
 from hipsta_bids.protocols.protocol import FAR_TO_NEAR, MEDIAL_TO_LATERAL, Tissue, lateral_rank
 from hipsta_bids.settings import BodySettings
@@ -39,7 +39,7 @@ def table(**changes):
 
 
 def test_bundled_protocols_with_cortex():
-    found = {name: load_scheme(name).neighbors for name in scheme_names()}
+    found = {name: load_protocol(name).neighbors for name in protocol_names()}
     assert {name: cortex for name, cortex in found.items() if cortex} == {
         "ashsABC3T": CORTEX,
         "ashsPMC": CORTEX,
@@ -49,11 +49,11 @@ def test_bundled_protocols_with_cortex():
 
 @pytest.mark.parametrize("name", ["ashsABC3T", "ashsPMC", "ashsUtrecht7T"])
 def test_ranks_rise_along_the_sheet_of_every_region(name):
-    scheme = load_scheme(name)
-    assert for_region(scheme, "body") is scheme
-    extended, alone = (for_region(scheme, region).sheet for region in ("extended", "entorhinal"))
-    assert extended == (*scheme.neighbors, *scheme.sheet)
-    assert alone == scheme.neighbors
+    protocol = load_protocol(name)
+    assert for_region(protocol, "body") is protocol
+    extended, alone = (for_region(protocol, region).sheet for region in ("extended", "entorhinal"))
+    assert extended == (*protocol.neighbors, *protocol.sheet)
+    assert alone == protocol.neighbors
     ranks = lateral_rank(np.array(extended, dtype=np.uint8))
     assert (np.diff(ranks) >= 0).all()
     assert (np.diff(ranks[len(alone) - 1 :]) > 0).all()
@@ -68,8 +68,8 @@ def test_ranks_of_subfields_are_their_values():
 
 def test_a_protocol_without_cortex_says_which_have():
     for region in set(REGIONS) - {"body"}:
-        with pytest.raises(SchemeError, match="ashsABC3T, ashsPMC, ashsUtrecht7T have") as caught:
-            for_region(load_scheme("freesurfer"), region)
+        with pytest.raises(ProtocolError, match="ashsABC3T, ashsPMC, ashsUtrecht7T have") as caught:
+            for_region(load_protocol("freesurfer"), region)
         assert caught.value.reason == "no-cortex-labels"
         assert "\n" not in str(caught.value)
 
@@ -89,13 +89,13 @@ def test_the_command_line_and_the_settings_know_the_same_regions():
     ],
 )
 def test_wrong_neighbors_are_named(neighbors, message):
-    assert parse_scheme(table(), origin="a").neighbors == (Tissue.BA35, Tissue.ENTORHINAL)
-    with pytest.raises(SchemeError, match=message):
-        parse_scheme(table(neighbors=neighbors), origin="a")
+    assert parse_protocol(table(), origin="a").neighbors == (Tissue.BA35, Tissue.ENTORHINAL)
+    with pytest.raises(ProtocolError, match=message):
+        parse_protocol(table(neighbors=neighbors), origin="a")
 
 
 def test_label_tables_name_their_cortex():
     names = ["SUB", "CA1", "DG", "ERC", "BA35", "BA36", "PHC"]
     rows = [NamedCode(code=code, name=name) for code, name in enumerate(names, start=1)]
-    assert scheme_from_names(rows, name="x", origin="a").neighbors == CORTEX
-    assert scheme_from_names(rows[:3], name="x", origin="a").neighbors == ()
+    assert protocol_from_names(rows, name="x", origin="a").neighbors == CORTEX
+    assert protocol_from_names(rows[:3], name="x", origin="a").neighbors == ()

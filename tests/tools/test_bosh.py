@@ -70,7 +70,7 @@ def sample_of(entry):
     return [value] * entry["min-list-entries"] if entry.get("list") else value
 
 
-def words_of(level, given):
+def display_name(level, given):
     """The command line as a user would write it, without quotes."""
     given = dict(given)
     words = [given.pop("bids_dir"), given.pop("output_dir"), level]
@@ -143,7 +143,7 @@ def test_full_command_lines_are_understood_as_they_were_meant(level, tmp_path):
     name = f"hipsta_bids_{level}"
     given = full_invocation(read_descriptor(name))
     parse = PARSERS[level]().parse_args
-    meant = vars(parse(words_of(level, given)))
+    meant = vars(parse(display_name(level, given)))
     defaults = vars(parse(["in", "out", level]))
     assert all(meant[key] != defaults[key] for key in given)
     command = simulate(tmp_path, name, **given)

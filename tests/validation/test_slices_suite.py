@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.types import LabelVolume
 from hipsta_bids.validation import invariance
 from hipsta_bids.validation.cases import Refusal, reslice
@@ -23,7 +23,7 @@ def numbered(shape=(20, 30, 16), voxel=0.3):
         tissue=(1 + i + j + k).astype(np.uint8),
         part=(j % 4).astype(np.uint8),
         affine=affine,
-        scheme=load_scheme("freesurfer"),
+        protocol=load_protocol("freesurfer"),
     )
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.phantom.shape import PITCH
-from hipsta_bids.protocols.load import load_scheme
+from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.validation.accuracy import ROWS, Row, _poses, _thickness_table
 from hipsta_bids.validation.cases import (
     CURVATURES,
@@ -91,7 +91,7 @@ def test_slices_stand_across_the_long_axis_but_for_the_tilt(tilt):
     for _ in range(5):
         pose, turn = along_slices(generator, tilt=tilt)
         volume = Phantom(SMALL).label_volume(
-            load_scheme("freesurfer"),
+            load_protocol("freesurfer"),
             voxel_size=(0.9, 0.9, 2.0),
             pose=pose,
             axes="LIA",
