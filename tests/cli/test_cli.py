@@ -173,7 +173,7 @@ def test_spellings_of_other_bids_apps(alias, field, value):
         ("in out participant --forc", "unrecognized arguments: --forc"),
         ("in in participant", "the output folder is the BIDS dataset itself"),
         ("in out participant --settings none.toml", "settings cannot be read"),
-        ("protocols x", "protocols takes no arguments"),
+        ("schemes x", "schemes takes no arguments"),
         ("settings x", "settings takes no arguments"),
         ("demo", "demo takes one folder"),
         ("demo-data a b", "demo-data takes one folder"),
@@ -323,7 +323,7 @@ def test_reader_that_goes_away_is_no_bug(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
         "import sys\nfrom hipsta_bids.cli.main import main\n"
-        "sys.stdin.readline()\nsys.exit(main(['protocols']))"
+        "sys.stdin.readline()\nsys.exit(main(['schemes']))"
     )
     reading, writing = os.pipe()
     with subprocess.Popen(

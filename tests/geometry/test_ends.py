@@ -102,7 +102,7 @@ def test_phantom_ends_are_where_they_were_drawn(case):
         assert np.abs(case.body.ends.height(plane, end)).max() < 0.2
 
 
-@pytest.mark.parametrize("scheme", ["ashsPMC", "hippunfold"])
+@pytest.mark.parametrize("protocol", ["ashsPMC", "hippunfold"])
 @pytest.mark.parametrize("slice_mm", [0.4, 1.0])
 def test_rule_of_the_paper_finds_the_body_without_head_and_tail_labels(protocol, slice_mm):
     phantom = short_phantom(length=14.0)
