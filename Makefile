@@ -55,7 +55,7 @@ layers: $(STAMP)
 	"$(BIN)/lint-imports" --no-cache
 
 unit: $(STAMP)
-	"$(BIN)/python" -m pytest -n 2
+	"$(BIN)/python" -m pytest -n 2 --dist loadfile
 
 docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 "$(BIN)/python" -m mkdocs build --strict --quiet

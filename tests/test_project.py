@@ -82,7 +82,7 @@ def test_lock_has_a_hash_for_every_package_and_no_address(lock):
     assert not re.search(r"^\s*-+(index|find|extra)", text, re.MULTILINE)
 
 
-def test_every_import_is_a_declared_dependency():
+def test_imports_are_the_declared_dependencies():
     distributions = {
         "PIL": "pillow",
         "bids": "pybids",
@@ -97,7 +97,7 @@ def test_every_import_is_a_declared_dependency():
     names = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
     names |= {node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)}
     packages = {name.split(".")[0] for name in names} - sys.stdlib_module_names - {"hipsta_bids"}
-    assert {distributions.get(name, name) for name in packages} <= declared
+    assert {distributions.get(name, name) for name in packages} == declared
 
 
 def test_both_locks_hold_the_same_versions():
