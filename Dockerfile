@@ -18,10 +18,11 @@ RUN python -m venv /opt/hipsta_bids; \
     find /opt/hipsta_bids -type d -name tests -prune -exec rm -r {} +
 
 COPY . .
+# Plotly (64 MB) is required by LaPy's metadata, but imported by lapy.plot alone, which nothing here uses.
 # Isolated (-I), since Apptainer hands on the environment: the caller's PYTHONPATH is for another Python.
 RUN /opt/hipsta_bids/bin/pip install --no-deps --no-build-isolation .; \
     /opt/hipsta_bids/bin/pip check; \
-    /opt/hipsta_bids/bin/pip uninstall --yes setuptools pip; \
+    /opt/hipsta_bids/bin/pip uninstall --yes plotly setuptools pip; \
     sed -i '1s/$/ -I/' /opt/hipsta_bids/bin/hipsta-bids; \
     python -m compileall -q -j 0 --invalidation-mode unchecked-hash /opt/hipsta_bids
 
