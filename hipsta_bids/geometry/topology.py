@@ -1,4 +1,8 @@
-"""Repair of a field's topology: one solid ribbon without holes, bridges or cavities."""
+"""Repair of a field's topology: one solid ribbon without holes, bridges or cavities.
+
+Also a field that marching cubes reads as digital topology does, and the columns of the sheet that
+rest on repaired voxels.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,28 +14,289 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry.digital import box_around, low_corner
-from hipsta_bids.geometry.grid import Field
-from hipsta_bids.geometry.membranes import (
+from hipsta_bids.geometry.digital import (
     ALL,
-    CORNER,
     FACES,
+    FIRST,
     INNER,
     PAD,
     Edit,
+    Index,
     Kind,
     apply_membranes,
+    box_around,
     euler,
+    low_corner,
     with_plates,
 )
+from hipsta_bids.geometry.grid import Field
 from hipsta_bids.settings import MeasureSettings, TopologySettings
-from hipsta_bids.types import Bool, Float, Sheet
+from hipsta_bids.types import Bool, Float, Sheet, position_text
 
-# Fields whose sign marching cubes reads as digital topology does.
+Locate = Callable[[Float], str]
+"""Function that names the subfields at (N, 3) points, RAS mm."""
+Contact = Callable[[Float], bool]
+"""Function that says whether, by the labels, two turns touch at (N, 3) points, RAS mm."""
 
 
-def consistent_values(values: NDArray[np.float32], after: Bool) -> NDArray[np.float32]:
-    """Make the field's sign that of the repaired body, and marching cubes agree with it.
+@dataclass(frozen=True, kw_only=True)
+class Repair:
+    """One change of the body's shape."""
+
+    kind: Kind
+    """``part`` turns that touch, fill a ``slit`` of the labels, ``cut`` a bridge, ``fill`` a hole,
+    remove an ``island``, fill a ``cavity``."""
+    voxels: int
+    """Changed nodes of the working grid."""
+    cost: float
+    """How much evidence was overruled: sum of the field's distance from its level. For a filled
+    hole, of the membrane alone, before it was made as thick as the wall."""
+    position: tuple[float, float, float]
+    """Center, RAS mm."""
+    subfield: str = ""
+    """Subfields at the center, if known."""
+    large: bool
+    """Whether it is beyond the limits of :class:`TopologySettings`, or contradicts the run of the
+    ribbon, and a person should look at it."""
+
+    def __str__(self) -> str:
+        what = {
+            "part": "parted two turns that touch, by a slit",
+            "slit": "filled a slit",
+            "cut": "cut a bridge",
+            "fill": "filled a hole",
+            "island": "removed a separate piece",
+            "cavity": "filled a cavity",
+        }[self.kind]
+        return (
+            f"{what} of {self.voxels} grid nodes at {position_text(self.position, self.subfield)}"
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SolidField:
+    """A field whose positive part is a ball together with plates on both ends."""
+
+    field: Field
+    """Field after all repairs."""
+    repairs: tuple[Repair, ...]
+    """Changes that were made, in their order."""
+    touched: Bool
+    """(A, B, W) nodes whose side was changed."""
+    euler_before: int
+    """Euler number of the body's voxels before the repairs; 1 is right."""
+    euler_after: int
+    """Euler number after the repairs; 1."""
+    changed_fraction: float
+    """Changed nodes over the nodes of the body."""
+
+
+def repair_topology(
+    field: Field,
+    settings: TopologySettings,
+    locate: Locate | None = None,
+    contact: Contact | None = None,
+) -> SolidField:
+    """Make the positive part of a field one solid piece without tunnels.
+
+    Solid plates beyond both ends make an ordinary tunnel of several cap pieces. Growing from inside
+    by simple points stops at the membranes that cut every tunnel; shrinking from outside stops at
+    those that fill it. The cheaper membrane of each tunnel is applied. (The two-sided use of
+    homotopic growing follows Kriegeskorte & Goebel 2001, NeuroImage 14:329-346.)
+    """
+    values = field.values
+    before = values > 0
+    if not before.any():
+        raise GeometryError(
+            "nothing is left of the body after smoothing: the sheet is too thin for its voxels; "
+            "use a finer segmentation",
+            reason="sheet-too-thin",
+        )
+    state = np.pad(before, PAD)
+    euler_before = euler(state)
+    padded = np.pad(values, PAD, constant_values=-1.0)
+    lifted = padded.copy()
+    _refuse_strips(state, field, settings, locate)
+
+    def touching(where: Index) -> bool:
+        return contact is not None and contact(field.grid.to_ras((where - FIRST).astype(float)))
+
+    edits = _before_smoothing(field)
+    edits += _remove_islands(state, field, locate) + _fill_cavities(state)
+    for _ in range(settings.rounds):
+        wrong = [plates for plates in (False, True) if euler(state, plates=plates) != 1]
+        if not wrong:
+            break
+        # Pits only once the body itself is sound: the inside of a closed tube is none.
+        pits = _fill_cavities(state, plates=True) if wrong[0] else []
+        found = pits or apply_membranes(
+            state, padded, lifted, settings, plates=wrong[0], contact=touching
+        )
+        edits += found
+        if not found or _has_strips(state, settings):
+            raise _unrepaired(edits, state, field, locate)
+        edits += _remove_islands(state, field, locate) + _fill_cavities(state)
+    else:
+        raise _unrepaired(edits, state, field, locate)
+    after = state[INNER]
+    size = int(np.count_nonzero(before))
+    changed = after != before
+    if field.slits is not None:
+        changed |= field.slits
+    touched = changed if field.separated is None else changed | field.separated
+    repairs = tuple(_describe(edit, field, size, settings, locate) for edit in edits)
+    return SolidField(
+        field=Field(grid=field.grid, values=_consistent_values(lifted[INNER], after)),
+        repairs=repairs,
+        touched=touched,
+        euler_before=euler_before,
+        euler_after=euler(state),
+        changed_fraction=float(np.count_nonzero(changed) / size),
+    )
+
+
+def _before_smoothing(field: Field) -> list[Edit]:
+    """List what was removed between turns that touch, and what was filled, before smoothing."""
+    edits = []
+    if field.separated is not None and field.separated.any():
+        edits.append(Edit("part", np.argwhere(field.separated) + FIRST))
+    if field.slits is not None:
+        pieces, count = ndimage.label(field.slits, structure=ALL)
+        edits += [Edit("slit", np.argwhere(pieces == n + 1) + FIRST) for n in range(count)]
+    return edits
+
+
+def _through_pieces(state: Bool) -> tuple[NDArray[Any], int, NDArray[Any]]:
+    """Pieces of the body, their number, and those from plate to plate, the largest first.
+
+    The plates are left out, or a fragment that touches one of them would count as connected.
+    """
+    pieces, count = ndimage.label(state[INNER], structure=FACES)
+    through = np.intersect1d(pieces[:, :, 0], pieces[:, :, -1])
+    through = through[through > 0]
+    sizes = np.bincount(pieces.ravel(), minlength=count + 1)[through]
+    return pieces, count, through[np.argsort(-sizes)]
+
+
+def _has_strips(state: Bool, settings: TopologySettings) -> bool:
+    """Whether two pieces of a fair size reach from plate to plate."""
+    pieces, _, through = _through_pieces(state)
+    sizes = [np.count_nonzero(pieces == n) for n in through[:2]]
+    return len(sizes) > 1 and bool(sizes[1] > settings.flag_fraction * sizes[0])
+
+
+def _refuse_strips(
+    state: Bool, field: Field, settings: TopologySettings, locate: Locate | None
+) -> None:
+    """Refuse a ribbon that a gap divides from end to end, and say where."""
+    if not _has_strips(state, settings):
+        return
+    pieces, _, through = _through_pieces(state)
+    gap, nearest = ndimage.distance_transform_edt(pieces != through[0], return_indices=True)
+    facing = np.argwhere((pieces == through[1]) & (gap <= gap[pieces == through[1]].min() + 1))
+    other = nearest[:, *facing.T].T
+    center = 0.5 * (facing.mean(axis=0) + other.mean(axis=0))
+    names = locate(field.grid.to_ras(np.vstack([facing, other]).astype(float))) if locate else ""
+    at = position_text(field.grid.to_ras(center[None])[0], names)
+    raise GeometryError(
+        f"a gap divides the sheet into {len(through)} strips from end to end, at {at}: "
+        "fill it in the labels, or check that the protocol fits them",
+        reason="body-split",
+    )
+
+
+def _unrepaired(
+    edits: list[Edit], state: Bool, field: Field, locate: Locate | None
+) -> GeometryError:
+    """Report the largest of the repairs that did not lead to one solid piece."""
+    nothing = Edit("cut", np.argwhere(state))
+    where = max(edits, key=lambda edit: len(edit.where), default=nothing).where
+    point = field.grid.to_ras((where - FIRST).mean(axis=0, keepdims=True))
+    at = position_text(point[0], locate(point) if locate else "")
+    return GeometryError(
+        f"the labels have holes or bridges that could not be repaired (Euler number "
+        f"{euler(state)}, with closed ends {euler(state, plates=True)}, instead of 1), the "
+        f"largest near {at}: correct the labels there by hand",
+        reason="topology",
+    )
+
+
+def _interrupted(pieces: Index, field: Field, locate: Locate | None) -> GeometryError:
+    """Report where the body ends that begins at the posterior plane."""
+    first = int(np.flatnonzero((pieces > 0).any(axis=(0, 1)))[0])
+    nodes = np.argwhere(np.isin(pieces, np.unique(pieces[:, :, first])) & (pieces > 0))
+    level = nodes[:, 2].max() if first == 0 else first
+    point = field.grid.to_ras(nodes[nodes[:, 2] == level].astype(float))
+    at = position_text(point.mean(axis=0), locate(point) if locate else "")
+    return GeometryError(
+        f"the body is interrupted at {at}: no connected path of its labels leads from the "
+        "posterior to the anterior end plane; fill in missing slices, correct head and tail labels "
+        "inside the body, or use a finer segmentation of a thin sheet",
+        reason="body-interrupted",
+    )
+
+
+def _remove_islands(state: Bool, field: Field, locate: Locate | None) -> list[Edit]:
+    """Remove (in place) all but the largest piece that reaches from plate to plate."""
+    pieces, count, through = _through_pieces(state)
+    if not len(through):
+        raise _interrupted(pieces, field, locate)
+    if count == 1:
+        return []
+    state[INNER] &= pieces == through[0]
+    return [
+        Edit("island", np.argwhere(pieces == n) + FIRST)
+        for n in range(1, count + 1)
+        if n != through[0]
+    ]
+
+
+def _fill_cavities(state: Bool, *, plates: bool = False) -> list[Edit]:
+    """Fill (in place) background that does not reach the border, or with plates that cannot."""
+    solid = with_plates(state, True) if plates else state
+    pieces, count = ndimage.label(~solid, structure=ALL)
+    if count == 1:
+        return []
+    outside = int(pieces[0, 0, 0])
+    state |= (pieces > 0) & (pieces != outside)
+    return [Edit("cavity", np.argwhere(pieces == n)) for n in range(1, count + 1) if n != outside]
+
+
+def _describe(
+    edit: Edit, field: Field, size: int, settings: TopologySettings, locate: Locate | None
+) -> Repair:
+    """Locate one change, and find out whether it is large."""
+    kind, where = edit.kind, edit.where
+    center = field.grid.to_ras((where - FIRST).mean(axis=0, keepdims=True))[0]
+    inside = np.clip(where - FIRST, 0, np.array(field.grid.shape) - 1)
+    cost = edit.cost or float(np.abs(field.values[tuple(inside.T)]).sum())
+    share = settings.flag_part if kind == "part" else settings.flag_fraction
+    limit = {"cut": settings.flag_cut_cost, "fill": settings.flag_fill_cost}.get(kind, np.inf)
+    return Repair(
+        kind=kind,
+        voxels=len(where),
+        cost=cost,
+        position=(float(center[0]), float(center[1]), float(center[2])),
+        subfield=locate(center[None]) if locate else "",
+        large=bool(
+            edit.doubtful
+            or cost > limit
+            or len(where) > share * size
+            or (kind == "fill" and _beside_slit(inside, field))
+        ),
+    )
+
+
+def _beside_slit(nodes: Index, field: Field) -> bool:
+    """Whether a hole lies next to a slit between turns, which then went through a wall."""
+    if field.separated is None:
+        return False
+    near = ndimage.binary_dilation(field.separated, structure=ALL, iterations=2)
+    return bool(near[tuple(nodes.T)].any())
+
+
+def _consistent_values(values: NDArray[np.float32], after: Bool) -> NDArray[np.float32]:
+    """Give the field the sign of the repaired body, and marching cubes the same topology.
 
     Where the sign is ambiguous on a face or inside a cube, marching cubes decides by the values;
     small positive and larger negative ones keep foreground corners apart, as 6-connectivity does.
@@ -71,285 +336,12 @@ def _mark(corners: Bool, cells: Bool, *, cube: bool) -> None:
                 corners[first, dy : dy - 1 or None, dz : dz - 1 or None] |= cells
 
 
-Locate = Callable[[Float], str]
-"""Names the subfields at (N, 3) points, RAS mm."""
-Contact = Callable[[Float], bool]
-"""Whether two turns of the sheet touch at (N, 3) points, RAS mm, by their labels."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Repair:
-    """One change of the body's shape."""
-
-    kind: Kind
-    """``part`` turns that touch, fill a ``slit`` of the labels, ``cut`` a bridge, ``fill`` a hole,
-    remove an ``island``, fill a ``cavity``."""
-    voxels: int
-    """Changed nodes of the working grid."""
-    cost: float
-    """How much evidence was overruled: sum of the field's distance from its level. For a filled
-    hole, of the membrane alone, without what made it as thick as the wall."""
-    position: tuple[float, float, float]
-    """Center, RAS mm."""
-    subfield: str = ""
-    """Subfield there, if known."""
-    large: bool
-    """Worth a look: beyond the limits of :class:`TopologySettings`, or against the ribbon's run."""
-
-    def __str__(self) -> str:
-        what = {
-            "part": "parted two turns that touch, by a slit",
-            "slit": "filled a slit",
-            "cut": "cut a bridge",
-            "fill": "filled a hole",
-            "island": "removed a separate piece",
-            "cavity": "filled a cavity",
-        }[self.kind]
-        return f"{what} of {self.voxels} grid nodes at {_place(self.position, self.subfield)}"
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class SolidField:
-    """A field whose positive part is a ball together with plates on both ends."""
-
-    field: Field
-    repairs: tuple[Repair, ...]
-    touched: Bool
-    """(A, B, W) nodes whose side was changed."""
-    euler_before: int
-    """Euler number of the body's voxels; 1 is right."""
-    euler_after: int
-    changed_fraction: float
-    """Changed nodes over the nodes of the body."""
-
-
-def repair_topology(
-    field: Field,
-    settings: TopologySettings,
-    locate: Locate | None = None,
-    contact: Contact | None = None,
-) -> SolidField:
-    """Make the positive part of a field one solid piece without tunnels.
-
-    Solid plates beyond both ends turn several cap pieces into an ordinary tunnel. Growing from
-    inside by simple points stops at the membranes that cut every tunnel; shrinking from outside
-    stops at those that fill it. The cheaper membrane of each tunnel is applied. (The two-sided
-    use of homotopic growing follows Kriegeskorte & Goebel 2001, NeuroImage 14:329-346.)
-    """
-    values = field.values
-    before = values > 0
-    if not before.any():
-        raise GeometryError(
-            "nothing is left of the body after smoothing: the sheet is too thin for its voxels",
-            reason="sheet-too-thin",
-        )
-    state = np.pad(before, PAD)
-    euler_before = euler(state)
-    padded = np.pad(values, PAD, constant_values=-1.0)
-    lifted = padded.copy()
-    _refuse_strips(state, field, settings, locate)
-
-    def touching(where: NDArray[np.intp]) -> bool:
-        return contact is not None and contact(field.grid.to_ras((where - CORNER).astype(float)))
-
-    edits = _before_smoothing(field)
-    edits += _remove_islands(state, field, locate) + _fill_cavities(state)
-    for _ in range(settings.rounds):
-        wrong = [plates for plates in (False, True) if euler(state, plates=plates) != 1]
-        if not wrong:
-            break
-        # Only once the body itself is sound: the inside of a closed tube is no pit.
-        pits = _fill_cavities(state, plates=True) if wrong[0] else []
-        found = pits or apply_membranes(
-            state, padded, lifted, settings, plates=wrong[0], contact=touching
-        )
-        edits += found
-        if not found or _has_strips(state, settings):
-            raise _unrepaired(edits, state, field, locate)
-        edits += _remove_islands(state, field, locate) + _fill_cavities(state)
-    else:
-        raise _unrepaired(edits, state, field, locate)
-    after = state[INNER]
-    size = int(np.count_nonzero(before))
-    changed = after != before
-    if field.slits is not None:
-        changed |= field.slits
-    repairs = tuple(_describe(edit, field, size, settings, locate) for edit in edits)
-    return SolidField(
-        field=Field(grid=field.grid, values=consistent_values(lifted[INNER], after)),
-        repairs=repairs,
-        touched=changed if field.parted is None else changed | field.parted,
-        euler_before=euler_before,
-        euler_after=euler(state),
-        changed_fraction=float(np.count_nonzero(changed) / size),
-    )
-
-
-def _before_smoothing(field: Field) -> list[Edit]:
-    """List what was taken out between turns that touch, and what was filled."""
-    edits = []
-    if field.parted is not None and field.parted.any():
-        edits.append(Edit("part", np.argwhere(field.parted) + CORNER))
-    if field.slits is not None:
-        pieces, count = ndimage.label(field.slits, structure=ALL)
-        edits += [Edit("slit", np.argwhere(pieces == n + 1) + CORNER) for n in range(count)]
-    return edits
-
-
-def _through_pieces(state: Bool) -> tuple[NDArray[Any], int, NDArray[Any]]:
-    """Pieces of the body, their number, and which of them reach from plate to plate.
-
-    The largest comes first. The plates are left out of the count, or a fragment that touches one of
-    them would count as connected.
-    """
-    pieces, count = ndimage.label(state[INNER], structure=FACES)
-    through = np.intersect1d(pieces[:, :, 0], pieces[:, :, -1])
-    through = through[through > 0]
-    sizes = np.bincount(pieces.ravel(), minlength=count + 1)[through]
-    return pieces, count, through[np.argsort(-sizes)]
-
-
-def _has_strips(state: Bool, settings: TopologySettings) -> bool:
-    """Whether two pieces of a fair size reach from plate to plate."""
-    pieces, _, through = _through_pieces(state)
-    sizes = [np.count_nonzero(pieces == n) for n in through[:2]]
-    return len(sizes) > 1 and bool(sizes[1] > settings.flag_fraction * sizes[0])
-
-
-def _refuse_strips(
-    state: Bool, field: Field, settings: TopologySettings, locate: Locate | None
-) -> None:
-    """Refuse a ribbon that a gap parts from end to end, and say where."""
-    if not _has_strips(state, settings):
-        return
-    pieces, _, through = _through_pieces(state)
-    gap, nearest = ndimage.distance_transform_edt(pieces != through[0], return_indices=True)
-    facing = np.argwhere((pieces == through[1]) & (gap <= gap[pieces == through[1]].min() + 1))
-    other = nearest[:, *facing.T].T
-    center = 0.5 * (facing.mean(axis=0) + other.mean(axis=0))
-    names = locate(field.grid.to_ras(np.vstack([facing, other]).astype(float))) if locate else ""
-    place = _place(field.grid.to_ras(center[None])[0], names)
-    raise GeometryError(
-        f"a gap parts the sheet into {len(through)} strips from end to end, at {place}: "
-        "fill it in the labels, or check that the protocol fits them",
-        reason="body-split",
-    )
-
-
-def _unrepaired(
-    edits: list[Edit], state: Bool, field: Field, locate: Locate | None
-) -> GeometryError:
-    """Say where the largest of the repairs was tried that did not lead to one solid piece."""
-    nothing = Edit("cut", np.argwhere(state))
-    where = max(edits, key=lambda edit: len(edit.where), default=nothing).where
-    point = field.grid.to_ras((where - CORNER).mean(axis=0, keepdims=True))
-    place = _place(point[0], locate(point) if locate else "")
-    return GeometryError(
-        f"the labels have holes or bridges that could not be repaired (Euler number "
-        f"{euler(state)}, with closed ends {euler(state, plates=True)}, instead of 1), the "
-        f"largest near {place}: correct the labels there by hand",
-        reason="topology",
-    )
-
-
-def _place(point: Float | tuple[float, float, float], subfield: str) -> str:
-    """Spell a place for people."""
-    words = " ".join(f"{value:.1f}" for value in point)
-    return f"RAS {words} mm ({subfield})" if subfield else f"RAS {words} mm"
-
-
-def _interrupted(pieces: NDArray[np.intp], field: Field, locate: Locate | None) -> GeometryError:
-    """Say where the pieces that come from both ends are closest to each other."""
-    first = int(np.flatnonzero((pieces > 0).any(axis=(0, 1)))[0])
-    nodes = np.argwhere(np.isin(pieces, np.unique(pieces[:, :, first])) & (pieces > 0))
-    level = nodes[:, 2].max() if first == 0 else first
-    point = field.grid.to_ras(nodes[nodes[:, 2] == level].astype(float))
-    place = _place(point.mean(axis=0), locate(point) if locate else "")
-    return GeometryError(
-        f"the body is interrupted at {place}: no connected path of its labels leads from the "
-        "posterior to the anterior end plane; fill in missing slices, correct head and tail labels "
-        "inside the body, or use a finer segmentation of a thin sheet",
-        reason="body-interrupted",
-    )
-
-
-def _remove_islands(state: Bool, field: Field, locate: Locate | None) -> list[Edit]:
-    """Remove all but the largest piece that reaches from plate to plate (in place)."""
-    pieces, count, through = _through_pieces(state)
-    if not len(through):
-        raise _interrupted(pieces, field, locate)
-    if count == 1:
-        return []
-    state[INNER] &= pieces == through[0]
-    return [
-        Edit("island", np.argwhere(pieces == n) + CORNER)
-        for n in range(1, count + 1)
-        if n != through[0]
-    ]
-
-
-def _fill_cavities(state: Bool, *, plates: bool = False) -> list[Edit]:
-    """Fill background that does not reach the border (in place).
-
-    With plates, pits that open at an end plane only are cavities too.
-    """
-    solid = with_plates(state, True) if plates else state
-    pieces, count = ndimage.label(~solid, structure=ALL)
-    if count == 1:
-        return []
-    outside = int(pieces[0, 0, 0])
-    state |= (pieces > 0) & (pieces != outside)
-    return [Edit("cavity", np.argwhere(pieces == n)) for n in range(1, count + 1) if n != outside]
-
-
-def _describe(
-    edit: Edit, field: Field, size: int, settings: TopologySettings, locate: Locate | None
-) -> Repair:
-    kind, where = edit.kind, edit.where
-    nodes: Float = where - CORNER
-    centre = field.grid.to_ras(nodes.mean(axis=0, keepdims=True))[0]
-    inside = np.clip(where - CORNER, 0, np.array(field.grid.shape) - 1)
-    cost = edit.cost or float(np.abs(field.values[tuple(inside.T)]).sum())
-    share = settings.flag_part if kind == "part" else settings.flag_fraction
-    limit = {
-        "cut": settings.flag_cut_cost,
-        "fill": settings.flag_fill_cost,
-    }.get(kind, np.inf)
-    return Repair(
-        kind=kind,
-        voxels=len(where),
-        cost=cost,
-        position=(float(centre[0]), float(centre[1]), float(centre[2])),
-        subfield=locate(centre[None]) if locate else "",
-        large=bool(
-            edit.doubtful
-            or cost > limit
-            or len(where) > share * size
-            or (kind == "fill" and _beside_part(inside, field))
-        ),
-    )
-
-
-def _beside_part(nodes: NDArray[np.intp], field: Field) -> bool:
-    """Whether a hole lies next to a slit between turns: it went through a wall, not between two."""
-    if field.parted is None:
-        return False
-    near = ndimage.binary_dilation(field.parted, structure=ALL, iterations=2)
-    return bool(near[tuple(nodes.T)].any())
-
-
-# Which columns of the sheet rest on repaired voxels.
-
-
-_ALL = np.ones((3, 3, 3), dtype=bool)
-
-
 def repaired_columns(sheet: Sheet, solid: SolidField, settings: MeasureSettings) -> Bool:
-    """Mark the columns of the sheet that a repair of the topology touched.
+    """Mark the columns (Nx, Ny) of the sheet that a repair of the topology touched.
 
-    A column stands for the part of the sheet up to halfway to its neighbors, so that a repair
-    between two columns is not lost. A cut bridge leaves its two stumps standing: what is nearest
-    to either face of the cut is marked, too. Pieces that were removed leave no mark.
+    A column represents the sheet up to halfway to its neighbors, so that a repair between two
+    columns is not lost. A cut bridge leaves two stumps: what is nearest to either face of the cut
+    is marked, too. Pieces that were removed leave no mark.
     """
     marked = np.zeros(sheet.valid.shape, dtype=bool)
     if not solid.touched.any():
@@ -359,7 +351,7 @@ def repaired_columns(sheet: Sheet, solid: SolidField, settings: MeasureSettings)
         return marked
     nodes, radii = _changed_nodes(solid, sheet.points[known].reshape(-1, 3), settings)
     gaps = np.stack([_gaps(sheet.points, axis) for axis in (0, 1)], axis=-1)
-    # Most columns are far from all repairs: looking closely at the others only saves much time.
+    # Most columns are far from all repairs: only the others are interpolated.
     near = np.asarray(cKDTree(nodes).query(sheet.points[known])[0])
     candidates = np.argwhere(known)[near.min(axis=1) <= radii.max() + gaps[known].mean(axis=-1)]
     if not len(candidates):
@@ -388,36 +380,33 @@ def _gaps(points: Float, axis: int) -> Float:
 def _changed_nodes(
     solid: SolidField, points: Float, settings: MeasureSettings
 ) -> tuple[Float, Float]:
-    """Points (N, 3), RAS mm, of changed nodes and faces of cuts, and how far each of them marks."""
+    """Points (N, 3), RAS mm, of changed nodes and faces of cuts, and the reach (N,) of each, mm."""
     box = box_around(np.argwhere(solid.touched))
     inside, touched = solid.field.values[box] > 0, solid.touched[box]
-    faces = ndimage.binary_dilation(touched & ~inside, structure=_ALL) & inside
-    places, _ = ndimage.label(faces & ~touched)
+    faces = ndimage.binary_dilation(touched & ~inside, structure=ALL) & inside
+    cuts, _ = ndimage.label(faces & ~touched)
     low = low_corner(box)
     changed = solid.field.grid.to_ras((np.argwhere(touched) + low).astype(np.float64))
     radius = np.full(len(changed), settings.repair_reach)
-    where = np.argwhere(places)
+    where = np.argwhere(cuts)
     if not len(where):
         return changed, radius
     face = solid.field.grid.to_ras((where + low).astype(np.float64))
-    number = places[tuple(where.T)]
+    number = cuts[tuple(where.T)]
     distance, _ = cKDTree(points).query(face)
     nearest = np.asarray(ndimage.minimum(distance, number, np.arange(number.max() + 1)))
     stumps = nearest[number] + settings.stump_reach
     return np.vstack([changed, face]), np.concatenate([radius, stumps])
 
 
-def _cells(points: Float, columns: NDArray[np.intp], parts: NDArray[np.intp]) -> Float:
-    """Interpolate round columns, up to halfway to their neighbors.
-
-    Returns NaN where a neighbor is undefined.
-    """
+def _cells(points: Float, columns: Index, parts: Index) -> Float:
+    """Interpolate round columns, up to halfway to their neighbors; NaN beside undefined ones."""
     steps = [np.linspace(-0.5, 0.5, int(n) + 1) for n in parts]
     offsets = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 2)
     last = np.array(points.shape[:2]) - 1
-    place = np.clip(columns[:, None] + offsets, 0, last)
-    low, high = np.floor(place).astype(np.intp), np.ceil(place).astype(np.intp)
-    share = (place - low)[..., None, None]
+    at = np.clip(columns[:, None] + offsets, 0, last)
+    low, high = np.floor(at).astype(np.intp), np.ceil(at).astype(np.intp)
+    share = (at - low)[..., None, None]
     x, y = share[:, :, 0], share[:, :, 1]
     (a, b), (c, d) = np.moveaxis(low, -1, 0), np.moveaxis(high, -1, 0)
     before = (1 - y) * points[a, b] + y * points[a, d]

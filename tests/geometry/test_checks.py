@@ -19,7 +19,7 @@ from hipsta_bids.geometry.checks import (
     check_voxels_across,
 )
 from hipsta_bids.geometry.measures import measure_thickness
-from hipsta_bids.geometry.surface import extract_surface
+from hipsta_bids.geometry.mesh import extract_surface
 from hipsta_bids.geometry.topology import repair_topology
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Part, Tissue

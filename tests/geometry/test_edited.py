@@ -38,7 +38,7 @@ def body(volume):
 
 
 @pytest.mark.parametrize(
-    ("scheme", "voxels"),
+    ("protocol", "voxels"),
     [("freesurfer", (0.4, 0.4, 0.4)), ("hippunfold", (0.4, 0.4, 0.4)), ("ashsPMC", (0.4, 2, 0.4))],
 )
 def test_a_mask_that_changes_nothing_changes_nothing(protocol, voxels):

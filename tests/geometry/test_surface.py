@@ -7,7 +7,7 @@ from scipy import sparse
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.grid import Field
-from hipsta_bids.geometry.surface import (
+from hipsta_bids.geometry.mesh import (
     extract_surface,
     lateral_triangles,
     mean_wall_thickness,

@@ -10,10 +10,9 @@ import pytest
 from geometry_cases import box_mesh
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry import tetra
-from hipsta_bids.geometry.surface import signed_volume
+from hipsta_bids.geometry import mesh
+from hipsta_bids.geometry.mesh import signed_volume, tetra_quality, tetra_volumes, tetrahedralize
 from hipsta_bids.geometry.tetgen_worker import TetgenClient
-from hipsta_bids.geometry.tetra import tetra_quality, tetra_volumes, tetrahedralize
 from hipsta_bids.settings import TetraSettings
 from hipsta_bids.types import Surface, TetMesh
 
@@ -45,7 +44,7 @@ def crossing_cubes():
 def client(monkeypatch):
     """A client of its own, so that killing its process disturbs nobody."""
     fresh = TetgenClient()
-    monkeypatch.setattr(tetra, "_CLIENT", fresh)
+    monkeypatch.setattr(mesh, "_CLIENT", fresh)
     yield fresh
     fresh._stop()
 

@@ -10,7 +10,7 @@ from scipy import ndimage
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.digital import euler_number
 from hipsta_bids.geometry.grid import Field
-from hipsta_bids.geometry.surface import extract_surface
+from hipsta_bids.geometry.mesh import extract_surface
 from hipsta_bids.geometry.topology import repair_topology
 from hipsta_bids.settings import SurfaceSettings, TopologySettings
 
@@ -320,15 +320,15 @@ def test_ambiguous_cubes_keep_foreground_corners_apart():
     assert euler_number(solid.field.values > 0) == 1
 
 
-def test_parted_turns_are_reported(slab):
-    parted = np.zeros(slab.field.grid.shape, dtype=bool)
+def test_separated_turns_are_reported(slab):
+    separated = np.zeros(slab.field.grid.shape, dtype=bool)
     where = np.argwhere(slab.field.values > 0.3)[:5]  # fewer than 1 % of the body
-    parted[tuple(where.T)] = True
-    found = repair_topology(replace(slab.field, parted=parted), TopologySettings())
+    separated[tuple(where.T)] = True
+    found = repair_topology(replace(slab.field, separated=separated), TopologySettings())
     (repair,) = found.repairs
     assert (repair.kind, repair.voxels, repair.large) == ("part", 5, False)
     assert str(repair).startswith("parted two turns that touch, by a slit of 5 grid nodes at RAS")
-    assert found.touched[parted].all()
+    assert found.touched[separated].all()
 
 
 @pytest.mark.parametrize(("apart", "doubtful"), [(0, True), (6, False)])
@@ -336,8 +336,8 @@ def test_a_hole_beside_a_slit_between_turns_is_doubtful(apart, doubtful):
     """The slit has then gone through a wall instead of between two."""
     mask, *_ = with_hole()
     field = field_of(mask, spacing=SPACING)
-    parted = np.zeros(mask.shape, dtype=bool)
-    parted[6:10, 19:22, 16 + apart] = True
-    found = repair_topology(replace(field, parted=parted), TopologySettings())
+    separated = np.zeros(mask.shape, dtype=bool)
+    separated[6:10, 19:22, 16 + apart] = True
+    found = repair_topology(replace(field, separated=separated), TopologySettings())
     (fill,) = [repair for repair in found.repairs if repair.kind == "fill"]
     assert fill.large == doubtful
