@@ -177,7 +177,7 @@ def _on_frontier(flat: Bool, queue: Index, shifts: Index, add: bool) -> Index:
 
 
 class _Table(NamedTuple):
-    """What an 18-neighborhood tells, by its bits."""
+    """Properties of 18-neighborhoods, by their bits."""
 
     bare_but_for: NDArray[np.uint8]
     """Corners of the cube that are bare if the voxel beyond them is object: a byte of bits."""
@@ -208,7 +208,7 @@ def _is_bare(bits: Bits, part: Index) -> Bool:
 
 
 def _is_one_piece(bits: Bits) -> Bool:
-    """Whether the object's faces hang together, by edges, in the 18-neighborhood."""
+    """Whether the object's faces are connected, by edges, in the 18-neighborhood."""
     faces = bits & np.uint32((1 << len(_SIDES)) - 1)
     reached = faces & (~faces + np.uint32(1))  # the lowest one
     before = np.zeros_like(reached)
@@ -415,7 +415,7 @@ def _implausibility(kind: Kind, where: Index, solid: Bool, settings: TopologySet
     )
     across = areas[2] ** 2 / float(areas @ areas)
     if kind == "cut":
-        severs = across > settings.cut_across and _goes_on(where, solid, settings)
+        severs = across > settings.cut_across and _continues(where, solid, settings)
         return settings.sever_factor if severs else 1.0
     level = float(where[:, 2].mean()) - FIRST[2]
     last = solid.shape[2] - 2 * FIRST[2] - 1
@@ -423,10 +423,10 @@ def _implausibility(kind: Kind, where: Index, solid: Bool, settings: TopologySet
     return settings.across_factor if across > settings.fill_across and not lid else 1.0
 
 
-def _goes_on(where: Index, solid: Bool, settings: TopologySettings) -> bool:
-    """Whether the body goes on along the axis on both sides of most of a membrane's nodes.
+def _continues(where: Index, solid: Bool, settings: TopologySettings) -> bool:
+    """Whether the body continues along the axis on both sides of most of a membrane's nodes.
 
-    It may step aside by a node; beyond an end plane it counts as going on.
+    It may deviate by a node; beyond an end plane it counts as continued.
     """
     wide = ndimage.maximum_filter(solid, size=(3, 3, 1))
     both = np.ones(len(where), dtype=bool)
@@ -474,7 +474,7 @@ def _thicken(
 
 def _half_thickness(wall: Bool, nodes: Index, settings: TopologySettings) -> Float:
     """Half the thickness of a wall, in nodes, (N,): the depth of its middle near (N, 3) nodes."""
-    padded = np.pad(wall, 1, mode="edge")  # what goes on beyond the block has no surface there
+    padded = np.pad(wall, 1, mode="edge")  # no surface where the wall continues beyond the block
     depth = ndimage.distance_transform_edt(padded)[1:-1, 1:-1, 1:-1]
     ridge = wall & (depth >= ndimage.maximum_filter(depth, 3))
     middle = np.argwhere(ridge)

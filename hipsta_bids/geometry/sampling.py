@@ -1,5 +1,6 @@
 """Other volumes on the sheet, at its points or averaged over depth, and maps in regions of it."""
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -186,13 +187,10 @@ def summarize_regions(
 
 def _moments(member: Bool, values: Float) -> tuple[Float, Float]:
     """Mean and standard deviation (R,) of a map over its known members."""
-    known = member & np.isfinite(values)
-    count = known.sum(axis=(1, 2))
-    safe = np.where(np.isfinite(values), values, 0.0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean = np.where(known, safe, 0.0).sum(axis=(1, 2)) / count
-        off = np.where(known, safe - mean[:, None, None], 0.0)
-        sd = np.sqrt((off**2).sum(axis=(1, 2)) / np.where(count > 1, count - 1, np.nan))
+    known = np.where(member & np.isfinite(values), values, np.nan)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of regions without two known points
+        mean, sd = np.nanmean(known, axis=(1, 2)), np.nanstd(known, axis=(1, 2), ddof=1)
     return np.asarray(mean), np.asarray(sd)
 
 

@@ -256,7 +256,7 @@ def sample_slices(body: Body, points: Float, settings: SliceSettings) -> Stack:
     tissue = np.moveaxis(body.tissue, through, 0)[part].copy()
     for step, depth, known in zip((1, -1), _depths(body, through, part), labeled, strict=True):
         if not known:
-            _continue(tissue[::step], (depth < settings.hidden_depth)[::step], pixel, settings)
+            _extrapolate(tissue[::step], (depth < settings.hidden_depth)[::step], pixel, settings)
     stack = _stacked(tissue, pixel, settings)
     voxels = body.to_voxels(points)[:, _order(through)] - low_corner(part)
     where = ((voxels[:, 1:] + 0.5) * settings.upsampling - 0.5).astype(np.float32).T
@@ -289,10 +289,10 @@ def _labeled_ends(body: Body, through: int) -> tuple[bool, bool]:
         inner = np.count_nonzero((depth > 0) & (depth < thickness))
         outer = np.count_nonzero((depth < 0) & (depth > -thickness))
         known.append(bool(outer > 0.5 * inner))  # a label that is only blurred at the plane is less
-    return (known[0], known[1]) if _goes_forward(body, through) else (known[1], known[0])
+    return (known[0], known[1]) if _runs_forward(body, through) else (known[1], known[0])
 
 
-def _goes_forward(body: Body, through: int) -> bool:
+def _runs_forward(body: Body, through: int) -> bool:
     """Whether slices are counted from posterior to anterior."""
     return bool(body.ends.axis @ body.affine[:3, through] > 0)
 
@@ -319,13 +319,13 @@ def _depths(body: Body, through: int, part: Box) -> tuple[Float, Float]:
     points = to_ras(np.stack(index, axis=-1), body.affine[:, columns])
     posterior = body.ends.height(points, "posterior")
     anterior = -body.ends.height(points, "anterior")
-    return (posterior, anterior) if _goes_forward(body, through) else (anterior, posterior)
+    return (posterior, anterior) if _runs_forward(body, through) else (anterior, posterior)
 
 
-def _continue(
+def _extrapolate(
     tissue: NDArray[np.uint8], hidden: Bool, pixel: float, settings: SliceSettings
 ) -> None:
-    """Fill in, in place, what end labels hide of oblique first slices, extrapolating the next ones.
+    """Extrapolate, in place, what end labels hide of oblique first slices.
 
     Left empty, the hidden part would thin the sheet up to a slice's thickness inside the plane.
     """

@@ -115,7 +115,7 @@ def _exactly(stream: IO[bytes], size: int, deadline: float | None) -> bytes:
 
 
 def _serve() -> None:
-    """Answer requests until the caller goes away."""
+    """Answer requests until the caller ends."""
     # TetGen prints: keep that apart from the messages.
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
@@ -131,7 +131,7 @@ def _serve() -> None:
 
 
 def _mesh(vertices: Float, triangles: Int, options: dict[str, Any]) -> tuple[Float, NDArray[Any]]:
-    from tetgen import TetGen  # noqa: PLC0415 -- only the child needs it
+    from tetgen import TetGen  # noqa: PLC0415 -- only the worker process needs it
 
     # TetGen writes the triangles that it could not use into the working folder.
     with (

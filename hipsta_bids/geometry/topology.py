@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
@@ -306,34 +307,22 @@ def _consistent_values(values: NDArray[np.float32], after: Bool) -> NDArray[np.f
     result = np.where(edited, np.where(after, 0.1, -0.1), result)
     corners = np.zeros(after.shape, dtype=bool)
     for axis in range(3):
-        a = np.moveaxis(after, axis, 0)
-        faces = (a[:, 1:, 1:] == a[:, :-1, :-1]) & (a[:, 1:, :-1] == a[:, :-1, 1:])
-        faces &= a[:, 1:, 1:] != a[:, 1:, :-1]
-        _mark(np.moveaxis(corners, axis, 0), faces, cube=False)
-    opposite = np.zeros(tuple(n - 1 for n in after.shape), dtype=bool)
-    total = after.astype(np.int8)
-    for axis in range(3):
-        total = np.take(total, range(1, total.shape[axis]), axis) + np.take(
-            total, range(total.shape[axis] - 1), axis
-        )
+        nodes = np.moveaxis(after, axis, 0)
+        square = sliding_window_view(nodes, (2, 2), axis=(1, 2))
+        a, b, c, d = (square[..., k, m] for k in (0, 1) for m in (0, 1))
+        marked = np.moveaxis(corners, axis, 0)
+        squares = sliding_window_view(marked, (2, 2), axis=(1, 2), writeable=True)
+        squares[(a == d) & (b == c) & (a != b)] = True
+    cube = sliding_window_view(after, (2, 2, 2))
+    total = cube.sum(axis=(-3, -2, -1), dtype=np.int8)
+    opposite = np.zeros(total.shape, dtype=bool)
     for dx, dy in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        first = after[dx : dx - 1 or None, dy : dy - 1 or None, :-1]
-        last = after[1 - dx : -dx or None, 1 - dy : -dy or None, 1:]
+        first, last = cube[..., dx, dy, 0], cube[..., 1 - dx, 1 - dy, 1]
         opposite |= first & last & (total == 2)  # noqa: PLR2004 -- two opposite corners only
         opposite |= ~first & ~last & (total == 6)  # noqa: PLR2004 -- the reverse
-    _mark(corners, opposite, cube=True)
-    positive = np.minimum(result, 0.03)
-    negative = np.minimum(result, -0.08)
-    return np.where(corners, np.where(after, positive, negative), result).astype(np.float32)
-
-
-def _mark(corners: Bool, cells: Bool, *, cube: bool) -> None:
-    """Mark the corners of flagged faces (first axis runs over nodes) or cubes, in place."""
-    for dx in (0, 1) if cube else (None,):
-        for dy in (0, 1):
-            for dz in (0, 1):
-                first = slice(None) if dx is None else slice(dx, dx - 1 or None)
-                corners[first, dy : dy - 1 or None, dz : dz - 1 or None] |= cells
+    sliding_window_view(corners, (2, 2, 2), writeable=True)[opposite] = True
+    ambiguous = np.where(after, np.minimum(result, 0.03), np.minimum(result, -0.08))
+    return np.where(corners, ambiguous, result).astype(np.float32)
 
 
 def repaired_columns(sheet: Sheet, solid: SolidField, settings: MeasureSettings) -> Bool:
