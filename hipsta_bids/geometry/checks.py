@@ -40,9 +40,6 @@ from hipsta_bids.types import (
     position_text,
 )
 
-Finding = tuple[str, str, str, Bool] | None
-"""Reason, what is wrong, remedy, and where."""
-
 
 def check_voxels_across(surface: Surface, body: Body, settings: CheckSettings) -> float:
     """Refuse a sheet that is too thin for its voxels; return its thickness in voxels."""
@@ -62,7 +59,7 @@ def check_label_order(
 ) -> float:
     """Refuse coordinates that do not follow the medial-to-lateral order of the subfields.
 
-    The rank correlation is returned; NaN with one subfield.
+    Returns their rank correlation; NaN with one subfield.
     """
     index, points = body.inside_points()
     thin = slice(None, None, max(len(points) // 5000, 1))  # some thousand voxels are plenty
@@ -144,11 +141,11 @@ def name_place(points: Float, body: Body) -> str:
 
 def check_image(body: Body, settings: CheckSettings) -> list[Flag]:
     """Flag images whose voxels or borders do not suit the body."""
-    edges = np.linalg.norm(body.affine[:3, :3], axis=0)
     flags = []
     if _sliced_lengthwise(body, settings):
+        longest = np.linalg.norm(body.affine[:3, :3], axis=0).max()
         message = (
-            f"the longest voxel edge ({edges.max():.2f} mm) lies across the long axis: check the "
+            f"the longest voxel edge ({longest:.2f} mm) lies across the long axis: check the "
             "header of the image; slices should lie across the hippocampus"
         )
         flags.append(Flag(reason="slices-along-axis", message=message))
@@ -218,62 +215,53 @@ def _check_beyond(volume: LabelVolume, body: Body, settings: CheckSettings) -> l
 
 def check_labels(body: Body, settings: CheckSettings) -> list[Flag]:
     """Flag noise and thin gaps in the labels, which smoothing hides from the later steps."""
-    index, _ = body.inside_points()
-    around = box_around(index)
-    low = low_corner(around)
+    around = box_around(body.inside_points()[0])
+    low = low_corner(around) - 1
     sheet = np.pad(body.tissue[around] > 0, 1)
     within = np.pad(body.inside[around], 1)
-    gap = np.zeros_like(sheet)
-    gap[tuple((body.gap - low + 1).T)] = True
-    # Only between the end planes: next to voxels that lie there.
-    free = ~sheet & ndimage.binary_dilation(within, structure=ALL)
-    flags = []
-    for finding in (
-        _noise(free, within, settings),
-        _thin_gap(gap, settings),
-        _loose_part(within, settings),
-    ):
-        if finding is not None:
-            reason, message, remedy, found = finding
-            at = name_place(to_ras(np.argwhere(found) - 1 + low, body.affine), body)
-            flags.append(Flag(reason=reason, message=f"{message}, near {at}: {remedy}"))
-    return flags
-
-
-def _noise(free: Bool, within: Bool, settings: CheckSettings) -> Finding:
-    """Find single voxels with the sheet on five or six of their sides."""
+    # Single voxels with the sheet on five or six of their sides, next to voxels of the body.
     sides = sum(
         np.roll(within, step, axis).astype(np.int8) for axis in range(3) for step in (-1, 1)
     )
-    pinholes = free & (sides >= 5)  # noqa: PLR2004 -- of six faces
-    share = int(np.count_nonzero(pinholes)) / int(np.count_nonzero(within))
-    if share <= settings.flag_pinholes:
-        return None
-    text = f"the labels are noisy: {share:.1%} of the sheet are single voxels without a label"
-    return "noisy-labels", text, "smooth or correct the labels", pinholes
-
-
-def _thin_gap(gap: Bool, settings: CheckSettings) -> Finding:
-    """Find a large layer of voxels that has the sheet on opposite sides."""
-    size = int(np.count_nonzero(gap))
-    if size <= settings.flag_gap:
-        return None
-    text = f"a thin gap of {size} voxels without a label divides the sheet"
-    return "thin-gap", text, "fill it in the labels", gap
-
-
-def _loose_part(within: Bool, settings: CheckSettings) -> Finding:
-    """Find a large second piece of voxels that share faces."""
-    pieces, count = ndimage.label(within, structure=FACES)
-    if count < 2:  # noqa: PLR2004 -- a second piece
-        return None
+    near = ndimage.binary_dilation(within, structure=ALL)
+    pinholes = np.argwhere(~sheet & near & (sides >= 5))  # noqa: PLR2004 -- of six faces
+    noise = len(pinholes) / int(np.count_nonzero(within))
+    # The second piece of voxels that share faces.
+    pieces, _ = ndimage.label(within, structure=FACES)
     sizes = piece_sizes(pieces)
     second = int(np.argsort(sizes)[-2])
-    share = float(sizes[second]) / float(sizes.sum())
-    if share <= settings.flag_loose_part:
-        return None
-    text = f"{share:.0%} of the sheet do not touch the rest by any face of a voxel"
-    return "loose-part", text, "fill the gap in the labels", pieces == second
+    loose = float(sizes[second]) / float(sizes.sum())
+    rows = (
+        (
+            "noisy-labels",
+            noise > settings.flag_pinholes,
+            f"the labels are noisy: {noise:.1%} of the sheet are single voxels without a label",
+            pinholes + low,
+            "smooth or correct the labels",
+        ),
+        (
+            "thin-gap",
+            len(body.gap) > settings.flag_gap,
+            f"a thin gap of {len(body.gap)} voxels without a label divides the sheet",
+            body.gap,
+            "fill it in the labels",
+        ),
+        (
+            "loose-part",
+            loose > settings.flag_loose_part,
+            f"{loose:.0%} of the sheet do not touch the rest by any face of a voxel",
+            np.argwhere(pieces == second) + low,
+            "fill the gap in the labels",
+        ),
+    )
+    return [
+        Flag(
+            reason=reason,
+            message=f"{what}, near {name_place(to_ras(voxels, body.affine), body)}: {remedy}",
+        )
+        for reason, found, what, voxels, remedy in rows
+        if found
+    ]
 
 
 def check_cross_sections(

@@ -72,7 +72,7 @@ def _signed_distance(mask: Bool, pixel: float) -> Float:
 def _join(
     distance: Float, ranks: NDArray[np.intp], labeled: Bool, pixel: float, settings: SliceSettings
 ) -> Float:
-    """Bridge near fragments of a slice to the largest, drop fragments, fill holes.
+    """Join near pieces of a slice to the largest, drop fragments farther away, fill small holes.
 
     A large piece farther away is left alone: only three dimensions show whether it belongs to the
     ribbon, which may bend into the uncus.
@@ -161,13 +161,13 @@ def _improved(images: Stack, flow: Stack, pixel: float, settings: SliceSettings)
 def _moved(images: Stack, by: Stack) -> Stack:
     where = np.indices(images.shape, dtype=np.float32)
     where[1:] += by
-    return _interpolated(images, where)
+    return _interpolated(images, *where)
 
 
-def _interpolated(images: Stack, where: Stack) -> Stack:
-    """Interpolate linearly, with the border's values beyond it."""
+def _interpolated(images: Stack, *where: Stack) -> Stack:
+    """Interpolate linearly at one coordinate per axis, with the border's values beyond it."""
     return np.asarray(
-        ndimage.map_coordinates(images, where, order=1, mode="nearest", output=np.float32)
+        ndimage.map_coordinates(images, np.stack(where), order=1, mode="nearest", output=np.float32)
     )
 
 
@@ -181,10 +181,10 @@ def _shrunk(images: Stack, factor: int) -> Stack:
 
 
 def _doubled(flow: Stack, shape: tuple[int, ...]) -> Stack:
-    """Displacements at pixels of half the size, counted in them."""
+    """Displacements at pixels of half the size, in these pixels."""
     at = (0.5 * np.arange(n, dtype=np.float32) - 0.25 for n in shape)
-    where = np.meshgrid(*(np.arange(n) for n in flow.shape[:2]), *at, indexing="ij")
-    return 2 * _interpolated(flow, np.stack(where).astype(np.float32))
+    whole = (np.arange(n, dtype=np.float32) for n in flow.shape[:2])
+    return 2 * _interpolated(flow, *np.meshgrid(*whole, *at, indexing="ij"))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -199,6 +199,7 @@ class _SliceStack:
     """(2, N - 1, I', J') fine pixels from each slice to the next, halfway between them, at the
     pixels of the segmentation."""
     settings: SliceSettings
+    """Settings of the interpolation."""
 
     def blend(self, level: Stack, where: Stack) -> Stack:
         """Signed distance, mm, within the plane of the slices, from the outline at any level.
@@ -214,13 +215,11 @@ class _SliceStack:
         # The flow is known halfway between the slices: find the point there that moves to here.
         for _ in range(3):
             middle = (where - (share - 0.5) * step + 0.5) * coarse - 0.5
-            step = np.stack(
-                [_interpolated(part, np.stack([below, *middle])) for part in self.flows]
-            )
+            step = np.stack([_interpolated(part, below, *middle) for part in self.flows])
         middle = where - (share - 0.5) * step
         distance, medial, lateral = (
-            (1 - share) * _interpolated(images, np.stack([below, *(middle - 0.5 * step)]))
-            + share * _interpolated(images, np.stack([below + 1, *(middle + 0.5 * step)]))
+            (1 - share) * _interpolated(images, below, *(middle - 0.5 * step))
+            + share * _interpolated(images, below + 1, *(middle + 0.5 * step))
             for images in (self.outlines, *self.ends)
         )
         return np.asarray(np.minimum(distance, self._slit(medial, lateral)), dtype=np.float32)

@@ -111,7 +111,7 @@ def test_swapped_subfields_are_refused(kinds):
         check_label_order(*striped_body(kinds), CHECKS)
 
 
-def test_a_crumb_in_the_wrong_place_is_no_swap():
+def test_a_fragment_elsewhere_is_no_swap():
     mesh, coordinates, body = striped_body(RIGHT_ORDERS[0])
     tissue = body.tissue.copy()
     tissue[0, :2] = Tissue.CA3  # 1 % of the voxels, at the medial rim

@@ -248,7 +248,7 @@ def test_slices_may_lie_along_any_axis_of_the_image(through):
 
 
 @pytest.mark.parametrize(("voxel", "thick"), [((0.4, 0.4, 0.4), False), ((0.4, 2.0, 0.4), True)])
-def test_thick_slices_are_told_by_the_voxel(voxel, thick):
+def test_thick_slices_are_recognized_by_the_voxel(voxel, thick):
     assert has_thick_slices(np.diag([*voxel, 1.0]), SETTINGS) == thick
 
 

@@ -41,7 +41,7 @@ def crossing_cubes():
 
 @pytest.fixture
 def client(monkeypatch):
-    """A client of its own, so that killing its process disturbs nobody."""
+    """A client of its own, so that killing its process disturbs no other test."""
     fresh = TetgenClient()
     monkeypatch.setattr(mesh, "_CLIENT", fresh)
     yield fresh
@@ -94,7 +94,7 @@ def kill_soon(client, *, after=0.2):
     return timer
 
 
-def test_a_crash_while_meshing_is_told_and_the_next_call_works(client, arc):
+def test_a_crash_while_meshing_is_reported_and_the_next_call_works(client, arc):
     assert_works()  # the process is up
     first = client._process.pid
     timer = kill_soon(client)
@@ -113,7 +113,7 @@ def test_a_process_that_died_between_calls_is_replaced(client):
     assert_works()
 
 
-def test_taking_too_long_is_told_and_the_next_call_works(client, arc):
+def test_taking_too_long_is_reported_and_the_next_call_works(client, arc):
     busy = {"maxvolume": 1e-6, "fixedvolume": True, "nobisect": False}
     assert_works()
     process = client._process

@@ -1,4 +1,4 @@
-"""Holes, bridges, islands, cavities and torn caps put into a ribbon, and taken out again."""
+"""Holes, bridges, islands, cavities and broken caps put into a ribbon, and repaired."""
 
 from dataclasses import replace
 
@@ -128,8 +128,8 @@ def test_a_filled_hole_is_thick():
     assert np.count_nonzero(column) >= 3  # of 5 nodes; a bare membrane has one
 
 
-def with_hole_at_the_rim():
-    """A hole that leaves a strip of three nodes at one rim of the ribbon, 50 degrees round."""
+def with_hole_at_the_edge():
+    """A hole that leaves a strip of three nodes at one edge of the ribbon, 50 degrees round."""
     mask = ribbon_mask()
     a, b, w = np.indices(mask.shape)
     angle = np.degrees(np.arctan2(b - MIDDLE, a - MIDDLE))
@@ -139,7 +139,7 @@ def with_hole_at_the_rim():
 
 def test_a_strip_beside_a_hole_is_not_severed():
     """The strip costs less than the hole; but a cut would leave a notch in the ribbon."""
-    mask = with_hole_at_the_rim()
+    mask = with_hole_at_the_edge()
     repair = only_repair(repaired(mask), "fill")
     at = np.radians(79.5)
     assert distance(repair, (MIDDLE + 12 * np.cos(at), MIDDLE + 12 * np.sin(at), 14)) < 2.5
