@@ -1,6 +1,6 @@
 """The typed values that pass between stages.
 
-Points are rows in RAS millimetres (float64), indices are int32. Every array is checked and made
+Points are rows in RAS millimeters (float64), indices are int32. Arrays are checked and made
 read-only at construction, so that nothing downstream has to check again. Axes of the sheet:
 x runs medial to lateral, y posterior to anterior, z interior to exterior, in both hemispheres.
 """
@@ -39,7 +39,7 @@ class EditedMask:
     """The body as a person corrected it."""
 
     inside: Bool
-    """(I, J, K) on the grid of the labels."""
+    """(I, J, K) whether a voxel of the labels' grid belongs to the body."""
     voxel: float
     """Edge of a voxel in plane in the mask's own file, mm."""
 
@@ -52,7 +52,7 @@ class BodyMask:
     """The measured body, on the whole grid of the file with its labels."""
 
     inside: Bool
-    """(I, J, K)"""
+    """(I, J, K) whether a voxel belongs to the body."""
     affine: Float
     """(4, 4), voxel index to RAS mm."""
 
@@ -73,11 +73,11 @@ class LabelVolume:
     """(4, 4), voxel index to RAS mm."""
     protocol: Protocol
     edited_mask: EditedMask | None = None
-    """What takes the place of the labels between the end planes, if anything."""
+    """Body that replaces that of the labels between the end planes, if a person corrected it."""
     start: tuple[int, int, int] = (0, 0, 0)
-    """Index of the first voxel in the file, from which this was cropped."""
+    """Index, in the file, of the first voxel of this part of it."""
     file_shape: tuple[int, int, int] | None = None
-    """Shape of the file; None where there is none or nothing was cropped."""
+    """Shape of the file; None without a file or if nothing was cropped."""
 
     def __post_init__(self) -> None:
         shape = np.shape(self.tissue)
@@ -92,9 +92,8 @@ class LabelVolume:
     def in_file(self, inside: Bool) -> BodyMask:
         """Put a mask (I, J, K) back into the whole grid of the file."""
         whole = np.zeros(self.file_shape or inside.shape, dtype=np.bool_)
-        whole[tuple(slice(a, a + n) for a, n in zip(self.start, inside.shape, strict=True))] = (
-            inside
-        )
+        part = (slice(a, a + n) for a, n in zip(self.start, inside.shape, strict=True))
+        whole[tuple(part)] = inside
         affine = self.affine.copy()
         affine[:3, 3] -= affine[:3, :3] @ np.array(self.start)
         return BodyMask(inside=whole, affine=affine)
@@ -107,11 +106,11 @@ class Surface:
     vertices: Float
     """(V, 3) RAS mm."""
     triangles: Int
-    """(F, 3)."""
+    """(F, 3) vertex indices."""
     posterior_cap: Bool
-    """(V,) vertices in the posterior end plane."""
+    """(V,) whether a vertex lies in the posterior end plane."""
     anterior_cap: Bool
-    """(V,) vertices in the anterior end plane."""
+    """(V,) whether a vertex lies in the anterior end plane."""
 
     def __post_init__(self) -> None:
         vertices = _set(self, "vertices", np.float64, (None, 3))
@@ -127,7 +126,7 @@ class TetMesh:
     vertices: Float
     """(V, 3) RAS mm."""
     tetrahedra: Int
-    """(T, 4), positive volume."""
+    """(T, 4) vertex indices; volumes are positive."""
 
     def __post_init__(self) -> None:
         _set(self, "vertices", np.float64, (None, 3))
@@ -139,7 +138,7 @@ class Coordinates:
     """Three harmonic functions on a tetrahedral mesh."""
 
     values: Float
-    """(V, 3) in [-1, 1]: medial-lateral, posterior-anterior, interior-exterior."""
+    """(V, 3) in [-1, 1]: x medial to lateral, y posterior to anterior, z interior to exterior."""
 
     def __post_init__(self) -> None:
         _set(self, "values", np.float64, (None, 3))
@@ -152,7 +151,7 @@ class Sheet:
     points: Float
     """(Nx, Ny, Nz, 3) RAS mm, NaN where undefined; the middle z level is the mid-surface."""
     valid: Bool
-    """(Nx, Ny) columns measured directly, not filled from neighbours."""
+    """(Nx, Ny) whether a column was measured directly, not filled from its neighbors."""
 
     def __post_init__(self) -> None:
         points = _set(self, "points", np.float64, (None, None, None, 3))
@@ -160,7 +159,7 @@ class Sheet:
 
     @property
     def middle(self) -> int:
-        """Number of the z level of the mid-surface."""
+        """Index of the z level of the mid-surface."""
         return int(self.points.shape[2] // 2)
 
 
@@ -178,9 +177,15 @@ class Flag:
     """Something a person should look at before trusting a map."""
 
     reason: str
-    """Machine-readable slug in kebab case."""
+    """Name of the reason in kebab case, for programs."""
     message: str
     """One line for people: what, where, what to try."""
+
+
+def position_text(point: Float | tuple[float, float, float], subfields: str = "") -> str:
+    """Write a point (3,), RAS mm, and perhaps the subfields there, as messages do."""
+    text = f"RAS {' '.join(f'{value:.1f}' for value in point)} mm"
+    return f"{text} ({subfields})" if subfields else text
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -188,29 +193,33 @@ class HemisphereMaps:
     """All that the participant level measures in one hemisphere."""
 
     sheet: Sheet
+    """Grid on which all maps are defined."""
     layers: Sheet
-    """The columns of the sheet cut into layers; the same points unless depths are by volume."""
+    """Columns of the sheet cut into layers; the same points unless depths are by volume."""
     maps: Mapping[str, Float]
-    """(Nx, Ny) each, by name in the catalog of measures; NaN where undefined."""
+    """Maps (Nx, Ny) by name in the catalog of measures; NaN where undefined."""
     profiles: Mapping[str, Mapping[str, Float]]
-    """The maps averaged: ``x`` over y, (Nx,) each, and ``y`` over x, (Ny,) each."""
+    """Maps averaged over the other axis, by axis and name: ``x`` (Nx,) and ``y`` (Ny,)."""
     sections: Mapping[str, Float]
-    """(Ny,) each, by name: one number per cross-section."""
+    """Measures of cross-sections, (Ny,), by name in the catalog of measures."""
     subfield: NDArray[np.uint8]
     """(Nx, Ny) values of Tissue."""
     repaired: Bool
     """(Nx, Ny) columns that a repair of the topology touched."""
     body_mask: BodyMask
-    """What was measured, on the grid of the labels' file."""
+    """Measured body, on the grid of the labels' file."""
     summary: Mapping[str, float]
     """One number per summary column (see the output table for units)."""
     qc: Mapping[str, Any]
-    """JSON-serialisable numbers and words that say whether to trust the map."""
+    """Numbers and words, ready for JSON, that tell whether to trust the maps."""
     repairs: tuple[str, ...] = ()
-    """What was changed, one line each; empty if nothing was."""
+    """Changes of the body's topology, one line each."""
     flags: tuple[Flag, ...] = ()
+    """Reasons to look at the maps before trusting them."""
     mesh: TetMesh
+    """Tetrahedra of the body."""
     coordinates: Coordinates
+    """Harmonic coordinates at the vertices of the mesh."""
 
     def __post_init__(self) -> None:
         shape = self.sheet.points.shape[:2]
@@ -226,21 +235,6 @@ class HemisphereMaps:
         return self.maps["thickness"]
 
     @property
-    def curvature(self) -> Float:
-        """(Nx, Ny) mean curvature of the mid-surface, 1/mm; positive round the interior."""
-        return self.maps["curvature"]
-
-    @property
-    def curvature_interior(self) -> Float:
-        """(Nx, Ny) the same of the interior surface."""
-        return self.maps["curvature_interior"]
-
-    @property
-    def curvature_exterior(self) -> Float:
-        """(Nx, Ny) the same of the exterior surface."""
-        return self.maps["curvature_exterior"]
-
-    @property
     def status(self) -> Status:
         """``flagged`` outranks ``repaired``; ``failed`` hemispheres have no maps."""
         if self.flags:
@@ -250,9 +244,9 @@ class HemisphereMaps:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Mesh:
-    """Surface whose vertices are the points of maps, where these lie on no regular grid."""
+    """Surface whose vertices are the points of maps that lie on no regular grid."""
 
     points: Float
-    """(points, 3)"""
+    """(V, 3) RAS mm."""
     triangles: NDArray[np.int64]
-    """(triangles, 3)"""
+    """(F, 3) vertex indices."""

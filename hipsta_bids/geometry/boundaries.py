@@ -17,7 +17,7 @@ from hipsta_bids.geometry.fem import (
     smallest_eigenfunctions,
     solve_dirichlet,
 )
-from hipsta_bids.geometry.surface import mean_wall_thickness, signed_volume, unique_edges
+from hipsta_bids.geometry.mesh import mean_wall_thickness, signed_volume, unique_edges
 from hipsta_bids.geometry.wall import Wall, edge_graph, end_to_end, vertex_normals
 from hipsta_bids.settings import BoundarySettings
 from hipsta_bids.types import Bool, Float, Int, Surface, TetMesh

@@ -1,4 +1,8 @@
-"""What must hold before a map is handed out."""
+"""What must hold before a map is written, and what a person should look at.
+
+Labels with noise or thin gaps, cross-sections and rows of the sheet that do not resemble their
+neighbors, bands of odd thickness, and coordinates that contradict the labels.
+"""
 
 from collections.abc import Callable, Iterator
 from itertools import pairwise
@@ -10,17 +14,35 @@ from scipy.spatial import cKDTree
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
-from hipsta_bids.geometry.digital import box_around, low_corner
+from hipsta_bids.geometry.digital import (
+    ALL,
+    FACES,
+    box_around,
+    low_corner,
+    piece_sizes,
+    to_ras,
+    voxel_points,
+)
 from hipsta_bids.geometry.grid import Field, in_plane_voxel
+from hipsta_bids.geometry.mesh import mean_wall_thickness
 from hipsta_bids.geometry.slices import points_of_ends
-from hipsta_bids.geometry.surface import mean_wall_thickness
 from hipsta_bids.protocols.protocol import Part, Tissue, lateral_rank
 from hipsta_bids.settings import CheckSettings, TopologySettings
-from hipsta_bids.types import Bool, Coordinates, Flag, Float, LabelVolume, Sheet, Surface, TetMesh
+from hipsta_bids.types import (
+    Bool,
+    Coordinates,
+    Flag,
+    Float,
+    LabelVolume,
+    Sheet,
+    Surface,
+    TetMesh,
+    position_text,
+)
 
 
 def check_voxels_across(surface: Surface, body: Body, settings: CheckSettings) -> float:
-    """Refuse a sheet that is too thin for its voxels."""
+    """Refuse a sheet that is too thin for its voxels; return its thickness in voxels."""
     thickness, voxel = mean_wall_thickness(surface), _voxel_across(body, settings)
     across = thickness / voxel
     if across < settings.min_voxels_across:
@@ -37,7 +59,7 @@ def check_label_order(
 ) -> float:
     """Refuse coordinates that do not follow the medial-to-lateral order of the subfields.
 
-    Returns NaN with one subfield.
+    Returns their rank correlation; NaN with one subfield.
     """
     index, points = body.inside_points()
     thin = slice(None, None, max(len(points) // 5000, 1))  # some thousand voxels are plenty
@@ -48,8 +70,11 @@ def check_label_order(
     _, nearest = cKDTree(mesh.vertices).query(points[thin])
     x = coordinates.values[nearest, 0]
     order = _rank_correlation(x, rank)
-    medians = [float(np.median(x[rank == kind])) for kind in kinds]
-    if not order >= settings.min_label_order or _swapped(medians, rank, kinds):
+    # Subfields with a few voxels only may lie anywhere.
+    fair = [kind for kind in kinds if (rank == kind).mean() > 0.03]  # noqa: PLR2004
+    medians = [float(np.median(x[rank == kind])) for kind in fair]
+    swapped = any(b < a for a, b in pairwise(medians))
+    if not order >= settings.min_label_order or swapped:
         raise GeometryError(
             f"the subfields do not follow each other from medial to lateral (rank correlation "
             f"{order:.2f}): check that the protocol fits the labels",
@@ -58,26 +83,17 @@ def check_label_order(
     return order
 
 
-def _swapped(medians: list[float], rank: NDArray[np.int8], kinds: NDArray[np.int8]) -> bool:
-    """Whether subfields of a fair size lie in another order than their names say."""
-    fair = [m for m, kind in zip(medians, kinds, strict=True) if (rank == kind).mean() > 0.03]  # noqa: PLR2004
-    return any(b < a for a, b in pairwise(fair))
-
-
 def _rank_correlation(x: Float, y: NDArray[np.int8]) -> float:
     """Spearman's rank correlation, ties at their mean rank (scipy.stats takes 1.6 s to import)."""
     ranks = []
     for values in (x, y):
-        _, place, count = np.unique(values, return_inverse=True, return_counts=True)
-        ranks.append((np.cumsum(count) - 0.5 * (count - 1))[place])
+        _, inverse, count = np.unique(values, return_inverse=True, return_counts=True)
+        ranks.append((np.cumsum(count) - 0.5 * (count - 1))[inverse])
     return float(np.corrcoef(ranks[0], ranks[1])[0, 1])
 
 
 def check_thickness(thickness: Float, expected: float, settings: CheckSettings) -> list[Flag]:
-    """Compare the mean thickness with 2 volume / area of the two sides.
-
-    ``expected`` mm.
-    """
+    """Compare the mean thickness with 2 volume / area of the two sides, ``expected`` mm."""
     mean = float(np.nanmean(thickness))
     ratio = abs(mean / expected - 1)
     text = f"mean thickness {mean:.2f} mm, but 2 volume / area is {expected:.2f} mm"
@@ -119,34 +135,28 @@ def find_contacts(body: Body, settings: TopologySettings) -> Callable[[Float], b
 
 
 def name_place(points: Float, body: Body) -> str:
-    """Spell the middle of (N, 3) points, RAS mm, and the subfields there."""
-    middle = " ".join(f"{value:.1f}" for value in points.mean(axis=0))
-    return f"RAS {middle} mm ({name_subfields(body)(points)})"
+    """Write the middle of (N, 3) points, RAS mm, and the subfields there."""
+    return position_text(points.mean(axis=0), name_subfields(body)(points))
 
 
 def check_image(body: Body, settings: CheckSettings) -> list[Flag]:
     """Flag images whose voxels or borders do not suit the body."""
-    edges = np.linalg.norm(body.affine[:3, :3], axis=0)
     flags = []
     if _sliced_lengthwise(body, settings):
-        flags.append(
-            Flag(
-                reason="slices-along-axis",
-                message=f"the longest voxel edge ({edges.max():.2f} mm) lies across the long axis: "
-                "check the header of the image; slices should lie across the hippocampus",
-            )
+        longest = np.linalg.norm(body.affine[:3, :3], axis=0).max()
+        message = (
+            f"the longest voxel edge ({longest:.2f} mm) lies across the long axis: check the "
+            "header of the image; slices should lie across the hippocampus"
         )
+        flags.append(Flag(reason="slices-along-axis", message=message))
     index, points = body.inside_points()
-    rim = ((index == 0) | (index == np.array(body.inside.shape) - 1)).any(axis=1)
-    if rim.any():
-        place = " ".join(f"{value:.1f}" for value in points[rim].mean(axis=0))
-        flags.append(
-            Flag(
-                reason="image-border",
-                message=f"{np.count_nonzero(rim)} voxels of the body lie at the border of the "
-                f"image, near RAS {place} mm: check that the image holds all of it",
-            )
+    outer = ((index == 0) | (index == np.array(body.inside.shape) - 1)).any(axis=1)
+    if outer.any():
+        message = (
+            f"{np.count_nonzero(outer)} voxels of the body lie at the border of the image, near "
+            f"{position_text(points[outer].mean(axis=0))}: check that the image holds all of it"
         )
+        flags.append(Flag(reason="image-border", message=message))
     return flags
 
 
@@ -168,25 +178,22 @@ def _voxel_across(body: Body, settings: CheckSettings) -> float:
 def check_end_labels(volume: LabelVolume, body: Body, settings: CheckSettings) -> list[Flag]:
     """Flag head or tail labels amid the body, and ends beyond which nothing is labeled."""
     labeled = np.isin(volume.part, (Part.HEAD, Part.TAIL)) & (volume.tissue > 0)
-    points = np.argwhere(labeled) @ volume.affine[:3, :3].T + volume.affine[:3, 3]
-    depth = np.minimum(body.ends.height(points, "posterior"), -body.ends.height(points, "anterior"))
-    inside = points[depth > settings.end_label_depth]
+    points = voxel_points(labeled, volume.affine)
+    inside = points[body.ends.depth(points) > settings.end_label_depth]
     flags = []
     if len(inside) > settings.end_label_share * max(len(body.inside_points()[0]), 1):
-        flags.append(
-            Flag(
-                reason="end-labels-inside",
-                message=f"{len(inside)} head or tail voxels lie inside the body, near "
-                f"{name_place(inside, body)}: correct these labels",
-            )
+        message = (
+            f"{len(inside)} head or tail voxels lie inside the body, near "
+            f"{name_place(inside, body)}: correct these labels"
         )
+        flags.append(Flag(reason="end-labels-inside", message=message))
     return flags + _check_beyond(volume, body, settings)
 
 
 def _check_beyond(volume: LabelVolume, body: Body, settings: CheckSettings) -> list[Flag]:
     """Flag ends without head or tail labels at which all labels end."""
     labeled = (volume.tissue > 0) & (volume.tissue <= Tissue.HIPPOCAMPUS)
-    points = np.argwhere(labeled) @ volume.affine[:3, :3].T + volume.affine[:3, 3]
+    points = voxel_points(labeled, volume.affine)
     flags = []
     ends = body.ends
     for end, rule, height in (
@@ -198,92 +205,63 @@ def _check_beyond(volume: LabelVolume, body: Body, settings: CheckSettings) -> l
         near = points[(height > 0) & (height < settings.beyond_reach)]
         beyond = np.count_nonzero((height < 0) & (height > -settings.beyond_reach))
         if beyond < settings.beyond_share * len(near):
-            flags.append(
-                Flag(
-                    reason="labels-end",
-                    message=f"the labels end where the body does, at its {end} end near "
-                    f"{name_place(near, body)}: it may be cut short there; label the whole "
-                    "hippocampus",
-                )
+            message = (
+                f"the labels end where the body does, at its {end} end near "
+                f"{name_place(near, body)}: it may be cut short there; label the whole hippocampus"
             )
+            flags.append(Flag(reason="labels-end", message=message))
     return flags
-
-
-# Noise and thin gaps in the labels themselves, which smoothing hides from the later steps.
-
-
-_ALL = np.ones((3, 3, 3), dtype=bool)
-_FACES = ndimage.generate_binary_structure(3, 1)
 
 
 def check_labels(body: Body, settings: CheckSettings) -> list[Flag]:
-    """Flag labels with noise, or with a gap of about one voxel through the sheet."""
-    index, _ = body.inside_points()
-    around = box_around(index)
-    low = low_corner(around)
+    """Flag noise and thin gaps in the labels, which smoothing hides from the later steps."""
+    around = box_around(body.inside_points()[0])
+    low = low_corner(around) - 1
     sheet = np.pad(body.tissue[around] > 0, 1)
     within = np.pad(body.inside[around], 1)
-    gap = np.zeros_like(sheet)
-    gap[tuple((body.gap - low + 1).T)] = True
-    # The gap between the end planes: next to voxels that lie between them.
-    free = ~sheet & ndimage.binary_dilation(within, structure=_ALL)
-    rows = [
-        _noise(free, within, settings),
-        _thin_gap(gap, settings),
-        _loose_part(within, settings),
-    ]
-    flags = []
-    for row in rows:
-        if row is not None:
-            reason, message, remedy, found = row
-            nodes = np.argwhere(found) - 1 + low
-            place = name_place(nodes @ body.affine[:3, :3].T + body.affine[:3, 3], body)
-            flags.append(Flag(reason=reason, message=f"{message}, near {place}: {remedy}"))
-    return flags
-
-
-Finding = tuple[str, str, str, Bool] | None
-"""Reason, what is wrong, remedy, and where."""
-
-
-def _noise(free: Bool, within: Bool, settings: CheckSettings) -> Finding:
-    """Find single voxels with the sheet on five or six of their sides."""
+    # Single voxels with the sheet on five or six of their sides, next to voxels of the body.
     sides = sum(
         np.roll(within, step, axis).astype(np.int8) for axis in range(3) for step in (-1, 1)
     )
-    pinholes = free & (sides >= 5)  # noqa: PLR2004 -- of six faces
-    share = int(np.count_nonzero(pinholes)) / int(np.count_nonzero(within))
-    if share <= settings.flag_pinholes:
-        return None
-    text = f"the labels are noisy: {share:.1%} of the sheet are single voxels without a label"
-    return "noisy-labels", text, "smooth or correct the labels", pinholes
-
-
-def _thin_gap(gap: Bool, settings: CheckSettings) -> Finding:
-    """Judge the largest layer of voxels that has the sheet on opposite sides."""
-    size = int(np.count_nonzero(gap))
-    if size <= settings.flag_gap:
-        return None
-    text = f"a thin gap of {size} voxels without a label parts the sheet"
-    return "thin-gap", text, "fill it in the labels", gap
-
-
-def _loose_part(within: Bool, settings: CheckSettings) -> Finding:
-    """Find a second piece of voxels that share faces."""
-    pieces, count = ndimage.label(within, structure=_FACES)
-    if count < 2:  # noqa: PLR2004 -- a second piece
-        return None
-    sizes = np.bincount(pieces.ravel())
-    sizes[0] = 0
+    near = ndimage.binary_dilation(within, structure=ALL)
+    pinholes = np.argwhere(~sheet & near & (sides >= 5))  # noqa: PLR2004 -- of six faces
+    noise = len(pinholes) / int(np.count_nonzero(within))
+    # The second piece of voxels that share faces.
+    pieces, _ = ndimage.label(within, structure=FACES)
+    sizes = piece_sizes(pieces)
     second = int(np.argsort(sizes)[-2])
-    share = float(sizes[second]) / float(sizes.sum())
-    if share <= settings.flag_loose_part:
-        return None
-    text = f"{share:.0%} of the sheet do not touch the rest by any face of a voxel"
-    return "loose-part", text, "fill the gap in the labels", pieces == second
-
-
-# Cross-sections and rows of the sheet that do not go with their neighbors.
+    loose = float(sizes[second]) / float(sizes.sum())
+    rows = (
+        (
+            "noisy-labels",
+            noise > settings.flag_pinholes,
+            f"the labels are noisy: {noise:.1%} of the sheet are single voxels without a label",
+            pinholes + low,
+            "smooth or correct the labels",
+        ),
+        (
+            "thin-gap",
+            len(body.gap) > settings.flag_gap,
+            f"a thin gap of {len(body.gap)} voxels without a label divides the sheet",
+            body.gap,
+            "fill it in the labels",
+        ),
+        (
+            "loose-part",
+            loose > settings.flag_loose_part,
+            f"{loose:.0%} of the sheet do not touch the rest by any face of a voxel",
+            np.argwhere(pieces == second) + low,
+            "fill the gap in the labels",
+        ),
+    )
+    return [
+        Flag(
+            reason=reason,
+            message=f"{what}, near {name_place(to_ras(voxels, body.affine), body)}: {remedy}",
+        )
+        for reason, found, what, voxels, remedy in rows
+        if found
+    ]
 
 
 def check_cross_sections(
@@ -291,33 +269,34 @@ def check_cross_sections(
 ) -> list[Flag]:
     """Flag a body of which a part is missing between cross-sections that have it, or added.
 
-    Each cross-section is compared with those at a distance on both sides. What both lack, or have
-    of the interior labels instead, is judged by how far it stands out from the same body's other
-    cross-sections: a bent ribbon moves sideways everywhere, a leak is in one place.
+    Each cross-section is compared with those at a distance on both sides. What both lack, or where
+    both have interior labels, is compared with the same body's other cross-sections: a bent ribbon
+    moves sideways everywhere, a leak is in one position. ``cuts`` are nodes of bridges that were
+    cut, whose stumps do not count.
     """
     solid, interior = field.values > 0, _interior_nodes(field, body)
-    strange = np.ones_like(solid)
+    counted = np.ones_like(solid)
     if cuts is not None and cuts.any():
-        strange = ndimage.distance_transform_edt(~cuts) > settings.stub_nodes
+        counted = ndimage.distance_transform_edt(~cuts) > settings.stub_nodes
     length = body.ends.length(body.inside_points()[1])
     step = length / (field.grid.shape[2] - 1)
     area = float(np.median(solid.sum(axis=(0, 1))))
-    notch, bump, intrusion = _Oddest(), _Oddest(), _Oddest()
+    notch, bump, intrusion = _Outlier(), _Outlier(), _Outlier()
     for reach, limit in zip(settings.notch_reach, settings.notch_share, strict=True):
         k = max(round(reach / step), 1)
         if 2 * k >= solid.shape[2]:
             continue
         before, here, after = solid[:, :, : -2 * k], solid[:, :, k:-k], solid[:, :, 2 * k :]
         missing = before & after & ~here
-        notch.look(missing, missing.sum(axis=(0, 1)) / here.sum(axis=(0, 1)), limit, k)
-        unknown = here & strange[:, :, k:-k]
-        enclosed = unknown & interior[:, :, : -2 * k] & interior[:, :, 2 * k :]
-        added = unknown & ~before & ~after
+        notch.update(missing, missing.sum(axis=(0, 1)) / here.sum(axis=(0, 1)), limit, k)
+        unexplained = here & counted[:, :, k:-k]
+        enclosed = unexplained & interior[:, :, : -2 * k] & interior[:, :, 2 * k :]
+        added = unexplained & ~before & ~after
         noise = settings.section_noise
-        for oddest, part, least in ((bump, added, noise * reach), (intrusion, enclosed, noise)):
+        for outlier, part, least in ((bump, added, noise * reach), (intrusion, enclosed, noise)):
             share = part.sum(axis=(0, 1)) / area
             usual = settings.bump_contrast * (float(np.median(share)) + least)
-            oddest.look(part, share, usual, k)
+            outlier.update(part, share, usual, k)
     rows = (
         ("section-notch", notch, "lacks what its neighbors have", "complete the labels there"),
         ("section-bump", bump, "has what its neighbors lack", "look for leaks and bridges there"),
@@ -331,11 +310,11 @@ def check_cross_sections(
     return [
         Flag(
             reason=reason,
-            message=f"a cross-section {what}, {oddest.share:.0%} of its area, at "
-            f"{name_place(field.grid.to_ras(oddest.nodes), body)}: {remedy}",
+            message=f"a cross-section {what}, {outlier.share:.0%} of its area, at "
+            f"{name_place(field.grid.to_ras(outlier.nodes), body)}: {remedy}",
         )
-        for reason, oddest, what, remedy in rows
-        if oddest.excess > 1
+        for reason, outlier, what, remedy in rows
+        if outlier.excess > 1
     ]
 
 
@@ -347,18 +326,18 @@ def _interior_nodes(field: Field, body: Body) -> Bool:
     return np.asarray((body.interior & (body.tissue == 0))[tuple(np.moveaxis(voxels, -1, 0))])
 
 
-class _Oddest:
+class _Outlier:
     """The cross-section that departs most from its neighbors."""
 
     excess = 1.0
-    """Times the limit."""
+    """How many times the limit the departing share is."""
     share = 0.0
-    """Of its area that departs."""
+    """Share of its area that departs."""
     nodes: Float = np.zeros((0, 3))
-    """Grid nodes that depart."""
+    """Grid nodes (N, 3) that depart."""
 
-    def look(self, part: Bool, share: Float, limit: float, first: int) -> None:
-        """Take note if a cross-section is odder than those seen before."""
+    def update(self, part: Bool, share: Float, limit: float, first: int) -> None:
+        """Take over the cross-section that departs most, if more than those before."""
         at = int(share.argmax())
         if share[at] > limit * self.excess:
             self.excess = float(share[at] / limit)
@@ -380,24 +359,20 @@ def check_rows(sheet: Sheet, settings: CheckSettings) -> list[Flag]:
     ):
         row = int(np.nanargmax(change))
         if change[row] > limit:
-            place = " ".join(f"{value:.1f}" for value in np.nanmean(middle[:, row], axis=0))
-            found.append(
-                Flag(
-                    reason=reason,
-                    message=f"the sheet's width {what.format(f'{change[row]:.0%}')}, near RAS "
-                    f"{place} mm: look for missing or added parts in the labels",
-                )
+            at = position_text(np.nanmean(middle[:, row], axis=0))
+            message = (
+                f"the sheet's width {what.format(f'{change[row]:.0%}')}, near {at}: look for "
+                "missing or added parts in the labels"
             )
+            found.append(Flag(reason=reason, message=message))
     return found
 
 
 def check_ridges(sheet: Sheet, thickness: Float, settings: CheckSettings) -> list[Flag]:
-    """Flag a band across the axis where the sheet is thicker, or thinner, than on both sides.
+    """Flag a band across the axis where thickness (Nx, Ny), mm, differs from that on both sides.
 
     Labels that leaked, or that a bar or a dent has changed, show in few cross-sections; thickness
     of a whole sheet changes more slowly along the axis.
-
-    ``thickness`` mm.
     """
     middle = sheet.points[:, :, sheet.middle]
     flags = []
@@ -408,14 +383,11 @@ def check_ridges(sheet: Sheet, thickness: Float, settings: CheckSettings) -> lis
         bands = _bands(sign * thickness, limits, _row_step(middle), settings)
         excess, size, at = max(bands, default=(0.0, 0.0, (0, 0)))
         if excess > 1:
-            place = " ".join(f"{value:.1f}" for value in middle[at])
-            flags.append(
-                Flag(
-                    reason=reason,
-                    message=f"a band of the sheet is {size:.1f} mm {what} than the sheet before "
-                    f"and behind it, near RAS {place} mm: look at the labels there",
-                )
+            message = (
+                f"a band of the sheet is {size:.1f} mm {what} than the sheet before and behind "
+                f"it, near {position_text(middle[at])}: look at the labels there"
             )
+            flags.append(Flag(reason=reason, message=message))
     return flags
 
 
@@ -441,7 +413,7 @@ def _row_step(middle: Float) -> float:
 
 
 def _wider(lengths: Float, middle: Float, reach: float) -> Float:
-    """Width (Ny,) that rows within a distance (mm) reach on both sides of each row."""
+    """Width (Ny,) that rows within ``reach`` mm attain on both sides of each row."""
     rows = np.arange(len(lengths))
     offset = rows[None, :] - rows[:, None]
     near = np.abs(offset) <= max(round(reach / _row_step(middle)), 1)

@@ -1,4 +1,4 @@
-"""Digital topology on voxel grids: Euler number, simple points, growing and shrinking.
+"""Voxel grids: positions, boxes, digital topology, and membranes that cut or fill tunnels.
 
 The object is 6-connected, the background 26-connected. A voxel is simple if changing it keeps the
 topology of both: one 6-connected piece of object in its 18-neighborhood touches it by a face, and
@@ -10,32 +10,86 @@ corners, edges and faces of the voxel's cube. What it leaves bare of the cube's 
 piece, as the object is; so by Alexander duality what it covers is in one piece if and only if
 covered corners - edges + faces are 1. All of this but the corners depends on the 18-neighborhood
 only, whose 2^18 states are tabulated once.
+
+Membranes are sought in padded arrays: along the axis by a layer for a plate and one of free space,
+across it by one of free space.
 """
 
+from collections.abc import Callable, Sequence
 from functools import cache
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import cKDTree
 
-from hipsta_bids.types import Bool
+from hipsta_bids.settings import TopologySettings
+from hipsta_bids.types import Bool, Float
 
 Bits = NDArray[np.uint32]
 Index = NDArray[np.intp]
+Box = tuple[slice, slice, slice]
+Kind = Literal["part", "slit", "cut", "fill", "island", "cavity"]
+
+FACES = ndimage.generate_binary_structure(3, 1)
+"""Structuring element: voxels that share a face."""
+ALL = np.ones((3, 3, 3), dtype=bool)
+"""Structuring element: voxels that share a face, an edge or a corner."""
+
+PAD = ((1, 1), (1, 1), (2, 2))
+"""Room round a field for plates and free space."""
+INNER = (slice(1, -1), slice(1, -1), slice(2, -2))
+"""The field in its padded array."""
+FIRST = np.array([1, 1, 2])
+"""Index of the field's first node in its padded array."""
 
 _BLOCK = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)])
-_CORNERS, _EDGES, _FACES = (_BLOCK[np.abs(_BLOCK).sum(axis=1) == n] for n in (3, 2, 1))
-_CLOSE = np.vstack([_FACES, _EDGES])
+_CORNERS, _EDGES, _SIDES = (_BLOCK[np.abs(_BLOCK).sum(axis=1) == n] for n in (3, 2, 1))
+_CLOSE = np.vstack([_SIDES, _EDGES])
 NEIGHBORS = np.vstack([_CORNERS, _CLOSE])
 """Offsets of the 26 neighbors in the order in which their bits are numbered."""
 
+_LEVELS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4)
+_SLOPE = 0.4  # of a smoothed step per node, at the body's surface
+
+
+def to_ras(index: Index | Float, affine: NDArray[np.floating]) -> Float:
+    """Points (..., 3), RAS mm, of voxel indices (..., 3)."""
+    return np.asarray(index @ affine[:3, :3].T + affine[:3, 3])
+
+
+def voxel_points(mask: Bool, affine: Float) -> Float:
+    """Centers (N, 3), RAS mm, of the voxels of a mask."""
+    return to_ras(np.argwhere(mask), affine)
+
+
+def box(low: Index, high: Index) -> Box:
+    """Part of a grid from one index (3,) up to, but without, another."""
+    first, second, third = (slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
+    return first, second, third
+
+
+def box_around(index: Index) -> Box:
+    """Box round voxels or nodes (N, 3), with one to spare on each side where the grid has one."""
+    return box(np.maximum(index.min(axis=0) - 1, 0), index.max(axis=0) + 2)
+
+
+def low_corner(part: Sequence[slice]) -> Index:
+    """Index (3,) at which a box begins."""
+    return np.array([side.start for side in part], dtype=np.intp)
+
+
+def piece_sizes(pieces: NDArray[Any]) -> Index:
+    """Count the voxels of each labeled piece, by its number; 0 for the background."""
+    sizes = np.bincount(pieces.ravel())
+    sizes[0] = 0
+    return sizes
+
 
 def euler_number(mask: Bool) -> int:
-    """Euler number of a 6-connected object: pieces - tunnels + cavities.
-
-    Voxels are the vertices of a cubical complex; face neighbors its edges.
-    """
+    """Euler number of a 6-connected object, pieces - tunnels + cavities, by its cubical complex."""
     edges = [mask[1:] & mask[:-1], mask[:, 1:] & mask[:, :-1], mask[:, :, 1:] & mask[:, :, :-1]]
     squares = [
         edges[0][:, 1:] & edges[0][:, :-1],
@@ -58,10 +112,7 @@ def grow(start: Bool, allowed: Bool, field: NDArray[np.float32], levels: int) ->
 
 
 def shrink(start: Bool, kept: Bool, field: NDArray[np.float32], levels: int) -> Bool:
-    """Shrink a set towards ``kept`` by simple points, lowest field value first.
-
-    Parameters and result as in :func:`grow`; ``kept`` must lie inside ``start``.
-    """
+    """Shrink a set towards ``kept``, a part of it, by simple points, lowest field value first."""
     state = start.copy()
     free = start & ~kept
     if free.any():
@@ -71,7 +122,7 @@ def shrink(start: Bool, kept: Bool, field: NDArray[np.float32], levels: int) -> 
 
 
 def are_simple(neighbors: Bool) -> Bool:
-    """Whether voxels are simple."""
+    """Whether voxels are simple, (N,), by their neighbors (N, 26) in the order of NEIGHBORS."""
     packed = np.packbits(neighbors, axis=1, bitorder="little")
     bits = np.ascontiguousarray(packed).view("<u4")[:, 0]
     table = _table()
@@ -90,14 +141,14 @@ def _sweep(state: Bool, free: Bool, *, add: bool) -> None:
     strides = np.array([state.shape[1] * state.shape[2], state.shape[2], 1])
     shifts = NEIGHBORS @ strides
     queue = _on_frontier(flat, np.flatnonzero(free & (flat != add)), shifts, add)
-    place = np.zeros(flat.shape, dtype=np.int32)
+    number_at = np.zeros(flat.shape, dtype=np.int32)
     while len(queue):
         moved = _change_simple(flat, queue, shifts, strides, add)
         near = (moved[:, None] + shifts).ravel()
         near = near[free[near] & (flat[near] != add)]
         number = np.arange(len(near), dtype=np.int32)
-        place[near] = number
-        queue = near[place[near] == number]  # each voxel once
+        number_at[near] = number
+        queue = near[number_at[near] == number]  # each voxel once
 
 
 def _change_simple(flat: Bool, queue: Index, shifts: Index, strides: Index, add: bool) -> Index:
@@ -126,7 +177,7 @@ def _on_frontier(flat: Bool, queue: Index, shifts: Index, add: bool) -> Index:
 
 
 class _Table(NamedTuple):
-    """What an 18-neighborhood tells, by its bits."""
+    """Properties of 18-neighborhoods, by their bits."""
 
     bare_but_for: NDArray[np.uint8]
     """Corners of the cube that are bare if the voxel beyond them is object: a byte of bits."""
@@ -144,12 +195,12 @@ def _table() -> _Table:
     wanted = np.full(len(bits), len(_CORNERS) - 1, dtype=np.int8)
     for edge in _EDGES:
         wanted -= ~_is_bare(bits, edge)
-    for face in _FACES:
+    for face in _SIDES:
         wanted += ~_is_bare(bits, face)
     return _Table(corners, np.where(_is_one_piece(bits), wanted, np.int8(-1)))
 
 
-def _is_bare(bits: Bits, part: NDArray[np.intp]) -> Bool:
+def _is_bare(bits: Bits, part: Index) -> Bool:
     """Whether all voxels of the 18-neighborhood that touch a part of the cube are object."""
     touching = ((_CLOSE == 0) | (part == _CLOSE)).all(axis=1)
     mask = np.uint32(sum(1 << int(k) for k in np.flatnonzero(touching)))
@@ -157,35 +208,280 @@ def _is_bare(bits: Bits, part: NDArray[np.intp]) -> Bool:
 
 
 def _is_one_piece(bits: Bits) -> Bool:
-    """Whether the object's faces hang together, by edges, in the 18-neighborhood."""
-    faces = bits & np.uint32((1 << len(_FACES)) - 1)
+    """Whether the object's faces are connected, by edges, in the 18-neighborhood."""
+    faces = bits & np.uint32((1 << len(_SIDES)) - 1)
     reached = faces & (~faces + np.uint32(1))  # the lowest one
     before = np.zeros_like(reached)
     while not np.array_equal(before, reached):
         before = reached
-        for number, edge in enumerate(_EDGES, start=len(_FACES)):
-            pair = np.uint32(sum(1 << int(k) for k in np.flatnonzero(_FACES @ edge > 0)))
+        for number, edge in enumerate(_EDGES, start=len(_SIDES)):
+            pair = np.uint32(sum(1 << int(k) for k in np.flatnonzero(_SIDES @ edge > 0)))
             linked = (bits >> np.uint32(number) & np.uint32(1)) != 0
             linked &= reached & pair != 0
             reached = np.where(linked, reached | (faces & pair), reached)
     return np.asarray((reached == faces) & (faces != 0))
 
 
-# Parts of a grid that hold what is worked on, so that the rest need not be touched.
+class Edit(NamedTuple):
+    """One change of a padded body."""
+
+    kind: Kind
+    where: Index
+    """(N, 3) nodes of the padded array."""
+    cost: float = 0.0
+    """Evidence overruled by a membrane, before it was thickened: sum of the field."""
+    doubtful: bool = False
+    """Whether it contradicts the run of the ribbon along the axis."""
 
 
-Box = tuple[slice, slice, slice]
+def with_plates(state: NDArray[Any], value: float) -> NDArray[Any]:
+    """Return a copy with solid plates beyond both ends."""
+    solid = state.copy()
+    solid[1:-1, 1:-1, 1] = value
+    solid[1:-1, 1:-1, -2] = value
+    return solid
 
 
-def box_around(index: NDArray[np.intp]) -> Box:
-    """Box round voxels or nodes (N, 3), with one to spare on each side where the grid has one."""
-    low = np.maximum(index.min(axis=0) - 1, 0)
-    first, second, third = (
-        slice(int(a), int(b)) for a, b in zip(low, index.max(axis=0) + 2, strict=True)
+def euler(state: Bool, *, plates: bool = False) -> int:
+    """Find the Euler number of a padded body, with or without plates on both ends."""
+    return euler_number(with_plates(state, True) if plates else state)
+
+
+def apply_membranes(
+    state: Bool,
+    values: NDArray[np.float32],
+    lifted: NDArray[np.float32],
+    settings: TopologySettings,
+    *,
+    plates: bool,
+    contact: Callable[[Index], bool],
+) -> list[Edit]:
+    """Apply the cheapest membranes (in place): all small ones, or one large one.
+
+    Without plates, tunnels of the body itself are found; with plates, pieces of an end's
+    cross-section that are connected only further inside. ``lifted`` receives the values of filled
+    holes. ``contact`` returns whether two turns of the sheet touch at nodes (N, 3).
+    """
+    ranked = _ranked(values, settings)
+    solid = with_plates(state, True) if plates else state
+    if plates:
+        ranked = with_plates(ranked, float(ranked.max()) + 1.0)
+    grown = grow(_inner_ball(solid, ranked), solid, ranked, settings.levels)
+    shrunk = shrink(_outer_ball(solid, ranked), solid, ranked, settings.levels)
+    both: tuple[tuple[Kind, Bool], ...] = (("cut", solid & ~grown), ("fill", shrunk & ~solid))
+    found = [
+        Edit(kind, where)
+        for kind, membrane in both
+        for where in _pieces(membrane)
+        if not (plates and _in_plates(where, solid))
+    ]
+    candidates = _priced(found, solid, values, settings, contact)
+    edits: list[Edit] = []
+    for cost, edit in candidates:
+        kind, where = edit.kind, edit.where
+        if edits and cost > settings.small_cost:
+            break
+        if edits and _gain(solid, where, kind) <= 0:
+            continue  # another membrane has already removed this tunnel
+        solid[tuple(where.T)] = kind == "fill"
+        state[tuple(where.T)] = kind == "fill"
+        if kind == "fill":
+            where = _thicken(state, lifted, where, settings)
+        edits.append(edit._replace(where=where))
+        if cost > settings.small_cost:
+            break
+    return edits
+
+
+def _pieces(membrane: Bool) -> list[Index]:
+    """Nodes (N, 3) of each connected piece."""
+    pieces, _ = ndimage.label(membrane, structure=ALL)
+    return [
+        np.argwhere(pieces[around] == number) + low_corner(around)
+        for number, around in enumerate(ndimage.find_objects(pieces), start=1)
+    ]
+
+
+def _priced(
+    found: list[Edit],
+    solid: Bool,
+    values: NDArray[np.float32],
+    settings: TopologySettings,
+    contact: Callable[[Index], bool],
+) -> list[tuple[float, Edit]]:
+    """Price per tunnel of the membranes that remove one, cheapest first.
+
+    A cut from a hole to an end plane removes none once the ends are closed; one through a
+    strand along that plane does not either, but closing the ends opens its tunnel. So of such
+    cuts only as many keep their price as there are additional tunnels without closed ends.
+    """
+    closed = with_plates(solid, True)
+    open_tunnels = euler_number(closed) - euler_number(solid)
+    any_hole = euler_number(closed) != 1
+    candidates = []
+    for kind, where, *_ in found:
+        gain = _gain(solid, where, kind)
+        if gain <= 0:
+            continue
+        cost = float(np.abs(values[tuple(where.T)]).sum())
+        factor = _implausibility(kind, where, solid, settings)
+        if kind == "cut" and factor > 1 and contact(where):
+            factor = 1.0
+        at_end = kind == "cut" and any_hole and _gain(closed, where, kind) <= 0
+        doubtful = factor > 1 and (kind == "cut" or cost > settings.doubtful_fill_cost)
+        candidates.append((factor * cost / gain, Edit(kind, where, cost, doubtful), at_end))
+    candidates.sort(key=lambda c: c[0])
+    priced = []
+    for price, edit, at_end in candidates:
+        wrong = at_end and open_tunnels <= 0
+        open_tunnels -= at_end
+        priced.append(
+            (price * settings.across_factor, edit._replace(doubtful=True))
+            if wrong
+            else (price, edit)
+        )
+    return sorted(priced, key=lambda c: c[0])
+
+
+def _ranked(values: NDArray[np.float32], settings: TopologySettings) -> NDArray[np.float32]:
+    """Order in which nodes are added or removed: by value, and by depth where values saturate.
+
+    So membranes come to lie midway across a wide hole, where the field is flat.
+    """
+    inside = values > 0
+    depth = ndimage.distance_transform_edt(inside) - ndimage.distance_transform_edt(~inside)
+    return np.asarray(values + settings.depth_rank * depth, dtype=np.float32)
+
+
+def _in_plates(where: Index, solid: Bool) -> bool:
+    """Whether a membrane lies in one of the plates, where nothing can be changed."""
+    return bool(((where[:, 2] == 1) | (where[:, 2] == solid.shape[2] - 2)).any())
+
+
+def _inner_ball(solid: Bool, values: NDArray[np.float32]) -> Bool:
+    """Find a ball to grow from: the largest level set that is one, or a single voxel."""
+    for level in _LEVELS:
+        pieces, count = ndimage.label(solid & (values > level), structure=FACES)
+        if not count:
+            break
+        part = pieces == piece_sizes(pieces).argmax()
+        if _is_ball(part):
+            return np.asarray(part)
+    seed = np.zeros_like(solid)
+    seed[np.unravel_index(np.argmax(np.where(solid, values, -np.inf)), solid.shape)] = True
+    return seed
+
+
+def _outer_ball(solid: Bool, values: NDArray[np.float32]) -> Bool:
+    """Find a ball to shrink from: the smallest level set that is one, or the full box."""
+    box = np.zeros_like(solid)
+    box[1:-1, 1:-1, 1:-1] = True
+    for level in _LEVELS:
+        part = (solid | (values > -level)) & box
+        pieces, _ = ndimage.label(part, structure=FACES)
+        part = pieces == pieces[tuple(np.argwhere(solid)[0])]
+        if _is_ball(part):
+            return np.asarray(part)
+    return box
+
+
+def _is_ball(mask: Bool) -> bool:
+    """Whether one 6-connected piece has neither tunnels nor cavities."""
+    return euler_number(mask) == 1 and ndimage.label(~mask, structure=ALL)[1] == 1
+
+
+def _gain(state: Bool, where: Index, kind: Kind) -> int:
+    """Change of the Euler number if these voxels change sides."""
+    low, high = where.min(axis=0) - 1, where.max(axis=0) + 2
+    block = state[box(low, high)].copy()
+    before = euler_number(block)
+    block[tuple((where - low).T)] = kind == "fill"
+    return euler_number(block) - before
+
+
+def _implausibility(kind: Kind, where: Index, solid: Bool, settings: TopologySettings) -> float:
+    """Factor by which the price of membranes across the long axis rises.
+
+    The ribbon runs along the axis, so what fills a hole in it lies along the axis too, and so does
+    what cuts a bridge between two of its turns. A cut across the axis, with ribbon before and
+    behind it, severs a strip of the ribbon beside a hole; a fill across the axis spans the inside
+    of a bend, unless it is the lid of a tunnel that opens at an end plane.
+    """
+    if len(where) < settings.oriented_nodes:
+        return 1.0
+    areas = np.array(
+        [len(np.unique(np.delete(where, axis, axis=1), axis=0)) for axis in range(3)],
+        dtype=float,
     )
-    return first, second, third
+    across = areas[2] ** 2 / float(areas @ areas)
+    if kind == "cut":
+        severs = across > settings.cut_across and _continues(where, solid, settings)
+        return settings.sever_factor if severs else 1.0
+    level = float(where[:, 2].mean()) - FIRST[2]
+    last = solid.shape[2] - 2 * FIRST[2] - 1
+    lid = min(level, last - level) < settings.lid_nodes
+    return settings.across_factor if across > settings.fill_across and not lid else 1.0
 
 
-def low_corner(box: Box) -> NDArray[np.intp]:
-    """Index (3,) at which a box begins."""
-    return np.array([side.start for side in box], dtype=np.intp)
+def _continues(where: Index, solid: Bool, settings: TopologySettings) -> bool:
+    """Whether the body continues along the axis on both sides of most of a membrane's nodes.
+
+    It may deviate by a node; beyond an end plane it counts as continued.
+    """
+    wide = ndimage.maximum_filter(solid, size=(3, 3, 1))
+    both = np.ones(len(where), dtype=bool)
+    a, b, w = where.T
+    for step in range(1, settings.sever_reach + 1):
+        for level in (w - step, w + step):
+            beyond = (level < FIRST[2]) | (level >= solid.shape[2] - FIRST[2])
+            both &= beyond | wide[a, b, np.clip(level, 0, solid.shape[2] - 1)]
+    return bool(both.mean() > settings.sever_share)
+
+
+def _thicken(
+    state: Bool,
+    lifted: NDArray[np.float32],
+    where: Index,
+    settings: TopologySettings,
+) -> Index:
+    """Make a filled membrane as thick as the wall around it (in place), if the topology allows.
+
+    Half the wall's thickness at a node of the membrane is the mean depth of the nearest nodes along
+    the wall's middle, which are sought within ``plug_reach`` nodes.
+    """
+    reach = settings.plug_reach
+    low = np.maximum(where.min(axis=0) - reach, FIRST)
+    high = np.minimum(where.max(axis=0) + reach + 1, np.array(state.shape) - FIRST)
+    around = box(low, high)
+    block = state[around]
+    membrane = np.zeros_like(block)
+    membrane[tuple((where - low).T)] = True
+    off, nearest = ndimage.distance_transform_edt(~membrane, return_indices=True)
+    at = _half_thickness(block & ~membrane, where - low, settings)
+    thickness = np.zeros(block.shape)
+    thickness[tuple((where - low).T)] = at
+    half = thickness[tuple(nearest)]
+    plug = np.clip(_SLOPE * (half - off), -0.5, 0.5).astype(np.float32)
+    added = (plug > 0) & ~block
+    trial = state.copy()
+    trial[around] |= added
+    if euler_number(trial) != euler_number(state):
+        return where
+    state[around] |= added
+    lifted[around] = np.maximum(lifted[around], np.where(off < half + 1, plug, -1))
+    return np.vstack([where, np.argwhere(added) + low])
+
+
+def _half_thickness(wall: Bool, nodes: Index, settings: TopologySettings) -> Float:
+    """Half the thickness of a wall, in nodes, (N,): the depth of its middle near (N, 3) nodes."""
+    padded = np.pad(wall, 1, mode="edge")  # no surface where the wall continues beyond the block
+    depth = ndimage.distance_transform_edt(padded)[1:-1, 1:-1, 1:-1]
+    ridge = wall & (depth >= ndimage.maximum_filter(depth, 3))
+    middle = np.argwhere(ridge)
+    if not len(middle):
+        return np.ones(len(nodes))
+    count = min(settings.plug_neighbors, len(middle))
+    _, nearest = cKDTree(middle).query(nodes, k=count)
+    # A node's depth is the distance from the next node outside, half a step beyond the surface.
+    found = depth[tuple(middle.T)][nearest.reshape(len(nodes), count)]
+    return np.asarray(found.mean(axis=1) - 0.5)

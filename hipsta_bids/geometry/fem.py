@@ -9,7 +9,7 @@ from scipy import sparse
 from scipy.sparse import linalg
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry.tetra import cross, tetra_volumes
+from hipsta_bids.geometry.mesh import cross, tetra_volumes
 from hipsta_bids.types import Bool, Float, Int, TetMesh
 
 # Conjugate gradients for the Laplace problems of the volume, faster than a factorization.

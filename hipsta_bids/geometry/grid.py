@@ -1,4 +1,4 @@
-"""The working grid: planes that turn from one end of the body to the other."""
+"""The working grid, which turns from one end plane to the other, and the smoothed body on it."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -25,6 +25,7 @@ class WedgeGrid:
     """
 
     shape: tuple[int, int, int]
+    """Number of nodes along a, b and w."""
     spacing: float
     """Distance of nodes across the axis, mm; along the axis it is close to it."""
     origin: Float
@@ -34,15 +35,14 @@ class WedgeGrid:
     axis: Float
     """(3,) unit vector of w."""
     posterior: Float
-    """(3,) height of the posterior plane above ``origin`` along the axis: c0 + c1 a + c2 b, mm."""
+    """(3,) height c0 + c1 a + c2 b of the posterior plane above ``origin`` along the axis, mm."""
     anterior: Float
-    """(3,) the same for the anterior plane."""
+    """(3,) height of the anterior plane, likewise."""
 
     def to_ras(self, nodes: Float) -> Float:
         """RAS mm of (N, 3) grid coordinates."""
         a, b, w = nodes.T
-        low = self._height(self.posterior, a, b)
-        high = self._height(self.anterior, a, b)
+        low, high = self._heights(a, b)
         along = low + (high - low) * w / (self.shape[2] - 1)
         return np.asarray(
             self.origin
@@ -54,8 +54,7 @@ class WedgeGrid:
         """Grid coordinates of (N, 3) RAS mm: the inverse of :meth:`to_ras`."""
         local = points - self.origin
         a, b = (local @ self.across.T / self.spacing).T
-        low = self._height(self.posterior, a, b)
-        high = self._height(self.anterior, a, b)
+        low, high = self._heights(a, b)
         w = (local @ self.axis - low) / (high - low) * (self.shape[2] - 1)
         return np.column_stack([a, b, w])
 
@@ -63,16 +62,19 @@ class WedgeGrid:
         """RAS mm of all nodes, (A, B, W, 3), kept ``clamp`` mm away from the end planes."""
         counts = (np.arange(n, dtype=np.float64) for n in self.shape[:2])
         a, b = np.meshgrid(*counts, indexing="ij")
-        low = self._height(self.posterior, a, b)
-        high = self._height(self.anterior, a, b)
+        low, high = self._heights(a, b)
         share = np.linspace(0, 1, self.shape[2])
         along = low[..., None] + (high - low)[..., None] * share
         along = np.clip(along, (low + clamp)[..., None], (high - clamp)[..., None])
         base = self.spacing * (a[..., None] * self.across[0] + b[..., None] * self.across[1])
         return np.asarray(self.origin + base[:, :, None, :] + along[..., None] * self.axis)
 
-    def _height(self, plane: Float, a: Float, b: Float) -> Float:
-        return np.asarray(plane[0] + plane[1] * a + plane[2] * b)
+    def _heights(self, a: Float, b: Float) -> tuple[Float, Float]:
+        """Heights of both end planes at nodes across the axis, mm."""
+        low, high = (
+            np.asarray(c[0] + c[1] * a + c[2] * b) for c in (self.posterior, self.anterior)
+        )
+        return low, high
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -80,9 +82,10 @@ class Field:
     """A smooth function on a wedge grid, positive inside the body."""
 
     grid: WedgeGrid
-    values: np.ndarray[tuple[int, ...], np.dtype[np.float32]]
+    """Grid with the nodes."""
+    values: NDArray[np.float32]
     """(A, B, W), -0.5 far outside and 0.5 deep inside; a little beyond near the wall."""
-    parted: Bool | None = None
+    separated: Bool | None = None
     """(A, B, W) nodes of the body that were taken out between turns that touch, if any."""
     slits: Bool | None = None
     """(A, B, W) nodes in slits of the labels that were filled, if any."""
@@ -91,7 +94,7 @@ class Field:
 def resample_body(body: Body, settings: GridSettings, slices: SliceSettings) -> Field:
     """Sample the body's mask on a wedge grid and smooth it."""
     grid = _fit_grid(body, settings)
-    parted = None
+    separated = None
     if has_thick_slices(body.affine, slices):
         points = grid.node_points(clamp=0.0).reshape(-1, 3)
         values = sample_slices(body, points, slices)
@@ -99,14 +102,14 @@ def resample_body(body: Body, settings: GridSettings, slices: SliceSettings) -> 
         points = grid.node_points(clamp=body.ends.half_slice).reshape(-1, 3)
         values = _sample_mask(body, points)
         between = _between_turns(body, points, slices)
-        parted = (between & (values > 0.5)).reshape(grid.shape)  # noqa: PLR2004 -- in the mask
+        separated = (between & (values > 0.5)).reshape(grid.shape)  # noqa: PLR2004 -- in the mask
         values[between] = 0
     sigma = max(settings.smoothing * in_plane_voxel(body.affine), settings.min_smoothing)
     smooth = _smooth(values.reshape(grid.shape), sigma / settings.spacing)
     return Field(
         grid=grid,
         values=smooth - np.float32(0.5),
-        parted=parted,
+        separated=separated,
         slits=_filled_nodes(body, points).reshape(grid.shape) if len(body.filled) else None,
     )
 
@@ -128,17 +131,17 @@ def _sample_mask(body: Body, points: Float) -> NDArray[np.float32]:
 
 
 def _between_turns(body: Body, points: Float, settings: SliceSettings) -> Bool:
-    """Which of (N, 3) points, RAS mm, part the two ends of the sheet where they touch."""
+    """Which of (N, 3) points, RAS mm, lie in a slit between ends of the sheet that touch."""
     medial, lateral = points_of_ends(body)
-    parts = np.zeros(len(points), dtype=bool)
+    slit = np.zeros(len(points), dtype=bool)
     if not (len(medial) and len(lateral)):
-        return parts
+        return slit
     trees = cKDTree(medial), cKDTree(lateral)
     reach = settings.touch + 0.5 * in_plane_voxel(body.affine)  # labels end beyond their centers
     gap = np.asarray(trees[1].query(medial, distance_upper_bound=reach)[0])
     touching = medial[np.isfinite(gap)]
     if not len(touching):
-        return parts
+        return slit
     low, high = touching.min(axis=0) - reach, touching.max(axis=0) + reach
     close = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
     first, second = (
@@ -146,12 +149,12 @@ def _between_turns(body: Body, points: Float, settings: SliceSettings) -> Bool:
     )
     between = np.isfinite(first) & np.isfinite(second)
     first, second = first[between], second[between]
-    parts[close[between]] = np.abs(first - second) < 2 * settings.slit
-    return parts
+    slit[close[between]] = np.abs(first - second) < 2 * settings.slit
+    return slit
 
 
 def _smooth(values: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
-    """Smooth by a Gaussian and add what it took off, smoothed too: 2 G - G * G.
+    """Smooth by a Gaussian and add what it removed, smoothed too: 2 G - G * G.
 
     A Gaussian alone moves bent walls towards their center of curvature, by sigma^2 / (2 radius),
     and rounds off edges; here the leading term cancels (twicing: Tukey 1977, Exploratory Data
@@ -174,10 +177,10 @@ def in_plane_voxel(affine: Float) -> float:
 
 
 def _fit_grid(body: Body, settings: GridSettings) -> WedgeGrid:
-    """Lay the grid round the body.
+    """Fit the grid to the body.
 
-    Its nodes across the axis form a lattice that hangs at one voxel and follows one edge of the
-    voxels, so that damage or an edit of the labels does not move the nodes elsewhere.
+    Its nodes across the axis form a lattice through the center of one voxel and along one edge of
+    the voxels, so that damage or an edit of the labels does not move the nodes elsewhere.
     """
     _, points = body.inside_points()
     axis = body.ends.axis
@@ -220,19 +223,16 @@ def _fit_grid(body: Body, settings: GridSettings) -> WedgeGrid:
 
 
 def _directions_across(body: Body, flat: Float) -> Float:
-    """Find two unit vectors (2, 3) across the axis.
+    """Find two unit vectors (2, 3) across the axis, the first along the most lateral voxel edge.
 
-    The first follows the edge of the voxels that points most to lateral.
-
-    ``flat`` The body's points without their part along the axis, mm.
+    ``flat`` holds the body's points (N, 3) without their part along the axis, mm.
     """
     axis = body.ends.axis
     edges = body.affine[:3, :3].T
     edges = edges / np.linalg.norm(edges, axis=1, keepdims=True)
     projected = edges - np.outer(edges @ axis, axis)
     length = np.linalg.norm(projected, axis=1)
-    rank = body.lateral
-    lateral = (flat - flat.mean(axis=0)).T @ (rank - rank.mean())
+    lateral = (flat - flat.mean(axis=0)).T @ (body.lateral - body.lateral.mean())
     along = projected @ lateral
     usable = length > 0.5  # noqa: PLR2004 -- not the edge along the axis
     best = int(np.argmax(np.where(usable, np.abs(along) / np.maximum(length, 0.5), -1.0)))

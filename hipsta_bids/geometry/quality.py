@@ -8,7 +8,7 @@ import numpy as np
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.boundaries import Boundaries
 from hipsta_bids.geometry.checks import check_cross_sections, check_image, check_labels, check_rows
-from hipsta_bids.geometry.tetra import tetra_quality
+from hipsta_bids.geometry.mesh import tetra_quality
 from hipsta_bids.geometry.topology import SolidField
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import Settings

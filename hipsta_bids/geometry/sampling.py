@@ -1,17 +1,15 @@
-"""Other volumes on the sheet: their values at its points, or averaged over its depth."""
+"""Other volumes on the sheet, at its points or averaged over depth, and maps in regions of it."""
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
+from hipsta_bids.geometry.digital import to_ras
 from hipsta_bids.geometry.measures import column_area
 from hipsta_bids.settings import MapSettings
 from hipsta_bids.types import Bool, Float, Sheet
-
-#: Where a volume is read, and how between its voxels.
-SAMPLINGS = ("depth", "mid")
-INTERPOLATIONS = ("linear", "nearest")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -25,7 +23,7 @@ class ScalarVolume:
     start: tuple[int, int, int]
     """Index of the first voxel in the whole image."""
     shape: tuple[int, int, int]
-    """Of the whole image."""
+    """Shape of the whole image."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -35,9 +33,9 @@ class SampledMap:
     values: Float
     """(Nx, Ny, T), NaN where missing."""
     outside: float
-    """Share of the points asked for that lie outside the field of view."""
+    """Share of the sampled points that lie outside the field of view."""
     unknown: float
-    """Share of the points inside it that have no known value."""
+    """Share of the points inside the field of view that have no known value."""
 
     @property
     def missing(self) -> float:
@@ -53,7 +51,7 @@ def sample_on_sheet(
     sampling: str,
     interpolation: str,
 ) -> SampledMap:
-    """Read a volume on the mid-surface or averaged over the depth of the sheet.
+    """Read a volume on the mid-surface (``mid``) or averaged over the sheet's ``depth``.
 
     The field of view ends at the outer faces of the outermost voxels; from their centers outward
     the value is that of the voxel.
@@ -64,27 +62,26 @@ def sample_on_sheet(
     read = _linear if interpolation == "linear" else _nearest
     values = read(volume.values, index, settings.min_known)
     values[~inside] = np.nan
-    # Columns without a position are missing, and no sign of a wrong field of view.
-    asked = np.isfinite(points.reshape(-1, 3)).all(axis=1)
+    # Columns without a position are missing, but do not suggest a wrong field of view.
+    defined = np.isfinite(points.reshape(-1, 3)).all(axis=1)
     known = ~np.isnan(values[inside])
     columns = values.reshape(*points.shape[:3], -1)
     merge = _mean if interpolation == "linear" else _most_frequent
     return SampledMap(
         values=merge(columns, settings.min_known),
-        outside=float((~inside)[asked].mean()) if asked.any() else 0.0,
+        outside=float((~inside)[defined].mean()) if defined.any() else 0.0,
         unknown=float(1 - known.mean()) if known.size else 0.0,
     )
 
 
 def _locate(volume: ScalarVolume, points: Float) -> tuple[Float, Bool]:
-    """Index (N, 3) into the values, clamped to centers of voxels; and which are inside."""
-    to_index = np.linalg.inv(volume.affine)
-    index = points @ to_index[:3, :3].T + to_index[:3, 3]
+    """Index (N, 3) into the values, clamped to centers of voxels, and which points are inside."""
+    index = to_ras(points, np.linalg.inv(volume.affine))
     whole = index + volume.start
     shape = np.array(volume.shape)
     slack = 0.5 + 1e-6  # rounding of affines must not decide about points on the outer face
     with np.errstate(invalid="ignore"):
-        inside = ((whole >= -slack) & (whole <= shape - 1 + slack)).all(axis=1)
+        inside = np.all((whole >= -slack) & (whole <= shape - 1 + slack), axis=1)
     index = np.where(inside[:, None], index, 0.0)
     return np.clip(index, 0, np.array(volume.values.shape[:3]) - 1), inside
 
@@ -144,31 +141,30 @@ def _quotient(total: Float, weight: Float, least: float) -> Float:
     return np.where(enough, total / np.where(enough, weight, 1.0), np.nan)
 
 
-# Regions drawn on the sheet: what the maps are in each of them.
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Regions:
     """Sets of sheet points, which may overlap."""
 
     names: tuple[str, ...]
+    """Name of each region."""
     member: Bool
     """(R, Nx, Ny) whether a point belongs to a region."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RegionStatistics:
-    """One number per region, (R,) each; NaN where there is nothing to take it of."""
+    """One number per region, (R,) each; NaN where a region has no value."""
 
     n_points: Float
+    """Number of points."""
     n_valid: Float
-    """Points whose columns were measured directly."""
+    """Number of points whose columns were measured directly."""
     area: Float
-    """Of the mid-surface round the points, mm2."""
+    """Area of the mid-surface round the points, mm2."""
     mean: Mapping[str, Float]
-    """Of each map, over its valid and known points."""
+    """Mean of each map over its valid and known points."""
     sd: Mapping[str, Float]
-    """With n - 1 in the denominator."""
+    """Standard deviation of each map, with n - 1 in the denominator."""
     mode: Mapping[str, Float]
     """Most frequent value of each map of labels; the smallest of equals."""
 
@@ -176,19 +172,13 @@ class RegionStatistics:
 def summarize_regions(
     regions: Regions, sheet: Sheet, maps: Mapping[str, Float], labels: Mapping[str, Float]
 ) -> RegionStatistics:
-    """Sum up maps in regions.
-
-    ``maps`` Numbers, NaN where missing; ``labels`` Labels, NaN where missing.
-
-    Each quadrilateral of the grid belongs to its corners in quarters.
-    """
+    """Summarize maps of numbers and maps of labels, NaN where missing, in regions."""
     member = regions.member & sheet.valid
-    area = column_area(sheet)
     moments = {name: _moments(member, values) for name, values in maps.items()}
     return RegionStatistics(
         n_points=regions.member.sum(axis=(1, 2)).astype(np.float64),
         n_valid=member.sum(axis=(1, 2)).astype(np.float64),
-        area=(regions.member * area).sum(axis=(1, 2)),
+        area=(regions.member * column_area(sheet)).sum(axis=(1, 2)),
         mean={name: mean for name, (mean, _) in moments.items()},
         sd={name: sd for name, (_, sd) in moments.items()},
         mode={name: _mode(member, values) for name, values in labels.items()},
@@ -196,17 +186,16 @@ def summarize_regions(
 
 
 def _moments(member: Bool, values: Float) -> tuple[Float, Float]:
-    known = member & np.isfinite(values)
-    count = known.sum(axis=(1, 2))
-    safe = np.where(np.isfinite(values), values, 0.0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean = np.where(known, safe, 0.0).sum(axis=(1, 2)) / count
-        off = np.where(known, safe - mean[:, None, None], 0.0)
-        sd = np.sqrt((off**2).sum(axis=(1, 2)) / np.where(count > 1, count - 1, np.nan))
+    """Mean and standard deviation (R,) of a map over its known members."""
+    known = np.where(member & np.isfinite(values), values, np.nan)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of regions without two known points
+        mean, sd = np.nanmean(known, axis=(1, 2)), np.nanstd(known, axis=(1, 2), ddof=1)
     return np.asarray(mean), np.asarray(sd)
 
 
 def _mode(member: Bool, values: Float) -> Float:
+    """Most frequent label (R,)."""
     known = np.isfinite(values)
     kinds, code = np.unique(values[known], return_inverse=True)
     if not len(kinds):

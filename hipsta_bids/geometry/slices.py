@@ -1,13 +1,12 @@
 """Between thick slices: outline each slice, and move its shape into the next one.
 
 Where slices are much thicker than their pixels, the ribbon moves sideways by its own thickness from
-one slice to the next, and blending slices in place would tear it. Each slice becomes a signed
+one slice to the next, and blending slices in place would break it. Each slice becomes a signed
 distance from its outline; neighboring slices are registered, and the shapes between them are blends
-of both, moved along the registration. Where head or tail labels hide how the sheet goes on, its
-shapes are continued from inside. Where the two ends of the ribbon touch, they are kept apart.
+of both, moved along the registration. Where head or tail labels hide how the sheet continues, its
+shapes are extrapolated from inside. Where the two ends of the ribbon touch, they are kept apart.
 """
 
-from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,25 +15,27 @@ from scipy import ndimage
 from scipy.special import ndtri
 
 from hipsta_bids.geometry.body import Body
+from hipsta_bids.geometry.digital import Box, box, low_corner, piece_sizes, to_ras, voxel_points
 from hipsta_bids.protocols.protocol import Tissue, lateral_rank
 from hipsta_bids.settings import SliceSettings
 from hipsta_bids.types import Bool, Float
 
-# The outline of the ribbon in one slice: between the pixels, fragments joined, holes filled.
+Stack = NDArray[np.float32]
+"""Images, on fine pixels or on those of the segmentation."""
+
+_LEVELS = (2, 1)
+"""Sizes of pixels in the registration, from coarse to those of the segmentation."""
+_ENDS = ((Tissue.PRESUBICULUM, Tissue.SUBICULUM), (Tissue.CA2, Tissue.CA2_3, Tissue.CA3))
+"""Subfields of the medial and the lateral end of the ribbon; CA1 lies between them."""
 
 
-Image = NDArray[np.float32]
+def outline_slice(tissue: NDArray[np.uint8], pixel: float, settings: SliceSettings) -> Stack:
+    """Signed distance, mm, from the ribbon's outline in a slice with pixels of ``pixel`` mm.
 
-
-def outline_slice(tissue: NDArray[np.uint8], pixel: float, settings: SliceSettings) -> Image:
-    """Find the signed distance from the ribbon's outline in a slice.
-
-    ``pixel`` Edge of a pixel, mm. Returns mm at finer pixels, positive inside, between minus and
-    plus ````reach````.
-
-    Across a straight edge, a mask smoothed by a Gaussian is the normal distribution function of the
-    distance over sigma. Its inverse finds the outline between pixels; whole pixels put it off by
-    up to half of one, which the smoothing of the working grid cannot undo along the slice.
+    It is sampled at finer pixels, positive inside, and clipped at the setting ``reach``. Across a
+    straight edge, a mask smoothed by a Gaussian is the normal distribution function of the distance
+    over sigma. Its inverse finds the outline between pixels; whole pixels would shift it by up to
+    half of one, which the smoothing of the working grid cannot undo along the slice.
     """
     block = np.ones((settings.upsampling,) * 2, dtype=np.uint8)
     labels = np.kron(tissue, block)
@@ -50,14 +51,11 @@ def outline_slice(tissue: NDArray[np.uint8], pixel: float, settings: SliceSettin
     return np.asarray(np.clip(distance, -settings.reach, settings.reach), dtype=np.float32)
 
 
-def part_distance(
-    tissue: NDArray[np.uint8], kinds: Collection[Tissue], pixel: float, settings: SliceSettings
-) -> Image:
-    """Find the signed distance from some subfields of a slice, to the pixel.
-
-    ``pixel`` Edge of a pixel, mm.
-    """
-    fine = np.kron(np.isin(tissue, tuple(kinds)), np.ones((settings.upsampling,) * 2, dtype=bool))
+def _part_distance(
+    tissue: NDArray[np.uint8], kinds: tuple[Tissue, ...], pixel: float, settings: SliceSettings
+) -> Stack:
+    """Signed distance, mm, from some subfields of a slice, accurate to a fine pixel."""
+    fine = np.kron(np.isin(tissue, kinds), np.ones((settings.upsampling,) * 2, dtype=bool))
     distance = _signed_distance(fine, pixel / settings.upsampling)
     return np.asarray(np.clip(distance, -settings.reach, settings.reach), dtype=np.float32)
 
@@ -74,17 +72,16 @@ def _signed_distance(mask: Bool, pixel: float) -> Float:
 def _join(
     distance: Float, ranks: NDArray[np.intp], labeled: Bool, pixel: float, settings: SliceSettings
 ) -> Float:
-    """Bridge near fragments of a slice to the largest, drop fragments, fill holes.
+    """Join near pieces of a slice to the largest, drop fragments farther away, fill small holes.
 
-    A large piece farther away is left alone: whether it belongs to the ribbon (it may turn into
-    the uncus) is seen in three dimensions only.
+    A large piece farther away is left alone: only three dimensions show whether it belongs to the
+    ribbon, which may bend into the uncus.
     """
     for _ in range(settings.max_fragments):
         pieces, count = ndimage.label(distance > 0)
         if count < 2:  # noqa: PLR2004 -- one piece is the aim
             break
-        sizes = np.bincount(pieces.ravel()) * pixel**2
-        sizes[0] = 0
+        sizes = piece_sizes(pieces) * pixel**2
         main = pieces == sizes.argmax()
         gap, nearest = ndimage.distance_transform_edt(~main, return_indices=True)
         gap *= pixel
@@ -121,23 +118,12 @@ def _segment_distance(
     return np.asarray(np.linalg.norm(grid - foot, axis=-1))
 
 
-# The way from each slice to the next.
-
-
-Stack = NDArray[np.float32]
-
-_LEVELS = (2, 1)  # sizes of pixels, those of the segmentation last
-
-
 def register_slices(outlines: Stack, pixel: float, settings: SliceSettings) -> Stack:
-    """Register each slice to the next, both sides alike.
+    """Register each outline (N, I, J), mm, to the next; fine pixels, (2, N - 1, I', J').
 
-    ``outlines`` Signed distances at fine pixels, mm; ``pixel`` Edge of a pixel of the segmentation,
-    ````upsampling```` times that of a fine one, mm.
-
-    Lucas & Kanade 1981, IJCAI:674-679, with a Gaussian window, from coarse to fine, all slices
-    at once. Halfway between both slices, no direction is preferred, and one displacement serves
-    both.
+    Lucas & Kanade 1981, IJCAI:674-679, with a Gaussian window, from coarse to fine, all slices at
+    once, on the pixels of the segmentation (``pixel``, mm). Displacements are defined halfway
+    between both slices, so that no direction is preferred.
     """
     flow = np.zeros((2, len(outlines) - 1, 1, 1), dtype=np.float32)
     for level in _LEVELS:
@@ -149,12 +135,13 @@ def register_slices(outlines: Stack, pixel: float, settings: SliceSettings) -> S
 
 
 def _improved(images: Stack, flow: Stack, pixel: float, settings: SliceSettings) -> Stack:
-    """One step of Gauss and Newton in a window around each pixel."""
+    """Take one step of Gauss and Newton in a window around each pixel."""
     first, second = _moved(images[:-1], -0.5 * flow), _moved(images[1:], 0.5 * flow)
     slope_i, slope_j = np.gradient((0.5 / pixel) * (first + second), axis=(1, 2))
     error = (first - second) / pixel
+    window = (settings.flow_window / pixel,) * 2
     ii, ij, jj, ei, ej = (
-        _windowed(product, settings.flow_window / pixel)
+        ndimage.gaussian_filter(product, (0, *window), truncate=2.5)
         for product in (
             slope_i * slope_i,
             slope_i * slope_j,
@@ -163,7 +150,7 @@ def _improved(images: Stack, flow: Stack, pixel: float, settings: SliceSettings)
             slope_j * error,
         )
     )
-    # Along a straight edge only the way across it is known; the ridge chooses the shortest.
+    # Along a straight edge only the shift across it is known; the ridge chooses the shortest.
     ii, jj = ii + settings.flow_ridge, jj + settings.flow_ridge
     det = ii * jj - ij * ij
     step = np.stack([(jj * ei - ij * ej) / det, (ii * ej - ij * ei) / det])
@@ -171,15 +158,16 @@ def _improved(images: Stack, flow: Stack, pixel: float, settings: SliceSettings)
     return np.asarray(ndimage.gaussian_filter(flow + step, (0, 0, width, width)), dtype=np.float32)
 
 
-def _windowed(values: Stack, sigma: float) -> Stack:
-    return np.asarray(ndimage.gaussian_filter(values, (0, sigma, sigma), truncate=2.5))
-
-
 def _moved(images: Stack, by: Stack) -> Stack:
     where = np.indices(images.shape, dtype=np.float32)
     where[1:] += by
+    return _interpolated(images, *where)
+
+
+def _interpolated(images: Stack, *where: Stack) -> Stack:
+    """Interpolate linearly at one coordinate per axis, with the border's values beyond it."""
     return np.asarray(
-        ndimage.map_coordinates(images, where, order=1, mode="nearest", output=np.float32)
+        ndimage.map_coordinates(images, np.stack(where), order=1, mode="nearest", output=np.float32)
     )
 
 
@@ -193,39 +181,30 @@ def _shrunk(images: Stack, factor: int) -> Stack:
 
 
 def _doubled(flow: Stack, shape: tuple[int, ...]) -> Stack:
-    """Displacements at pixels of half the size, counted in them."""
+    """Displacements at pixels of half the size, in these pixels."""
     at = (0.5 * np.arange(n, dtype=np.float32) - 0.25 for n in shape)
-    where = np.stack(
-        np.meshgrid(*(np.arange(n) for n in flow.shape[:2]), *at, indexing="ij")
-    ).astype(np.float32)
-    return np.asarray(
-        2 * ndimage.map_coordinates(flow, where, order=1, mode="nearest", output=np.float32)
-    )
-
-
-Box = tuple[slice, slice, slice]
-
-#: Subfields of the medial and the lateral end of the ribbon. CA1 lies between them.
-_ENDS = ((Tissue.PRESUBICULUM, Tissue.SUBICULUM), (Tissue.CA2, Tissue.CA2_3, Tissue.CA3))
+    whole = (np.arange(n, dtype=np.float32) for n in flow.shape[:2])
+    return 2 * _interpolated(flow, *np.meshgrid(*whole, *at, indexing="ij"))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class SliceStack:
-    """Outlines of slices and the way from each to the next."""
+class _SliceStack:
+    """Outlines of slices and the displacements from each to the next."""
 
     outlines: Stack
     """(N, I, J) signed distances at fine pixels, mm, positive inside; at least two slices."""
     ends: Stack
-    """(2, N, I, J) the same of the medial and of the lateral subfields alone."""
+    """(2, N, I, J) signed distances of the medial and of the lateral subfields alone, mm."""
     flows: Stack
     """(2, N - 1, I', J') fine pixels from each slice to the next, halfway between them, at the
     pixels of the segmentation."""
     settings: SliceSettings
+    """Settings of the interpolation."""
 
     def blend(self, level: Stack, where: Stack) -> Stack:
-        """Find the signed distance from the outline of the shape at any level.
+        """Signed distance, mm, within the plane of the slices, from the outline at any level.
 
-        Returns mm, within the plane of the slices, positive inside.
+        ``level`` (N,) counts slices, ``where`` (2, N) fine pixels.
         """
         last = len(self.outlines) - 1
         level = level + (self.settings.extrapolation - 1) * (level - np.clip(level, 0, last))
@@ -233,14 +212,14 @@ class SliceStack:
         share = level - below
         coarse = self.flows.shape[2] / self.outlines.shape[1]
         step = np.zeros_like(where)
-        # The flow is known halfway between the slices: find the place there that moves to here.
+        # The flow is known halfway between the slices: find the point there that moves to here.
         for _ in range(3):
             middle = (where - (share - 0.5) * step + 0.5) * coarse - 0.5
-            step = np.stack([_sample(part, below, middle) for part in self.flows])
+            step = np.stack([_interpolated(part, below, *middle) for part in self.flows])
         middle = where - (share - 0.5) * step
         distance, medial, lateral = (
-            (1 - share) * _sample(images, below, middle - 0.5 * step)
-            + share * _sample(images, below + 1, middle + 0.5 * step)
+            (1 - share) * _interpolated(images, below, *(middle - 0.5 * step))
+            + share * _interpolated(images, below + 1, *(middle + 0.5 * step))
             for images in (self.outlines, *self.ends)
         )
         return np.asarray(np.minimum(distance, self._slit(medial, lateral)), dtype=np.float32)
@@ -267,36 +246,32 @@ def has_thick_slices(affine: Float, settings: SliceSettings) -> bool:
 
 
 def sample_slices(body: Body, points: Float, settings: SliceSettings) -> Stack:
-    """Sample the body's mask between and beyond its thick slices.
-
-    ``points`` RAS mm.
-    """
+    """Sample the body's mask between and beyond its thick slices, at points (N, 3), RAS mm."""
     edges = np.linalg.norm(body.affine[:3, :3], axis=0)
     through = int(np.argmax(edges))
     pixel = float(np.delete(edges, through).mean())
     labeled = _labeled_ends(body, through)
-    box = _bounds(np.moveaxis(body.inside, through, 0), settings.reach / pixel, labeled)
-    tissue = np.moveaxis(body.tissue, through, 0)[box].copy()
-    for turn, depth, known in zip((1, -1), _depths(body, through, box), labeled, strict=True):
+    part = _bounds(np.moveaxis(body.inside, through, 0), settings.reach / pixel, labeled)
+    tissue = np.moveaxis(body.tissue, through, 0)[part].copy()
+    for step, depth, known in zip((1, -1), _depths(body, through, part), labeled, strict=True):
         if not known:
-            _continue(tissue[::turn], (depth < settings.hidden_depth)[::turn], pixel, settings)
+            _extrapolate(tissue[::step], (depth < settings.hidden_depth)[::step], pixel, settings)
     stack = _stacked(tissue, pixel, settings)
-    order = np.array([through, *np.delete(np.arange(3), through)])
-    inverse = np.linalg.inv(body.affine)[order]
-    voxels = points @ inverse[:, :3].T + inverse[:, 3] - [part.start for part in box]
+    voxels = body.to_voxels(points)[:, _order(through)] - low_corner(part)
     where = ((voxels[:, 1:] + 0.5) * settings.upsampling - 0.5).astype(np.float32).T
     distance = stack.blend(voxels[:, 0].astype(np.float32), where)
     return np.asarray(np.clip(distance / (2 * settings.edge) + 0.5, 0, 1), dtype=np.float32)
 
 
-def _stacked(tissue: NDArray[np.uint8], pixel: float, settings: SliceSettings) -> SliceStack:
+def _stacked(tissue: NDArray[np.uint8], pixel: float, settings: SliceSettings) -> _SliceStack:
+    """Outline and register slices; a single one is taken twice."""
     if len(tissue) == 1:
         tissue = np.concatenate([tissue, tissue])
     outlines = np.stack([outline_slice(image, pixel, settings) for image in tissue])
     ends = np.array(
-        [[part_distance(image, end, pixel, settings) for image in tissue] for end in _ENDS]
+        [[_part_distance(image, end, pixel, settings) for image in tissue] for end in _ENDS]
     )
-    return SliceStack(
+    return _SliceStack(
         outlines=outlines,
         ends=ends,
         flows=register_slices(outlines, pixel, settings),
@@ -304,65 +279,60 @@ def _stacked(tissue: NDArray[np.uint8], pixel: float, settings: SliceSettings) -
     )
 
 
-def _sample(images: Stack, number: Stack, where: Stack) -> Stack:
-    return np.asarray(
-        ndimage.map_coordinates(
-            images, np.stack([number, *where]), order=1, mode="nearest", output=np.float32
-        )
-    )
-
-
 def _labeled_ends(body: Body, through: int) -> tuple[bool, bool]:
     """Whether the sheet's labels go on beyond the first and beyond the last slice of the body."""
-    index = np.argwhere(body.tissue > 0)
-    points = index @ body.affine[:3, :3].T + body.affine[:3, 3]
+    points = voxel_points(body.tissue > 0, body.affine)
     thickness = float(np.linalg.norm(body.affine[:3, through]))
     known = []
     for depth in (body.ends.height(points, "posterior"), -body.ends.height(points, "anterior")):
         inner = np.count_nonzero((depth > 0) & (depth < thickness))
         outer = np.count_nonzero((depth < 0) & (depth > -thickness))
         known.append(bool(outer > 0.5 * inner))  # a label that is only blurred at the plane is less
-    return (known[0], known[1]) if _goes_forward(body, through) else (known[1], known[0])
+    return (known[0], known[1]) if _runs_forward(body, through) else (known[1], known[0])
 
 
-def _goes_forward(body: Body, through: int) -> bool:
-    """Whether the numbers of the slices rise from posterior to anterior."""
+def _runs_forward(body: Body, through: int) -> bool:
+    """Whether slices are counted from posterior to anterior."""
     return bool(body.ends.axis @ body.affine[:3, through] > 0)
 
 
+def _order(through: int) -> list[int]:
+    """Axes of the image, the one through the slices first."""
+    return [through, *(axis for axis in range(3) if axis != through)]
+
+
 def _bounds(inside: Bool, margin: float, labeled: tuple[bool, bool]) -> Box:
-    """Slices that hold the body, one more where labels go on, and a box in them with a margin."""
+    """Box round the body: a margin within the slices, and one slice more where labels go on."""
     index = np.argwhere(inside)
     room = np.ceil([0, margin, margin]).astype(int)
     low, high = index.min(axis=0) - room, index.max(axis=0) + 1 + room
     low[0] -= labeled[0]
     high[0] += labeled[1]
-    low, high = np.maximum(low, 0), np.minimum(high, inside.shape)
-    return slice(low[0], high[0]), slice(low[1], high[1]), slice(low[2], high[2])
+    return box(np.maximum(low, 0), np.minimum(high, inside.shape))
 
 
-def _depths(body: Body, through: int, box: Box) -> tuple[Float, Float]:
+def _depths(body: Body, through: int, part: Box) -> tuple[Float, Float]:
     """Depths of the box's voxels inside the planes at its first and last slices, mm."""
-    order = [through, *(axis for axis in range(3) if axis != through)]
-    index = np.meshgrid(*(np.arange(part.start, part.stop) for part in box), indexing="ij")
-    points = np.stack(index, axis=-1) @ body.affine[:3, order].T + body.affine[:3, 3]
+    index = np.meshgrid(*(np.arange(side.start, side.stop) for side in part), indexing="ij")
+    columns = [*_order(through), 3]
+    points = to_ras(np.stack(index, axis=-1), body.affine[:, columns])
     posterior = body.ends.height(points, "posterior")
     anterior = -body.ends.height(points, "anterior")
-    return (posterior, anterior) if _goes_forward(body, through) else (anterior, posterior)
+    return (posterior, anterior) if _runs_forward(body, through) else (anterior, posterior)
 
 
-def _continue(
+def _extrapolate(
     tissue: NDArray[np.uint8], hidden: Bool, pixel: float, settings: SliceSettings
 ) -> None:
-    """Fill in, in place, what end labels hide of oblique first slices, as the next ones suggest.
+    """Extrapolate, in place, what end labels hide of oblique first slices.
 
     Left empty, the hidden part would thin the sheet up to a slice's thickness inside the plane.
     """
-    parted = np.flatnonzero((hidden[:-2] & (tissue[1:-1] > 0)).any(axis=(1, 2)))
+    cut = np.flatnonzero((hidden[:-2] & (tissue[1:-1] > 0)).any(axis=(1, 2)))
     up = settings.upsampling
     where = np.indices(tissue.shape[1:], dtype=np.float32).reshape(2, -1) * up + 0.5 * (up - 1)
     level = np.full(where.shape[1], -1.0, dtype=np.float32)
-    for number in range(int(parted.max(initial=-1)), -1, -1):
+    for number in range(int(cut.max(initial=-1)), -1, -1):
         stack = _stacked(tissue[number + 1 : number + 3], pixel, settings)
         expected = stack.blend(level, where).reshape(tissue.shape[1:]) > 0
         inner = tissue[number + 1]

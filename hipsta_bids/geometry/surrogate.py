@@ -1,7 +1,8 @@
 """Thickness from single slices without a mesh: a cross-check of unexpected findings.
 
-As the image-based check of Diers et al. 2023: the medial axis of the merged labels in a slice, the
-closest points of the contour on both sides, at places proportional or equidistant along the axis.
+As in the image-based check of Diers et al. 2023, thickness is measured from the medial axis of the
+merged labels in a slice to the closest points of the contour on both sides, at proportional or
+equidistant points of the axis, and compared with that of a sheet nearby.
 """
 
 from dataclasses import dataclass
@@ -16,40 +17,38 @@ from skimage.morphology import skeletonize
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
+from hipsta_bids.geometry.digital import piece_sizes
 from hipsta_bids.geometry.grid import in_plane_voxel
 from hipsta_bids.settings import SheetSettings, SurrogateSettings
 from hipsta_bids.types import Bool, Float
 
-#: How points are spread along the medial axis.
-PROPORTIONAL, EQUIDISTANT = "proportional", "equidistant"
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SurrogateProfile:
-    """Thickness along the medial axis of one slice, from medial to lateral; all arrays (N,)."""
+    """Thickness along the medial axis of one slice, from medial to lateral."""
 
     position: float
-    """Of the slice: fraction of the body's length from its posterior end."""
+    """Fraction of the body's length from its posterior end to the slice."""
     sampling: str
-    """``proportional`` or ``equidistant``."""
+    """Spacing of the points along the axis: ``proportional`` or ``equidistant``."""
     fraction: Float
-    """Of the axis, 0 at the medial and 1 at the lateral rim."""
+    """(N,) fraction of the axis, 0 at the medial and 1 at the lateral edge of the sheet."""
     distance: Float
-    """From the medial rim along the axis, mm."""
+    """(N,) distance from the medial edge along the axis, mm."""
     points: Float
     """(N, 3) RAS mm."""
     thickness: Float
-    """Distances to the closest points of the contour on both sides, added, mm."""
+    """(N,) distances to the closest points of the contour on both sides, added, mm."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Slice:
+class _Slice:
     """A slice of the merged labels, drawn on fine pixels."""
 
     values: Float
     """(A, B) share of the pixel that is inside; the contour is where it is a half."""
     inside: Bool
-    """(A, B) one piece without small holes."""
+    """(A, B) whether a pixel is inside; one piece without small holes."""
     origin: Float
     """(3,) RAS mm of the first pixel."""
     directions: Float
@@ -63,39 +62,43 @@ class Slice:
 def surrogate_profiles(
     body: Body, position: float, sheet: SheetSettings, settings: SurrogateSettings
 ) -> tuple[SurrogateProfile, SurrogateProfile]:
-    """Measure thickness along the medial axis of one slice."""
+    """Measure thickness in one slice at points proportional and equidistant along its axis.
+
+    Proportional points are those at which the sheet has its nodes along x.
+    """
     cut = draw_slice(body, position, settings)
     axis = _from_medial(body, cut, _medial_axis(cut, position, settings))
-    sides = _sides(cut, axis)
-    steps = np.linalg.norm(np.diff(axis, axis=0), axis=1) * settings.pixel
-    along = np.concatenate([[0.0], steps.cumsum()])
+    first, second = (cKDTree(side) for side in _sides(cut, axis))
+    along = _path_lengths(axis, settings.pixel)
     nodes = np.linspace(-sheet.x_extent, sheet.x_extent, sheet.x_nodes)
-    places = {
-        PROPORTIONAL: along[-1] * (nodes + 1) / 2,
-        EQUIDISTANT: np.arange(settings.step, along[-1], settings.step),
-    }
-    index = {
-        sampling: np.stack([np.interp(at, along, axis[:, k]) for k in (0, 1)], axis=1)
-        for sampling, at in places.items()
-    }
-    first, second = (
-        SurrogateProfile(
+
+    def profile(sampling: str, distance: Float) -> SurrogateProfile:
+        index = np.stack([np.interp(distance, along, axis[:, k]) for k in (0, 1)], axis=1)
+        return SurrogateProfile(
             position=position,
             sampling=sampling,
-            fraction=at / along[-1],
-            distance=at,
-            points=cut.to_ras(index[sampling]),
-            thickness=_wall(index[sampling], sides) * settings.pixel,
+            fraction=distance / along[-1],
+            distance=distance,
+            points=cut.to_ras(index),
+            thickness=np.asarray(first.query(index)[0] + second.query(index)[0]) * settings.pixel,
         )
-        for sampling, at in places.items()
+
+    return (
+        profile("proportional", along[-1] * (nodes + 1) / 2),
+        profile("equidistant", np.arange(settings.step, along[-1], settings.step)),
     )
-    return first, second
 
 
-def draw_slice(body: Body, position: float, settings: SurrogateSettings) -> Slice:
+def _path_lengths(index: Float, pixel: float) -> Float:
+    """Length of a path through pixels (N, 2) up to each of its points, (N,)."""
+    steps = np.linalg.norm(np.diff(index, axis=0), axis=1) * pixel
+    return np.append(0.0, steps.cumsum())
+
+
+def draw_slice(body: Body, position: float, settings: SurrogateSettings) -> _Slice:
     """Draw the merged labels where a plane between the end planes cuts them.
 
-    The plane turns from the posterior to the anterior end plane as it moves along the body.
+    The plane rotates from the posterior to the anterior end plane as it moves along the body.
     """
     ends, (_, points) = body.ends, body.inside_points()
     normal = (1 - position) * ends.posterior_normal + position * ends.anterior_normal
@@ -104,10 +107,7 @@ def draw_slice(body: Body, position: float, settings: SurrogateSettings) -> Slic
     normal, height = normal / np.linalg.norm(normal), height / np.linalg.norm(normal)
     near = np.abs(height) < 2 * ends.half_slice
     if not near.any():
-        raise GeometryError(
-            f"no labels at {position:.0%} of the body's length: choose another slice",
-            reason="surrogate-empty",
-        )
+        raise _empty(position)
     flat = points[near] - height[near, None] * normal
     across = np.eye(3)[np.abs(normal).argmin()]
     first = np.cross(normal, across)
@@ -129,7 +129,7 @@ def draw_slice(body: Body, position: float, settings: SurrogateSettings) -> Slic
     )[..., 0]
     sigma = settings.smoothing * in_plane_voxel(body.affine) / settings.pixel
     values = ndimage.gaussian_filter(values, sigma)
-    return Slice(
+    return _Slice(
         values=values,
         inside=_one_piece(values > 0.5, position, settings),  # noqa: PLR2004 -- half inside
         origin=origin,
@@ -137,15 +137,19 @@ def draw_slice(body: Body, position: float, settings: SurrogateSettings) -> Slic
     )
 
 
+def _empty(position: float) -> GeometryError:
+    return GeometryError(
+        f"no labels at {position:.0%} of the body's length: choose another slice",
+        reason="surrogate-empty",
+    )
+
+
 def _one_piece(inside: Bool, position: float, settings: SurrogateSettings) -> Bool:
     """Take the largest piece, fill its small holes, and refuse others."""
     pieces, _ = ndimage.label(inside)
     if not inside.any():
-        raise GeometryError(
-            f"no labels at {position:.0%} of the body's length: choose another slice",
-            reason="surrogate-empty",
-        )
-    largest = pieces == np.bincount(pieces.ravel())[1:].argmax() + 1
+        raise _empty(position)
+    largest = pieces == piece_sizes(pieces).argmax()
     # Pixels that touch by corners only separate inside, and connect outside.
     outside, count = ndimage.label(~largest, structure=np.ones((3, 3)))
     small = np.bincount(outside.ravel(), minlength=count + 1) * settings.pixel**2
@@ -160,14 +164,14 @@ def _one_piece(inside: Bool, position: float, settings: SurrogateSettings) -> Bo
     return np.asarray(largest | hole[outside])
 
 
-def _medial_axis(cut: Slice, position: float, settings: SurrogateSettings) -> Float:
-    """Longest path through the skeleton, smooth, and straight on to the rims: (N, 2) indices."""
+def _medial_axis(cut: _Slice, position: float, settings: SurrogateSettings) -> Float:
+    """Find the smoothed longest path through the skeleton, extended to both edges, (N, 2)."""
     skeleton = skeletonize(cut.inside)  # type: ignore[no-untyped-call]
     pixels = np.argwhere(skeleton)
     path = pixels[_longest_path(pixels)].astype(np.float64)
     depth = ndimage.distance_transform_edt(cut.inside)
     half = depth[tuple(path.astype(int).T)]
-    along = np.concatenate([[0.0], np.linalg.norm(np.diff(path, axis=0), axis=1).cumsum()])
+    along = _path_lengths(path, 1.0)
     middle = (along > 0.2 * along[-1]) & (along < 0.8 * along[-1])  # without forks
     width = float(np.median(half[middle])) if middle.any() else 0.0
     trim = settings.fork * width
@@ -181,11 +185,9 @@ def _medial_axis(cut: Slice, position: float, settings: SurrogateSettings) -> Fl
     sigma = settings.axis_smoothing / settings.pixel
     smooth = ndimage.gaussian_filter1d(path, sigma, axis=0, mode="nearest")[kept]
     back = min(max(int(2 * width), 2), len(smooth) - 1)
-    ends = (
-        _to_the_rim(cut, smooth[0], smooth[0] - smooth[back])[::-1],
-        _to_the_rim(cut, smooth[-1], smooth[-1] - smooth[-1 - back]),
-    )
-    return np.concatenate([ends[0], smooth, ends[1]])
+    start = _to_the_edge(cut, smooth[0], smooth[0] - smooth[back])[::-1]
+    stop = _to_the_edge(cut, smooth[-1], smooth[-1] - smooth[-1 - back])
+    return np.concatenate([start, smooth, stop])
 
 
 def _longest_path(pixels: NDArray[np.intp]) -> NDArray[np.intp]:
@@ -193,7 +195,7 @@ def _longest_path(pixels: NDArray[np.intp]) -> NDArray[np.intp]:
     pairs = cKDTree(pixels).query_pairs(1.5, output_type="ndarray")
     length = np.linalg.norm(pixels[pairs[:, 0]] - pixels[pairs[:, 1]], axis=1)
     graph = sparse.csr_matrix((length, pairs.T), shape=(len(pixels), len(pixels)))
-    # In a tree, what is farthest from anywhere is an end of the longest path.
+    # In a tree, the point farthest from any other is an end of the longest path.
     start = int(dijkstra(graph, directed=False, indices=np.array([0]))[0].argmax())
     from_start = dijkstra(graph, directed=False, indices=np.array([start]))[0]
     from_end = dijkstra(graph, directed=False, indices=np.array([from_start.argmax()]))[0]
@@ -201,52 +203,44 @@ def _longest_path(pixels: NDArray[np.intp]) -> NDArray[np.intp]:
     return np.asarray(on_path[np.argsort(from_start[on_path], kind="stable")])
 
 
-def _to_the_rim(cut: Slice, start: Float, direction: Float) -> Float:
-    """Points (M, 2) straight on from an end of the axis until the slice ends."""
+def _to_the_edge(cut: _Slice, start: Float, direction: Float) -> Float:
+    """Extend an end of the axis straight to the edge of the slice by points (M, 2)."""
     steps = np.arange(1, sum(cut.inside.shape))[:, None]
     ray = start + steps * direction / np.linalg.norm(direction)
     within = ndimage.map_coordinates(cut.inside.astype(np.uint8), ray.T, order=0) > 0
     return np.asarray(ray[: int(np.argmin(within))])
 
 
-def _from_medial(body: Body, cut: Slice, axis: Float) -> Float:
-    """Turn the axis so that it runs from medial to lateral, by the labels along it."""
-    inverse = np.linalg.inv(body.affine)
-    index = cut.to_ras(axis) @ inverse[:3, :3].T + inverse[:3, 3]
+def _from_medial(body: Body, cut: _Slice, axis: Float) -> Float:
+    """Order the axis from medial to lateral, by the labels along it."""
+    index = body.to_voxels(cut.to_ras(axis))
     labels = ndimage.map_coordinates(body.tissue, index.T, order=0)
     known = np.flatnonzero(labels)
     trend = float(((known - known.mean()) * labels[known]).sum()) if known.size else 0.0
     return axis if trend >= 0 else axis[::-1]
 
 
-def _sides(cut: Slice, axis: Float) -> tuple[Float, Float]:
-    """Cut the contour at both rims: two lines of points, (M, 2) each."""
+def _sides(cut: _Slice, axis: Float) -> tuple[Float, Float]:
+    """Cut the contour at both ends of the axis into two lines of points, (M, 2) each."""
     held = np.where(cut.inside, np.maximum(cut.values, 0.5 + 1e-6), np.minimum(cut.values, 0.5))
     lines = find_contours(held, 0.5 + 5e-7)  # type: ignore[no-untyped-call]
     contour = max(lines, key=len)[:-1]
     first, second = (int(cKDTree(contour).query(end)[1]) for end in (axis[0], axis[-1]))
-    turned = np.roll(contour, -first, axis=0)
+    contour = np.roll(contour, -first, axis=0)
     middle = (second - first) % len(contour)
-    return turned[: middle + 1], np.concatenate([turned[middle:], turned[:1]])
-
-
-def _wall(index: Float, sides: tuple[Float, Float]) -> Float:
-    """Add the distances (N,) from points to the closest points of both sides, pixels."""
-    return np.asarray(sum(cKDTree(side).query(index)[0] for side in sides))
-
-
-# Two measures of the same thing, at the same places.
+    return contour[: middle + 1], np.concatenate([contour[middle:], contour[:1]])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Agreement:
-    """How well two measures of thickness at the same places agree."""
+    """How well two measures of thickness at the same points agree."""
 
     count: int
-    """Places where both are known."""
+    """Number of points at which both are known."""
     correlation: float
+    """Pearson's correlation."""
     slope: float
-    """Of the first on the second, by least squares."""
+    """Slope of the first on the second, by least squares."""
     difference: float
     """Mean of the first minus the second, mm."""
     deviation: float
@@ -254,10 +248,9 @@ class Agreement:
 
 
 def compare_nearby(points: Float, surface: Float, values: Float, reach: float) -> Float:
-    """Look up values of a surface near points.
+    """Interpolate values (M,) of surface points (M, 3) at points (N, 3) within ``reach`` mm.
 
-    ``points`` RAS mm; ``surface`` RAS mm, NaN where undefined; ``values`` NaN where missing;
-    ``reach`` mm. Returns NaN where the nearest lies farther away than ````reach````.
+    The result is NaN where no known value is near.
     """
     known = np.isfinite(surface).all(axis=-1) & np.isfinite(values)
     if not known.any():
@@ -271,19 +264,21 @@ def compare_nearby(points: Float, surface: Float, values: Float, reach: float) -
 
 
 def agreement(first: Float, second: Float) -> Agreement:
-    """Compare two measures (N,), mm, where both are known; NaN with fewer than three places."""
+    """Compare two measures (N,), mm, where both are known; NaN with fewer than three points."""
     known = np.isfinite(first) & np.isfinite(second)
     a, b = first[known], second[known]
-    few = len(a) < 3  # noqa: PLR2004 -- a line through two points is always perfect
-    if few or not np.ptp(a) or not np.ptp(b):
-        nan = float("nan")
-        off = float((a - b).mean()) if len(a) else nan
-        return Agreement(count=len(a), correlation=nan, slope=nan, difference=off, deviation=nan)
-    covariance = np.cov(a, b)
+    difference = float((a - b).mean()) if len(a) else np.nan
+    correlation = slope = deviation = np.nan
+    # A line through two points is always perfect.
+    if len(a) > 2 and np.ptp(a) and np.ptp(b):  # noqa: PLR2004
+        covariance = np.cov(a, b)
+        correlation = float(covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1]))
+        slope = float(covariance[0, 1] / covariance[1, 1])
+        deviation = float((a - b).std(ddof=1))
     return Agreement(
         count=len(a),
-        correlation=float(covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1])),
-        slope=float(covariance[0, 1] / covariance[1, 1]),
-        difference=float((a - b).mean()),
-        deviation=float((a - b).std(ddof=1)),
+        correlation=correlation,
+        slope=slope,
+        difference=difference,
+        deviation=deviation,
     )

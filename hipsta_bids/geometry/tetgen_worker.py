@@ -1,9 +1,10 @@
 """TetGen in a process of its own.
 
-TetGen aborts the whole process on some self-intersecting surfaces, sometimes without an
-exception. This module is run as a program that meshes one surface after the other, and
-holds the client that starts it, waits, and starts a new one after a crash. Messages are pickles
-with a length in front, over the standard streams.
+TetGen aborts the whole process on some self-intersecting surfaces, sometimes without an exception.
+This module is run as a program that meshes one surface after the other, and holds the client that
+starts it, waits, and starts it again after a crash. Messages are pickles with their length in
+front, over the standard streams. The file stands alone, with its own types, because the program
+must start fast and hold little memory: it loads nothing but NumPy and TetGen.
 """
 
 import atexit
@@ -37,33 +38,27 @@ class TetgenClient:
     def mesh(
         self, vertices: Float, triangles: Int, options: dict[str, Any], timeout: float
     ) -> tuple[Float, NDArray[Any]] | str:
-        """Tetrahedralize one closed surface.
-
-        Returns Vertices (V, 3) and tetrahedra (T, 4), or why there are none.
-        """
-        reply = self._ask((vertices, triangles, options), timeout)
-        return reply if isinstance(reply, str) else (reply[0], reply[1])
-
-    def _ask(self, request: tuple[Any, ...], timeout: float) -> Any:  # noqa: ANN401 -- any reply
+        """Return vertices (V, 3) and tetrahedra (T, 4) that fill a surface, or why none do."""
         process = self._running()
         try:
-            _write(_pipe(process.stdin), request)
-            return _read(_pipe(process.stdout), deadline=time.monotonic() + timeout)
+            _write(_pipe(process.stdin), (vertices, triangles, options))
+            reply = _read(_pipe(process.stdout), deadline=time.monotonic() + timeout)
         except (BrokenPipeError, EOFError):
             code = self._stop()
             return f"TetGen crashed (exit status {code})"
         except TimeoutError:
             self._stop()
             return f"TetGen took longer than {timeout:g} s"
+        return reply if isinstance(reply, str) else (reply[0], reply[1])
 
     def _running(self) -> subprocess.Popen[bytes]:
         if self._process is None or self._owner != os.getpid() or self._process.poll() is not None:
             self._stop()
             environment = dict(os.environ, OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
-            # Where this process is shielded from the user's Python settings, so is the other.
-            shield = ["-I"] if sys.flags.isolated else []
+            # A process that is isolated from the user's Python settings starts an isolated one.
+            isolated = ["-I"] if sys.flags.isolated else []
             self._process = subprocess.Popen(  # noqa: S603 -- our own module
-                [sys.executable, *shield, "-m", __name__],
+                [sys.executable, *isolated, "-m", __name__],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
@@ -120,8 +115,8 @@ def _exactly(stream: IO[bytes], size: int, deadline: float | None) -> bytes:
 
 
 def _serve() -> None:
-    """Answer requests until the caller goes away."""
-    # TetGen prints; its words must not land between the messages.
+    """Answer requests until the caller ends."""
+    # TetGen prints: keep that apart from the messages.
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     while True:
@@ -136,7 +131,7 @@ def _serve() -> None:
 
 
 def _mesh(vertices: Float, triangles: Int, options: dict[str, Any]) -> tuple[Float, NDArray[Any]]:
-    from tetgen import TetGen  # noqa: PLC0415 -- only the child needs it
+    from tetgen import TetGen  # noqa: PLC0415 -- only the worker process needs it
 
     # TetGen writes the triangles that it could not use into the working folder.
     with (

@@ -1,80 +1,43 @@
-"""Repair of a field's topology: one solid ribbon without holes, bridges or cavities."""
+"""Repair of a field's topology: one solid ribbon without holes, bridges or cavities.
+
+Also a field that marching cubes reads as digital topology does, and the columns of the sheet that
+rest on repaired voxels.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry.digital import box_around, low_corner
-from hipsta_bids.geometry.grid import Field
-from hipsta_bids.geometry.membranes import (
+from hipsta_bids.geometry.digital import (
     ALL,
-    CORNER,
     FACES,
+    FIRST,
     INNER,
     PAD,
     Edit,
+    Index,
     Kind,
     apply_membranes,
+    box_around,
     euler,
+    low_corner,
     with_plates,
 )
+from hipsta_bids.geometry.grid import Field
 from hipsta_bids.settings import MeasureSettings, TopologySettings
-from hipsta_bids.types import Bool, Float, Sheet
-
-# Fields whose sign marching cubes reads as digital topology does.
-
-
-def consistent_values(values: NDArray[np.float32], after: Bool) -> NDArray[np.float32]:
-    """Make the field's sign that of the repaired body, and marching cubes agree with it.
-
-    Where the sign is ambiguous on a face or inside a cube, marching cubes decides by the values;
-    small positive and larger negative ones keep foreground corners apart, as 6-connectivity does.
-    """
-    result = np.where(after, np.maximum(values, 0.01), np.minimum(values, -0.01))
-    edited = after != (values > 0)
-    result = np.where(edited, np.where(after, 0.1, -0.1), result)
-    corners = np.zeros(after.shape, dtype=bool)
-    for axis in range(3):
-        a = np.moveaxis(after, axis, 0)
-        faces = (a[:, 1:, 1:] == a[:, :-1, :-1]) & (a[:, 1:, :-1] == a[:, :-1, 1:])
-        faces &= a[:, 1:, 1:] != a[:, 1:, :-1]
-        _mark(np.moveaxis(corners, axis, 0), faces, cube=False)
-    opposite = np.zeros(tuple(n - 1 for n in after.shape), dtype=bool)
-    total = after.astype(np.int8)
-    for axis in range(3):
-        total = np.take(total, range(1, total.shape[axis]), axis) + np.take(
-            total, range(total.shape[axis] - 1), axis
-        )
-    for dx, dy in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        first = after[dx : dx - 1 or None, dy : dy - 1 or None, :-1]
-        last = after[1 - dx : -dx or None, 1 - dy : -dy or None, 1:]
-        opposite |= first & last & (total == 2)  # noqa: PLR2004 -- two opposite corners only
-        opposite |= ~first & ~last & (total == 6)  # noqa: PLR2004 -- the reverse
-    _mark(corners, opposite, cube=True)
-    positive = np.minimum(result, 0.03)
-    negative = np.minimum(result, -0.08)
-    return np.where(corners, np.where(after, positive, negative), result).astype(np.float32)
-
-
-def _mark(corners: Bool, cells: Bool, *, cube: bool) -> None:
-    """Mark the corners of flagged faces (first axis runs over nodes) or cubes, in place."""
-    for dx in (0, 1) if cube else (None,):
-        for dy in (0, 1):
-            for dz in (0, 1):
-                first = slice(None) if dx is None else slice(dx, dx - 1 or None)
-                corners[first, dy : dy - 1 or None, dz : dz - 1 or None] |= cells
-
+from hipsta_bids.types import Bool, Float, Sheet, position_text
 
 Locate = Callable[[Float], str]
-"""Names the subfields at (N, 3) points, RAS mm."""
+"""Function that names the subfields at (N, 3) points, RAS mm."""
 Contact = Callable[[Float], bool]
-"""Whether two turns of the sheet touch at (N, 3) points, RAS mm, by their labels."""
+"""Function that says whether, by the labels, two turns touch at (N, 3) points, RAS mm."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,13 +51,14 @@ class Repair:
     """Changed nodes of the working grid."""
     cost: float
     """How much evidence was overruled: sum of the field's distance from its level. For a filled
-    hole, of the membrane alone, without what made it as thick as the wall."""
+    hole, of the membrane alone, before it was made as thick as the wall."""
     position: tuple[float, float, float]
     """Center, RAS mm."""
     subfield: str = ""
-    """Subfield there, if known."""
+    """Subfields at the center, if known."""
     large: bool
-    """Worth a look: beyond the limits of :class:`TopologySettings`, or against the ribbon's run."""
+    """Whether it is beyond the limits of :class:`TopologySettings`, or contradicts the run of the
+    ribbon, and a person should look at it."""
 
     def __str__(self) -> str:
         what = {
@@ -105,7 +69,9 @@ class Repair:
             "island": "removed a separate piece",
             "cavity": "filled a cavity",
         }[self.kind]
-        return f"{what} of {self.voxels} grid nodes at {_place(self.position, self.subfield)}"
+        return (
+            f"{what} of {self.voxels} grid nodes at {position_text(self.position, self.subfield)}"
+        )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -113,12 +79,15 @@ class SolidField:
     """A field whose positive part is a ball together with plates on both ends."""
 
     field: Field
+    """Field after all repairs."""
     repairs: tuple[Repair, ...]
+    """Changes that were made, in their order."""
     touched: Bool
     """(A, B, W) nodes whose side was changed."""
     euler_before: int
-    """Euler number of the body's voxels; 1 is right."""
+    """Euler number of the body's voxels before the repairs; 1 is right."""
     euler_after: int
+    """Euler number after the repairs; 1."""
     changed_fraction: float
     """Changed nodes over the nodes of the body."""
 
@@ -131,16 +100,17 @@ def repair_topology(
 ) -> SolidField:
     """Make the positive part of a field one solid piece without tunnels.
 
-    Solid plates beyond both ends turn several cap pieces into an ordinary tunnel. Growing from
-    inside by simple points stops at the membranes that cut every tunnel; shrinking from outside
-    stops at those that fill it. The cheaper membrane of each tunnel is applied. (The two-sided
-    use of homotopic growing follows Kriegeskorte & Goebel 2001, NeuroImage 14:329-346.)
+    Solid plates beyond both ends make an ordinary tunnel of several cap pieces. Growing from inside
+    by simple points stops at the membranes that cut every tunnel; shrinking from outside stops at
+    those that fill it. The cheaper membrane of each tunnel is applied. (The two-sided use of
+    homotopic growing follows Kriegeskorte & Goebel 2001, NeuroImage 14:329-346.)
     """
     values = field.values
     before = values > 0
     if not before.any():
         raise GeometryError(
-            "nothing is left of the body after smoothing: the sheet is too thin for its voxels",
+            "nothing is left of the body after smoothing: the sheet is too thin for its voxels; "
+            "use a finer segmentation",
             reason="sheet-too-thin",
         )
     state = np.pad(before, PAD)
@@ -149,8 +119,8 @@ def repair_topology(
     lifted = padded.copy()
     _refuse_strips(state, field, settings, locate)
 
-    def touching(where: NDArray[np.intp]) -> bool:
-        return contact is not None and contact(field.grid.to_ras((where - CORNER).astype(float)))
+    def touching(where: Index) -> bool:
+        return contact is not None and contact(field.grid.to_ras((where - FIRST).astype(float)))
 
     edits = _before_smoothing(field)
     edits += _remove_islands(state, field, locate) + _fill_cavities(state)
@@ -158,7 +128,7 @@ def repair_topology(
         wrong = [plates for plates in (False, True) if euler(state, plates=plates) != 1]
         if not wrong:
             break
-        # Only once the body itself is sound: the inside of a closed tube is no pit.
+        # Pits only once the body itself is sound: the inside of a closed tube is none.
         pits = _fill_cavities(state, plates=True) if wrong[0] else []
         found = pits or apply_membranes(
             state, padded, lifted, settings, plates=wrong[0], contact=touching
@@ -174,11 +144,12 @@ def repair_topology(
     changed = after != before
     if field.slits is not None:
         changed |= field.slits
+    touched = changed if field.separated is None else changed | field.separated
     repairs = tuple(_describe(edit, field, size, settings, locate) for edit in edits)
     return SolidField(
-        field=Field(grid=field.grid, values=consistent_values(lifted[INNER], after)),
+        field=Field(grid=field.grid, values=_consistent_values(lifted[INNER], after)),
         repairs=repairs,
-        touched=changed if field.parted is None else changed | field.parted,
+        touched=touched,
         euler_before=euler_before,
         euler_after=euler(state),
         changed_fraction=float(np.count_nonzero(changed) / size),
@@ -186,21 +157,20 @@ def repair_topology(
 
 
 def _before_smoothing(field: Field) -> list[Edit]:
-    """List what was taken out between turns that touch, and what was filled."""
+    """List what was removed between turns that touch, and what was filled, before smoothing."""
     edits = []
-    if field.parted is not None and field.parted.any():
-        edits.append(Edit("part", np.argwhere(field.parted) + CORNER))
+    if field.separated is not None and field.separated.any():
+        edits.append(Edit("part", np.argwhere(field.separated) + FIRST))
     if field.slits is not None:
         pieces, count = ndimage.label(field.slits, structure=ALL)
-        edits += [Edit("slit", np.argwhere(pieces == n + 1) + CORNER) for n in range(count)]
+        edits += [Edit("slit", np.argwhere(pieces == n + 1) + FIRST) for n in range(count)]
     return edits
 
 
 def _through_pieces(state: Bool) -> tuple[NDArray[Any], int, NDArray[Any]]:
-    """Pieces of the body, their number, and which of them reach from plate to plate.
+    """Pieces of the body, their number, and those from plate to plate, the largest first.
 
-    The largest comes first. The plates are left out of the count, or a fragment that touches one of
-    them would count as connected.
+    The plates are left out, or a fragment that touches one of them would count as connected.
     """
     pieces, count = ndimage.label(state[INNER], structure=FACES)
     through = np.intersect1d(pieces[:, :, 0], pieces[:, :, -1])
@@ -219,7 +189,7 @@ def _has_strips(state: Bool, settings: TopologySettings) -> bool:
 def _refuse_strips(
     state: Bool, field: Field, settings: TopologySettings, locate: Locate | None
 ) -> None:
-    """Refuse a ribbon that a gap parts from end to end, and say where."""
+    """Refuse a ribbon that a gap divides from end to end, and say where."""
     if not _has_strips(state, settings):
         return
     pieces, _, through = _through_pieces(state)
@@ -228,9 +198,9 @@ def _refuse_strips(
     other = nearest[:, *facing.T].T
     center = 0.5 * (facing.mean(axis=0) + other.mean(axis=0))
     names = locate(field.grid.to_ras(np.vstack([facing, other]).astype(float))) if locate else ""
-    place = _place(field.grid.to_ras(center[None])[0], names)
+    at = position_text(field.grid.to_ras(center[None])[0], names)
     raise GeometryError(
-        f"a gap parts the sheet into {len(through)} strips from end to end, at {place}: "
+        f"a gap divides the sheet into {len(through)} strips from end to end, at {at}: "
         "fill it in the labels, or check that the protocol fits them",
         reason="body-split",
     )
@@ -239,34 +209,28 @@ def _refuse_strips(
 def _unrepaired(
     edits: list[Edit], state: Bool, field: Field, locate: Locate | None
 ) -> GeometryError:
-    """Say where the largest of the repairs was tried that did not lead to one solid piece."""
+    """Report the largest of the repairs that did not lead to one solid piece."""
     nothing = Edit("cut", np.argwhere(state))
     where = max(edits, key=lambda edit: len(edit.where), default=nothing).where
-    point = field.grid.to_ras((where - CORNER).mean(axis=0, keepdims=True))
-    place = _place(point[0], locate(point) if locate else "")
+    point = field.grid.to_ras((where - FIRST).mean(axis=0, keepdims=True))
+    at = position_text(point[0], locate(point) if locate else "")
     return GeometryError(
         f"the labels have holes or bridges that could not be repaired (Euler number "
         f"{euler(state)}, with closed ends {euler(state, plates=True)}, instead of 1), the "
-        f"largest near {place}: correct the labels there by hand",
+        f"largest near {at}: correct the labels there by hand",
         reason="topology",
     )
 
 
-def _place(point: Float | tuple[float, float, float], subfield: str) -> str:
-    """Spell a place for people."""
-    words = " ".join(f"{value:.1f}" for value in point)
-    return f"RAS {words} mm ({subfield})" if subfield else f"RAS {words} mm"
-
-
-def _interrupted(pieces: NDArray[np.intp], field: Field, locate: Locate | None) -> GeometryError:
-    """Say where the pieces that come from both ends are closest to each other."""
+def _interrupted(pieces: Index, field: Field, locate: Locate | None) -> GeometryError:
+    """Report where the body ends that begins at the posterior plane."""
     first = int(np.flatnonzero((pieces > 0).any(axis=(0, 1)))[0])
     nodes = np.argwhere(np.isin(pieces, np.unique(pieces[:, :, first])) & (pieces > 0))
     level = nodes[:, 2].max() if first == 0 else first
     point = field.grid.to_ras(nodes[nodes[:, 2] == level].astype(float))
-    place = _place(point.mean(axis=0), locate(point) if locate else "")
+    at = position_text(point.mean(axis=0), locate(point) if locate else "")
     return GeometryError(
-        f"the body is interrupted at {place}: no connected path of its labels leads from the "
+        f"the body is interrupted at {at}: no connected path of its labels leads from the "
         "posterior to the anterior end plane; fill in missing slices, correct head and tail labels "
         "inside the body, or use a finer segmentation of a thin sheet",
         reason="body-interrupted",
@@ -274,7 +238,7 @@ def _interrupted(pieces: NDArray[np.intp], field: Field, locate: Locate | None) 
 
 
 def _remove_islands(state: Bool, field: Field, locate: Locate | None) -> list[Edit]:
-    """Remove all but the largest piece that reaches from plate to plate (in place)."""
+    """Remove (in place) all but the largest piece that reaches from plate to plate."""
     pieces, count, through = _through_pieces(state)
     if not len(through):
         raise _interrupted(pieces, field, locate)
@@ -282,17 +246,14 @@ def _remove_islands(state: Bool, field: Field, locate: Locate | None) -> list[Ed
         return []
     state[INNER] &= pieces == through[0]
     return [
-        Edit("island", np.argwhere(pieces == n) + CORNER)
+        Edit("island", np.argwhere(pieces == n) + FIRST)
         for n in range(1, count + 1)
         if n != through[0]
     ]
 
 
 def _fill_cavities(state: Bool, *, plates: bool = False) -> list[Edit]:
-    """Fill background that does not reach the border (in place).
-
-    With plates, pits that open at an end plane only are cavities too.
-    """
+    """Fill (in place) background that does not reach the border, or with plates that cannot."""
     solid = with_plates(state, True) if plates else state
     pieces, count = ndimage.label(~solid, structure=ALL)
     if count == 1:
@@ -305,51 +266,71 @@ def _fill_cavities(state: Bool, *, plates: bool = False) -> list[Edit]:
 def _describe(
     edit: Edit, field: Field, size: int, settings: TopologySettings, locate: Locate | None
 ) -> Repair:
+    """Locate one change, and find out whether it is large."""
     kind, where = edit.kind, edit.where
-    nodes: Float = where - CORNER
-    centre = field.grid.to_ras(nodes.mean(axis=0, keepdims=True))[0]
-    inside = np.clip(where - CORNER, 0, np.array(field.grid.shape) - 1)
+    center = field.grid.to_ras((where - FIRST).mean(axis=0, keepdims=True))[0]
+    inside = np.clip(where - FIRST, 0, np.array(field.grid.shape) - 1)
     cost = edit.cost or float(np.abs(field.values[tuple(inside.T)]).sum())
     share = settings.flag_part if kind == "part" else settings.flag_fraction
-    limit = {
-        "cut": settings.flag_cut_cost,
-        "fill": settings.flag_fill_cost,
-    }.get(kind, np.inf)
+    limit = {"cut": settings.flag_cut_cost, "fill": settings.flag_fill_cost}.get(kind, np.inf)
     return Repair(
         kind=kind,
         voxels=len(where),
         cost=cost,
-        position=(float(centre[0]), float(centre[1]), float(centre[2])),
-        subfield=locate(centre[None]) if locate else "",
+        position=(float(center[0]), float(center[1]), float(center[2])),
+        subfield=locate(center[None]) if locate else "",
         large=bool(
             edit.doubtful
             or cost > limit
             or len(where) > share * size
-            or (kind == "fill" and _beside_part(inside, field))
+            or (kind == "fill" and _beside_slit(inside, field))
         ),
     )
 
 
-def _beside_part(nodes: NDArray[np.intp], field: Field) -> bool:
-    """Whether a hole lies next to a slit between turns: it went through a wall, not between two."""
-    if field.parted is None:
+def _beside_slit(nodes: Index, field: Field) -> bool:
+    """Whether a hole lies next to a slit between turns, which then went through a wall."""
+    if field.separated is None:
         return False
-    near = ndimage.binary_dilation(field.parted, structure=ALL, iterations=2)
+    near = ndimage.binary_dilation(field.separated, structure=ALL, iterations=2)
     return bool(near[tuple(nodes.T)].any())
 
 
-# Which columns of the sheet rest on repaired voxels.
+def _consistent_values(values: NDArray[np.float32], after: Bool) -> NDArray[np.float32]:
+    """Give the field the sign of the repaired body, and marching cubes the same topology.
 
-
-_ALL = np.ones((3, 3, 3), dtype=bool)
+    Where the sign is ambiguous on a face or inside a cube, marching cubes decides by the values;
+    small positive and larger negative ones keep foreground corners apart, as 6-connectivity does.
+    """
+    result = np.where(after, np.maximum(values, 0.01), np.minimum(values, -0.01))
+    edited = after != (values > 0)
+    result = np.where(edited, np.where(after, 0.1, -0.1), result)
+    corners = np.zeros(after.shape, dtype=bool)
+    for axis in range(3):
+        nodes = np.moveaxis(after, axis, 0)
+        square = sliding_window_view(nodes, (2, 2), axis=(1, 2))
+        a, b, c, d = (square[..., k, m] for k in (0, 1) for m in (0, 1))
+        marked = np.moveaxis(corners, axis, 0)
+        squares = sliding_window_view(marked, (2, 2), axis=(1, 2), writeable=True)
+        squares[(a == d) & (b == c) & (a != b)] = True
+    cube = sliding_window_view(after, (2, 2, 2))
+    total = cube.sum(axis=(-3, -2, -1), dtype=np.int8)
+    opposite = np.zeros(total.shape, dtype=bool)
+    for dx, dy in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        first, last = cube[..., dx, dy, 0], cube[..., 1 - dx, 1 - dy, 1]
+        opposite |= first & last & (total == 2)  # noqa: PLR2004 -- two opposite corners only
+        opposite |= ~first & ~last & (total == 6)  # noqa: PLR2004 -- the reverse
+    sliding_window_view(corners, (2, 2, 2), writeable=True)[opposite] = True
+    ambiguous = np.where(after, np.minimum(result, 0.03), np.minimum(result, -0.08))
+    return np.where(corners, ambiguous, result).astype(np.float32)
 
 
 def repaired_columns(sheet: Sheet, solid: SolidField, settings: MeasureSettings) -> Bool:
-    """Mark the columns of the sheet that a repair of the topology touched.
+    """Mark the columns (Nx, Ny) of the sheet that a repair of the topology touched.
 
-    A column stands for the part of the sheet up to halfway to its neighbors, so that a repair
-    between two columns is not lost. A cut bridge leaves its two stumps standing: what is nearest
-    to either face of the cut is marked, too. Pieces that were removed leave no mark.
+    A column represents the sheet up to halfway to its neighbors, so that a repair between two
+    columns is not lost. A cut bridge leaves two stumps: what is nearest to either face of the cut
+    is marked, too. Pieces that were removed leave no mark.
     """
     marked = np.zeros(sheet.valid.shape, dtype=bool)
     if not solid.touched.any():
@@ -359,7 +340,7 @@ def repaired_columns(sheet: Sheet, solid: SolidField, settings: MeasureSettings)
         return marked
     nodes, radii = _changed_nodes(solid, sheet.points[known].reshape(-1, 3), settings)
     gaps = np.stack([_gaps(sheet.points, axis) for axis in (0, 1)], axis=-1)
-    # Most columns are far from all repairs: looking closely at the others only saves much time.
+    # Most columns are far from all repairs: only the others are interpolated.
     near = np.asarray(cKDTree(nodes).query(sheet.points[known])[0])
     candidates = np.argwhere(known)[near.min(axis=1) <= radii.max() + gaps[known].mean(axis=-1)]
     if not len(candidates):
@@ -388,36 +369,33 @@ def _gaps(points: Float, axis: int) -> Float:
 def _changed_nodes(
     solid: SolidField, points: Float, settings: MeasureSettings
 ) -> tuple[Float, Float]:
-    """Points (N, 3), RAS mm, of changed nodes and faces of cuts, and how far each of them marks."""
+    """Points (N, 3), RAS mm, of changed nodes and faces of cuts, and the reach (N,) of each, mm."""
     box = box_around(np.argwhere(solid.touched))
     inside, touched = solid.field.values[box] > 0, solid.touched[box]
-    faces = ndimage.binary_dilation(touched & ~inside, structure=_ALL) & inside
-    places, _ = ndimage.label(faces & ~touched)
+    faces = ndimage.binary_dilation(touched & ~inside, structure=ALL) & inside
+    cuts, _ = ndimage.label(faces & ~touched)
     low = low_corner(box)
     changed = solid.field.grid.to_ras((np.argwhere(touched) + low).astype(np.float64))
     radius = np.full(len(changed), settings.repair_reach)
-    where = np.argwhere(places)
+    where = np.argwhere(cuts)
     if not len(where):
         return changed, radius
     face = solid.field.grid.to_ras((where + low).astype(np.float64))
-    number = places[tuple(where.T)]
+    number = cuts[tuple(where.T)]
     distance, _ = cKDTree(points).query(face)
     nearest = np.asarray(ndimage.minimum(distance, number, np.arange(number.max() + 1)))
     stumps = nearest[number] + settings.stump_reach
     return np.vstack([changed, face]), np.concatenate([radius, stumps])
 
 
-def _cells(points: Float, columns: NDArray[np.intp], parts: NDArray[np.intp]) -> Float:
-    """Interpolate round columns, up to halfway to their neighbors.
-
-    Returns NaN where a neighbor is undefined.
-    """
+def _cells(points: Float, columns: Index, parts: Index) -> Float:
+    """Interpolate round columns, up to halfway to their neighbors; NaN beside undefined ones."""
     steps = [np.linspace(-0.5, 0.5, int(n) + 1) for n in parts]
     offsets = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 2)
     last = np.array(points.shape[:2]) - 1
-    place = np.clip(columns[:, None] + offsets, 0, last)
-    low, high = np.floor(place).astype(np.intp), np.ceil(place).astype(np.intp)
-    share = (place - low)[..., None, None]
+    at = np.clip(columns[:, None] + offsets, 0, last)
+    low, high = np.floor(at).astype(np.intp), np.ceil(at).astype(np.intp)
+    share = (at - low)[..., None, None]
     x, y = share[:, :, 0], share[:, :, 1]
     (a, b), (c, d) = np.moveaxis(low, -1, 0), np.moveaxis(high, -1, 0)
     before = (1 - y) * points[a, b] + y * points[a, d]

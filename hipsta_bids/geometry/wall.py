@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.fem import triangle_stiffness
-from hipsta_bids.geometry.surface import lateral_triangles, triangle_areas, unique_edges
+from hipsta_bids.geometry.mesh import lateral_triangles, triangle_areas, unique_edges
 from hipsta_bids.settings import BoundarySettings
 from hipsta_bids.types import Bool, Float, Int, Surface
 

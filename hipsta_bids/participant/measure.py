@@ -30,6 +30,7 @@ from hipsta_bids.geometry.checks import (
 from hipsta_bids.geometry.fem import HarmonicSolver
 from hipsta_bids.geometry.grid import in_plane_voxel, resample_body
 from hipsta_bids.geometry.measures import bending_angle, subfield_areas, subfield_volumes
+from hipsta_bids.geometry.mesh import extract_surface, signed_volume, tetrahedralize
 from hipsta_bids.geometry.quality import Evidence, find_flags, quality_metrics
 from hipsta_bids.geometry.sheet import (
     check_layers,
@@ -42,8 +43,6 @@ from hipsta_bids.geometry.sheet import (
     solve_coordinates,
     whole_body,
 )
-from hipsta_bids.geometry.surface import extract_surface, signed_volume
-from hipsta_bids.geometry.tetra import tetrahedralize
 from hipsta_bids.geometry.topology import SolidField, repair_topology, repaired_columns
 from hipsta_bids.protocols.load import for_region
 from hipsta_bids.settings import Settings

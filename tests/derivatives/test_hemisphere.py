@@ -65,7 +65,7 @@ def test_sheet_table(written):
     # half a unit of the last of four decimals
     np.testing.assert_allclose(table[["r", "a", "s"]], middle, atol=5e-5)
     np.testing.assert_allclose(table.thickness, maps.thickness.ravel(), atol=5e-5)
-    np.testing.assert_allclose(table.curvature, maps.curvature.ravel(), atol=5e-6)
+    np.testing.assert_allclose(table.curvature, maps.maps["curvature"].ravel(), atol=5e-6)
     assert table.subfield.tolist()[:: NY * 3] == ["Sub", "Sub"]
     assert table.valid.dtype == bool
     assert table.index[~table.valid].tolist() == [ROW]

@@ -10,9 +10,8 @@ from hipsta_bids.geometry.body import Body, extract_body
 from hipsta_bids.geometry.boundaries import Boundaries, find_boundaries
 from hipsta_bids.geometry.ends import EndPlanes
 from hipsta_bids.geometry.grid import Field, WedgeGrid, resample_body
+from hipsta_bids.geometry.mesh import extract_surface, tetrahedralize
 from hipsta_bids.geometry.sheet import sample_sheet, solve_coordinates
-from hipsta_bids.geometry.surface import extract_surface
-from hipsta_bids.geometry.tetra import tetrahedralize
 from hipsta_bids.geometry.topology import SolidField, repair_topology
 from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.protocols.load import load_protocol

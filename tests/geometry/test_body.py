@@ -9,7 +9,7 @@ from hypothesis.extra import numpy as arrays
 from scipy import ndimage
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry.body import _give_away_layer, check_side, extract_body
+from hipsta_bids.geometry.body import _merge_layer, check_side, extract_body
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import BodySettings
@@ -35,7 +35,7 @@ def row(*tissues):
 def test_layer_goes_to_the_nearest_sheet_subfield():
     layer = Tissue.MOLECULAR_LAYER
     line = row(Tissue.SUBICULUM, layer, layer, layer, layer, Tissue.DENTATE_GYRUS)
-    tissue, given_away = _give_away_layer(line, "nearest-sheet")
+    tissue, given_away = _merge_layer(line, "nearest-sheet")
     assert tissue.ravel().tolist() == [Tissue.SUBICULUM] * 5 + [0]
     assert given_away == 4
 
@@ -43,7 +43,7 @@ def test_layer_goes_to_the_nearest_sheet_subfield():
 def test_layer_nearest_to_the_dentate_gyrus_is_left_out_by_the_other_rule():
     layer = Tissue.MOLECULAR_LAYER
     line = row(Tissue.SUBICULUM, layer, layer, layer, layer, Tissue.DENTATE_GYRUS)
-    tissue, given_away = _give_away_layer(line, "nearest-label")
+    tissue, given_away = _merge_layer(line, "nearest-label")
     assert tissue.ravel().tolist() == [Tissue.SUBICULUM] * 3 + [0] * 3
     assert given_away == 2
 
@@ -53,7 +53,7 @@ def test_layer_distances_are_millimetres_not_voxels():
     tissue[0, 0] = Tissue.MOLECULAR_LAYER
     tissue[1, 0] = Tissue.CA1  # one voxel of 2 mm
     tissue[0, 2] = Tissue.SUBICULUM  # two voxels of 0.5 mm
-    given_to, _ = _give_away_layer(volume_of(tissue, (2.0, 0.5, 1.0)), "nearest-sheet")
+    given_to, _ = _merge_layer(volume_of(tissue, (2.0, 0.5, 1.0)), "nearest-sheet")
     assert given_to[0, 0, 0] == Tissue.SUBICULUM
 
 
@@ -71,7 +71,7 @@ def test_layer_takers_are_as_near_as_any(tissue):
     """Against Euclidean distance transforms, one per subfield."""
     voxel = (0.5, 0.7, 1.3)
     volume = volume_of(tissue, voxel)
-    given_to, _ = _give_away_layer(volume, "nearest-sheet")
+    given_to, _ = _merge_layer(volume, "nearest-sheet")
     if not np.isin(tissue, FREESURFER.sheet).any():
         assert not given_to.any()
         return
@@ -153,7 +153,7 @@ def test_the_medial_side_lies_towards_the_midline(hemi):
 def test_a_swapped_hemisphere_is_refused(hemi):
     volume = short_phantom().label_volume(FREESURFER, hemi=hemi)
     other = "R" if hemi == "L" else "L"
-    with pytest.raises(GeometryError, match="labelled") as caught:
+    with pytest.raises(GeometryError, match="labeled") as caught:
         check_side(extract_body(volume, BodySettings()), other)
     assert caught.value.reason == "left-right-swapped"
 

@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.boundaries import find_boundaries
 from hipsta_bids.geometry.measures import bending_angle
+from hipsta_bids.geometry.mesh import lateral_triangles
 from hipsta_bids.geometry.sheet import sample_sheet, solve_coordinates
-from hipsta_bids.geometry.surface import lateral_triangles
 from hipsta_bids.settings import BoundarySettings, MeasureSettings, SheetSettings
 from hipsta_bids.types import Coordinates
 

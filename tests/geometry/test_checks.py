@@ -19,7 +19,7 @@ from hipsta_bids.geometry.checks import (
     check_voxels_across,
 )
 from hipsta_bids.geometry.measures import measure_thickness
-from hipsta_bids.geometry.surface import extract_surface
+from hipsta_bids.geometry.mesh import extract_surface
 from hipsta_bids.geometry.topology import repair_topology
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Part, Tissue
@@ -111,7 +111,7 @@ def test_swapped_subfields_are_refused(kinds):
         check_label_order(*striped_body(kinds), CHECKS)
 
 
-def test_a_crumb_in_the_wrong_place_is_no_swap():
+def test_a_fragment_elsewhere_is_no_swap():
     mesh, coordinates, body = striped_body(RIGHT_ORDERS[0])
     tissue = body.tissue.copy()
     tissue[0, :2] = Tissue.CA3  # 1 % of the voxels, at the medial rim

@@ -272,8 +272,8 @@ def test_labels_that_do_not_lead_away_from_their_end_are_refused():
     """The interface of the tail lies along what is left of the body."""
     turned = ends_mod._checked(
         {
-            "posterior": (np.zeros(3), np.array([0.0, 1.0, 0.0]), "labels"),
-            "anterior": (np.ones(3), np.array([0.0, 1.0, 0.0]), "subfields"),
+            "posterior": ends_mod._Plane(np.zeros(3), np.array([0.0, 1.0, 0.0]), "labels"),
+            "anterior": ends_mod._Plane(np.ones(3), np.array([0.0, 1.0, 0.0]), "subfields"),
         },
         np.array([0.0, 1.0, 0.0]),
         0.2,
@@ -282,8 +282,8 @@ def test_labels_that_do_not_lead_away_from_their_end_are_refused():
     with pytest.raises(GeometryError, match="may be cut short there") as caught:
         ends_mod._checked(
             {
-                "posterior": (np.zeros(3), np.array([0.5, 0.866, 0.0]), "labels"),
-                "anterior": (np.ones(3), np.array([0.5, 0.866, 0.0]), "subfields"),
+                "posterior": ends_mod._Plane(np.zeros(3), np.array([0.5, 0.866, 0.0]), "labels"),
+                "anterior": ends_mod._Plane(np.ones(3), np.array([0.5, 0.866, 0.0]), "subfields"),
             },
             np.array([0.94, -0.34, 0.0]),  # 80 degrees from the normals
             0.2,

@@ -175,7 +175,7 @@ def test_planes_that_meet_beside_the_body_are_refused():
     assert caught.value.reason == "ends-crossed"
 
 
-def test_turns_that_touch_are_parted():
+def test_turns_that_touch_are_separated():
     """Subiculum and CA3 side by side, in a block without a gap: the field is negative between."""
     body = box_body()
     half = body.tissue.shape[1] // 2

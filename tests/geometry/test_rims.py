@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from hipsta_bids.geometry.boundaries import center_curves, guided_curves, rim_paths
-from hipsta_bids.geometry.surface import mean_wall_thickness
+from hipsta_bids.geometry.mesh import mean_wall_thickness
 from hipsta_bids.geometry.wall import Wall
 from hipsta_bids.settings import BoundarySettings
 

@@ -1,20 +1,127 @@
-"""Shapes between thick slices."""
+"""Outlines of slices, their registration, and shapes between thick slices."""
 
 import numpy as np
 import pytest
 from geometry_cases import plain_body, solve_case, straight_ends
 from scipy import ndimage
 
-from hipsta_bids.geometry import slices
 from hipsta_bids.geometry.measures import measure_thickness
+from hipsta_bids.geometry.slices import (
+    has_thick_slices,
+    outline_slice,
+    register_slices,
+    sample_slices,
+)
 from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import Settings
 
 SETTINGS = Settings().slices
 PIXEL = 0.4  # mm
+FINE = PIXEL / SETTINGS.upsampling
 STEP = 2.0  # mm
 MOVING = [8.0, 8.8, 9.6, 10.4, 11.2]  # mm, whole pixels apart
+
+
+def outline(tissue):
+    return outline_slice(tissue, PIXEL, SETTINGS)
+
+
+def fine_positions(count):
+    """Centers of fine pixels, in pixels of the segmentation."""
+    return (np.arange(count * SETTINGS.upsampling) + 0.5) / SETTINGS.upsampling - 0.5
+
+
+def test_a_straight_edge_lies_where_the_pixels_end():
+    tissue = np.zeros((30, 30), dtype=np.uint8)
+    tissue[:, 10:] = Tissue.CA1
+    expected = (fine_positions(30) - 9.5) * PIXEL
+    near = np.abs(expected) < 1.5
+    # Fine pixels sample the Gaussian at a fourth of its sigma; beyond it whole fine pixels count.
+    np.testing.assert_allclose(outline(tissue)[30][near], expected[near], atol=0.03)
+
+
+def test_a_slanting_edge_lies_between_the_pixels():
+    """Whole pixels would shift it by up to half of one, 0.2 mm."""
+    grid = np.indices((40, 40))
+    slope = 1 / np.pi  # no row ends exactly at a pixel center
+    tissue = np.where(grid[1] > slope * grid[0] + 8, Tissue.CA1, 0).astype(np.uint8)
+    rows, columns = np.meshgrid(fine_positions(40), fine_positions(40), indexing="ij")
+    expected = (columns - slope * rows - 8) / np.hypot(1, slope) * PIXEL
+    # Away from the borders of the image, near the edge.
+    inner = (np.abs(rows - 20) < 12) & (np.abs(expected) < 0.2)
+    error = (outline(tissue) - expected)[inner]
+    assert inner.sum() > 50
+    # A tenth of a pixel's half: what the Gaussian leaves of steps that are three pixels long.
+    assert error.std() < 0.06
+    assert abs(error.mean()) < 0.02
+
+
+def test_an_empty_slice_is_outside_everywhere():
+    empty = outline(np.zeros((8, 9), dtype=np.uint8))
+    assert empty.shape == (16, 18)
+    assert (empty == -SETTINGS.reach).all()
+
+
+@pytest.mark.parametrize(
+    ("gap", "other", "joined"),
+    [(2, Tissue.CA1, True), (2, Tissue.SUBICULUM, False), (6, Tissue.CA1, False)],
+)
+def test_fragments_are_joined_if_near_and_next_in_order(gap, other, joined):
+    """0.8 mm may be a broken ribbon, 2.4 mm is not; CA3 and subiculum face each other."""
+    tissue = np.zeros((60, 60), dtype=np.uint8)
+    tissue[20:26, 5:30] = Tissue.CA3 if other == Tissue.SUBICULUM else Tissue.CA2
+    tissue[20:26, 30 + gap : 50] = other
+    assert (ndimage.label(outline(tissue) > 0)[1] == 1) == joined
+
+
+def test_fragments_are_dropped_and_small_holes_filled():
+    tissue = np.zeros((60, 60), dtype=np.uint8)
+    tissue[10:24, 5:40] = Tissue.CA1
+    tissue[16:18, 20:22] = 0
+    tissue[45:47, 45:47] = Tissue.CA1
+    found = outline(tissue)
+    assert ndimage.label(found > 0)[1] == 1
+    assert ndimage.label(found <= 0)[1] == 1
+
+
+def disc(center, radius, size=100):
+    """Signed distance from a circle, mm, clipped as outlines are."""
+    grid = np.indices((size, size)) * FINE
+    gap = np.hypot(grid[0] - center[0], grid[1] - center[1])
+    return np.clip(radius - gap, -SETTINGS.reach, SETTINGS.reach).astype(np.float32)
+
+
+def test_equal_slices_do_not_move():
+    flow = register_slices(np.stack([disc((8, 10), 2.0)] * 3), PIXEL, SETTINGS)
+    assert flow.shape == (2, 2, 50, 50)
+    assert (flow == 0).all()
+
+
+def test_a_shift_is_found():
+    """Twice the distance over which blending in place would still overlap half."""
+    flow = register_slices(np.stack([disc((8, 10), 2.0), disc((10, 9), 2.0)]), PIXEL, SETTINGS)
+    middle = flow[:, 0, 22, 23] * FINE  # at the middle of both, mm
+    # The ridge, 0.02 of a mean squared slope of up to 1, holds back some per cent.
+    np.testing.assert_allclose(middle, [2, -1], atol=0.15)
+
+
+def test_the_way_back_is_the_way_there():
+    pair = np.stack([disc((8, 10), 2.0), disc((10, 9), 2.5)])
+    there, back = (register_slices(stack, PIXEL, SETTINGS) for stack in (pair, pair[::-1]))
+    np.testing.assert_allclose(there, -back, atol=1e-4)  # pixels; float32
+
+
+def test_slices_are_registered_independently():
+    shapes = [disc((8, 10), 2.0), disc((9, 10), 2.0), disc((9, 11), 2.5)]
+    together = register_slices(np.stack(shapes), PIXEL, SETTINGS)
+    alone = register_slices(np.stack(shapes[1:]), PIXEL, SETTINGS)
+    np.testing.assert_allclose(together[:, 1:], alone, atol=1e-6)  # float32
+
+
+def test_odd_sizes_are_covered():
+    flow = register_slices(np.stack([disc((4, 5), 2.0, 54)] * 2), PIXEL, SETTINGS)
+    assert flow.shape == (2, 1, 27, 27)
 
 
 def block(centers, *, width=4.0, height=8.0, size=(60, 60)):
@@ -42,7 +149,7 @@ def section(body, z):
     fine = 0.1
     at = np.arange(0.5 * fine, 24, fine)  # edges of pixels lie between these places
     grid = np.stack(np.meshgrid(at, at, [z], indexing="ij"))
-    found = slices.sample_slices(body, grid.reshape(3, -1).T, SETTINGS).reshape(240, 240) > 0.5
+    found = sample_slices(body, grid.reshape(3, -1).T, SETTINGS).reshape(240, 240) > 0.5
     across = found[:, 120].sum() * fine
     return (ndimage.center_of_mass(found)[0] + 0.5) * fine, across, found.sum() * fine**2
 
@@ -83,7 +190,7 @@ def test_the_ends_of_the_ribbon_are_kept_apart():
     for z in (2.0, 3.0):  # in a slice and between slices
         y = np.arange(9, 15, 0.05)
         points = np.column_stack([np.full(len(y), 8.0), y, np.full(len(y), z)])
-        inside = slices.sample_slices(kissing, points, SETTINGS) > 0.5
+        inside = sample_slices(kissing, points, SETTINGS) > 0.5
         gap = y[~inside]
         # Of twice the slit's half width, at the border of the labels; the ramp of 0.2 mm and the
         # fine pixels of 0.2 mm blunt its bottom.
@@ -115,7 +222,7 @@ def test_what_an_oblique_end_label_hides_is_continued():
     depth = rng.uniform(0.05, 1.0, 300)  # mm inside the plane, in the middle of the block
     y = rng.uniform(9.0, 15.0, 300)
     z = 1.0 + (depth - (y - 12.0) * np.sin(0.3)) / np.cos(0.3)
-    there = slices.sample_slices(body, np.column_stack([np.full(300, 10.0), y, z]), SETTINGS)
+    there = sample_slices(body, np.column_stack([np.full(300, 10.0), y, z]), SETTINGS)
     assert (there > 0.5).mean() > 0.99
 
 
@@ -136,13 +243,13 @@ def test_slices_may_lie_along_any_axis_of_the_image(through):
     )
     turned.inside[...] = np.moveaxis(body.inside, 2, through)
     points = np.random.default_rng(2).uniform([4, 6, 0], [16, 18, 9], (500, 3))
-    first, second = (slices.sample_slices(b, points, SETTINGS) for b in (body, turned))
+    first, second = (sample_slices(b, points, SETTINGS) for b in (body, turned))
     np.testing.assert_allclose(first, second, atol=1e-5)  # float32
 
 
 @pytest.mark.parametrize(("voxel", "thick"), [((0.4, 0.4, 0.4), False), ((0.4, 2.0, 0.4), True)])
-def test_thick_slices_are_told_by_the_voxel(voxel, thick):
-    assert slices.has_thick_slices(np.diag([*voxel, 1.0]), SETTINGS) == thick
+def test_thick_slices_are_recognized_by_the_voxel(voxel, thick):
+    assert has_thick_slices(np.diag([*voxel, 1.0]), SETTINGS) == thick
 
 
 @pytest.mark.parametrize("kind", ["arc", "spiral"])

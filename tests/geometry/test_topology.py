@@ -1,4 +1,4 @@
-"""Holes, bridges, islands, cavities and torn caps put into a ribbon, and taken out again."""
+"""Holes, bridges, islands, cavities and broken caps put into a ribbon, and repaired."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from scipy import ndimage
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.digital import euler_number
 from hipsta_bids.geometry.grid import Field
-from hipsta_bids.geometry.surface import extract_surface
+from hipsta_bids.geometry.mesh import extract_surface
 from hipsta_bids.geometry.topology import repair_topology
 from hipsta_bids.settings import SurfaceSettings, TopologySettings
 
@@ -128,8 +128,8 @@ def test_a_filled_hole_is_thick():
     assert np.count_nonzero(column) >= 3  # of 5 nodes; a bare membrane has one
 
 
-def with_hole_at_the_rim():
-    """A hole that leaves a strip of three nodes at one rim of the ribbon, 50 degrees round."""
+def with_hole_at_the_edge():
+    """A hole that leaves a strip of three nodes at one edge of the ribbon, 50 degrees round."""
     mask = ribbon_mask()
     a, b, w = np.indices(mask.shape)
     angle = np.degrees(np.arctan2(b - MIDDLE, a - MIDDLE))
@@ -139,7 +139,7 @@ def with_hole_at_the_rim():
 
 def test_a_strip_beside_a_hole_is_not_severed():
     """The strip costs less than the hole; but a cut would leave a notch in the ribbon."""
-    mask = with_hole_at_the_rim()
+    mask = with_hole_at_the_edge()
     repair = only_repair(repaired(mask), "fill")
     at = np.radians(79.5)
     assert distance(repair, (MIDDLE + 12 * np.cos(at), MIDDLE + 12 * np.sin(at), 14)) < 2.5
@@ -320,15 +320,15 @@ def test_ambiguous_cubes_keep_foreground_corners_apart():
     assert euler_number(solid.field.values > 0) == 1
 
 
-def test_parted_turns_are_reported(slab):
-    parted = np.zeros(slab.field.grid.shape, dtype=bool)
+def test_separated_turns_are_reported(slab):
+    separated = np.zeros(slab.field.grid.shape, dtype=bool)
     where = np.argwhere(slab.field.values > 0.3)[:5]  # fewer than 1 % of the body
-    parted[tuple(where.T)] = True
-    found = repair_topology(replace(slab.field, parted=parted), TopologySettings())
+    separated[tuple(where.T)] = True
+    found = repair_topology(replace(slab.field, separated=separated), TopologySettings())
     (repair,) = found.repairs
     assert (repair.kind, repair.voxels, repair.large) == ("part", 5, False)
     assert str(repair).startswith("parted two turns that touch, by a slit of 5 grid nodes at RAS")
-    assert found.touched[parted].all()
+    assert found.touched[separated].all()
 
 
 @pytest.mark.parametrize(("apart", "doubtful"), [(0, True), (6, False)])
@@ -336,8 +336,8 @@ def test_a_hole_beside_a_slit_between_turns_is_doubtful(apart, doubtful):
     """The slit has then gone through a wall instead of between two."""
     mask, *_ = with_hole()
     field = field_of(mask, spacing=SPACING)
-    parted = np.zeros(mask.shape, dtype=bool)
-    parted[6:10, 19:22, 16 + apart] = True
-    found = repair_topology(replace(field, parted=parted), TopologySettings())
+    separated = np.zeros(mask.shape, dtype=bool)
+    separated[6:10, 19:22, 16 + apart] = True
+    found = repair_topology(replace(field, separated=separated), TopologySettings())
     (fill,) = [repair for repair in found.repairs if repair.kind == "fill"]
     assert fill.large == doubtful

@@ -5,7 +5,7 @@ import pytest
 from geometry_cases import cylinder
 from lapy import Solver, TriaMesh
 
-from hipsta_bids.geometry.surface import lateral_triangles
+from hipsta_bids.geometry.mesh import lateral_triangles
 from hipsta_bids.geometry.wall import Wall, edge_graph, end_to_end, vertex_normals
 from hipsta_bids.settings import BoundarySettings
 

@@ -145,7 +145,7 @@ def test_curvature_changes_sign_with_the_bend():
     case = measured(PhantomSpec(kind="s-shape", thickness=1.6, length=LENGTH))
     uv = sheet_coordinates(case)[6:-6, 4:-4]
     expected = case.phantom.truth(uv[..., 0], uv[..., 1]).curvature
-    found = case.maps.curvature[6:-6, 4:-4]
+    found = case.maps.maps["curvature"][6:-6, 4:-4]
     assert expected.min() < -0.02
     assert expected.max() > 0.1
     # 1/mm; a tenth of the range, by smoothing along x and the roughness of 0.4 mm voxels.
@@ -173,7 +173,7 @@ def test_left_and_right_are_mirror_images(plain):
     assert abs(difference.mean()) < 0.02
     assert difference.std() < 0.04
     np.testing.assert_allclose(
-        np.median(right.maps.curvature), np.median(plain.maps.curvature), rtol=0.03
+        np.median(right.maps.maps["curvature"]), np.median(plain.maps.maps["curvature"]), rtol=0.03
     )
     assert (right.maps.subfield == plain.maps.subfield).mean() > 0.95
 
@@ -205,7 +205,7 @@ def test_the_grid_has_the_size_that_is_asked_for(plain):
     settings = Settings(sheet=SheetSettings(x_nodes=21, y_nodes=11, z_nodes=5))
     maps = measure(plain.volume, settings=settings)
     assert maps.sheet.points.shape == (21, 11, 5, 3)
-    assert maps.thickness.shape == maps.subfield.shape == maps.curvature.shape == (21, 11)
+    assert maps.thickness.shape == maps.subfield.shape == maps.maps["curvature"].shape == (21, 11)
     # Every other node of the finer grid. Bent columns are cut into longer pieces, which moves
     # the points that are spaced evenly along them, mm.
     finer = plain.maps.sheet.points[::2, ::2, ::2]

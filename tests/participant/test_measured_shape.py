@@ -210,7 +210,7 @@ def test_layers_by_volume_leave_every_measure_alone():
     n = np.moveaxis(
         plain.phantom.body.locate(moved.layers.points[10:-10, 4:-4, 4].reshape(-1, 3)), -1, 0
     )[2]
-    curvature = plain.maps.curvature[10:-10, 4:-4].ravel() * 2
+    curvature = plain.maps.maps["curvature"][10:-10, 4:-4].ravel() * 2
     # To first order by thickness^2 * curvature / 8; 0.03 mm is the error of the middle itself.
     assert n.mean() == pytest.approx((4.0 * curvature / 8).mean(), abs=0.03)
 

@@ -1,4 +1,4 @@
-"""Cross-sections and rows that do not go with their neighbors, at the place where they are."""
+"""Cross-sections and rows that differ from their neighbors, located."""
 
 from dataclasses import dataclass, replace
 
@@ -141,7 +141,7 @@ def test_dips_are_sought_within_a_reach():
 
 
 def banded(size, rows=slice(10, 11), columns=slice(10, 30)):
-    """Thickness of 41 x 21 columns, 8 mm long, with a band that departs by so many mm."""
+    """Thickness of 41 x 21 columns, 8 mm long, with a band that departs by ``size`` mm."""
     thickness = np.full((41, 21), 1.7)
     thickness[columns, rows] += size
     return thickness

@@ -1,4 +1,4 @@
-"""Tetrahedra, and the process that makes them: it may die, the caller may not."""
+"""The process that makes tetrahedra may die or hang; the caller may not."""
 
 import os
 import signal
@@ -7,15 +7,13 @@ import time
 
 import numpy as np
 import pytest
-from geometry_cases import box_mesh
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry import tetra
-from hipsta_bids.geometry.surface import signed_volume
+from hipsta_bids.geometry import mesh
+from hipsta_bids.geometry.mesh import tetra_volumes, tetrahedralize
 from hipsta_bids.geometry.tetgen_worker import TetgenClient
-from hipsta_bids.geometry.tetra import tetra_quality, tetra_volumes, tetrahedralize
 from hipsta_bids.settings import TetraSettings
-from hipsta_bids.types import Surface, TetMesh
+from hipsta_bids.types import Surface
 
 SETTINGS = TetraSettings()
 OPTIONS = {"plc": True, "quality": True, "minratio": 2.0, "nobisect": True, "quiet": True}
@@ -43,64 +41,11 @@ def crossing_cubes():
 
 @pytest.fixture
 def client(monkeypatch):
-    """A client of its own, so that killing its process disturbs nobody."""
+    """A client of its own, so that killing its process disturbs no other test."""
     fresh = TetgenClient()
-    monkeypatch.setattr(tetra, "_CLIENT", fresh)
+    monkeypatch.setattr(mesh, "_CLIENT", fresh)
     yield fresh
     fresh._stop()
-
-
-def test_volume_is_that_of_the_surface(case):
-    volumes = tetra_volumes(case.mesh.vertices, case.mesh.tetrahedra)
-    surface = case.surface
-    wanted = signed_volume(surface.vertices, surface.triangles)
-    assert volumes.min() > 0
-    assert volumes.sum() == pytest.approx(wanted, rel=1e-9)  # rounding of sums
-
-
-def test_vertices_of_the_surface_come_first(case):
-    surface = case.surface
-    np.testing.assert_array_equal(case.mesh.vertices[: len(surface.vertices)], surface.vertices)
-
-
-def test_faces_of_the_surface_are_kept(arc):
-    """So boundary sets found on the surface bound the volume too."""
-    cells = arc.mesh.tetrahedra
-    faces = np.sort(np.vstack([np.delete(cells, k, axis=1) for k in range(4)]))
-    count = len(arc.mesh.vertices)
-    code, times = np.unique(faces.astype(np.int64) @ [count**2, count, 1], return_counts=True)
-    outer = np.sort(np.sort(arc.surface.triangles).astype(np.int64) @ [count**2, count, 1])
-    np.testing.assert_array_equal(code[times == 1], outer)
-    assert times.max() == 2
-
-
-def test_every_vertex_is_used(case):
-    assert len(np.unique(case.mesh.tetrahedra)) == len(case.mesh.vertices)
-
-
-def test_quality_of_known_tetrahedra():
-    regular = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], dtype=float)
-    corner = np.vstack([np.zeros(3), np.eye(3)])
-    flat = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 1e-9]], dtype=float)
-    wanted = [1.0, 12 * (0.5) ** (2 / 3) / 9, 0.0]
-    for vertices, value in zip((regular, corner, flat), wanted, strict=True):
-        cell = [[0, 1, 2, 3]]
-        if tetra_volumes(vertices, np.array(cell))[0] < 0:
-            cell = [[0, 2, 1, 3]]
-        mesh = TetMesh(vertices=vertices, tetrahedra=cell)
-        assert tetra_quality(mesh)[0] == pytest.approx(value, abs=1e-5)  # (1e-9)^(2/3)
-
-
-def test_quality_of_phantoms(case):
-    quality = tetra_quality(case.mesh)
-    assert quality.max() <= 1 + 1e-12
-    assert np.median(quality) > 0.5  # TetGen's usual range at a radius-edge ratio of 2
-
-
-def test_box_volumes():
-    mesh = box_mesh((2, 3, 4), (1.0, 2.0, 3.0))
-    volumes = tetra_volumes(mesh.vertices, mesh.tetrahedra)
-    np.testing.assert_allclose(volumes, 6.0 / (24 * 6), rtol=1e-12)  # rounding
 
 
 @pytest.mark.usefixtures("client")
@@ -149,7 +94,7 @@ def kill_soon(client, *, after=0.2):
     return timer
 
 
-def test_a_crash_while_meshing_is_told_and_the_next_call_works(client, arc):
+def test_a_crash_while_meshing_is_reported_and_the_next_call_works(client, arc):
     assert_works()  # the process is up
     first = client._process.pid
     timer = kill_soon(client)
@@ -168,7 +113,7 @@ def test_a_process_that_died_between_calls_is_replaced(client):
     assert_works()
 
 
-def test_taking_too_long_is_told_and_the_next_call_works(client, arc):
+def test_taking_too_long_is_reported_and_the_next_call_works(client, arc):
     busy = {"maxvolume": 1e-6, "fixedvolume": True, "nobisect": False}
     assert_works()
     process = client._process

@@ -1,21 +1,24 @@
-"""The closed surface: sphere, planar caps, orientation, volume."""
+"""The closed surface and its tetrahedra: sphere, planar caps, orientation, volume, quality."""
 
 import numpy as np
 import pytest
-from geometry_cases import field_of, ribbon_mask, short_phantom, straight_grid
+from geometry_cases import box_mesh, field_of, ribbon_mask, short_phantom, straight_grid
 from scipy import sparse
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.grid import Field
-from hipsta_bids.geometry.surface import (
+from hipsta_bids.geometry.mesh import (
     extract_surface,
     lateral_triangles,
     mean_wall_thickness,
     signed_volume,
+    tetra_quality,
+    tetra_volumes,
     triangle_areas,
     unique_edges,
 )
 from hipsta_bids.settings import SurfaceSettings
+from hipsta_bids.types import TetMesh
 
 SMOOTH, RAW = SurfaceSettings(), SurfaceSettings(taubin_iterations=0)
 SPACING = 0.5
@@ -122,7 +125,7 @@ def test_caps_carry_the_cross_section(arc):
 
 def test_volume_is_the_phantoms(case):
     truth = case.phantom.truth(0.5, 0.5).summary["volume"]
-    # The Gaussian of a third of a millimetre rounds the rims of a wall of 2 mm.
+    # The Gaussian of a third of a millimeter rounds the rims of a wall of 2 mm.
     got = signed_volume(case.surface.vertices, case.surface.triangles)
     assert got == pytest.approx(truth, rel=0.04)
 
@@ -171,3 +174,56 @@ def test_phantom_width_does_not_change_its_wall_thickness(arc):
     rims = 2 * 2.0 * 8.0  # two rims, thickness times length
     wanted = 2 * truth["volume"] / (truth["area_interior"] + truth["area_exterior"] + rims)
     assert mean_wall_thickness(arc.surface) == pytest.approx(wanted, rel=0.03)  # rounded rims
+
+
+def test_volume_is_that_of_the_surface(case):
+    volumes = tetra_volumes(case.mesh.vertices, case.mesh.tetrahedra)
+    surface = case.surface
+    wanted = signed_volume(surface.vertices, surface.triangles)
+    assert volumes.min() > 0
+    assert volumes.sum() == pytest.approx(wanted, rel=1e-9)  # rounding of sums
+
+
+def test_vertices_of_the_surface_come_first(case):
+    surface = case.surface
+    np.testing.assert_array_equal(case.mesh.vertices[: len(surface.vertices)], surface.vertices)
+
+
+def test_faces_of_the_surface_are_kept(arc):
+    """So boundary sets found on the surface bound the volume too."""
+    cells = arc.mesh.tetrahedra
+    faces = np.sort(np.vstack([np.delete(cells, k, axis=1) for k in range(4)]))
+    count = len(arc.mesh.vertices)
+    code, times = np.unique(faces.astype(np.int64) @ [count**2, count, 1], return_counts=True)
+    outer = np.sort(np.sort(arc.surface.triangles).astype(np.int64) @ [count**2, count, 1])
+    np.testing.assert_array_equal(code[times == 1], outer)
+    assert times.max() == 2
+
+
+def test_every_vertex_is_used(case):
+    assert len(np.unique(case.mesh.tetrahedra)) == len(case.mesh.vertices)
+
+
+def test_quality_of_known_tetrahedra():
+    regular = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], dtype=float)
+    corner = np.vstack([np.zeros(3), np.eye(3)])
+    flat = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 1e-9]], dtype=float)
+    wanted = [1.0, 12 * (0.5) ** (2 / 3) / 9, 0.0]
+    for vertices, value in zip((regular, corner, flat), wanted, strict=True):
+        cell = [[0, 1, 2, 3]]
+        if tetra_volumes(vertices, np.array(cell))[0] < 0:
+            cell = [[0, 2, 1, 3]]
+        mesh = TetMesh(vertices=vertices, tetrahedra=cell)
+        assert tetra_quality(mesh)[0] == pytest.approx(value, abs=1e-5)  # (1e-9)^(2/3)
+
+
+def test_quality_of_phantoms(case):
+    quality = tetra_quality(case.mesh)
+    assert quality.max() <= 1 + 1e-12
+    assert np.median(quality) > 0.5  # TetGen's usual range at a radius-edge ratio of 2
+
+
+def test_box_volumes():
+    mesh = box_mesh((2, 3, 4), (1.0, 2.0, 3.0))
+    volumes = tetra_volumes(mesh.vertices, mesh.tetrahedra)
+    np.testing.assert_allclose(volumes, 6.0 / (24 * 6), rtol=1e-12)  # rounding

@@ -54,7 +54,7 @@ def test_a_slit_is_filled_with_the_labels_beside_it():
     assert len(found.gap) == 0
 
 
-def test_a_crevice_from_one_side_stays_and_is_told():
+def test_a_crevice_from_one_side_stays_and_is_reported():
     """As between two folds: it is open on one side only."""
     tissue = with_slit(depth=8)  # four of five voxels deep
     found = slits(tissue)

@@ -1,4 +1,4 @@
-"""Noise and thin gaps in labels: flagged with their place, and sound labels left alone."""
+"""Noise and thin gaps in labels: flagged with their position, and sound labels left alone."""
 
 from dataclasses import replace
 
@@ -47,8 +47,8 @@ def test_a_missing_slice_is_a_gap_and_leaves_a_loose_part(arc):
     where, middle = voxels_near_plane(arc.body, arc.body.ends.axis, 0.45)
     flags = {flag.reason: flag.message for flag in check_labels(damaged(arc.body, where), CHECKS)}
     assert set(flags) == {"thin-gap", "loose-part"}
-    place = np.array(flags["thin-gap"].split("RAS ")[1].split(" mm")[0].split(), dtype=float)
-    assert abs((place - middle) @ arc.body.ends.axis) < 0.4  # mm, a voxel
+    position = np.array(flags["thin-gap"].split("RAS ")[1].split(" mm")[0].split(), dtype=float)
+    assert abs((position - middle) @ arc.body.ends.axis) < 0.4  # mm, a voxel
 
 
 def test_a_gap_of_two_voxels_is_loose_but_not_thin(arc):

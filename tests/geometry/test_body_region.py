@@ -1,4 +1,4 @@
-"""Cortex beside the body: joined, checked for its reach, and its sides told apart."""
+"""Cortex beside the body: joined, checked for its reach, and its sides distinguished."""
 
 import numpy as np
 import pytest
@@ -71,7 +71,7 @@ def test_missing_cortex_is_named():
 
 @pytest.mark.parametrize(("levels", "enough"), [(10, True), (9, True), (8, False), (1, False)])
 def test_cortex_has_to_reach_along_nine_tenths(levels, enough):
-    """Ten voxels lie between planes 10 mm apart; so many of them are cortex."""
+    """Ten voxels lie between planes 10 mm apart; ``levels`` of them are cortex."""
     points = np.array([[x, 0.0, k + 0.5] for x in (0.0, 1.0) for k in range(10)])
     tissue = np.repeat([ERC, CA1], 10).astype(np.uint8)
     tissue[levels:10] = SUB

@@ -1,0 +1,214 @@
+"""From a solid field to a closed triangle surface with planar end caps, and to its tetrahedra."""
+
+import numpy as np
+from scipy import sparse
+from skimage.measure import marching_cubes
+
+from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry.grid import Field
+from hipsta_bids.geometry.tetgen_worker import TetgenClient
+from hipsta_bids.settings import SurfaceSettings, TetraSettings
+from hipsta_bids.types import Bool, Float, Int, Surface, TetMesh, position_text
+
+_CLIENT = TetgenClient()
+
+
+def extract_surface(field: Field, settings: SurfaceSettings) -> Surface:
+    """Extract the zero level of a field, closed by planar caps, and smooth it.
+
+    Beyond the end planes the field counts as strongly negative, so that marching cubes puts the
+    caps into the end planes and their vertices are known. Smoothing: Taubin 1995, SIGGRAPH
+    '95:351-358.
+    """
+    outside = -1e4 * float(np.abs(field.values).max())
+    padded = np.pad(field.values, 1, constant_values=outside)
+    nodes, faces, _, _ = marching_cubes(padded, level=0.0)  # type: ignore[no-untyped-call]
+    nodes = nodes.astype(np.float64) - 1.0
+    last = field.grid.shape[2] - 1
+    nodes[:, 2] = np.clip(nodes[:, 2], 0, last)
+    # Crossings against the free space outside land within 1e-4 of a step from the end plane.
+    posterior, anterior = nodes[:, 2] < 1e-3, nodes[:, 2] > last - 1e-3  # noqa: PLR2004
+    nodes[posterior, 2], nodes[anterior, 2] = 0, last
+    faces = faces.astype(np.int32)
+    _check_sphere(len(nodes), faces)
+    nodes = _taubin(nodes, faces, (posterior, anterior), settings)
+    # TetGen turns differences of 1e-14 mm, as between orders of the voxel axes, into other meshes.
+    vertices = field.grid.to_ras(nodes).round(6)
+    if signed_volume(vertices, faces) < 0:
+        faces = faces[:, ::-1]
+    return Surface(
+        vertices=vertices, triangles=faces, posterior_cap=posterior, anterior_cap=anterior
+    )
+
+
+def signed_volume(vertices: Float, triangles: Int) -> float:
+    """Volume enclosed by outward triangles, mm3."""
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+
+
+def triangle_areas(vertices: Float, triangles: Int) -> Float:
+    """Areas of triangles, (F,), mm2."""
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
+
+
+def lateral_triangles(surface: Surface) -> Bool:
+    """Whether each triangle belongs to the wall, not to a cap, (F,)."""
+    first, second = (
+        surface.posterior_cap[surface.triangles],
+        surface.anterior_cap[surface.triangles],
+    )
+    return np.asarray(~(first.all(axis=1) | second.all(axis=1)))
+
+
+def mean_wall_thickness(surface: Surface) -> float:
+    """2 volume / wall area, mm: the thickness of a sheet whose two sides make up its wall."""
+    areas = triangle_areas(surface.vertices, surface.triangles)
+    volume = signed_volume(surface.vertices, surface.triangles)
+    return 2 * volume / float(areas[lateral_triangles(surface)].sum())
+
+
+def unique_edges(cells: Int) -> Int:
+    """Edges (E, 2) of triangles (F, 3) or tetrahedra (T, 4), each once, lower vertex first."""
+    first, second = np.triu_indices(cells.shape[1], k=1)
+    a, b = cells[:, first].ravel(), cells[:, second].ravel()
+    code = np.sort(np.minimum(a, b).astype(np.int64) << 32 | np.maximum(a, b))
+    code = code[np.diff(code, prepend=-1) > 0]
+    return np.column_stack([code >> 32, code & 0xFFFFFFFF]).astype(np.int32)
+
+
+def _check_sphere(count: int, faces: Int) -> None:
+    """Refuse triangles between ``count`` vertices that are not one closed sphere."""
+    edges = unique_edges(faces)
+    euler = count - len(edges) + len(faces)
+    pieces, _ = sparse.csgraph.connected_components(_adjacency(edges, count), directed=False)
+    if euler != 2 or pieces != 1 or 2 * len(edges) != 3 * len(faces):  # noqa: PLR2004
+        raise GeometryError(
+            f"the surface is not one closed sphere (Euler number {euler}, {pieces} pieces): "
+            "correct the labels by hand",
+            reason="surface-topology",
+        )
+
+
+def _adjacency(edges: Int, count: int) -> sparse.csr_array:
+    ones = np.ones(2 * len(edges))
+    both = np.vstack([edges, edges[:, ::-1]])
+    return sparse.csr_array((ones, (both[:, 0], both[:, 1])), shape=(count, count))
+
+
+def _taubin(nodes: Float, faces: Int, caps: tuple[Bool, Bool], settings: SurfaceSettings) -> Float:
+    """Smooth in grid coordinates; caps stay in their planes, outlines on themselves."""
+    edges = unique_edges(faces)
+    cap = caps[0] | caps[1]
+    on_cap = caps[0][faces].all(axis=1) | caps[1][faces].all(axis=1)
+    outline = np.zeros(len(nodes), dtype=bool)
+    outline[faces[~on_cap]] = True
+    outline &= cap
+    weights = _adjacency(edges, len(nodes)).tocoo()
+    outline_edge = _outline_edges(faces[on_cap], len(nodes))
+    keep = ~outline[weights.row]
+    graph = sparse.csr_array(
+        (weights.data[keep], (weights.row[keep], weights.col[keep])), shape=weights.shape
+    )
+    graph = graph + _adjacency(outline_edge, len(nodes))
+    graph = graph.multiply(1 / np.maximum(graph.sum(axis=1), 1)[:, None]).tocsr()
+    free = np.ones((len(nodes), 3))
+    free[cap, 2] = 0
+    nodes = nodes.copy()
+    for _ in range(settings.taubin_iterations):
+        for factor in (settings.taubin_shrink, settings.taubin_inflate):
+            nodes += factor * free * (graph @ nodes - nodes)
+    return nodes
+
+
+def _outline_edges(cap_faces: Int, count: int) -> Int:
+    """Edges that belong to one cap triangle only."""
+    pairs = np.sort(np.vstack([cap_faces[:, [0, 1]], cap_faces[:, [1, 2]], cap_faces[:, [2, 0]]]))
+    code, times = np.unique(pairs[:, 0].astype(np.int64) * count + pairs[:, 1], return_counts=True)
+    once = code[times == 1]
+    return np.column_stack([once // count, once % count]).astype(np.int32)
+
+
+def tetrahedralize(surface: Surface, settings: TetraSettings) -> TetMesh:
+    """Fill a surface with tetrahedra; its vertices come first and stay in place.
+
+    TetGen: Si 2015, ACM Trans Math Softw 41:11. ``nobisect`` keeps the surface as it is, so that
+    boundary sets found on the surface are valid in the volume.
+    """
+    options = {
+        "plc": True,
+        "quality": True,
+        "minratio": settings.radius_edge_ratio,
+        "smooth_maxiter": settings.smoothing_steps,
+        "nobisect": True,
+        "quiet": True,
+    }
+    result = _CLIENT.mesh(surface.vertices, surface.triangles, options, settings.timeout)
+    if isinstance(result, str):
+        remedy = _where_to_look(surface) if "intersect" in result else "check the labels"
+        raise GeometryError(f"{result}: {remedy}", reason="tetrahedralization")
+    vertices, cells = result
+    cells = cells.astype(np.int32)
+    if not np.array_equal(vertices[: len(surface.vertices)], surface.vertices):
+        raise GeometryError("TetGen moved vertices of the surface", reason="tetrahedralization")
+    volume = tetra_volumes(vertices, cells)
+    enclosed = signed_volume(surface.vertices, surface.triangles)
+    if not np.isclose(np.abs(volume).sum(), enclosed, rtol=1e-6):  # rounding of 1e5 elements
+        raise GeometryError(
+            f"the tetrahedra fill {np.abs(volume).sum():.1f} of {enclosed:.1f} mm3: "
+            f"{_where_to_look(surface)}",
+            reason="tetrahedralization",
+        )
+    cells[volume < 0] = cells[volume < 0][:, [0, 2, 1, 3]]
+    return TetMesh(vertices=vertices, tetrahedra=cells[volume != 0])
+
+
+def _where_to_look(surface: Surface) -> str:
+    return (
+        "the surface intersects itself; check the labels for touching parts, first near "
+        f"{position_text(_sharpest_fold(surface))}, where it is most sharply folded"
+    )
+
+
+def _sharpest_fold(surface: Surface) -> Float:
+    """Middle (3,), RAS mm, of the edge at which two triangles enclose the smallest angle."""
+    triangles = surface.triangles
+    a, b, c = (surface.vertices[triangles[:, k]] for k in range(3))
+    normals = np.cross(b - a, c - a)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    # On a closed surface each edge occurs twice: next to each other once they are in order.
+    order = np.lexsort(edges.T).reshape(-1, 2)
+    first, second = (order // 3).T
+    sharpest = order[np.argmin(np.einsum("ij,ij->i", normals[first], normals[second])), 0]
+    return np.asarray(surface.vertices[edges[sharpest]].mean(axis=0))
+
+
+def tetra_volumes(vertices: Float, tetrahedra: Int) -> Float:
+    """Signed volumes of tetrahedra, (T,), mm3."""
+    a, b, c = (vertices[tetrahedra[:, k]] - vertices[tetrahedra[:, 0]] for k in (1, 2, 3))
+    return np.asarray(np.einsum("ij,ij->i", a, cross(b, c)) / 6)
+
+
+def cross(a: Float, b: Float) -> Float:
+    """Cross products of the rows of (N, 3) arrays, in half the time of NumPy's own."""
+    return np.column_stack(
+        [
+            a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1],
+            a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2],
+            a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0],
+        ]
+    )
+
+
+def tetra_quality(mesh: TetMesh) -> Float:
+    """Mean ratio of each tetrahedron, (T,): 1 for a regular one, 0 for a flat one.
+
+    Liu & Joe 1994, BIT 34:268-287: 12 (3 volume)^(2/3) / sum of squared edge lengths.
+    """
+    first, second = np.triu_indices(4, k=1)
+    corners = mesh.vertices[mesh.tetrahedra]
+    edges = corners[:, second] - corners[:, first]
+    volume = tetra_volumes(mesh.vertices, mesh.tetrahedra)
+    return np.asarray(12 * np.cbrt(3 * volume) ** 2 / (edges**2).sum(axis=(1, 2)))
