@@ -7,7 +7,7 @@ from hipsta_bids.cli.main import main
 from hipsta_bids.errors import UsageError
 from hipsta_bids.group.collect import QualityCondition
 from hipsta_bids.group.settings import GroupSettings, load_group_settings
-from hipsta_bids.settings import settings_toml
+from hipsta_bids.toml import settings_toml
 
 
 @pytest.mark.parametrize(
