@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 from hipsta_bids import __version__
 from hipsta_bids.cli.participant import Parser, named_pattern, rebuild_group_reports
 from hipsta_bids.errors import ExitCode, UsageError
-from hipsta_bids.group.settings import CORRECTIONS
 
 if TYPE_CHECKING:
     from hipsta_bids.group.read import GroupOptions
@@ -220,7 +219,7 @@ def _add_methods(parser: Parser) -> None:
     )
     add(
         "--correction",
-        choices=CORRECTIONS,
+        choices=["fdr2", "bh", "permutation-tfce", "permutation-max"],
         help="for the number of points: false discovery rate (fdr2, the default; bh), or"
         " family-wise error by permutation of residuals (permutation-tfce, permutation-max)",
     )
