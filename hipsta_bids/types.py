@@ -1,6 +1,6 @@
 """The typed values that pass between stages.
 
-Points are rows in RAS millimetres (float64), indices are int32. Every array is checked and made
+Points are rows in RAS millimeters (float64), indices are int32. Every array is checked and made
 read-only at construction, so that nothing downstream has to check again. Axes of the sheet:
 x runs medial to lateral, y posterior to anterior, z interior to exterior, in both hemispheres.
 """
@@ -152,7 +152,7 @@ class Sheet:
     points: Float
     """(Nx, Ny, Nz, 3) RAS mm, NaN where undefined; the middle z level is the mid-surface."""
     valid: Bool
-    """(Nx, Ny) columns measured directly, not filled from neighbours."""
+    """(Nx, Ny) columns measured directly, not filled from neighbors."""
 
     def __post_init__(self) -> None:
         points = _set(self, "points", np.float64, (None, None, None, 3))

@@ -373,7 +373,7 @@ def check_side(body: Body, hemi: str) -> float:
         side = {"L": "left", "R": "right"}
         other = side["R" if hemi == "L" else "L"]
         raise GeometryError(
-            f"labelled {side[hemi]}, but the subiculum lies {-offset:.1f} mm lateral of CA1 as in "
+            f"labeled {side[hemi]}, but the subiculum lies {-offset:.1f} mm lateral of CA1 as in "
             f"a {other} hemisphere: check the image's affine and which file is which",
             reason="left-right-swapped",
         )
@@ -415,7 +415,7 @@ def _give_away_layer(volume: LabelVolume, rule: str) -> tuple[NDArray[np.uint8],
 
 
 def _touching(mask: Bool) -> Bool:
-    """Voxels of a mask with a face neighbour outside it: the nearest voxel is always one."""
+    """Voxels of a mask with a face neighbor outside it: the nearest voxel is always one."""
     deep = np.zeros_like(mask)
     deep[1:-1, 1:-1, 1:-1] = (
         mask[:-2, 1:-1, 1:-1]

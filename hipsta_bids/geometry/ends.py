@@ -339,9 +339,9 @@ def _logistic_plane(below: Float, above: Float, axis: Float) -> tuple[Float, Flo
     points = np.vstack([below, above])
     target = np.repeat([0.0, 1.0], [len(below), len(above)])
     weight = np.repeat([0.5 / len(below), 0.5 / len(above)], [len(below), len(above)])
-    centre = points.mean(axis=0)
+    center = points.mean(axis=0)
     scale = max(float(points.std(axis=0).mean()), 1e-9)
-    design = np.column_stack([(points - centre) / scale, np.ones(len(points))])
+    design = np.column_stack([(points - center) / scale, np.ones(len(points))])
     beta = np.append(axis, 0.0)
     # A weak ridge keeps separable classes finite and turns the plane to the widest margin.
     ridge = np.diag([1e-4, 1e-4, 1e-4, 0.0])
@@ -356,5 +356,5 @@ def _logistic_plane(below: Float, above: Float, axis: Float) -> tuple[Float, Flo
             break
     length = np.linalg.norm(beta[:3])
     normal = beta[:3] / length
-    point = centre - beta[3] / length * scale * normal
+    point = center - beta[3] / length * scale * normal
     return point, normal

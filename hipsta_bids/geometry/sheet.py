@@ -182,7 +182,7 @@ def _barycentric(corners: Float, points: Float) -> tuple[Float, Bool]:
 
 
 def _filled(points: Float) -> Float:
-    """Replace missing points by normalised averages of their neighbors in the same z level."""
+    """Replace missing points by normalized averages of their neighbors in the same z level."""
     missing = np.asarray(~np.isfinite(points).all(axis=-1))
     if not missing.any():
         return points

@@ -307,7 +307,7 @@ def _describe(
 ) -> Repair:
     kind, where = edit.kind, edit.where
     nodes: Float = where - CORNER
-    centre = field.grid.to_ras(nodes.mean(axis=0, keepdims=True))[0]
+    center = field.grid.to_ras(nodes.mean(axis=0, keepdims=True))[0]
     inside = np.clip(where - CORNER, 0, np.array(field.grid.shape) - 1)
     cost = edit.cost or float(np.abs(field.values[tuple(inside.T)]).sum())
     share = settings.flag_part if kind == "part" else settings.flag_fraction
@@ -319,8 +319,8 @@ def _describe(
         kind=kind,
         voxels=len(where),
         cost=cost,
-        position=(float(centre[0]), float(centre[1]), float(centre[2])),
-        subfield=locate(centre[None]) if locate else "",
+        position=(float(center[0]), float(center[1]), float(center[2])),
+        subfield=locate(center[None]) if locate else "",
         large=bool(
             edit.doubtful
             or cost > limit

@@ -153,7 +153,7 @@ def test_the_medial_side_lies_towards_the_midline(hemi):
 def test_a_swapped_hemisphere_is_refused(hemi):
     volume = short_phantom().label_volume(FREESURFER, hemi=hemi)
     other = "R" if hemi == "L" else "L"
-    with pytest.raises(GeometryError, match="labelled") as caught:
+    with pytest.raises(GeometryError, match="labeled") as caught:
         check_side(extract_body(volume, BodySettings()), other)
     assert caught.value.reason == "left-right-swapped"
 

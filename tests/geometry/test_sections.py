@@ -29,7 +29,7 @@ class Ribbon:
 
 @pytest.fixture(scope="module")
 def ribbon():
-    """An arc, 16 mm long: a defect of some millimetres is an exception on it."""
+    """An arc, 16 mm long: a defect of some millimeters is an exception on it."""
     phantom = short_phantom(length=16.0)
     body = extract_body(phantom.label_volume(load_protocol("freesurfer")), BodySettings())
     return Ribbon(phantom=phantom, body=body, field=resampled(body))

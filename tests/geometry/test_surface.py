@@ -122,7 +122,7 @@ def test_caps_carry_the_cross_section(arc):
 
 def test_volume_is_the_phantoms(case):
     truth = case.phantom.truth(0.5, 0.5).summary["volume"]
-    # The Gaussian of a third of a millimetre rounds the rims of a wall of 2 mm.
+    # The Gaussian of a third of a millimeter rounds the rims of a wall of 2 mm.
     got = signed_volume(case.surface.vertices, case.surface.triangles)
     assert got == pytest.approx(truth, rel=0.04)
 
