@@ -1,6 +1,5 @@
 """The sheet: the body on a regular grid of its own coordinates."""
 
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,7 +47,8 @@ def whole_body(settings: SheetSettings) -> SheetSettings:
 
     Columns on the rims themselves have no thickness, but lengths and areas need them.
     """
-    return replace(settings, x_extent=1.0, y_extent=1.0, z_extent=1.0, z_nodes=5, max_filled=1.0)
+    whole = {"x_extent": 1.0, "y_extent": 1.0, "z_extent": 1.0}
+    return settings.changed(**whole, z_nodes=5, max_filled=1.0)
 
 
 def folded_fraction(mesh: TetMesh, coordinates: Coordinates) -> float:
