@@ -43,6 +43,7 @@ test: lint types layers unit
 lint: $(STAMP)
 	"$(BIN)/python" -m ruff check .
 	"$(BIN)/python" -m ruff format --check .
+	"$(BIN)/codespell"
 
 types: $(STAMP)
 	"$(BIN)/python" -m mypy --strict

@@ -1,7 +1,7 @@
 """Errors that a user can act on, and the exit codes that go with them.
 
-A message says what is wrong, where, and what to try, on one line. Any exception that is not
-a :class:`HipstaError` is a bug in this package and shows its traceback.
+A message says what is wrong, where, and what to try, on one line. Any exception that is not a
+:class:`HipstaError` is a bug in this package and shows its traceback.
 """
 
 from enum import IntEnum
@@ -35,15 +35,7 @@ EXIT_MEANINGS: dict[int, str] = {
 
 
 class HipstaError(Exception):
-    """Base of all foreseen errors.
-
-    Parameters
-    ----------
-    message : str
-        One line: what, where, what to try.
-    reason : str
-        Machine-readable slug in kebab case, written to ``status.tsv``.
-    """
+    """Base of all foreseen errors; ``reason`` is a name for programs, written to ``status.tsv``."""
 
     exit_code = ExitCode.BAD_DATA
 

@@ -190,22 +190,3 @@ def test_links_lead_somewhere(page):
 def test_pages_say_what_the_code_says(name):
     written = (ROOT / "docs" / name).read_text(encoding="utf-8")
     assert written == PAGES[name](), "run tools/make-docs"
-
-
-def test_every_setting_says_what_it_means():
-    path = ROOT / "hipsta_bids" / "settings.py"
-    classes = [
-        node
-        for node in ast.parse(path.read_text(encoding="utf-8")).body
-        if isinstance(node, ast.ClassDef)
-    ]
-    assert {node.name for node in classes} > {"Settings"}
-    undocumented = [
-        f"{node.name}.{field.target.id}"
-        for node in classes
-        if node.name != "Settings"
-        for field, after in zip(node.body, [*node.body[1:], None], strict=True)
-        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
-        if not (isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant))
-    ]
-    assert not undocumented

@@ -1,100 +1,126 @@
+import pickle
 import tomllib
-from dataclasses import dataclass, field, fields, is_dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import pytest
+from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
 from hipsta_bids.errors import SettingsError
-from hipsta_bids.settings import (
-    Settings,
-    field_meanings,
+from hipsta_bids.group.settings import GroupSettings
+from hipsta_bids.protocols.toml import (
+    Numbers,
+    Odd,
+    SettingsTable,
     flatten,
-    load_settings,
     resolve,
     settings_from,
     settings_hash,
     settings_toml,
 )
+from hipsta_bids.settings import Settings, load_settings
 
 
-@dataclass(frozen=True, kw_only=True)
-class Inner:
+class Inner(SettingsTable):
     """A stage."""
 
-    length: float = 2.0
+    length: PositiveFloat = 2.0
     """A length, mm."""
     count: int = 3
     """A count."""
+    window: Odd = 5
+    """A window."""
     rule: Literal["a", "b"] = "a"
     """A rule."""
     exact: bool = False
     """A switch."""
 
-    def __post_init__(self):
-        if self.length <= 0:
-            raise ValueError(f"length is {self.length}, but has to be above 0 mm")
+    @model_validator(mode="after")
+    def _count_below_window(self):
+        if self.count >= self.window:
+            raise ValueError("count has to be below window")
+        return self
 
 
-@dataclass(frozen=True, kw_only=True)
-class Outer:
+class Outer(SettingsTable):
     """Everything."""
 
     title: str = 'x "quoted"'
     """A text."""
-    window: tuple[float, float] = (1.0, 2.0)
-    """A window, mm."""
-    steps: tuple[int, ...] = (1,)
+    steps: Numbers = (1.0,)
     """Steps."""
-    limit: float | None = None
+    limit: Annotated[float, Field(ge=0, le=4)] = 0.0
     """A limit, mm."""
-    inner: Inner = field(default_factory=Inner)
+    inner: Inner = Field(default_factory=Inner)
 
 
 def test_file_overrides_defaults_and_keeps_the_rest(tmp_path):
     path = tmp_path / "s.toml"
     path.write_text('[body]\nlayer_rule = "nearest-label"\n')
     assert load_settings(path).body.layer_rule == "nearest-label"
+    assert load_settings(path).changed(body={"layer_rule": "nearest-sheet"}) == Settings()
     assert load_settings(None) == Settings()
 
 
 def test_values_are_converted_to_their_fields_types():
-    values = {
-        "window": [0, 3],
-        "steps": [1, 2, 3],
-        "limit": 4,
-        "inner": {"length": 1, "rule": "b", "exact": True},
-    }
+    values = {"steps": [1, 2, 3], "limit": 4, "inner": {"length": 1, "rule": "b", "exact": True}}
     made = settings_from(values, Outer, where="f")
-    assert made.window == (0.0, 3.0)
-    assert isinstance(made.window[0], float)
-    assert made.steps == (1, 2, 3)
-    assert made.limit == 4.0
+    assert made.steps == (1.0, 2.0, 3.0)
+    assert {type(value) for value in (made.limit, *made.steps, made.inner.length)} == {float}
     assert made.inner == Inner(length=1.0, rule="b", exact=True)
+
+
+@pytest.mark.parametrize(
+    ("values", "message", "reason"),
+    [
+        ({"titel": "x"}, r"unknown key titel \(did you mean 'title'\?\)", "unknown-setting"),
+        ({"inner": {"lenght": 1}}, r"inner\.lenght \(did you mean 'length'", "unknown-setting"),
+        ({"zzz": 1}, "unknown key zzz; known here: title, steps, limit, inner", "unknown-setting"),
+        ({"inner": {"length": "1"}}, r"inner\.length is '1', .* a number", "bad-setting"),
+        ({"inner": {"count": 1.5}}, r"inner\.count is 1\.5, .* a whole number", "bad-setting"),
+        ({"inner": {"count": True}}, r"inner\.count is True, .* a whole number", "bad-setting"),
+        ({"inner": {"length": True}}, r"inner\.length is True, .* a number", "bad-setting"),
+        ({"inner": {"exact": 1}}, r"inner\.exact is 1, .* true or false", "bad-setting"),
+        ({"title": 1}, "title is 1, but has to be a text", "bad-setting"),
+        ({"inner": 3}, "inner is 3, but has to be a table", "bad-setting"),
+        ({"steps": 1}, "steps is 1, but has to be a list", "bad-setting"),
+        ({"steps": [1, "x"]}, "entry 2 of steps is 'x', but has to be a number", "bad-setting"),
+        ({"inner": {"rule": "c"}}, "'c', but has to be 'a' or 'b'", "setting-out-of-range"),
+        ({"inner": {"length": -1}}, r"inner\.length is -1, .* above 0", "setting-out-of-range"),
+        ({"inner": {"window": 6}}, r"window is 6, .* an odd number", "setting-out-of-range"),
+        ({"limit": 4.5}, "limit is 4.5, but has to be at most 4", "setting-out-of-range"),
+        ({"limit": float("nan")}, "limit is nan, but has to be at", "setting-out-of-range"),
+        ({"inner": {"count": 5}}, "f: inner: count has to be below", "setting-out-of-range"),
+        ({"limit": "x", "titel": "x"}, "unknown key titel", "unknown-setting"),
+    ],
+)
+def test_wrong_values_are_named(values, message, reason):
+    with pytest.raises(SettingsError, match=message) as caught:
+        settings_from(values, Outer, where="f")
+    assert str(caught.value).startswith("f: ")
+    assert "\n" not in str(caught.value)
+    assert (caught.value.exit_code, caught.value.reason) == (64, reason)
+
+
+def test_changed_values_are_checked():
+    assert Outer().changed(inner={"count": 2}) == Outer(inner=Inner(count=2))
+    with pytest.raises(SettingsError, match=r"settings: inner\.count is 'x'"):
+        Outer().changed(inner={"count": "x"})
 
 
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"titel": "x"}, "unknown setting titel; did you mean title"),
-        ({"inner": {"lenght": 1}}, r"unknown setting inner\.lenght; did you mean length"),
-        ({"zzz": 1}, "unknown setting zzz; known here: title, window"),
-        ({"inner": {"length": "1"}}, r"inner\.length is '1', but has to be a number"),
-        ({"inner": {"count": 1.5}}, r"inner\.count is 1\.5, but has to be a whole number"),
-        ({"inner": {"count": True}}, r"inner\.count is True, but has to be a whole number"),
-        ({"inner": {"length": True}}, r"inner\.length is True, but has to be a number"),
-        ({"inner": {"exact": 1}}, r"inner\.exact is 1, but has to be true or false"),
-        ({"inner": {"rule": "c"}}, r"inner\.rule is 'c', but has to be 'a' or 'b'"),
-        ({"inner": {"length": -1}}, r"inner: length is -1\.0, but has to be above 0 mm"),
-        ({"inner": 3}, "inner is a group of settings"),
-        ({"window": [1]}, "window is"),
-        ({"window": 1}, "window is"),
-        ({"steps": [1, "x"]}, "steps is"),
+        ({"grid": {"spacing": 2}}, r"grid\.spacing is 2, but has to be at most 1"),
+        ({"measures": {"gaussian_window": 8}}, r"gaussian_window is 8, but has to be an odd"),
+        ({"measures": {"curvature_order": 9}}, "measures: curvature_order has to be below"),
+        ({"surrogate": {"positions": []}}, "positions is .*, but has to be a list of at least 1"),
+        ({"surrogate": {"positions": [0.5, 1.0]}}, r"entry 2 of .*positions is 1\.0, .* below 1"),
+        ({"body": {"region": "head"}}, r"body\.region is 'head', .* 'body', 'extended'"),
     ],
 )
-def test_wrong_values_are_named(values, message):
-    with pytest.raises(SettingsError, match=message) as caught:
-        settings_from(values, Outer, where="f")
-    assert caught.value.exit_code == 64
+def test_values_that_no_stage_could_work_with_are_refused(values, message):
+    with pytest.raises(SettingsError, match=message):
+        settings_from(values, Settings, where="f")
 
 
 @pytest.mark.parametrize(
@@ -109,30 +135,28 @@ def test_unusable_files_are_named(tmp_path, content, message):
         load_settings(path)
 
 
-@pytest.mark.parametrize("settings", [Settings(), Outer(limit=2.5)])
-def test_printed_settings_read_back(settings):
+@pytest.mark.parametrize("settings", [Settings(), GroupSettings(), Outer(limit=2.5)])
+def test_printed_and_pickled_settings_read_back(settings):
     values = tomllib.loads(settings_toml(settings))
     assert settings_from(values, type(settings), where="f") == settings
+    assert pickle.loads(pickle.dumps(settings)) == settings  # noqa: S301 -- made here
 
 
 def test_printed_settings_explain_themselves():
     text = settings_toml(Outer())
     assert "# A length, mm.\nlength = 2.0" in text
     assert "# A stage.\n[inner]" in text
-    assert "# limit is not set" in text
 
 
 def test_hash_depends_on_values_only():
-    @dataclass(frozen=True, kw_only=True)
-    class Reordered:
-        inner: Inner = field(default_factory=Inner)
-        limit: float | None = None
-        steps: tuple[int, ...] = (1,)
-        window: tuple[float, float] = (1.0, 2.0)
+    class Reordered(SettingsTable):
+        inner: Inner = Field(default_factory=Inner)
+        limit: NonNegativeFloat = 0.0
+        steps: Numbers = (1.0,)
         title: str = 'x "quoted"'
 
     assert settings_hash(Outer()) == settings_hash(Reordered())
-    assert settings_hash(Outer()) != settings_hash(Outer(limit=0.0))
+    assert settings_hash(Outer()) != settings_hash(Outer(limit=1.0))
     assert len(settings_hash(Outer())) == 64
 
 
@@ -140,15 +164,11 @@ def test_flat_names():
     assert flatten(resolve(Outer()))["inner.length"] == 2.0
 
 
-def groups(kind):
-    yield kind
-    for entry in fields(kind):
-        if is_dataclass(entry.default_factory):
-            yield from groups(entry.default_factory)
-
-
-@pytest.mark.parametrize("kind", list(groups(Settings)))
-def test_every_setting_has_a_meaning(kind):
-    meanings = field_meanings(kind)
-    bare = [f.name for f in fields(kind) if not is_dataclass(f.default_factory)]
-    assert [name for name in bare if not meanings.get(name)] == []
+@pytest.mark.parametrize("settings", [Settings(), GroupSettings()])
+def test_every_setting_has_a_meaning_and_refuses_what_is_no_number(settings):
+    for group, values in settings:
+        for name, field in type(values).model_fields.items():
+            assert field.description, name
+            if field.annotation is float:
+                with pytest.raises(SettingsError, match=f"{name} is nan"):
+                    settings.changed(**{group: {name: float("nan")}})

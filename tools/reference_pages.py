@@ -1,12 +1,10 @@
 """Pages of docs/ that are made from the code: outputs, settings, reasons, options."""
 
 import argparse
-import dataclasses
 import inspect
 import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any
 
 from hipsta_bids.cli.group import group_parser
 from hipsta_bids.cli.participant import build_parser
@@ -25,7 +23,7 @@ from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY, 
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.tables import COLUMNS
 from hipsta_bids.reports.words import reason_sections
-from hipsta_bids.settings import Settings, field_meanings
+from hipsta_bids.settings import Settings
 
 NOTE = "<!-- Written by `tools/make-docs`; do not edit, run it again. -->"
 
@@ -148,18 +146,16 @@ def settings_page() -> str:
 
 
 def _stages(settings: Settings | GroupSettings) -> Iterator[str]:
-    for field in dataclasses.fields(settings):
-        stage = getattr(settings, field.name)
-        meanings = field_meanings(type(stage))
-        yield f"### {field.name}"
-        yield " ".join((inspect.getdoc(type(stage)) or "").split()).replace("``", "`")
-        yield _table(("setting", "default", "meaning"), _settings(stage, meanings))
+    for name, stage in settings:
+        yield f"### {name}"
+        yield _words(inspect.getdoc(type(stage)))
+        meanings = type(stage).model_fields
+        rows = ((f"`{k}`", f"`{json.dumps(v)}`", _words(meanings[k].description)) for k, v in stage)
+        yield _table(("setting", "default", "meaning"), rows)
 
 
-def _settings(stage: Any, meanings: Mapping[str, str]) -> Iterator[tuple[str, ...]]:  # noqa: ANN401  (any dataclass)
-    for field in dataclasses.fields(stage):
-        words = " ".join(meanings[field.name].split()).replace("``", "`")
-        yield f"`{field.name}`", f"`{json.dumps(getattr(stage, field.name))}`", words
+def _words(text: str | None) -> str:
+    return " ".join((text or "").split()).replace("``", "`")
 
 
 def reasons_page() -> str:

@@ -3,14 +3,12 @@
 import argparse
 import os
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hipsta_bids import __version__
 from hipsta_bids.cli.participant import Parser, named_pattern, rebuild_group_reports
 from hipsta_bids.errors import ExitCode, UsageError
-from hipsta_bids.group.settings import CORRECTIONS
 
 if TYPE_CHECKING:
     from hipsta_bids.group.read import GroupOptions
@@ -221,7 +219,7 @@ def _add_methods(parser: Parser) -> None:
     )
     add(
         "--correction",
-        choices=CORRECTIONS,
+        choices=["fdr2", "bh", "permutation-tfce", "permutation-max"],
         help="for the number of points: false discovery rate (fdr2, the default; bh), or"
         " family-wise error by permutation of residuals (permutation-tfce, permutation-max)",
     )
@@ -345,7 +343,7 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
     settings = load_group_settings(parsed.settings)
     if parsed.align is not None:
         align = parsed.align.replace("penalised", "penalized")
-        settings = replace(settings, registration=replace(settings.registration, align=align))
+        settings = settings.changed(registration={"align": align})
     given = {
         "method": parsed.correction,
         "scope": parsed.fdr_scope,
@@ -353,13 +351,11 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
         "blocks": parsed.blocks,
     }
     chosen = {name: value for name, value in given.items() if value is not None}
-    settings = replace(settings, multiplicity=replace(settings.multiplicity, **chosen))
+    settings = settings.changed(multiplicity=chosen)
     if parsed.longitudinal is not None:
-        longitudinal = replace(settings.longitudinal, random=parsed.longitudinal)
-        settings = replace(settings, longitudinal=longitudinal)
+        settings = settings.changed(longitudinal={"random": parsed.longitudinal})
     if parsed.base:
-        classification = replace(settings.classification, base=tuple(parsed.base))
-        settings = replace(settings, classification=classification)
+        settings = settings.changed(classification={"base": parsed.base})
     return settings
 
 

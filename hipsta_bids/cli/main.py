@@ -126,7 +126,8 @@ def _settings(arguments: list[str]) -> ExitCode:
     group = arguments == ["group"]
     _no_arguments([] if group else arguments, "settings")
     from hipsta_bids.group.settings import GroupSettings  # noqa: PLC0415  (start-up time)
-    from hipsta_bids.settings import Settings, settings_toml  # noqa: PLC0415  (start-up time)
+    from hipsta_bids.protocols.toml import settings_toml  # noqa: PLC0415  (start-up time)
+    from hipsta_bids.settings import Settings  # noqa: PLC0415  (start-up time)
 
     echo(settings_toml(GroupSettings() if group else Settings()).rstrip())
     return ExitCode.OK

@@ -563,7 +563,7 @@ def _find(request: "InputRequest", shard: "Shard | None") -> "Findings | None":
 def _with_region(settings: "Settings", region: str | None) -> "Settings":
     if region is None:
         return settings
-    return replace(settings, body=replace(settings.body, region=region))
+    return settings.changed(body={"region": region})
 
 
 def check_folders(options: "Namespace") -> None:

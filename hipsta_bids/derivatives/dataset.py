@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,8 @@ from hipsta_bids.derivatives.names import DATASET_FILES, ignore_patterns
 from hipsta_bids.errors import InputError, SettingsError, UsageError
 from hipsta_bids.io import files
 from hipsta_bids.protocols.protocol import Protocol
-from hipsta_bids.settings import BodySettings, Settings, flatten, resolve, settings_hash
+from hipsta_bids.protocols.toml import flatten, resolve, settings_hash
+from hipsta_bids.settings import BodySettings, Settings
 
 NAME = "hipsta_bids"
 BIDS_VERSION = "1.11.0"
@@ -82,7 +82,7 @@ def shared_settings(settings: Settings) -> tuple[str, dict[str, Any]]:
 
     The region is in the names of the files, so that one folder may hold several.
     """
-    anywhere = replace(settings, body=replace(settings.body, region=BodySettings().region))
+    anywhere = settings.changed(body={"region": BodySettings().region})
     resolved = resolve(anywhere)
     del resolved["body"]["region"]
     return settings_hash(anywhere), resolved

@@ -136,10 +136,10 @@ def _below_top(values: Float, share: Float) -> Float:
     slices = np.minimum((share * count).astype(int), count - 1)
     top = np.full(count, -np.inf)
     np.maximum.at(top, slices, values)
-    centres = (np.arange(count) + 0.5) / count
+    centers = (np.arange(count) + 0.5) / count
     known = np.isfinite(top)
-    top = ndimage.median_filter(np.interp(centres, centres[known], top[known]), 5, mode="nearest")
-    return np.asarray(np.interp(share, centres, top) - values)
+    top = ndimage.median_filter(np.interp(centers, centers[known], top[known]), 5, mode="nearest")
+    return np.asarray(np.interp(share, centers, top) - values)
 
 
 def _below_rim(depth: Float, path: NDArray[np.intp], wall: Wall) -> Float:

@@ -1,7 +1,5 @@
 """The sheet: the body on a regular grid of its own coordinates."""
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -48,7 +46,8 @@ def whole_body(settings: SheetSettings) -> SheetSettings:
 
     Columns on the rims themselves have no thickness, but lengths and areas need them.
     """
-    return replace(settings, x_extent=1.0, y_extent=1.0, z_extent=1.0, z_nodes=5, max_filled=1.0)
+    whole = {"x_extent": 1.0, "y_extent": 1.0, "z_extent": 1.0}
+    return settings.changed(**whole, z_nodes=5, max_filled=1.0)
 
 
 def folded_fraction(mesh: TetMesh, coordinates: Coordinates) -> float:
@@ -182,7 +181,7 @@ def _barycentric(corners: Float, points: Float) -> tuple[Float, Bool]:
 
 
 def _filled(points: Float) -> Float:
-    """Replace missing points by normalised averages of their neighbors in the same z level."""
+    """Replace missing points by normalized averages of their neighbors in the same z level."""
     missing = np.asarray(~np.isfinite(points).all(axis=-1))
     if not missing.any():
         return points

@@ -23,7 +23,8 @@ from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.group.covariates import relocate
 from hipsta_bids.group.data import PARTICIPANT, SESSION, Float, Measures, SideMaps
 from hipsta_bids.io import files
-from hipsta_bids.settings import Settings, resolve, settings_hash
+from hipsta_bids.protocols.toml import resolve, settings_hash
+from hipsta_bids.settings import Settings
 from hipsta_bids.types import Status
 
 # The user's table of participants to leave out.

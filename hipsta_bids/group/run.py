@@ -21,8 +21,8 @@ from hipsta_bids.group.shapes import average_shapes, write_shapes
 from hipsta_bids.group.template import templates_from_json
 from hipsta_bids.group.write import draw, write_results
 from hipsta_bids.io import files
+from hipsta_bids.protocols.toml import resolve
 from hipsta_bids.reports.group import write_group_report
-from hipsta_bids.settings import resolve
 
 # What the group level is asked for, what comes of it, and the record of both.
 

@@ -195,7 +195,8 @@ def _described(item: HemisphereInput) -> HemisphereInput:
     except HipstaError as error:
         return replace(item, problem=item.problem or error)
     # The citation is that of the protocol; a table has none.
-    protocol = replace(protocol, title=item.protocol.title, citation=item.protocol.citation)
+    known = {"title": item.protocol.title, "citation": item.protocol.citation}
+    protocol = protocol.model_copy(update=known)
     return replace(
         item,
         protocol=protocol,

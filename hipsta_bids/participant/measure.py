@@ -191,7 +191,7 @@ def _filled(
         except GeometryError:
             steps = settings.surface.taubin_iterations * (2 + extra)
             surface = extract_surface(
-                solid.field, replace(settings.surface, taubin_iterations=steps)
+                solid.field, settings.surface.changed(taubin_iterations=steps)
             )
     return surface, tetrahedralize(surface, settings.tetra), settings.surface.untangle_tries
 

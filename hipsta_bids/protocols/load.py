@@ -1,14 +1,15 @@
-"""Reading and checking protocol files."""
+"""Bundled protocols, users' protocol files, and protocols made of label tables; regions."""
 
-import difflib
 import re
 import tomllib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
+
+from pydantic import ValidationError
 
 from hipsta_bids.errors import ProtocolError
 from hipsta_bids.protocols.protocol import (
@@ -19,211 +20,7 @@ from hipsta_bids.protocols.protocol import (
     Protocol,
     Tissue,
 )
-
-_Member = TypeVar("_Member", Tissue, Part)
-
-_KEYS = {
-    "name": str,
-    "title": str,
-    "citation": str,
-    "sheet": list,
-    "layer": list,
-    "interior": list,
-    "labels": list,
-}
-_OPTIONAL_KEYS = {"tool": str, "unlisted": str, "right_offset": int, "neighbors": list}
-_LABEL_KEYS = {"code": int, "tissue": str, "name": str, "abbreviation": str, "color": str}
-_OPTIONAL_LABEL_KEYS = {"part": str}
-
-
-@cache
-def protocol_names() -> tuple[str, ...]:
-    """List the names of the bundled protocols, in alphabetical order."""
-    files = resources.files("hipsta_bids.protocols").iterdir()
-    return tuple(sorted(f.name.removesuffix(".toml") for f in files if f.name.endswith(".toml")))
-
-
-def load_protocol(name_or_path: str | Path) -> Protocol:
-    """Load a bundled protocol by name, or a user's protocol file."""
-    if isinstance(name_or_path, Path) or name_or_path.endswith(".toml"):
-        return _load_file(Path(name_or_path))
-    if name_or_path not in protocol_names():
-        raise ProtocolError(
-            f"no protocol is called {name_or_path!r}"
-            f"{_did_you_mean(name_or_path, protocol_names())}; "
-            f"bundled: {', '.join(protocol_names())} (a file's name has to end in .toml)",
-            reason="unknown-scheme",
-        )
-    return _load_bundled(name_or_path)
-
-
-def protocol_table() -> list[dict[str, str]]:
-    """Describe each bundled protocol in one row."""
-    rows = []
-    for name in protocol_names():
-        protocol = load_protocol(name)
-        parts = sorted({label.part for label in protocol.labels} - {Part.UNKNOWN})
-        rows.append(
-            {
-                "name": name,
-                "tool": protocol.tool,
-                "title": protocol.title,
-                "sheet": ", ".join(tissue.name for tissue in protocol.sheet),
-                "neighbors": ", ".join(tissue.name for tissue in protocol.neighbors) or "none",
-                "labels": str(len(protocol.labels)),
-                "parts": ", ".join(part.name.lower() for part in parts),
-                "citation": protocol.citation,
-            }
-        )
-    return rows
-
-
-@cache
-def _load_bundled(name: str) -> Protocol:
-    text = resources.files("hipsta_bids.protocols").joinpath(f"{name}.toml").read_text("utf-8")
-    protocol = parse_protocol(tomllib.loads(text), origin=f"{name}.toml")
-    if protocol.name != name:
-        raise _invalid(
-            f"{name}.toml", f"its name is {protocol.name!r}; name and file have to agree"
-        )
-    return protocol
-
-
-def _load_file(path: Path) -> Protocol:
-    try:
-        table = tomllib.loads(path.read_text("utf-8"))
-    except OSError as error:
-        raise ProtocolError(
-            f"{path}: cannot read the protocol ({error.strerror}); check the path",
-            reason="unreadable-scheme",
-        ) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ProtocolError(
-            f"{path}: not a TOML file ({error}); start from a bundled protocol",
-            reason="unreadable-scheme",
-        ) from error
-    return parse_protocol(table, origin=str(path))
-
-
-def parse_protocol(table: Mapping[str, Any], *, origin: str) -> Protocol:
-    """Check the contents of a protocol file."""
-    _check_keys(table, _KEYS, _OPTIONAL_KEYS, origin)
-    labels = tuple(_parse_label(entry, origin) for entry in table["labels"])
-    protocol = Protocol(
-        name=table["name"],
-        title=table["title"],
-        citation=table["citation"],
-        sheet=_tissues(table, "sheet", origin),
-        layer=_tissues(table, "layer", origin),
-        interior=_tissues(table, "interior", origin),
-        labels=labels,
-        tool=table.get("tool", ""),
-        unlisted=table.get("unlisted", "error"),
-        right_offset=table.get("right_offset", 0),
-        neighbors=_tissues(table, "neighbors", origin) if "neighbors" in table else (),
-    )
-    check_protocol(protocol, origin=origin)
-    return protocol
-
-
-def check_protocol(protocol: Protocol, *, origin: str) -> None:
-    """Check that the parts of a protocol agree with each other."""
-    codes = [label.code for label in protocol.labels]
-    twice = sorted({code for code in codes if codes.count(code) > 1})
-    used = {label.tissue for label in protocol.labels}
-    named = (*protocol.sheet, *protocol.layer, *protocol.interior, *protocol.neighbors)
-    absent = [tissue.name for tissue in dict.fromkeys(named) if tissue not in used]
-    order = tuple(tissue for tissue in MEDIAL_TO_LATERAL if tissue in protocol.sheet)
-    beside = tuple(tissue for tissue in FAR_TO_NEAR if tissue in protocol.neighbors)
-    problems = {
-        f"name {protocol.name!r} has to consist of letters and digits": not re.fullmatch(
-            "[A-Za-z0-9]+", protocol.name
-        ),
-        "there are no labels": not codes,
-        f"code {', '.join(map(str, twice))} is listed twice": bool(twice),
-        "unlisted has to be 'error' or 'other'": protocol.unlisted not in {"error", "other"},
-        "right_offset has to exceed every code": bool(codes)
-        and protocol.right_offset != 0
-        and protocol.right_offset <= max(codes),
-        f"no label has tissue {', '.join(absent)}": bool(absent),
-        "sheet has to list each tissue once, medial to lateral, out of "
-        + ", ".join(t.name for t in MEDIAL_TO_LATERAL): protocol.sheet != order,
-        "neighbors has to list each tissue once, far to near, out of "
-        + ", ".join(t.name for t in FAR_TO_NEAR): protocol.neighbors != beside,
-        "a tissue is in both sheet and layer": not set(protocol.sheet).isdisjoint(protocol.layer),
-        "a tissue is in both sheet and interior": not set(protocol.sheet).isdisjoint(
-            protocol.interior
-        ),
-        "layer, interior or neighbors is given without a sheet": not protocol.sheet and bool(named),
-        "there is neither a sheet nor a label with a part": not protocol.sheet
-        and all(label.part is Part.UNKNOWN for label in protocol.labels),
-    }
-    for problem, wrong in problems.items():
-        if wrong:
-            raise _invalid(origin, problem)
-
-
-def _parse_label(entry: object, origin: str) -> Label:
-    if not isinstance(entry, dict):
-        raise _invalid(origin, f"label {entry!r} is not a table")
-    where = f"{origin}, label {entry.get('code', '?')}"
-    _check_keys(entry, _LABEL_KEYS, _OPTIONAL_LABEL_KEYS, where)
-    if entry["code"] <= 0:
-        raise _invalid(where, "codes are positive (0 is background)")
-    if not re.fullmatch("#[0-9a-fA-F]{6}", entry["color"]):
-        raise _invalid(where, f"color {entry['color']!r} is not of the form #rrggbb")
-    return Label(
-        code=entry["code"],
-        tissue=_member(Tissue, entry["tissue"], where),
-        part=_member(Part, entry.get("part", "unknown"), where),
-        name=entry["name"],
-        abbreviation=entry["abbreviation"],
-        color=entry["color"].lower(),
-    )
-
-
-def _tissues(table: Mapping[str, Any], key: str, origin: str) -> tuple[Tissue, ...]:
-    return tuple(_member(Tissue, name, f"{origin}, {key}") for name in table[key])
-
-
-def _member(kind: type[_Member], name: object, where: str) -> _Member:
-    """Find an enumeration's member by its name in any case."""
-    names = {member.name.lower(): member for member in kind}
-    if not isinstance(name, str) or name.lower() not in names:
-        hint = _did_you_mean(str(name).lower(), names)
-        raise _invalid(where, f"unknown {kind.__name__.lower()} {name!r}{hint}")
-    return names[name.lower()]
-
-
-def _check_keys(
-    table: Mapping[str, Any],
-    required: Mapping[str, type],
-    optional: Mapping[str, type],
-    where: str,
-) -> None:
-    kinds = {**required, **optional}
-    for key, value in table.items():
-        if key not in kinds:
-            raise _invalid(where, f"unknown key {key!r}{_did_you_mean(key, kinds)}")
-        # bool is a subclass of int, and "code = true" is a mistake.
-        if not isinstance(value, kinds[key]) or isinstance(value, bool):
-            raise _invalid(where, f"{key} has to be of type {kinds[key].__name__}")
-    for key in required:
-        if key not in table:
-            raise _invalid(where, f"key {key!r} is missing")
-
-
-def _did_you_mean(name: str, names: Iterable[str]) -> str:
-    near = difflib.get_close_matches(name, list(names), n=1)
-    return f" (did you mean {near[0]!r}?)" if near else ""
-
-
-def _invalid(where: str, problem: str) -> ProtocolError:
-    return ProtocolError(f"{where}: {problem}", reason="invalid-scheme")
-
-
-# Protocols described by names instead of numbers: label tables that come with a dataset.
-
+from hipsta_bids.protocols.toml import did_you_mean, first_mistake
 
 #: What laboratories call the tissues, after :func:`identify_tissue` has reduced a name.
 _NAMES = {
@@ -268,8 +65,117 @@ _FILLERS = {
 _NEIGHBORS = {Tissue.BA35, Tissue.ENTORHINAL, Tissue.PARAHIPPOCAMPAL}
 _WHOLE = {"hippocampus", "hippocampal", "hipp", "hp"}
 
-#: Colors of tissues in tables that give none (ColorBrewer's qualitative sets, recycled).
+#: Colors of tissues in tables without any (ColorBrewer's qualitative sets, recycled).
 _COLORS = ("#1b9e77", "#d95f02", "#7570b3", "#e7298a", "#66a61e", "#e6ab02", "#a6761d", "#666666")
+
+
+@cache
+def protocol_names() -> tuple[str, ...]:
+    """List the names of the bundled protocols, in alphabetical order."""
+    files = resources.files("hipsta_bids.protocols").iterdir()
+    return tuple(sorted(f.name.removesuffix(".toml") for f in files if f.name.endswith(".toml")))
+
+
+def load_protocol(name_or_path: str | Path) -> Protocol:
+    """Load a bundled protocol by name, or a user's protocol file."""
+    if isinstance(name_or_path, Path) or name_or_path.endswith(".toml"):
+        return _load_file(Path(name_or_path))
+    if name_or_path not in protocol_names():
+        raise ProtocolError(
+            f"no protocol is called {name_or_path!r}"
+            f"{did_you_mean(name_or_path, protocol_names())}; "
+            f"bundled: {', '.join(protocol_names())} (a file's name has to end in .toml)",
+            reason="unknown-scheme",
+        )
+    return _load_bundled(name_or_path)
+
+
+def protocol_table() -> list[dict[str, str]]:
+    """Describe each bundled protocol in one row."""
+    rows = []
+    for name in protocol_names():
+        protocol = load_protocol(name)
+        parts = sorted({label.part for label in protocol.labels} - {Part.UNKNOWN})
+        rows.append(
+            {
+                "name": name,
+                "tool": protocol.tool,
+                "title": protocol.title,
+                "sheet": ", ".join(tissue.name for tissue in protocol.sheet),
+                "neighbors": ", ".join(tissue.name for tissue in protocol.neighbors) or "none",
+                "labels": str(len(protocol.labels)),
+                "parts": ", ".join(part.name.lower() for part in parts),
+                "citation": protocol.citation,
+            }
+        )
+    return rows
+
+
+@cache
+def _load_bundled(name: str) -> Protocol:
+    text = resources.files("hipsta_bids.protocols").joinpath(f"{name}.toml").read_text("utf-8")
+    return parse_protocol(tomllib.loads(text), origin=f"{name}.toml")
+
+
+def _load_file(path: Path) -> Protocol:
+    try:
+        table = tomllib.loads(path.read_text("utf-8"))
+    except OSError as error:
+        raise ProtocolError(
+            f"{path}: cannot read the protocol ({error.strerror}); check the path",
+            reason="unreadable-scheme",
+        ) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ProtocolError(
+            f"{path}: not a TOML file ({error}); start from a bundled protocol",
+            reason="unreadable-scheme",
+        ) from error
+    return parse_protocol(table, origin=str(path))
+
+
+def parse_protocol(table: Mapping[str, Any], *, origin: str) -> Protocol:
+    """Check the contents of a protocol file."""
+    try:
+        protocol = Protocol.model_validate(table)
+    except ValidationError as error:
+        _, mistake = first_mistake(error, Protocol)
+        raise ProtocolError(f"{origin}: {mistake}", reason="invalid-scheme") from error
+    _check_agreement(protocol, origin=origin)
+    return protocol
+
+
+def _check_agreement(protocol: Protocol, *, origin: str) -> None:
+    """Check that the parts of a protocol agree with each other."""
+    codes = [label.code for label in protocol.labels]
+    top = max(codes, default=0)
+    twice = sorted({code for code in codes if codes.count(code) > 1})
+    used = {label.tissue for label in protocol.labels}
+    named = (*protocol.sheet, *protocol.layer, *protocol.interior, *protocol.neighbors)
+    absent = [tissue.name for tissue in dict.fromkeys(named) if tissue not in used]
+    order = tuple(tissue for tissue in MEDIAL_TO_LATERAL if tissue in protocol.sheet)
+    beside = tuple(tissue for tissue in FAR_TO_NEAR if tissue in protocol.neighbors)
+    sheet = set(protocol.sheet)
+    problems = {
+        f"name {protocol.name!r} has to consist of letters and digits": not re.fullmatch(
+            "[A-Za-z0-9]+", protocol.name
+        ),
+        "there are no labels": not codes,
+        f"code {', '.join(map(str, twice))} is listed twice": twice,
+        "right_offset has to exceed every code": protocol.right_offset in range(1, top + 1),
+        f"no label has tissue {', '.join(absent)}": absent,
+        "sheet has to list each tissue once, medial to lateral, out of "
+        + ", ".join(t.name for t in MEDIAL_TO_LATERAL): protocol.sheet != order,
+        "neighbors has to list each tissue once, far to near, out of "
+        + ", ".join(t.name for t in FAR_TO_NEAR): protocol.neighbors != beside,
+        "a tissue is in both sheet and layer": not sheet.isdisjoint(protocol.layer),
+        "a tissue is in both sheet and interior": not sheet.isdisjoint(protocol.interior),
+        "layer, interior or neighbors is given without a sheet": named and not sheet,
+        "there is neither a sheet nor a label with a part": not sheet
+        and all(label.part is Part.UNKNOWN for label in protocol.labels),
+    }
+    for problem, wrong in problems.items():
+        if wrong:
+            raise ProtocolError(f"{origin}: {problem}", reason="invalid-scheme")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -319,7 +225,7 @@ def protocol_from_names(rows: Iterable[NamedCode], *, name: str, origin: str) ->
         labels=labels,
         neighbors=tuple(t for t in FAR_TO_NEAR if t in tissues and t in _NEIGHBORS),
     )
-    check_protocol(protocol, origin=origin)
+    _check_agreement(protocol, origin=origin)
     return protocol
 
 
@@ -356,11 +262,8 @@ def _label(row: NamedCode, index: int) -> Label:
     )
 
 
-# What is measured: the hippocampal body, with the cortex beside it, or that cortex alone.
-
-
 def for_region(protocol: Protocol, region: str) -> Protocol:
-    """Give a protocol the sheet of a region."""
+    """Return a protocol with the sheet of a region: body, extended by cortex, or cortex alone."""
     if region == "body":
         return protocol
     if not protocol.neighbors:
@@ -372,4 +275,4 @@ def for_region(protocol: Protocol, region: str) -> Protocol:
             reason="no-cortex-labels",
         )
     hippocampal = protocol.sheet if region == "extended" else ()
-    return replace(protocol, sheet=(*protocol.neighbors, *hippocampal))
+    return protocol.model_copy(update={"sheet": (*protocol.neighbors, *hippocampal)})

@@ -1,12 +1,15 @@
-"""The vocabulary that every segmentation protocol is translated into."""
+"""What segmentation protocols are made of: tissues, parts, labels; translation of their codes."""
 
-from dataclasses import dataclass
+import re
 from enum import IntEnum
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import AfterValidator, BeforeValidator, NonNegativeInt, PositiveInt, Strict
 
 from hipsta_bids.errors import ProtocolError
+from hipsta_bids.protocols.toml import TomlTable, did_you_mean
 
 
 class Tissue(IntEnum):
@@ -70,68 +73,69 @@ _RANKS = np.arange(max(Tissue) + 1, dtype=np.int8)
 _RANKS[list(FAR_TO_NEAR)] = (-3, -2, -1, -1, 0)
 _RANKS.flags.writeable = False
 
-
-def lateral_rank(tissue: NDArray[np.uint8]) -> NDArray[np.int8]:
-    """Rank from medial to lateral of the tissues of a sheet and of the cortex beside it."""
-    return np.asarray(_RANKS[tissue])
-
-
-# Segmentation protocols as data, and the translation of their codes.
-
-
 #: Tissues outside the hippocampal formation proper: they never decide where to crop.
-OUTSIDE = frozenset(
-    {
-        Tissue.BACKGROUND,
-        Tissue.ENTORHINAL,
-        Tissue.BA35,
-        Tissue.BA36,
-        Tissue.PARAHIPPOCAMPAL,
-        Tissue.OTHER,
-    }
-)
+OUTSIDE = frozenset({Tissue.BACKGROUND, Tissue.OTHER, *FAR_TO_NEAR}) - {Tissue.PARASUBICULUM}
 
 #: How many codes an error message lists before it says how many more there are.
 SHOWN = 12
 
 
-@dataclass(frozen=True, kw_only=True)
-class Label:
-    """One code of a protocol."""
+def _named(kind: type[IntEnum]) -> BeforeValidator:
+    """Take a member of an enumeration, or its name in any case."""
+    names = {member.name.lower(): member for member in kind}
 
-    code: int
-    tissue: Tissue
-    part: Part
+    def find(value: object) -> object:
+        name = str(value).lower()
+        if isinstance(value, kind) or name in names:
+            return names.get(name, value)
+        raise ValueError(f"the name of a {kind.__name__.lower()}{did_you_mean(name, names)}")
+
+    return BeforeValidator(find)
+
+
+def _lower_color(value: str) -> str:
+    if not re.fullmatch("#[0-9a-fA-F]{6}", value):
+        raise ValueError("of the form #rrggbb")
+    return value.lower()
+
+
+TissueName = Annotated[Tissue, _named(Tissue)]
+Tissues = Annotated[tuple[TissueName, ...], Strict(strict=False)]
+
+
+class Label(TomlTable):
+    """One code of a protocol; 0 is background."""
+
+    code: PositiveInt
+    tissue: TissueName
+    part: Annotated[Part, _named(Part)] = Part.UNKNOWN
     name: str
     abbreviation: str
-    color: str
+    color: Annotated[str, AfterValidator(_lower_color)]
     """``#rrggbb``, for pictures and label GIFTIs."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Protocol:
-    """A segmentation protocol.
-
-    ``name`` is alphanumeric: it becomes the ``seg-`` entity of output names.
-    """
+class Protocol(TomlTable):
+    """A segmentation protocol."""
 
     name: str
+    """Letters and digits: it becomes the ``seg-`` entity of output names."""
     title: str
     citation: str
-    sheet: tuple[Tissue, ...]
+    sheet: Tissues
     """Tissues merged into the sheet, medial to lateral; empty where only parts are labeled."""
-    layer: tuple[Tissue, ...]
+    layer: Tissues
     """Tissues whose voxels go to the nearest sheet tissue."""
-    interior: tuple[Tissue, ...]
+    interior: Tissues
     """Tissues on the concave (interior) side of the sheet."""
-    labels: tuple[Label, ...]
+    labels: Annotated[tuple[Label, ...], Strict(strict=False)]
     tool: str = ""
     """The software that writes these codes (``freesurfer``, ``ashs``, ``hippunfold``), if any."""
-    unlisted: str = "error"
+    unlisted: Literal["error", "other"] = "error"
     """What a code that is not listed means: ``error``, or ``other`` (outside the hippocampus)."""
-    neighbors: tuple[Tissue, ...] = ()
+    neighbors: Tissues = ()
     """Cortex beyond the medial end of the sheet, from far to near, for the regions with cortex."""
-    right_offset: int = 0
+    right_offset: NonNegativeInt = 0
     """Added to right-hand codes in files that carry both hemispheres; 0 if there are none."""
 
     @property
@@ -189,3 +193,8 @@ def _some(values: NDArray[np.integer]) -> str:
     """List the first few values."""
     more = f" and {len(values) - SHOWN} more" if len(values) > SHOWN else ""
     return ", ".join(str(value) for value in values[:SHOWN].tolist()) + more
+
+
+def lateral_rank(tissue: NDArray[np.uint8]) -> NDArray[np.int8]:
+    """Rank from medial to lateral of the tissues of a sheet and of the cortex beside it."""
+    return np.asarray(_RANKS[tissue])

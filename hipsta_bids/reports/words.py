@@ -3,7 +3,7 @@
 import math
 import tomllib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from typing import Any
@@ -112,7 +112,7 @@ def usual_ranges(thickness: float, settings: Mapping[str, Any]) -> tuple[Usual, 
 
     ``thickness`` Mean over the sheet, mm, to which some limits are relative.
     """
-    usual = asdict(Settings())
+    usual = Settings().model_dump()
     stages = {name: usual[name] | dict(settings.get(name) or {}) for name in usual}
     checks, topology, body = stages["checks"], stages["topology"], stages["body"]
     return (

@@ -86,7 +86,7 @@ def measure_case(case: Case) -> Measured:
     hemi = "R" if case.mirrored else case.hemi
     settings = Settings()
     if case.spacing is not None:
-        settings = replace(settings, grid=GridSettings(spacing=case.spacing))
+        settings = Settings(grid=GridSettings(spacing=case.spacing))
     maps = measure_hemisphere(volume, hemi, settings, lambda _: nullcontext())
     return compare(phantom, case, maps)
 

@@ -250,8 +250,7 @@ def simulate_corrections(
         empty = simulate_cohort(replace(plan, effect=0.0), seed)
         affected.append(cohort.affected)
         for method, results in found.items():
-            how = replace(settings.multiplicity, method=method, seed=seed)
-            chosen = replace(settings, multiplicity=how)
+            chosen = settings.changed(multiplicity={"method": method, "seed": seed})
             results.append((_found(cohort, chosen), _found(empty, chosen)))
     return {method: _summary(results, affected) for method, results in found.items()}
 
@@ -325,7 +324,7 @@ def run(full: bool) -> Suite:
     settings = GroupSettings()
     rows: list[tuple[Cell, ...]] = []
     for align, title in _METHODS.items():
-        how = replace(settings, registration=replace(settings.registration, align=align))
+        how = settings.changed(registration={"align": align})
         rows.append(_row(title, align, run_simulation(plan, how, seeds)))
     return Suite(
         name="group",
@@ -360,9 +359,8 @@ def run(full: bool) -> Suite:
 
 def _corrections(cohorts: int) -> Table:
     """Tell what each correction finds where there is nothing, and where there is something."""
-    settings = GroupSettings()
-    how = replace(settings.multiplicity, permutations=PERMUTATIONS, alpha=LEVEL)
-    found = simulate_corrections(SMALL, replace(settings, multiplicity=how), range(cohorts))
+    how = GroupSettings().changed(multiplicity={"permutations": PERMUTATIONS, "alpha": LEVEL})
+    found = simulate_corrections(SMALL, how, range(cohorts))
     # Three binomial standard deviations above the level.
     most = LEVEL + 3 * (LEVEL * (1 - LEVEL) / cohorts) ** 0.5
     return Table(

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -113,7 +113,7 @@ def _place(item: HemisphereInput, out_dir: Path) -> ResultPlace:
 
 def _measure(item: HemisphereInput, place: ResultPlace, settings: Settings) -> Iterator[str]:
     """Measure one hemisphere, write its table, and give a line per slice."""
-    body = extract_body(read_label_volume(item), replace(settings.body, region="body"))
+    body = extract_body(read_label_volume(item), settings.body.changed(region="body"))
     sheet = _read_sheet(place)
     rows: list[list[str]] = []
     lines = []

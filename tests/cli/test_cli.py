@@ -19,7 +19,10 @@ from hipsta_bids.participant import run as runner
 from hipsta_bids.participant.run import RunOptions
 from hipsta_bids.settings import Settings, load_settings
 
-HEAVY = ("bids", "hipsta_bids.participant.run", "nibabel", "numpy", "pandas", "scipy", "tqdm")
+HEAVY = (
+    *("bids", "hipsta_bids.participant.run", "nibabel", "numpy", "pandas", "pydantic", "scipy"),
+    "tqdm",
+)
 
 
 def python(*arguments, **options):

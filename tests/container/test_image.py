@@ -36,7 +36,8 @@ LEFT_OVERS = r"""
 find / -xdev -path /proc -prune -o -type f -perm -100 \
     \( -name 'gcc*' -o -name 'g++*' -o -name 'cc1*' -o -name '*-ld' -o -name ld \) -print
 find ~/.cache /build /tmp -mindepth 1 2>/dev/null
-find /opt/hipsta_bids -path '*-packages/pip' -o -path '*-packages/plotly' -o -name tests -o -name '*.whl'
+find /opt/hipsta_bids -path '*-packages/pip' -o -path '*-packages/plotly' -o -name tests \
+    -o -name '*.whl'
 true
 """
 

@@ -1,6 +1,5 @@
 import json
 import multiprocessing
-from dataclasses import dataclass, field
 
 import pytest
 from stand_ins import make_scheme
@@ -76,13 +75,8 @@ def test_other_settings_are_refused_by_name(tmp_path):
 
 
 def test_settings_of_another_version_are_refused_by_name(tmp_path):
-    @dataclass(frozen=True, kw_only=True)
     class Newer(Settings):
         extra: int = 3
-
-    @dataclass(frozen=True, kw_only=True)
-    class Plain:
-        body: BodySettings = field(default_factory=BodySettings)
 
     dataset.settle_settings(tmp_path, Settings())
     with pytest.raises(SettingsError, match="extra was not there, now 3"):

@@ -156,7 +156,7 @@ def test_a_mirrored_phantom_gives_the_mirrored_boundaries():
 
 
 def test_the_eigenfunction_is_overruled_where_the_rules_disagree(arc):
-    strict = replace(SETTINGS, max_distance=-1.0)
+    strict = SETTINGS.changed(max_distance=0.0)
     found = find_boundaries(arc.surface, arc.mesh, arc.body, strict)
     assert found.rule == "rims"
     for u, curve in ((0, found.medial_curve), (1, found.lateral_curve)):
@@ -165,7 +165,7 @@ def test_the_eigenfunction_is_overruled_where_the_rules_disagree(arc):
 
 
 def test_strips_that_swallow_the_sides_are_refused(arc):
-    wide = replace(SETTINGS, first_strip=6.0, least_strip=6.0)
+    wide = SETTINGS.changed(first_strip=6.0, least_strip=6.0)
     with pytest.raises(GeometryError, match=r"do not separate the interior.*RAS") as caught:
         find_boundaries(arc.surface, arc.mesh, arc.body, wide)
     assert caught.value.reason == "boundaries"

@@ -38,7 +38,7 @@ def surface_of(kind, voxel, thickness):
 
 
 def test_a_sheet_of_hardly_more_than_a_voxel_is_refused():
-    """At 1.0 mm, 1.2 mm come out wrong by millimetres without any other sign."""
+    """At 1.0 mm, 1.2 mm come out wrong by millimeters without any other sign."""
     surface, body = surface_of("spiral", 1.0, 1.2)
     with pytest.raises(GeometryError, match=r"voxels of 1\.00 mm; 2\.5 are needed") as caught:
         check_voxels_across(surface, body, CHECKS)

@@ -29,7 +29,7 @@ class Ribbon:
 
 @pytest.fixture(scope="module")
 def ribbon():
-    """An arc, 16 mm long: a defect of some millimetres is an exception on it."""
+    """An arc, 16 mm long: a defect of some millimeters is an exception on it."""
     phantom = short_phantom(length=16.0)
     body = extract_body(phantom.label_volume(load_protocol("freesurfer")), BodySettings())
     return Ribbon(phantom=phantom, body=body, field=resampled(body))
@@ -137,7 +137,7 @@ def test_rows_that_jump_or_dip(widths, wanted):
 
 def test_dips_are_sought_within_a_reach():
     widths = 20 - 4 * np.exp(-(((np.arange(21) - 10) / 3.0) ** 2))
-    assert check_rows(rows(widths), replace(CHECKS, row_dip_reach=2.0)) == []
+    assert check_rows(rows(widths), CHECKS.changed(row_dip_reach=2.0)) == []
 
 
 def banded(size, rows=slice(10, 11), columns=slice(10, 30)):

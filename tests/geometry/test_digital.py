@@ -18,7 +18,7 @@ masks = arrays.arrays(np.bool_, st.tuples(*[st.integers(3, 8)] * 3), elements=st
 
 
 def simple_by_counting(block):
-    """The definition, by labelling: one object piece and one background piece at the center."""
+    """The definition, by labeling: one object piece and one background piece at the center."""
     around = block.copy()
     around[1, 1, 1] = False
     pieces, _ = ndimage.label(around & EDGES, structure=FACES)

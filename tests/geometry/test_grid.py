@@ -133,7 +133,7 @@ def test_field_reaches_both_ends_at_full_strength():
 def test_labels_beyond_the_end_planes_do_not_count():
     whole = box_body()
     cut = box_body()
-    cut.tissue[:, :, : int(2.5 / 0.4)] = 0  # the tail, half a millimetre off the plane
+    cut.tissue[:, :, : int(2.5 / 0.4)] = 0  # the tail, half a millimeter off the plane
     np.testing.assert_array_equal(resampled(cut).values, resampled(whole).values)
 
 

@@ -26,7 +26,7 @@ def drawn(spec, hemi="L"):
 
 
 def profiles(body, position=0.5, **changes):
-    settings = replace(SETTINGS.surrogate, **changes)
+    settings = SETTINGS.surrogate.changed(**changes)
     return surrogate_profiles(body, position, SETTINGS.sheet, settings)
 
 

@@ -1,7 +1,6 @@
 """Small cohorts of sheets as the participant level leaves them; nothing is measured."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 
@@ -9,7 +8,7 @@ from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.hemisphere import ResultPlace, format_column
 from hipsta_bids.derivatives.names import HemisphereName
 from hipsta_bids.io import files
-from hipsta_bids.settings import Settings
+from hipsta_bids.settings import Settings, SheetSettings
 from hipsta_bids.validation.group import SimulationPlan, simulate_cohort
 
 NODES = (21, 7)
@@ -23,7 +22,7 @@ PLAN = SimulationPlan(
     shift=1.0,
     warp_sd=(0.5, 0.25),
 )
-SETTINGS = replace(Settings(), sheet=replace(Settings().sheet, x_nodes=NODES[0], y_nodes=NODES[1]))
+SETTINGS = Settings(sheet=SheetSettings(x_nodes=NODES[0], y_nodes=NODES[1]))
 COLUMNS = ["x", "y", "thickness", "curvature", "subfield"]
 GROUPS = ("CN", "AD")
 

@@ -1,7 +1,5 @@
 """Logistic models, areas under the curve and separation, against R, statsmodels and simulation."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy import optimize, special, stats
@@ -149,7 +147,7 @@ def test_separated_groups_get_finite_answers_and_are_told():
 
 def test_likelihood_ratio_does_not_depend_on_units_and_keeps_its_size():
     p = []
-    quick = replace(SETTINGS, folds=2, repeats=1)
+    quick = SETTINGS.changed(folds=2, repeats=1)
     for seed in range(60):
         base, added, case = simulated(seed, n=80, effect=0.0)
         p.append(compare_models(base, added, case, quick).p)
@@ -188,11 +186,11 @@ def test_cross_validation_does_not_reward_noise():
     random = np.random.default_rng(2)
     case = np.arange(60) % 2 == 0
     matrix = np.column_stack([np.ones(60), random.standard_normal((60, 8))])
-    validated = cross_validate(matrix, case, replace(SETTINGS, repeats=10))
+    validated = cross_validate(matrix, case, SETTINGS.changed(repeats=10))
     fit = fit_logistic(matrix, case, SETTINGS, firth=False)
     assert delong(matrix @ fit.coefficients, case, 0.95).area > 0.65  # optimistic
     assert validated.auc < 0.6
-    repeated = cross_validate(matrix, case, replace(SETTINGS, repeats=10))
+    repeated = cross_validate(matrix, case, SETTINGS.changed(repeats=10))
     assert validated.auc == repeated.auc
 
 
@@ -201,7 +199,7 @@ def test_cross_validation_survives_a_level_that_a_fold_lacks():
     rare = np.zeros(60)
     rare[[3, 7]] = 1.0
     matrix = np.column_stack([base, added, rare])
-    assert np.isfinite(cross_validate(matrix, case, replace(SETTINGS, repeats=5)).auc)
+    assert np.isfinite(cross_validate(matrix, case, SETTINGS.changed(repeats=5)).auc)
 
 
 def test_calibration_of_right_and_of_exaggerated_chances():

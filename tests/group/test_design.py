@@ -1,7 +1,6 @@
 """Formulas, BIDS Stats Models and contrasts; and what is said when a design is impossible."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -154,7 +153,7 @@ def test_more_refusals():
     with pytest.raises(ModelError, match="no row has all"):
         design("group + age", table=table.assign(age=np.nan))
     with pytest.raises(ModelError, match="6 complete rows are too few for 4 columns"):
-        design("group + age", table=table.iloc[:6], settings=replace(SETTINGS, min_level=2))
+        design("group + age", table=table.iloc[:6], settings=SETTINGS.changed(min_level=2))
     with pytest.raises(ModelError, match="did you mean group"):
         design("group + age", ["group[CU]-group[DTA]"])
     with pytest.raises(ModelError, match="which is no factor"):

@@ -1,13 +1,15 @@
 """Which calls mean the group level, its help, and its settings as a file."""
 
+from typing import get_args
+
 import pytest
 
-from hipsta_bids.cli.group import is_group_level
+from hipsta_bids.cli.group import group_parser, is_group_level
 from hipsta_bids.cli.main import main
 from hipsta_bids.errors import UsageError
 from hipsta_bids.group.collect import QualityCondition
 from hipsta_bids.group.settings import GroupSettings, load_group_settings
-from hipsta_bids.settings import settings_toml
+from hipsta_bids.protocols.toml import settings_toml
 
 
 @pytest.mark.parametrize(
@@ -33,6 +35,21 @@ def test_settings_are_printed_and_read_back(tmp_path, capsys):
     path.write_text(capsys.readouterr().out)
     assert load_group_settings(path) == GroupSettings()
     assert "added" in settings_toml(GroupSettings())
+
+
+@pytest.mark.parametrize(
+    ("option", "group", "name"),
+    [
+        ("--align", "registration", "align"),
+        ("--correction", "multiplicity", "method"),
+        ("--fdr-scope", "multiplicity", "scope"),
+        ("--longitudinal", "longitudinal", "random"),
+    ],
+)
+def test_options_and_settings_know_the_same_choices(option, group, name):
+    (action,) = (a for a in group_parser()._actions if option in a.option_strings)
+    known = get_args(type(dict(GroupSettings())[group]).model_fields[name].annotation)
+    assert set(action.choices) - {"penalised"} == set(known)
 
 
 @pytest.mark.parametrize(

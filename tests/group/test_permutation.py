@@ -1,6 +1,5 @@
 """Permutation tests: statistics of the model, exact counts, family-wise error, power."""
 
-from dataclasses import replace
 from itertools import permutations
 
 import numpy as np
@@ -38,7 +37,7 @@ def case(seed=0, subjects=40):
 def test_statistic_is_that_of_the_model(contrast):
     _, matrix, maps = case()
     maps[:, 5] = 1.0
-    few = replace(SETTINGS, permutations=2)
+    few = SETTINGS.changed(permutations=2)
     (expected,) = fit_points(maps, matrix, [contrast], GlmSettings()).tests
     found = permute(maps, matrix, contrast, SHEET, settings=few)
     np.testing.assert_allclose(found.statistic, expected.statistic, rtol=1e-9)  # rounding
@@ -50,7 +49,7 @@ def test_uncorrected_p_approaches_that_of_all_permutations():
     matrix = np.column_stack([np.ones(6), np.arange(6.0)])
     maps = random.standard_normal((6, 4)) + 0.5 * matrix[:, 1:]
     slope = Contrast("slope", np.array([0.0, 1.0]))
-    found = permute(maps, matrix, slope, (2, 2), settings=replace(SETTINGS, permutations=6000))
+    found = permute(maps, matrix, slope, (2, 2), settings=SETTINGS.changed(permutations=6000))
     orders = np.array(list(permutations(range(6))))
     for point in range(4):
         r = np.abs([np.corrcoef(maps[order, point], matrix[:, 1])[0, 1] for order in orders])
@@ -61,18 +60,18 @@ def test_uncorrected_p_approaches_that_of_all_permutations():
 
 def test_large_samples_give_the_p_of_the_t_test():
     _, matrix, maps = case(2, subjects=80)
-    found = permute(maps, matrix, GROUP, SHEET, settings=replace(SETTINGS, permutations=4000))
+    found = permute(maps, matrix, GROUP, SHEET, settings=SETTINGS.changed(permutations=4000))
     (test,) = fit_points(maps, matrix, [GROUP], GlmSettings()).tests
     # Four standard deviations of a share of 4000 (63 of them are compared).
     np.testing.assert_allclose(found.p_uncorrected, test.p, atol=0.032)
 
 
 def test_family_wise_error_is_kept_on_null_maps():
-    few = replace(SETTINGS, permutations=60)
+    few = SETTINGS.changed(permutations=60)
     smallest = []
     for seed in range(120):
         _, matrix, maps = case(seed, subjects=24)
-        found = permute(maps, matrix, GROUP, SHEET, settings=replace(few, seed=seed))
+        found = permute(maps, matrix, GROUP, SHEET, settings=few.changed(seed=seed))
         smallest.append((found.p_max.min(), found.p_enhanced.min()))
     rates = (np.array(smallest) <= 0.1).mean(axis=0)
     # Binomial SD .027 around .1; three of them.
@@ -85,7 +84,7 @@ def test_enhancement_finds_weak_wide_effects_that_the_maximum_misses():
     for seed in range(10):
         _, matrix, maps = case(seed)
         maps.reshape(-1, *SHEET)[matrix[:, 1] == 1, 2:7, 1:6] += 0.75
-        found = permute(maps, matrix, GROUP, SHEET, settings=replace(SETTINGS, permutations=200))
+        found = permute(maps, matrix, GROUP, SHEET, settings=SETTINGS.changed(permutations=200))
         hits += [(p <= 0.05).sum() for p in (found.p_max, found.p_enhanced)]
     assert hits[1] > 2 * hits[0]
 
@@ -100,7 +99,7 @@ def test_blocks_keep_a_site_effect_from_looking_like_a_group_effect():
         group = random.random(40) < np.where(site, 0.8, 0.2)
         matrix = np.column_stack([np.ones(40), group])
         maps = random.standard_normal((40, 4)) + 1.0 * site[:, None]
-        few = replace(SETTINGS, permutations=60, seed=seed)
+        few = SETTINGS.changed(permutations=60, seed=seed)
         for i, blocks in enumerate((None, site)):
             contrast = Contrast("group", np.array([0.0, 1.0]))
             found = permute(maps, matrix, contrast, (2, 2), settings=few, blocks=blocks)

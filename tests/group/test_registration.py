@@ -1,6 +1,5 @@
 """Registration against R, known warps and frozen templates; what warps do to maps."""
 
-from dataclasses import replace
 from time import process_time
 
 import numpy as np
@@ -51,7 +50,7 @@ def test_agrees_with_r(oracle):
     run = oracle["registr"]["A"]
     expected = np.array(run["t_hat_R"])
     profiles = np.array(run["Y"])
-    plain = register(profiles, replace(SETTINGS, center=False))
+    plain = register(profiles, SETTINGS.changed(center=False))
     assert np.abs(plain.warps - expected).max() <= 0.005
     assert root_mean_square(plain.warps - expected) <= 0.001
     centered = register(profiles, SETTINGS)
@@ -159,7 +158,7 @@ def test_extreme_warp_is_flagged():
 
 def test_no_alignment_leaves_all_alone():
     profiles, _, _ = simulated(5)
-    found = register(profiles, replace(SETTINGS, align="none"))
+    found = register(profiles, SETTINGS.changed(align="none"))
     np.testing.assert_array_equal(found.warps, np.tile(GRID, (5, 1)))
     assert found.template is None
     assert found.explained_before == found.explained_after

@@ -235,7 +235,7 @@ def test_senseless_grids_are_refused(phantom, options, message):
 def test_protocol_with_too_few_subfields_is_refused(phantom):
     few = tuple(label for label in FREESURFER.labels if label.tissue is not Tissue.CA1)
     with pytest.raises(ProtocolError, match="no label for some subfield"):
-        phantom.label_volume(replace(FREESURFER, labels=few), voxel_size=COARSE)
+        phantom.label_volume(FREESURFER.model_copy(update={"labels": few}), voxel_size=COARSE)
 
 
 def test_a_volume_is_not_written_in_a_protocol_that_cannot_say_it(phantom):

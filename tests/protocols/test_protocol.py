@@ -1,15 +1,9 @@
-import io
-import tokenize
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from hipsta_bids.errors import ProtocolError
 from hipsta_bids.protocols.load import load_protocol, protocol_names, protocol_table
 from hipsta_bids.protocols.protocol import MEDIAL_TO_LATERAL, Part, Tissue, translate
-
-PACKAGE = Path(__file__).parents[2] / "hipsta_bids"
 
 #: The codes that the protocols' authors publish, by tissue and part (the user's list).
 PUBLISHED = {
@@ -148,19 +142,6 @@ def test_freesurfer_lists_every_amygdala_nucleus():
     assert others == set(range(7001, 7021))
 
 
-def test_no_code_of_a_label_appears_in_the_package_outside_of_protocol_files():
-    # Codes from 200 on are distinctive enough to be searched for as numbers.
-    codes = {code for name in protocol_names() for code in load_protocol(name).codes if code >= 200}
-    hits = [
-        f"{path.name}:{token.start[0]}: {token.line.strip()}"
-        for folder in ("schemes", "bids", "geometry")
-        for path in (PACKAGE / folder).glob("*.py")
-        for token in tokenize.generate_tokens(io.StringIO(path.read_text("utf-8")).readline)
-        if token.type == tokenize.NUMBER and token.string in map(str, codes)
-    ]
-    assert hits == []
-
-
 def test_a_users_file_loads_and_fills_in_defaults(tmp_path):
     protocol = load_protocol(write(tmp_path, MINIMAL))
     assert (protocol.unlisted, protocol.right_offset, protocol.tool) == ("error", 0, "")
@@ -172,17 +153,21 @@ def test_a_users_file_loads_and_fills_in_defaults(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('title = "Mine"', 'titel = "Mine"', r"unknown key 'titel' \(did you mean 'title'\?\)"),
-        ('title = "Mine"', "", "key 'title' is missing"),
-        ('title = "Mine"', "title = 3", "title has to be of type str"),
+        ('title = "Mine"', 'titel = "Mine"', r"unknown key titel \(did you mean 'title'\?\)"),
+        ('title = "Mine"', "", "key title is missing"),
+        ('title = "Mine"', "title = 3", "title is 3, but has to be a text"),
         ('name = "mine"', 'name = "my-own"', "letters and digits"),
         ("code = 2", "code = 1", "code 1 is listed twice"),
-        ("code = 2", "code = true", "code has to be of type int"),
-        ("code = 2", "code = 0", "codes are positive"),
-        ("code = 2", "kode = 2", "unknown key 'kode'"),
-        ('tissue = "CA1"', 'tissue = "CA9"', r"unknown tissue 'CA9' \(did you mean 'ca"),
-        ('part = "body"', 'part = "bodi"', r"unknown part 'bodi' \(did you mean 'body'\?\)"),
-        ('color = "#0000AA"', 'color = "blue"', "color 'blue' is not of the form #rrggbb"),
+        ("code = 2", "code = true", "entry 2 of labels: code is True, .* a whole number"),
+        ("code = 2", "code = 0", "code is 0, but has to be above 0"),
+        ("code = 2", "kode = 2", r"entry 2 of labels: unknown key kode \(did you mean 'code'\?\)"),
+        ('tissue = "CA1"', 'tissue = "CA9"', r"'CA9', .* name of a tissue \(did you mean 'ca"),
+        ('part = "body"', 'part = "bodi"', r"'bodi', .* of a part \(did you mean 'body'\?\)"),
+        (
+            'color = "#0000AA"',
+            'color = "blue"',
+            "color is 'blue', .* of the form #rrggbb",
+        ),
         ('sheet = ["subiculum", "CA1"]', 'sheet = ["CA1", "subiculum"]', "medial to lateral"),
         ('sheet = ["subiculum", "CA1"]', 'sheet = ["CA1", "CA3"]', "no label has tissue CA3"),
         ('sheet = ["subiculum", "CA1"]', 'sheet = ["dentate_gyrus"]', "medial to lateral"),
@@ -191,7 +176,7 @@ def test_a_users_file_loads_and_fills_in_defaults(tmp_path):
         ('interior = ["dentate_gyrus"]', 'interior = ["CA1"]', "in both sheet and interior"),
         ("layer = []", 'layer = []\nunlisted = "ignore"', "'error' or 'other'"),
         ("layer = []", "layer = []\nright_offset = 2", "exceed every code"),
-        ("labels = [", "labels = [ 7,", "label 7 is not a table"),
+        ("labels = [", "labels = [ 7,", "entry 1 of labels is 7, but has to be a table"),
     ],
 )
 def test_a_mistake_in_a_file_is_named(tmp_path, old, new, message):

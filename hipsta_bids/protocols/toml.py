@@ -1,0 +1,208 @@
+"""Checked tables of TOML files: models, one line for a mistake, reading, printing, hashing."""
+
+import difflib
+import hashlib
+import inspect
+import json
+import textwrap
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Self, TypeVar, get_args
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    NonNegativeFloat,
+    Strict,
+    ValidationError,
+)
+
+from hipsta_bids.errors import SettingsError
+
+_LINE = 96
+
+#: What a value has to be, by pydantic's type of mistake; braces take its limits.
+_EXPECTED = {
+    "bool_type": "true or false",
+    "float_type": "a number",
+    "int_type": "a whole number",
+    "string_type": "a text",
+    "tuple_type": "a list",
+    "model_type": "a table of keys and values",
+    "literal_error": "{expected}",
+    "greater_than": "above {gt:g}",
+    "greater_than_equal": "at least {ge:g}",
+    "less_than": "below {lt:g}",
+    "less_than_equal": "at most {le:g}",
+    "too_short": "a list of at least {min_length}",
+    "value_error": "{error}",
+}
+
+#: Reasons of mistakes in settings that are not merely out of range.
+_REASONS = {"extra_forbidden": "unknown-setting"} | {
+    kind: "bad-setting" for kind in ("missing", *_EXPECTED) if kind.endswith(("_type", "missing"))
+}
+
+
+class TomlTable(BaseModel):
+    """A table of a TOML file; nothing is converted but whole numbers to floats."""
+
+    # Workers get their settings pickled and need no validator: it is built where one is used.
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, use_attribute_docstrings=True, defer_build=True
+    )
+
+
+Table = TypeVar("Table", bound=TomlTable)
+
+
+class SettingsTable(TomlTable):
+    """A group of settings; the docstrings of its fields are their meanings."""
+
+    def changed(self, **values: object) -> Self:
+        """Return a copy with other, checked values; a mapping changes some values of a group."""
+        groups = {
+            name: dict(getattr(self, name)) | dict(value)
+            for name, value in values.items()
+            if isinstance(value, Mapping)
+        }
+        return settings_from({**dict(self), **values, **groups}, type(self), where="settings")
+
+
+def _odd(value: int) -> int:
+    if value % 2 == 0:
+        raise ValueError("an odd number")
+    return value
+
+
+Fraction = Annotated[float, Field(ge=0, le=1)]
+PositiveFraction = Annotated[float, Field(gt=0, le=1)]
+OpenFraction = Annotated[float, Field(gt=0, lt=1)]
+Odd = Annotated[int, Field(ge=3), AfterValidator(_odd)]
+# TOML has lists, and settings do not change: these become tuples.
+Numbers = Annotated[tuple[NonNegativeFloat, ...], Strict(strict=False)]
+Texts = Annotated[tuple[str, ...], Strict(strict=False)]
+
+
+def did_you_mean(name: str, names: Iterable[str]) -> str:
+    """Name the nearest known name as a question, or nothing if none is near."""
+    near = difflib.get_close_matches(name, list(names), n=1)
+    return f" (did you mean {near[0]!r}?)" if near else ""
+
+
+def first_mistake(error: ValidationError, kind: type[BaseModel]) -> tuple[str, str]:
+    """Return pydantic's type of the first mistake, unknown keys before others, and say it."""
+    # A mistyped key is also a missing one, but says more.
+    mistake = min(error.errors(), key=lambda found: found["type"] != "extra_forbidden")
+    position, given, words = mistake["loc"], mistake["input"], mistake["type"]
+    name = _name(position)
+    table, colon, key = name.rpartition(": ")
+    if words == "extra_forbidden":
+        known = _table_at(kind, position[:-1]).model_fields
+        hint = did_you_mean(str(position[-1]), known) or f"; known here: {', '.join(known)}"
+        return words, f"{table}{colon}unknown key {key}{hint}"
+    if words == "missing":
+        return words, f"{table}{colon}key {key} is missing"
+    expected = _EXPECTED.get(words, "{msg}").format(msg=mistake["msg"], **mistake.get("ctx", {}))
+    if isinstance(given, Mapping | BaseModel):  # a rule on several of its values
+        return words, f"{name}: {expected}".removeprefix(": ")
+    return words, f"{name} is {given!r}, but has to be {expected}"
+
+
+def _name(position: Iterable[str | int]) -> str:
+    """Name a value as in ``body.region`` or ``entry 2 of labels: code``."""
+    name = ""
+    for key in position:
+        name = f"entry {key + 1} of {name[:-1]}: " if isinstance(key, int) else f"{name}{key}."
+    return name.rstrip(".: ")
+
+
+def _table_at(kind: type[BaseModel], position: Iterable[str | int]) -> type[BaseModel]:
+    for key in position:
+        if isinstance(key, str):
+            annotation = kind.model_fields[key].annotation
+            kind = (get_args(annotation) or (annotation,))[0]
+    return kind
+
+
+def read_settings(path: Path | None, kind: type[Table]) -> Table:
+    """Read a TOML file as settings of some kind; what it leaves out keeps its default."""
+    if path is None:
+        return kind()
+    try:
+        with path.open("rb") as file:
+            values = tomllib.load(file)
+    except OSError as error:
+        raise SettingsError(
+            f"{path}: settings cannot be read ({error.strerror}); check the path",
+            reason="settings-unreadable",
+        ) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SettingsError(
+            f"{path}: not a TOML file ({error}); start from `hipsta-bids settings`",
+            reason="settings-not-toml",
+        ) from error
+    return settings_from(values, kind, where=str(path))
+
+
+def settings_from(values: Mapping[str, Any], kind: type[Table], *, where: str) -> Table:
+    """Make settings of nested tables, or say what is wrong in them."""
+    try:
+        return kind.model_validate(values)
+    except ValidationError as error:
+        found, mistake = first_mistake(error, kind)
+        reason = _REASONS.get(found, "setting-out-of-range")
+        raise SettingsError(f"{where}: {mistake}", reason=reason) from error
+
+
+def resolve(settings: BaseModel) -> dict[str, Any]:
+    """Turn settings into nested dictionaries of plain values, every default filled in."""
+    return settings.model_dump(mode="json")
+
+
+def settings_hash(settings: BaseModel) -> str:
+    """Hash the resolved settings."""
+    canonical = json.dumps(resolve(settings), sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(canonical.encode()).hexdigest()
+
+
+def flatten(resolved: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Name each leaf of resolved settings by its dotted path."""
+    flat: dict[str, Any] = {}
+    for key, value in resolved.items():
+        if isinstance(value, Mapping):
+            flat |= flatten(value, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = value
+    return flat
+
+
+def settings_toml(settings: BaseModel) -> str:
+    """Write settings as TOML, each with its meaning as a comment."""
+    return "\n".join(_toml_lines(settings, "")).strip() + "\n"
+
+
+def _toml_lines(group: BaseModel, prefix: str) -> Iterator[str]:
+    """Write the leaves of one group first, then its tables, as TOML demands."""
+    yield from _comment(inspect.getdoc(type(group)))
+    if prefix:
+        yield f"[{prefix.rstrip('.')}]"
+    nested = []
+    for name, entry in type(group).model_fields.items():
+        value = getattr(group, name)
+        if isinstance(value, BaseModel):
+            nested.append((name, value))
+            continue
+        yield from _comment(entry.description)
+        # TOML writes numbers, booleans, basic strings and lists as JSON does.
+        yield f"{name} = {json.dumps(value)}"
+    for name, table in nested:
+        yield ""
+        yield from _toml_lines(table, f"{prefix}{name}.")
+
+
+def _comment(text: str | None) -> list[str]:
+    return [f"# {line}" for line in textwrap.wrap(" ".join((text or "").split()), _LINE)]
