@@ -14,9 +14,8 @@ from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.catalog import SUMMARY
 from hipsta_bids.io import files
 from hipsta_bids.reports.maps import MAP_KINDS, make_sprites, read_maps
-from hipsta_bids.reports.page import render
+from hipsta_bids.reports.page import number, render
 from hipsta_bids.reports.results import Hemisphere, find_results, number_of
-from hipsta_bids.reports.words import number
 from hipsta_bids.types import Float, Status
 
 #: Ranges are shown of at least so many hemispheres ...

@@ -1,13 +1,19 @@
-"""Static figures by matplotlib: unfolded maps and profiles."""
+"""Static figures by matplotlib, without a screen: unfolded maps, profiles, and tiles of maps."""
 
+import atexit
 import base64
+import contextlib
 import io
+import os
 import re
-from collections.abc import Mapping, Sequence
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -15,7 +21,6 @@ from numpy.typing import NDArray
 from pyarrow import csv
 
 from hipsta_bids.io import files
-from hipsta_bids.reports.plotting import new_figure
 from hipsta_bids.reports.results import Hemisphere
 from hipsta_bids.types import Float, Status
 
@@ -23,6 +28,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+#: What a user may have in the environment that would change figures.
+_PREFERENCES = ("MPLBACKEND", "MATPLOTLIBRC")
 
 #: Colors of the hemispheres (Okabe and Ito 2008).
 HEMISPHERE_COLORS = {"L": "#0072B2", "R": "#D55E00"}
@@ -37,6 +44,38 @@ _STYLE: Any = {
     "svg.fonttype": "none",
     "svg.hashsalt": "hipsta_bids",
 }
+
+# Tiles: many small maps in one picture, of which a browser shows a part each.
+_COLUMNS = 20  # side by side
+_COLORS = 128  # shades; one more stands for missing values
+_MISSING = (217, 217, 217)
+_FULL_SIZE = 1500  # tiles; of more, each has a quarter of the pixels, so that pages stay small
+
+
+def new_figure(size: tuple[float, float], layout: Literal["constrained", "compressed"]) -> "Figure":
+    """Return an empty figure; it needs no screen and no home folder."""
+    with contextlib.nullcontext() if "matplotlib" in sys.modules else _own_settings():
+        from matplotlib.figure import Figure  # noqa: PLC0415  (slow to load)
+
+    return Figure(figsize=size, layout=layout)
+
+
+@contextlib.contextmanager
+def _own_settings() -> Iterator[None]:
+    """Let matplotlib load with its own folder, which is removed when this process ends.
+
+    It keeps a list of fonts in the user's home, which may be missing or read-only in containers
+    and on clusters, and would read that user's preferences there.
+    """
+    folder = tempfile.mkdtemp(prefix="hipsta-bids-fonts-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    before = {name: os.environ.pop(name, None) for name in (*_PREFERENCES, "MPLCONFIGDIR")}
+    os.environ["MPLCONFIGDIR"] = folder
+    try:
+        yield
+    finally:
+        del os.environ["MPLCONFIGDIR"]
+        os.environ.update({name: value for name, value in before.items() if value is not None})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -307,15 +346,6 @@ def _mark_subfields(axis: "Axes", hemisphere: Hemisphere) -> None:
             middle, 1.01, usual[start], ha="center", va="bottom", fontsize=9, color="0.3",
             transform=axis.get_xaxis_transform(),
         )  # fmt: skip
-
-
-# Many small maps in one picture, of which a browser shows a part each: hundreds at once, fast.
-
-
-_COLUMNS = 20  # tiles side by side
-_COLORS = 128  # shades; one more stands for missing values
-_MISSING = (217, 217, 217)
-_FULL_SIZE = 1500  # beyond so many, tiles have a quarter of the pixels, so that pages stay small
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,7 +21,14 @@ from hipsta_bids.reports.maps import (
     gradient_of,
 )
 from hipsta_bids.reports.maps import scale_of as scale_of_map
-from hipsta_bids.reports.page import Section, build_sections, render
+from hipsta_bids.reports.page import (
+    VERDICTS,
+    Section,
+    build_sections,
+    number,
+    render,
+    usual_ranges,
+)
 from hipsta_bids.reports.results import (
     Finding,
     Hemisphere,
@@ -32,7 +39,6 @@ from hipsta_bids.reports.results import (
 )
 from hipsta_bids.reports.slices import place_panels, section_panels, slice_panels
 from hipsta_bids.reports.viewer import scales_of, scene_of, subfields_of
-from hipsta_bids.reports.words import number, usual_ranges, verdict_of
 from hipsta_bids.types import Float, Status
 
 # What the sections of a participant's page are about.
@@ -231,7 +237,7 @@ def _status(series: Series) -> Mapping[str, Any]:
             {
                 "side": h.side,
                 "status": str(h.status),
-                "verdict": verdict_of(h),
+                "verdict": VERDICTS[h.status],
                 "findings": h.findings,
                 "reason": h.record.get("reason"),
                 "notes": h.record.get("notes") or [],
