@@ -155,7 +155,7 @@ def colors_of(name: str, n: int = 64) -> NDArray[np.str_]:
 
 
 def gradient_of(colors: NDArray[np.str_]) -> str:
-    """Spell a color table as a CSS gradient from left to right."""
+    """Write a color table as a CSS gradient from left to right."""
     stops = colors[np.linspace(0, len(colors) - 1, 9).round().astype(int)]
     return f"linear-gradient(to right,{','.join(stops.tolist())})"
 
@@ -193,20 +193,20 @@ def draw_profiles(
     for hemisphere in hemispheres:
         hemi = hemisphere.place.name.hemi
         values = hemisphere.sheet.columns[kind.column]
-        place = np.linspace(0, 100, values.shape[0])
+        x = np.linspace(0, 100, values.shape[0])
         color = HEMISPHERE_COLORS[hemi]
         low, high = np.nanpercentile(values, [5, 95], axis=1)
         bands += [low, high]
-        axis.fill_between(place, low, high, color=color, alpha=0.18, linewidth=0)
-        axis.plot(place, np.nanmean(values, axis=1), color=color, label=hemisphere.side)
+        axis.fill_between(x, low, high, color=color, alpha=0.18, linewidth=0)
+        axis.plot(x, np.nanmean(values, axis=1), color=color, label=hemisphere.side)
         cohort = others.get(hemi)
         if cohort is not None and len(cohort):
             style = {"color": color, "linewidth": 0.9, "linestyle": (0, (2, 2))}
             for line in np.nanpercentile(cohort, [5, 95], axis=0):
-                axis.plot(place, line, **style)
+                axis.plot(x, line, **style)
     _mark_subfields(axis, hemispheres[0])
     axis.set_xlim(0, 100)
-    # The columns next to the rims may lie far off; they need not squeeze the rest.
+    # Columns beside the edges of the sheet may be far off; they must not squeeze the rest.
     bottom, top = np.nanpercentile(np.concatenate(bands), [3, 97])
     axis.set_ylim(bottom - 0.15 * (top - bottom), top + 0.2 * (top - bottom))
     axis.set_xlabel("medial  ←  % of the width  →  lateral")
@@ -303,7 +303,7 @@ def _hatch(axis: "Axes", where: NDArray[np.bool_], x: Float, y: Float, hatch: st
 
 
 def _edges(nodes: Float) -> Float:
-    """Place cell edges halfway between nodes."""
+    """Compute cell edges halfway between nodes."""
     step = nodes[1] - nodes[0]
     return np.append(nodes - step / 2, nodes[-1] + step / 2)
 
@@ -359,7 +359,7 @@ class Sprites:
     high: str
     """Values at the ends of the colors."""
     gradient: str
-    """Of the color bar, as CSS spells it."""
+    """Of the color bar, in CSS."""
     address: str
     """Data address of the picture."""
 
@@ -413,7 +413,7 @@ def make_sprites(
     trusted = [row for row in shown if hemispheres[row].status != Status.FLAGGED] or shown
     sprites = []
     for kind in MAP_KINDS if shown else ():
-        # What is flagged may be far off; it need not stretch the colors of all others.
+        # Flagged hemispheres may be far off; they must not stretch the colors of all others.
         scale = scale_of(kind, [maps[row][kind.column] for row in trusted])
         tiles = [maps[row][kind.column][::step, ::step] for row in shown]
         sprites.append(_sprites(kind, tiles, mirrored, grid, scale))
