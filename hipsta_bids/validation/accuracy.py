@@ -300,7 +300,7 @@ defaults.
 _THICKNESS_NOTES = """\
 Bias is the mean over the grid, averaged over the poses; SD is over the grid, its root mean square
 over the poses. Both take the whole default grid, edges included. The truth is that of the phantom
-at the place where the mid-surface was found. Without edges: without the {edge} outer nodes on each
+at the point where the mid-surface was found. Without edges: without the {edge} outer nodes on each
 side. The SD of the mean map is what remains when the error is averaged over the poses at each grid
-point: errors that stay at their place, near rims and bends.
+point: errors that stay in one position, near edges and bends.
 """
