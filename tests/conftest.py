@@ -7,7 +7,7 @@ import pytest
 
 import hipsta_bids
 from hipsta_bids.errors import HipstaError
-from hipsta_bids.reports.words import reason_sections
+from hipsta_bids.reports.page import reason_sections
 from hipsta_bids.types import Flag
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from measure_example import Example
+from measure_example import Comparison, Example
 from measure_figures import DRAWINGS
 from measure_topics import ERRORS, INTRODUCTION, PUBLISHED, SIZES_TEXT, TOPICS, Topic
 from PIL import Image
@@ -27,8 +27,7 @@ from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.settings import Settings
-from hipsta_bids.validation.accuracy import Comparison
-from hipsta_bids.validation.report import Cell, Picture, Table, markdown, render
+from hipsta_bids.validation.report import Cell, Cells, Picture, Table, markdown, render
 
 #: Where measures are found, and the rows of the catalog that are there.
 TABLES: Mapping[str, Sequence[Column]] = {
@@ -146,12 +145,12 @@ def _row(column: Column, table: str, shown: Example) -> tuple[Cell, ...]:
 
 
 def _errors(others: Mapping[str, Example]) -> Table:
-    rows: list[tuple[Cell, ...]] = []
+    rows: list[Cells] = []
     for table in TABLES:
         for name in next(iter(others.values())).measured[table]:
-            measured = [example.measured[table][name] for example in others.values()]
-            rows.append((f"`{name}`", table, *map(_error, measured)))
-    return Table(title="Errors", columns=("measure", "table", *others), rows=tuple(rows))
+            errors = {key: _error(one.measured[table][name]) for key, one in others.items()}
+            rows.append({"measure": f"`{name}`", "table": table, **errors})
+    return Table(title="Errors", rows=rows)
 
 
 def _error(one: Comparison) -> str:
@@ -176,7 +175,8 @@ def _real_sizes(record: Mapping[str, object]) -> str:
 
 def _table(headings: tuple[str, ...], rows: Iterable[tuple[Cell, ...]]) -> str:
     """Write a table in Markdown, without a title."""
-    text = markdown(Table(title="", columns=headings, rows=tuple(rows)))
+    cells = [dict(zip(headings, row, strict=True)) for row in rows]
+    text = markdown(Table(title="", rows=cells))
     return text.split("\n\n", 1)[1]
 
 

@@ -22,7 +22,7 @@ from hipsta_bids.errors import EXIT_MEANINGS
 from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY, Column
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.tables import COLUMNS
-from hipsta_bids.reports.words import reason_sections
+from hipsta_bids.reports.page import reason_sections
 from hipsta_bids.settings import Settings
 
 NOTE = "<!-- Written by `tools/make-docs`; do not edit, run it again. -->"

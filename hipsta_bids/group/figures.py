@@ -15,7 +15,7 @@ from hipsta_bids.group.fit import FittedMaps
 from hipsta_bids.group.glm import PointTest
 from hipsta_bids.group.inference import MapKey
 from hipsta_bids.group.shapes import AverageShape
-from hipsta_bids.reports.plotting import new_figure
+from hipsta_bids.reports.maps import new_figure
 from hipsta_bids.types import Mesh
 
 if TYPE_CHECKING:

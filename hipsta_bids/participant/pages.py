@@ -166,7 +166,7 @@ def _is_newer(page: Path, root: Path, *patterns: str) -> bool:
 def warm_up() -> None:
     """Load the libraries, so that no page's time includes it."""
     import hipsta_bids.reports.participant  # noqa: F401, PLC0415  (loaded in workers only)
-    from hipsta_bids.reports.plotting import new_figure  # noqa: PLC0415
+    from hipsta_bids.reports.maps import new_figure  # noqa: PLC0415
 
     new_figure((1.0, 1.0), "constrained")
 

@@ -10,7 +10,7 @@ from hipsta_bids.phantom.dataset import (
 )
 from hipsta_bids.phantom.labels import encode
 from hipsta_bids.phantom.phantom import Phantom
-from hipsta_bids.phantom.spec import KINDS, PhantomSpec, Thinning
+from hipsta_bids.phantom.shape import KINDS, PhantomSpec, Thinning
 from hipsta_bids.phantom.truth import PhantomTruth
 
 __all__ = [

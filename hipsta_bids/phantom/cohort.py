@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hipsta_bids.errors import UsageError
 from hipsta_bids.io import files
@@ -19,7 +19,7 @@ from hipsta_bids.phantom.dataset import (
 )
 from hipsta_bids.phantom.labels import SUBFIELD_STARTS
 from hipsta_bids.phantom.phantom import Phantom
-from hipsta_bids.phantom.spec import KINDS, PhantomSpec, Thinning
+from hipsta_bids.phantom.shape import KINDS, PhantomSpec, Thinning
 from hipsta_bids.types import Float
 
 Range = tuple[float, float]
@@ -44,6 +44,20 @@ def _regions() -> Mapping[str, tuple[Range, Range]]:
 
 #: Regions of the sheet in which an effect can be planted: ranges of u and v.
 REGIONS = _regions()
+
+#: Years, mL; sex and the means of intracranial volume of women and men.
+_AGES, _MEAN_AGE = (50.0, 80.0), 65.0
+_ICV, _ICV_SD, _ICV_MEAN = MappingProxyType({"F": 1400.0, "M": 1560.0}), 110.0, 1480.0
+_TURN, _SHIFT = 6.0, 3.0  # degrees and mm, SD of a head's position
+
+#: True maps of each hemisphere, and where the effect was planted; below the dataset.
+MAPS_FOLDER = "phantom_maps"
+EFFECT_TABLE = "phantom_effect.tsv"
+
+#: Nodes of the true maps along x and y: as many as the default sheet has.
+NODES = (41, 21)
+
+_ROUNDING = 1e-9  # nodes on the border of a region belong to it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,35 +98,22 @@ class CohortPlan:
     sites: tuple[float, ...] = (0.0, 0.03)
     """mm that each site adds to thickness."""
     cortex: float = 0.0
-    """mm of neighboring cortex, by which the mid-curve goes on beyond the subiculum."""
+    """mm of neighboring cortex, by which the mid-curve extends beyond the subiculum."""
 
     def __post_init__(self) -> None:
-        if self.region not in REGIONS:
-            raise UsageError(
-                f"phantom: region {self.region!r} is unknown; choose from {', '.join(REGIONS)}",
-                reason="phantom-region",
-            )
-        if self.kind not in KINDS:
-            raise UsageError(
-                f"phantom: kind {self.kind!r} is unknown; choose from {', '.join(KINDS)}",
-                reason="phantom-setting",
-            )
+        for name, value, known in (("region", self.region, REGIONS), ("kind", self.kind, KINDS)):
+            if value not in known:
+                raise UsageError(
+                    f"phantom: {name} {value!r} is unknown; choose from {', '.join(known)}",
+                    reason="phantom-region" if name == "region" else "phantom-setting",
+                )
+        problem = None
         if self.cortex and KINDS[self.kind].power != 1:
-            raise UsageError(
-                f"phantom: the shape {self.kind} cannot go on into cortex; choose another kind",
-                reason="phantom-setting",
-            )
+            problem = f"the shape {self.kind} cannot extend into cortex; choose another kind"
         if self.n_subjects < 1 or not self.groups or len(set(self.groups)) < len(self.groups):
-            raise UsageError(
-                "phantom: give at least one subject, and groups with different names",
-                reason="phantom-setting",
-            )
-
-
-#: Years, mL; sex and the means of intracranial volume of women and men.
-_AGES, _MEAN_AGE = (50.0, 80.0), 65.0
-_ICV, _ICV_SD, _ICV_MEAN = MappingProxyType({"F": 1400.0, "M": 1560.0}), 110.0, 1480.0
-_TURN, _SHIFT = 6.0, 3.0  # degrees and mm, SD of a head's position
+            problem = "give at least one subject, and groups with different names"
+        if problem is not None:
+            raise UsageError(f"phantom: {problem}", reason="phantom-setting")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,15 +132,12 @@ class Subject:
 
 
 def make_cohort(plan: CohortPlan) -> list[Subject]:
-    """Draw subjects; the same plan gives the same cohort.
-
-    Each subject has a generator of its own, so that more subjects leave the first ones alone.
-    """
+    """Draw subjects, each with its own random generator: more subjects do not change the first."""
     return [_make_subject(plan, number) for number in range(plan.n_subjects)]
 
 
 def typical_shape(plan: CohortPlan, dose: int) -> PhantomSpec:
-    """Shape of a mean subject, with the planted effect so many times."""
+    """Shape of a mean subject, with ``dose`` times the planted effect."""
     return _spec(plan, thickness=plan.thickness, scale=1.0, offset=plan.shift * dose, dose=dose)
 
 
@@ -184,7 +182,7 @@ def _spec(
 ) -> PhantomSpec:
     """Shape of one hemisphere; a larger one has the same bends, only wider.
 
-    Curvature goes on into the cortex as it changes along the hippocampus, whose shape stays.
+    Curvature changes in the cortex as it does along the hippocampus, whose shape stays.
     """
     plain = PhantomSpec(kind=plan.kind)
     bend = KINDS[plan.kind]
@@ -213,19 +211,6 @@ def _three(random: np.random.Generator, sd: float) -> tuple[float, float, float]
     return float(x), float(y), float(z)
 
 
-# A synthetic cohort as files: a BIDS dataset, participants, true maps, planted effect.
-
-
-#: True maps of each hemisphere, and where the effect was planted; below the dataset.
-MAPS_FOLDER = "phantom_maps"
-EFFECT_TABLE = "phantom_effect.tsv"
-
-#: Nodes of the true maps along x and y: as many as the default sheet has.
-NODES = (41, 21)
-
-_ROUNDING = 1e-9  # nodes on the border of a region belong to it
-
-
 def write_cohort(
     out: Path,
     plan: CohortPlan,
@@ -235,7 +220,7 @@ def write_cohort(
 ) -> None:
     """Write a cohort as a BIDS dataset with segmentations, participants and all truth.
 
-    ``voxel_size`` mm along the image's axes, which point left, inferior and anterior.
+    ``voxel_size`` is in mm along left, inferior and anterior, the axes of the images.
     """
     refuse_taken(out)
     subjects = make_cohort(plan)
@@ -288,15 +273,11 @@ def _grid() -> tuple[Float, Float]:
 
 
 def _write_maps(out: Path, item: Hemisphere) -> None:
-    """Write the true map of one hemisphere: one row per node, x slowest."""
+    """Write the true map of one hemisphere."""
     phantom = Phantom(item.spec)
     u, v = _grid()
     truth = phantom.truth(u, v, hemi=item.hemi, pose=item.pose)
-    columns: dict[str, Any] = {
-        "x": np.repeat(np.arange(1, NODES[0] + 1), NODES[1]),
-        "y": np.tile(np.arange(1, NODES[1] + 1), NODES[0]),
-        "u": u,
-        "v": v,
+    columns = {
         **{name: truth.points[..., axis] for axis, name in enumerate("ras")},
         "thickness": truth.thickness,
         "curvature": truth.curvature,
@@ -304,11 +285,11 @@ def _write_maps(out: Path, item: Hemisphere) -> None:
         "curvature_exterior": truth.curvature_exterior,
     }
     path = out / MAPS_FOLDER / f"sub-{item.subject}_hemi-{item.hemi}_truth.tsv"
-    _write_columns(path, columns)
+    _write_nodes(path, columns)
 
 
 def _write_effect(out: Path, plan: CohortPlan) -> None:
-    """Write the plan, and by how much a group's wall differs at each place of the sheet."""
+    """Write the plan, and by how much a group's wall differs at each point of the sheet."""
     u, v = _grid()
     doses = (0, min(1, len(plan.groups) - 1))
     without, with_effect = (Phantom(typical_shape(plan, dose)) for dose in doses)
@@ -322,13 +303,9 @@ def _write_effect(out: Path, plan: CohortPlan) -> None:
             for at, (low, high) in zip((u, v), limits, strict=True)
         ]
     )
-    _write_columns(
+    _write_nodes(
         out / EFFECT_TABLE,
         {
-            "x": np.repeat(np.arange(1, NODES[0] + 1), NODES[1]),
-            "y": np.tile(np.arange(1, NODES[1] + 1), NODES[0]),
-            "u": u,
-            "v": v,
             "in_region": inside.astype(int),
             "difference": thinning,
             "difference_unregistered": observed,
@@ -354,11 +331,12 @@ def _write_effect(out: Path, plan: CohortPlan) -> None:
     )
 
 
-def _write_columns(path: Path, columns: Mapping[str, Any]) -> None:
+def _write_nodes(path: Path, columns: Mapping[str, NDArray[np.generic]]) -> None:
+    """Write one row per node, x slowest: its numbers along x and y, u and v, and other columns."""
+    x, y = np.indices(NODES) + 1
+    every = {"x": x, "y": y, **dict(zip("uv", _grid(), strict=True)), **columns}
     text = [
-        [str(x) for x in values.ravel()]
-        if np.issubdtype(values.dtype, np.integer)
-        else [f"{x:.5f}" for x in values.ravel()]
-        for values in map(np.asarray, columns.values())
+        [str(cell) if values.dtype.kind in "iu" else f"{cell:.5f}" for cell in values.ravel()]
+        for values in every.values()
     ]
-    files.write_tsv(path, list(columns), [list(row) for row in zip(*text, strict=True)])
+    files.write_tsv(path, list(every), zip(*text, strict=True))

@@ -16,7 +16,7 @@ from hipsta_bids.errors import SettingsError, UsageError
 from hipsta_bids.io import files
 from hipsta_bids.phantom.labels import encode
 from hipsta_bids.phantom.phantom import Phantom
-from hipsta_bids.phantom.spec import PhantomSpec
+from hipsta_bids.phantom.shape import PhantomSpec
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.types import Float, LabelVolume
 
@@ -53,7 +53,7 @@ class Layout:
     path: str
     """Of one hemisphere, below the tool's folder."""
     sides: Mapping[str, str]
-    """How the tool spells L and R."""
+    """How the tool names L and R."""
 
 
 #: Tools whose folders can be imitated; the name is that of the folder in ``derivatives``.
@@ -93,7 +93,7 @@ class Hemisphere:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Participants:
-    """What ``participants.tsv`` says beside the names."""
+    """Columns of ``participants.tsv`` beside the labels."""
 
     columns: Mapping[str, Mapping[str, Any]]
     """Descriptions by column, in the form of a BIDS sidecar."""
@@ -137,8 +137,8 @@ def write_dataset(
                 axes=axes,
                 supersample=supersample,
             )
-            place = layout.path.format(subject=f"sub-{item.subject}", side=layout.sides[item.hemi])
-            _write_image(out / "derivatives" / name / place, volume)
+            path = layout.path.format(subject=f"sub-{item.subject}", side=layout.sides[item.hemi])
+            _write_image(out / "derivatives" / name / path, volume)
     _write_truth(out, hemispheres, truth)
     _write_participants(out, hemispheres, participants or Participants(columns={}, rows={}))
     _write_descriptions(out, layouts)
@@ -180,7 +180,7 @@ def refuse_taken(out: Path, what: str = "phantoms") -> None:
 
 
 def rigid_motion(degrees: tuple[float, float, float], shift: tuple[float, float, float]) -> Float:
-    """Make a (4, 4) rigid motion: turns about R, A and S in this order, then a shift in mm."""
+    """Make a (4, 4) rigid motion: rotations about R, A and S in this order, then a shift, mm."""
     motion = np.eye(4)
     motion[:3, :3] = Rotation.from_euler("xyz", degrees, degrees=True).as_matrix()
     motion[:3, 3] = shift
@@ -210,7 +210,7 @@ def _truth_rows(item: Hemisphere, phantom: Phantom) -> list[dict[str, str]]:
 
 
 def _write_image(path: Path, volume: LabelVolume) -> None:
-    """Write codes as a compressed MGH or NIfTI image, as the name says."""
+    """Write codes as a compressed MGH or NIfTI image, by the suffix."""
     codes = encode(volume)
     image: Any
     if path.suffix == ".mgz":

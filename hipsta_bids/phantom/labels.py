@@ -8,12 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hipsta_bids.errors import ProtocolError, SettingsError
-from hipsta_bids.phantom.shape import Body, check_rotation
-from hipsta_bids.phantom.spec import PhantomSpec
+from hipsta_bids.phantom.shape import Body, PhantomSpec, check_rotation
 from hipsta_bids.protocols.protocol import Label, Part, Protocol, Tissue
 from hipsta_bids.types import Bool, Float, Int, LabelVolume
-
-# The voxel grid that a phantom is drawn on.
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -32,14 +29,10 @@ def make_grid(
     rotation: Float | None,
     border: float,
 ) -> Grid:
-    """Lay a grid round points.
+    """Lay a grid round points (N, 3), RAS mm, with a border of background, mm.
 
     The lattice is fixed in space (a voxel center lies at the origin of RAS), so that moving the
     phantom by part of a voxel changes its voxels.
-
-    ``points`` RAS mm, to be covered; ``voxel_size`` mm along the three voxel axes; ``axes`` Where
-    the voxel axes point, such as ````RAS```` or ````LIA````; ``border`` mm of background to add on
-    every side.
     """
     if not all(size > 0.0 for size in voxel_size):
         raise SettingsError(
@@ -104,7 +97,7 @@ _STAND_INS: Mapping[Tissue, tuple[Tissue, ...]] = MappingProxyType(
 )
 
 #: Without head and tail labels, the body is known by slices that hold these (Diers et al. 2023,
-#: section 2.1: NeuroImage 276:120182), so they must not go on beyond it.
+#: section 2.1: NeuroImage 276:120182), so they must not extend beyond it.
 _BODY_ONLY = (Tissue.CA2, Tissue.CA2_3, Tissue.CA3)
 
 #: mm of dentate gyrus before CA4 begins, going inwards.
@@ -149,14 +142,14 @@ def draw(
 
 
 def subfield_at(u: Float) -> NDArray[np.uint8]:
-    """Tissue of the sheet at positions ``u``, in the finest division; the ends go on."""
+    """Tissue of the sheet at positions ``u``, in the finest division."""
     starts = np.array([start for _, start in SUBFIELD_STARTS])
     tissues = np.array([tissue for tissue, _ in SUBFIELD_STARTS], dtype=np.uint8)
     return np.asarray(tissues[np.searchsorted(starts[1:], u, side="right")])
 
 
 def subfield_spans(protocol: Protocol) -> dict[Tissue, tuple[float, float]]:
-    """Range of the hippocampal part of the sheet that a protocol gives each of its subfields."""
+    """Range of the hippocampal part of the sheet that each subfield of a protocol has."""
     ends = [start for _, start in SUBFIELD_STARTS[1:]] + [1.0]
     spans: dict[Tissue, tuple[float, float]] = {}
     for (tissue, start), end in zip(SUBFIELD_STARTS, ends, strict=True):
@@ -168,14 +161,14 @@ def subfield_spans(protocol: Protocol) -> dict[Tissue, tuple[float, float]]:
 
 def tissue_at(spec: PhantomSpec, u: Float, v: Float) -> NDArray[np.uint8]:
     """Tissue of the whole wall, cortex included, at positions ``u`` and ``v``."""
-    place, cortex = _along(spec, u - spec.offset)
-    return np.asarray(np.where(place < 0.0, cortex_at(cortex, v), subfield_at(place)))
+    share, cortex = _along(spec, u - spec.offset)
+    return np.asarray(np.where(share < 0.0, _cortex_at(cortex, v), subfield_at(share)))
 
 
-def cortex_at(place: Float, v: Float) -> NDArray[np.uint8]:
+def _cortex_at(share: Float, v: Float) -> NDArray[np.uint8]:
     """Kind of cortex at a share of its extent, from far to near, and at ``v``."""
     near = np.where(v < 0.5, Tissue.PARAHIPPOCAMPAL, Tissue.ENTORHINAL)  # noqa: PLR2004 -- half
-    return np.where(place < _BA35_SHARE, Tissue.BA35, near).astype(np.uint8)
+    return np.where(share < _BA35_SHARE, Tissue.BA35, near).astype(np.uint8)
 
 
 def _along(spec: PhantomSpec, u: Float) -> tuple[Float, Float]:
@@ -187,7 +180,7 @@ def _along(spec: PhantomSpec, u: Float) -> tuple[Float, Float]:
 
 
 def label_for(protocol: Protocol, tissue: Tissue, part: Part) -> Label | None:
-    """Label that a protocol gives a tissue of a part; None if it leaves it out.
+    """Label of a tissue of a part in a protocol; None if it has none.
 
     First the tissue (or its stand-in) in this part, then a label for the whole part, then the
     tissue wherever it is.
@@ -263,11 +256,11 @@ def _regions(
     u, v, n = u[near], v[near], n[near]
     half = body.thickness(u, v) / 2.0
     starts = [start for _, start in SUBFIELD_STARTS[1:]]
-    place, share = _along(spec, u - spec.offset)
-    band = 1 + np.searchsorted(starts, place, side="right")
+    position, share = _along(spec, u - spec.offset)
+    band = 1 + np.searchsorted(starts, position, side="right")
     layer = n < -half + spec.layer_thickness
-    cortex = 2 * _SHEET + 3 + np.searchsorted(CORTEX, cortex_at(share, v))
-    wall = np.where(place < 0.0, cortex, band + _SHEET * layer)
+    cortex = 2 * _SHEET + 3 + np.searchsorted(CORTEX, _cortex_at(share, v))
+    wall = np.where(position < 0.0, cortex, band + _SHEET * layer)
     depth = -half - n
     lined = _along(spec, u)[0] >= spec.interior_start
     inner = (depth > 0.0) & (depth <= spec.interior_depth) & lined

@@ -1,17 +1,15 @@
-"""The phantom itself: a specification that can be drawn and that knows its own truth."""
+"""The phantom itself: a shape that can be drawn and whose truth is known."""
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from hipsta_bids.phantom.labels import draw, make_grid, subfield_spans, tissue_at
-from hipsta_bids.phantom.shape import Body
-from hipsta_bids.phantom.spec import PhantomSpec
+from hipsta_bids.phantom.shape import Body, PhantomSpec
 from hipsta_bids.phantom.truth import (
     SURFACES,
     PhantomTruth,
-    gaussian_curvature,
+    curvatures,
     line_lengths,
-    mean_curvature,
     summarize,
 )
 from hipsta_bids.protocols.protocol import Protocol, Tissue
@@ -37,11 +35,22 @@ class Phantom:
         supersample: int | tuple[int, int, int] = 1,
         border: float = 3.0,
     ) -> LabelVolume:
-        """Draw the phantom as a segmentation in the package's vocabulary.
+        """Draw the phantom as a segmentation.
 
-        ``voxel_size`` mm along the three voxel axes; ``pose`` Rigid motion of the phantom in RAS
-        mm; ``axes`` Where the voxel axes point, such as ````RAS```` or ````LIA````; ``border`` mm
-        of background on every side.
+        Parameters
+        ----------
+        voxel_size
+            mm along the three voxel axes.
+        pose
+            (4, 4) rigid motion of the phantom, RAS mm.
+        axes
+            Where the voxel axes point, such as ``RAS`` or ``LIA``.
+        grid_rotation
+            (3, 3) rotation of the voxel grid.
+        supersample
+            Points per voxel and axis that vote for its label.
+        border
+            mm of background on every side.
         """
         grid = make_grid(
             self._outline(hemi, pose),
@@ -60,20 +69,19 @@ class Phantom:
     def truth(
         self, u: ArrayLike, v: ArrayLike, *, hemi: str = "L", pose: Float | None = None
     ) -> PhantomTruth:
-        """Tell what a perfect method would measure."""
+        """Return what a perfect method would measure at positions (u, v)."""
         x, y = np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64))
-        bent = {name: mean_curvature(self.body, x, y, at=at) for name, at in SURFACES.items()}
-        domed = {name: gaussian_curvature(self.body, x, y, at=at) for name, at in SURFACES.items()}
+        curved = {name: curvatures(self.body, x, y, at=at) for name, at in SURFACES.items()}
         extent_x, extent_y = line_lengths(self.body, x, y)
         return PhantomTruth(
             thickness=self.body.thickness(x, y),
             points=self.body.place(x, y, 0.0, hemi=hemi, pose=pose),
-            curvature_interior=bent["interior"],
-            curvature=bent["mid"],
-            curvature_exterior=bent["exterior"],
-            gaussian_curvature=domed["mid"],
-            gaussian_curvature_interior=domed["interior"],
-            gaussian_curvature_exterior=domed["exterior"],
+            curvature_interior=curved["interior"][0],
+            curvature=curved["mid"][0],
+            curvature_exterior=curved["exterior"][0],
+            gaussian_curvature=curved["mid"][1],
+            gaussian_curvature_interior=curved["interior"][1],
+            gaussian_curvature_exterior=curved["exterior"][1],
             extent_x=extent_x,
             extent_y=extent_y,
             subfield=tissue_at(self.spec, x, y),
@@ -86,14 +94,14 @@ class Phantom:
         return ("body", "extended", "entorhinal") if self.spec.cortex else ("body",)
 
     def region_summary(self, region: str) -> dict[str, float]:
-        """Tell what a perfect method would measure in a region as a whole."""
+        """Return what a perfect method would measure in a region as a whole."""
         border = self.spec.cortex_share
         border += self.spec.offset if border else 0.0
         spans = {"body": (border, 1.0), "extended": (0.0, 1.0), "entorhinal": (0.0, border)}
         return summarize(self.body, span=spans[region])
 
     def subfield_summary(self, protocol: Protocol) -> dict[Tissue, dict[str, float]]:
-        """Tell what a perfect method would measure in each subfield that a protocol draws."""
+        """Return what a perfect method would measure in each subfield that a protocol draws."""
         share, shift = self.spec.cortex_share, self.spec.offset
         return {
             tissue: summarize(

@@ -1,12 +1,15 @@
-"""The mid-curve of a cross-section: a plane curve given by its curvature.
+"""The shape of a phantom: its specification, its mid-curve, and the sweep to scanner space.
 
 A plane curve is fixed by curvature against arc length (fundamental theorem of plane curves;
 do Carmo, Differential Geometry of Curves and Surfaces, section 1-5). Curvature here is a monomial
 in arc length, so tangent angles are exact and positions are integrals of smooth functions.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from types import MappingProxyType
+from typing import Annotated, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,16 +17,177 @@ from scipy.spatial import KDTree
 from scipy.special import erf
 
 from hipsta_bids.errors import SettingsError
-from hipsta_bids.phantom.spec import Bend, PhantomSpec
 from hipsta_bids.types import Float
 
 #: rad, direction in which the curve leaves its medial end, against the lateral direction. The
 #: subiculum slopes down a little before the sheet turns up.
 START_ANGLE = -0.35
 
+#: RAS mm of the middle of a left body, and its pitch in rad (anterior end down), both about as in
+#: an adult brain in scanner space.
+CENTER = (-25.0, -20.0, -15.0)
+PITCH = 0.45
+
+#: rad, largest deviation from orthogonality in a pose.
+_RIGID_TOLERANCE = 1e-6
+
+#: mm of arc length within which two points of the mid-curve are the same: above the accuracy of
+#: projection, below what a voxel can show.
+_SAME_POINT = 0.02
+
 _PANELS = 400
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)  # error far below 1e-12 mm in such panels
 _SEEDS = 2000  # starting points for projection, about 0.01 mm apart
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bend:
+    """Curvature of a mid-curve: ``medial + (lateral - medial) * u ** power``, u in [0, 1]."""
+
+    medial: float
+    """1/mm at u = 0; positive where the sheet curls round its interior."""
+    lateral: float
+    """1/mm at u = 1."""
+    power: int = 1
+
+
+#: The shapes on offer. A spiral is a clothoid (curvature linear in arc length); the tight one
+#: stays open for longer and ends with a radius of 1.6 mm.
+KINDS: Mapping[str, Bend] = MappingProxyType(
+    {
+        "slab": Bend(medial=0.0, lateral=0.0),
+        "arc": Bend(medial=0.25, lateral=0.25),
+        "spiral": Bend(medial=0.02, lateral=0.44),
+        "s-shape": Bend(medial=-0.15, lateral=0.35),
+        "tight": Bend(medial=0.08, lateral=0.625, power=2),
+    }
+)
+
+VARIATION_AXES = ("x", "y", "xy")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Thinning:
+    """A region of the sheet in which the wall is thinner.
+
+    Its edges are smooth: at u and v of the limits, half of the depth is reached.
+    """
+
+    depth: float
+    """mm, taken off the thickness inside; negative thickens."""
+    u: tuple[float, float]
+    """Limits medial to lateral, in sheet coordinates; beyond 0 or 1 there is no edge."""
+    v: tuple[float, float]
+    """Limits posterior to anterior."""
+    edge: float = 1.0
+    """mm, scale of the edges' error functions: 84 % of a step happens within this distance."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhantomSpec:
+    """An analytic hippocampal body. Two equal specifications are the same shape.
+
+    Ranges only catch typing errors; whether the shape can exist is decided by the geometry.
+    """
+
+    kind: str = "spiral"
+    """One of ``KINDS``: how the cross-section bends."""
+    curvature: tuple[float, float] | None = None
+    """1/mm at the medial and the lateral end, in place of the kind's own."""
+    thickness: Annotated[float, (0.1, 10.0)] = 2.0
+    """mm, mean over the sheet."""
+    variation: Annotated[float, (0.0, 0.9)] = 0.0
+    """Amplitude of the thickness sinusoid as a fraction of the mean, 0 to below 1."""
+    variation_axis: str = "xy"
+    """Where thickness varies: along x (medial-lateral), y (posterior-anterior) or both."""
+    width: Annotated[float, (2.0, 100.0)] = 20.0
+    """mm, arc length of the mid-curve."""
+    length: Annotated[float, (2.0, 100.0)] = 16.0
+    """mm, body along the long axis."""
+    bend: Annotated[float, (-0.1, 0.1)] = 0.0
+    """1/mm, curvature of the long axis (a circular arc, its center on the medial side if
+    positive)."""
+    end_length: Annotated[float, (0.0, 50.0)] = 4.0
+    """mm by which head and tail go on beyond the body."""
+    layer_thickness: Annotated[float, (0.0, 10.0)] = 0.0
+    """mm of the wall, from its interior side, that are labeled molecular layer. The truth stays
+    the whole wall, because measuring returns the layer to the sheet's subfields."""
+    interior_depth: Annotated[float, (0.0, 10.0)] = 1.5
+    """mm, depth of the dentate gyrus and CA4 beneath the interior side."""
+    interior_start: Annotated[float, (0.0, 1.0)] = 0.45
+    """Share of the hippocampal part of the mid-curve from which on dentate gyrus and CA4 line the
+    interior side."""
+    cortex: Annotated[float, (0.0, 80.0)] = 0.0
+    """mm of the mid-curve, from its medial end, that are neighboring cortex; the hippocampal
+    subfields share the rest. Drawn where the protocol has labels for it."""
+    thinnings: tuple[Thinning, ...] = ()
+    """Regions in which the wall is thinner. Where they overlap, depths add up."""
+    offset: Annotated[float, (-0.15, 0.15)] = 0.0
+    """Shift of the pattern of thickness (sinusoids and thinnings) and of the borders of subfields,
+    in u from medial to lateral; the shape stays."""
+
+    def __post_init__(self) -> None:
+        _check_choice("kind", self.kind, tuple(KINDS))
+        _check_choice("variation_axis", self.variation_axis, VARIATION_AXES)
+        for name, hint in get_type_hints(PhantomSpec, include_extras=True).items():
+            for low, high in getattr(hint, "__metadata__", ()):
+                _check_range(name, getattr(self, name), low, high)
+        for value in self.curvature or ():
+            _check_range("curvature", value, -10.0, 10.0)
+        for thinning in self.thinnings:
+            _check_range("thinning depth", thinning.depth, -10.0, 10.0)
+            _check_range("thinning edge", thinning.edge, 0.2, 10.0)
+            for limit in (*thinning.u, *thinning.v):
+                _check_range("thinning limit", limit, -1.0, 2.0)
+        depth = sum(max(0.0, thinning.depth) for thinning in self.thinnings)
+        thinnest = self.thickness * (1.0 - self.variation) - depth
+        if thinnest <= 0.0:
+            raise SettingsError(
+                f"phantom: thinning by {depth:g} mm leaves no wall of {self.thickness:g} mm; "
+                "thin it less",
+                reason="phantom-setting",
+            )
+        if self.cortex > 0.8 * self.width:
+            raise SettingsError(
+                f"phantom: cortex of {self.cortex:g} mm leaves less than a fifth of the sheet's "
+                f"{self.width:g} mm to the hippocampus; make it shorter",
+                reason="phantom-setting",
+            )
+        if self.layer_thickness >= thinnest:
+            raise SettingsError(
+                f"phantom: layer_thickness {self.layer_thickness:g} mm fills the wall, which is "
+                f"{thinnest:g} mm at its thinnest; make the layer thinner",
+                reason="phantom-layer",
+            )
+
+    @property
+    def cortex_share(self) -> float:
+        """Share of the mid-curve that is cortex."""
+        return self.cortex / self.width
+
+    @property
+    def section_bend(self) -> Bend:
+        """Curvature of the mid-curve, with the user's own end values if there are any."""
+        preset = KINDS[self.kind]
+        if self.curvature is None:
+            return preset
+        medial, lateral = self.curvature
+        return Bend(medial=medial, lateral=lateral, power=preset.power)
+
+
+def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise SettingsError(
+            f"phantom: {name} {value!r} is unknown; choose one of {', '.join(choices)}",
+            reason="phantom-setting",
+        )
+
+
+def _check_range(name: str, value: float, low: float, high: float) -> None:
+    if not low <= value <= high:  # also catches NaN
+        raise SettingsError(
+            f"phantom: {name} {value:g} is outside {low:g} to {high:g}", reason="phantom-setting"
+        )
 
 
 class MidCurve:
@@ -32,8 +196,6 @@ class MidCurve:
     Plane coordinates are (lateral, superior) in mm; arc length runs medial to lateral. The
     normal points to the exterior (right of the tangent), so that a positive curvature turns the
     curve round its interior.
-
-    ``bend`` Curvature at both ends, 1/mm; ``width`` Arc length, mm.
     """
 
     def __init__(self, bend: Bend, width: float) -> None:
@@ -54,7 +216,7 @@ class MidCurve:
         return np.asarray(self._bend.medial + rise * (s / self.width) ** self._bend.power)
 
     def curvature_slope(self, s: Float) -> Float:
-        """Return the derivative of curvature along the curve, 1/mm2."""
+        """Differentiate curvature along the curve, 1/mm2."""
         power = self._bend.power
         rise = self._bend.lateral - self._bend.medial
         return np.asarray(rise * power / self.width * (s / self.width) ** (power - 1))
@@ -84,11 +246,10 @@ class MidCurve:
         return np.asarray(self._edges[panel] + self._integrate(start, s - start))
 
     def project(self, points: Float, *, reach: float = np.inf) -> tuple[Float, Float]:
-        """Find the nearest place on the curve.
+        """Arc length and signed distance (N,), mm, of the nearest point on the curve.
 
-        ``points`` mm; ``reach`` mm. Returns Arc length, mm; NaN where out of reach, or beyond a
-        flat end of the curve. Returns Signed distance, mm, positive on the exterior side; NaN
-        likewise.
+        Distances are positive on the exterior side. Both are NaN for points (N, 2) farther than
+        ``reach`` or beyond a flat end of the curve.
         """
         s = np.full(len(points), np.nan)
         n = np.full(len(points), np.nan)
@@ -107,7 +268,7 @@ class MidCurve:
         return s, n
 
     def foot(self, points: Float) -> Float:
-        """Arc length (N,), mm, of the nearest place to points (N, 2), the ends included."""
+        """Arc length (N,), mm, of the nearest point to points (N, 2), the ends included."""
         nearest = np.asarray(self._tree.query(points)[1])
         return self._refine(points, self._seeds[nearest])
 
@@ -138,28 +299,9 @@ def gauss_panels(low: float, high: float, panels: int) -> tuple[Float, Float]:
     return nodes.ravel(), (half * _WEIGHTS).ravel()
 
 
-# From sheet coordinates to scanner space and back.
-
-
-#: RAS mm of the middle of a left body, and its pitch in rad (anterior end down), both about as in
-#: an adult brain in scanner space.
-CENTER = (-25.0, -20.0, -15.0)
-PITCH = 0.45
-
-#: rad, largest deviation from orthogonality in a pose.
-_RIGID_TOLERANCE = 1e-6
-
-#: mm of arc length within which two places of the mid-curve are the same: above the accuracy of
-#: projection, below what a voxel can show.
-_SAME_PLACE = 0.02
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ThicknessJet:
-    """Thickness of the wall and its derivatives by arc length s and long axis w.
-
-    In mm, 1, and 1/mm.
-    """
+    """Thickness of the wall and its derivatives by arc length s and long axis w; mm, 1, 1/mm."""
 
     value: Float
     s: Float
@@ -185,10 +327,10 @@ Window = tuple[Float, Float, Float]
 
 
 def window_jet(at: Float, limits: tuple[float, float], extent: float, edge: float) -> Window:
-    """Window that is 1 between two limits and 0 outside, with edges like error functions.
+    """Window that is 1 between two limits and 0 outside, with error functions as edges.
 
-    ``at`` mm; ``extent`` mm; ``edge`` Scale of the edges, mm. Returns The window, its slope (1/mm)
-    and second derivative (1/mm2).
+    ``at``, ``extent`` and the scale ``edge`` are in mm, limits in fractions of the extent; returns
+    the window, its slope (1/mm) and second derivative (1/mm2).
     """
     value, slope, second = (np.zeros(np.shape(at)) for _ in range(3))
     for limit, sign, open_end in ((limits[0], 1.0, 0.0), (limits[1], -1.0, 1.0)):
@@ -258,10 +400,7 @@ class Body:
         hemi: str = "L",
         pose: Float | None = None,
     ) -> Float:
-        """Scanner coordinates (..., 3), RAS mm, of sheet coordinates (u, v, n).
-
-        ``u, v, n`` n in mm.
-        """
+        """Scanner coordinates (..., 3), RAS mm, of sheet coordinates (u, v, n)."""
         across, along, off = np.broadcast_arrays(
             *(np.asarray(x, dtype=np.float64) for x in (u, v, n))
         )
@@ -281,9 +420,8 @@ class Body:
     ) -> Float:
         """Sheet coordinates (N, 3) of scanner points (N, 3): the inverse of :meth:`place`.
 
-        Rows are (u, v, n), of the nearest place on the mid-surface. They are NaN for points
+        Rows are (u, v, n) of the nearest point on the mid-surface. They are NaN for points
         beyond the flat ends u = 0 and u = 1, or farther than ``reach`` (mm) from the mid-surface.
-        The other parameters and errors are those of :meth:`place`.
         """
         rotation, shift = placement(hemi, pose)
         section, w = self._unsweep((points - shift) @ rotation)
@@ -339,7 +477,7 @@ class Body:
     def _refuse_overlap(self) -> None:
         """Refuse a wall of which one turn runs into another.
 
-        Two turns overlap exactly if, from a boundary point of one, some other place of the
+        Two turns overlap exactly if, from a boundary point of one, some other point of the
         mid-curve is nearer than its own, or as near where they coincide.
         """
         u, v = np.meshgrid(np.linspace(0.0, 1.0, 801), np.linspace(0.0, 1.0, 5), indexing="ij")
@@ -347,7 +485,7 @@ class Body:
         s = u.ravel() * self.spec.width
         for side in (-1.0, 1.0):
             boundary = self.curve.position(s) + side * half[:, None] * self.curve.normal(s)
-            astray = np.abs(self.curve.foot(boundary) - s) > _SAME_PLACE
+            astray = np.abs(self.curve.foot(boundary) - s) > _SAME_POINT
             if astray.any():
                 raise SettingsError(
                     f"phantom: turns of the wall overlap near u = {u.ravel()[astray][0]:.2f}; "

@@ -30,15 +30,18 @@ class PhantomTruth:
     points: Float
     """(..., 3) RAS mm, on the mid-surface."""
     curvature_interior: Float
-    """Mean curvature (half the sum of the principal curvatures), 1/mm; positive where the sheet
-    curls round its interior. Likewise below."""
+    """Mean curvature (half the sum of the principal curvatures) of the interior surface, 1/mm;
+    positive where the sheet curls round its interior."""
     curvature: Float
-    """Of the mid-surface."""
+    """Mean curvature of the mid-surface, 1/mm."""
     curvature_exterior: Float
+    """Mean curvature of the exterior surface, 1/mm."""
     gaussian_curvature: Float
-    """Gaussian curvature of the mid-surface, 1/mm2. Likewise below."""
+    """Gaussian curvature of the mid-surface, 1/mm2."""
     gaussian_curvature_interior: Float
+    """Gaussian curvature of the interior surface, 1/mm2."""
     gaussian_curvature_exterior: Float
+    """Gaussian curvature of the exterior surface, 1/mm2."""
     extent_x: Float
     """Length of the line u from 0 to 1 through each position, on the mid-surface, mm."""
     extent_y: Float
@@ -63,33 +66,28 @@ class _Jet:
     ww: Float
 
 
-def mean_curvature(body: Body, u: Float, v: Float, *, at: float) -> Float:
-    """Mean curvature at positions (u, v) of a surface of the wall, 1/mm.
+def curvatures(body: Body, u: Float, v: Float, *, at: float) -> tuple[Float, Float]:
+    """Mean (1/mm) and Gaussian (1/mm2) curvature at positions (u, v) of a surface of the wall.
 
-    ``at`` is the surface's place in the wall, from -0.5 (interior) to 0.5 (exterior). With
+    ``at`` is where the surface lies in the wall, from -0.5 (interior) to 0.5 (exterior). With
     E, F, G and e, f, g the coefficients of the first and second fundamental form,
-    H = (e G - 2 f F + g E) / (2 (E G - F^2)) (do Carmo, Differential Geometry of Curves and
-    Surfaces, section 3-3), here for the normal that points to the interior.
+    H = (e G - 2 f F + g E) / (2 (E G - F^2)) and K = (e g - f^2) / (E G - F^2) (do Carmo,
+    Differential Geometry of Curves and Surfaces, section 3-3), here for the normal that points to
+    the interior.
     """
-    (first_ss, first_sw, first_ww), (ss, sw, ww) = _fundamental_forms(body, u, v, at)
-    twice_det = 2.0 * (first_ss * first_ww - first_sw**2)
-    return np.asarray((ss * first_ww - 2.0 * sw * first_sw + ww * first_ss) / twice_det)
-
-
-def gaussian_curvature(body: Body, u: Float, v: Float, *, at: float) -> Float:
-    """Gaussian curvature at positions (u, v) of a surface of the wall, 1/mm2.
-
-    K = (e g - f^2) / (E G - F^2), in the terms of :func:`mean_curvature`.
-    """
-    (first_ss, first_sw, first_ww), (ss, sw, ww) = _fundamental_forms(body, u, v, at)
-    return np.asarray((ss * ww - sw**2) / (first_ss * first_ww - first_sw**2))
+    jet = _surface_jet(body, u, v, at)
+    normal = np.cross(jet.s, jet.w)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    normal *= -np.sign(normal[..., 1:2])  # to the interior: the section's normal points away
+    first_ss, first_sw, first_ww = _dot(jet.s, jet.s), _dot(jet.s, jet.w), _dot(jet.w, jet.w)
+    ss, sw, ww = _dot(jet.ss, normal), _dot(jet.sw, normal), _dot(jet.ww, normal)
+    det = first_ss * first_ww - first_sw**2
+    mean = (ss * first_ww - 2.0 * sw * first_sw + ww * first_ss) / (2.0 * det)
+    return np.asarray(mean), np.asarray((ss * ww - sw**2) / det)
 
 
 def cut_sections(body: Body, v: Float) -> dict[str, Float]:
-    """Measure the cross-sections at positions v along the axis.
-
-    Returns As in the output's table of cross-sections, mm and mm2.
-    """
+    """Measure the cross-sections at positions v, as the output's table of them; mm and mm2."""
     u, weights = gauss_panels(0.0, 1.0, _PANELS_U)
     u, v = u[:, None], np.asarray(v, np.float64)[None, :]
     cell = weights[:, None] * body.spec.width
@@ -116,10 +114,9 @@ def cut_sections(body: Body, v: Float) -> dict[str, Float]:
 def summarize(body: Body, *, span: tuple[float, float] = (0.0, 1.0)) -> dict[str, float]:
     """Measure the body, or the part of it between two positions u.
 
-    Returns ````thickness_mean```` (mm, over the mid-surface), ````extent_x````, ````extent_y````,
-    ````extent_z```` (mm: arc length of the mid-curve, length along v averaged over u, mean
-    thickness), ````volume```` (mm3), ````area_interior````, ````area_mid```` and
-    ````area_exterior```` (mm2), and for the whole body what :func:``summarize_ratios`` adds.
+    Mean thickness is over the mid-surface; extents are the arc length of the mid-curve, the length
+    along v averaged over u, and the mean thickness (mm, mm2 and mm3). The whole body also has
+    ratios of sizes, and means of cross-sections over its length.
     """
     u, weights_u = gauss_panels(*span, _PANELS_U)
     v, weights_v = gauss_panels(0.0, 1.0, _PANELS_V)
@@ -145,26 +142,17 @@ def summarize(body: Body, *, span: tuple[float, float] = (0.0, 1.0)) -> dict[str
         "volume": float((cell * column).sum()),
         **areas,
     }
-    return summary if span != (0.0, 1.0) else summary | summarize_ratios(body, summary)
-
-
-def summarize_ratios(body: Body, summary: Mapping[str, float]) -> dict[str, float]:
-    """Average cross-sections over the whole body, and relate its sizes.
-
-    ``summary`` Its areas (mm2) and volume (mm3). Returns ````area_ratio````,
-    ````surface_volume_ratio```` (1/mm), and means of what :func:``cut_sections`` gives over the
-    body's length.
-    """
-    v, weights_v = gauss_panels(0.0, 1.0, _PANELS_V)
-    sections = cut_sections(body, v)
+    if span != (0.0, 1.0):
+        return summary
+    sections = cut_sections(body, v.ravel())
     walls = summary["area_interior"] + summary["area_exterior"]
-    ratios = {
+    means = ("circumference", "interior_exterior_ratio", "section_area", "shape_index")
+    return {
+        **summary,
         "area_ratio": summary["area_interior"] / summary["area_exterior"],
         "surface_volume_ratio": walls / summary["volume"],
+        **{f"{name}_mean": float(sections[name] @ weights_v) for name in means},
     }
-    for name in ("circumference", "interior_exterior_ratio", "section_area", "shape_index"):
-        ratios[f"{name}_mean"] = float(sections[name] @ weights_v)
-    return ratios
 
 
 def line_lengths(body: Body, u: Float, v: Float) -> tuple[Float, Float]:
@@ -172,19 +160,6 @@ def line_lengths(body: Body, u: Float, v: Float) -> tuple[Float, Float]:
     u, v = np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64))
     along = _axis_stretch(body, u)[0] * body.spec.length
     return np.full(v.shape, body.spec.width), np.broadcast_to(along, u.shape).copy()
-
-
-_Form = tuple[Float, Float, Float]
-
-
-def _fundamental_forms(body: Body, u: Float, v: Float, at: float) -> tuple[_Form, _Form]:
-    """First and second fundamental form, for the normal that points to the interior."""
-    jet = _surface_jet(body, u, v, at)
-    normal = np.cross(jet.s, jet.w)
-    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    normal *= -np.sign(normal[..., 1:2])  # to the interior: the section's normal points away
-    first = (_dot(jet.s, jet.s), _dot(jet.s, jet.w), _dot(jet.w, jet.w))
-    return first, (_dot(jet.ss, normal), _dot(jet.sw, normal), _dot(jet.ww, normal))
 
 
 def _surface_jet(body: Body, u: Float, v: Float, at: float) -> _Jet:

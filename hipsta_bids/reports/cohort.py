@@ -1,8 +1,8 @@
-"""All hemispheres of an output dataset: the range of their numbers, and who stands apart."""
+"""All hemispheres of an output dataset: the range of their numbers, and which are outliers."""
 
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,18 +14,34 @@ from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.catalog import SUMMARY
 from hipsta_bids.io import files
 from hipsta_bids.reports.maps import MAP_KINDS, make_sprites, read_maps
-from hipsta_bids.reports.page import render
+from hipsta_bids.reports.page import number, render
 from hipsta_bids.reports.results import Hemisphere, find_results, number_of
-from hipsta_bids.reports.words import number
 from hipsta_bids.types import Float, Status
 
-#: Ranges are shown of at least so many hemispheres ...
+#: Least number of hemispheres whose range is shown.
 SMALLEST_COHORT = 5
 
-#: ... and distances from them of at least so many: of fewer, the spread is too unsure.
+#: Least number among which outliers are sought: with fewer, the spread is too uncertain.
 SMALLEST_COMPARED = 10
 
+#: Robust z-scores beyond this are rare without a cause (Iglewicz and Hoaglin 1993).
+OUTLIER = 3.5
+
 _MAD_TO_SD = 1.4826  # of a normal distribution
+
+#: Columns of the table, with shorter titles than those of the measures.
+_SHOWN = {
+    "thickness_mean": "Thickness",
+    "curvature_mean": "Curvature",
+    "volume": "Volume",
+    "area_mid": "Area",
+    "extent_y": "Length",
+}
+_QUALITY = {
+    "voxels_across": "Voxels across",
+    "changed_fraction": "Repaired",
+    "filled_fraction": "Filled",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,7 +107,7 @@ class Cohort:
         ]
 
     def origin(self, hemisphere: Hemisphere) -> Origin | None:
-        """Which run measured it, if its log is there."""
+        """Find the run that measured a hemisphere, if its log is there."""
         return self.origins.get(title_of(hemisphere.place.name))
 
     def profiles(self, name: HemisphereName, column: str) -> Float:
@@ -108,14 +124,14 @@ class Cohort:
         return self._profiles[title]
 
     def values(self, name: HemisphereName, measure: str) -> Float:
-        """List a number of all hemispheres of the same kind, without NaN."""
+        """Collect a number of all hemispheres of the same kind, without NaN."""
         found = [other.summary.get(measure, np.nan) for other in self.like(name)]
         every = np.array(found, dtype=np.float64)
         return every[np.isfinite(every)]
 
 
 def title_of(name: HemisphereName) -> str:
-    """Spell a hemisphere as the log does."""
+    """Name a hemisphere as the log does."""
     return f"{name.stem}_{name.protocol}"
 
 
@@ -151,7 +167,7 @@ def _is_readable(hemisphere: Hemisphere) -> bool:
 
 
 def _read_origins(root: Path) -> dict[str, Origin]:
-    """Read from the logs which command measured what; the last one counts."""
+    """Read from the logs which command measured each hemisphere last."""
     origins = {}
     for path in sorted((root / DATASET_FILES["logs"]).glob("run-*.log")):
         command = None
@@ -172,18 +188,18 @@ def _read_origins(root: Path) -> dict[str, Origin]:
 
 @dataclass(frozen=True, kw_only=True)
 class Distance:
-    """How far a hemisphere stands from the others."""
+    """How far a hemisphere is from the others."""
 
     value: float
     """Largest robust z-score; NaN where there are too few others."""
     measure: str
-    """Title of the number in which it stands farthest."""
+    """Title of the number in which it is farthest."""
 
 
 def robust_scores(values: Float) -> Float:
     """Robust z-scores: distance from the median over the scaled median absolute deviation.
 
-    ``values`` NaN where missing. Returns NaN where missing, 0 where nothing varies.
+    NaN where values are missing, 0 where nothing varies.
     """
     away = values - np.nanmedian(values, axis=0)
     spread = _MAD_TO_SD * np.nanmedian(np.abs(away), axis=0)
@@ -191,9 +207,14 @@ def robust_scores(values: Float) -> Float:
 
 
 def distances(cohort: Cohort, thickness: Mapping[str, Float]) -> dict[str, Distance]:
-    """Measure how far each hemisphere stands from those of its kind."""
+    """Measure how far each hemisphere is from those of the same side, protocol and region."""
+    kinds: dict[tuple[str, str, str], list[Hemisphere]] = {}
+    for hemisphere in cohort.hemispheres:
+        name = hemisphere.place.name
+        if hemisphere.measured:
+            kinds.setdefault((name.hemi, name.seg, name.region), []).append(hemisphere)
     found = {}
-    for members in _kinds(cohort):
+    for members in kinds.values():
         if len(members) < SMALLEST_COMPARED:
             continue
         table = np.array([[h.summary.get(m.name, np.nan) for m in MEASURES] for h in members])
@@ -201,7 +222,7 @@ def distances(cohort: Cohort, thickness: Mapping[str, Float]) -> dict[str, Dista
         maps = [thickness.get(title_of(h.place.name), np.empty((0, 0))) for h in members]
         scores = np.abs(np.nan_to_num(robust_scores(table)))
         if maps[0].size and len({m.shape for m in maps}) == 1:
-            # Only a large departure is far; a small one is nearest.
+            # A map much like the median map is no outlier.
             departure = np.maximum(robust_scores(_departure(np.array(maps))), 0)
             scores = np.column_stack([scores, departure])
             titles.append("Map of thickness")
@@ -217,37 +238,6 @@ def _departure(maps: Float) -> Float:
     """(N,) root mean square over the sheet of each map's difference from the median map, mm."""
     away = maps - np.nanmedian(maps, axis=0)
     return np.asarray(np.sqrt(np.nanmean(away**2, axis=(1, 2))), dtype=np.float64)
-
-
-def _kinds(cohort: Cohort) -> list[Sequence[Hemisphere]]:
-    """Measured hemispheres by side, protocol and region."""
-    kinds: dict[tuple[str, str, str], list[Hemisphere]] = {}
-    for hemisphere in cohort.hemispheres:
-        name = hemisphere.place.name
-        if hemisphere.measured:
-            kinds.setdefault((name.hemi, name.seg, name.region), []).append(hemisphere)
-    return list(kinds.values())
-
-
-# The page about everybody: who can be used, who stands apart, and who is to be left out.
-
-
-#: Robust z-scores beyond this are rare without a cause (Iglewicz and Hoaglin 1993).
-APART = 3.5
-
-#: Columns of the table, with shorter titles than those of the measures.
-_SHOWN = {
-    "thickness_mean": "Thickness",
-    "curvature_mean": "Curvature",
-    "volume": "Volume",
-    "area_mid": "Area",
-    "extent_y": "Length",
-}
-_QUALITY = {
-    "voxels_across": "Voxels across",
-    "changed_fraction": "Repaired",
-    "filled_fraction": "Filled",
-}
 
 
 def cohort_page(cohort: Cohort) -> str | None:
@@ -274,15 +264,15 @@ def cohort_page(cohort: Cohort) -> str | None:
         n=len(hemispheres),
         n_participants=len({h.place.name.subject for h in hemispheres}),
         counts=[(str(status), counts[str(status)]) for status in Status if counts[str(status)]],
-        n_apart=sum(distance.value > APART for distance in apart.values()),
-        apart=APART,
+        n_apart=sum(distance.value > OUTLIER for distance in apart.values()),
+        apart=OUTLIER,
         smallest=SMALLEST_COMPARED,
         compared=bool(apart),
         sprites=sprites,
         data={
             "columns": _columns(hemispheres),
             "rows": rows,
-            "apart": APART,
+            "apart": OUTLIER,
             "grid": {
                 "columns": grid.columns,
                 "rows": grid.rows,
@@ -293,7 +283,7 @@ def cohort_page(cohort: Cohort) -> str | None:
 
 
 def _columns(hemispheres: tuple[Hemisphere, ...]) -> list[Mapping[str, Any]]:
-    """Columns of the table; those that say the same everywhere are left out."""
+    """Columns of the table; those of one value throughout are left out."""
     names = [h.place.name for h in hemispheres]
     measures = {measure.name: measure for measure in MEASURES}
     columns: list[Mapping[str, Any]] = [{"key": "participant", "title": "Participant"}]
@@ -307,27 +297,20 @@ def _columns(hemispheres: tuple[Hemisphere, ...]) -> list[Mapping[str, Any]]:
     columns += [
         {"key": "status", "title": "Status"},
         {"key": "reason", "title": "Reason"},
-        {"key": "distance", "title": "Apart", "digits": 1, "help": "largest robust z-score"},
-        {"key": "farthest", "title": "most in"},
-    ]
-    columns += [
         {
-            "key": name,
-            "title": title,
-            "unit": measures[name].unit,
-            "digits": measures[name].digits,
-        }
-        for name, title in _SHOWN.items()
-    ]
-    columns += [
-        {
-            "key": key,
-            "title": title,
+            "key": "distance",
+            "title": "Outlier score",
             "digits": 1,
-            **({"percent": True} if key.endswith("fraction") else {}),
-        }
-        for key, title in _QUALITY.items()
+            "help": "largest robust z-score",
+        },
+        {"key": "farthest", "title": "Outlier measure"},
     ]
+    for key, title in _SHOWN.items():
+        unit, digits = measures[key].unit, measures[key].digits
+        columns.append({"key": key, "title": title, "unit": unit, "digits": digits})
+    for key, title in _QUALITY.items():
+        percent = {"percent": True} if key.endswith("fraction") else {}
+        columns.append({"key": key, "title": title, "digits": 1, **percent})
     return columns
 
 
@@ -353,7 +336,7 @@ def _row(hemisphere: Hemisphere, distance: Distance | None, tile: int | None) ->
 
 
 def _aspect(hemispheres: tuple[Hemisphere, ...]) -> float:
-    """Usual length over width of a sheet."""
+    """Median length over width of the sheets."""
     ratios = [
         h.summary["extent_y"] / h.summary["extent_x"]
         for h in hemispheres

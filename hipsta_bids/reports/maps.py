@@ -1,13 +1,19 @@
-"""Static figures by matplotlib: unfolded maps and profiles."""
+"""Static figures by matplotlib, without a screen: unfolded maps, profiles, and tiles of maps."""
 
+import atexit
 import base64
+import contextlib
 import io
+import os
 import re
-from collections.abc import Mapping, Sequence
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -15,7 +21,6 @@ from numpy.typing import NDArray
 from pyarrow import csv
 
 from hipsta_bids.io import files
-from hipsta_bids.reports.plotting import new_figure
 from hipsta_bids.reports.results import Hemisphere
 from hipsta_bids.types import Float, Status
 
@@ -23,6 +28,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+#: What a user may have in the environment that would change figures.
+_PREFERENCES = ("MPLBACKEND", "MATPLOTLIBRC")
 
 #: Colors of the hemispheres (Okabe and Ito 2008).
 HEMISPHERE_COLORS = {"L": "#0072B2", "R": "#D55E00"}
@@ -37,6 +44,38 @@ _STYLE: Any = {
     "svg.fonttype": "none",
     "svg.hashsalt": "hipsta_bids",
 }
+
+# Tiles: many small maps in one picture, of which a browser shows a part each.
+_COLUMNS = 20  # side by side
+_COLORS = 128  # shades; one more stands for missing values
+_MISSING = (217, 217, 217)
+_FULL_SIZE = 1500  # tiles; of more, each has a quarter of the pixels, so that pages stay small
+
+
+def new_figure(size: tuple[float, float], layout: Literal["constrained", "compressed"]) -> "Figure":
+    """Return an empty figure; it needs no screen and no home folder."""
+    with contextlib.nullcontext() if "matplotlib" in sys.modules else _own_settings():
+        from matplotlib.figure import Figure  # noqa: PLC0415  (slow to load)
+
+    return Figure(figsize=size, layout=layout)
+
+
+@contextlib.contextmanager
+def _own_settings() -> Iterator[None]:
+    """Let matplotlib load with its own folder, which is removed when this process ends.
+
+    It keeps a list of fonts in the user's home, which may be missing or read-only in containers
+    and on clusters, and would read that user's preferences there.
+    """
+    folder = tempfile.mkdtemp(prefix="hipsta-bids-fonts-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    before = {name: os.environ.pop(name, None) for name in (*_PREFERENCES, "MPLCONFIGDIR")}
+    os.environ["MPLCONFIGDIR"] = folder
+    try:
+        yield
+    finally:
+        del os.environ["MPLCONFIGDIR"]
+        os.environ.update({name: value for name, value in before.items() if value is not None})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,7 +155,7 @@ def colors_of(name: str, n: int = 64) -> NDArray[np.str_]:
 
 
 def gradient_of(colors: NDArray[np.str_]) -> str:
-    """Spell a color table as a CSS gradient from left to right."""
+    """Write a color table as a CSS gradient from left to right."""
     stops = colors[np.linspace(0, len(colors) - 1, 9).round().astype(int)]
     return f"linear-gradient(to right,{','.join(stops.tolist())})"
 
@@ -154,20 +193,20 @@ def draw_profiles(
     for hemisphere in hemispheres:
         hemi = hemisphere.place.name.hemi
         values = hemisphere.sheet.columns[kind.column]
-        place = np.linspace(0, 100, values.shape[0])
+        x = np.linspace(0, 100, values.shape[0])
         color = HEMISPHERE_COLORS[hemi]
         low, high = np.nanpercentile(values, [5, 95], axis=1)
         bands += [low, high]
-        axis.fill_between(place, low, high, color=color, alpha=0.18, linewidth=0)
-        axis.plot(place, np.nanmean(values, axis=1), color=color, label=hemisphere.side)
+        axis.fill_between(x, low, high, color=color, alpha=0.18, linewidth=0)
+        axis.plot(x, np.nanmean(values, axis=1), color=color, label=hemisphere.side)
         cohort = others.get(hemi)
         if cohort is not None and len(cohort):
             style = {"color": color, "linewidth": 0.9, "linestyle": (0, (2, 2))}
             for line in np.nanpercentile(cohort, [5, 95], axis=0):
-                axis.plot(place, line, **style)
+                axis.plot(x, line, **style)
     _mark_subfields(axis, hemispheres[0])
     axis.set_xlim(0, 100)
-    # The columns next to the rims may lie far off; they need not squeeze the rest.
+    # Columns beside the edges of the sheet may be far off; they must not squeeze the rest.
     bottom, top = np.nanpercentile(np.concatenate(bands), [3, 97])
     axis.set_ylim(bottom - 0.15 * (top - bottom), top + 0.2 * (top - bottom))
     axis.set_xlabel("medial  ←  % of the width  →  lateral")
@@ -264,7 +303,7 @@ def _hatch(axis: "Axes", where: NDArray[np.bool_], x: Float, y: Float, hatch: st
 
 
 def _edges(nodes: Float) -> Float:
-    """Place cell edges halfway between nodes."""
+    """Compute cell edges halfway between nodes."""
     step = nodes[1] - nodes[0]
     return np.append(nodes - step / 2, nodes[-1] + step / 2)
 
@@ -309,15 +348,6 @@ def _mark_subfields(axis: "Axes", hemisphere: Hemisphere) -> None:
         )  # fmt: skip
 
 
-# Many small maps in one picture, of which a browser shows a part each: hundreds at once, fast.
-
-
-_COLUMNS = 20  # tiles side by side
-_COLORS = 128  # shades; one more stands for missing values
-_MISSING = (217, 217, 217)
-_FULL_SIZE = 1500  # beyond so many, tiles have a quarter of the pixels, so that pages stay small
-
-
 @dataclass(frozen=True, kw_only=True)
 class Sprites:
     """All maps of one kind."""
@@ -329,7 +359,7 @@ class Sprites:
     high: str
     """Values at the ends of the colors."""
     gradient: str
-    """Of the color bar, as CSS spells it."""
+    """Of the color bar, in CSS."""
     address: str
     """Data address of the picture."""
 
@@ -383,7 +413,7 @@ def make_sprites(
     trusted = [row for row in shown if hemispheres[row].status != Status.FLAGGED] or shown
     sprites = []
     for kind in MAP_KINDS if shown else ():
-        # What is flagged may be far off; it need not stretch the colors of all others.
+        # Flagged hemispheres may be far off; they must not stretch the colors of all others.
         scale = scale_of(kind, [maps[row][kind.column] for row in trusted])
         tiles = [maps[row][kind.column][::step, ::step] for row in shown]
         sprites.append(_sprites(kind, tiles, mirrored, grid, scale))

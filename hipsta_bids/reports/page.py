@@ -1,17 +1,23 @@
-"""Pages from templates: one file each, without anything from outside."""
+"""What pages say and how they are made: reasons, verdicts, usual ranges, and templates.
+
+A page is one file that asks for nothing from outside.
+"""
 
 import logging
+import math
+import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
-from importlib.resources import files as package_files
+from importlib.resources import files
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from hipsta_bids import __version__
+from hipsta_bids.settings import Settings
+from hipsta_bids.types import Status
 
 if TYPE_CHECKING:
     from jinja2 import Environment
-
 
 _LOGGER = logging.getLogger(__name__)
 _Topic = TypeVar("_Topic")
@@ -27,7 +33,7 @@ class Section(Generic[_Topic]):
     template: str
     """File in ``templates/``."""
     build: Callable[[_Topic], Mapping[str, Any] | None]
-    """Gives what the template shows; ``None`` leaves the section out."""
+    """Returns what the template shows; ``None`` leaves the section out."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +50,7 @@ class Content:
 def build_sections(
     sections: Iterable[Section[_Topic]], topic: _Topic, prefix: str
 ) -> list[Content]:
-    """Build sections; one that fails says so in the page and in the log, and harms no other."""
+    """Build sections; one that fails is noted in the page and in the log, and harms no other."""
     built = []
     for section in sections:
         try:
@@ -53,14 +59,9 @@ def build_sections(
             _LOGGER.exception("report: section %s of %s", section.key, prefix)
             values = {"problem": f"{type(error).__name__}: {error}"}
         if values is not None:
-            built.append(
-                Content(
-                    key=f"{prefix}-{section.key}",
-                    title=section.title,
-                    template=section.template if "problem" not in values else "problem.html",
-                    values=values,
-                )
-            )
+            template = section.template if "problem" not in values else "problem.html"
+            key = f"{prefix}-{section.key}"
+            built.append(Content(key=key, title=section.title, template=template, values=values))
     return built
 
 
@@ -83,9 +84,171 @@ def _environment() -> "Environment":
     )
 
     def asset(name: str) -> Markup:
-        """Give a file of the package's own as it is."""
-        source = package_files("hipsta_bids.reports") / "assets" / name
+        """Return one of the package's own files as it is."""
+        source = files("hipsta_bids.reports") / "assets" / name
         return Markup(source.read_text(encoding="utf-8"))  # noqa: S704  (no user's text in it)
 
     environment.globals["asset"] = asset
     return environment
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reason:
+    """What a machine-readable reason means, and what to do about it."""
+
+    meaning: str
+    remedy: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReasonSection:
+    """Reasons that occur in the same situation."""
+
+    title: str
+    text: str
+    reasons: Mapping[str, Reason]
+    """By their names."""
+
+
+@cache
+def reason_sections() -> tuple[ReasonSection, ...]:
+    """Read the table of all reasons, in the order of the reference page."""
+    text = (files("hipsta_bids.reports") / "reasons.toml").read_text(encoding="utf-8")
+    return tuple(
+        ReasonSection(
+            title=section["title"],
+            text=section["text"],
+            reasons={name: Reason(**row) for name, row in section["reasons"].items()},
+        )
+        for section in tomllib.loads(text)["section"]
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """How a hemisphere ended, for a reader who decides about its use."""
+
+    title: str
+    advice: str
+
+
+VERDICTS: Mapping[Status, Verdict] = {
+    Status.OK: Verdict(title="Measured", advice="Nothing stood out. It can be used as it is."),
+    Status.REPAIRED: Verdict(
+        title="Measured after repair",
+        advice="Small defects of the labels were repaired. Look at the points below; if the repair"
+        " fits, it can be used.",
+    ),
+    Status.FLAGGED: Verdict(
+        title="Look before use",
+        advice="It was measured, but something is doubtful. Look at the points below, then use it,"
+        " correct it, or leave it out.",
+    ),
+    Status.FAILED: Verdict(
+        title="Not measured",
+        advice="There are no maps. The cause and what to try are below.",
+    ),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Usual:
+    """A quality number and its usual range."""
+
+    name: str
+    """In the quality record."""
+    title: str
+    meaning: str
+    low: float = -math.inf
+    high: float = math.inf
+    unit: str = ""
+    percent: bool = False
+
+    def text(self, value: float) -> str:
+        """Format a value with its unit."""
+        if self.percent:
+            return f"{value:.1%}"
+        return f"{value:.3g}{f' {self.unit}' if self.unit else ''}"
+
+    @property
+    def range(self) -> str:
+        """Format the usual range."""
+        low, high = math.isfinite(self.low), math.isfinite(self.high)
+        if low and high:
+            return f"{self.text(self.low)} to {self.text(self.high)}"
+        if low:
+            return f"at least {self.text(self.low)}"
+        return f"at most {self.text(self.high)}" if high else "any"
+
+
+def usual_ranges(thickness: float, settings: Mapping[str, Any]) -> tuple[Usual, ...]:
+    """List the quality numbers that a page shows; some limits are relative to the thickness, mm."""
+    usual = Settings().model_dump()
+    stages = {name: usual[name] | dict(settings.get(name) or {}) for name in usual}
+    checks, topology, body = stages["checks"], stages["topology"], stages["body"]
+    return (
+        Usual(
+            name="voxels_across",
+            title="Voxels across the sheet",
+            meaning="mean thickness in in-plane voxels: fewer make thickness coarse",
+            low=checks["min_voxels_across"],
+        ),
+        Usual(
+            name="body_length_mm",
+            title="Length of the body",
+            meaning="from one end plane to the other",
+            low=body["min_length"],
+            unit="mm",
+        ),
+        Usual(
+            name="changed_fraction",
+            title="Changed by repairs",
+            meaning="share of the body that repairs of its topology added or removed",
+            high=topology["flag_fraction"],
+            percent=True,
+        ),
+        Usual(
+            name="boundary_rim_distance_mm",
+            title="Disagreement of the boundaries",
+            meaning="how far two ways to find the medial and the lateral boundary differ",
+            high=checks["flag_rim_distance"] * thickness,
+            unit="mm",
+        ),
+        Usual(
+            name="label_order",
+            title="Order of labels",
+            meaning="rank correlation of x with the order of labels from medial to lateral",
+            low=checks["min_label_order"],
+        ),
+        Usual(
+            name="folded_fraction",
+            title="Folded coordinates",
+            meaning="share of the volume whose coordinates are inverted",
+            high=checks["flag_folded"],
+            percent=True,
+        ),
+        Usual(
+            name="filled_fraction",
+            title="Filled columns",
+            meaning="share of the columns that were filled from their neighbors",
+            high=checks["flag_filled"],
+            percent=True,
+        ),
+        Usual(
+            name="repaired_fraction",
+            title="Repaired columns",
+            meaning="share of the columns that a repair touched; they are hatched on the sheet",
+            percent=True,
+        ),
+        Usual(
+            name="tetra_quality_median",
+            title="Quality of tetrahedra",
+            meaning="median, 1 for regular ones",
+        ),
+    )
+
+
+def number(metrics: Mapping[str, Any], name: str) -> float:
+    """Look up a number of the quality record; NaN where there is none."""
+    value = metrics.get(name)
+    return float(value) if isinstance(value, (int, float)) else math.nan

@@ -21,7 +21,14 @@ from hipsta_bids.reports.maps import (
     gradient_of,
 )
 from hipsta_bids.reports.maps import scale_of as scale_of_map
-from hipsta_bids.reports.page import Section, build_sections, render
+from hipsta_bids.reports.page import (
+    VERDICTS,
+    Section,
+    build_sections,
+    number,
+    render,
+    usual_ranges,
+)
 from hipsta_bids.reports.results import (
     Finding,
     Hemisphere,
@@ -30,12 +37,19 @@ from hipsta_bids.reports.results import (
     input_path,
     read_views,
 )
-from hipsta_bids.reports.slices import place_panels, section_panels, slice_panels
+from hipsta_bids.reports.slices import point_panels, section_panels, slice_panels
 from hipsta_bids.reports.viewer import scales_of, scene_of, subfields_of
-from hipsta_bids.reports.words import number, usual_ranges, verdict_of
 from hipsta_bids.types import Float, Status
 
-# What the sections of a participant's page are about.
+#: Points that messages name are all listed; this many are shown in slices.
+_POINTS_SHOWN = 4
+
+#: Rows of the quality table that hold words, and the keys of the quality record.
+_FACTS = (
+    ("End planes", "posterior_end_rule", "anterior_end_rule"),
+    ("Boundaries found by", "boundary_rule"),
+    ("Interior side found by", "side_rule"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +62,7 @@ class Series:
 
     @property
     def measured(self) -> list[Hemisphere]:
-        """Those with maps."""
+        """Hemispheres with maps."""
         return [h for h in self.hemispheres if h.measured]
 
     @property
@@ -68,22 +82,17 @@ class Series:
         return self.views[hemisphere.place.name.hemi]
 
 
-# Tables of a participant's page: key numbers and quality.
-
-
-def key_numbers(series: Series) -> Mapping[str, Any] | None:
+def _key_numbers(series: Series) -> Mapping[str, Any] | None:
     """Set the numbers of both hemispheres beside those of the cohort."""
     measured = series.measured
     if not measured:
         return None
-    first = measured[0].place.name
     rows = [_number_row(measure, series) for measure in (*MEASURES, *_subfield_measures(series))]
     counts = [len(series.cohort.values(h.place.name, MEASURES[0].name)) for h in measured]
     return {
         "sides": [h.side for h in measured],
         "rows": rows,
         "others": min(counts) if min(counts) >= SMALLEST_COHORT else 0,
-        "seg": first.seg,
         "smallest": SMALLEST_COHORT,
     }
 
@@ -92,28 +101,21 @@ def _subfield_measures(series: Series) -> list[Measure]:
     """Mean thickness of each subfield that one of the hemispheres has."""
     prefix = "thickness_mean_"
     names = dict.fromkeys(
-        name
+        name.removeprefix(prefix)
         for hemisphere in series.measured
         for name, value in hemisphere.summary.items()
         if name.startswith(prefix) and np.isfinite(value)
     )
-    return [
-        Measure(
-            name=name,
-            title=f"Mean thickness, {_subfield_title(name.removeprefix(prefix))}",
-            unit="mm",
-            digits=2,
-        )
-        for name in names
-    ]
-
-
-def _subfield_title(name: str) -> str:
-    return name.replace("_", "/") if name.startswith(("CA", "BA")) else name.lower()
+    measures = []
+    for name in names:
+        shown = name.replace("_", "/") if name.startswith(("CA", "BA")) else name.lower()
+        title = f"Mean thickness, {shown}"
+        measures.append(Measure(name=f"{prefix}{name}", title=title, unit="mm", digits=2))
+    return measures
 
 
 def _number_row(measure: Measure, series: Series) -> Mapping[str, Any]:
-    """One number of both hemispheres, with its place in the range of the cohort."""
+    """One number of both hemispheres, with its position in the range of the cohort."""
     values = [h.summary.get(measure.name, np.nan) for h in series.measured]
     cohort = [series.cohort.values(h.place.name, measure.name) for h in series.measured]
     return {
@@ -129,22 +131,25 @@ def _number_row(measure: Measure, series: Series) -> Mapping[str, Any]:
 
 
 def _strip(value: float, others: Float, measure: Measure) -> Mapping[str, Any]:
-    """Places of one value and all of the cohort between 0 and 100."""
+    """Positions of one value and all of the cohort between 0 and 100."""
     low, high = float(others.min()), float(others.max())
-    span = max(high - low, 1e-9)
     median = float(np.median(others))
     digits = measure.digits
     share = float(np.mean(others <= value))
+
+    def scaled(v: float) -> float:
+        return round(100 * (v - low) / max(high - low, 1e-9), 1)
+
     return {
-        "dots": [round(100 * (float(v) - low) / span, 1) for v in others],
-        "value": round(100 * (value - low) / span, 1),
-        "median": round(100 * (median - low) / span, 1),
+        "dots": [scaled(float(v)) for v in others],
+        "value": scaled(value),
+        "median": scaled(median),
         "words": f"{value:.{digits}f}; cohort of {len(others)}: {low:.{digits}f} to"
         f" {high:.{digits}f}, median {median:.{digits}f}; {share:.0%} are not larger",
     }
 
 
-def quality_numbers(series: Series) -> Mapping[str, Any] | None:
+def _quality_numbers(series: Series) -> Mapping[str, Any] | None:
     """Set the quality numbers of both hemispheres beside their usual ranges."""
     measured = series.measured
     if not measured:
@@ -169,20 +174,11 @@ def quality_numbers(series: Series) -> Mapping[str, Any] | None:
                 ],
             }
         )
-    words = [
-        ("End planes", "posterior_end_rule", "anterior_end_rule"),
-        ("Boundaries found by", "boundary_rule"),
-        ("Interior side found by", "side_rule"),
-    ]
     facts = [
         (title, [", ".join(str(h.metrics.get(key, "n/a")) for key in keys) for h in measured])
-        for title, *keys in words
+        for title, *keys in _FACTS
     ]
     return {"sides": [h.side for h in measured], "rows": rows, "facts": facts}
-
-
-#: So many places are shown in slices; all are listed.
-_PLACES_SHOWN = 4
 
 
 def participant_page(root: Path, subject: str, session: str | None, cohort: Cohort) -> str | None:
@@ -231,7 +227,7 @@ def _status(series: Series) -> Mapping[str, Any]:
             {
                 "side": h.side,
                 "status": str(h.status),
-                "verdict": verdict_of(h),
+                "verdict": VERDICTS[h.status],
                 "findings": h.findings,
                 "reason": h.record.get("reason"),
                 "notes": h.record.get("notes") or [],
@@ -242,26 +238,26 @@ def _status(series: Series) -> Mapping[str, Any]:
     }
 
 
-def _places(series: Series) -> Mapping[str, Any] | None:
-    """Slices through the places that messages name."""
+def _points(series: Series) -> Mapping[str, Any] | None:
+    """Slices through the points that messages name."""
     groups = []
     for hemisphere in series.hemispheres:
         view = series.view(hemisphere)
-        places: dict[tuple[float, float, float], list[Finding]] = {}
+        points: dict[tuple[float, float, float], list[Finding]] = {}
         for finding in hemisphere.findings:
             if finding.point is not None:
-                places.setdefault(finding.point, []).append(finding)
-        if view is None or not places:
+                points.setdefault(finding.point, []).append(finding)
+        if view is None or not points:
             continue
         shown = [
             {
                 "findings": findings,
                 "urgent": any(finding.kind != "repair" for finding in findings),
-                "panels": place_panels(hemisphere, view, point),
+                "panels": point_panels(hemisphere, view, point),
             }
-            for point, findings in list(places.items())[:_PLACES_SHOWN]
+            for point, findings in list(points.items())[:_POINTS_SHOWN]
         ]
-        groups.append({"side": hemisphere.side, "places": shown, "more": len(places) - len(shown)})
+        groups.append({"side": hemisphere.side, "points": shown, "more": len(points) - len(shown)})
     return {"groups": groups, "legend": _legend(series)} if groups else None
 
 
@@ -276,7 +272,7 @@ def _input(series: Series) -> Mapping[str, Any]:
                 "file": path.name if path else "not known",
                 "why": hemisphere.record.get("chosen_because") or "",
                 "voxel": " by ".join(f"{edge:.2g}" for edge in view.voxel) if view else None,
-                "missing": view.missing if view else "neither labels nor mask are at hand",
+                "missing": view.missing if view else "neither labels nor mask are available",
                 "panels": slice_panels(hemisphere, view) if view else [],
                 "measured": hemisphere.measured,
             }
@@ -333,10 +329,9 @@ def _profiles(series: Series) -> Mapping[str, Any] | None:
     measured = series.measured
     if not measured:
         return None
-    pictures = [
-        draw_profiles(kind, measured, _cohort_profiles(series, kind.column)) for kind in MAP_KINDS
-    ]
-    return {"pictures": pictures, "others": bool(_cohort_profiles(series, "thickness"))}
+    others = {kind.column: _cohort_profiles(series, kind.column) for kind in MAP_KINDS}
+    pictures = [draw_profiles(kind, measured, others[kind.column]) for kind in MAP_KINDS]
+    return {"pictures": pictures, "others": bool(others["thickness"])}
 
 
 def _cohort_profiles(series: Series, column: str) -> dict[str, Float]:
@@ -350,7 +345,7 @@ def _cohort_profiles(series: Series, column: str) -> dict[str, Float]:
 
 
 def _correct(series: Series) -> Mapping[str, Any] | None:
-    """How to edit what was measured; nothing where nothing is to be said."""
+    """How to correct what was measured; nothing if all is well."""
     wanted = [h for h in series.hemispheres if h.status != Status.OK]
     if not wanted:
         return None
@@ -396,25 +391,20 @@ def _origin(series: Series) -> Mapping[str, Any]:
     return {"rows": rows}
 
 
-#: From top to bottom.
-SECTIONS: tuple[Section[Series], ...] = (
-    Section(key="status", title="Status", template="sections/status.html", build=_status),
-    Section(key="places", title="Where to look", template="sections/places.html", build=_places),
-    Section(
-        key="numbers", title="Key numbers", template="sections/numbers.html", build=key_numbers
-    ),
-    Section(key="input", title="Labels and body", template="sections/input.html", build=_input),
-    Section(key="sheet", title="Unfolded maps", template="sections/sheet.html", build=_sheets),
-    Section(key="view", title="Three dimensions", template="sections/view.html", build=_view),
-    Section(
-        key="sections", title="Cross-sections", template="sections/sections.html", build=_sections
-    ),
-    Section(key="profiles", title="Profiles", template="sections/profiles.html", build=_profiles),
-    Section(
-        key="quality", title="Quality", template="sections/quality.html", build=quality_numbers
-    ),
-    Section(
-        key="correct", title="How to correct it", template="sections/correct.html", build=_correct
-    ),
-    Section(key="origin", title="Origin", template="sections/origin.html", build=_origin),
+#: From top to bottom: key, which is also the template's name, title, and what builds it.
+SECTIONS: tuple[Section[Series], ...] = tuple(
+    Section(key=key, title=title, template=f"sections/{key}.html", build=build)
+    for key, title, build in (
+        ("status", "Status", _status),
+        ("points", "Where to look", _points),
+        ("numbers", "Key numbers", _key_numbers),
+        ("input", "Labels and body", _input),
+        ("sheet", "Unfolded maps", _sheets),
+        ("view", "Three dimensions", _view),
+        ("sections", "Cross-sections", _sections),
+        ("profiles", "Profiles", _profiles),
+        ("quality", "Quality", _quality_numbers),
+        ("correct", "How to correct it", _correct),
+        ("origin", "Origin", _origin),
+    )
 )

@@ -1,4 +1,4 @@
-"""What the output dataset holds of one hemisphere, as the pages need it."""
+"""What the output dataset holds of one hemisphere, as the pages need it: numbers and images."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -25,10 +25,16 @@ SURFACES = ("interior", "midthickness", "exterior")
 SIDES = {"L": "left", "R": "right"}
 
 _NUMBER = r"(-?\d+(?:\.\d+)?)"
-#: How messages name a place.
+#: How messages name a point.
 _PLACE = re.compile(rf"RAS {_NUMBER} {_NUMBER} {_NUMBER} mm")
 #: Folders before a file's name, which may tell more about a person than BIDS labels do.
 _FOLDERS = re.compile(r"(?:[^\s:;,()/]*/){2,}(?=[^\s:;,()/])")
+
+#: mm of the image that are kept round the body.
+_MARGIN = 5.0
+
+#: Colors of labels whose protocol is not available (Okabe and Ito 2008).
+_COLORS = ("#E69F00", "#56B4E9", "#009E73", "#F0E442", "#0072B2", "#D55E00", "#CC79A7", "#999999")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +45,7 @@ class Finding:
     """``failure``, ``flag`` or ``repair``."""
     message: str
     point: tuple[float, float, float] | None
-    """RAS mm, where the message names a place."""
+    """RAS mm, where the message names a point."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -61,16 +67,10 @@ class SheetTable:
         nx, ny = self.valid.shape
         return nx, ny
 
-    def nearest(self, point: tuple[float, float, float]) -> tuple[int, int]:
-        """Node of the mid-surface that is nearest to a place."""
-        distance = np.linalg.norm(self.points["midthickness"] - np.array(point), axis=-1)
-        i, j = np.unravel_index(int(np.argmin(distance)), distance.shape)
-        return int(i), int(j)
-
 
 @dataclass(frozen=True, eq=False)
 class Hemisphere:
-    """All files of one hemisphere, read when they are first asked for."""
+    """All files of one hemisphere, read when first used."""
 
     place: ResultPlace
     record: Mapping[str, Any]
@@ -130,11 +130,6 @@ class Hemisphere:
                 " again with --force",
                 reason="bad-table",
             ) from error
-
-    @cached_property
-    def sections(self) -> list[dict[str, str]]:
-        """Rows of the table of cross-sections."""
-        return files.read_tsv(self.place.path("sections"))
 
 
 def find_results(
@@ -211,16 +206,6 @@ def _sheet(rows: list[dict[str, str]], place: ResultPlace) -> SheetTable:
     )
 
 
-# Labels and masks for pictures of slices, with axes that run right, anterior and superior.
-
-
-#: Kept round what is of interest, mm.
-_MARGIN = 5.0
-
-#: Colors of labels whose protocol is not at hand (Okabe and Ito 2008).
-_COLORS = ("#E69F00", "#56B4E9", "#009E73", "#F0E442", "#0072B2", "#D55E00", "#CC79A7", "#999999")
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LabelName:
     """How a label is shown."""
@@ -235,7 +220,7 @@ class Views:
     """Labels and mask of one hemisphere, cropped to what is of interest."""
 
     labels: NDArray[np.int32] | None
-    """(I, J, K) codes; ``None`` if the input is not at hand any more."""
+    """(I, J, K) codes; ``None`` if the input is no longer available."""
     mask: Bool | None
     """(I, J, K) the body; ``None`` if it could not be found."""
     affine: Float
@@ -283,7 +268,7 @@ def read_views(hemisphere: Hemisphere) -> Views | None:
     return Views(
         labels=None if data is None else data[box].astype(np.int32),
         mask=None if inside is None else inside[box],
-        affine=_moved(affine, box),  # type: ignore[arg-type]  # likewise
+        affine=_cropped(affine, box),  # type: ignore[arg-type]  # likewise
         names=names,
         missing=missing,
     )
@@ -307,7 +292,7 @@ def input_path(hemisphere: Hemisphere) -> Path | None:
 
 def _read_mask(hemisphere: Hemisphere) -> tuple[NDArray[np.generic], Float] | None:
     path = hemisphere.place.path("body_mask")
-    return _turned(*read_voxels(path)) if path.exists() else None
+    return _reoriented(*read_voxels(path)) if path.exists() else None
 
 
 def _read_labels(
@@ -317,16 +302,17 @@ def _read_labels(
     if path is None:
         return None, "the record names no file"
     try:
-        return _turned(*read_voxels(path)), None
+        return _reoriented(*read_voxels(path)), None
     except InputError as error:
         reason = "is not there any more" if not path.exists() else f"is unusable: {error.reason}"
         return None, f"{path.name} {reason}"
 
 
-def _turned(data: NDArray[np.generic], affine: Float) -> tuple[NDArray[np.generic], Float]:
-    turn = io_orientation(affine)
-    turned = np.asarray(affine @ inv_ornt_aff(turn, data.shape), dtype=np.float64)
-    return apply_orientation(data, turn), turned
+def _reoriented(data: NDArray[np.generic], affine: Float) -> tuple[NDArray[np.generic], Float]:
+    """Flip and swap axes so that they run to the right, anterior and superior."""
+    orientation = io_orientation(affine)
+    moved = np.asarray(affine @ inv_ornt_aff(orientation, data.shape), dtype=np.float64)
+    return apply_orientation(data, orientation), moved
 
 
 def _names(hemisphere: Hemisphere, data: NDArray[np.generic] | None) -> dict[int, LabelName]:
@@ -357,7 +343,7 @@ def _protocol(name: str) -> Protocol | None:
 
 
 def _box(interest: NDArray[np.bool_], voxel: Float) -> tuple[slice, ...]:
-    """Smallest box of voxels round what is of interest, with a margin."""
+    """Smallest box of voxels that holds what is of interest, with a margin."""
     box = []
     for axis in range(interest.ndim):
         others = tuple(other for other in range(interest.ndim) if other != axis)
@@ -368,7 +354,7 @@ def _box(interest: NDArray[np.bool_], voxel: Float) -> tuple[slice, ...]:
     return tuple(box)
 
 
-def _moved(affine: Float, box: tuple[slice, ...]) -> Float:
+def _cropped(affine: Float, box: tuple[slice, ...]) -> Float:
     moved = affine.copy()
     moved[:3, 3] += affine[:3, :3] @ np.array([part.start for part in box])
     return moved

@@ -1,4 +1,4 @@
-"""Slices and cross-sections as small SVG pictures, one per place, that wrap on narrow screens."""
+"""Slices and cross-sections as small SVG pictures that wrap on narrow screens."""
 
 import base64
 import io
@@ -12,11 +12,42 @@ from hipsta_bids.io.gifti import sheet_triangles
 from hipsta_bids.reports.results import SURFACES, Hemisphere, SheetTable, Views
 from hipsta_bids.types import Float
 
-# Lines and pictures of small SVG panels: arrays to what the browser draws.
+#: Axes of a picture (to the right, up) and across it; 0 is right, 1 anterior, 2 superior.
+_AXES = {"coronal": (0, 2, 1), "sagittal": (1, 2, 0), "axial": (0, 1, 2)}
+_LETTERS = (("L", "R"), ("P", "A"), ("I", "S"))
+
+#: Where along the body slices and cross-sections are shown.
+POSITIONS = (0.1, 0.3, 0.5, 0.7, 0.9)
+
+_PALE = 0.45  # share of the label's color; the rest is white, so that lines show on it
+_MARGIN = 3.0  # mm round the body that are shown
+_NEAR = 22.0  # mm across, of a window about a point that a message names
+_REACH = 7.0  # mm, how far the line of an end plane extends up and down
+
+
+@dataclass(frozen=True, kw_only=True)
+class Panel:
+    """One picture; lengths are mm, y runs downwards."""
+
+    window: tuple[float, float, float, float]
+    """Left, top, width and height of what is shown."""
+    caption: str
+    alt: str
+    image: str | None = None
+    """Data address of the labels' picture."""
+    size: tuple[float, float] = (0.0, 0.0)
+    """Width and height of the labels' picture, whose corner is (0, 0)."""
+    paths: Mapping[str, str] = field(default_factory=dict)
+    """SVG path data by CSS class."""
+    lines: tuple[tuple[str, str], ...] = ()
+    """Colored lines: path data and color."""
+    marks: tuple[tuple[float, float], ...] = ()
+    letters: tuple[str, str, str, str] | None = None
+    """What is at the left, right, lower and upper edge."""
 
 
 def cut(points: Float, axis: int, level: float) -> Float:
-    """Cut a grid of points by a plane across one of their axes."""
+    """Cut a grid of points (Nx, Ny, 3) by a plane across an axis: line segments (N, 2, 3)."""
     triangles = points.reshape(-1, 3)[sheet_triangles(*points.shape[:2])]
     height = triangles[:, :, axis] - level
     above = height > 0
@@ -33,15 +64,12 @@ def cut(points: Float, axis: int, level: float) -> Float:
 
 
 def outline(inside: NDArray[np.bool_]) -> Float:
-    """Find the edges between pixels inside and outside.
-
-    Returns the center of pixel (0, 0) is at (0, 0).
-    """
+    """Find the edges (N, 2, 2) between pixels inside and outside; pixel centers are integers."""
     padded = np.pad(inside, 1)
     edges = []
     for axis in (0, 1):
-        turned = padded if axis == 0 else padded.T
-        change = turned[1:] != turned[:-1]
+        rows = padded if axis == 0 else padded.T
+        change = rows[1:] != rows[:-1]
         for line in np.flatnonzero(change.any(axis=1)):
             steps = np.flatnonzero(np.diff(np.pad(change[line].astype(np.int8), 1)))
             for start, stop in steps.reshape(-1, 2):
@@ -51,7 +79,7 @@ def outline(inside: NDArray[np.bool_]) -> Float:
 
 
 def path_data(lines: Float | Iterable[Float]) -> str:
-    """Spell lines of points (N, 2) each as the data of an SVG path, to a hundredth of a mm."""
+    """Write lines of points (N, 2) each as the data of an SVG path, to a hundredth of a mm."""
     return " ".join(
         "M" + "L".join(f"{x:.2f} {y:.2f}" for x, y in line)
         for line in lines
@@ -68,40 +96,6 @@ def png_address(pixels: NDArray[np.uint8]) -> str:
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
 
 
-#: Axes of a picture (to the right, up) and across it; 0 is right, 1 anterior, 2 superior.
-_AXES = {"coronal": (0, 2, 1), "sagittal": (1, 2, 0), "axial": (0, 1, 2)}
-_LETTERS = (("L", "R"), ("P", "A"), ("I", "S"))
-
-#: Where along the body slices and cross-sections are shown.
-POSITIONS = (0.1, 0.3, 0.5, 0.7, 0.9)
-
-_PALE = 0.45  # share of the label's color; the rest is white, so that lines show on it
-_MARGIN = 3.0  # mm round the body that are shown
-_NEAR = 22.0  # mm across, of a window about a place that a message names
-_REACH = 7.0  # mm, how far the line of an end plane goes up and down
-
-
-@dataclass(frozen=True, kw_only=True)
-class Panel:
-    """One picture; lengths are mm, y runs downwards."""
-
-    window: tuple[float, float, float, float]
-    """Left, top, width and height of what is shown."""
-    caption: str
-    alt: str
-    image: str | None = None
-    """Data address of the labels' picture ..."""
-    size: tuple[float, float] = (0.0, 0.0)
-    """... and its width and height, from (0, 0) on."""
-    paths: Mapping[str, str] = field(default_factory=dict)
-    """SVG path data by CSS class."""
-    lines: tuple[tuple[str, str], ...] = ()
-    """Colored lines: path data and color."""
-    marks: tuple[tuple[float, float], ...] = ()
-    letters: tuple[str, str, str, str] | None = None
-    """What is at the left, right, lower and upper edge."""
-
-
 def slice_panels(hemisphere: Hemisphere, views: Views) -> list[Panel]:
     """Draw five slices across the body, and one along it."""
     centers = _centers(hemisphere, views)
@@ -116,8 +110,8 @@ def slice_panels(hemisphere: Hemisphere, views: Views) -> list[Panel]:
     ]
 
 
-def place_panels(hemisphere: Hemisphere, views: Views, point: Sequence[float]) -> list[Panel]:
-    """Draw the three slices through a place that a message names."""
+def point_panels(hemisphere: Hemisphere, views: Views, point: Sequence[float]) -> list[Panel]:
+    """Draw the three slices through a point that a message names."""
     index = views.to_index(np.asarray(point, dtype=np.float64))
     return [_slice(hemisphere, views, name, index, mark=True) for name in _AXES]
 
@@ -127,7 +121,7 @@ def section_panels(
 ) -> list[Panel]:
     """Draw cross-sections of the sheet, with a line per column in the color of its thickness.
 
-    ``scale`` Thickness at both ends of the table, mm.
+    ``scale`` is the thickness at both ends of the colors, mm.
     """
     sheet = hemisphere.sheet
     rows = [round(share * (sheet.shape[1] - 1)) for share in POSITIONS]
@@ -186,13 +180,13 @@ def _slice(
     words: str = "",
     mark: bool = False,
 ) -> Panel:
-    """One slice through a voxel index, about the body or, marked, about that place."""
+    """Draw one slice through a voxel index, about the body or, marked, about that point."""
     right, up, across = _AXES[orientation]
     level = int(np.clip(round(float(center[across])), 0, views.shape[across] - 1))
     edge, top = views.voxel[[right, up]], views.shape[up] - 0.5
 
     def flat(index: Float) -> Float:
-        """Voxel indices to mm in the picture."""
+        """Convert voxel indices to mm in the picture."""
         return np.stack(
             [(index[..., right] + 0.5) * edge[0], (top - index[..., up]) * edge[1]], axis=-1
         )
@@ -215,12 +209,12 @@ def _slice(
             paths[name] = path_data(flat(cut(index, across, level)))
         if orientation == "sagittal":
             paths["plane"] = path_data(flat(_plane_lines(hemisphere, views)))
-    place = flat(np.asarray(center))
+    point = flat(np.asarray(center))
     where = views.affine[:3, :3] @ np.asarray(center) + views.affine[:3, 3]
     caption = (
         f"{orientation}{', ' if words else ''}{words} ({'RAS'[across]} {where[across]:.1f} mm)"
     )
-    middle, size = (place, (_NEAR, _NEAR)) if mark else (shown.mean(axis=0), shown[1] - shown[0])
+    middle, size = (point, (_NEAR, _NEAR)) if mark else (shown.mean(axis=0), shown[1] - shown[0])
     return Panel(
         window=_window(float(middle[0]), float(middle[1]), float(size[0]), float(size[1])),
         caption=caption,
@@ -229,13 +223,9 @@ def _slice(
         image=_label_image(views, across, level, right, up),
         size=(round(float(width), 2), round(float(height), 2)),
         paths=paths,
-        marks=(_pair(place),) if mark else (),
+        marks=((round(float(point[0]), 2), round(float(point[1]), 2)),) if mark else (),
         letters=(*_LETTERS[right], *_LETTERS[up]),
     )
-
-
-def _pair(point: Float) -> tuple[float, float]:
-    return round(float(point[0]), 2), round(float(point[1]), 2)
 
 
 def _picture(
@@ -247,7 +237,7 @@ def _picture(
 
 
 def _plane_lines(hemisphere: Hemisphere, views: Views) -> Float:
-    """Find the end planes in a sagittal slice: both ends of each line, voxel indices."""
+    """Find the end planes in a sagittal slice: both ends (2, 2, 3) of each line, voxel indices."""
     lines = []
     middle = hemisphere.sheet.points["midthickness"]
     for end, row in (("posterior_plane", 0), ("anterior_plane", -1)):

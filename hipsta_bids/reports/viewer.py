@@ -1,4 +1,4 @@
-"""What the three-dimensional view of a page is drawn from."""
+"""Data of the three-dimensional view of a page."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -78,12 +78,12 @@ def _sheet_scene(hemisphere: Hemisphere, names: Sequence[str]) -> dict[str, Any]
 
 def subfields_of(hemispheres: Sequence[Hemisphere]) -> list[str]:
     """List the subfields of measured hemispheres from medial to lateral."""
-    places: dict[str, list[float]] = {}
+    columns: dict[str, list[float]] = {}
     for hemisphere in hemispheres:
         subfield = hemisphere.sheet.subfield
         for name in np.unique(subfield[subfield != ""]).tolist():
-            places.setdefault(name, []).extend(np.nonzero(subfield == name)[0].tolist())
-    return sorted(places, key=lambda name: float(np.mean(places[name])))
+            columns.setdefault(name, []).extend(np.nonzero(subfield == name)[0].tolist())
+    return sorted(columns, key=lambda name: float(np.mean(columns[name])))
 
 
 def _flat(values: Float, digits: int) -> list[float | None]:

@@ -1,18 +1,14 @@
 """Thickness, curvature, volume, areas and extents of phantoms against the truth."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY
-from hipsta_bids.geometry.measures import away_from_edges, column_area
-from hipsta_bids.phantom import Phantom, PhantomSpec, PhantomTruth
-from hipsta_bids.phantom.truth import cut_sections
-from hipsta_bids.protocols.protocol import Protocol
-from hipsta_bids.settings import MeasureSettings
-from hipsta_bids.types import Float, HemisphereMaps
+from hipsta_bids.phantom import PhantomSpec
+from hipsta_bids.types import Float
 from hipsta_bids.validation.cases import (
     CURVATURES,
     EDGE,
@@ -23,20 +19,34 @@ from hipsta_bids.validation.cases import (
     along_slices,
     any_pose,
     measure_case,
-    run_cases,
+    refusal_notes,
+    run_groups,
     without_edges,
 )
-from hipsta_bids.validation.report import Cell, Picture, Suite, Table
+from hipsta_bids.validation.report import Cell, Cells, Picture, Suite, Table, show_map
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-
-# Which phantoms the accuracy suite measures, in which voxels, and what is asked of each.
-
-
 TILT = 10.0
 """Degrees by which tilted slices miss the perpendicular to the long axis."""
+SEED = 20230
+POSES_QUICK, POSES_FULL = 4, 12
+MAX_SIZE_ERROR = 2.0
+"""Percent, of volume, areas and extents."""
+MAX_CURVATURE_ERROR = 5.0
+"""Percent, of mean curvature in the middle of an arc."""
+MAX_GAUSSIAN_ERROR = 0.005
+"""1/mm2, root mean square over the middle of the sheet, on straight extrusions."""
+SIZES = ("volume", "area_interior", "area_mid", "area_exterior", "extent_x", "extent_y")
+SECTION_SIZES = (
+    "circumference_mean",
+    "interior_exterior_ratio_mean",
+    "section_area_mean",
+    "shape_index_mean",
+    "area_ratio",
+    "surface_volume_ratio",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,49 +104,30 @@ def _rows() -> tuple[Row, ...]:
 ROWS = _rows()
 
 
-SEED = 20230
-POSES_QUICK, POSES_FULL = 4, 12
-MAX_SIZE_ERROR = 2.0
-"""Percent, of volume, areas and extents."""
-MAX_CURVATURE_ERROR = 5.0
-"""Percent, of mean curvature in the middle of an arc."""
-MAX_GAUSSIAN_ERROR = 0.005
-"""1/mm2, root mean square over the middle of the sheet, on straight extrusions."""
-SIZES = ("volume", "area_interior", "area_mid", "area_exterior", "extent_x", "extent_y")
-SECTION_SIZES = (
-    "circumference_mean",
-    "interior_exterior_ratio_mean",
-    "section_area_mean",
-    "shape_index_mean",
-    "area_ratio",
-    "surface_volume_ratio",
-)
+Results = Mapping[Row, Sequence[Measured | Refusal]]
 
 
 def run(full: bool) -> Suite:
     """Measure every row in several poses."""
     poses = POSES_FULL if full else POSES_QUICK
-    cases = [case for number, row in enumerate(ROWS) for case in _poses(number, row, poses)]
-    results = run_cases(measure_case, cases)
-    groups = [results[i * poses : (i + 1) * poses] for i in range(len(ROWS))]
-    measured = [[m for m in group if isinstance(m, Measured)] for group in groups]
+    results = run_groups(measure_case, {r: _poses(n, r, poses) for n, r in enumerate(ROWS)})
     return Suite(
         name="accuracy",
         title="Accuracy on phantoms",
         text=_TEXT.format(poses=poses),
         tables=(
-            _thickness_table(groups),
-            _curvature_table(measured),
-            _gaussian_table(measured),
-            _size_table(measured, "Volume, areas and extents, error in percent", SIZES),
-            _size_table(measured, "Cross-sections and ratios, error in percent", SECTION_SIZES),
+            _thickness_table(results),
+            _curvature_table(results),
+            _gaussian_table(results),
+            _size_table(results, "Volume, areas and extents, error in percent", SIZES),
+            _size_table(results, "Cross-sections and ratios, error in percent", SECTION_SIZES),
         ),
-        pictures=(_error_picture(measured),),
+        pictures=(_error_picture(results),),
     )
 
 
 def _poses(number: int, row: Row, count: int) -> list[Case]:
-    """Draw poses; the first ones are the same however many there are."""
+    """Draw poses; the first ones are the same whatever the count."""
     generator = np.random.default_rng((SEED, number))
     cases = []
     for _ in range(count):
@@ -149,194 +140,132 @@ def _poses(number: int, row: Row, count: int) -> list[Case]:
     return cases
 
 
-def mean_map(measured: Sequence[Measured]) -> Float:
-    """Average the error of thickness over poses, (Nx, Ny) mm: what is not luck of the voxels."""
-    return np.asarray(np.mean([m.error for m in measured], axis=0))
+def _measured(results: Results) -> dict[Row, list[Measured]]:
+    """Keep the rows of which something was measured."""
+    kept = {row: [m for m in group if isinstance(m, Measured)] for row, group in results.items()}
+    return {row: group for row, group in kept.items() if group}
 
 
-def _thickness_table(groups: Sequence[Sequence[Measured | Refusal]]) -> Table:
-    rows: list[tuple[Cell, ...]] = []
-    for row, group in zip(ROWS, groups, strict=True):
-        errors = [m.error for m in group if isinstance(m, Measured)]
-        targets = (f"≤ {row.bias:g}", f"≤ {row.sd:g}")
+def _thickness_table(results: Results) -> Table:
+    rows: list[Cells] = []
+    measured = _measured(results)
+    for row, group in results.items():
+        errors = [m.error for m in measured.get(row, ())]
         refused = len(group) - len(errors)
-        if not errors:
-            rows.append((row.name, row.voxels, None, None, *targets, *(None,) * 3, refused, False))
-            continue
-        bias = np.array([np.nanmean(error) for error in errors])
-        sd = np.array([np.nanstd(error) for error in errors])
-        inside = np.array([np.nanstd(without_edges(error)) for error in errors])
-        lasting = float(np.nanstd(np.mean(errors, axis=0)))
-        good = abs(bias.mean()) <= row.bias and _rms(sd) <= row.sd and refused == 0
-        rows.append(
-            (
-                row.name,
-                row.voxels,
-                f"{bias.mean():+.3f}",
-                _rms(sd),
-                *targets,
-                f"{bias.min():+.3f} to {bias.max():+.3f}",
-                _rms(inside),
-                lasting,
-                refused,
-                bool(good),
-            )
-        )
+        cells: dict[str, Cell] = {"phantom": row.name, "voxels, mm": row.voxels}
+        good = False
+        if errors:
+            bias = np.array([np.nanmean(error) for error in errors])
+            sd = _rms([np.nanstd(error) for error in errors])
+            good = bool(abs(bias.mean()) <= row.bias and sd <= row.sd and refused == 0)
+            cells |= {"bias": f"{bias.mean():+.3f}", "SD": sd}
+        cells |= {"target |bias|": f"≤ {row.bias:g}", "target SD": f"≤ {row.sd:g}"}
+        if errors:
+            cells |= {
+                "bias, pose by pose": f"{bias.min():+.3f} to {bias.max():+.3f}",
+                "SD without edges": _rms([np.nanstd(without_edges(error)) for error in errors]),
+                "SD of the mean map": float(np.nanstd(np.mean(errors, axis=0))),
+            }
+        rows.append({**cells, "refused": refused, "met": good})
+    refusals = refusal_notes({f"{row.name}, {row.voxels}": g for row, g in results.items()})
     return Table(
         title="Thickness over the whole grid, mm",
-        columns=(
-            "phantom",
-            "voxels, mm",
-            "bias",
-            "SD",
-            "target |bias|",
-            "target SD",
-            "bias, pose by pose",
-            "SD without edges",
-            "SD of the mean map",
-            "refused",
-            "met",
-        ),
-        rows=tuple(rows),
-        notes=_THICKNESS_NOTES.format(edge=EDGE) + _refusals(groups),
+        rows=rows,
+        notes=_THICKNESS_NOTES.format(edge=EDGE) + refusals,
     )
 
 
-def _refusals(groups: Sequence[Sequence[Measured | Refusal]]) -> str:
-    """Say why maps are missing; bullets of Markdown, or nothing."""
-    lines = [
-        f"- {row.name}, {row.voxels}: {result}"
-        for row, group in zip(ROWS, groups, strict=True)
-        for result in group
-        if isinstance(result, Refusal)
-    ]
-    return "\n".join(["\nRefused:\n", *lines]) if lines else ""
+def _curvature_table(results: Results) -> Table:
+    """Compare the middle half of each row's sheet; only the arc has a target."""
+    rows: list[Cells] = []
+    for row, surface, true, found in _middles(results, CURVATURES):
+        percent = 100.0 * (np.nanmean(found) / np.nanmean(true) - 1.0)
+        target = row.spec.kind == "arc"
+        rows.append(
+            {
+                "phantom, 0.4 mm voxels": row.name,
+                "surface": surface,
+                "true mean": float(np.nanmean(true)),
+                "measured mean": float(np.nanmean(found)),
+                "error of the mean": f"{percent:+.1f} %",
+                "RMS error of points": _rms(found - true),
+                "target": f"≤ {MAX_CURVATURE_ERROR:g} %" if target else None,
+                "met": bool(abs(percent) <= MAX_CURVATURE_ERROR) if target else None,
+            }
+        )
+    return Table(title="Mean curvature in the middle half of the sheet, 1/mm", rows=rows)
 
 
-def _curvature_table(measured: Sequence[Sequence[Measured]]) -> Table:
-    """Middle half of each row's sheet; the target is the issue of the arc alone."""
-    rows: list[tuple[Cell, ...]] = []
-    for row, group in zip(ROWS, measured, strict=True):
-        if not group or row.tilt is not None:
-            continue
-        for name in CURVATURES:
-            pairs = [(_middle(m.curvature[name]), _middle(m.true_curvature[name])) for m in group]
-            found, true = (np.array(values) for values in zip(*pairs, strict=True))
-            percent = 100.0 * (np.nanmean(found) / np.nanmean(true) - 1.0)
-            target = row.spec.kind == "arc"
-            rows.append(
-                (
-                    row.name,
-                    name.removeprefix("curvature_").replace("curvature", "mid"),
-                    float(np.nanmean(true)),
-                    float(np.nanmean(found)),
-                    f"{percent:+.1f} %",
-                    float(np.sqrt(np.nanmean((found - true) ** 2))),
-                    f"≤ {MAX_CURVATURE_ERROR:g} %" if target else None,
-                    bool(abs(percent) <= MAX_CURVATURE_ERROR) if target else None,
-                )
-            )
-    return Table(
-        title="Mean curvature in the middle half of the sheet, 1/mm",
-        columns=(
-            "phantom, 0.4 mm voxels",
-            "surface",
-            "true mean",
-            "measured mean",
-            "error of the mean",
-            "RMS error of points",
-            "target",
-            "met",
-        ),
-        rows=tuple(rows),
-    )
+def _gaussian_table(results: Results) -> Table:
+    """Compare the middle half of each row's sheet, over all poses."""
+    rows: list[Cells] = []
+    for row, surface, true, found in _middles(results, GAUSSIAN_CURVATURES):
+        error = _rms(found - true)
+        rows.append(
+            {
+                "phantom, 0.4 mm voxels": row.name,
+                "surface": surface,
+                "true mean": f"{np.nanmean(true):.4f}",
+                "measured mean": f"{np.nanmean(found):.4f}",
+                "RMS error of points": f"{error:.4f}",
+                "target": f"≤ {MAX_GAUSSIAN_ERROR:g}",
+                "met": bool(error <= MAX_GAUSSIAN_ERROR),
+            }
+        )
+    return Table(title="Gaussian curvature in the middle half of the sheet, 1/mm²", rows=rows)
 
 
-def _gaussian_table(measured: Sequence[Sequence[Measured]]) -> Table:
-    """Middle half of each row's sheet, over all surfaces and poses."""
-    rows: list[tuple[Cell, ...]] = []
-    for row, group in zip(ROWS, measured, strict=True):
-        if not group or row.tilt is not None:
-            continue
-        for name in GAUSSIAN_CURVATURES:
-            found = np.array([_middle(m.curvature[name]) for m in group])
-            true = np.array([_middle(m.true_curvature[name]) for m in group])
-            error = float(np.sqrt(np.nanmean((found - true) ** 2)))
-            surface = name.removeprefix("gaussian_curvature").removeprefix("_") or "mid"
-            rows.append(
-                (
-                    row.name,
-                    surface,
-                    f"{np.nanmean(true):.4f}",
-                    f"{np.nanmean(found):.4f}",
-                    f"{error:.4f}",
-                    f"≤ {MAX_GAUSSIAN_ERROR:g}",
-                    bool(error <= MAX_GAUSSIAN_ERROR),
-                )
-            )
-    return Table(
-        title="Gaussian curvature in the middle half of the sheet, 1/mm²",
-        columns=(
-            "phantom, 0.4 mm voxels",
-            "surface",
-            "true mean",
-            "measured mean",
-            "RMS error of points",
-            "target",
-            "met",
-        ),
-        rows=tuple(rows),
-    )
+def _middles(results: Results, names: Sequence[str]) -> Iterator[tuple[Row, str, Float, Float]]:
+    """Yield row, surface, truth and measurement of curvatures in isotropic voxels."""
+    for row, group in _measured(results).items():
+        if row.tilt is None:
+            for name in names:
+                surface = name.rpartition("curvature")[2].removeprefix("_") or "mid"
+                true = np.array([_middle(m.true_curvature[name]) for m in group])
+                found = np.array([_middle(m.curvature[name]) for m in group])
+                yield row, surface, true, found
 
 
-def _size_table(
-    measured: Sequence[Sequence[Measured]], title: str, names: tuple[str, ...]
-) -> Table:
-    rows: list[tuple[Cell, ...]] = []
-    for row, group in zip(ROWS, measured, strict=True):
-        if not group:
-            continue
+def _size_table(results: Results, title: str, names: Sequence[str]) -> Table:
+    rows: list[Cells] = []
+    for row, group in _measured(results).items():
         errors = {
-            name: 100.0 * np.mean([m.summary[name] / m.true_summary[name] - 1.0 for m in group])
+            name.removesuffix("_mean").replace("_", " "): 100.0
+            * float(np.mean([m.summary[name] / m.true_summary[name] - 1.0 for m in group]))
             for name in names
         }
-        worst = max(map(abs, errors.values()))
         rows.append(
-            (
-                row.name,
-                row.voxels,
-                *(f"{error:+.1f}" for error in errors.values()),
-                f"≤ {MAX_SIZE_ERROR:g}",
-                bool(worst <= MAX_SIZE_ERROR),
-            )
+            {
+                "phantom": row.name,
+                "voxels, mm": row.voxels,
+                **{heading: f"{error:+.1f}" for heading, error in errors.items()},
+                "target": f"≤ {MAX_SIZE_ERROR:g}",
+                "met": max(map(abs, errors.values())) <= MAX_SIZE_ERROR,
+            }
         )
-    headings = tuple(name.removesuffix("_mean").replace("_", " ") for name in names)
     return Table(
         title=title,
-        columns=("phantom", "voxels, mm", *headings, "target", "met"),
-        rows=tuple(rows),
+        rows=rows,
         notes="Mean over the poses. Extents are arc lengths of the mid-surface; cross-sections are"
         " averaged over the length of the body.",
     )
 
 
-def _error_picture(measured: Sequence[Sequence[Measured]]) -> Picture:
-    maps = [(row, mean_map(group)) for row, group in zip(ROWS, measured, strict=True) if group]
+def _error_picture(results: Results) -> Picture:
+    maps = {
+        row: np.mean([m.error for m in group], axis=0) for row, group in _measured(results).items()
+    }
 
     def draw(figure: "Figure") -> None:
         columns = 5
         axes = figure.subplots(-(-len(maps) // columns), columns, squeeze=False)
-        for axis in axes.flat:
+        for axis in axes.flat[len(maps) :]:
             axis.set_axis_off()
-        for axis, (row, error) in zip(axes.flat, maps, strict=False):
-            axis.set_axis_on()
-            image = axis.imshow(
-                error.T, origin="lower", cmap="RdBu_r", vmin=-0.15, vmax=0.15, aspect="auto"
-            )
-            name = row.name.replace(", tilted", "\ntilted")
-            axis.set_title(f"{name}\n{row.voxels}", fontsize="small")
-            axis.set_xticks([0, error.shape[0] - 1], ["medial", "lateral"])
-            axis.set_yticks([0, error.shape[1] - 1], ["post.", "ant."])
+        for axis, (row, error) in zip(axes.flat, maps.items(), strict=False):
+            title = row.name.replace(", tilted", "\ntilted") + f"\n{row.voxels}"
+            style = {"cmap": "RdBu_r", "vmin": -0.15, "vmax": 0.15}
+            image = show_map(axis, error, title, ends=("post.", "ant."), **style)
+            axis.title.set_fontsize("small")
         figure.colorbar(image, ax=axes, label="error of thickness, mm", shrink=0.8)
 
     return Picture(
@@ -354,8 +283,8 @@ def _middle(values: Float) -> Float:
     return values[x:-x, y:-y]
 
 
-def _rms(values: Float) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
+def _rms(values: ArrayLike) -> float:
+    return float(np.sqrt(np.nanmean(np.square(values))))
 
 
 _TEXT = """\
@@ -371,123 +300,7 @@ defaults.
 _THICKNESS_NOTES = """\
 Bias is the mean over the grid, averaged over the poses; SD is over the grid, its root mean square
 over the poses. Both take the whole default grid, edges included. The truth is that of the phantom
-at the place where the mid-surface was found. Without edges: without the {edge} outer nodes on each
+at the point where the mid-surface was found. Without edges: without the {edge} outer nodes on each
 side. The SD of the mean map is what remains when the error is averaged over the poses at each grid
-point: errors that stay at their place, near rims and bends.
+point: errors that stay in one position, near edges and bends.
 """
-
-
-# Every measure of a phantom beside its analytic value.
-
-
-#: Sizes of a subfield, and what they are called where the truth of a part of the body is summed up.
-_SUBFIELD_SIZES = {"area": "area_mid", "volume": "volume"}
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Comparison:
-    """One measure of one phantom."""
-
-    name: str
-    """Of the column."""
-    unit: str
-    found: Float
-    """Values where it is measured: (Nx, Ny) of a map, (Ny,) of sections, one of a summary."""
-    true: Float
-    """The same, analytic."""
-    weights: Float
-    """Of the values in the mean; nodes beside rims and ends have none for curvatures."""
-
-    @property
-    def means(self) -> tuple[float, float]:
-        """Means of what was found and of the truth."""
-        found, true = (np.average(x, weights=self.weights) for x in (self.found, self.true))
-        return float(found), float(true)
-
-    @property
-    def rms_error(self) -> float:
-        """Root mean square error of the values."""
-        return float(np.sqrt(np.average((self.found - self.true) ** 2, weights=self.weights)))
-
-
-def compare_maps(phantom: Phantom, maps: HemisphereMaps, *, hemi: str = "L") -> list[Comparison]:
-    """Set each map beside the truth where its mid-surface was found."""
-    truth = _truth_at_nodes(phantom, maps, hemi)
-    area = column_area(maps.sheet)
-    inner = area * away_from_edges(area.shape, MeasureSettings())
-    return [
-        Comparison(
-            name=row.name,
-            unit=row.unit,
-            found=maps.maps[row.name],
-            true=getattr(truth, row.name),
-            weights=inner if "curvature" in row.name else area,
-        )
-        for row in MAPS
-    ]
-
-
-def compare_sections(
-    phantom: Phantom, maps: HemisphereMaps, *, hemi: str = "L"
-) -> list[Comparison]:
-    """Set each measure of cross-sections beside the truth where they were found."""
-    _, v = sheet_coordinates(phantom, maps, hemi=hemi)
-    quarter = len(v) // 4  # rims may lie outside of the phantom
-    truth = cut_sections(phantom.body, np.clip(np.nanmean(v[quarter:-quarter], axis=0), 0, 1))
-    return [
-        _comparison(row.name, row.unit, maps.sections[row.name], truth[row.name])
-        for row in SECTIONS
-    ]
-
-
-def compare_summary(phantom: Phantom, maps: HemisphereMaps, *, hemi: str = "L") -> list[Comparison]:
-    """Set each number of the summary beside the truth.
-
-    Curvatures are averaged over part of the sheet; the truth is averaged over the same.
-    """
-    means = {f"{one.name}_mean": one.means[1] for one in compare_maps(phantom, maps, hemi=hemi)}
-    truth = means | dict(phantom.region_summary("extended"))
-    return [
-        _comparison(row.name, row.unit, maps.summary[row.name], truth[row.name]) for row in SUMMARY
-    ]
-
-
-def compare_subfields(
-    phantom: Phantom, maps: HemisphereMaps, protocol: Protocol, *, hemi: str = "L"
-) -> list[Comparison]:
-    """Set the numbers of each subfield beside the truth."""
-    thickness = _truth_at_nodes(phantom, maps, hemi).thickness
-    area = column_area(maps.sheet)
-    rows = []
-    for tissue, truth in phantom.subfield_summary(protocol).items():
-        inside = area * (maps.subfield == tissue)
-        for row in PER_SUBFIELD:
-            name = f"{row.name}_{tissue.name}"
-            wanted = (
-                np.average(thickness, weights=inside)
-                if row.name == "thickness_mean"
-                else truth[_SUBFIELD_SIZES[row.name]]
-            )
-            rows.append(_comparison(name, row.unit, maps.summary[name], wanted))
-    return rows
-
-
-def sheet_coordinates(
-    phantom: Phantom, maps: HemisphereMaps, *, hemi: str = "L"
-) -> tuple[Float, Float]:
-    """Find the true u and v (Nx, Ny) of the mid-surface; NaN beyond the phantom's rims."""
-    points = maps.sheet.points[:, :, maps.sheet.middle]
-    found = phantom.body.locate(points.reshape(-1, 3), hemi=hemi).reshape(points.shape)
-    return found[..., 0], found[..., 1]
-
-
-def _truth_at_nodes(phantom: Phantom, maps: HemisphereMaps, hemi: str) -> PhantomTruth:
-    u, v = sheet_coordinates(phantom, maps, hemi=hemi)
-    return phantom.truth(*(np.clip(np.nan_to_num(x, nan=0.5), 0, 1) for x in (u, v)))
-
-
-def _comparison(name: str, unit: str, found: Float | float, true: Float | float) -> Comparison:
-    values, wanted = np.atleast_1d(found), np.atleast_1d(true)
-    return Comparison(
-        name=name, unit=unit, found=values, true=wanted, weights=np.ones(values.shape)
-    )

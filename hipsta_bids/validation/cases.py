@@ -1,13 +1,14 @@
-"""One phantom, drawn, measured and set beside its truth; and the poses in which to draw it."""
+"""What suites measure: phantoms in chosen poses beside their truth, and bodies, in workers."""
 
 import contextlib
 import os
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,20 +18,25 @@ from hipsta_bids.inputs.labels import read_label_volume
 from hipsta_bids.inputs.search import HemisphereInput, InputRequest, find_hemispheres
 from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.participant.pool import WorkerLost, WorkerPlan, run_jobs
-from hipsta_bids.phantom import Phantom, PhantomSpec
+from hipsta_bids.phantom import Phantom, PhantomSpec, PhantomTruth
 from hipsta_bids.phantom.shape import PITCH
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.settings import GridSettings, Settings
-from hipsta_bids.types import Float, HemisphereMaps, LabelVolume
+from hipsta_bids.types import Bool, Float, HemisphereMaps, LabelVolume
 
 #: Maps of curvature that are compared with the truth, interior to exterior.
 CURVATURES = ("curvature_interior", "curvature", "curvature_exterior")
 GAUSSIAN_CURVATURES = tuple(f"gaussian_{name}" for name in CURVATURES)
 
-#: Nodes at each border of the grid that are its edge: rims and end planes.
+#: Outer nodes on each side of the grid, beside its medial and lateral edge and the end planes.
 EDGE = 2
 
+#: What suites damage or reslice: a phantom, or a segmentation of a dataset.
+ValidationBody = PhantomSpec | HemisphereInput
+
 _MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
+
+Key = TypeVar("Key", bound=Hashable)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -54,7 +60,7 @@ class Case:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Measured:
-    """What was measured, and the truth at the same places; all arrays (Nx, Ny)."""
+    """What was measured, and the truth at the same points; all arrays (Nx, Ny)."""
 
     thickness: Float
     """mm."""
@@ -70,24 +76,23 @@ class Measured:
 
     @property
     def error(self) -> Float:
-        """Error of thickness, mm; NaN where the sheet has left the phantom's rims."""
+        """Error of thickness, mm; NaN beyond the medial and lateral edge of the phantom."""
         return self.thickness - self.true_thickness
 
 
 def without_edges(values: Float) -> Float:
-    """Take the edges off a map (Nx, Ny)."""
+    """Crop the outer nodes of a map (Nx, Ny)."""
     return values[EDGE:-EDGE, EDGE:-EDGE]
 
 
 def measure_case(case: Case) -> Measured:
-    """Draw a phantom, measure it with default settings, and look up the truth."""
+    """Draw a phantom, measure it, and look up the truth."""
     phantom = Phantom(case.spec)
     volume = draw(phantom, case)
-    hemi = "R" if case.mirrored else case.hemi
     settings = Settings()
     if case.spacing is not None:
         settings = Settings(grid=GridSettings(spacing=case.spacing))
-    maps = measure_hemisphere(volume, hemi, settings, lambda _: nullcontext())
+    maps = measure_body(volume, "R" if case.mirrored else case.hemi, settings)
     return compare(phantom, case, maps)
 
 
@@ -105,22 +110,17 @@ def draw(phantom: Phantom, case: Case) -> LabelVolume:
 
 
 def compare(phantom: Phantom, case: Case, maps: HemisphereMaps) -> Measured:
-    """Set maps beside the truth at the places where the mid-surface was found."""
+    """Set maps beside the truth at the points where the mid-surface was found."""
     points = maps.sheet.points[:, :, maps.sheet.middle]
     if case.mirrored:
         points = points * _MIRROR.diagonal()[:3]
-    found = phantom.body.locate(points.reshape(-1, 3), hemi=case.hemi, pose=case.pose)
-    u, v, _ = np.moveaxis(found.reshape(points.shape), -1, 0)
-    inside = np.isfinite(u)
-    truth = phantom.truth(np.where(inside, u, 0.5), np.where(inside, v, 0.5))
+    truth, inside = truth_at(phantom, points, hemi=case.hemi, pose=case.pose)
+    names = (*CURVATURES, *GAUSSIAN_CURVATURES)
     return Measured(
         thickness=maps.thickness,
         true_thickness=np.where(inside, truth.thickness, np.nan),
-        curvature={name: maps.maps[name] for name in (*CURVATURES, *GAUSSIAN_CURVATURES)},
-        true_curvature={
-            name: np.where(inside, getattr(truth, name), np.nan)
-            for name in (*CURVATURES, *GAUSSIAN_CURVATURES)
-        },
+        curvature={name: maps.maps[name] for name in names},
+        true_curvature={name: np.where(inside, getattr(truth, name), np.nan) for name in names},
         summary=dict(maps.summary),
         true_summary=dict(truth.summary),
         status=str(maps.status),
@@ -128,8 +128,18 @@ def compare(phantom: Phantom, case: Case, maps: HemisphereMaps) -> Measured:
     )
 
 
+def truth_at(
+    phantom: Phantom, points: Float, *, hemi: str = "L", pose: Float | None = None
+) -> tuple[PhantomTruth, Bool]:
+    """Look up the truth beside points (..., 3), and whether they lie within the sheet's edges."""
+    found = phantom.body.locate(points.reshape(-1, 3), hemi=hemi, pose=pose).reshape(points.shape)
+    inside = np.isfinite(found[..., 0])
+    u, v = (np.where(inside, found[..., axis], 0.5) for axis in (0, 1))
+    return phantom.truth(u, v), inside
+
+
 def any_pose(generator: np.random.Generator, *, degrees: float = 25.0) -> Float:
-    """Turn by up to so many degrees about each axis, shift by up to 2 mm along each: (4, 4)."""
+    """Rotate by up to ``degrees`` about each axis, shift by up to 2 mm along each: (4, 4)."""
     turn = Rotation.from_euler("xyz", generator.uniform(-degrees, degrees, 3), degrees=True)
     return _motion(turn.as_matrix(), generator.uniform(-2.0, 2.0, 3))
 
@@ -137,9 +147,9 @@ def any_pose(generator: np.random.Generator, *, degrees: float = 25.0) -> Float:
 def along_slices(
     generator: np.random.Generator, *, tilt: float = 0.0, degrees: float = 25.0
 ) -> tuple[Float, Float]:
-    """Choose a pose, and a voxel grid whose third axis is the body's long axis, as scans have.
+    """Choose a shift (4, 4) by up to 2 mm along each axis, and a rotation (3, 3) of the grid.
 
-    Returns Shift by up to 2 mm along each axis, no turn.
+    The third axis of the voxels is the body's long axis, as in scans, but for the tilt.
     """
     to_body = Rotation.from_euler("x", -PITCH)  # anterior to the long axis, which points down
     within = Rotation.from_euler("y", generator.uniform(-degrees, degrees), degrees=True)
@@ -151,7 +161,7 @@ def along_slices(
 
 
 def random_motion(generator: np.random.Generator) -> Float:
-    """Turn by any rotation (uniform over all of them), shift by up to 20 mm along each axis."""
+    """Rotate by any angle (uniform over all rotations), shift by up to 20 mm along each axis."""
     turn = Rotation.from_quat(generator.normal(size=4))  # normalized: uniform
     return _motion(turn.as_matrix(), generator.uniform(-20.0, 20.0, 3))
 
@@ -160,12 +170,6 @@ def _motion(turn: Float, shift: Float) -> Float:
     motion = np.eye(4)
     motion[:3, :3], motion[:3, 3] = turn, shift
     return motion
-
-
-# Bodies that suites damage or reslice: phantoms, and segmentations of a dataset.
-
-
-ValidationBody = PhantomSpec | HemisphereInput
 
 
 def fine_segmentations(labels: Path, largest: float) -> list[HemisphereInput]:
@@ -179,26 +183,27 @@ def fine_segmentations(labels: Path, largest: float) -> list[HemisphereInput]:
 
 
 def load_body(body: ValidationBody, voxel: float) -> tuple[LabelVolume, str]:
-    """Labels of a body and its hemisphere; phantoms are drawn in voxels of ``voxel`` mm."""
+    """Labels of a body and its hemisphere; a phantom is drawn in voxels of ``voxel`` mm."""
     if isinstance(body, PhantomSpec):
         volume = Phantom(body).label_volume(load_protocol("freesurfer"), voxel_size=(voxel,) * 3)
         return volume, "L"
     return read_label_volume(body), body.hemi
 
 
-def name_body(body: ValidationBody) -> str:
-    """Name a body for people."""
-    if isinstance(body, PhantomSpec):
-        return body.kind
-    return f"labels {body.subject} {body.hemi}"
+@lru_cache(maxsize=2)
+def measure_reference(
+    body: ValidationBody, voxel: float
+) -> tuple[LabelVolume, str, HemisphereMaps]:
+    """Load and measure a body as it is; the cases of one body should follow each other."""
+    volume, hemi = load_body(body, voxel)
+    return volume, hemi, measure_body(volume, hemi)
 
 
-def measure_body(volume: LabelVolume, hemi: str) -> HemisphereMaps:
-    """Measure with default settings, without a clock."""
-    return measure_hemisphere(volume, hemi, Settings(), lambda _: nullcontext())
-
-
-# Cases of a suite on all processors, each in a worker that may die or hang without harm.
+def measure_body(
+    volume: LabelVolume, hemi: str, settings: Settings | None = None
+) -> HemisphereMaps:
+    """Measure labels, with default settings if none are given."""
+    return measure_hemisphere(volume, hemi, settings or Settings(), lambda _: nullcontext())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,7 +226,7 @@ class Refusal:
 def run_cases(
     work: Callable[[Any], Any], cases: Sequence[Any], *, timeout: float = 60.0
 ) -> list[Any]:
-    """Work off cases in parallel, one processor each."""
+    """Run cases in parallel, one processor each, in workers that may die or hang without harm."""
     results: list[Any] = [None] * len(cases)
     with tempfile.TemporaryDirectory() as folder:
         plan = WorkerPlan(
@@ -231,11 +236,30 @@ def run_cases(
             log=Path(folder) / "workers.log",
         )
         jobs = [(number, work, case) for number, case in enumerate(cases)]
-        # Closed here and now: what is left of the workers ends before their log goes.
+        # Closed at once: the workers end before their log is removed.
         with contextlib.closing(run_jobs(plan, jobs)) as done:
             for job, result in done:
                 results[job[0]] = _lost(result) if isinstance(result, WorkerLost) else result
     return results
+
+
+def run_groups(
+    work: Callable[[Any], Any], groups: Mapping[Key, Sequence[Any]]
+) -> dict[Key, list[Any]]:
+    """Run the cases of all groups together, and return the results by group."""
+    results = iter(run_cases(work, [case for cases in groups.values() for case in cases]))
+    return {key: [next(results) for _ in cases] for key, cases in groups.items()}
+
+
+def refusal_notes(groups: Mapping[str, Sequence[Any]]) -> str:
+    """List why maps are missing in Markdown, by name of the group; empty where none is."""
+    lines = [
+        f"- {name}: {result}"
+        for name, group in groups.items()
+        for result in group
+        if isinstance(result, Refusal)
+    ]
+    return "\n".join(["\nRefused:\n", *lines]) if lines else ""
 
 
 def processors() -> int:
@@ -259,48 +283,3 @@ def _work(job: tuple[int, Callable[[Any], Any], Any]) -> Any:  # noqa: ANN401  (
         return Refusal(reason=error.reason, message=str(error))
     except Exception as error:  # noqa: BLE001  (a bug becomes a row of the report)
         return Refusal(reason="crash", message=f"{type(error).__name__}: {error}")
-
-
-# Labels as a scanner with thick slices would give them.
-
-
-def reslice(
-    volume: LabelVolume,
-    axis: Float,
-    voxel_size: tuple[float, float, float],
-    *,
-    offset: float = 0.0,
-    tilt: float = 0.0,
-) -> LabelVolume:
-    """Take the labels at the centers of the voxels of another grid.
-
-    ``axis`` Unit vector across the slices, RAS; ``voxel_size`` Pixel, pixel, distance of slices,
-    mm.
-    """
-    aside = np.cross(axis, [0.0, 0.0, 1.0])
-    aside /= np.linalg.norm(aside)
-    turn = Rotation.from_euler("x", tilt, degrees=True).as_matrix()
-    matrix = np.column_stack([aside, np.cross(axis, aside), axis]) @ turn * np.array(voxel_size)
-    size = np.array(volume.tissue.shape) - 1
-    corners = np.array(np.meshgrid(*([0, n] for n in size))).reshape(3, -1)
-    corners = volume.affine[:3, :3] @ corners + volume.affine[:3, 3:]
-    middle = corners.mean(axis=1)
-    reach = np.linalg.solve(matrix, corners - middle[:, None])
-    low = np.floor(reach.min(axis=1)) - 1
-    shape = (np.ceil(reach.max(axis=1)) + 2 - low).astype(int)
-    affine = np.eye(4)
-    affine[:3, :3] = matrix
-    affine[:3, 3] = middle + matrix @ (low + np.array([0.0, 0.0, offset]))
-    to_volume = np.linalg.inv(volume.affine) @ affine
-    index = np.indices(shape).reshape(3, -1)
-    nearest = np.rint(to_volume[:3, :3] @ index + to_volume[:3, 3:]).astype(int)
-    inside = ((nearest >= 0) & (nearest <= size[:, None])).all(axis=0)
-    tissue, part = (np.zeros(index.shape[1], dtype=np.uint8) for _ in range(2))
-    tissue[inside] = volume.tissue[tuple(nearest[:, inside])]
-    part[inside] = volume.part[tuple(nearest[:, inside])]
-    return LabelVolume(
-        tissue=tissue.reshape(shape),
-        part=part.reshape(shape),
-        affine=affine,
-        protocol=volume.protocol,
-    )

@@ -1,10 +1,11 @@
-"""How fast the error falls with the voxel size."""
+"""How fast the error falls with the voxel size, and sheets too thin for their voxels."""
 
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.stats import linregress
 
 from hipsta_bids.phantom import PhantomSpec
 from hipsta_bids.settings import GridSettings
@@ -17,18 +18,21 @@ from hipsta_bids.validation.cases import (
     any_pose,
     measure_case,
     run_cases,
+    run_groups,
     without_edges,
 )
-from hipsta_bids.validation.report import Cell, Picture, Suite, Table
+from hipsta_bids.validation.report import Cell, Cells, Picture, Suite, Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
 
 SEED = 20231
 SIZES = (0.6, 0.5, 0.4, 0.3)
 """mm, isotropic voxels."""
 POSES_QUICK, POSES_FULL = 2, 8
+LIMITS_SEED = 20233
+MAX_SILENT_ERROR = 0.15
+"""mm; where the mean is farther off, the hemisphere has to be refused or flagged."""
 
 #: Working grid in mm for each voxel size: as it is by default, or always as fine as by default
 #: for voxels of 0.4 mm.
@@ -58,15 +62,13 @@ def run(full: bool) -> Suite:
     poses = POSES_FULL if full else POSES_QUICK
     names = list(SPECS) if full else list(SPECS)[:1]
     keys = [(name, grid) for name in names for grid in GRIDS]
-    cases = [_case(key, size, pose) for key in keys for size in SIZES for pose in range(poses)]
-    results = run_cases(measure_case, cases)
-    table: dict[Key, list[list[Measured | Refusal]]] = {}
-    for number, key in enumerate(keys):
-        start = number * len(SIZES) * poses
-        table[key] = [
-            results[start + i * poses : start + (i + 1) * poses] for i in range(len(SIZES))
-        ]
-    errors = {key: [_errors(group) for group in groups] for key, groups in table.items()}
+    cases = {
+        (key, size): [_case(key, size, pose) for pose in range(poses)]
+        for key in keys
+        for size in SIZES
+    }
+    results = run_groups(measure_case, cases)
+    errors = {key: [_errors(results[key, size]) for size in SIZES] for key in keys}
     return Suite(
         name="convergence",
         title="Convergence with voxel size",
@@ -77,17 +79,9 @@ def run(full: bool) -> Suite:
 
 
 def rate(sizes: Sequence[float], errors: Sequence[float]) -> tuple[float, float]:
-    """Fit ``error = constant * size ** rate`` by least squares in the logarithms.
-
-    Returns The standard error is NaN for two sizes.
-    """
-    x, y = np.log(sizes), np.log(errors)
-    design = np.column_stack([x, np.ones_like(x)])
-    solution, *_ = np.linalg.lstsq(design, y, rcond=None)
-    freedom = len(x) - 2
-    residual = y - design @ solution
-    variance = float(residual @ residual) / freedom if freedom else np.nan
-    return float(solution[0]), float(np.sqrt(variance / ((x - x.mean()) ** 2).sum()))
+    """Fit ``error = constant * size ** rate`` by least squares: the rate and its standard error."""
+    fit = linregress(np.log(sizes), np.log(errors))
+    return float(fit.slope), float(fit.stderr)
 
 
 def _case(key: Key, size: float, pose: int) -> Case:
@@ -103,7 +97,7 @@ def _case(key: Key, size: float, pose: int) -> Case:
 
 
 def _errors(group: Sequence[Measured | Refusal]) -> dict[str, float]:
-    """Average over the poses: bias, and root mean square with and without edges, mm."""
+    """Average over the poses: bias, and root mean square in each zone, mm."""
     errors = [m.error for m in group if isinstance(m, Measured)]
     if not errors:
         return dict.fromkeys(("bias", *ZONES), float("nan"))
@@ -115,36 +109,27 @@ def _errors(group: Sequence[Measured | Refusal]) -> dict[str, float]:
 
 
 def _table(errors: Mapping[Key, Sequence[Mapping[str, float]]]) -> Table:
-    rows: list[tuple[Cell, ...]] = []
+    rows: list[Cells] = []
     for (name, grid), values in errors.items():
         for zone in ZONES:
             rms = [value[zone] for value in values]
-            slope, doubt = rate(SIZES, rms)
-            falls = all(finer < coarser for coarser, finer in pairwise(rms))
+            slope, standard_error = rate(SIZES, rms)
             bias = [f"{v['bias']:+.3f} / " if zone == WHOLE else "" for v in values]
+            sizes = [f"{size:g} mm" for size in SIZES]
             rows.append(
-                (
-                    name,
-                    grid,
-                    zone,
-                    *(f"{b}{r:.3f}" for b, r in zip(bias, rms, strict=True)),
-                    f"{slope:.2f} ± {doubt:.2f}",
-                    "falls",
-                    bool(falls),
-                )
+                {
+                    "phantom": name,
+                    "working grid": grid,
+                    "part": zone,
+                    **{s: f"{b}{r:.3f}" for s, b, r in zip(sizes, bias, rms, strict=True)},
+                    "rate": f"{slope:.2f} ± {standard_error:.2f}",
+                    "target": "falls",
+                    "met": all(finer < coarser for coarser, finer in pairwise(rms)),
+                }
             )
     return Table(
         title="Bias / root mean square error of thickness, mm, by voxel size",
-        columns=(
-            "phantom",
-            "working grid",
-            "part",
-            *(f"{size:g} mm" for size in SIZES),
-            "rate",
-            "target",
-            "met",
-        ),
-        rows=tuple(rows),
+        rows=rows,
         notes=_NOTES.format(edge=EDGE),
     )
 
@@ -194,30 +179,11 @@ The target is that each smaller voxel size has a smaller error.
 """
 
 
-# Sheets too thin for their voxels: refused or flagged, never silently wrong.
-
-
-LIMITS_SEED = 20233
-MAX_SILENT_ERROR = 0.15
-"""mm; where the mean is farther off, the hemisphere has to be refused or flagged."""
-
-
 def run_limits(full: bool) -> Suite:
-    """Measure ever thinner sheets in ever larger voxels."""
-    cases = _cases(full=full)
-    return Suite(
-        name="limits",
-        title="Limits",
-        text="Spirals, isotropic voxels, one pose each.",
-        tables=(_limits_table(cases, run_cases(measure_case, cases)),),
-    )
-
-
-def _cases(*, full: bool) -> list[Case]:
-    """Go from comfortable to far too thin."""
+    """Measure sheets that are too thin for their voxels: refused or flagged, not silently wrong."""
     sizes = (0.4, 0.6, 0.8, 1.0) if full else (0.5, 1.0)
     walls = (0.8, 1.2, 1.6, 3.0) if full else (0.8, 1.6)
-    return [
+    cases = [
         Case(
             spec=PhantomSpec(kind="spiral", thickness=wall, curvature=(0.02, 0.35)),
             voxel_size=(size, size, size),
@@ -226,25 +192,37 @@ def _cases(*, full: bool) -> list[Case]:
         for i, wall in enumerate(walls)
         for j, size in enumerate(sizes)
     ]
+    return Suite(
+        name="limits",
+        title="Limits",
+        text="Spirals, isotropic voxels, one pose each.",
+        tables=(_limits_table(cases, run_cases(measure_case, cases)),),
+    )
 
 
 def _limits_table(cases: Sequence[Case], results: Sequence[Measured | Refusal]) -> Table:
-    rows: list[tuple[Cell, ...]] = []
+    rows: list[Cells] = []
     for case, result in zip(cases, results, strict=True):
-        start: tuple[Cell, ...] = (f"{case.spec.thickness:g}", f"{case.voxel_size[0]:g}")
-        across = f"{case.spec.thickness / case.voxel_size[0]:.1f}"
+        cells: dict[str, Cell] = {
+            "thickness, mm": f"{case.spec.thickness:g}",
+            "voxels, mm": f"{case.voxel_size[0]:g}",
+            "voxels across": f"{case.spec.thickness / case.voxel_size[0]:.1f}",
+        }
         if isinstance(result, Refusal):
-            outcome = str(result) if result.is_bug else f"refused: {result.reason}"
-            rows.append((*start, across, outcome, None, None, not result.is_bug))
-            continue
-        bias = float(np.nanmean(result.error))
-        outcome = ", ".join([result.status, *result.flags])
-        told = bool(result.flags) or abs(bias) <= MAX_SILENT_ERROR
-        rows.append((*start, across, outcome, f"{bias:+.3f}", float(np.nanstd(result.error)), told))
+            cells["outcome"] = str(result) if result.is_bug else f"refused: {result.reason}"
+            met = not result.is_bug
+        else:
+            bias = float(np.nanmean(result.error))
+            met = bool(result.flags) or abs(bias) <= MAX_SILENT_ERROR
+            cells |= {
+                "outcome": ", ".join([result.status, *result.flags]),
+                "bias": f"{bias:+.3f}",
+                "SD": float(np.nanstd(result.error)),
+            }
+        rows.append({**cells, "met": met})
     return Table(
         title="Sheets too thin for their voxels",
-        columns=("thickness, mm", "voxels, mm", "voxels across", "outcome", "bias", "SD", "met"),
-        rows=tuple(rows),
+        rows=rows,
         notes="Met: the map is refused or flagged, or its mean is within"
         f" {MAX_SILENT_ERROR:g} mm of the truth.",
     )

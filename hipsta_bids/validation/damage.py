@@ -1,11 +1,12 @@
-"""Damage to labels, as segmentations show it, at known places of any hippocampal body.
+"""Damage to labels, as segmentations show it, at known positions of any hippocampal body.
 
-Places are given in sheet coordinates of the undamaged body, so that the same defect can be put
-into a phantom and into a real segmentation.
+Positions are sheet coordinates of the undamaged body, so that the same defect can be put into a
+phantom and into a real segmentation.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from types import MappingProxyType
 
 import numpy as np
@@ -17,14 +18,14 @@ from hipsta_bids.errors import SettingsError
 from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.types import Bool, Float, LabelVolume, Sheet
 
-# A hippocampal body with known places on its sheet, whose labels can be changed.
-
-
-Place = tuple[float, float]
+Position = tuple[float, float]
 """Sheet coordinates (u, v), each from 0 to 1: medial to lateral, posterior to anterior."""
 
 #: Refinement of the sheet's grid along x, y and z, so that its points lie closer than voxels.
 _FINER = (3, 3, 2)
+
+#: mm beyond either wall up to which a hole is cut, so that it opens on both sides.
+_THROUGH = 1.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -63,23 +64,23 @@ class Site:
         tree = cKDTree(self.columns.reshape(-1, 3))
         _, nearest = tree.query(self.points[body])
         column = np.unravel_index(nearest, self.columns.shape[:3])[:2]
-        self.sheet_place: Float = np.stack(column, axis=1) / (count - 1)
+        self.sheet_position: Float = np.stack(column, axis=1) / (count - 1)
         """(N, 2) sheet coordinates of these voxels."""
 
-    def column(self, place: Place) -> Float:
-        """Points (Nz, 3), RAS mm, of the column at a place, interior to exterior."""
+    def column(self, position: Position) -> Float:
+        """Points (Nz, 3), RAS mm, of the column at a position, interior to exterior."""
         count = np.array(self.columns.shape[:2])
-        i, j = np.rint(np.array(place) * (count - 1)).astype(int)
+        i, j = np.rint(np.array(position) * (count - 1)).astype(int)
         return np.asarray(self.columns[i, j])
 
-    def normal(self, place: Place) -> Float:
-        """Find the unit vector (3,) from interior to exterior."""
-        column = self.column(place)
+    def normal(self, position: Position) -> Float:
+        """Compute the unit vector (3,) from interior to exterior."""
+        column = self.column(position)
         return np.asarray((column[-1] - column[0]) / np.linalg.norm(column[-1] - column[0]))
 
-    def beside(self, place: Place, distance: float) -> Float:
+    def beside(self, position: Position, distance: float) -> Float:
         """Point (3,) at a distance (mm) outside the exterior wall; inside of it if negative."""
-        return np.asarray(self.column(place)[-1] + distance * self.normal(place))
+        return np.asarray(self.column(position)[-1] + distance * self.normal(position))
 
     def within(self, points: Float, radius: float) -> Bool:
         """Voxels (I, J, K) within a radius (mm) of any of (N, 3) points."""
@@ -91,17 +92,17 @@ class Site:
         return found
 
     def among(self, chosen: Bool) -> Bool:
-        """Voxels (I, J, K) of the wall chosen by a mask (N,) over :attr:`voxels`."""
+        """Voxels (I, J, K) of the wall, chosen by a mask (N,) of :attr:`voxels`."""
         found = np.zeros(self.wall.shape, dtype=bool)
         found[tuple(self.voxels[chosen].T)] = True
         return found
 
-    def slab(self, place: Place, thickness: float) -> Bool:
+    def slab(self, position: Position, thickness: float) -> Bool:
         """Voxels (I, J, K) of whole cross-sections, ``thickness`` mm along the axis."""
-        return np.abs(self.v - place[1]) * self.length <= thickness / 2
+        return np.abs(self.v - position[1]) * self.length <= thickness / 2
 
     def erased(self, where: Bool) -> Defect:
-        """Turn voxels into background."""
+        """Make voxels background."""
         return self.relabeled(where, Tissue.BACKGROUND, Part.UNKNOWN)
 
     def relabeled(self, where: Bool, tissue: Tissue | None, part: Part) -> Defect:
@@ -112,9 +113,9 @@ class Site:
         changed = (codes != old.tissue) | (parts != old.part)
         return Defect(volume=replace(old, tissue=codes, part=parts), changed=self.points[changed])
 
-    def added(self, where: Bool, place: Place) -> Defect:
-        """Give voxels outside the wall the label of the wall at a place."""
-        middle = self.column(place)[len(self.columns[0, 0]) // 2]
+    def added(self, where: Bool, position: Position) -> Defect:
+        """Give voxels outside the wall the label of the wall at a position."""
+        middle = self.column(position)[len(self.columns[0, 0]) // 2]
         nearest = np.argmin(np.linalg.norm(self.points[self.wall] - middle, axis=1))
         tissue = Tissue(int(self.volume.tissue[self.wall][nearest]))
         part = Part(int(self.volume.part[self.wall][nearest]))
@@ -134,31 +135,24 @@ def _refined(points: Float) -> NDArray[np.float64]:
     )
 
 
-#: mm beyond either wall up to which a hole is cut, so that it opens on both sides.
-_THROUGH = 1.0
-
-
-def make_defect(site: Site, kind: str, size: float, place: Place = (0.5, 0.5)) -> Defect:
-    """Damage a segmentation.
-
-    ``size`` mm.
-    """
+def make_defect(site: Site, kind: str, size: float, position: Position = (0.5, 0.5)) -> Defect:
+    """Damage a segmentation; the unit of ``size`` is that of the kind."""
     if kind not in DEFECTS:
         raise SettingsError(
             f"defect {kind!r} is unknown; choose one of {', '.join(DEFECTS)}", reason="defect-kind"
         )
-    defect = DEFECTS[kind](site, size, place)
+    defect = DEFECTS[kind](site, size, position)
     if not len(defect.changed):
         raise SettingsError(
-            f"defect {kind} of size {size:g} at {place} changes no voxel: make it larger",
+            f"defect {kind} of size {size:g} at {position} changes no voxel: make it larger",
             reason="defect-empty",
         )
     return defect
 
 
-def _hole(site: Site, size: float, place: Place) -> Defect:
+def _hole(site: Site, size: float, position: Position) -> Defect:
     """Open a round hole through the wall; size is its radius."""
-    column, normal = site.column(place), site.normal(place)
+    column, normal = site.column(position), site.normal(position)
     line = np.vstack(
         [
             column,
@@ -169,65 +163,55 @@ def _hole(site: Site, size: float, place: Place) -> Defect:
     return site.erased(site.wall & site.within(line, size))
 
 
-def _cavity(site: Site, size: float, place: Place) -> Defect:
+def _cavity(site: Site, size: float, position: Position) -> Defect:
     """Hollow the wall out; size is the radius."""
-    middle = site.column(place).mean(axis=0, keepdims=True)
+    middle = site.column(position).mean(axis=0, keepdims=True)
     return site.erased(site.wall & site.within(middle, size))
 
 
-def _bridge_across(site: Site, size: float, places: tuple[Place, Place]) -> Defect:
-    """Join the interior sides of two places by a bar; size is its radius."""
-    first, last = (site.column(place)[0] for place in places)
+def _bridge(site: Site, size: float, position: Position, *, ends: tuple[float, float]) -> Defect:
+    """Join the interior sides at two u by a bar; size is its radius."""
+    first, last = (site.column((u, position[1]))[0] for u in ends)
     bar = first + np.linspace(0, 1, 101)[:, None] * (last - first)
-    return site.added(site.within(bar, size), places[0])
+    return site.added(site.within(bar, size), (ends[0], position[1]))
 
 
-def _bridge_far(site: Site, size: float, place: Place) -> Defect:
-    """Join CA3 to the subiculum; size is the bar's radius, and only v counts of the place."""
-    return _bridge_across(site, size, ((0.92, place[1]), (0.2, place[1])))
-
-
-def _bridge_near(site: Site, size: float, place: Place) -> Defect:
-    """Join two places of CA1 by a bar; size is its radius, and only v counts of the place."""
-    return _bridge_across(site, size, ((0.72, place[1]), (0.4, place[1])))
-
-
-def _island(site: Site, size: float, place: Place) -> Defect:
+def _island(site: Site, size: float, position: Position) -> Defect:
     """Add a ball that touches nothing; size is its radius."""
-    middle = site.beside(place, size + 1.0)[None]
-    return site.added(site.within(middle, size), place)
+    middle = site.beside(position, size + 1.0)[None]
+    return site.added(site.within(middle, size), position)
 
 
-def _salt(site: Site, size: float, place: Place) -> Defect:
+def _salt(site: Site, size: float, position: Position) -> Defect:
     """Flip voxels at random, the wall's and those within 1.5 mm; size is their share."""
-    generator = np.random.default_rng(round(1000 * size + 100 * place[0] + 10 * place[1]))
+    generator = np.random.default_rng(round(1000 * size + 100 * position[0] + 10 * position[1]))
     spots = generator.random(site.wall.shape) < size
     near = site.within(site.columns.reshape(-1, 3), 1.5)
     hit = spots & near
-    added = site.added(hit, place)
+    added = site.added(hit, position)
     tissue = np.where(hit & site.wall, np.uint8(Tissue.BACKGROUND), added.volume.tissue)
     return Defect(volume=replace(added.volume, tissue=tissue), changed=site.points[hit])
 
 
-def _protrusion(site: Site, size: float, place: Place) -> Defect:
+def _protrusion(site: Site, size: float, position: Position) -> Defect:
     """Let a spike 2.5 mm long stand on the exterior wall; size is its radius."""
-    spike = np.array([site.beside(place, step) for step in np.linspace(-0.3, 2.5, 15)])
-    return site.added(site.within(spike, size), place)
+    spike = np.array([site.beside(position, step) for step in np.linspace(-0.3, 2.5, 15)])
+    return site.added(site.within(spike, size), position)
 
 
-def _leak(site: Site, size: float, place: Place) -> Defect:
+def _leak(site: Site, size: float, position: Position) -> Defect:
     """Let the label leak out of the exterior wall as a ball; size is its radius."""
-    return site.added(site.within(site.beside(place, 0.6 * size)[None], size), place)
+    return site.added(site.within(site.beside(position, 0.6 * size)[None], size), position)
 
 
-def _slit(site: Site, size: float, place: Place) -> Defect:
+def _slit(site: Site, size: float, position: Position) -> Defect:
     """Slit the wall along 4 mm of the long axis; size is the slit's width."""
-    return site.erased(_gap_voxels(site, size, place[0]) & site.slab(place, 4.0))
+    return site.erased(_gap_voxels(site, size, position[0]) & site.slab(position, 4.0))
 
 
-def _gap(site: Site, size: float, place: Place) -> Defect:
-    """Part two neighboring subfields from end to end; size is the gap's width."""
-    return site.erased(_gap_voxels(site, size, place[0]))
+def _gap(site: Site, size: float, position: Position) -> Defect:
+    """Separate two neighboring subfields from end to end; size is the gap's width."""
+    return site.erased(_gap_voxels(site, size, position[0]))
 
 
 def _gap_voxels(site: Site, width: float, u: float) -> Bool:
@@ -239,21 +223,21 @@ def _gap_voxels(site: Site, width: float, u: float) -> Bool:
     return site.wall & site.within(np.vstack(longer), 0.5 * width)
 
 
-def _missing_subfield(site: Site, size: float, place: Place) -> Defect:
-    """Erase the subfield at the place; size is of no account."""
+def _missing_subfield(site: Site, size: float, position: Position) -> Defect:
+    """Erase the subfield at the position; size is ignored."""
     del size
-    middle = site.column(place)[site.columns.shape[2] // 2]
+    middle = site.column(position)[site.columns.shape[2] // 2]
     own = np.isin(site.volume.tissue, site.volume.protocol.sheet)
     nearest = np.argmin(np.linalg.norm(site.points[own] - middle, axis=1))
     return site.erased(site.volume.tissue == site.volume.tissue[own][nearest])
 
 
-def _missing_slices(site: Site, size: float, place: Place) -> Defect:
+def _missing_slices(site: Site, size: float, position: Position) -> Defect:
     """Erase all labels in the image's own slices; size is the thickness of the gap."""
     linear = site.volume.affine[:3, :3]
     edges = np.linalg.norm(linear, axis=0)
     across = int(np.argmax(np.abs(site.axis @ (linear / edges))))
-    middle = site.column(place).mean(axis=0)
+    middle = site.column(position).mean(axis=0)
     index = np.linalg.solve(linear, middle - site.volume.affine[:3, 3])[across]
     number = np.arange(site.wall.shape[across])
     half = max(0.5 * size / float(edges[across]), 0.5)
@@ -264,18 +248,9 @@ def _missing_slices(site: Site, size: float, place: Place) -> Defect:
     return site.erased(gone & (site.volume.tissue > 0))
 
 
-def _tail_inside(site: Site, size: float, place: Place) -> Defect:
-    """Label cross-sections in the middle as tail; size is their thickness."""
-    return _part_inside(site, size, place, Part.TAIL)
-
-
-def _head_inside(site: Site, size: float, place: Place) -> Defect:
-    """Label cross-sections in the middle as head; size is their thickness."""
-    return _part_inside(site, size, place, Part.HEAD)
-
-
-def _part_inside(site: Site, size: float, place: Place, part: Part) -> Defect:
-    where = site.slab(place, size) & (site.volume.tissue > 0)
+def _part_inside(site: Site, size: float, position: Position, *, part: Part) -> Defect:
+    """Label cross-sections in the middle as head or tail; size is their thickness."""
+    where = site.slab(position, size) & (site.volume.tissue > 0)
     whole = any(
         label.part is part and label.tissue is Tissue.HIPPOCAMPUS
         for label in site.volume.protocol.labels
@@ -283,32 +258,29 @@ def _part_inside(site: Site, size: float, place: Place, part: Part) -> Defect:
     return site.relabeled(where, Tissue.HIPPOCAMPUS if whole else None, part)
 
 
-def _cut_short(site: Site, size: float, place: Place) -> Defect:
-    """Erase all from a cross-section on to the front; size is what stays of the body, mm."""
-    del place
+def _cut_short(site: Site, size: float, position: Position) -> Defect:
+    """Erase all labels anterior of a cross-section; size is what remains of the body, mm."""
+    del position
     return site.erased((site.v * site.length > size) & (site.volume.tissue > 0))
 
 
-def _notch(site: Site, size: float, place: Place) -> Defect:
-    """Erase the ribbon lateral of the place; size is the notch's length along the axis."""
-    lateral = site.among(site.sheet_place[:, 0] > place[0])
-    return site.erased(lateral & site.slab(place, size))
+def _notch(site: Site, size: float, position: Position) -> Defect:
+    """Erase the ribbon lateral of the position; size is the notch's length along the axis."""
+    lateral = site.among(site.sheet_position[:, 0] > position[0])
+    return site.erased(lateral & site.slab(position, size))
 
 
-def _waist(site: Site, size: float, place: Place) -> Defect:
+def _waist(site: Site, size: float, position: Position) -> Defect:
     """Peel voxels off the wall over 4 mm of the long axis; size is the depth on each side."""
     depth = ndimage.distance_transform_edt(
         site.wall, sampling=np.linalg.norm(site.volume.affine[:3, :3], axis=0)
     )
-    return site.erased(site.wall & (depth <= size) & site.slab(place, 4.0))
+    return site.erased(site.wall & (depth <= size) & site.slab(position, 4.0))
 
 
-def _wrong_voxels(site: Site, size: float, place: Place) -> Defect:
-    """Stretch the voxels across the long axis, as a wrong header does; size is the factor.
-
-    The image keeps its labels; what changes is where they lie.
-    """
-    del place
+def _wrong_voxels(site: Site, size: float, position: Position) -> Defect:
+    """Stretch the voxels across the long axis, as a wrong header does; size is the factor."""
+    del position
     affine = site.volume.affine.copy()
     edges = np.linalg.norm(affine[:3, :3], axis=0)
     along = np.abs(site.axis @ (affine[:3, :3] / edges))
@@ -316,9 +288,9 @@ def _wrong_voxels(site: Site, size: float, place: Place) -> Defect:
     return Defect(volume=replace(site.volume, affine=affine), changed=site.points[site.wall])
 
 
-def _at_border(site: Site, size: float, place: Place) -> Defect:
-    """Let the image end inside the body; size is what it loses of it, mm (0: it just touches)."""
-    del place
+def _at_border(site: Site, size: float, position: Position) -> Defect:
+    """Let the image end inside the body; size is what the body loses, mm (0: it just touches)."""
+    del position
     linear = site.volume.affine[:3, :3]
     edges = np.linalg.norm(linear, axis=0)
     across = int(np.argmin(np.abs(site.axis @ (linear / edges))))
@@ -328,28 +300,28 @@ def _at_border(site: Site, size: float, place: Place) -> Defect:
     box = tuple(keep)
     lost = np.ones(site.wall.shape, dtype=bool)
     lost[box] = False
-    rim = np.zeros(site.wall.shape, dtype=bool)
+    border = np.zeros(site.wall.shape, dtype=bool)
     keep[across] = slice(last, last + 1)
-    rim[tuple(keep)] = True
+    border[tuple(keep)] = True
     return Defect(
         volume=replace(site.volume, tissue=site.volume.tissue[box], part=site.volume.part[box]),
-        changed=site.points[(lost | rim) & site.wall],
+        changed=site.points[(lost | border) & site.wall],
     )
 
 
-def _ends_flush(site: Site, size: float, place: Place) -> Defect:
-    """Erase head and tail, so that the labels end where the body does; size is of no account."""
-    del size, place
+def _ends_flush(site: Site, size: float, position: Position) -> Defect:
+    """Erase head and tail, so that the labels end where the body does; size is ignored."""
+    del size, position
     return site.erased(np.isin(site.volume.part, (Part.HEAD, Part.TAIL)))
 
 
-#: How each kind of damage is done. The first line of each function says what its size means.
-DEFECTS: Mapping[str, Callable[[Site, float, Place], Defect]] = MappingProxyType(
+#: Functions by kind of damage; their docstrings say what the size means.
+DEFECTS: Mapping[str, Callable[[Site, float, Position], Defect]] = MappingProxyType(
     {
         "hole": _hole,
         "cavity": _cavity,
-        "bridge-ca3-subiculum": _bridge_far,
-        "bridge-ca1-ca1": _bridge_near,
+        "bridge-ca3-subiculum": partial(_bridge, ends=(0.92, 0.2)),
+        "bridge-ca1-ca1": partial(_bridge, ends=(0.72, 0.4)),
         "island": _island,
         "salt": _salt,
         "protrusion": _protrusion,
@@ -358,8 +330,8 @@ DEFECTS: Mapping[str, Callable[[Site, float, Place], Defect]] = MappingProxyType
         "gap": _gap,
         "missing-subfield": _missing_subfield,
         "missing-slices": _missing_slices,
-        "tail-inside": _tail_inside,
-        "head-inside": _head_inside,
+        "tail-inside": partial(_part_inside, part=Part.TAIL),
+        "head-inside": partial(_part_inside, part=Part.HEAD),
         "cut-short": _cut_short,
         "notch": _notch,
         "waist": _waist,

@@ -1,4 +1,4 @@
-"""What becomes of damaged labels: repaired, flagged or refused, and how far the maps move."""
+"""How damaged labels end: repaired, flagged or refused, and how far the maps move."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -13,13 +13,12 @@ from hipsta_bids.validation.cases import (
     Refusal,
     ValidationBody,
     fine_segmentations,
-    load_body,
     measure_body,
-    name_body,
+    measure_reference,
     run_cases,
 )
-from hipsta_bids.validation.damage import Place, Site, make_defect
-from hipsta_bids.validation.report import Cell, Suite, Table
+from hipsta_bids.validation.damage import Position, Site, make_defect
+from hipsta_bids.validation.report import Cell, Cells, Suite, Table
 
 NEAR = 2.0
 """mm; columns within this distance of a changed voxel are near the defect."""
@@ -53,10 +52,10 @@ SPECS = (
 VOXEL = 0.4
 """mm, of the phantoms and at most of labels."""
 
-MIDDLE: Place = (0.5, 0.5)
-HOLES: tuple[Place, ...] = (MIDDLE, (0.2, 0.35), (0.82, 0.6))
-#: Kind, size (see the kind's description) and place. The quick selection takes every third.
-PLAN: tuple[tuple[str, float, Place], ...] = (
+MIDDLE: Position = (0.5, 0.5)
+HOLES: tuple[Position, ...] = (MIDDLE, (0.2, 0.35), (0.82, 0.6))
+#: Kind, size (see the kind's description) and position. The quick selection takes every third.
+PLAN: tuple[tuple[str, float, Position], ...] = (
     *(("hole", r, p) for r in (0.4, 0.8, 1.3, 1.6, 2.0) for p in HOLES),
     ("cavity", 0.4, MIDDLE),
     ("cavity", 0.8, MIDDLE),
@@ -88,7 +87,14 @@ class Trial:
     body: ValidationBody
     kind: str
     size: float
-    place: Place
+    position: Position
+
+    @property
+    def name(self) -> str:
+        """Of the body, for people."""
+        if isinstance(self.body, PhantomSpec):
+            return self.body.kind
+        return f"labels {self.body.subject} {self.body.hemi}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +109,7 @@ class Damage:
     near_wrong: int = 0
     """Columns near the defect that are off."""
     far_wrong: int = 0
-    """The same elsewhere."""
+    """Columns elsewhere that are off."""
     shift: float = 0.0
     """Largest change elsewhere, mm."""
     mean: float = 0.0
@@ -135,7 +141,7 @@ def run(full: bool, labels: Path | None = None) -> Suite:
     if labels is not None:
         bodies += fine_segmentations(labels, VOXEL)[::2]
     plan = PLAN if full else PLAN[::3]
-    trials = [Trial(body=body, kind=k, size=s, place=p) for body in bodies for k, s, p in plan]
+    trials = [Trial(body=body, kind=k, size=s, position=p) for body in bodies for k, s, p in plan]
     results = [
         _refused(result) if isinstance(result, Refusal) else result
         for result in run_cases(measure_trial, trials, timeout=TIMEOUT)
@@ -151,16 +157,22 @@ def run(full: bool, labels: Path | None = None) -> Suite:
 
 
 def measure_trial(trial: Trial) -> Damage:
-    """Measure one damaged phantom and compare it with the undamaged one."""
-    site, hemi, reference = _undamaged(trial.body)
-    defect = make_defect(site, trial.kind, trial.size, trial.place)
+    """Measure one damaged body and compare it with the undamaged one."""
+    _, hemi, reference = measure_reference(trial.body, VOXEL)
+    defect = make_defect(_site(trial.body), trial.kind, trial.size, trial.position)
     return compare(measure_body(defect.volume, hemi), reference, defect.changed)
+
+
+@lru_cache(maxsize=2)
+def _site(body: ValidationBody) -> Site:
+    volume, _, reference = measure_reference(body, VOXEL)
+    return Site(volume, reference.sheet)
 
 
 def compare(maps: HemisphereMaps, reference: HemisphereMaps, changed: Float) -> Damage:
     """Compare the maps of damaged labels with those of the undamaged ones.
 
-    ``changed`` Centers of the changed voxels, RAS mm.
+    ``changed`` are centers (N, 3) of the changed voxels, RAS mm.
     """
     points = reference.sheet.points
     distance = np.asarray(cKDTree(changed).query(points.reshape(-1, 3))[0])
@@ -179,55 +191,34 @@ def compare(maps: HemisphereMaps, reference: HemisphereMaps, changed: Float) -> 
     )
 
 
-@lru_cache(maxsize=2)
-def _undamaged(body: ValidationBody) -> tuple[Site, str, HemisphereMaps]:
-    """Where a body can be damaged, its hemisphere and its maps; the cases of one are together."""
-    volume, hemi = load_body(body, VOXEL)
-    maps = measure_body(volume, hemi)
-    return Site(volume, maps.sheet), hemi, maps
-
-
 def _refused(refusal: Refusal) -> Damage:
     status = CRASH if refusal.is_bug else Status.FAILED
     return Damage(status=status, reasons=(refusal.reason,), message=refusal.message)
 
 
 def _cases(trials: list[Trial], results: list[Damage]) -> Table:
-    rows: list[tuple[Cell, ...]] = []
+    rows: list[Cells] = []
     for trial, result in zip(trials, results, strict=True):
-        numbers: tuple[Cell, ...] = (None,) * 4
+        cells: dict[str, Cell] = {
+            "body": trial.name,
+            "defect": trial.kind,
+            "size": f"{trial.size:g}",
+            "position (u, v)": "{:g}, {:g}".format(*trial.position),
+            "outcome": OUTCOMES[result.status],
+            "reason": ", ".join(result.reasons) or "-",
+        }
         if result.status not in (Status.FAILED, CRASH):
-            numbers = (result.near_wrong, result.far_wrong, result.shift, result.mean)
-        rows.append(
-            (
-                name_body(trial.body),
-                trial.kind,
-                f"{trial.size:g}",
-                f"{trial.place[0]:g}, {trial.place[1]:g}",
-                OUTCOMES[result.status],
-                ", ".join(result.reasons) or "-",
-                *numbers,
-                ", ".join(result.missed) or "-",
-                not result.missed,
-            )
-        )
+            cells |= {
+                f"columns off by > {WRONG:g} mm within {NEAR:g} mm": result.near_wrong,
+                "the same elsewhere": result.far_wrong,
+                "largest change elsewhere (mm)": result.shift,
+                "change of mean (mm)": result.mean,
+            }
+        broken = ", ".join(result.missed) or "-"
+        rows.append({**cells, "rules broken": broken, "met": not result.missed})
     return Table(
         title="Defects",
-        columns=(
-            "body",
-            "defect",
-            "size",
-            "place (u, v)",
-            "outcome",
-            "reason",
-            f"columns off by > {WRONG:g} mm within {NEAR:g} mm",
-            "the same elsewhere",
-            "largest change elsewhere (mm)",
-            "change of mean (mm)",
-            "rules broken",
-            "met",
-        ),
-        rows=tuple(rows),
+        rows=rows,
         notes="Sizes are radii, widths, depths or lengths in mm; a share of voxels for salt; a "
         "factor for wrong voxels. Rules, for maps handed out as sound: at most "
         f"{MAX_WRONG:.0%} of the columns off by > {WRONG:g} mm (*wrong*), none moved by > "
@@ -243,13 +234,14 @@ def _totals(results: list[Damage]) -> Table:
     ends = [OUTCOMES[result.status] for result in results]
     return Table(
         title="How damaged labels ended",
-        columns=("outcome", "cases", "of them within the rules"),
-        rows=tuple(
-            (
-                word,
-                ends.count(word),
-                sum(not r.missed for r, end in zip(results, ends, strict=True) if end == word),
-            )
+        rows=[
+            {
+                "outcome": word,
+                "cases": ends.count(word),
+                "of them within the rules": sum(
+                    not r.missed for r, end in zip(results, ends, strict=True) if end == word
+                ),
+            }
             for word in OUTCOMES.values()
-        ),
+        ],
     )

@@ -1,29 +1,33 @@
 """Simulated cohorts: what registration, models and multiplicity make of a known effect."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from scipy import ndimage
 
-from hipsta_bids.group.data import Float, SideMaps
+from hipsta_bids.group.data import SideMaps
 from hipsta_bids.group.design import Design
 from hipsta_bids.group.fit import RowModel, fit_maps
 from hipsta_bids.group.formula import Contrast
-from hipsta_bids.group.glm import PointTest, fit_points
-from hipsta_bids.group.inference import MapKey, correct, fdr_two_stage
+from hipsta_bids.group.inference import MapKey, correct
 from hipsta_bids.group.registration import mean_profiles, register
 from hipsta_bids.group.settings import CORRECTIONS, GroupSettings
 from hipsta_bids.group.warps import warp_values
-from hipsta_bids.validation.report import Cell, Suite, Table
+from hipsta_bids.types import Bool, Float
+from hipsta_bids.validation.report import Cells, Suite, Table
 
-# Simulated cohorts of sheets with known effects, and what the analysis makes of them.
+COHORTS, FEW_COHORTS = 40, 4
+MAX_FALSE, MIN_POWER, MAX_PEAK, MAX_NULL = 0.08, 0.70, 1.5, 0.15
+"""Targets with registration: shares, and nodes."""
+MIN_FALSE_UNREGISTERED = 0.4
+"""Without registration, the shift has to be taken for thinning; else this is no test of it."""
 
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+#: Mean thickness across the sheet, mm: a constant, and bumps of height, place and width.
+_WALL = (1.6, ((0.35, 0.25, 0.10), (-0.30, 0.50, 0.08), (0.30, 0.80, 0.09)))
+#: Mean curvature, 1/mm, in the same way.
+_BEND = (0.10, ((0.20, 0.22, 0.08), (0.30, 0.62, 0.10), (-0.10, 0.85, 0.06)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,28 +62,41 @@ class SimulationPlan:
     """mm per year."""
 
 
-#: Mean thickness across the sheet, mm: a constant, and bumps of height, place and width.
-_WALL = (1.6, ((0.35, 0.25, 0.10), (-0.30, 0.50, 0.08), (0.30, 0.80, 0.09)))
-#: Mean curvature, 1/mm, in the same way.
-_BEND = (0.10, ((0.20, 0.22, 0.08), (0.30, 0.62, 0.10), (-0.10, 0.85, 0.06)))
+#: For corrections: cohorts without displacement, whose effect is hard to find.
+NULL_COHORTS, FEW_NULL_COHORTS, PERMUTATIONS = 100, 10, 200
+SMALL = SimulationPlan(sizes=(40, 40), effect=0.8, shift=0.0, warp_sd=(0.0, 0.0))
+LEVEL = 0.05
+
+_CORRECTIONS = {
+    "fdr2": "false discovery rate, two stages (default)",
+    "bh": "false discovery rate, Benjamini-Hochberg",
+    "permutation-tfce": "family-wise error, cluster enhancement",
+    "permutation-max": "family-wise error, largest t",
+}
+_METHODS = {
+    "registr": "registered, registr (default)",
+    "penalized": "registered, penalized",
+    "none": "not registered",
+}
+_GROUP = "group"
 
 
 @dataclass(frozen=True)
 class SimulatedCohort:
-    """Maps as the participant level would give them, and the truth."""
+    """Maps as the participant level would write them, and the truth."""
 
-    thickness: FloatArray
+    thickness: Float
     """(subjects, x, y) mm."""
-    curvature: FloatArray
+    curvature: Float
     """(subjects, x, y) 1/mm."""
-    group: BoolArray
+    group: Bool
     """Who has the effect."""
-    age: FloatArray
+    age: Float
     """Years."""
-    sex: BoolArray
-    warps: FloatArray
+    sex: Bool
+    warps: Float
     """(subjects, x) true registered coordinate of each node, 0..1."""
-    affected: FloatArray
+    affected: Float
     """(x, y) share of the full effect, at registered nodes."""
 
 
@@ -92,7 +109,7 @@ class Finding:
     false_share: float
     """Of those found, points without effect; 0 if none is found."""
     core_power: float
-    """Points with the full effect that are found, fraction."""
+    """Points with the full effect that are found, fraction; NaN for cohorts without effect."""
     peak_error: float
     """Distance along x from the region's center to the largest statistic, nodes."""
 
@@ -102,12 +119,14 @@ class SimulationResult:
     """Means over cohorts."""
 
     false_discovery_rate: float
+    """Share of the findings that have no effect, in cohorts with one."""
     core_power: float
     peak_error: float
     """Nodes; cohorts with a finding."""
     null_findings: float
-    """Share of cohorts with a shift but no effect in which anything is found."""
+    """Share of cohorts without effect, but with the shift, in which anything is found."""
     cohorts: int
+    """Of each kind."""
 
 
 def simulate_cohort(plan: SimulationPlan, seed: int) -> SimulatedCohort:
@@ -128,56 +147,12 @@ def simulate_cohort(plan: SimulationPlan, seed: int) -> SimulatedCohort:
     field = plan.thickness_sd * _smooth_noise(random, (n, x_nodes, y_nodes), plan.correlation)
     field += plan.age_slope * (age - age.mean())[:, None, None]
     field -= plan.effect * plan.thickness_sd * group[:, None, None] * affected
-    # What belongs to a registered place is seen where the subject has that place.
+    # A subject shows the values of a registered point where that point lies in the subject.
     seen = _at(field, warps) + _bumps(warps, _WALL)[:, :, None]
     return SimulatedCohort(seen, curvature, group, age, sex, warps, affected)
 
 
-def analyze(cohort: SimulatedCohort, plan: SimulationPlan, settings: GroupSettings) -> Finding:
-    """Register, fit group + age + sex at each point, control the FDR, compare with the truth."""
-    profiles = mean_profiles(cohort.curvature, settings.registration)
-    registration = register(profiles, settings.registration)
-    maps = warp_values(cohort.thickness, registration.warps).reshape(len(profiles), -1)
-    matrix = np.column_stack(
-        [np.ones(len(maps)), cohort.group, cohort.age - cohort.age.mean(), cohort.sex]
-    ).astype(np.float64)
-    contrast = Contrast("group", np.array([0.0, 1.0, 0.0, 0.0]))
-    (test,) = fit_points(maps, matrix, [contrast], settings.glm).tests
-    return _judge(test, cohort, plan, settings.multiplicity.alpha)
-
-
-def run_simulation(
-    plan: SimulationPlan, settings: GroupSettings, seeds: Sequence[int]
-) -> SimulationResult:
-    """Analyze cohorts with and without the effect; both have the shift."""
-    null = replace(plan, effect=0.0)
-    with_effect = [analyze(simulate_cohort(plan, seed), plan, settings) for seed in seeds]
-    without = [analyze(simulate_cohort(null, seed), null, settings) for seed in seeds]
-    peaks = [one.peak_error for one in with_effect if one.n_found]
-    return SimulationResult(
-        false_discovery_rate=float(np.mean([one.false_share for one in with_effect])),
-        core_power=float(np.mean([one.core_power for one in with_effect])),
-        peak_error=float(np.mean(peaks)) if peaks else float("nan"),
-        null_findings=float(np.mean([one.n_found > 0 for one in without])),
-        cohorts=len(seeds),
-    )
-
-
-def _judge(test: PointTest, cohort: SimulatedCohort, plan: SimulationPlan, alpha: float) -> Finding:
-    found = fdr_two_stage(test.p, alpha).rejected.reshape(cohort.affected.shape)
-    count = int(found.sum())
-    peak = int(np.nanargmax(np.abs(test.statistic))) // plan.nodes[1]
-    return Finding(
-        n_found=count,
-        false_share=float((found & (cohort.affected == 0)).sum()) / max(count, 1)
-        if plan.effect
-        else float(count > 0),
-        core_power=float(found[cohort.affected == 1].mean()),
-        peak_error=abs(peak - plan.center[0]),
-    )
-
-
-def _region(plan: SimulationPlan) -> FloatArray:
+def _region(plan: SimulationPlan) -> Float:
     """Share of the full effect at each registered node: a plateau with cosine edges."""
     edges = []
     for nodes, center, half in zip(plan.nodes, plan.center, plan.core, strict=True):
@@ -186,19 +161,15 @@ def _region(plan: SimulationPlan) -> FloatArray:
     return np.asarray(np.outer(edges[0], edges[1]), dtype=np.float64)
 
 
-def _bumps(
-    at: FloatArray, shape: tuple[float, tuple[tuple[float, float, float], ...]]
-) -> FloatArray:
+def _bumps(at: Float, shape: tuple[float, tuple[tuple[float, float, float], ...]]) -> Float:
     level, bumps = shape
     total = np.full(at.shape, level)
-    for height, place, width in bumps:
-        total += height * np.exp(-(((at - place) / width) ** 2))
+    for height, center, width in bumps:
+        total += height * np.exp(-(((at - center) / width) ** 2))
     return total
 
 
-def _smooth_noise(
-    random: np.random.Generator, shape: tuple[int, int, int], width: float
-) -> FloatArray:
+def _smooth_noise(random: np.random.Generator, shape: tuple[int, int, int], width: float) -> Float:
     """Gaussian noise of variance one, smooth along the sheet."""
     pad = int(np.ceil(4 * width))
     large = (shape[0], shape[1] + 2 * pad, shape[2] + 2 * pad)
@@ -207,69 +178,20 @@ def _smooth_noise(
     return np.asarray(noise / noise.std(), dtype=np.float64)
 
 
-def _at(maps: FloatArray, warps: FloatArray) -> FloatArray:
-    """Values of maps at other places along x, linearly between nodes."""
-    place = np.clip(warps, 0, 1) * (maps.shape[1] - 1)
-    left = np.minimum(place.astype(np.int64), maps.shape[1] - 2)
-    weight = (place - left)[:, :, None]
+def _at(maps: Float, warps: Float) -> Float:
+    """Values of maps at other points along x, linearly between nodes."""
+    x = np.clip(warps, 0, 1) * (maps.shape[1] - 1)
+    left = np.minimum(x.astype(np.int64), maps.shape[1] - 2)
+    weight = (x - left)[:, :, None]
     rows = np.arange(len(maps))[:, None]
-    mixed: FloatArray = (1 - weight) * maps[rows, left] + weight * maps[rows, left + 1]
+    mixed: Float = (1 - weight) * maps[rows, left] + weight * maps[rows, left + 1]
     return mixed
 
 
-# Simulated cohorts without displacement: what each correction for many points finds.
-
-
-Bool = NDArray[np.bool_]
-
-_GROUP = "group"
-
-
-@dataclass(frozen=True, kw_only=True)
-class CorrectionResult:
-    """Means over cohorts."""
-
-    null_findings: float
-    """Share of cohorts without an effect in which anything is found: family-wise error."""
-    false_discovery_rate: float
-    """Share of the findings that have no effect, in cohorts with one."""
-    core_power: float
-    """Points with the full effect that are found, fraction."""
-    cohorts: int
-    """Of each kind."""
-
-
-def simulate_corrections(
-    plan: SimulationPlan, settings: GroupSettings, seeds: Sequence[int]
-) -> Mapping[str, CorrectionResult]:
-    """Analyze cohorts with and without an effect by each correction."""
-    found: dict[str, list[tuple[Bool, Bool]]] = {method: [] for method in CORRECTIONS}
-    affected = []
-    for seed in seeds:
-        cohort = simulate_cohort(plan, seed)
-        empty = simulate_cohort(replace(plan, effect=0.0), seed)
-        affected.append(cohort.affected)
-        for method, results in found.items():
-            chosen = settings.changed(multiplicity={"method": method, "seed": seed})
-            results.append((_found(cohort, chosen), _found(empty, chosen)))
-    return {method: _summary(results, affected) for method, results in found.items()}
-
-
-def _summary(results: Sequence[tuple[Bool, Bool]], affected: Sequence[Float]) -> CorrectionResult:
-    shares, power = [], []
-    for (found, _), where in zip(results, affected, strict=True):
-        shares.append((found & (where == 0)).sum() / max(found.sum(), 1))
-        power.append(found[where == 1].mean())
-    return CorrectionResult(
-        null_findings=float(np.mean([empty.any() for _, empty in results])),
-        false_discovery_rate=float(np.mean(shares)),
-        core_power=float(np.mean(power)),
-        cohorts=len(results),
-    )
-
-
-def _found(cohort: SimulatedCohort, settings: GroupSettings) -> Bool:
-    """(x, y) points that survive."""
+def analyze(cohort: SimulatedCohort, plan: SimulationPlan, settings: GroupSettings) -> Finding:
+    """Register, fit group + age + sex at each point, correct, and compare with the truth."""
+    profiles = mean_profiles(cohort.curvature, settings.registration)
+    warps = register(profiles, settings.registration).warps
     n = len(cohort.age)
     matrix = np.column_stack([np.ones(n), cohort.group, cohort.age - cohort.age.mean(), cohort.sex])
     design = Design(
@@ -282,47 +204,52 @@ def _found(cohort: SimulatedCohort, settings: GroupSettings) -> Bool:
     )
     side = SideMaps(
         rows=np.arange(n),
-        maps={"thickness": cohort.thickness},
+        maps={"thickness": warp_values(cohort.thickness, warps)},
         subfield=np.zeros(cohort.thickness.shape, dtype=np.int8),
         names=("all",),
         summary=pd.DataFrame(index=range(n)),
     )
     model = RowModel(design)
     fitted = {"L": fit_maps("L", side, model, settings)}
-    found = correct(fitted, model, pd.DataFrame(index=range(n)), settings)
-    flags: Bool = found[MapKey("thickness", _GROUP, "L")].rejected
-    return flags.reshape(cohort.affected.shape)
+    flags = correct(fitted, model, pd.DataFrame(index=range(n)), settings)
+    found = flags[MapKey("thickness", _GROUP, "L")].rejected.reshape(cohort.affected.shape)
+    (test,) = (t for t in fitted["L"].fits["thickness"].tests if t.contrast.name == _GROUP)
+    count = int(found.sum())
+    affected = cohort.affected if plan.effect else np.zeros_like(cohort.affected)
+    core = found[affected == 1]
+    return Finding(
+        n_found=count,
+        false_share=float((found & (affected == 0)).sum()) / max(count, 1),
+        core_power=float(core.mean()) if core.size else float("nan"),
+        peak_error=abs(int(np.nanargmax(np.abs(test.statistic))) // plan.nodes[1] - plan.center[0]),
+    )
 
 
-COHORTS, FEW_COHORTS = 40, 4
-MAX_FALSE, MIN_POWER, MAX_PEAK, MAX_NULL = 0.08, 0.70, 1.5, 0.15
-"""Targets with registration: shares, and nodes."""
-MIN_FALSE_UNREGISTERED = 0.4
-"""Without registration, the shift has to be taken for thinning; else this is no test of it."""
-
-#: For corrections: cohorts without displacement, whose effect is hard to find.
-NULL_COHORTS, FEW_NULL_COHORTS, PERMUTATIONS = 100, 10, 200
-SMALL = SimulationPlan(sizes=(40, 40), effect=0.8, shift=0.0, warp_sd=(0.0, 0.0))
-LEVEL = 0.05
-
-_CORRECTIONS = {
-    "fdr2": "false discovery rate, two stages (default)",
-    "bh": "false discovery rate, Benjamini-Hochberg",
-    "permutation-tfce": "family-wise error, cluster enhancement",
-    "permutation-max": "family-wise error, largest t",
-}
-_METHODS = {
-    "registr": "registered, registr (default)",
-    "penalized": "registered, penalized",
-    "none": "not registered",
-}
+def run_simulation(
+    plan: SimulationPlan, settings: GroupSettings, seeds: Sequence[int]
+) -> SimulationResult:
+    """Analyze cohorts with and without the effect; both have the shift."""
+    null = replace(plan, effect=0.0)
+    with_effect, without = [], []
+    for seed in seeds:
+        own = settings.changed(multiplicity={"seed": seed})
+        with_effect.append(analyze(simulate_cohort(plan, seed), plan, own))
+        without.append(analyze(simulate_cohort(null, seed), null, own))
+    peaks = [one.peak_error for one in with_effect if one.n_found]
+    return SimulationResult(
+        false_discovery_rate=float(np.mean([one.false_share for one in with_effect])),
+        core_power=float(np.mean([one.core_power for one in with_effect])),
+        peak_error=float(np.mean(peaks)) if peaks else float("nan"),
+        null_findings=float(np.mean([one.n_found > 0 for one in without])),
+        cohorts=len(seeds),
+    )
 
 
 def run(full: bool) -> Suite:
     """Analyze cohorts with a thinner region and a shift, and with the shift alone."""
     plan, seeds = SimulationPlan(), range(COHORTS if full else FEW_COHORTS)
     settings = GroupSettings()
-    rows: list[tuple[Cell, ...]] = []
+    rows = []
     for align, title in _METHODS.items():
         how = settings.changed(registration={"align": align})
         rows.append(_row(title, align, run_simulation(plan, how, seeds)))
@@ -336,16 +263,7 @@ def run(full: bool) -> Suite:
         tables=(
             Table(
                 title="Simulated cohorts",
-                columns=(
-                    "analysis",
-                    "cohorts",
-                    "FDR",
-                    "core power",
-                    "peak error, nodes",
-                    "null cohorts with findings",
-                    "met",
-                ),
-                rows=tuple(rows),
+                rows=rows,
                 notes="FDR: share of the findings that lie where there is no effect. Null cohorts"
                 " have the shift only. Targets with registration: FDR at most"
                 f" {MAX_FALSE:g}, power at least {MIN_POWER:g}, peak error at most {MAX_PEAK:g},"
@@ -357,35 +275,7 @@ def run(full: bool) -> Suite:
     )
 
 
-def _corrections(cohorts: int) -> Table:
-    """Tell what each correction finds where there is nothing, and where there is something."""
-    how = GroupSettings().changed(multiplicity={"permutations": PERMUTATIONS, "alpha": LEVEL})
-    found = simulate_corrections(SMALL, how, range(cohorts))
-    # Three binomial standard deviations above the level.
-    most = LEVEL + 3 * (LEVEL * (1 - LEVEL) / cohorts) ** 0.5
-    return Table(
-        title="Corrections for many points",
-        columns=("correction", "cohorts", "null cohorts with findings", "FDR", "core power", "met"),
-        rows=tuple(
-            (
-                _CORRECTIONS[method],
-                one.cohorts,
-                one.null_findings,
-                one.false_discovery_rate,
-                one.core_power,
-                bool(one.null_findings <= most),
-            )
-            for method, one in found.items()
-        ),
-        notes=f"Cohorts of {SMALL.sizes[0]} and {SMALL.sizes[1]} subjects without displacement,"
-        f" with d = {SMALL.effect:g} in the region or without any effect; {PERMUTATIONS}"
-        f" permutations. Target: at most {most:.2g} of the null cohorts have findings, that is"
-        f" {LEVEL:g} and three standard deviations of this many cohorts. The false discovery rate"
-        " is held at the same level by the first two only; by the others, it comes out as it may.",
-    )
-
-
-def _row(title: str, align: str, found: SimulationResult) -> tuple[Cell, ...]:
+def _row(title: str, align: str, found: SimulationResult) -> Cells:
     if align == "none":
         met = found.false_discovery_rate > MIN_FALSE_UNREGISTERED
     else:
@@ -395,12 +285,43 @@ def _row(title: str, align: str, found: SimulationResult) -> tuple[Cell, ...]:
             and found.peak_error <= MAX_PEAK
             and found.null_findings <= MAX_NULL
         )
-    return (
-        title,
-        found.cohorts,
-        found.false_discovery_rate,
-        found.core_power,
-        found.peak_error,
-        found.null_findings,
-        bool(met),
+    return {
+        "analysis": title,
+        "cohorts": found.cohorts,
+        "FDR": found.false_discovery_rate,
+        "core power": found.core_power,
+        "peak error, nodes": found.peak_error,
+        "null cohorts with findings": found.null_findings,
+        "met": bool(met),
+    }
+
+
+def _corrections(cohorts: int) -> Table:
+    """Count what each correction finds where there is nothing, and where there is something."""
+    # Three binomial standard deviations above the level.
+    most = LEVEL + 3 * (LEVEL * (1 - LEVEL) / cohorts) ** 0.5
+    settings = GroupSettings()
+    rows: list[Cells] = []
+    for method in CORRECTIONS:
+        how = {"method": method, "permutations": PERMUTATIONS, "alpha": LEVEL}
+        plain = settings.changed(registration={"align": "none"}, multiplicity=how)
+        found = run_simulation(SMALL, plain, range(cohorts))
+        rows.append(
+            {
+                "correction": _CORRECTIONS[method],
+                "cohorts": found.cohorts,
+                "null cohorts with findings": found.null_findings,
+                "FDR": found.false_discovery_rate,
+                "core power": found.core_power,
+                "met": found.null_findings <= most,
+            }
+        )
+    return Table(
+        title="Corrections for many points",
+        rows=rows,
+        notes=f"Cohorts of {SMALL.sizes[0]} and {SMALL.sizes[1]} subjects without displacement,"
+        f" with d = {SMALL.effect:g} in the region or without any effect; {PERMUTATIONS}"
+        f" permutations. Target: at most {most:.2g} of the null cohorts have findings, that is"
+        f" {LEVEL:g} and three standard deviations of this many cohorts. The false discovery rate"
+        " is held at the same level by the first two only; by the others, it comes out as it may.",
     )

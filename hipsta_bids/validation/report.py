@@ -1,4 +1,4 @@
-"""From suites to the page ``validation.md`` and its figures."""
+"""Validation suites: their tables with targets, their figures, and the page ``validation.md``."""
 
 import platform
 from collections.abc import Callable, Mapping, Sequence
@@ -8,22 +8,17 @@ from importlib.metadata import version
 from io import BytesIO
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from hipsta_bids import __version__
 from hipsta_bids.errors import UsageError
 from hipsta_bids.io import files
-from hipsta_bids.reports.plotting import new_figure
+from hipsta_bids.reports.maps import new_figure
+from hipsta_bids.types import Float
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-
-# What a validation suite hands over: tables with targets, and figures.
-
-
-#: A float is shown with the table's number of digits, a bool as met or missed, None as n/a.
-Cell = str | int | float | bool | None
 
 #: Suites in the order of the report: name, and the function that runs it.
 SUITES: Mapping[str, str] = MappingProxyType(
@@ -39,9 +34,21 @@ SUITES: Mapping[str, str] = MappingProxyType(
     }
 )
 
-
 #: Suites that measure real segmentations too, where there are any.
 WITH_LABELS = frozenset({"defects", "slices", "surrogate"})
+
+#: What is written, below the output folder.
+PAGE = "validation.md"
+IMAGES = "images"
+
+_DPI = 100
+_LIBRARIES = ("numpy", "scipy", "scikit-image", "lapy", "tetgen")
+
+#: A float is shown with the table's number of digits, a bool as met or missed, None as n/a.
+Cell = str | int | float | bool | None
+
+#: Cells by heading, with units; a target and whether it was met have headings of their own.
+Cells = Mapping[str, Cell]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,27 +56,32 @@ class Table:
     """One table of the report."""
 
     title: str
-    columns: tuple[str, ...]
-    """Headings, with units; a target and whether it was met have columns of their own."""
-    rows: tuple[tuple[Cell, ...], ...]
+    rows: Sequence[Cells]
+    """The longest one has all headings, in order; the others may lack cells."""
     notes: str = ""
     """Markdown below the table: what was measured, and how to read it."""
     digits: int = 3
     """Decimals of float cells; for others, format the cell as str."""
 
     def __post_init__(self) -> None:
-        if any(len(row) != len(self.columns) for row in self.rows):
-            raise ValueError(f"table {self.title!r}: a row has not {len(self.columns)} cells")
+        if stray := {heading for row in self.rows for heading in row} - set(self.columns):
+            raise ValueError(f"table {self.title!r}: the longest row has no {sorted(stray)}")
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Headings."""
+        longest: Cells = max(self.rows, key=len, default={})
+        return tuple(longest)
 
     @property
     def missed(self) -> int:
         """Number of targets that were missed: cells that are False."""
-        return sum(cell is False for row in self.rows for cell in row)
+        return sum(cell is False for row in self.rows for cell in row.values())
 
     @property
     def targets(self) -> int:
         """Number of targets: cells that are True or False."""
-        return sum(isinstance(cell, bool) for row in self.rows for cell in row)
+        return sum(isinstance(cell, bool) for row in self.rows for cell in row.values())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,6 +96,11 @@ class Picture:
     """Draws into an empty figure."""
     size: tuple[float, float] = (9.0, 4.0)
     """Width and height, inches."""
+
+    @property
+    def file(self) -> str:
+        """Name of the file."""
+        return f"validation-{self.name}.png"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,14 +123,6 @@ def run_suite(name: str, *, full: bool, labels: Path | None = None) -> Suite:
     return run(full, labels) if name in WITH_LABELS else run(full)
 
 
-#: What is written, below the output folder.
-PAGE = "validation.md"
-IMAGES = "images"
-
-_DPI = 100
-_LIBRARIES = ("numpy", "scipy", "scikit-image", "lapy", "tetgen")
-
-
 def validate(
     out: Path,
     *,
@@ -122,7 +131,7 @@ def validate(
     labels: Path | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> int:
-    """Run suites and write their report."""
+    """Run suites, write their report, and count the targets that were missed."""
     unknown = [name for name in names if name not in SUITES]
     if unknown:
         raise UsageError(
@@ -130,16 +139,19 @@ def validate(
             reason="unknown-suite",
         )
     files.check_writable(out)
-    suites = []
+    suites, missed = [], 0
     for name in names or SUITES:
         suite = run_suite(name, full=full, labels=labels)
         suites.append(suite)
-        report(f"{suite.title}: {_score(suite)}")
+        targets = sum(table.targets for table in suite.tables)
+        missing = sum(table.missed for table in suite.tables)
+        missed += missing
+        report(f"{suite.title}: {targets - missing} of {targets} targets met")
     for suite in suites:
         for picture in suite.pictures:
-            files.write_bytes(out / IMAGES / file_name(picture), render(picture))
+            files.write_bytes(out / IMAGES / picture.file, render(picture))
     files.write_text(out / PAGE, page(suites, full=full, labels=labels is not None))
-    return sum(table.missed for suite in suites for table in suite.tables)
+    return missed
 
 
 def page(suites: Sequence[Suite], *, full: bool, labels: bool = False) -> str:
@@ -154,6 +166,16 @@ def page(suites: Sequence[Suite], *, full: bool, labels: bool = False) -> str:
     )
     python = f"Python {platform.python_version()}"
     libraries = ", ".join([python, *(f"{name} {version(name)}" for name in _LIBRARIES)])
+    overview: list[Cells] = [
+        {
+            "suite": suite.title,
+            "table": table.title,
+            "targets": table.targets,
+            "missed": table.missed,
+        }
+        for suite in suites
+        for table in suite.tables
+    ]
     intro = (
         f"Written by `{command}` of hipsta_bids {__version__} ({libraries}). The same command"
         " with the same versions gives the same numbers."
@@ -162,26 +184,43 @@ def page(suites: Sequence[Suite], *, full: bool, labels: bool = False) -> str:
         f"<!-- Written by `{command}`; do not edit, run it again. -->",
         "# Validation",
         intro,
-        markdown(_overview(suites)),
+        markdown(Table(title="Overview", rows=overview)),
         *(_section(suite) for suite in suites),
     ]
     return "\n\n".join(parts) + "\n"
 
 
+def _section(suite: Suite) -> str:
+    parts = [f"## {suite.title}"]
+    if suite.text:
+        parts.append(suite.text.strip())
+    parts += [markdown(table) for table in suite.tables]
+    parts += [
+        f"![{picture.caption}]({IMAGES}/{picture.file})\n\n*{picture.caption}*"
+        for picture in suite.pictures
+    ]
+    return "\n\n".join(parts)
+
+
 def markdown(table: Table) -> str:
     """Write one table in Markdown."""
+    columns = table.columns
     lines = [
         f"**{table.title}**",
         "",
-        _line(table.columns),
-        _line(["---"] * len(table.columns)),
-        *(_line([show(cell, table.digits) for cell in row]) for row in table.rows),
+        _line(columns),
+        _line(["---"] * len(columns)),
+        *(_line([show(row.get(name), table.digits) for name in columns]) for row in table.rows),
     ]
     return "\n".join([*lines, "", table.notes.strip()] if table.notes else lines)
 
 
+def _line(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |"
+
+
 def show(cell: Cell, digits: int) -> str:
-    """Spell one cell."""
+    """Format one cell."""
     if cell is None or cell != cell:  # noqa: PLR0124  (NaN)
         return "n/a"
     if isinstance(cell, bool):
@@ -198,39 +237,17 @@ def render(picture: Picture) -> bytes:
     return data.getvalue()
 
 
-def file_name(picture: Picture) -> str:
-    """Name the file of a figure."""
-    return f"validation-{picture.name}.png"
-
-
-def _overview(suites: Sequence[Suite]) -> Table:
-    rows: list[tuple[Cell, ...]] = [
-        (suite.title, table.title, table.targets, table.missed)
-        for suite in suites
-        for table in suite.tables
-    ]
-    return Table(
-        title="Overview", columns=("suite", "table", "targets", "missed"), rows=tuple(rows)
-    )
-
-
-def _score(suite: Suite) -> str:
-    targets = sum(table.targets for table in suite.tables)
-    missed = sum(table.missed for table in suite.tables)
-    return f"{targets - missed} of {targets} targets met"
-
-
-def _section(suite: Suite) -> str:
-    parts = [f"## {suite.title}"]
-    if suite.text:
-        parts.append(suite.text.strip())
-    parts += [markdown(table) for table in suite.tables]
-    parts += [
-        f"![{picture.caption}]({IMAGES}/{file_name(picture)})\n\n*{picture.caption}*"
-        for picture in suite.pictures
-    ]
-    return "\n\n".join(parts)
-
-
-def _line(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |"
+def show_map(
+    axis: "Axes",
+    values: Float,
+    title: str,
+    *,
+    ends: tuple[str, str] = ("posterior", "anterior"),
+    **style: Any,  # noqa: ANN401  (what matplotlib takes)
+) -> Any:  # noqa: ANN401  (matplotlib's mappables have no common public type)
+    """Draw a map of the sheet (Nx, Ny), medial to lateral and ``ends`` of y."""
+    image = axis.imshow(values.T, origin="lower", aspect="auto", **style)
+    axis.set_title(title)
+    axis.set_xticks([0, values.shape[0] - 1], ["medial", "lateral"])
+    axis.set_yticks([0, values.shape[1] - 1], list(ends))
+    return image

@@ -1,7 +1,7 @@
-"""``hipsta-bids surrogate``: thickness in single slices, to cross-check that of the mesh."""
+"""``hipsta-bids surrogate``: thickness in single slices, and its comparison with the mesh."""
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -30,17 +30,21 @@ from hipsta_bids.inputs.labels import read_label_volume
 from hipsta_bids.inputs.request import HemisphereInput
 from hipsta_bids.inputs.search import InputRequest, find_hemispheres
 from hipsta_bids.io import files
-from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.phantom import Phantom, PhantomSpec
-from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Float
-from hipsta_bids.validation.cases import Refusal, run_cases
-from hipsta_bids.validation.report import Cell, Picture, Suite, Table
+from hipsta_bids.validation.cases import (
+    Refusal,
+    ValidationBody,
+    load_body,
+    measure_body,
+    run_cases,
+    truth_at,
+)
+from hipsta_bids.validation.report import Cell, Cells, Picture, Suite, Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
 
 #: Columns of the table: definition and unit.
 COLUMNS: dict[str, tuple[str, str | None]] = {
@@ -61,15 +65,22 @@ COLUMNS: dict[str, tuple[str, str | None]] = {
 
 _DIGITS = 4
 
+POSITIONS = (0.25, 0.5, 0.75)
+"""Of the slices, fractions of the body's length."""
 
-@dataclass(frozen=True, kw_only=True)
-class _Sheet:
-    """What the participant level wrote."""
+VOXEL = 0.4
+"""mm, of phantoms."""
 
-    points: Float
-    """(M, 3) RAS mm."""
-    thickness: Float
-    """(M,) mm."""
+LEAST_CORRELATION = 0.9
+"""Of surrogate and mesh, on phantoms of varying thickness."""
+
+PHANTOMS = (
+    PhantomSpec(kind="spiral", thickness=2.0, variation=0.3),
+    PhantomSpec(kind="arc", thickness=2.0, variation=0.3),
+    PhantomSpec(kind="s-shape", thickness=2.0, variation=0.3),
+    PhantomSpec(kind="tight", thickness=1.6, variation=0.3),
+    PhantomSpec(kind="spiral", thickness=1.2, variation=0.3),
+)
 
 
 def crosscheck(
@@ -87,7 +98,10 @@ def crosscheck(
     dataset.write_description(out_dir, sources)
     errors = []
     for item in items:
-        place = _place(item, out_dir)
+        name = HemisphereName(
+            subject=item.subject, session=item.session, hemi=item.hemi, seg=item.protocol.name
+        )
+        place = ResultPlace(root=out_dir, name=name)
         files.remove([place.path("surrogate"), place.path("surrogate_sidecar")])
         title = f"{place.name.stem}_seg-{place.name.seg}"
         try:
@@ -104,28 +118,20 @@ def crosscheck(
     return ExitCode.BAD_DATA if bad and len(errors) == len(items) else ExitCode.SOME_FAILED
 
 
-def _place(item: HemisphereInput, out_dir: Path) -> ResultPlace:
-    name = HemisphereName(
-        subject=item.subject, session=item.session, hemi=item.hemi, seg=item.protocol.name
-    )
-    return ResultPlace(root=out_dir, name=name)
-
-
-def _measure(item: HemisphereInput, place: ResultPlace, settings: Settings) -> Iterator[str]:
-    """Measure one hemisphere, write its table, and give a line per slice."""
+def _measure(item: HemisphereInput, place: ResultPlace, settings: Settings) -> list[str]:
+    """Measure one hemisphere, write its table, and return a line per slice."""
     body = extract_body(read_label_volume(item), settings.body.changed(region="body"))
     sheet = _read_sheet(place)
     rows: list[list[str]] = []
     lines = []
     for position in settings.surrogate.positions:
-        profiles = surrogate_profiles(body, position, settings.sheet, settings.surrogate)
-        mesh = [_mesh_thickness(profile, sheet, settings) for profile in profiles]
-        rows += [
-            row
-            for profile, beside in zip(profiles, mesh, strict=True)
-            for row in _rows(profile, beside)
-        ]
-        lines.append(_line(profiles[0], mesh[0]))
+        for profile in surrogate_profiles(body, position, settings.sheet, settings.surrogate):
+            mesh = np.full(len(profile.points), np.nan)
+            if sheet is not None:
+                mesh = compare_nearby(profile.points, *sheet, settings.surrogate.reach)
+            rows += _rows(profile, mesh)
+            if profile.sampling == "proportional":
+                lines.append(_line(profile, mesh))
     files.write_tsv(place.path("surrogate"), list(COLUMNS), rows)
     files.write_json(
         place.path("surrogate_sidecar"),
@@ -134,29 +140,17 @@ def _measure(item: HemisphereInput, place: ResultPlace, settings: Settings) -> I
             for name, (text, unit) in COLUMNS.items()
         },
     )
-    yield from lines
+    return lines
 
 
-def _read_sheet(place: ResultPlace) -> _Sheet | None:
-    """Read the sheet that the participant level measured, if it did."""
+def _read_sheet(place: ResultPlace) -> tuple[Float, Float] | None:
+    """Read points (M, 3), RAS mm, and thickness (M,), mm, that the participant level measured."""
     with suppress(InputError):
         rows = files.read_tsv(place.path("sheet"))
-        columns = {
-            name: np.array([np.nan if row[name] == files.MISSING else row[name] for row in rows])
-            for name in ("r", "a", "s", "thickness")
-        }
-        values = {name: column.astype(np.float64) for name, column in columns.items()}
-        return _Sheet(
-            points=np.stack([values["r"], values["a"], values["s"]], axis=-1),
-            thickness=values["thickness"],
-        )
+        cells = [[row[name] for name in ("r", "a", "s", "thickness")] for row in rows]
+        values = np.where(np.array(cells) == files.MISSING, "nan", cells).astype(np.float64)
+        return values[:, :3], values[:, 3]
     return None
-
-
-def _mesh_thickness(profile: SurrogateProfile, sheet: _Sheet | None, settings: Settings) -> Float:
-    if sheet is None:
-        return np.full(len(profile.points), np.nan)
-    return compare_nearby(profile.points, sheet.points, sheet.thickness, settings.surrogate.reach)
 
 
 def _rows(profile: SurrogateProfile, mesh: Float) -> Iterator[list[str]]:
@@ -185,30 +179,12 @@ def _line(profile: SurrogateProfile, mesh: Float) -> str:
     )
 
 
-# The surrogate without a mesh against the mesh: two ways to thickness that share labels only.
-
-
-POSITIONS = (0.25, 0.5, 0.75)
-"""Of the slices, fractions of the body's length."""
-
-LEAST_CORRELATION = 0.9
-"""Of surrogate and mesh, on phantoms of varying thickness."""
-
-PHANTOMS = (
-    PhantomSpec(kind="spiral", thickness=2.0, variation=0.3),
-    PhantomSpec(kind="arc", thickness=2.0, variation=0.3),
-    PhantomSpec(kind="s-shape", thickness=2.0, variation=0.3),
-    PhantomSpec(kind="tight", thickness=1.6, variation=0.3),
-    PhantomSpec(kind="spiral", thickness=1.2, variation=0.3),
-)
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Compared:
-    """Thickness at the same places, by slice; all arrays (slices, N), mm."""
+    """Thickness at the same points, by slice; all arrays (slices, N), mm."""
 
     fraction: Float
-    """Of the medial axis, 0 at the medial rim."""
+    """Of the medial axis, 0 at the medial edge."""
     surrogate: Float
     mesh: Float
     truth: Float
@@ -221,14 +197,15 @@ class Compared:
 
 def run(full: bool, labels: Path | None = None) -> Suite:
     """Compare on phantoms and, where there are any, on real segmentations."""
-    bodies: list[PhantomSpec | HemisphereInput] = list(PHANTOMS if full else PHANTOMS[:1])
+    bodies: list[ValidationBody] = list(PHANTOMS if full else PHANTOMS[:1])
+    n_phantoms = len(bodies)
     if labels is not None:
         bodies += [
             item for item in find_hemispheres(InputRequest(bids_dir=labels)) if not item.problem
         ]
     results = run_cases(compare_body, bodies)
     shown = [(_name(b), r) for b, r in zip(bodies, results, strict=True) if isinstance(r, Compared)]
-    pictured = [*shown[:2], *shown[len(PHANTOMS if full else PHANTOMS[:1]) :][:2]]
+    pictured = [*shown[:2], *shown[n_phantoms:][:2]]
     return Suite(
         name="surrogate",
         title="Thickness without a mesh",
@@ -238,15 +215,12 @@ def run(full: bool, labels: Path | None = None) -> Suite:
     )
 
 
-def compare_body(body: PhantomSpec | HemisphereInput) -> Compared:
+def compare_body(body: ValidationBody) -> Compared:
     """Measure one body both ways."""
     settings = Settings()
     phantom = Phantom(body) if isinstance(body, PhantomSpec) else None
-    if isinstance(body, PhantomSpec):
-        volume, hemi = Phantom(body).label_volume(load_protocol("freesurfer"), hemi="L"), "L"
-    else:
-        volume, hemi = read_label_volume(body), body.hemi
-    maps = measure_hemisphere(volume, hemi, settings, lambda _: nullcontext())
+    volume, hemi = load_body(body, VOXEL)
+    maps = measure_body(volume, hemi)
     middle = maps.sheet.points[:, :, maps.sheet.middle].reshape(-1, 3)
     merged = extract_body(volume, settings.body)
     columns: list[tuple[Float, Float, Float, Float]] = []
@@ -272,67 +246,43 @@ def compare_body(body: PhantomSpec | HemisphereInput) -> Compared:
 
 
 def _truth(phantom: Phantom | None, points: Float) -> Float:
-    """Look up true thickness (N,) beside points; NaN outside of the phantom's rims."""
+    """Look up true thickness (N,) beside points; NaN where it is not known."""
     if phantom is None:
         return np.full(len(points), np.nan)
-    u, v, _ = phantom.body.locate(points).T
-    inside = np.isfinite(u)
-    found = phantom.truth(np.where(inside, u, 0.5), np.where(inside, v, 0.5))
-    return np.where(inside, found.thickness, np.nan)
+    truth, inside = truth_at(phantom, points)
+    return np.where(inside, truth.thickness, np.nan)
 
 
-def _name(body: PhantomSpec | HemisphereInput) -> str:
+def _name(body: ValidationBody) -> str:
     if isinstance(body, PhantomSpec):
         return f"{body.kind} {body.thickness:g} mm, ±{body.variation:.0%}"
     return f"sub-{body.subject} {body.hemi} ({body.protocol.name})"
 
 
-def _table(
-    bodies: Sequence[PhantomSpec | HemisphereInput], results: Sequence[Compared | Refusal]
-) -> Table:
-    rows: list[tuple[Cell, ...]] = []
+def _table(bodies: Sequence[ValidationBody], results: Sequence[Compared | Refusal]) -> Table:
+    rows: list[Cells] = []
     for body, result in zip(bodies, results, strict=True):
         is_phantom = isinstance(body, PhantomSpec)
-        target = f"r ≥ {LEAST_CORRELATION}" if is_phantom else "n/a"
+        cells: dict[str, Cell] = {"body": _name(body)}
+        met = False
         if isinstance(result, Refusal):
-            rows.append(
-                (_name(body), result.reason, *[None] * 6, target, False if is_phantom else None)
-            )
-            continue
-        pair = agreement(result.surrogate.ravel(), result.mesh.ravel())
-        true = agreement(result.surrogate.ravel(), result.truth.ravel())
-        met = bool(pair.correlation >= LEAST_CORRELATION) if is_phantom else None
-        rows.append(
-            (
-                _name(body),
-                "; ".join(result.problems) or f"{len(result.surrogate)} slices",
-                pair.correlation,
-                pair.slope,
-                pair.difference,
-                pair.deviation,
-                true.correlation if is_phantom else None,
-                true.slope if is_phantom else None,
-                target,
-                met,
-            )
-        )
-    return Table(
-        title="Surrogate against mesh",
-        columns=(
-            "body",
-            "slices",
-            "r",
-            "slope",
-            "difference, mm",
-            "SD, mm",
-            "r with truth",
-            "slope on truth",
-            "target",
-            "met",
-        ),
-        rows=tuple(rows),
-        notes=_NOTES,
-    )
+            cells["slices"] = result.reason
+        else:
+            pair = agreement(result.surrogate.ravel(), result.mesh.ravel())
+            true = agreement(result.surrogate.ravel(), result.truth.ravel())
+            met = bool(pair.correlation >= LEAST_CORRELATION)
+            cells |= {
+                "slices": "; ".join(result.problems) or f"{len(result.surrogate)} slices",
+                "r": pair.correlation,
+                "slope": pair.slope,
+                "difference, mm": pair.difference,
+                "SD, mm": pair.deviation,
+                "r with truth": true.correlation if is_phantom else None,
+                "slope on truth": true.slope if is_phantom else None,
+            }
+        cells["target"] = f"r ≥ {LEAST_CORRELATION}" if is_phantom else "n/a"
+        rows.append({**cells, "met": met if is_phantom else None})
+    return Table(title="Surrogate against mesh", rows=rows, notes=_NOTES)
 
 
 def _picture(shown: Sequence[tuple[str, Compared]]) -> Picture:
@@ -347,7 +297,7 @@ def _picture(shown: Sequence[tuple[str, Compared]]) -> Picture:
             axis.plot(x, result.surrogate[k], "C1o", markersize=3, label="proportional")
             axis.plot(*result.equidistant[k], "C3+", markersize=5, label="equidistant")
             axis.set_title(name, fontsize="small")
-            axis.set_xlabel("place on the medial axis")
+            axis.set_xlabel("position on the medial axis")
         axes[0].set_ylim(bottom=0)
         axes[0].set_ylabel("thickness, mm")
         axes[0].legend(fontsize="small")
@@ -355,7 +305,7 @@ def _picture(shown: Sequence[tuple[str, Compared]]) -> Picture:
     return Picture(
         name="surrogate",
         caption="Thickness from medial (0) to lateral (1) in the middle slice: of the mesh, and of"
-        " the surrogate with proportional and equidistant sampling. At the rims the closest points"
+        " the surrogate with proportional and equidistant sampling. At the edges the closest points"
         " lie on the rounded ends.",
         draw=draw,
         size=(3.0 * max(len(shown), 2), 3.2),

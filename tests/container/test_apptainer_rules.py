@@ -46,7 +46,7 @@ ENVIRONMENT = {
 
 DRAW = """
 import os
-from hipsta_bids.reports.plotting import new_figure
+from hipsta_bids.reports.maps import new_figure
 new_figure((2, 2), "constrained").savefig(os.devnull, format="png")
 """
 

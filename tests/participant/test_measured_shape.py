@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from measure_example import compare_maps, compare_sections, compare_subfields, compare_summary
 from measured_phantoms import measure, measured, sheet_coordinates, spiral
 
 from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY
@@ -13,12 +14,6 @@ from hipsta_bids.participant import measure as participant
 from hipsta_bids.phantom import PhantomSpec
 from hipsta_bids.settings import Settings, SheetSettings
 from hipsta_bids.types import Sheet
-from hipsta_bids.validation.accuracy import (
-    compare_maps,
-    compare_sections,
-    compare_subfields,
-    compare_summary,
-)
 
 SHAPES = [
     PhantomSpec(kind="slab", thickness=2.0),

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from hipsta_bids.phantom.shape import START_ANGLE, MidCurve, gauss_panels
-from hipsta_bids.phantom.spec import KINDS, Bend
+from hipsta_bids.phantom.shape import KINDS, START_ANGLE, Bend, MidCurve, gauss_panels
 
 WIDTH = 20.0
 EXACT = 1e-10  # mm: quadrature and rounding are far smaller, any mistake is far larger

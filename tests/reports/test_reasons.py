@@ -13,7 +13,7 @@ import pytest
 from hipsta_bids.cli.group import group_parser
 from hipsta_bids.cli.participant import build_parser
 from hipsta_bids.errors import HipstaError
-from hipsta_bids.reports.words import reason_sections
+from hipsta_bids.reports.page import reason_sections
 from hipsta_bids.types import Flag
 
 ROWS = [(name, row) for section in reason_sections() for name, row in section.reasons.items()]

@@ -2,31 +2,30 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.validation import defects
-from hipsta_bids.validation.cases import Refusal
+from hipsta_bids.validation.cases import Refusal, measure_reference
 from hipsta_bids.validation.defects import Damage, Trial, compare, measure_trial
 
 SPIRAL = defects.SPECS[0]
 
 
-def trial(kind, size, place=(0.5, 0.5)):
-    return Trial(body=SPIRAL, kind=kind, size=size, place=place)
+def trial(kind, size, position=(0.5, 0.5)):
+    return Trial(body=SPIRAL, kind=kind, size=size, position=position)
 
 
-@pytest.mark.parametrize("place", [(0.5, 0.5), (0.2, 0.35), (0.82, 0.6)])
-def test_holes_are_filled_to_the_walls_thickness(place):
-    found = measure_trial(trial("hole", 0.8, place))
+@pytest.mark.parametrize("position", [(0.5, 0.5), (0.2, 0.35), (0.82, 0.6)])
+def test_holes_are_filled_to_the_walls_thickness(position):
+    found = measure_trial(trial("hole", 0.8, position))
     assert found.status == "repaired"
     assert found.shift < 0.15  # mm, the rule; the grid's nodes are the same, the mesh is not
     # Of about 100 columns near it; a plug of the wall's own thickness leaves few.
     assert found.near_wrong <= 6
 
 
-def test_a_hole_beside_a_rim_is_not_cut_open():
+def test_a_hole_beside_an_edge_is_not_cut_open():
     found = measure_trial(trial("hole", 1.6, (0.2, 0.35)))
     assert found.status == "flagged"
     assert found.reasons[0] == "large-repair"
@@ -34,7 +33,7 @@ def test_a_hole_beside_a_rim_is_not_cut_open():
     assert found.shift < 0.15  # mm, as above
 
 
-def test_a_notch_is_flagged_with_its_place():
+def test_a_notch_is_flagged_with_its_position():
     found = measure_trial(trial("notch", 2.0))
     assert "section-notch" in found.reasons
 
@@ -73,7 +72,7 @@ def test_what_cannot_be_repaired_is_flagged(kind, size, reason):
 
 
 def test_columns_are_counted_near_and_far():
-    _, _, reference = defects._undamaged(SPIRAL)
+    _, _, reference = measure_reference(SPIRAL, defects.VOXEL)
     shifted = reference.thickness.copy()
     shifted[0, 0] += 0.5
     shifted[-1, -1] -= 0.2
@@ -118,9 +117,10 @@ def test_the_tables_show_every_case_and_miss_crashes(monkeypatch):
     cases, totals = suite.tables
     assert len(cases.rows) == len(defects.PLAN[::3])
     assert len(defects.run(True).tables[0].rows) == 2 * len(defects.PLAN)
-    assert cases.rows[0][4:6] == ("unnoticed", "-")
-    assert cases.rows[1][4:7] == ("refused", "topology", None)
-    assert [row[-2] for row in cases.rows[:3]] == ["-", "placeless", "crash"]
+    assert (cases.rows[0]["outcome"], cases.rows[0]["reason"]) == ("unnoticed", "-")
+    assert (cases.rows[1]["outcome"], cases.rows[1]["reason"]) == ("refused", "topology")
+    assert "the same elsewhere" not in cases.rows[1]
+    assert [row["rules broken"] for row in cases.rows[:3]] == ["-", "placeless", "crash"]
     assert cases.missed == 2
-    assert {row[0]: row[1] for row in totals.rows}["crash"] == 1
-    assert np.sum([row[1] for row in totals.rows]) == len(cases.rows)
+    assert {row["outcome"]: row["cases"] for row in totals.rows}["crash"] == 1
+    assert sum(row["cases"] for row in totals.rows) == len(cases.rows)

@@ -35,7 +35,7 @@ def test_corrections_keep_the_family_wise_error_and_find_the_effect(monkeypatch)
     table = group._corrections(12)
     assert table.targets == 4
     assert table.missed == 0
-    power = {row[0]: row[4] for row in table.rows}
+    power = {row["correction"]: row["core power"] for row in table.rows}
     wide, single = (
         power[f"family-wise error, {how}"] for how in ("cluster enhancement", "largest t")
     )

@@ -22,8 +22,10 @@ from hipsta_bids.validation.report import (
 
 TABLE = Table(
     title="Bias",
-    columns=("case", "|mm|", "target", "met"),
-    rows=(("a|b", 0.01234, "≤ 0.02", True), ("c", float("nan"), "≤ 0.02", False)),
+    rows=[
+        {"case": "a|b", "|mm|": 0.01234, "target": "≤ 0.02", "met": True},
+        {"case": "c", "target": "≤ 0.02", "met": False},
+    ],
     notes="Read it so.",
 )
 
@@ -63,20 +65,22 @@ def test_a_table_in_markdown():
 
 
 @pytest.mark.parametrize(
-    ("cell", "text"), [(None, "n/a"), (3, "3"), (1.0, "1.00"), (True, "yes"), ("≤ 1", "≤ 1")]
+    ("cell", "text"),
+    [(None, "n/a"), (float("nan"), "n/a"), (3, "3"), (1.0, "1.00"), (True, "yes"), ("≤ 1", "≤ 1")],
 )
 def test_cells(cell, text):
     assert show(cell, 2) == text
 
 
 def test_targets_are_counted_and_numbers_are_not():
-    table = Table(title="t", columns=("n", "x"), rows=((1, True), (0, False), (0, None)))
+    rows = [{"n": 1, "x": True}, {"n": 0, "x": False}, {"n": 0, "x": None}]
+    table = Table(title="t", rows=rows)
     assert (table.targets, table.missed) == (2, 1)
 
 
-def test_a_row_of_another_length_is_refused():
-    with pytest.raises(ValueError, match="a row has not 2 cells"):
-        Table(title="t", columns=("a", "b"), rows=((1,),))
+def test_a_heading_that_the_longest_row_lacks_is_refused():
+    with pytest.raises(ValueError, match=r"the longest row has no \['c'\]"):
+        Table(title="t", rows=[{"a": 1, "b": 2}, {"c": 3}])
 
 
 def test_page_says_that_it_is_generated_and_shows_all():

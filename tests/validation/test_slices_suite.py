@@ -8,8 +8,8 @@ import pytest
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.types import LabelVolume
 from hipsta_bids.validation import invariance
-from hipsta_bids.validation.cases import Refusal, reslice
-from hipsta_bids.validation.invariance import Outcome, Trial
+from hipsta_bids.validation.cases import Refusal
+from hipsta_bids.validation.invariance import Outcome, Trial, reslice
 
 AXIS = np.array([0.0, 1.0, 0.0])
 
@@ -95,7 +95,7 @@ def row_of(results, step=2.0):
     ]
     table = invariance._table(trials, results)
     assert len(table.rows) == 1
-    return dict(zip(table.columns[:9], table.rows[0], strict=False)), table.rows[0][-1], table
+    return table.rows[0], table.rows[0]["met"], table
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ def run_with(monkeypatch, results, *, full=False):
 
 def row_of(suite, number=0):
     (table,) = suite.tables
-    return dict(zip(table.columns, table.rows[number], strict=True))
+    return table.rows[number]
 
 
 def test_the_table_has_the_line_that_was_put_in(monkeypatch):
@@ -54,7 +54,7 @@ def test_a_low_correlation_is_missed(monkeypatch):
 def test_a_refused_phantom_is_missed(monkeypatch):
     results = [compared(), *[Refusal(reason="too-thin", message="thin")] * 4]
     row = row_of(run_with(monkeypatch, results, full=True), 1)
-    assert (row["slices"], row["r"], row["met"]) == ("too-thin", None, False)
+    assert (row["slices"], row.get("r"), row["met"]) == ("too-thin", None, False)
 
 
 def test_it_is_drawn(monkeypatch):

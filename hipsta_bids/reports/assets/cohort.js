@@ -119,7 +119,7 @@
 
   function exclusions() {
     const cell = (text) => String(text || "n/a").split(/\s+/).join(" ");
-    const why = (row) => row.status === "ok" && row.distance > apart ? `apart in ${row.farthest}` : row.reason || "selected by hand";
+    const why = (row) => row.status === "ok" && row.distance > apart ? `outlier in ${row.farthest}` : row.reason || "selected by hand";
     const lines = rows.filter((row) => selected.has(row)).map((row) => [row.participant, row.session, row.hemi, `${row.status}: ${why(row)}`].map(cell).join("\t"));
     return ["participant_id\tsession_id\themi\treason", ...new Set(lines)].join("\n") + "\n";
   }

@@ -9,7 +9,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 DRAW = """
 import os
-from hipsta_bids.reports.plotting import new_figure
+from hipsta_bids.reports.maps import new_figure
 before = dict(os.environ)
 new_figure((2, 2), "constrained").savefig("figure.png")
 assert dict(os.environ) == before
