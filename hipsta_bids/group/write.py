@@ -369,9 +369,8 @@ def draw(
 ) -> None:
     """Draw the figures."""
     for one in ((cohort, analysis, shapes), *((*one, {}) for one in others.values())):
-        for drawing in draw_figures(*one):
-            files.write_bytes(folder / "figures" / f"{drawing.name}.png", drawing.png)
-            files.write_bytes(folder / "figures" / f"{drawing.name}.svg", drawing.svg)
+        for name, content in draw_figures(*one):
+            files.write_bytes(folder / "figures" / name, content)
 
 
 def _write_gifti(folder: Path, cohort: Cohort, analysis: Analysis) -> None:
