@@ -13,7 +13,7 @@ from hipsta_bids.errors import ExitCode, UsageError
 from hipsta_bids.group.settings import CORRECTIONS
 
 if TYPE_CHECKING:
-    from hipsta_bids.group.read import GroupOptions
+    from hipsta_bids.group.run import GroupOptions
     from hipsta_bids.group.settings import GroupSettings
 
 
@@ -367,7 +367,7 @@ def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOpti
     from hipsta_bids.group.collect import GroupRequest, QualityCondition  # noqa: PLC0415  (heavy)
     from hipsta_bids.group.comparison import Comparison  # noqa: PLC0415  (heavy)
     from hipsta_bids.group.model import ModelRequest  # noqa: PLC0415  (heavy)
-    from hipsta_bids.group.read import GroupOptions  # noqa: PLC0415  (heavy)
+    from hipsta_bids.group.run import GroupOptions  # noqa: PLC0415  (heavy)
 
     condition = None if parsed.exclude_qc is None else QualityCondition(parsed.exclude_qc)
     return GroupOptions(
