@@ -11,7 +11,7 @@ from hipsta_bids.cli.participant import Parser, named_pattern, rebuild_group_rep
 from hipsta_bids.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
-    from hipsta_bids.group.read import GroupOptions
+    from hipsta_bids.group.run import GroupOptions
     from hipsta_bids.group.settings import GroupSettings
 
 
@@ -363,7 +363,7 @@ def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOpti
     from hipsta_bids.group.collect import GroupRequest, QualityCondition  # noqa: PLC0415  (heavy)
     from hipsta_bids.group.comparison import Comparison  # noqa: PLC0415  (heavy)
     from hipsta_bids.group.model import ModelRequest  # noqa: PLC0415  (heavy)
-    from hipsta_bids.group.read import GroupOptions  # noqa: PLC0415  (heavy)
+    from hipsta_bids.group.run import GroupOptions  # noqa: PLC0415  (heavy)
 
     condition = None if parsed.exclude_qc is None else QualityCondition(parsed.exclude_qc)
     return GroupOptions(

@@ -1,6 +1,6 @@
 """The group level from sheets and covariates to results: a straight line of calls."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +19,7 @@ from hipsta_bids.group.data import PARTICIPANT, Cohort, Float, Measures, SideMap
 from hipsta_bids.group.design import Design, build_design
 from hipsta_bids.group.fit import FittedMaps, RowModel, fit_maps, longitudinal_model, with_mean
 from hipsta_bids.group.formula import ModelSpec
+from hipsta_bids.group.glm import PointTest
 from hipsta_bids.group.inference import Discoveries, MapKey, check_permutations, correct
 from hipsta_bids.group.model import Groups
 from hipsta_bids.group.normative import Scores, score_cohort
@@ -34,6 +35,9 @@ from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.summaries import MeasureFit, classify_groups, fit_summaries
 from hipsta_bids.group.template import Template
 from hipsta_bids.group.warps import warp_labels, warp_values
+
+#: Group of all, where there are no groups.
+ALL = "all"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -289,20 +293,22 @@ def _register_maps(side: SideMaps, warps: Float) -> SideMaps:
     )
 
 
-# Which rows belong to which group, and what they have in common.
-
-
-#: Group of all, where there are no groups.
-ALL = "all"
+def tested_maps(analysis: Analysis) -> Iterator[tuple[MapKey, PointTest, Discoveries]]:
+    """Tests of all maps, with what survives correction."""
+    for hemi, one in analysis.fitted.items():
+        for measure, fit in one.fits.items():
+            for test in fit.tests:
+                key = MapKey(measure, test.contrast.name, hemi)
+                yield key, test, analysis.found[key]
 
 
 def rows_of(analysis: Analysis, one: FittedMaps) -> pd.DataFrame:
-    """Rows of the model's table that the sheets used belong to."""
+    """Rows of the model's table of the sheets that were used."""
     return analysis.compared.table.iloc[one.maps.rows[one.used]]
 
 
 def members_of(analysis: Analysis, table: pd.DataFrame) -> Mapping[str, NDArray[np.bool_]]:
-    """Tell which rows belong to each group."""
+    """Tell which rows belong to each group; all to one where there are no groups."""
     if analysis.groups is None:
         return {ALL: np.ones(len(table), dtype=bool)}
     names = table[analysis.groups.column]

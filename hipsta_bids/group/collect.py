@@ -1,4 +1,4 @@
-"""Which hemispheres of the participant level enter the group level, and who is left out, why."""
+"""Which hemispheres of the participant level enter the group level, and which are left out, why."""
 
 import ast
 import difflib
@@ -7,31 +7,35 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-import pandas as pd
-import pyarrow as pa
-from pyarrow import csv
 
 from hipsta_bids.derivatives.hemisphere import ResultPlace
 from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName
 from hipsta_bids.derivatives.status import NOT_FINISHED, name_of, read_status
 from hipsta_bids.errors import InputError, NothingToDoError, UsageError
-from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.group.covariates import relocate
-from hipsta_bids.group.data import PARTICIPANT, SESSION, Float, Measures, SideMaps
 from hipsta_bids.io import files
 from hipsta_bids.protocols.toml import resolve, settings_hash
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Status
 
-# The user's table of participants to leave out.
-
-
-#: How many names a note lists.
+#: Number of names that a note lists.
 _SHOWN = 4
+_ALLOWED = "may hold comparisons, and, or, not, + - * / only"
+_OPERATORS: Mapping[type[ast.AST], Callable[[Any, Any], Any]] = {
+    ast.Lt: operator.lt,
+    ast.LtE: operator.le,
+    ast.Gt: operator.gt,
+    ast.GtE: operator.ge,
+    ast.Eq: operator.eq,
+    ast.NotEq: operator.ne,
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+}
 
 
 def read_exclusions(path: Path | None) -> list[dict[str, str]]:
@@ -50,18 +54,18 @@ def read_exclusions(path: Path | None) -> list[dict[str, str]]:
 def lost_exclusions(
     path: Path | None, rows: Sequence[Mapping[str, str]], found: Sequence[HemisphereName]
 ) -> tuple[str, ...]:
-    """Say which rows of the user's table are about nobody here: labels may be misspelled."""
+    """Note rows of the user's table that match no hemisphere: labels may be misspelled."""
     if path is None:
         return ()
     if not rows:
-        return (f"{path}: lists nobody to exclude",)
+        return (f"{path}: has no rows; nothing is excluded",)
     lost = [
         row["participant_id"] for row in rows if not any(is_listed(name, row) for name in found)
     ]
     if not lost:
         return ()
     more = f" and {len(lost) - _SHOWN} more" if len(lost) > _SHOWN else ""
-    return (f"{path}: not here, or not so, are {', '.join(lost[:_SHOWN])}{more}",)
+    return (f"{path}: matches no hemisphere here: {', '.join(lost[:_SHOWN])}{more}",)
 
 
 def is_listed(name: HemisphereName, row: Mapping[str, str]) -> bool:
@@ -74,27 +78,8 @@ def is_listed(name: HemisphereName, row: Mapping[str, str]) -> bool:
     return True
 
 
-# Conditions on quality metrics, such as ``filled_fraction > 0.01 or voxels_across < 3``.
-
-
-_COMPARISONS: Mapping[type[ast.cmpop], Callable[[Any, Any], bool]] = {
-    ast.Lt: operator.lt,
-    ast.LtE: operator.le,
-    ast.Gt: operator.gt,
-    ast.GtE: operator.ge,
-    ast.Eq: operator.eq,
-    ast.NotEq: operator.ne,
-}
-_ARITHMETIC: Mapping[type[ast.operator], Callable[[Any, Any], Any]] = {
-    ast.Add: operator.add,
-    ast.Sub: operator.sub,
-    ast.Mult: operator.mul,
-    ast.Div: operator.truediv,
-}
-
-
 class QualityCondition:
-    """A condition under which a hemisphere is left out."""
+    """A condition on quality metrics, such as ``filled_fraction > 0.01 or voxels_across < 3``."""
 
     def __init__(self, text: str) -> None:
         self.text = text
@@ -104,41 +89,42 @@ class QualityCondition:
             raise self._refusal("cannot be read; write it as filled_fraction > 0.01") from error
 
     def holds(self, metrics: Mapping[str, Any]) -> bool:
-        """Evaluate the condition."""
+        """Evaluate the condition; comparisons with missing metrics do not hold."""
         return bool(self._value(self._tree, metrics))
 
     def _value(self, node: ast.expr, metrics: Mapping[str, Any]) -> Any:  # noqa: ANN401 -- of the metric
-        if isinstance(node, ast.Constant):
-            return node.value
-        if isinstance(node, ast.Name):
-            return self._metric(node.id, metrics)
-        if isinstance(node, ast.Compare) and all(type(sign) in _COMPARISONS for sign in node.ops):
-            values = [self._value(part, metrics) for part in (node.left, *node.comparators)]
-            signs = [_COMPARISONS[type(sign)] for sign in node.ops]
-            return all(
-                None not in {a, b} and self._act(sign, a, b)
-                for sign, a, b in zip(signs, values, values[1:], strict=False)
-            )
-        return self._joined(node, metrics)
+        value: Any = None
+        match node:
+            case ast.Constant():
+                value = node.value
+            case ast.Name(id=name):
+                value = self._metric(name, metrics)
+            case ast.Compare():
+                values = [self._value(part, metrics) for part in (node.left, *node.comparators)]
+                pairs = zip(node.ops, pairwise(values), strict=True)
+                value = all(self._act(sign, a, b) for sign, (a, b) in pairs)
+            case ast.BoolOp(op=ast.And()):
+                value = all(self._value(part, metrics) for part in node.values)
+            case ast.BoolOp():
+                value = any(self._value(part, metrics) for part in node.values)
+            case ast.UnaryOp(op=ast.Not()):
+                value = not self._value(node.operand, metrics)
+            case ast.UnaryOp(op=ast.USub()):
+                value = self._act(ast.Sub(), 0, self._value(node.operand, metrics))
+            case ast.BinOp():
+                a, b = self._value(node.left, metrics), self._value(node.right, metrics)
+                value = self._act(node.op, a, b)
+            case _:
+                raise self._refusal(_ALLOWED)
+        return value
 
-    def _joined(self, node: ast.expr, metrics: Mapping[str, Any]) -> Any:  # noqa: ANN401 -- as above
-        if isinstance(node, ast.BoolOp):
-            both = isinstance(node.op, ast.And)
-            parts = (self._value(part, metrics) for part in node.values)  # noqa: PD011  (of a syntax tree)
-            return all(parts) if both else any(parts)
-        if isinstance(node, ast.UnaryOp) and isinstance(node.op, (ast.Not, ast.USub)):
-            value = self._value(node.operand, metrics)
-            if isinstance(node.op, ast.Not):
-                return not value
-            return None if value is None else self._act(operator.sub, 0, value)
-        if isinstance(node, ast.BinOp) and type(node.op) in _ARITHMETIC:
-            a, b = self._value(node.left, metrics), self._value(node.right, metrics)
-            return None if None in {a, b} else self._act(_ARITHMETIC[type(node.op)], a, b)
-        raise self._refusal("may hold comparisons, and, or, not, + - * / only")
-
-    def _act(self, act: Callable[[Any, Any], Any], a: Any, b: Any) -> Any:  # noqa: ANN401 -- as above
+    def _act(self, sign: ast.AST, a: Any, b: Any) -> Any:  # noqa: ANN401 -- as above
+        if type(sign) not in _OPERATORS:
+            raise self._refusal(_ALLOWED)
+        if a is None or b is None:
+            return None
         try:
-            return act(a, b)
+            return _OPERATORS[type(sign)](a, b)
         except (TypeError, ZeroDivisionError) as error:
             raise self._refusal(f"cannot combine {a!r} and {b!r}") from error
 
@@ -207,13 +193,13 @@ class Exclusion:
 class Collection:
     """What was found."""
 
-    records: tuple[SheetRecord, ...]
-    """Sorted by subject, session, hemisphere."""
-    exclusions: tuple[Exclusion, ...]
     settings: Mapping[str, Any]
     """Those of the participant level, resolved."""
     settings_hash: str
-    versions: tuple[str, ...]
+    records: tuple[SheetRecord, ...] = ()
+    """Sorted by subject, session, hemisphere."""
+    exclusions: tuple[Exclusion, ...] = ()
+    versions: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     """What to know, one line each."""
 
@@ -226,7 +212,7 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
     roots = [root for root in request.roots if root.is_dir() or not may_lack]
     found = [entry for root in roots for entry in _quality_files(root, request)]
     if may_lack and not found:
-        return _nothing()
+        return Collection(settings=resolve(Settings()), settings_hash=settings_hash(Settings()))
     seg = _one_protocol(found, request)
     found = [place for place in found if place.name.seg == seg]
     _refuse_twice(found)
@@ -254,16 +240,6 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
         settings_hash=digest,
         versions=tuple(sorted({record.version for record in kept})),
         notes=lost_exclusions(request.exclude_table, unwanted, [place.name for place in found]),
-    )
-
-
-def _nothing() -> Collection:
-    return Collection(
-        records=(),
-        exclusions=(),
-        settings=resolve(Settings()),
-        settings_hash=settings_hash(Settings()),
-        versions=(),
     )
 
 
@@ -428,262 +404,3 @@ def _settings_of(root: Path) -> Mapping[str, Any]:
             reason="bad-json",
         )
     return settings
-
-
-# What the names of measures stand for: maps of the sheet, sampled maps, or summary measures.
-
-
-#: What registration rests on.
-CURVATURE = "curvature"
-#: Maps that are analyzed unless others are asked for.
-DEFAULT = ("thickness", CURVATURE)
-#: Names of all maps in the sheet tables.
-SHEET_MAPS = tuple(row.name for row in MAPS)
-#: What begins the names of volumes that other programs give.
-VOLUME = "volume_"
-
-_MEASURES_SHOWN = 12
-
-
-def choose_measures(
-    wanted: Sequence[str], records: Sequence[SheetRecord], others: Sequence[str] = ()
-) -> Measures:
-    """Tell maps from summary measures."""
-    own = DEFAULT if records else ()
-    if not wanted:
-        return Measures(maps=(*own, *others))
-    summaries = _summary_names(records)
-    maps, numbers = [], []
-    for name in wanted:
-        if name in others or (records and name in SHEET_MAPS) or _is_sampled(name, records):
-            maps.append(name)
-        elif name in summaries or name.startswith(VOLUME):
-            numbers.append(name)
-        else:
-            known = [*(SHEET_MAPS if records else ()), *others, *_sampled(records), *summaries]
-            near = difflib.get_close_matches(name, known, n=1)
-            more = " ..." if len(known) > _MEASURES_SHOWN else ""
-            hint = (
-                f"did you mean {near[0]}?"
-                if near
-                else f"there are {', '.join(known[:_MEASURES_SHOWN])}{more}"
-            )
-            raise InputError(f"no measure is called {name!r}; {hint}", reason="unknown-measure")
-    return Measures(maps=tuple(maps), summaries=tuple(numbers) or None)
-
-
-def check_summaries(measures: Measures, sides: Mapping[str, SideMaps]) -> None:
-    """Refuse summary measures that no hemisphere has."""
-    known = sorted({str(name) for side in sides.values() for name in side.summary.columns})
-    for name in measures.summaries or ():
-        if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
-            hint = f"did you mean {near[0]}?" if near else "are its tables there?"
-            raise InputError(f"no measure is called {name!r}; {hint}", reason="unknown-measure")
-
-
-def sampled_desc(name: str) -> str:
-    """Name of the sampled map that a column belongs to: ``bold_3`` is the third of ``bold``."""
-    return name.partition("_")[0]
-
-
-def _is_sampled(name: str, records: Sequence[SheetRecord]) -> bool:
-    desc = sampled_desc(name)
-    return any(record.place.path("map_table", desc).is_file() for record in records)
-
-
-def _sampled(records: Sequence[SheetRecord]) -> list[str]:
-    """Names of maps that were sampled, as far as the first hemisphere has them."""
-    if not records:
-        return []
-    pattern = records[0].place.path("map_table", "*")
-    start, _, end = pattern.name.partition("*")
-    found = pattern.parent.glob(pattern.name)
-    return sorted(path.name.removeprefix(start).removesuffix(end) for path in found)
-
-
-def _summary_names(records: Sequence[SheetRecord]) -> tuple[str, ...]:
-    if not records:
-        return ()
-    rows: Sequence[Mapping[str, str]] = files.read_tsv(records[0].place.path("summary"))
-    return tuple(rows[0]) if rows else ()
-
-
-# Reads the participant level's tables of many hemispheres into arrays.
-
-
-#: Unit of sampled maps, whose own unit nobody told.
-ARBITRARY = "arbitrary"
-
-
-Visit = tuple[str, str | None]
-"""Subject and session, without prefixes."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Measured:
-    """Sheets and summaries, before covariates are known."""
-
-    visits: pd.DataFrame
-    """Participant and session, one row per visit; the index names it."""
-    sides: Mapping[str, SideMaps]
-    x: Float
-    y: Float
-    units: Mapping[str, str]
-    sources: Mapping[str, tuple[str, Path]]
-    """Address of one segmentation, and dataset that it is said in, of visits with sheets."""
-
-
-def read_sheets(
-    records: Sequence[SheetRecord],
-    settings: Mapping[str, Any],
-    maps: Sequence[str],
-    visits: Sequence[Visit] | None = None,
-) -> Measured:
-    """Read all sheets and summaries."""
-    grid = settings["sheet"]
-    shape = (int(grid["x_nodes"]), int(grid["y_nodes"]))
-    visits = visits_of(records) if visits is None else visits
-    row_of = {visit: row for row, visit in enumerate(visits)}
-    names = tuple(dict.fromkeys((*maps, CURVATURE)))
-    sides = {}
-    for hemi in "LR":
-        own = [record for record in records if record.place.name.hemi == hemi]
-        rows = [row_of[r.place.name.subject, r.place.name.session] for r in own]
-        if own:
-            sides[hemi] = _read_side(own, np.array(rows, dtype=np.int64), shape, names)
-    return Measured(
-        visits=_visit_table(visits),
-        sides=sides,
-        x=_coordinates(grid["x_extent"], shape[0]),
-        y=_coordinates(grid["y_extent"], shape[1]),
-        units=_units(records) | {n: ARBITRARY for n in names if n not in SHEET_MAPS},
-        sources={
-            visit_name(r.place.name.subject, r.place.name.session): (r.source, r.place.root)
-            for r in reversed(records)
-        },
-    )
-
-
-def visits_of(records: Sequence[SheetRecord]) -> list[Visit]:
-    """List subjects and sessions that have sheets, each once."""
-    return list(dict.fromkeys((r.place.name.subject, r.place.name.session) for r in records))
-
-
-def _coordinates(extent: float, nodes: int) -> Float:
-    """Coordinates of the nodes, without the rounding errors that would show in tables."""
-    return np.asarray(np.linspace(-extent, extent, nodes).round(10) + 0.0, dtype=np.float64)
-
-
-def visit_name(subject: str, session: str | None) -> str:
-    """Spell a visit as the covariates' rows are named; labels have no prefixes."""
-    return f"sub-{subject}_ses-{session}" if session else f"sub-{subject}"
-
-
-def _visit_table(visits: Sequence[Visit]) -> pd.DataFrame:
-    names = [f"sub-{subject}" for subject, _ in visits]
-    sessions = [None if session is None else f"ses-{session}" for _, session in visits]
-    index = [visit_name(*visit) for visit in visits]
-    return pd.DataFrame(
-        {PARTICIPANT: names, SESSION: pd.array(sessions, dtype=object)}, index=index
-    )
-
-
-def _read_side(
-    records: Sequence[SheetRecord],
-    rows: np.ndarray[Any, Any],
-    shape: tuple[int, int],
-    names: Sequence[str],
-) -> SideMaps:
-    maps = {name: np.full((len(records), *shape), np.nan) for name in names}
-    measured = [name for name in names if name in SHEET_MAPS]
-    sampled = [name for name in names if name not in SHEET_MAPS]
-    subfield = np.empty((len(records), *shape), dtype=np.int8)
-    codes: dict[str, int] = {}
-    summaries = []
-    for i, record in enumerate(records):
-        table = _read_columns(record.place.path("sheet"), shape, measured, ["subfield"])
-        for name in measured:
-            maps[name][i] = table.column(name).to_numpy().reshape(shape)
-        for name in sampled:
-            path = record.place.path("map_table", sampled_desc(name))
-            if path.is_file():
-                column = _read_columns(path, shape, [name]).column(name)
-                maps[name][i] = column.to_numpy().reshape(shape)
-        subfield[i] = _encode(table.column("subfield"), codes).reshape(shape)
-        summaries.append(_read_summary(record.place.path("summary")))
-    summary = pd.DataFrame(summaries).astype(np.float64)
-    return SideMaps(rows=rows, maps=maps, subfield=subfield, names=tuple(codes), summary=summary)
-
-
-def _read_columns(
-    path: Path, shape: tuple[int, int], numbers: Sequence[str], words: Sequence[str] = ()
-) -> pa.Table:
-    try:
-        table = csv.read_csv(
-            path,
-            read_options=csv.ReadOptions(use_threads=False),
-            parse_options=csv.ParseOptions(delimiter="\t"),
-            convert_options=csv.ConvertOptions(
-                include_columns=["x", "y", *numbers, *words],
-                column_types={
-                    **dict.fromkeys(numbers, pa.float64()),
-                    **dict.fromkeys(words, pa.string()),
-                },
-                null_values=[files.MISSING],
-                strings_can_be_null=True,
-            ),
-        )
-    except (OSError, pa.ArrowInvalid, pa.ArrowKeyError, KeyError) as error:
-        first = str(error).partition("\n")[0]
-        raise InputError(
-            f"{path}: not readable as a sheet ({first}); run the participant level again with"
-            " --force",
-            reason="unreadable-table",
-        ) from error
-    x, y = (table.column(name).to_numpy() for name in "xy")
-    expected = np.divmod(np.arange(shape[0] * shape[1]), shape[1])
-    if len(x) != len(expected[0]) or any(
-        (given != wanted + 1).any() for given, wanted in zip((x, y), expected, strict=True)
-    ):
-        raise InputError(
-            f"{path}: not a sheet of {shape[0]} x {shape[1]} nodes, as the settings say; run the"
-            " participant level again with --force",
-            reason="mixed-grids",
-        )
-    return table
-
-
-def _encode(column: pa.ChunkedArray, codes: dict[str, int]) -> np.ndarray[Any, Any]:
-    """Numbers instead of names, new names at the end; -1 where missing."""
-    encoded = column.combine_chunks().dictionary_encode()
-    names = encoded.dictionary.to_pylist()
-    numbers = np.array([codes.setdefault(name, len(codes)) for name in names] + [-1])
-    places = encoded.indices.fill_null(len(names)).to_numpy()
-    return np.asarray(numbers[places], dtype=np.int8)
-
-
-def _read_summary(path: Path) -> dict[str, float]:
-    rows = files.read_tsv(path)
-    try:
-        (row,) = rows
-        return {
-            name: float("nan") if cell == files.MISSING else float(cell)
-            for name, cell in row.items()
-        }
-    except ValueError as error:
-        raise InputError(
-            f"{path}: not one row of numbers; run the participant level again with --force",
-            reason="bad-table",
-        ) from error
-
-
-def _units(records: Sequence[SheetRecord]) -> dict[str, str]:
-    """Units of maps and summary columns, from the sidecars of the first hemisphere."""
-    units = {}
-    paths = [r.place.path(key) for r in records[:1] for key in ("sheet_sidecar", "summary_sidecar")]
-    for path in paths:
-        for name, entry in files.read_json(path).items():
-            if isinstance(entry, Mapping) and "Units" in entry:
-                units[name] = str(entry["Units"])
-    return units

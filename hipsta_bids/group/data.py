@@ -1,4 +1,4 @@
-"""Values that pass between reading, analyzing and writing at the group level."""
+"""Values passed between reading, analyzing and writing at the group level."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +12,7 @@ from hipsta_bids.types import Mesh
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-#: Columns that tell visits apart, with the prefixes of BIDS.
+#: Columns that identify visits, with the prefixes of BIDS.
 PARTICIPANT, SESSION = "participant_id", "session_id"
 
 
@@ -31,17 +31,17 @@ class SideMaps:
     """Sheets of one hemisphere of all visits that have it."""
 
     rows: Int
-    """(sheets,) row of each in the cohort's table, rising."""
+    """(sheets,) row of each in the cohort's table, ascending."""
     maps: Mapping[str, Float]
     """(sheets, x, y) per measure; NaN is missing."""
     subfield: NDArray[np.int8]
-    """(sheets, x, y) place in ``names``; -1 is missing."""
+    """(sheets, x, y) index into ``names``; -1 is missing."""
     names: tuple[str, ...]
     """Abbreviations of subfields."""
     summary: pd.DataFrame
     """One row per sheet: the columns of the participant level's summaries, as numbers."""
     mesh: Mesh | None = None
-    """Where the points lie if it is not on the grid: x are its vertices then, and y is 1."""
+    """Surface of the points if they are not on the grid: x are its vertices then, and y is 1."""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -58,7 +58,7 @@ class SideMaps:
         return replace(self, summary=joined)
 
     def take(self, keep: NDArray[np.bool_]) -> "SideMaps":
-        """Keep some rows of the cohort's table, which are numbered anew."""
+        """Keep some rows of the cohort's table, which are renumbered."""
         own = keep[self.rows]
         return replace(
             self,
@@ -85,24 +85,9 @@ class Cohort:
     """Units of maps and summary columns."""
 
     def take(self, keep: NDArray[np.bool_]) -> "Cohort":
-        """Keep some visits.
-
-        Parameters
-        ----------
-        keep : ndarray of bool, shape (visits,)
-            Which.
-        """
+        """Keep some visits; ``keep`` has one value per visit."""
         return replace(
             self,
             table=self.table[keep],
             sides={hemi: side.take(keep) for hemi, side in self.sides.items()},
         )
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ResultTable:
-    """A table of results, to be written with a sidecar."""
-
-    name: str
-    """File name without its extension."""
-    rows: pd.DataFrame

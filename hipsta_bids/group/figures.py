@@ -1,20 +1,34 @@
-"""How well groups are told apart: receiver operating characteristics and calibration."""
+"""Figures: maps, profiles, warps, cross-sections, receiver operating characteristics, calibration.
+
+How values become colors is that of the page (``reports.group_maps``).
+"""
 
 import io
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from itertools import cycle
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from hipsta_bids.group.analysis import Analysis, mean_of_known, members_of, rows_of, spread_of_known
 from hipsta_bids.group.classify import ClassifierResult, PairComparison, roc_curve
-from hipsta_bids.group.comparison import BOTH
 from hipsta_bids.group.data import Cohort, Float, Int
 from hipsta_bids.group.fit import FittedMaps
 from hipsta_bids.group.glm import PointTest
 from hipsta_bids.group.inference import MapKey
 from hipsta_bids.group.shapes import AverageShape
+from hipsta_bids.reports.group_maps import (
+    CHANGE_COLORS,
+    EFFECT_COLORS,
+    EFFECT_NAMES,
+    MEAN_COLORS,
+    P_COLORS,
+    effect_reach,
+    mean_limits,
+    signed_logarithm,
+    significance_reach,
+)
+from hipsta_bids.reports.group_tables import BOTH, SIDES, display_name
 from hipsta_bids.reports.maps import new_figure
 from hipsta_bids.types import Mesh
 
@@ -23,37 +37,38 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# What the figures of the group level share.
-
-
-#: Colors of groups that people who cannot tell red from green can tell (Okabe and Ito 2008).
+#: Colors of groups, safe for color-blind readers (Okabe and Ito 2008).
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-#: Points; of titles, of axes, and of what stands inside.
+#: Font sizes in points: of titles, of axes, and inside.
 TITLE, LABEL, SMALL = 9, 7.5, 6.5
 _DOTS_PER_INCH = 150
+_MAP_PANEL, _SQUARE_PANEL = (2.6, 3.4), (3.1, 3.2)  # inches
+#: A surface is flat if it is thinner than this share of its length.
+_FLAT = 1e-3
+#: Positions of cross-sections along the long axis, as a fraction from posterior to anterior.
+_SECTIONS = {0.1: "posterior", 0.5: "middle", 0.9: "anterior"}
+_WIDTHS = (1.2, 0.7, 1.2)  # of the lines of interior, middle and exterior, points
+_STYLES = ("-", ":", "-")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Drawing:
-    """One figure, encoded."""
-
-    name: str
-    """File name without its extension."""
-    png: bytes
-    svg: bytes
+Scale = Mapping[str, Any]
+"""Color map and the values at its ends, as matplotlib's arguments."""
 
 
-def encode(name: str, figure: "Figure") -> Drawing:
-    """Encode a figure as a picture and as a drawing; the same results give the same bytes."""
+def scale_of(colors: str, low: float, high: float) -> Scale:
+    """Name the arguments of a color scale."""
+    return {"cmap": colors, "vmin": low, "vmax": high}
+
+
+def encode(name: str, figure: "Figure") -> Iterator[tuple[str, bytes]]:
+    """Encode a figure as PNG and SVG files; the same results give the same bytes."""
     from matplotlib import rc_context  # noqa: PLC0415  (optional, slow to load)
 
-    encoded = {}
     with rc_context({"svg.hashsalt": "hipsta_bids", "svg.fonttype": "none"}):
         for kind, metadata in (("png", {"Software": None}), ("svg", {"Date": None})):
             buffer = io.BytesIO()
             figure.savefig(buffer, format=kind, dpi=_DOTS_PER_INCH, metadata=metadata)
-            encoded[kind] = buffer.getvalue()
-    return Drawing(name=name, png=encoded["png"], svg=encoded["svg"])
+            yield f"{name}.{kind}", buffer.getvalue()
 
 
 def panels(n_rows: int, n_columns: int, size: tuple[float, float]) -> tuple["Figure", Any]:
@@ -62,25 +77,9 @@ def panels(n_rows: int, n_columns: int, size: tuple[float, float]) -> tuple["Fig
     return figure, figure.subplots(n_rows, n_columns, squeeze=False)
 
 
-def side_name(hemi: str) -> str:
-    """Spell a hemisphere out."""
-    return {"L": "left", "R": "right"}.get(hemi, "left minus right")
-
-
-def display_name(measure: str) -> str:
-    """Spell a measure with spaces."""
-    return measure.replace("_", " ")
-
-
 def shown(analysis: Analysis, measure: str) -> Mapping[str, FittedMaps]:
-    """Give hemispheres, or their difference, that have maps of a measure."""
+    """Fitted maps of the hemispheres, or of their difference, that have a measure."""
     return {hemi: one for hemi, one in analysis.fitted.items() if measure in one.fits}
-
-
-def repeat_colors() -> Iterator[str]:
-    """Colors of groups, again and again."""
-    while True:
-        yield from COLORS
 
 
 def mark_medial(axis: "Axes", cohort: Cohort) -> None:
@@ -91,16 +90,11 @@ def mark_medial(axis: "Axes", cohort: Cohort) -> None:
     right.set_horizontalalignment("right")
 
 
-_Place = Literal["lower right", "upper left"]
-_SQUARE_PANEL = (3.1, 3.2)  # inches
-_SIDES = {"L": "left", "R": "right"}
-
-
 def draw_roc(analysis: Analysis) -> "Figure":
     """Draw the curves of the first added measure."""
-    figure, axes = panels(*_shape(analysis), _SQUARE_PANEL)
-    for axis, pair in _pairs(analysis, axes):
-        for color, name, result in _models(analysis, pair):
+    figure, panels_of_pairs = _pair_panels(analysis)
+    for axis, measure, pair in panels_of_pairs:
+        for color, name, result in _models(measure, pair):
             area, validation = result.auc, result.cross_validation
             text = f"{name}: {area.area:.2f} ({area.low:.2f}-{area.high:.2f})"
             text += f"\nleft out: {validation.auc:.2f}"
@@ -113,9 +107,9 @@ def draw_roc(analysis: Analysis) -> "Figure":
 
 def draw_calibration(analysis: Analysis) -> "Figure":
     """Draw predicted chances, cross-validated, against what happened."""
-    figure, axes = panels(*_shape(analysis), _SQUARE_PANEL)
-    for axis, pair in _pairs(analysis, axes):
-        for color, name, result in _models(analysis, pair):
+    figure, panels_of_pairs = _pair_panels(analysis)
+    for axis, measure, pair in panels_of_pairs:
+        for color, name, result in _models(measure, pair):
             found = result.calibration
             text = f"{name}: {found.slope:.2f}, {found.brier:.2f}"
             axis.plot(found.predicted, found.observed, "o-", color=color, label=text, markersize=3)
@@ -124,54 +118,45 @@ def draw_calibration(analysis: Analysis) -> "Figure":
     return figure
 
 
-def _shape(analysis: Analysis) -> tuple[int, int]:
-    hemis, pairs = _names(analysis)
-    return len(pairs), len(hemis)
-
-
-def _names(analysis: Analysis) -> tuple[list[str], list[tuple[str, str]]]:
+def _pair_panels(
+    analysis: Analysis,
+) -> tuple["Figure", list[tuple["Axes", str, PairComparison]]]:
+    """Title a panel for each pair and hemisphere, with the measure that was added first."""
     hemis = list(dict.fromkeys(hemi for hemi, _, _ in analysis.pairs))
-    pairs = list(dict.fromkeys((pair.control, pair.case) for _, _, pair in analysis.pairs))
-    return hemis, pairs
-
-
-def _pairs(analysis: Analysis, axes: Any) -> Iterator[tuple["Axes", PairComparison]]:  # noqa: ANN401  (of matplotlib)
-    """Give the first added measure of each pair and hemisphere, with its panel."""
-    hemis, pairs = _names(analysis)
-    first: dict[tuple[str, str, str], PairComparison] = {}
-    for hemi, _, pair in analysis.pairs:
-        first.setdefault((hemi, pair.control, pair.case), pair)
-    for i, (control, case) in enumerate(pairs):
+    groups = list(dict.fromkeys((pair.control, pair.case) for _, _, pair in analysis.pairs))
+    figure, axes = panels(len(groups), len(hemis), _SQUARE_PANEL)
+    first: dict[tuple[str, str, str], tuple[str, PairComparison]] = {}
+    for hemi, measure, pair in analysis.pairs:
+        first.setdefault((pair.control, pair.case, hemi), (measure, pair))
+    titled = []
+    for i, (control, case) in enumerate(groups):
         for j, hemi in enumerate(hemis):
             axis = axes[i, j]
-            if (hemi, control, case) not in first:
+            if (control, case, hemi) not in first:
                 axis.set_axis_off()
                 continue
-            pair = first[hemi, control, case]
+            measure, pair = first[control, case, hemi]
             how = "\n(separated: Firth's method)" if pair.comparison.separated else ""
-            side = _SIDES.get(hemi, "both sides")
+            side = {"L": "left", "R": "right"}.get(hemi, "both sides")
             axis.set_title(f"{control} against {case}, {side}{how}", fontsize=TITLE)
             axis.plot([0, 1], [0, 1], color="0.6", linewidth=0.5)
-            yield axis, pair
+            titled.append((axis, measure, pair))
+    return figure, titled
 
 
-def _models(
-    analysis: Analysis, pair: PairComparison
-) -> Iterator[tuple[str, str, ClassifierResult]]:
-    added = next(measure for _, measure, other in analysis.pairs if other is pair)
+def _models(measure: str, pair: PairComparison) -> Iterator[tuple[str, str, ClassifierResult]]:
     yield COLORS[0], "base", pair.comparison.base
-    yield COLORS[1], f"with {display_name(added)}", pair.comparison.full
+    yield COLORS[1], f"with {display_name(measure)}", pair.comparison.full
 
 
-def _finish(axis: "Axes", labels: tuple[str, str], title: str, place: _Place) -> None:
+def _finish(
+    axis: "Axes", labels: tuple[str, str], title: str, corner: Literal["lower right", "upper left"]
+) -> None:
     axis.set_xlabel(labels[0], fontsize=LABEL)
     axis.set_ylabel(labels[1], fontsize=LABEL)
     axis.set_aspect("equal")
     axis.tick_params(labelsize=LABEL)
-    axis.legend(fontsize=SMALL, loc=place, title=title, title_fontsize=SMALL)
-
-
-# Curves along x by group: profiles before and after registration, and warps.
+    axis.legend(fontsize=SMALL, loc=corner, title=title, title_fontsize=SMALL)
 
 
 def draw_profiles(cohort: Cohort, analysis: Analysis) -> "Figure":
@@ -185,10 +170,10 @@ def draw_profiles(cohort: Cohort, analysis: Analysis) -> "Figure":
             for axis, (when, source) in zip(pair, sources.items(), strict=True):
                 values = mean_of_known(source.maps[measure], 2)
                 members = members_of(analysis, cohort.table.iloc[source.rows])
-                for color, (group, own) in zip(repeat_colors(), members.items(), strict=False):
+                for color, (group, own) in zip(cycle(COLORS), members.items(), strict=False):
                     _band(axis, cohort.x, values[own], group, color)
                 axis.set_title(
-                    f"{display_name(measure)}, {side_name(hemi)},\n{when} registration",
+                    f"{display_name(measure)}, {SIDES[hemi]},\n{when} registration",
                     fontsize=TITLE,
                 )
                 _finish_curve(
@@ -206,12 +191,12 @@ def draw_warps(cohort: Cohort, analysis: Analysis) -> "Figure":
         nodes = side.registration.warps.shape[1]
         moved = (side.registration.warps - np.linspace(0, 1, nodes)) * (nodes - 1)
         members = members_of(analysis, cohort.table.iloc[side.registered.rows])
-        for color, (group, own) in zip(repeat_colors(), members.items(), strict=False):
+        for color, (group, own) in zip(cycle(COLORS), members.items(), strict=False):
             axes[i, 0].plot(cohort.x, moved[own].T, color=color, alpha=0.4, linewidth=0.6)
             _band(axes[i, 1], cohort.x, moved[own], group, color)
         for axis, what in zip(axes[i], ("each participant", "means, 2 SE"), strict=True):
             axis.axhline(0, color="black", linewidth=0.5)
-            axis.set_title(f"warps, {side_name(hemi)}, {what}", fontsize=TITLE)
+            axis.set_title(f"warps, {SIDES[hemi]}, {what}", fontsize=TITLE)
             _finish_curve(axis, cohort, "shift to lateral [nodes]")
     axes[0, 1].legend(fontsize=LABEL)
     return figure
@@ -232,16 +217,7 @@ def _band(axis: "Axes", x: Float, values: Float, name: str, color: str) -> None:
     axis.fill_between(x, mean - 2 * error, mean + 2 * error, color=color, alpha=0.25, linewidth=0)
 
 
-# Maps on a triangle mesh, flat or folded.
-
-
-#: A surface is flat if it is thinner than this share of its length.
-_FLAT = 1e-3
-
-
-def draw_mesh(
-    axis: "Axes", mesh: Mesh, values: Float, colors: str, limits: tuple[float, float]
-) -> Any:  # noqa: ANN401  (what colorbars take)
+def draw_mesh(axis: "Axes", mesh: Mesh, values: Float, scale: Scale) -> Any:  # noqa: ANN401  (what colorbars take)
     """Draw one map, upright as sheets are.
 
     A flat surface is drawn in its own coordinates. HippUnfold's runs from anterior to posterior
@@ -266,9 +242,7 @@ def draw_mesh(
         plane[:, 1],
         some,
         facecolors=np.nan_to_num(flat[some].mean(axis=1)),
-        cmap=colors,
-        vmin=limits[0],
-        vmax=limits[1],
+        **scale,
         edgecolors="none",
         rasterized=True,
         visible=bool(known.any()),
@@ -285,45 +259,31 @@ def _laid_out(mesh: Mesh) -> tuple[Float, Int, tuple[str, str]]:
             return mesh.points[:, [1, 0]], mesh.triangles, (names[1], names[0])
         return mesh.points[:, :2], mesh.triangles, names
     axes = np.linalg.svd(centered, full_matrices=False)[2]
-    turned = centered @ axes.T
-    order = np.argsort(turned[mesh.triangles, 2].mean(axis=1))
-    return turned[:, [1, 0]], mesh.triangles[order], ("second axis", "longest axis")
-
-
-# Average cross-sections of the groups: interior wall, middle and exterior wall.
-
-
-#: Where along the long axis, as a fraction from posterior to anterior.
-_PLACES = (0.1, 0.5, 0.9)
-_WIDTHS = (1.2, 0.7, 1.2)  # of the lines of interior, middle and exterior, points
-_STYLES = ("-", ":", "-")
+    rotated = centered @ axes.T
+    order = np.argsort(rotated[mesh.triangles, 2].mean(axis=1))
+    return rotated[:, [1, 0]], mesh.triangles[order], ("second axis", "longest axis")
 
 
 def draw_sections(
     cohort: Cohort, analysis: Analysis, shapes: Mapping[str, AverageShape]
 ) -> "Figure":
     """Draw the groups' mean walls at three places along the long axis, superior up."""
-    figure, axes = panels(len(shapes), len(_PLACES), (3.2, 2.8))
+    figure, axes = panels(len(shapes), len(_SECTIONS), (3.2, 2.8))
     for i, (hemi, shape) in enumerate(shapes.items()):
-        for j, place in enumerate(_PLACES):
-            axis, node = axes[i, j], round(place * (len(cohort.y) - 1))
+        for j, (share, name) in enumerate(_SECTIONS.items()):
+            axis, node = axes[i, j], round(share * (len(cohort.y) - 1))
             plane = _plane(shape.mean[1], node, left=hemi == "L")
             center = np.nanmean(shape.mean[:, :, node], axis=(0, 1))
-            for color, (group, layers) in zip(
-                repeat_colors(), shape.by_group.items(), strict=False
-            ):
+            for color, (group, layers) in zip(cycle(COLORS), shape.by_group.items(), strict=False):
                 flat = (layers[:, :, node] - center) @ plane.T
                 for line, width, style in zip(flat, _WIDTHS, _STYLES, strict=True):
                     axis.plot(*line.T, color=color, linewidth=width, linestyle=style)
-                # One line more for the legend alone.
-                label = f"{group} (n = {shape.counts[group]})"
-                axis.plot([], [], color=color, label=label)
+                # Another line for the legend alone.
+                axis.plot([], [], color=color, label=f"{group} (n = {shape.counts[group]})")
             if hemi in analysis.fitted:
                 middle = (shape.mean[:, :, node] - center) @ plane.T
                 _mark_subfields(axis, middle, analysis.fitted[hemi], node)
-            axis.set_title(
-                f"{side_name(hemi)}, y = {cohort.y[node]:.2g} ({_where(place)})", fontsize=TITLE
-            )
+            axis.set_title(f"{SIDES[hemi]}, y = {cohort.y[node]:.2g} ({name})", fontsize=TITLE)
             axis.set_xlabel("to lateral [mm]", fontsize=LABEL)
             axis.set_ylabel("to superior [mm]", fontsize=LABEL)
             axis.set_aspect("equal", adjustable="datalim")
@@ -332,15 +292,8 @@ def draw_sections(
     return figure
 
 
-def _where(place: float) -> str:
-    return {0.5: "middle"}.get(place, "posterior" if place < 0.5 else "anterior")  # noqa: PLR2004 -- the middle
-
-
 def _plane(middle: Float, node: int, *, left: bool) -> Float:
-    """Two directions across the long axis: to lateral, and to superior.
-
-    ``middle`` Mean middle surface, RAS mm.
-    """
+    """Two directions across the long axis of a surface (RAS): to lateral, and to superior."""
     centers = np.nanmean(middle, axis=0)
     along = centers[min(node + 2, len(centers) - 1)] - centers[max(node - 2, 0)]
     along = along / np.linalg.norm(along)
@@ -361,46 +314,31 @@ def _mark_subfields(axis: "Axes", layers: Float, one: FittedMaps, node: int) -> 
     for number, name in enumerate(one.maps.names):
         nodes = np.flatnonzero(fields == number)
         if len(nodes):
-            place = nodes[len(nodes) // 2]
+            x, y = middle[nodes[len(nodes) // 2]]
             box = {"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 0.3}
-            x, y = middle[place]
             axis.text(x, y, name, fontsize=SMALL, ha="center", va="center", bbox=box)
-
-
-# Maps on the sheet: means of groups, effect sizes and significance.
-
-
-_PANEL = (2.6, 3.4)  # inches
-_SHARED = (2.0, 98.0)  # percentiles that the colors of means span
-_EFFECTS = 99.0  # percentile of sizes that the colors of effects span
-_SMALLEST_P = 1e-10
-_LEAST_REACH = 3.0  # powers of ten of p that colors span at least
 
 
 def draw_means(cohort: Cohort, analysis: Analysis, measure: str) -> "Figure":
     """Draw the mean map of each group."""
     groups = analysis.groups.levels if analysis.groups else ("all",)
     sides = shown(analysis, measure)
-    figure, axes = panels(len(sides), len(groups), _PANEL)
+    figure, axes = panels(len(sides), len(groups), _MAP_PANEL)
     means, counts = {}, {}
     for hemi, one in sides.items():
         for group, own in members_of(analysis, rows_of(analysis, one)).items():
             values = mean_of_known(one.values(measure)[own], 0)
             means[hemi, group] = values.reshape(one.maps.shape)
             counts[hemi, group] = int(own.sum())
-    low, high = np.nanpercentile(np.concatenate([m.ravel() for m in means.values()]), _SHARED)
-    colors = "viridis"
-    if analysis.comparison.pair or set(sides) == {BOTH}:  # differences, to either side of zero
-        high = max(abs(low), abs(high))
-        low, colors = -high, "PRGn"
+    centered = bool(analysis.comparison.pair) or set(sides) == {BOTH}
+    limits = mean_limits(list(means.values()), centered=centered)
+    scale = scale_of(CHANGE_COLORS if centered else MEAN_COLORS, *limits)
     images: list[Any] = []
     for i, (hemi, one) in enumerate(sides.items()):
         for j, group in enumerate(groups):
             axis = axes[i, j]
-            images.append(_draw(axis, (cohort, one), means[hemi, group], colors, (low, high)))
-            axis.set_title(
-                f"{group}, {side_name(hemi)} (n = {counts[hemi, group]})", fontsize=TITLE
-            )
+            images.append(_draw(axis, cohort, one, means[hemi, group], scale))
+            axis.set_title(f"{group}, {SIDES[hemi]} (n = {counts[hemi, group]})", fontsize=TITLE)
     change = " change of" if analysis.comparison.pair else ""
     unit = cohort.units.get(measure, "1")
     _bar(figure, images[0], axes, f"mean{change} {display_name(measure)} [{unit}]")
@@ -411,27 +349,26 @@ def draw_contrasts(cohort: Cohort, analysis: Analysis, measure: str) -> "Figure"
     """Draw effect sizes and corrected p-values, one row per contrast."""
     sides = shown(analysis, measure)
     tests = next(iter(sides.values())).fits[measure].tests
-    figure, axes = panels(len(tests), 2 * len(sides), _PANEL)
-    sizes = np.concatenate([_effect(t) for one in sides.values() for t in one.fits[measure].tests])
-    reach = max(float(np.nanpercentile(np.abs(sizes), _EFFECTS)), 1e-6)
-    signed = {
-        (hemi, i): _signed_logarithm(analysis, MapKey(measure, test.contrast.name, hemi), test)
-        for hemi, one in sides.items()
-        for i, test in enumerate(one.fits[measure].tests)
-    }
-    top = max(_LEAST_REACH, *(float(np.nanmax(np.abs(v), initial=0)) for v in signed.values()))
+    figure, axes = panels(len(tests), 2 * len(sides), _MAP_PANEL)
+    reach = effect_reach([_effect(t) for one in sides.values() for t in one.fits[measure].tests])
+    signed = {}
+    for hemi, one in sides.items():
+        for i, test in enumerate(one.fits[measure].tests):
+            found = analysis.found[MapKey(measure, test.contrast.name, hemi)]
+            signed[hemi, i] = signed_logarithm(found.adjusted, found.rejected, test.statistic)
+    top = significance_reach(list(signed.values()))
+    effect_scale, p_scale = scale_of(EFFECT_COLORS, -reach, reach), scale_of(P_COLORS, -top, top)
     images: list[Any] = []
     for j, (hemi, one) in enumerate(sides.items()):
         for i, test in enumerate(one.fits[measure].tests):
             left, right = axes[i, 2 * j], axes[i, 2 * j + 1]
             effect = _effect(test).reshape(one.maps.shape)
             p = signed[hemi, i].reshape(one.maps.shape)
-            images.append(_draw(left, (cohort, one), effect, "RdBu_r", (-reach, reach)))
-            images.append(_draw(right, (cohort, one), p, "PuOr_r", (-top, top)))
+            images.append(_draw(left, cohort, one, effect, effect_scale))
+            images.append(_draw(right, cohort, one, p, p_scale))
             for axis, what in ((left, "effect size"), (right, "significance")):
-                axis.set_title(f"{test.contrast.name}\n{side_name(hemi)}, {what}", fontsize=TITLE)
-    kinds = {"t": "Cohen's d", "F": "partial eta squared"}
-    label = ", ".join(kinds[kind] for kind in sorted({t.kind for t in tests}, reverse=True))
+                axis.set_title(f"{test.contrast.name}\n{SIDES[hemi]}, {what}", fontsize=TITLE)
+    label = ", ".join(EFFECT_NAMES[kind] for kind in sorted({t.kind for t in tests}, reverse=True))
     _bar(figure, images[1], axes, "-log10 of corrected p,\nwith the sign of the effect")
     _bar(figure, images[0], axes, label, extend="both")
     return figure
@@ -439,13 +376,6 @@ def draw_contrasts(cohort: Cohort, analysis: Analysis, measure: str) -> "Figure"
 
 def _effect(test: PointTest) -> Float:
     return test.cohen_d if test.kind == "t" else test.eta_squared
-
-
-def _signed_logarithm(analysis: Analysis, key: MapKey, test: PointTest) -> Float:
-    """Minus the logarithm of corrected p where it survives, with the sign of the statistic."""
-    found = analysis.found[key]
-    size = -np.log10(np.clip(found.adjusted, _SMALLEST_P, 1))
-    return np.where(found.rejected, size * np.sign(test.statistic), np.nan)
 
 
 def _bar(figure: "Figure", image: Any, axes: Any, label: str, extend: str = "neither") -> None:  # noqa: ANN401  (of matplotlib)
@@ -456,41 +386,23 @@ def _bar(figure: "Figure", image: Any, axes: Any, label: str, extend: str = "nei
 
 def _draw(
     axis: "Axes",
-    place: tuple[Cohort, FittedMaps],
+    cohort: Cohort,
+    one: FittedMaps,
     values: Float,
-    colors: str,
-    limits: tuple[float, float],
+    scale: Scale,
 ) -> Any:  # noqa: ANN401  (what colorbars take)
     """Draw one map on the sheet with its subfields, or on the surface that it lies on."""
-    cohort, one = place
     if one.maps.mesh is not None:
-        return draw_mesh(axis, one.maps.mesh, values, colors, limits)
-    image = _sheet(axis, cohort, values, colors, limits)
-    _borders(axis, cohort, one)
-    return image
-
-
-def _sheet(
-    axis: "Axes", cohort: Cohort, values: Float, colors: str, limits: tuple[float, float]
-) -> Any:  # noqa: ANN401  (what colorbars take)
-    """Draw one map: medial left, posterior below."""
-    image = axis.pcolormesh(
-        cohort.x,
-        cohort.y,
-        values.T,
-        cmap=colors,
-        vmin=limits[0],
-        vmax=limits[1],
-        shading="nearest",
-        rasterized=True,
-    )
+        return draw_mesh(axis, one.maps.mesh, values, scale)
+    x, y = cohort.x, cohort.y
+    image = axis.pcolormesh(x, y, values.T, **scale, shading="nearest", rasterized=True)
     axis.set_facecolor("0.92")
     mark_medial(axis, cohort)
-    ends = ["posterior", "anterior"]
-    axis.set_yticks([cohort.y[0], cohort.y[-1]], ends, fontsize=LABEL, rotation=90)
+    axis.set_yticks([y[0], y[-1]], ["posterior", "anterior"], fontsize=LABEL, rotation=90)
     lower, upper = axis.get_yticklabels()
     lower.set_verticalalignment("bottom")
     upper.set_verticalalignment("top")
+    _borders(axis, cohort, one)
     return image
 
 
@@ -504,10 +416,10 @@ def _borders(axis: "Axes", cohort: Cohort, one: FittedMaps) -> None:
     i, j = np.nonzero(fields[:, 1:] != fields[:, :-1])
     axis.hlines(y[j] + dy, x[i] - dx, x[i] + dx, colors="black", linewidth=0.8)
     for number, name in enumerate(one.maps.names):
-        places = np.nonzero(fields == number)
-        if len(places[0]):
+        nodes = np.nonzero(fields == number)[0]
+        if len(nodes):
             axis.text(
-                float(x[places[0]].mean()),
+                float(x[nodes].mean()),
                 float(y[0]) + 2 * dy,
                 name,
                 fontsize=SMALL,
@@ -516,27 +428,24 @@ def _borders(axis: "Axes", cohort: Cohort, one: FittedMaps) -> None:
             )
 
 
-# Which figures a model has.
-
-
 def draw_figures(
     cohort: Cohort, analysis: Analysis, shapes: Mapping[str, AverageShape]
-) -> Iterator[Drawing]:
-    """Draw all figures of one model."""
+) -> Iterator[tuple[str, bytes]]:
+    """Draw all figures of one model, as files."""
     for measure in dict.fromkeys(m for one in analysis.fitted.values() for m in one.fits):
-        yield encode(f"{measure}_means", draw_means(cohort, analysis, measure))
+        yield from encode(f"{measure}_means", draw_means(cohort, analysis, measure))
         if any(one.fits[measure].tests for one in analysis.fitted.values() if measure in one.fits):
-            yield encode(f"{measure}_contrasts", draw_contrasts(cohort, analysis, measure))
+            yield from encode(f"{measure}_contrasts", draw_contrasts(cohort, analysis, measure))
     if analysis.sides:
-        yield encode("profiles", draw_profiles(cohort, analysis))
+        yield from encode("profiles", draw_profiles(cohort, analysis))
     if (
         analysis.groups is not None
         and analysis.sides
         and all(side.registration.template is not None for side in analysis.sides.values())
     ):
-        yield encode("warps", draw_warps(cohort, analysis))
+        yield from encode("warps", draw_warps(cohort, analysis))
     if shapes:
-        yield encode("sections", draw_sections(cohort, analysis, shapes))
+        yield from encode("sections", draw_sections(cohort, analysis, shapes))
     if analysis.pairs:
-        yield encode("roc", draw_roc(analysis))
-        yield encode("calibration", draw_calibration(analysis))
+        yield from encode("roc", draw_roc(analysis))
+        yield from encode("calibration", draw_calibration(analysis))

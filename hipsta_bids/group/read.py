@@ -1,195 +1,261 @@
-"""All that the group level reads, joined into rows of a table and maps of these rows."""
+"""Reads the participant level's tables of many hemispheres into arrays, for chosen measures."""
 
+import difflib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+from pyarrow import csv
 
-from hipsta_bids.group.collect import (
-    Collection,
-    Exclusion,
-    GroupRequest,
-    Measured,
-    check_summaries,
-    choose_measures,
-    collect_sheets,
-    read_sheets,
-    visits_of,
-    wanted_by,
-)
-from hipsta_bids.group.comparison import Comparison, choose_visits
-from hipsta_bids.group.covariates import VisitTime, add_time, read_covariates, read_icv
-from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Measures
-from hipsta_bids.group.model import ModelRequest, wanted_measures
-from hipsta_bids.group.settings import GroupSettings
-from hipsta_bids.group.surfaces import (
-    ExternalCohorts,
-    MapPattern,
-    add_external,
-    find_all,
-    map_patterns,
-    taken_names,
-)
-from hipsta_bids.group.volumes import add_volumes, check_volumes
+from hipsta_bids.errors import InputError
+from hipsta_bids.geometry.catalog import MAPS
+from hipsta_bids.group.collect import SheetRecord
+from hipsta_bids.group.data import PARTICIPANT, SESSION, Float, Measures, SideMaps
 from hipsta_bids.io import files
+
+#: Map that registration rests on.
+CURVATURE = "curvature"
+#: Maps that are analyzed unless others are asked for.
+DEFAULT = ("thickness", CURVATURE)
+#: Names of all maps in the sheet tables.
+SHEET_MAPS = tuple(row.name for row in MAPS)
+#: Prefix of the names of volumes from other programs.
+VOLUME = "volume_"
+#: Unit of sampled maps whose own unit is not known.
+ARBITRARY = "arbitrary"
+#: Number of measures that a message lists.
+_SHOWN = 12
+
+Visit = tuple[str, str | None]
+"""Subject and session, without prefixes."""
+
+
+def choose_measures(
+    wanted: Sequence[str], records: Sequence[SheetRecord], others: Sequence[str] = ()
+) -> Measures:
+    """Tell maps from summary measures."""
+    if not wanted:
+        return Measures(maps=(*(DEFAULT if records else ()), *others))
+    summaries = _summary_names(records)
+    known = [*(SHEET_MAPS if records else ()), *others, *_sampled(records), *summaries]
+    maps, numbers = [], []
+    for name in wanted:
+        if name in others or (records and name in SHEET_MAPS) or _is_sampled(name, records):
+            maps.append(name)
+        elif name in summaries or name.startswith(VOLUME):
+            numbers.append(name)
+        else:
+            more = " ..." if len(known) > _SHOWN else ""
+            raise _unknown(name, known, f"there are {', '.join(known[:_SHOWN])}{more}")
+    return Measures(maps=tuple(maps), summaries=tuple(numbers) or None)
+
+
+def check_summaries(measures: Measures, sides: Mapping[str, SideMaps]) -> None:
+    """Refuse summary measures that no hemisphere has."""
+    known = sorted({str(name) for side in sides.values() for name in side.summary.columns})
+    for name in measures.summaries or ():
+        if name not in known:
+            raise _unknown(name, known, "are its tables there?")
+
+
+def _unknown(name: str, known: Sequence[str], hint: str) -> InputError:
+    if near := difflib.get_close_matches(name, known, n=1):
+        hint = f"did you mean {near[0]}?"
+    return InputError(f"no measure is called {name!r}; {hint}", reason="unknown-measure")
+
+
+def _is_sampled(name: str, records: Sequence[SheetRecord]) -> bool:
+    return any(_sampled_table(record, name).is_file() for record in records)
+
+
+def _sampled(records: Sequence[SheetRecord]) -> list[str]:
+    """Names of the sampled maps of the first hemisphere."""
+    if not records:
+        return []
+    pattern = records[0].place.path("map_table", "*")
+    start, _, end = pattern.name.partition("*")
+    found = pattern.parent.glob(pattern.name)
+    return sorted(path.name.removeprefix(start).removesuffix(end) for path in found)
+
+
+def _summary_names(records: Sequence[SheetRecord]) -> tuple[str, ...]:
+    if not records:
+        return ()
+    rows: Sequence[Mapping[str, str]] = files.read_tsv(records[0].place.path("summary"))
+    return tuple(rows[0]) if rows else ()
 
 
 @dataclass(frozen=True, kw_only=True)
-class GroupOptions:
-    """What the user asked for."""
+class Measured:
+    """Sheets and summaries, before covariates are known."""
 
-    bids_dir: Path
-    out_dir: Path
-    sheets: GroupRequest
-    model: ModelRequest
-    covariates: tuple[Path, ...] = ()
-    maps: tuple[tuple[str, str], ...] = ()
-    """Names and patterns of other programs' maps."""
-    surfaces: tuple[tuple[str | None, str], ...] = ()
-    """Patterns of the surfaces to draw these on, for one or for all."""
-    volumes: tuple[tuple[str, str], ...] = ()
-    """Names and patterns of other programs' tables of volumes."""
-    measures: tuple[str, ...] = ()
-    """What to fit the model to; empty for the default or the formula's left-hand side."""
-    template: Path | None = None
-    comparison: Comparison = field(default_factory=Comparison)
-    reports: bool = True
-    """Whether a page is made."""
-    command: tuple[str, ...] = ()
-    """The command line, for the record."""
+    visits: pd.DataFrame
+    """Participant and session, one row per visit; the index has the names of visits."""
+    sides: Mapping[str, SideMaps]
+    x: Float
+    y: Float
+    units: Mapping[str, str]
+    sources: Mapping[str, tuple[str, Path]]
+    """Address of one segmentation, and the dataset whose record has it, of visits with sheets."""
 
 
-#: Column that takes the intracranial volume estimated by the segmentation's program.
-_ICV = "icv"
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class GroupInputs:
-    """What the models are fitted to."""
-
-    found: Collection
-    """Hemispheres that were measured."""
-    cohort: Cohort
-    """Visits that are compared, with covariates and sheets."""
-    others: Mapping[str, Cohort]
-    """The same visits with other programs' maps, by the names of these."""
-    wanted: tuple[str, ...]
-    """Measures by the user's choice; empty is the default."""
-    measures: Measures
-    """Those of the sheets."""
-    icv: str | None
-    """Column of intracranial volume."""
-    time: VisitTime | None
-    exclusions: tuple[Exclusion, ...]
-    n_other_visits: int
-    """How many of the exclusions are sessions that are not compared."""
-    notes: tuple[str, ...]
-
-
-def read_inputs(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
-    """Find and read sheets, other maps, volumes and covariates."""
-    check_volumes(options.volumes)
-    found = collect_sheets(options.sheets, may_lack=bool(options.maps))
-    taken = taken_names(with_sheets=bool(found.records))
-    requests = map_patterns(options.maps, options.surfaces, taken)
-    wanted = wanted_measures(options.model, options.measures)
-    measures = choose_measures(wanted, found.records, [one.name for one in requests])
-    foreign = _read_maps(options, found, requests, measures)
-    measured, volume_notes = add_volumes(
-        foreign.measured, found.records, options.volumes, options.bids_dir
-    )
-    check_summaries(measures, measured.sides)
-    everybody = Cohort(
-        table=read_covariates(measured.visits, options.bids_dir, options.covariates),
-        sides=measured.sides,
-        x=measured.x,
-        y=measured.y,
-        units=measured.units,
-    )
-    cohort, reasons = choose_visits(everybody, options.comparison)
-    keep = everybody.table.index.isin(cohort.table.index)
-    cohort, icv = _with_icv(cohort, measured, settings)
-    cohort, time = _with_time(cohort, options.comparison, settings)
-    return GroupInputs(
-        found=found,
-        cohort=cohort,
-        others={
-            name: replace(other.take(keep), table=cohort.table)
-            for name, other in foreign.others.items()
+def read_sheets(
+    records: Sequence[SheetRecord],
+    settings: Mapping[str, Any],
+    maps: Sequence[str],
+    visits: Sequence[Visit] | None = None,
+) -> Measured:
+    """Read all sheets and summaries."""
+    grid = settings["sheet"]
+    shape = (int(grid["x_nodes"]), int(grid["y_nodes"]))
+    visits = visits_of(records) if visits is None else visits
+    row_of = {visit: row for row, visit in enumerate(visits)}
+    names = tuple(dict.fromkeys((*maps, CURVATURE)))
+    sides = {}
+    for hemi in "LR":
+        own = [record for record in records if record.place.name.hemi == hemi]
+        rows = [row_of[r.place.name.subject, r.place.name.session] for r in own]
+        if own:
+            sides[hemi] = _read_side(own, np.array(rows, dtype=np.int64), shape, names)
+    table = pd.DataFrame(
+        {
+            PARTICIPANT: [f"sub-{subject}" for subject, _ in visits],
+            SESSION: pd.array([s and f"ses-{s}" for _, s in visits], dtype=object),
         },
-        wanted=wanted,
-        measures=replace(
-            measures, maps=tuple(name for name in measures.maps if name not in foreign.others)
-        ),
-        icv=icv,
-        time=time,
-        exclusions=(*found.exclusions, *_other_visits(measured, reasons, options.comparison)),
-        n_other_visits=len(reasons),
-        notes=(*found.notes, *foreign.notes, *volume_notes),
+        index=[visit_name(*visit) for visit in visits],
+    )
+    return Measured(
+        visits=table,
+        sides=sides,
+        x=_coordinates(grid["x_extent"], shape[0]),
+        y=_coordinates(grid["y_extent"], shape[1]),
+        units=_units(records) | {n: ARBITRARY for n in names if n not in SHEET_MAPS},
+        sources={
+            visit_name(r.place.name.subject, r.place.name.session): (r.source, r.place.root)
+            for r in reversed(records)
+        },
     )
 
 
-def _read_maps(
-    options: GroupOptions,
-    found: Collection,
-    requests: Sequence[MapPattern],
-    measures: Measures,
-) -> ExternalCohorts:
-    """Read the maps that are asked for, of the sheets and of other programs."""
-    asked = [one for one in requests if one.name in measures.maps]
-    files_of, visits = find_all(
-        asked, options.bids_dir, visits_of(found.records), wanted_by(options.sheets)
-    )
-    names = {one.name for one in requests}
-    own = [name for name in measures.maps if name not in names]
-    measured = read_sheets(found.records, found.settings, own, visits)
-    return add_external(measured, files_of, visits)
+def visits_of(records: Sequence[SheetRecord]) -> list[Visit]:
+    """List subjects and sessions that have sheets, each once."""
+    return list(dict.fromkeys((r.place.name.subject, r.place.name.session) for r in records))
 
 
-def _other_visits(
-    measured: Measured, reasons: Mapping[str, str], comparison: Comparison
-) -> list[Exclusion]:
-    """List the sessions that are not compared."""
-    return [
-        Exclusion(
-            participant=row[PARTICIPANT],
-            session=row[SESSION],
-            hemi=files.MISSING,
-            reason="other-session" if comparison.pair else "later-session",
-            message=message,
+def _coordinates(extent: float, nodes: int) -> Float:
+    """Coordinates of the nodes, without the rounding errors that would show in tables."""
+    return np.asarray(np.linspace(-extent, extent, nodes).round(10) + 0.0, dtype=np.float64)
+
+
+def visit_name(subject: str, session: str | None) -> str:
+    """Name a visit as the covariates' rows; labels have no prefixes."""
+    return f"sub-{subject}_ses-{session}" if session else f"sub-{subject}"
+
+
+def _read_side(
+    records: Sequence[SheetRecord],
+    rows: np.ndarray[Any, Any],
+    shape: tuple[int, int],
+    names: Sequence[str],
+) -> SideMaps:
+    maps = {name: np.full((len(records), *shape), np.nan) for name in names}
+    measured = [name for name in names if name in SHEET_MAPS]
+    sampled = [name for name in names if name not in SHEET_MAPS]
+    subfield = np.empty((len(records), *shape), dtype=np.int8)
+    codes: dict[str, int] = {}
+    summaries = []
+    for i, record in enumerate(records):
+        table = _read_columns(record.place.path("sheet"), shape, measured, ["subfield"])
+        for name in measured:
+            maps[name][i] = table.column(name).to_numpy().reshape(shape)
+        for name in sampled:
+            path = _sampled_table(record, name)
+            if path.is_file():
+                column = _read_columns(path, shape, [name]).column(name)
+                maps[name][i] = column.to_numpy().reshape(shape)
+        subfield[i] = _encode(table.column("subfield"), codes).reshape(shape)
+        summaries.append(_read_summary(record.place.path("summary")))
+    summary = pd.DataFrame(summaries).astype(np.float64)
+    return SideMaps(rows=rows, maps=maps, subfield=subfield, names=tuple(codes), summary=summary)
+
+
+def _sampled_table(record: SheetRecord, name: str) -> Path:
+    """Table of the sampled map of a column: ``bold_3`` is the third of ``bold``."""
+    return record.place.path("map_table", name.partition("_")[0])
+
+
+def _read_columns(
+    path: Path, shape: tuple[int, int], numbers: Sequence[str], words: Sequence[str] = ()
+) -> pa.Table:
+    try:
+        table = csv.read_csv(
+            path,
+            read_options=csv.ReadOptions(use_threads=False),
+            parse_options=csv.ParseOptions(delimiter="\t"),
+            convert_options=csv.ConvertOptions(
+                include_columns=["x", "y", *numbers, *words],
+                column_types={
+                    **dict.fromkeys(numbers, pa.float64()),
+                    **dict.fromkeys(words, pa.string()),
+                },
+                null_values=[files.MISSING],
+                strings_can_be_null=True,
+            ),
         )
-        for visit, message in reasons.items()
-        for row in measured.visits.loc[[visit]].to_dict("records")
-    ]
+    except (OSError, pa.ArrowInvalid, pa.ArrowKeyError, KeyError) as error:
+        first = str(error).partition("\n")[0]
+        raise InputError(
+            f"{path}: not readable as a sheet ({first}); run the participant level again with"
+            " --force",
+            reason="unreadable-table",
+        ) from error
+    x, y = (table.column(name).to_numpy() for name in "xy")
+    expected = np.divmod(np.arange(shape[0] * shape[1]), shape[1])
+    if len(x) != len(expected[0]) or any(
+        (given != wanted + 1).any() for given, wanted in zip((x, y), expected, strict=True)
+    ):
+        raise InputError(
+            f"{path}: not a sheet of {shape[0]} x {shape[1]} nodes, as the settings say; run the"
+            " participant level again with --force",
+            reason="mixed-grids",
+        )
+    return table
 
 
-def _with_time(
-    cohort: Cohort, comparison: Comparison, settings: GroupSettings
-) -> tuple[Cohort, VisitTime | None]:
-    """Add the time of visits, if it is needed."""
-    if not comparison.longitudinal:
-        return cohort, None
-    visits = add_time(cohort.table, settings)
-    return replace(cohort, table=visits.table), visits
+def _encode(column: pa.ChunkedArray, codes: dict[str, int]) -> np.ndarray[Any, Any]:
+    """Replace names by numbers, new names at the end; -1 where missing."""
+    encoded = column.combine_chunks().dictionary_encode()
+    names = encoded.dictionary.to_pylist()
+    numbers = np.array([codes.setdefault(name, len(codes)) for name in names] + [-1])
+    indices = encoded.indices.fill_null(len(names)).to_numpy()
+    return np.asarray(numbers[indices], dtype=np.int8)
 
 
-def _with_icv(
-    cohort: Cohort, measured: Measured, settings: GroupSettings
-) -> tuple[Cohort, str | None]:
-    """Find the column of intracranial volume, or make one from what the programs estimated."""
-    by_name = {str(column).casefold(): str(column) for column in cohort.table.columns}
-    for name in settings.model.icv_columns:
-        if name in by_name:
-            return cohort, by_name[name]
-    known = {
-        name: measured.sources[name] for name in cohort.table.index if name in measured.sources
-    }
-    read = read_icv([source for source, _ in known.values()], [root for _, root in known.values()])
-    volumes = dict(zip(known, read, strict=True))
-    if all(volume is None for volume in read):
-        return cohort, None
-    column = [volumes.get(name) for name in cohort.table.index]
-    table = cohort.table.assign(**{_ICV: pd.array(column, dtype=np.float64)})
-    return replace(cohort, table=table), _ICV
+def _read_summary(path: Path) -> dict[str, float]:
+    rows = files.read_tsv(path)
+    try:
+        (row,) = rows
+        return {
+            name: float("nan") if cell == files.MISSING else float(cell)
+            for name, cell in row.items()
+        }
+    except ValueError as error:
+        raise InputError(
+            f"{path}: not one row of numbers; run the participant level again with --force",
+            reason="bad-table",
+        ) from error
+
+
+def _units(records: Sequence[SheetRecord]) -> dict[str, str]:
+    """Units of maps and summary columns, from the sidecars of the first hemisphere."""
+    units = {}
+    paths = [r.place.path(key) for r in records[:1] for key in ("sheet_sidecar", "summary_sidecar")]
+    for path in paths:
+        for name, entry in files.read_json(path).items():
+            if isinstance(entry, Mapping) and "Units" in entry:
+                units[name] = str(entry["Units"])
+    return units

@@ -1,9 +1,12 @@
 """The group level from files to files."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+import pandas as pd
 
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset
@@ -11,91 +14,96 @@ from hipsta_bids.derivatives.names import group_report
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group import write
 from hipsta_bids.group.analysis import Analysis, analyze_cohort, analyze_points
-from hipsta_bids.group.collect import Collection, Exclusion
-from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort
+from hipsta_bids.group.collect import (
+    Collection,
+    Exclusion,
+    GroupRequest,
+    collect_sheets,
+    wanted_by,
+)
+from hipsta_bids.group.comparison import Comparison, choose_visits
+from hipsta_bids.group.covariates import VisitTime, add_time, read_covariates, read_icv
+from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Measures
 from hipsta_bids.group.formula import parse_model
-from hipsta_bids.group.model import choose_references, folder_name, model_document
-from hipsta_bids.group.read import GroupOptions, read_inputs
+from hipsta_bids.group.model import (
+    ModelRequest,
+    choose_references,
+    folder_name,
+    model_document,
+    wanted_measures,
+)
+from hipsta_bids.group.read import (
+    Measured,
+    check_summaries,
+    choose_measures,
+    read_sheets,
+    visits_of,
+)
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.shapes import average_shapes, write_shapes
+from hipsta_bids.group.surfaces import (
+    ExternalCohorts,
+    MapPattern,
+    add_external,
+    find_all,
+    map_patterns,
+    taken_names,
+)
 from hipsta_bids.group.template import templates_from_json
+from hipsta_bids.group.volumes import add_volumes, check_volumes
 from hipsta_bids.group.write import draw, write_results
 from hipsta_bids.io import files
 from hipsta_bids.protocols.toml import resolve
 from hipsta_bids.reports.group import write_group_report
 
-# What the group level is asked for, what comes of it, and the record of both.
+#: Column that takes the intracranial volume estimated by the segmentation's program.
+_ICV = "icv"
 
 
-def notes_of(found: Collection, analysis: Analysis, *, n_other_visits: int) -> list[str]:
-    """Say what a reader of the results should know, one line each."""
-    notes = list(analysis.skipped)
-    if n_other_visits and analysis.comparison.pair is None:
-        notes.append(
-            f"{n_other_visits} later sessions are not in it; --longitudinal takes all, --paired two"
-        )
-    if flagged := sum(record.flagged for record in found.records):
-        notes.append(
-            f"{flagged} flagged hemispheres are in it; look at them, or use --exclude-flagged"
-        )
-    if len(found.versions) > 1:
-        notes.append(f"hemispheres were measured by several versions, {', '.join(found.versions)}")
-    if separated := sum(pair.comparison.separated for _, _, pair in analysis.pairs):
-        notes.append(
-            f"{separated} of {len(analysis.pairs)} comparisons of classifiers are separated, and"
-            " fitted by Firth's method"
-        )
-    for key, discoveries in analysis.found.items():
-        if discoveries.lenient:
-            notes.append(
-                f"{key.measure}, {key.contrast}, {key.hemi}: p up to {discoveries.cutoff:.3g}"
-                " survives, above the level; effects are widespread"
-            )
-    for hemi, side in analysis.sides.items():
-        if not side.registration.converged:
-            notes.append(f"hemisphere {hemi}: registration had not settled when it ended")
-        if side.registration.extreme.any():
-            notes.append(
-                f"hemisphere {hemi}: extreme warps: {int(side.registration.extreme.sum())}, see"
-                " warps.tsv"
-            )
-    return notes
+@dataclass(frozen=True, kw_only=True)
+class GroupOptions:
+    """What the user asked for."""
+
+    bids_dir: Path
+    out_dir: Path
+    sheets: GroupRequest
+    model: ModelRequest
+    covariates: tuple[Path, ...] = ()
+    maps: tuple[tuple[str, str], ...] = ()
+    """Names and patterns of other programs' maps."""
+    surfaces: tuple[tuple[str | None, str], ...] = ()
+    """Patterns of the surfaces to draw these on, for one or for all."""
+    volumes: tuple[tuple[str, str], ...] = ()
+    """Names and patterns of other programs' tables of volumes."""
+    measures: tuple[str, ...] = ()
+    """What to fit the model to; empty for the default or the formula's left-hand side."""
+    template: Path | None = None
+    comparison: Comparison = field(default_factory=Comparison)
+    reports: bool = True
+    """Whether a page is made."""
+    command: tuple[str, ...] = ()
+    """The command line, for the record."""
 
 
-def record_of(
-    options: GroupOptions,
-    found: Collection,
-    settings: GroupSettings,
-    analysis: Analysis,
-    notes: Sequence[str],
-) -> dict[str, Any]:
-    """Record what was run, with which settings and seeds, on what."""
-    return {
-        "command": list(options.command),
-        "version": __version__,
-        "inputs": {
-            "datasets": [str(root.resolve()) for root in options.sheets.roots],
-            "settings_hash": found.settings_hash,
-            "versions": found.versions,
-            "seg": found.records[0].place.name.seg if found.records else None,
-            "maps": dict(options.maps),
-            "volumes": dict(options.volumes),
-            "covariates": [str(path) for path in options.covariates],
-            "template": None if options.template is None else str(options.template),
-        },
-        "measures": {"maps": analysis.measured.maps, "summaries": analysis.measured.summaries},
-        "formula": analysis.model.formula,
-        "columns": analysis.design.columns,
-        "references": analysis.design.references,
-        "contrasts": {c.name: c.weights.tolist() for c in analysis.design.contrasts},
-        "comparison": asdict(analysis.comparison),
-        "groups": None if analysis.groups is None else asdict(analysis.groups),
-        "participants": analysis.n_participants,
-        "rows": len(analysis.design.rows),
-        "hemispheres": {hemi: len(one.used) for hemi, one in analysis.fitted.items()},
-        "notes": notes,
-        "settings": resolve(settings),
-    }
+@dataclass(frozen=True, eq=False, kw_only=True)
+class GroupInputs:
+    """What was read."""
+
+    found: Collection
+    """Hemispheres that were measured."""
+    cohort: Cohort
+    """Visits that are compared, with covariates and sheets."""
+    others: Mapping[str, Cohort]
+    """The same visits with other programs' maps, by the names of these."""
+    measures: Measures
+    """Measures of the sheets."""
+    icv: str | None
+    """Column of intracranial volume."""
+    time: VisitTime | None
+    exclusions: tuple[Exclusion, ...]
+    """Of hemispheres, and of sessions that are not compared."""
+    notes: tuple[str, ...]
+    """What to know, one line each."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,8 +143,8 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         If inputs, model or output folder do not allow it.
     """
     dataset.check_own_dataset(options.out_dir)
-    read = read_inputs(options, settings)
-    cohort = read.cohort
+    inputs = _read(options, settings)
+    cohort = inputs.cohort
     references, groups = choose_references(options.model, cohort.table, settings)
     document = model_document(
         options.model,
@@ -144,7 +152,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         groups,
         settings,
         comparison=options.comparison,
-        visits=read.time,
+        visits=inputs.time,
     )
     model = parse_model(document)
     templates = None
@@ -156,35 +164,35 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         model,
         groups,
         settings,
-        measures=read.measures,
+        measures=inputs.measures,
         references=references,
         comparison=options.comparison,
-        time=read.time.column if read.time else None,
-        icv=read.icv,
+        time=inputs.time.column if inputs.time else None,
+        icv=inputs.icv,
         templates=templates,
     )
     others = {
         name: (other, analyze_points(other, analysis, settings))
-        for name, other in read.others.items()
+        for name, other in inputs.others.items()
     }
     found = dict(analysis.found)
     for _, other in others.values():
         found |= other.found
     analysis = replace(analysis, found=found)
-    exclusions = [*read.exclusions, *_incomplete(analysis)]
-    name = options.model.name
-    name = name or folder_name(model.formula, read.wanted) + options.comparison.suffix
-    notes = [*read.notes, *notes_of(read.found, analysis, n_other_visits=read.n_other_visits)]
-    shapes = average_shapes(read.found.records, cohort, analysis, settings)
+    exclusions = [*inputs.exclusions, *_incomplete(analysis)]
+    wanted = wanted_measures(options.model, options.measures)
+    name = options.model.name or folder_name(model.formula, wanted) + options.comparison.suffix
+    notes = [*inputs.notes, *_notes(inputs, analysis)]
+    shapes = average_shapes(inputs.found.records, cohort, analysis, settings)
     _describe(options)
     with write.model_folder(options.out_dir, name) as folder:
         write_results(folder, cohort, analysis, settings, exclusions, others=others)
         files.write_json(folder / "model.json", document)
         write_shapes(folder, shapes)
-        if analysis.sides and read.found.records and not shapes:
+        if analysis.sides and inputs.found.records and not shapes:
             notes.append("no average surfaces: those of the participant level are missing")
         draw(folder, cohort, analysis, shapes, others=others)
-        record = record_of(options, read.found, settings, analysis, notes)
+        record = _record(options, inputs.found, settings, analysis, notes)
         files.write_json(folder / "analysis.json", record)
     page, problem = _report(options, name)
     return GroupResult(
@@ -195,6 +203,174 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         n_excluded=len(exclusions),
         notes=tuple(notes),
     )
+
+
+def _read(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
+    """Find and read sheets, other maps, volumes and covariates."""
+    check_volumes(options.volumes)
+    found = collect_sheets(options.sheets, may_lack=bool(options.maps))
+    taken = taken_names(with_sheets=bool(found.records))
+    requests = map_patterns(options.maps, options.surfaces, taken)
+    wanted = wanted_measures(options.model, options.measures)
+    measures = choose_measures(wanted, found.records, [one.name for one in requests])
+    external = _read_maps(options, found, requests, measures)
+    measured, volume_notes = add_volumes(
+        external.measured, found.records, options.volumes, options.bids_dir
+    )
+    check_summaries(measures, measured.sides)
+    everybody = Cohort(
+        table=read_covariates(measured.visits, options.bids_dir, options.covariates),
+        sides=measured.sides,
+        x=measured.x,
+        y=measured.y,
+        units=measured.units,
+    )
+    cohort, reasons = choose_visits(everybody, options.comparison)
+    keep = everybody.table.index.isin(cohort.table.index)
+    cohort, icv = _with_icv(cohort, measured, settings)
+    time = None
+    if options.comparison.longitudinal:
+        time = add_time(cohort.table, settings)
+        cohort = replace(cohort, table=time.table)
+    own = tuple(name for name in measures.maps if name not in external.others)
+    return GroupInputs(
+        found=found,
+        cohort=cohort,
+        others={
+            name: replace(other.take(keep), table=cohort.table)
+            for name, other in external.others.items()
+        },
+        measures=replace(measures, maps=own),
+        icv=icv,
+        time=time,
+        exclusions=(*found.exclusions, *_other_visits(measured, reasons, options.comparison)),
+        notes=(*found.notes, *external.notes, *volume_notes),
+    )
+
+
+def _read_maps(
+    options: GroupOptions,
+    found: Collection,
+    requests: Sequence[MapPattern],
+    measures: Measures,
+) -> ExternalCohorts:
+    """Read the maps that are asked for, of the sheets and of other programs."""
+    asked = [one for one in requests if one.name in measures.maps]
+    files_of, visits = find_all(
+        asked, options.bids_dir, visits_of(found.records), wanted_by(options.sheets)
+    )
+    names = {one.name for one in requests}
+    own = [name for name in measures.maps if name not in names]
+    measured = read_sheets(found.records, found.settings, own, visits)
+    return add_external(measured, files_of, visits)
+
+
+def _other_visits(
+    measured: Measured, reasons: Mapping[str, str], comparison: Comparison
+) -> list[Exclusion]:
+    """List the sessions that are not compared."""
+    return [
+        Exclusion(
+            participant=row[PARTICIPANT],
+            session=row[SESSION],
+            hemi=files.MISSING,
+            reason="other-session" if comparison.pair else "later-session",
+            message=message,
+        )
+        for visit, message in reasons.items()
+        for row in measured.visits.loc[[visit]].to_dict("records")
+    ]
+
+
+def _with_icv(
+    cohort: Cohort, measured: Measured, settings: GroupSettings
+) -> tuple[Cohort, str | None]:
+    """Find the column of intracranial volume, or make one from what the programs estimated."""
+    by_name = {str(column).casefold(): str(column) for column in cohort.table.columns}
+    for name in settings.model.icv_columns:
+        if name in by_name:
+            return cohort, by_name[name]
+    known = {
+        name: measured.sources[name] for name in cohort.table.index if name in measured.sources
+    }
+    read = read_icv([source for source, _ in known.values()], [root for _, root in known.values()])
+    volumes = dict(zip(known, read, strict=True))
+    if all(volume is None for volume in read):
+        return cohort, None
+    column = [volumes.get(name) for name in cohort.table.index]
+    table = cohort.table.assign(**{_ICV: pd.array(column, dtype=np.float64)})
+    return replace(cohort, table=table), _ICV
+
+
+def _notes(inputs: GroupInputs, analysis: Analysis) -> list[str]:
+    """List what a reader of the results should know, one line each."""
+    found, notes = inputs.found, list(analysis.skipped)
+    if later := sum(one.reason == "later-session" for one in inputs.exclusions):
+        notes.append(
+            f"{later} later sessions are not in it; --longitudinal takes all, --paired two"
+        )
+    if flagged := sum(record.flagged for record in found.records):
+        notes.append(
+            f"{flagged} flagged hemispheres are in it; look at them, or use --exclude-flagged"
+        )
+    if len(found.versions) > 1:
+        notes.append(f"hemispheres were measured by several versions, {', '.join(found.versions)}")
+    if separated := sum(pair.comparison.separated for _, _, pair in analysis.pairs):
+        notes.append(
+            f"{separated} of {len(analysis.pairs)} comparisons of classifiers are separated, and"
+            " fitted by Firth's method"
+        )
+    for key, discoveries in analysis.found.items():
+        if discoveries.lenient:
+            notes.append(
+                f"{key.measure}, {key.contrast}, {key.hemi}: p up to {discoveries.cutoff:.3g}"
+                " survives, above the level; effects are widespread"
+            )
+    for hemi, side in analysis.sides.items():
+        if not side.registration.converged:
+            notes.append(f"hemisphere {hemi}: registration had not settled when it ended")
+        if side.registration.extreme.any():
+            notes.append(
+                f"hemisphere {hemi}: extreme warps: {int(side.registration.extreme.sum())}, see"
+                " warps.tsv"
+            )
+    return notes
+
+
+def _record(
+    options: GroupOptions,
+    found: Collection,
+    settings: GroupSettings,
+    analysis: Analysis,
+    notes: Sequence[str],
+) -> dict[str, Any]:
+    """Record what was run, with which settings and seeds, on what."""
+    return {
+        "command": list(options.command),
+        "version": __version__,
+        "inputs": {
+            "datasets": [str(root.resolve()) for root in options.sheets.roots],
+            "settings_hash": found.settings_hash,
+            "versions": found.versions,
+            "seg": found.records[0].place.name.seg if found.records else None,
+            "maps": dict(options.maps),
+            "volumes": dict(options.volumes),
+            "covariates": [str(path) for path in options.covariates],
+            "template": None if options.template is None else str(options.template),
+        },
+        "measures": {"maps": analysis.measured.maps, "summaries": analysis.measured.summaries},
+        "formula": analysis.model.formula,
+        "columns": analysis.design.columns,
+        "references": analysis.design.references,
+        "contrasts": {c.name: c.weights.tolist() for c in analysis.design.contrasts},
+        "comparison": asdict(analysis.comparison),
+        "groups": None if analysis.groups is None else asdict(analysis.groups),
+        "participants": analysis.n_participants,
+        "rows": len(analysis.design.rows),
+        "hemispheres": {hemi: len(one.used) for hemi, one in analysis.fitted.items()},
+        "notes": notes,
+        "settings": resolve(settings),
+    }
 
 
 def _report(options: GroupOptions, name: str) -> tuple[Path | None, str | None]:

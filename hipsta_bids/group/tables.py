@@ -1,21 +1,30 @@
 """Results as tables, and the meaning of their columns."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
-from hipsta_bids.group.analysis import Analysis, mean_of_known, members_of, rows_of, spread_of_known
+from hipsta_bids.group.analysis import (
+    Analysis,
+    mean_of_known,
+    members_of,
+    rows_of,
+    spread_of_known,
+    tested_maps,
+)
 from hipsta_bids.group.classify import ClassifierResult, roc_curve
-from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float, ResultTable
-from hipsta_bids.group.glm import PointTest
-from hipsta_bids.group.inference import Discoveries, MapKey
+from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort
 from hipsta_bids.group.peaks import Frame, frame_of, peak_table
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.summaries import hemispheres, summary_values
 
-# The meaning of every column of the group level's tables.
-
+Named = tuple[str, pd.DataFrame]
+"""File name without extension, and table."""
+Columns = Mapping[str, Any]
+CurveOf = Callable[[ClassifierResult, NDArray[np.bool_]], Columns]
 
 #: Meaning of every column; the unit is that of the measure unless said.
 COLUMNS: Mapping[str, str] = {
@@ -112,53 +121,46 @@ COLUMNS: Mapping[str, str] = {
 }
 
 
-# What the figures show, as tables, so that pages and other programs can draw it anew.
-
-
-def figure_tables(cohort: Cohort, analysis: Analysis) -> Iterator[ResultTable]:
-    """Give the tables behind the figures of one model."""
+def result_tables(cohort: Cohort, analysis: Analysis, settings: GroupSettings) -> Iterator[Named]:
+    """Make all tables of one model."""
+    grouped = analysis.groups is not None
     if analysis.fitted:
-        yield ResultTable(name="means", rows=mean_table(cohort, analysis))
+        yield "peaks", _stacked(_peaks(cohort, analysis, settings))
+        yield "means", _stacked(_means(cohort, analysis))
+    if analysis.found:
+        yield "maps", _overview(analysis)
     if analysis.sides:
-        yield ResultTable(name="profiles", rows=_profiles(cohort, analysis))
+        yield "registration", _registration(analysis)
+        yield "warps", _stacked(_warps(cohort, analysis))
+        yield "profiles", _stacked(_profiles(cohort, analysis))
+        if grouped:
+            yield "shifts", _stacked(_shifts(analysis))
+    if analysis.measures:
+        yield "measures", _stacked(_measures(cohort, analysis))
+        if grouped:
+            yield "descriptives", _stacked(_descriptives(analysis))
+    if analysis.scores is not None and len(analysis.scores.table):
+        yield "wscores", analysis.scores.table
     if analysis.pairs:
-        yield ResultTable(name="roc", rows=_roc(analysis))
-        yield ResultTable(name="calibration", rows=_calibration(analysis))
+        yield "classification", _classification(analysis, settings)
+        yield "roc", _stacked(_curves(analysis, _roc))
+        yield "calibration", _stacked(_curves(analysis, _calibration))
+    yield from _statistics(cohort, analysis)
 
 
-def mean_table(cohort: Cohort, analysis: Analysis) -> pd.DataFrame:
-    """Means and standard deviations of groups at each point of the maps that were fitted."""
-    parts = []
-    for hemi, one in analysis.fitted.items():
-        frame = frame_of(cohort, one)
-        points = np.arange(frame.shape[0] * frame.shape[1])
-        place = {**frame.number(points), **frame.place(points)}
-        members = members_of(analysis, rows_of(analysis, one))
-        for measure in one.fits:
-            values = one.values(measure)
-            for group, own in members.items():
-                what = {
-                    "measure": measure,
-                    "unit": cohort.units.get(measure, "1"),
-                    "hemi": hemi,
-                    "group": group,
-                }
-                parts.append(
-                    pd.DataFrame(
-                        {
-                            **what,
-                            **place,
-                            "n": np.isfinite(values[own]).sum(axis=0),
-                            "mean": mean_of_known(values[own], 0),
-                            "sd": spread_of_known(values[own]),
-                        }
-                    )
-                )
-    return pd.concat(parts, ignore_index=True)
+def point_tables(
+    name: str, cohort: Cohort, analysis: Analysis, settings: GroupSettings
+) -> Iterator[Named]:
+    """Make the tables of maps that lie on a surface of their own."""
+    yield f"{name}_peaks", _stacked(_peaks(cohort, analysis, settings))
+    if analysis.scores is not None:
+        yield f"{name}_wscores", analysis.scores.table
+    yield f"{name}_means", _stacked(_means(cohort, analysis))
+    yield from _statistics(cohort, analysis)
 
 
 def design_table(analysis: Analysis) -> pd.DataFrame:
-    """Give the design matrix, a row per row of the model."""
+    """Return the design matrix with participants and sessions."""
     names = analysis.compared.table.iloc[analysis.design.rows][[PARTICIPANT, SESSION]]
     matrix = pd.DataFrame(
         analysis.design.matrix, columns=list(analysis.design.columns), index=names.index
@@ -166,111 +168,8 @@ def design_table(analysis: Analysis) -> pd.DataFrame:
     return pd.concat([names, matrix], axis=1)
 
 
-def _profiles(cohort: Cohort, analysis: Analysis) -> pd.DataFrame:
-    parts = []
-    for hemi, side in analysis.sides.items():
-        for registered, source in ((False, cohort.sides[hemi]), (True, side.registered)):
-            members = members_of(analysis, cohort.table.iloc[source.rows])
-            for measure, maps in source.maps.items():
-                values = mean_of_known(maps, 2)
-                for group, own in members.items():
-                    count = np.isfinite(values[own]).sum(axis=0)
-                    error = spread_of_known(values[own]) / np.sqrt(np.maximum(count, 1))
-                    parts.append(
-                        pd.DataFrame(
-                            {
-                                "measure": measure,
-                                "unit": cohort.units.get(measure, "1"),
-                                "hemi": hemi,
-                                "registered": registered,
-                                "group": group,
-                                "node_x": np.arange(len(cohort.x)) + 1,
-                                "n": count,
-                                "mean": mean_of_known(values[own], 0),
-                                "mean_se": error,
-                            }
-                        )
-                    )
-    return pd.concat(parts, ignore_index=True)
-
-
-def _curves(
-    analysis: Analysis, curves: Mapping[tuple[int, str], Mapping[str, Float]]
-) -> pd.DataFrame:
-    """Put curves, by number of the comparison and model, under each other."""
-    parts = []
-    for (i, classifier), columns in curves.items():
-        hemi, measure, pair = analysis.pairs[i]
-        what = {"hemi": hemi, "control": pair.control, "case": pair.case, "added": measure}
-        parts.append(pd.DataFrame({**what, "classifier": classifier, **columns}))
-    return pd.concat(parts, ignore_index=True)
-
-
-def _roc(analysis: Analysis) -> pd.DataFrame:
-    curves = {}
-    for i, (_, _, pair) in enumerate(analysis.pairs):
-        for classifier, result in (("base", pair.comparison.base), ("full", pair.comparison.full)):
-            wrong, right = roc_curve(result.score, pair.is_case)
-            curves[i, classifier] = {"false_positives": wrong, "true_positives": right}
-    return _curves(analysis, curves)
-
-
-def _calibration(analysis: Analysis) -> pd.DataFrame:
-    curves = {}
-    for i, (_, _, pair) in enumerate(analysis.pairs):
-        for classifier, result in (("base", pair.comparison.base), ("full", pair.comparison.full)):
-            found = result.calibration
-            curves[i, classifier] = {"predicted": found.predicted, "observed": found.observed}
-    return _curves(analysis, curves)
-
-
-def result_tables(
-    cohort: Cohort, analysis: Analysis, settings: GroupSettings
-) -> Iterator[ResultTable]:
-    """Give all tables of one model."""
-    if analysis.fitted:
-        yield ResultTable(name="peaks", rows=_peaks(cohort, analysis, settings))
-    if analysis.found:
-        yield ResultTable(name="maps", rows=_overview(analysis))
-    if analysis.sides:
-        yield ResultTable(name="registration", rows=_registration(analysis))
-        yield ResultTable(name="warps", rows=_warps(cohort, analysis))
-    if analysis.measures:
-        yield ResultTable(name="measures", rows=_measures(cohort, analysis))
-    if analysis.groups is not None and analysis.measures:
-        yield ResultTable(name="descriptives", rows=_descriptives(analysis))
-    if analysis.groups is not None and analysis.sides:
-        yield ResultTable(name="shifts", rows=_shifts(analysis))
-    if analysis.scores is not None and len(analysis.scores.table):
-        yield ResultTable(name="wscores", rows=analysis.scores.table)
-    if analysis.pairs:
-        yield ResultTable(name="classification", rows=_classification(analysis, settings))
-    yield from figure_tables(cohort, analysis)
-    yield from _statistics(cohort, analysis)
-
-
-def point_tables(
-    name: str, cohort: Cohort, analysis: Analysis, settings: GroupSettings
-) -> Iterator[ResultTable]:
-    """Give the tables of maps that lie on a surface of their own."""
-    yield ResultTable(name=f"{name}_peaks", rows=_peaks(cohort, analysis, settings))
-    if analysis.scores is not None:
-        yield ResultTable(name=f"{name}_wscores", rows=analysis.scores.table)
-    yield ResultTable(name=f"{name}_means", rows=mean_table(cohort, analysis))
-    yield from _statistics(cohort, analysis)
-
-
-def _statistics(cohort: Cohort, analysis: Analysis) -> Iterator[ResultTable]:
-    for hemi, one in analysis.fitted.items():
-        for measure, fit in one.fits.items():
-            for test in fit.tests:
-                found = analysis.found[MapKey(measure, test.contrast.name, hemi)]
-                rows = _map(frame_of(cohort, one), fit.n, test, found)
-                yield ResultTable(name=map_name(hemi, measure, test.contrast.name), rows=rows)
-
-
 def map_name(hemi: str, measure: str, contrast: str) -> str:
-    """Name of the files of one map of statistics, without suffix and extension."""
+    """Name the files of one map of statistics, without suffix and extension."""
     label = _label(contrast) or "contrast"
     # BIDS knows L and R only: what is made of both has no hemisphere in its name.
     side = f"hemi-{hemi}_" if hemi in {"L", "R"} else ""
@@ -278,33 +177,38 @@ def map_name(hemi: str, measure: str, contrast: str) -> str:
 
 
 def entity_label(measure: str) -> str:
-    """Spell a measure as the value of an entity: ``mean_x`` as ``meanX``."""
+    """Write a measure as the value of an entity: ``mean_x`` as ``meanX``."""
     return measure[:1] + _label(measure)[1:]
 
 
 def _label(text: str) -> str:
-    """Spell a name with letters and digits only, as entities want it."""
+    """Write a name with letters and digits only, as entities require."""
     words = "".join(c if c.isalnum() else " " for c in text).split()
     return "".join(word[:1].upper() + word[1:] for word in words)
 
 
-def _map(
-    frame: Frame,
-    n: np.ndarray,
-    test: PointTest,
-    found: Discoveries,
-) -> pd.DataFrame:
+def _stacked(blocks: Iterable[Columns]) -> pd.DataFrame:
+    """Put blocks of rows under each other; single values hold for all rows of a block."""
+    return pd.concat([pd.DataFrame(block) for block in blocks], ignore_index=True)
+
+
+def _points(frame: Frame) -> dict[str, np.ndarray]:
+    """Numbers and positions of all points, by column."""
     points = np.arange(frame.shape[0] * frame.shape[1])
-    single = test.kind == "t"
-    blank = np.full(len(points), np.nan)
-    return pd.DataFrame(
-        {
-            **frame.number(points),
-            **frame.place(points),
+    return {**frame.number(points), **frame.place(points)}
+
+
+def _statistics(cohort: Cohort, analysis: Analysis) -> Iterator[Named]:
+    for key, test, found in tested_maps(analysis):
+        one = analysis.fitted[key.hemi]
+        frame = frame_of(cohort, one)
+        single = test.kind == "t"
+        columns = {
+            **_points(frame),
             "subfield": frame.subfield.ravel(),
-            "n": n,
-            "estimate": test.estimate[0] if single else blank,
-            "se": test.se[0] if single else blank,
+            "n": one.fits[key.measure].n,
+            "estimate": test.estimate[0] if single else np.nan,
+            "se": test.se[0] if single else np.nan,
             "statistic": test.statistic,
             "df": test.df,
             "p": test.p,
@@ -317,21 +221,55 @@ def _map(
             "eta_squared_low": test.eta_squared_limits[0],
             "eta_squared_high": test.eta_squared_limits[1],
         }
-    )
+        yield map_name(key.hemi, key.measure, key.contrast), pd.DataFrame(columns)
 
 
-def _peaks(cohort: Cohort, analysis: Analysis, settings: GroupSettings) -> pd.DataFrame:
-    parts = []
+def _peaks(cohort: Cohort, analysis: Analysis, settings: GroupSettings) -> Iterator[Columns]:
+    for key, test, found in tested_maps(analysis):
+        frame = frame_of(cohort, analysis.fitted[key.hemi])
+        peaks = peak_table(test, found, frame, settings.multiplicity.neighbors)
+        yield {"measure": key.measure, "hemi": key.hemi, **peaks}
+
+
+def _means(cohort: Cohort, analysis: Analysis) -> Iterator[Columns]:
+    """Means and standard deviations of groups at each point of the maps that were fitted."""
     for hemi, one in analysis.fitted.items():
-        frame = frame_of(cohort, one)
-        for measure, fit in one.fits.items():
-            for test in fit.tests:
-                found = analysis.found[MapKey(measure, test.contrast.name, hemi)]
-                part = peak_table(test, found, frame, settings.multiplicity.neighbors)
-                part.insert(0, "hemi", hemi)
-                part.insert(0, "measure", measure)
-                parts.append(part)
-    return pd.concat(parts, ignore_index=True)
+        points = _points(frame_of(cohort, one))
+        members = members_of(analysis, rows_of(analysis, one))
+        for measure in one.fits:
+            values = one.values(measure)
+            for group, own in members.items():
+                yield {
+                    "measure": measure,
+                    "unit": cohort.units.get(measure, "1"),
+                    "hemi": hemi,
+                    "group": group,
+                    **points,
+                    "n": np.isfinite(values[own]).sum(axis=0),
+                    "mean": mean_of_known(values[own], 0),
+                    "sd": spread_of_known(values[own]),
+                }
+
+
+def _profiles(cohort: Cohort, analysis: Analysis) -> Iterator[Columns]:
+    for hemi, side in analysis.sides.items():
+        for registered, source in ((False, cohort.sides[hemi]), (True, side.registered)):
+            members = members_of(analysis, cohort.table.iloc[source.rows])
+            for measure, maps in source.maps.items():
+                values = mean_of_known(maps, 2)
+                for group, own in members.items():
+                    count = np.isfinite(values[own]).sum(axis=0)
+                    yield {
+                        "measure": measure,
+                        "unit": cohort.units.get(measure, "1"),
+                        "hemi": hemi,
+                        "registered": registered,
+                        "group": group,
+                        "node_x": np.arange(len(cohort.x)) + 1,
+                        "n": count,
+                        "mean": mean_of_known(values[own], 0),
+                        "mean_se": spread_of_known(values[own]) / np.sqrt(np.maximum(count, 1)),
+                    }
 
 
 def _overview(analysis: Analysis) -> pd.DataFrame:
@@ -353,63 +291,48 @@ def _overview(analysis: Analysis) -> pd.DataFrame:
     )
 
 
-def _measures(cohort: Cohort, analysis: Analysis) -> pd.DataFrame:
-    parts = []
+def _measures(cohort: Cohort, analysis: Analysis) -> Iterator[Columns]:
     for one in analysis.measures:
         for test in one.fit.tests:
             single = test.kind == "t"
             limits = test.cohen_d_limits if single else test.eta_squared_limits
-            blank = np.full(len(one.measures), np.nan)
-            parts.append(
-                pd.DataFrame(
-                    {
-                        "hemi": one.hemi,
-                        "measure": one.measures,
-                        "unit": [cohort.units.get(name, "1") for name in one.measures],
-                        "model": one.formula,
-                        "contrast": test.contrast.name,
-                        "test": test.kind,
-                        "n": one.fit.n,
-                        "estimate": test.estimate[0] if single else blank,
-                        "se": test.se[0] if single else blank,
-                        "statistic": test.statistic,
-                        "df": test.df,
-                        "p": test.p,
-                        "effect": "cohen_d" if single else "partial_eta_squared",
-                        "effect_size": test.cohen_d if single else test.eta_squared,
-                        "effect_low": limits[0],
-                        "effect_high": limits[1],
-                    }
-                )
-            )
-    return pd.concat(parts, ignore_index=True)
+            yield {
+                "hemi": one.hemi,
+                "measure": one.measures,
+                "unit": [cohort.units.get(name, "1") for name in one.measures],
+                "model": one.formula,
+                "contrast": test.contrast.name,
+                "test": test.kind,
+                "n": one.fit.n,
+                "estimate": test.estimate[0] if single else np.nan,
+                "se": test.se[0] if single else np.nan,
+                "statistic": test.statistic,
+                "df": test.df,
+                "p": test.p,
+                "effect": "cohen_d" if single else "partial_eta_squared",
+                "effect_size": test.cohen_d if single else test.eta_squared,
+                "effect_low": limits[0],
+                "effect_high": limits[1],
+            }
 
 
-def _descriptives(analysis: Analysis) -> pd.DataFrame:
-    groups, cohort = analysis.groups, analysis.compared
-    if groups is None:
-        return pd.DataFrame()
-    members = cohort.table[groups.column].iloc[analysis.design.rows]
-    parts = []
+def _descriptives(analysis: Analysis) -> Iterator[Columns]:
+    cohort = analysis.compared
+    members = members_of(analysis, cohort.table.iloc[analysis.design.rows])
     for hemi in hemispheres(cohort):
-        only = analysis.measured.summaries
-        values = summary_values(cohort, hemi, only).iloc[analysis.design.rows]
-        for level in groups.levels:
-            own = values[(members == level).to_numpy()]
-            parts.append(
-                pd.DataFrame(
-                    {
-                        "hemi": hemi,
-                        "group": level,
-                        "measure": own.columns,
-                        "unit": [cohort.units.get(str(name), "1") for name in own.columns],
-                        "n": own.notna().sum().to_numpy(),
-                        "mean": own.mean().to_numpy(),
-                        "sd": own.std().to_numpy(),
-                    }
-                )
-            )
-    return pd.concat(parts, ignore_index=True)
+        values = summary_values(cohort, hemi, analysis.measured.summaries)
+        values = values.iloc[analysis.design.rows]
+        for group, rows in members.items():
+            own = values[rows]
+            yield {
+                "hemi": hemi,
+                "group": group,
+                "measure": own.columns,
+                "unit": [cohort.units.get(str(name), "1") for name in own.columns],
+                "n": own.notna().sum().to_numpy(),
+                "mean": own.mean().to_numpy(),
+                "sd": own.std().to_numpy(),
+            }
 
 
 def _registration(analysis: Analysis) -> pd.DataFrame:
@@ -428,44 +351,49 @@ def _registration(analysis: Analysis) -> pd.DataFrame:
     )
 
 
-def _warps(cohort: Cohort, analysis: Analysis) -> pd.DataFrame:
-    parts = []
+def _warps(cohort: Cohort, analysis: Analysis) -> Iterator[Columns]:
     for hemi, side in analysis.sides.items():
         visits = cohort.table.iloc[side.registered.rows]
-        nodes = side.registration.warps.shape[1]
-        parts.append(
-            pd.DataFrame(
-                {
-                    "participant_id": visits["participant_id"].to_numpy(),
-                    "session_id": visits["session_id"].to_numpy(),
-                    "hemi": hemi,
-                    "displacement": side.registration.displacement,
-                    "extreme": side.registration.extreme,
-                    **{f"node_{i + 1}": side.registration.warps[:, i] for i in range(nodes)},
-                }
-            )
-        )
-    return pd.concat(parts, ignore_index=True)
+        warps = side.registration.warps
+        yield {
+            PARTICIPANT: visits[PARTICIPANT].to_numpy(),
+            SESSION: visits[SESSION].to_numpy(),
+            "hemi": hemi,
+            "displacement": side.registration.displacement,
+            "extreme": side.registration.extreme,
+            **{f"node_{i + 1}": warps[:, i] for i in range(warps.shape[1])},
+        }
 
 
-def _shifts(analysis: Analysis) -> pd.DataFrame:
-    return pd.concat(
-        [
-            pd.DataFrame(
-                {
-                    "hemi": hemi,
-                    "group": group,
-                    "node_x": np.arange(len(shift.mean)) + 1,
-                    "n": shift.n,
-                    "shift": shift.mean,
-                    "shift_se": shift.se,
-                }
-            )
-            for hemi, side in analysis.sides.items()
-            for group, shift in side.shifts.items()
-        ],
-        ignore_index=True,
-    )
+def _shifts(analysis: Analysis) -> Iterator[Columns]:
+    for hemi, side in analysis.sides.items():
+        for group, shift in side.shifts.items():
+            yield {
+                "hemi": hemi,
+                "group": group,
+                "node_x": np.arange(len(shift.mean)) + 1,
+                "n": shift.n,
+                "shift": shift.mean,
+                "shift_se": shift.se,
+            }
+
+
+def _curves(analysis: Analysis, curve: CurveOf) -> Iterator[Columns]:
+    """Curves of both models of each comparison."""
+    for hemi, measure, pair in analysis.pairs:
+        what = {"hemi": hemi, "control": pair.control, "case": pair.case, "added": measure}
+        for classifier, result in (("base", pair.comparison.base), ("full", pair.comparison.full)):
+            yield {**what, "classifier": classifier, **curve(result, pair.is_case)}
+
+
+def _roc(result: ClassifierResult, is_case: NDArray[np.bool_]) -> Columns:
+    wrong, right = roc_curve(result.score, is_case)
+    return {"false_positives": wrong, "true_positives": right}
+
+
+def _calibration(result: ClassifierResult, _: NDArray[np.bool_]) -> Columns:
+    found = result.calibration
+    return {"predicted": found.predicted, "observed": found.observed}
 
 
 def _classification(analysis: Analysis, settings: GroupSettings) -> pd.DataFrame:

@@ -14,8 +14,9 @@ import numpy as np
 import pandas as pd
 
 from hipsta_bids.errors import InputError, NothingToDoError, UsageError
-from hipsta_bids.group.collect import VOLUME, Measured, SheetRecord, visit_name
+from hipsta_bids.group.collect import SheetRecord
 from hipsta_bids.group.covariates import locate_sources
+from hipsta_bids.group.read import VOLUME, Measured, visit_name
 from hipsta_bids.inputs import ashs, freesurfer
 from hipsta_bids.inputs.maps import check_pattern, fields_of, scan
 from hipsta_bids.io import files

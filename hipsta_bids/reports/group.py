@@ -11,37 +11,37 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from hipsta_bids.derivatives.names import DATASET_FILES, group_report
 from hipsta_bids.errors import HipstaError
 from hipsta_bids.io import files
 from hipsta_bids.io.files import hide_home
-from hipsta_bids.reports.group_maps import classifiers, map_scenes, registration
+from hipsta_bids.reports.group_maps import embedded, map_scenes
 from hipsta_bids.reports.group_tables import (
     GroupResults,
+    classification,
     display_name,
     findings,
     number_text,
     participants,
     peaks,
     read_group,
+    registration,
     scores,
     summaries,
 )
-from hipsta_bids.reports.maps import colors_of, picture_of_file
+from hipsta_bids.reports.maps import colors_of
 from hipsta_bids.reports.page import Section, build_sections, render
 
-# The model of an analysis: in words, and as a picture of its design matrix.
-
-
 _LOGGER = logging.getLogger(__name__)
-_CELL = (24, 6)  # pixels of a cell, as wide and as high as a short table wants
-_TALLEST = 360  # pixels on the screen
+_PREFIX = "group"
+_ROW_HEIGHT, _LOWEST, _TALLEST = 6, 60, 360  # of the picture of a design matrix, CSS pixels
 _SHADES = 64
 
 
-def design(results: GroupResults) -> Mapping[str, Any] | None:
-    """Show the design matrix, its contrasts, and what was modeled."""
+def design(results: GroupResults) -> Mapping[str, Any]:
+    """Describe the model in words, by its contrasts, and as a picture of its design matrix."""
     record = results.record
     table = results.table("design")
     columns = [str(name) for name in record.get("columns") or ()]
@@ -62,12 +62,12 @@ def design(results: GroupResults) -> Mapping[str, Any] | None:
             }
             for name, weights in (record.get("contrasts") or {}).items()
         ],
-        "picture": _picture(table, columns) if len(table) else None,
+        "picture": _matrix_picture(table, columns) if len(table) else None,
     }
 
 
 def _what(comparison: Mapping[str, Any]) -> str:
-    """Say what a row of the model is."""
+    """Describe what a row of the model is."""
     if comparison.get("longitudinal"):
         return (
             "A row is a visit; a mixed model gives each participant an intercept, or a slope too."
@@ -78,7 +78,8 @@ def _what(comparison: Mapping[str, Any]) -> str:
     return "A row is a participant."
 
 
-def _picture(table: Any, columns: list[str]) -> dict[str, Any]:  # noqa: ANN401  (of pandas)
+def _matrix_picture(table: pd.DataFrame, columns: list[str]) -> dict[str, Any]:
+    """Draw the design matrix, each column from its smallest to its largest value."""
     from PIL import Image  # noqa: PLC0415  (slow to load)
 
     matrix = table[columns].to_numpy(dtype=np.float64)
@@ -96,7 +97,7 @@ def _picture(table: Any, columns: list[str]) -> dict[str, Any]:  # noqa: ANN401 
     ]
     return {
         "address": "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode(),
-        "height": int(min(_TALLEST, max(60, _CELL[1] * len(matrix)))),
+        "height": min(_TALLEST, max(_LOWEST, _ROW_HEIGHT * len(matrix))),
         "columns": list(zip(columns, ends, strict=True)),
         "rows": len(matrix),
         "colors": colors[::9].tolist(),
@@ -122,9 +123,6 @@ def origin(results: GroupResults) -> Mapping[str, Any]:
     }
 
 
-_PREFIX = "group"
-
-
 def group_page(folder: Path) -> str:
     """Make the page about one analysis from its files."""
     results = read_group(folder)
@@ -141,25 +139,44 @@ def group_page(folder: Path) -> str:
     )
 
 
-def _sections_of_groups(results: GroupResults) -> Mapping[str, Any] | None:
-    """Show the average cross-sections, and maps on other surfaces, as the figures have them."""
-    path = results.folder / "figures" / "sections.svg"
-    if not path.exists():
+def _classification(results: GroupResults) -> Mapping[str, Any] | None:
+    """List how well groups are told apart, with the curves of the first added measures."""
+    rows = classification(results)
+    if not rows:
         return None
-    alt = "Average cross-sections of the groups, from posterior to anterior"
-    return {"picture": picture_of_file(path, alt=alt, caption="Average cross-sections")}
+    first: dict[tuple[str, str], dict[str, Any]] = {}
+    for row in rows:
+        first.setdefault((row["pair"], row["side"]), row)
+    areas = "; ".join(
+        f"{row['pair']}, {row['side']}: {row['base']} {row['areas'][0]},"
+        f" with {row['added']} {row['areas'][1]}"
+        for row in first.values()
+    )
+    roc, calibration = "Receiver operating characteristics", "Calibration"
+    alt = f"{roc}; areas under the curve: {areas}"
+    pictures = embedded(results, "roc", roc, alt)
+    pictures += embedded(
+        results, "calibration", calibration, "Share of cases against cross-validated chance"
+    )
+    return {"rows": rows, "pictures": pictures}
 
 
-def _maps(results: GroupResults) -> Mapping[str, Any] | None:
-    values = map_scenes(results)
+def _registration(results: GroupResults) -> Mapping[str, Any] | None:
+    """Describe what registration has done, with the profiles before and after it, and warps."""
+    values = registration(results)
     if values is None:
         return None
-    figures = results.folder / "figures"
-    pictures = [
-        picture_of_file(figures / f"{one['name']}.svg", alt=one["title"], caption=one["title"])
-        for one in values["pictures"]
-    ]
-    return {**values, "pictures": pictures}
+    profiles = "Means of groups from medial to lateral, before and after registration"
+    warps = "How far sheets were moved to lateral: each sheet, and means of groups"
+    pictures = embedded(results, "profiles", "Profiles before and after", profiles)
+    return {**values, "pictures": pictures + embedded(results, "warps", "Warps", warps)}
+
+
+def _sections_of_groups(results: GroupResults) -> Mapping[str, Any] | None:
+    """Show the average cross-sections of the groups."""
+    alt = "Average cross-sections of the groups, from posterior to anterior"
+    pictures = embedded(results, "sections", "Average cross-sections", alt)
+    return {"picture": pictures[0]} if pictures else None
 
 
 def _methods(results: GroupResults) -> Mapping[str, Any] | None:
@@ -171,7 +188,7 @@ def _methods(results: GroupResults) -> Mapping[str, Any] | None:
 
 
 def _blocks(text: str) -> list[dict[str, Any]]:
-    """Part the markdown of ``methods.md``: headings, lists and paragraphs; code is marked."""
+    """Split the markdown of ``methods.md`` into headings, lists and paragraphs."""
     blocks = []
     for part in re.split(r"\n\s*\n", text.strip()):
         lines = part.splitlines()
@@ -187,14 +204,14 @@ def _blocks(text: str) -> list[dict[str, Any]]:
 
 
 def _runs(text: str) -> list[tuple[bool, str]]:
-    """Part a text into runs, and tell which are code."""
+    """Split a text into runs, and tell which are code."""
     return [(i % 2 == 1, run) for i, run in enumerate(text.split("`")) if run]
 
 
-#: From top to bottom.
+#: Sections of the page, from top to bottom.
 SECTIONS: tuple[Section[GroupResults], ...] = (
     Section(key="found", title="What was found", template="group/found.html", build=findings),
-    Section(key="maps", title="Maps", template="group/maps.html", build=_maps),
+    Section(key="maps", title="Maps", template="group/maps.html", build=map_scenes),
     Section(key="peaks", title="Clusters and peaks", template="group/peaks.html", build=peaks),
     Section(
         key="summaries", title="Summary measures", template="group/summaries.html", build=summaries
@@ -203,7 +220,7 @@ SECTIONS: tuple[Section[GroupResults], ...] = (
         key="classification",
         title="Classification",
         template="group/classification.html",
-        build=classifiers,
+        build=_classification,
     ),
     Section(key="scores", title="w-scores", template="group/scores.html", build=scores),
     Section(key="people", title="Participants", template="group/people.html", build=participants),
@@ -212,7 +229,7 @@ SECTIONS: tuple[Section[GroupResults], ...] = (
         key="registration",
         title="Registration",
         template="group/registration.html",
-        build=registration,
+        build=_registration,
     ),
     Section(
         key="sections",

@@ -1,8 +1,8 @@
-"""Tables of a group page: participants, model, summary measures, classification, w-scores."""
+"""What a group page says: findings in sentences, and tables of all else that an analysis left."""
 
 import csv
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,15 +12,19 @@ import pandas as pd
 
 from hipsta_bids.io import files
 
-# Reads the files of one analysis of the group level.
-
-
-#: Sides as they stand in tables; of maps and of summary measures, both mean different things.
+#: Names of the sides in tables of maps; in those of summary measures LR may be a mean.
 SIDES = {"L": "left", "R": "right", "LR": "left minus right"}
 BOTH = "LR"
 
 MINUS = "\N{MINUS SIGN}"
 
+_THIRD = 1 / 3
+_ALPHA = 0.05  # of tests that are not corrected, for a word only
+_MOST_ROWS = 200  # of lists, so that pages stay small
+_IDS = ("participant_id", "session_id")
+_FAR = 2.0  # w-scores beyond are listed: about one in twenty of the reference
+
+#: Columns that are never numbers.
 _TEXT = (
     *("measure", "unit", "contrast", "hemi", "group", "subfield", "shares", "test", "effect"),
     *("file", "model", "control", "case", "base", "added", "classifier", "region"),
@@ -39,12 +43,12 @@ class GroupResults:
 
     @property
     def name(self) -> str:
-        """Of the model."""
+        """Name of the model."""
         return self.folder.name
 
     @property
     def levels(self) -> tuple[str, ...]:
-        """Groups that are compared, from least to most affected; perhaps none."""
+        """Groups that are compared, from least to most affected; may be empty."""
         return tuple(str(level) for level in (self.record.get("groups") or {}).get("levels", ()))
 
     def table(self, name: str) -> pd.DataFrame:
@@ -73,7 +77,7 @@ class GroupResults:
 
 
 def read_group(folder: Path) -> GroupResults:
-    """Read what an analysis says of itself."""
+    """Read the record of an analysis."""
     return GroupResults(folder=folder, record=files.read_json(folder / "analysis.json"))
 
 
@@ -83,22 +87,22 @@ def records(table: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def display_name(measure: str) -> str:
-    """Spell a measure with spaces."""
+    """Write a measure with spaces."""
     return measure.replace("_", " ")
 
 
 def unit_of(unit: str) -> str:
-    """Spell a unit as people write it; nothing for pure numbers."""
+    """Write a unit with superscripts; nothing for pure numbers."""
     return "" if unit == "1" else unit.replace("^2", "²").replace("^3", "³")
 
 
 def with_unit(text: str, unit: str) -> str:
-    """Put a unit behind a number or a name."""
+    """Append a unit to a number."""
     return f"{text} {unit_of(unit)}".rstrip()
 
 
 def statistic_text(row: Mapping[str, Any]) -> str:
-    """Spell a statistic with its degrees of freedom; of F, tables have those of the error."""
+    """Write a statistic with its degrees of freedom; of F, those of the error."""
     value = number_text(row["statistic"])
     if row["test"] == "t":
         return f"t({row['df']:.0f}) {value}"
@@ -106,7 +110,7 @@ def statistic_text(row: Mapping[str, Any]) -> str:
 
 
 def number_text(value: float) -> str:
-    """Spell a number with three digits."""
+    """Write a number with three digits."""
     if not np.isfinite(value):
         return files.MISSING
     text = f"{value:.3g}"
@@ -115,14 +119,14 @@ def number_text(value: float) -> str:
 
 
 def p_text(p: float) -> str:
-    """Spell a p-value."""
+    """Write a p-value."""
     if not np.isfinite(p):
         return files.MISSING
     return "< 0.001" if p < 0.001 else f"{p:.3f}"  # noqa: PLR2004  (as papers have it)
 
 
 def direction(results: GroupResults, contrast: str, hemi: str, sign: float) -> str:
-    """Say what a contrast above or below zero means."""
+    """Describe what a contrast above or below zero means."""
     comparison = results.record.get("comparison") or {}
     if contrast == "mean" and hemi == BOTH:
         return "larger on the left" if sign > 0 else "larger on the right"
@@ -137,15 +141,8 @@ def direction(results: GroupResults, contrast: str, hemi: str, sign: float) -> s
     return "positive" if sign > 0 else "negative"
 
 
-# What an analysis found, and where, in sentences.
-
-
-_THIRD = 1 / 3
-_ALPHA = 0.05  # of tests that are not corrected, for a word only
-
-
 def findings(results: GroupResults) -> Mapping[str, Any] | None:
-    """Say per measure and contrast what survived."""
+    """Describe what survived, by measure and contrast."""
     maps = results.table("maps")
     cards = []
     if len(maps):
@@ -177,7 +174,7 @@ def _side(results: GroupResults, row: Mapping[str, Any]) -> dict[str, Any]:
     same = (peaks["measure"] == row["measure"]) & (peaks["contrast"] == row["contrast"])
     own = peaks[same & (peaks["hemi"] == row["hemi"])]
     n, total = int(row["n_significant"]), int(row["n_tests"])
-    title = SIDES.get(str(row["hemi"]), str(row["hemi"])).capitalize()
+    title = SIDES[row["hemi"]].capitalize()
     if not len(own):
         return {"title": title, "found": False, "text": "nothing could be tested.", "peak": ""}
     if n:
@@ -200,7 +197,7 @@ def _percent(share: float) -> str:
 
 
 def _where(results: GroupResults, row: Mapping[str, Any], points: pd.DataFrame) -> str:
-    """Say how many points lie in which subfield, by direction."""
+    """Count the points in each subfield, by direction."""
     found = points[points["significant"] == True]  # noqa: E712  (may hold missing values)
     signed = points["cohen_d"].notna().any()
     parts = []
@@ -209,11 +206,11 @@ def _where(results: GroupResults, row: Mapping[str, Any], points: pd.DataFrame) 
         if not len(own):
             continue
         shares = own["subfield"].fillna("n/a").value_counts(normalize=True)
-        places = [f"{name} {share:.0%}" for name, share in shares.items() if name != "n/a"]
+        fields = [f"{name} {share:.0%}" for name, share in shares.items() if name != "n/a"]
         words = [f"{len(own)} points"]
         if signed:
             words.append(direction(results, str(row["contrast"]), str(row["hemi"]), sign))
-        parts.append(" ".join(words) + (f" ({', '.join(places)})" if places else ""))
+        parts.append(" ".join(words) + (f" ({', '.join(fields)})" if fields else ""))
     return "; ".join(parts)
 
 
@@ -223,8 +220,7 @@ def _peak(results: GroupResults, peak: Mapping[str, Any], points: pd.DataFrame) 
     if here is not None and np.isfinite(here["estimate"]):
         unit = _unit(results, str(peak["measure"]))
         what.insert(0, f"estimate {with_unit(number_text(here['estimate']), unit)}")
-    place = place_words(peak)
-    return f"{place}: {', '.join(what)}, corrected p {p_text(peak['p_corrected'])}"
+    return f"{position_text(peak)}: {', '.join(what)}, corrected p {p_text(peak['p_corrected'])}"
 
 
 def _unit(results: GroupResults, measure: str) -> str:
@@ -242,9 +238,9 @@ def point_of(peak: Mapping[str, Any], points: pd.DataFrame) -> pd.Series | None:
     return points[same].iloc[0] if same.any() else None
 
 
-def place_words(peak: Mapping[str, Any]) -> str:
-    """Say where a peak lies."""
-    field = peak["subfield"] if isinstance(peak["subfield"], str) else ""
+def position_text(peak: Mapping[str, Any]) -> str:
+    """Describe the position of a peak."""
+    inside = f"{peak['subfield']}, " if isinstance(peak["subfield"], str) else ""
     if np.isfinite(peak.get("x", np.nan)):
         words = [
             ends[1] if abs(peak[axis]) < _THIRD else ends[0 if peak[axis] < 0 else 2]
@@ -254,19 +250,17 @@ def place_words(peak: Mapping[str, Any]) -> str:
             )
         ]
         x, y = (f"{peak[axis]:.2f}".replace("-", MINUS) for axis in "xy")
-        inside = f"{field}, " if field else ""
         return f"{inside}{', '.join(words)} (x {x}, y {y})"
-    inside = f"{field}, " if field else ""
     return f"{inside}vertex {int(peak['vertex'])}"
 
 
 def effect_name(effect: str) -> str:
-    """Spell the kind of an effect size."""
+    """Write the kind of an effect size."""
     return {"cohen_d": "d", "partial_eta_squared": "partial η²"}.get(effect, effect)
 
 
 def _summaries(results: GroupResults) -> Iterator[str]:
-    """Summary measures that differ, uncorrected."""
+    """List summary measures that differ, uncorrected."""
     table = results.table("measures")
     if not len(table):
         return
@@ -281,14 +275,14 @@ def _summaries(results: GroupResults) -> Iterator[str]:
 
 
 def summary_side(hemi: str, measure: str) -> str:
-    """Spell the side of a summary measure."""
+    """Write the side of a summary measure."""
     if hemi == "LR" and not measure.endswith("_asymmetry"):
         return "mean of both sides"
-    return SIDES.get(hemi, hemi)
+    return SIDES[hemi]
 
 
 def _classification(results: GroupResults) -> Iterator[str]:
-    """Name the pairs in which a measure adds to the base model."""
+    """List the pairs in which a measure adds to the base model."""
     table = results.table("classification")
     for row in records(table):
         if row["p"] < _ALPHA:
@@ -300,29 +294,24 @@ def _classification(results: GroupResults) -> Iterator[str]:
             )
 
 
-_MOST_ROWS = 200  # of lists, so that pages stay small
-_IDS = ("participant_id", "session_id")
-_APART = 2.0  # w-scores beyond are listed: about one in twenty of the reference
-
-
 def peaks(results: GroupResults) -> Mapping[str, Any] | None:
     """List clusters with their peaks, and the strongest point of maps without."""
     table = results.everywhere("peaks")
     if not len(table):
         return None
-    files = results.table("maps").set_index(["measure", "contrast", "hemi"])["file"]
+    file_of = results.table("maps").set_index(["measure", "contrast", "hemi"])["file"]
     numbers = table.groupby(["measure", "contrast", "hemi"]).cumcount() + 1
     rows = []
     for number, row in zip(numbers, records(table), strict=True):
-        points = results.table(files[row["measure"], row["contrast"], row["hemi"]])
+        points = results.table(file_of[row["measure"], row["contrast"], row["hemi"]])
         here = point_of(row, points)
         rows.append(
             {
                 "number": int(number) if row["extent"] > 0 else "",
                 "measure": display_name(row["measure"]),
                 "contrast": row["contrast"],
-                "side": SIDES.get(row["hemi"], row["hemi"]),
-                "place": place_words(row),
+                "side": SIDES[row["hemi"]],
+                "position": position_text(row),
                 "extent": int(row["extent"]),
                 "shares": row["shares"] if isinstance(row["shares"], str) else "",
                 "estimate": number_text(np.nan if here is None else here["estimate"]),
@@ -336,13 +325,13 @@ def peaks(results: GroupResults) -> Mapping[str, Any] | None:
 
 
 def effect_text(row: Any) -> str:  # noqa: ANN401  (a row of pandas)
-    """Spell an effect size with its limits."""
+    """Write an effect size with its limits."""
     limits = f"{number_text(row['effect_low'])} to {number_text(row['effect_high'])}"
     return f"{effect_name(row['effect'])} {number_text(row['effect_size'])} ({limits})"
 
 
 def participants(results: GroupResults) -> Mapping[str, Any]:
-    """Say who is in the model, by group, and who is not, with reasons."""
+    """Describe who is in the model, by group, and list who is not, with reasons."""
     people = results.table("covariates")
     groups = results.record.get("groups") or {}
     visits = len(people)
@@ -357,8 +346,7 @@ def participants(results: GroupResults) -> Mapping[str, Any]:
         "n": len(people),
         "visits": visits,
         "hemispheres": [
-            (SIDES.get(hemi, hemi), n)
-            for hemi, n in (results.record.get("hemispheres") or {}).items()
+            (SIDES[hemi], n) for hemi, n in (results.record.get("hemispheres") or {}).items()
         ],
         "levels": levels or ["all"],
         "counts": [len(part) for part in members],
@@ -389,7 +377,7 @@ def _described(values: pd.Series, everyone: pd.Series) -> str:
 
 
 def summaries(results: GroupResults) -> Mapping[str, Any] | None:
-    """Set tests of summary measures beside the means of the groups."""
+    """List tests of summary measures with the means of the groups."""
     table = results.table("measures")
     if not len(table):
         return None
@@ -416,7 +404,7 @@ def summaries(results: GroupResults) -> Mapping[str, Any] | None:
                 "estimate": number_text(row["estimate"]),
                 "statistic": statistic_text(row),
                 "p": p_text(row["p"]),
-                "low": bool(row["p"] < 0.05),  # noqa: PLR2004  (emphasis only)
+                "low": bool(row["p"] < _ALPHA),
                 "effect": effect_text(row),
             }
         )
@@ -424,7 +412,7 @@ def summaries(results: GroupResults) -> Mapping[str, Any] | None:
     return {"groups": groups, "rows": rows, "models": models if len(models) > 1 else []}
 
 
-def classification(results: GroupResults) -> Sequence[dict[str, Any]]:
+def classification(results: GroupResults) -> list[dict[str, Any]]:
     """List pairs of groups with both models."""
     table = results.table("classification")
     return [
@@ -445,12 +433,50 @@ def classification(results: GroupResults) -> Sequence[dict[str, Any]]:
             "p": p_text(row["p"]),
             "separated": bool(row["separated"]),
         }
-        for row in (records(table) if len(table) else ())
+        for row in records(table)
     ]
 
 
+def registration(results: GroupResults) -> dict[str, Any] | None:
+    """List what registration explains, and sheets whose warps are outliers."""
+    table = results.table("registration")
+    if not len(table):
+        return None
+    warps = results.table("warps")
+    extreme = warps[warps["extreme"] == True] if len(warps) else warps  # noqa: E712  (may be text)
+    if len(extreme):
+        extreme = extreme.sort_values("displacement", ascending=False)
+    settings = (results.record.get("settings") or {}).get("registration") or {}
+    return {
+        "align": settings.get("align"),
+        "rows": [
+            {
+                "side": SIDES[row["hemi"]],
+                "n": row["n"],
+                "before": f"{row['explained_before']:.0%}",
+                "after": f"{row['explained_after']:.0%}",
+                "converged": bool(row["converged"]),
+            }
+            for row in records(table)
+        ],
+        "extreme": [
+            {
+                "who": _visit(row),
+                "side": SIDES[row["hemi"]],
+                "displacement": f"{row['displacement']:.1f}",
+            }
+            for row in records(extreme)
+        ],
+    }
+
+
+def _visit(row: Mapping[str, Any]) -> str:
+    """Name a participant, and the session if there is one."""
+    return " ".join(row[name] for name in _IDS if isinstance(row[name], str))
+
+
 def scores(results: GroupResults) -> Mapping[str, Any] | None:
-    """Say how groups stand to the reference, and who stands apart."""
+    """Compare the groups with the reference, and list participants far from it."""
     table = results.everywhere("wscores")
     if not len(table):
         return None
@@ -459,18 +485,18 @@ def scores(results: GroupResults) -> Mapping[str, Any] | None:
     return {
         "reference": "=".join(str(part) for part in level),
         "rows": list(_score_rows(whole)),
-        "apart": list(_apart(whole)),
-        "limit": _APART,
+        "far": list(_far(whole)),
+        "limit": _FAR,
     }
 
 
 def _score_rows(table: pd.DataFrame) -> Iterator[dict[str, Any]]:
     for (measure, hemi), rows in table.groupby(["measure", "hemi"], sort=False):
-        kinds = (("reference", rows["reference"]), ("others", ~rows["reference"].astype(bool)))
+        reference = rows["reference"].astype(bool)
         cells = []
-        for _, own in kinds:
-            w = rows.loc[own.astype(bool), "w"].dropna()
-            beyond = f"{(w < -_APART).sum()} low, {(w > _APART).sum()} high"
+        for own in (reference, ~reference):
+            w = rows.loc[own, "w"].dropna()
+            beyond = f"{(w < -_FAR).sum()} low, {(w > _FAR).sum()} high"
             spread = f"{number_text(w.mean())} ({number_text(w.std())})"
             cells.append(f"{spread}; {beyond} of {len(w)}" if len(w) else "")
         yield {
@@ -480,13 +506,12 @@ def _score_rows(table: pd.DataFrame) -> Iterator[dict[str, Any]]:
         }
 
 
-def _apart(table: pd.DataFrame) -> Iterator[dict[str, str]]:
-    far = table[table["w"].abs() > _APART]
+def _far(table: pd.DataFrame) -> Iterator[dict[str, str]]:
+    far = table[table["w"].abs() > _FAR]
     far = far.reindex(far["w"].abs().sort_values(ascending=False, kind="stable").index)
     for row in records(far.head(_MOST_ROWS)):
-        session = row["session_id"] if isinstance(row["session_id"], str) else ""
         yield {
-            "who": f"{row['participant_id']} {session}".strip(),
+            "who": _visit(row),
             "measure": display_name(row["measure"]),
             "side": summary_side(row["hemi"], row["measure"]),
             "w": number_text(row["w"]),

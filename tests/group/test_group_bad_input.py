@@ -234,4 +234,4 @@ def test_exclusions_of_nobody_are_told(study, tmp_path, capsys):
     listed.write_text("participant_id\themi\nsub-77\tn/a\nsub-01\tL\n")
     options = ["--align", "none", "--exclude", str(listed)]
     assert main([str(study.data), str(study.out), "group", *options]) == 0
-    assert "not here, or not so, are sub-77" in capsys.readouterr().out
+    assert "matches no hemisphere here: sub-77" in capsys.readouterr().out

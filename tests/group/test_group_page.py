@@ -1,5 +1,6 @@
 """The page about an analysis: what it says, that it is whole and safe, and how it behaves."""
 
+import base64
 import json
 import re
 import shutil
@@ -43,7 +44,7 @@ def dataset(tmp_path_factory):
     given = ["--settings", str(folder / "group.toml"), "--exclude", str(excluded)]
     given += ["--asymmetry", "--normative", "group=CN", "--name", MODEL]
     with pytest.MonkeyPatch.context() as patch:
-        # Figures take longer than all else, and the page draws its own.
+        # Figures take longer than all else, and the page works without them.
         patch.setattr(write, "draw_figures", lambda *_: iter(()))
         assert main([str(data), str(out), "group", *given]) == 0
     return data, out, given
@@ -116,6 +117,26 @@ def test_maps_are_those_of_the_tables(out, page):
     own = means[(means.measure == "thickness") & (means.hemi == "L") & (means.group == "AD")]
     (group,) = [one for one in side["means"] if one["group"] == "AD"]
     np.testing.assert_allclose(group["values"], own["mean"], rtol=1e-3)
+
+
+def test_figures_are_embedded_with_text_alternatives(copy, page):
+    folder = copy / "group" / MODEL
+    names = {"roc", "calibration", "profiles", "warps", "sections"}
+    for name in names:
+        svg = f'<svg xmlns="http://www.w3.org/2000/svg" width="90pt"><title>{name}</title></svg>'
+        files.write_text(folder / "figures" / f"{name}.svg", svg)
+    text = group_page(folder)
+    embedded = re.findall(r'data:image/svg\+xml;base64,([^"]+)" alt="[^"]{20,}"', text)
+    titles = {
+        re.search("<title>(.*)</title>", base64.b64decode(one).decode())[1] for one in embedded
+    }
+    assert titles == names
+    auc = table(folder / "classification.tsv").auc_full[0]
+    assert re.search(rf'alt="Receiver [^"]*CN against AD, left: [^"]*{auc:.2f}', text)
+    outline = Outline(text)
+    assert outline.open == outline.unlabeled == []
+    assert max(np.diff(outline.headings)) <= 1
+    assert "image/svg" not in page  # it was made without figures
 
 
 def test_who_is_left_out_is_said_with_the_reason(page):
