@@ -65,7 +65,7 @@ def write_hippunfold(data, version):
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("foreign")
+    folder = tmp_path_factory.mktemp("external")
     data, _ = write_dataset(folder)
     for version in (1, 2):
         write_hippunfold(data, version)
