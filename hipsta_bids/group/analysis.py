@@ -1,7 +1,8 @@
-"""The group level from sheets and covariates to results: a straight line of calls."""
+"""The group level from sheets and covariates to results."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -48,9 +49,9 @@ class SideResult:
     """(sheets, x) curvature before registration, 1/mm."""
     registration: Registration
     registered: SideMaps
-    """Of all visits that were chosen."""
+    """Maps of all visits that were chosen."""
     shifts: Mapping[str, GroupShift]
-    """By group; empty without groups."""
+    """Shifts by group; empty without groups."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -62,7 +63,7 @@ class Analysis:
     design: Design
     groups: Groups | None
     sides: Mapping[str, SideResult]
-    """By hemisphere."""
+    """Registered sheets by hemisphere."""
     measured: Measures
     """What the model was fitted to."""
     compared: Cohort
@@ -70,10 +71,10 @@ class Analysis:
     row_model: RowModel
     """What was fitted to each row."""
     fitted: Mapping[str, FittedMaps]
-    """By hemisphere; ``LR`` is left minus right."""
+    """Fitted maps by hemisphere; ``LR`` is left minus right."""
     found: Mapping[MapKey, Discoveries]
     scores: Scores | None
-    """Of participants against a reference group, if there is one."""
+    """Scores of participants against a reference group, if there is one."""
     measures: Sequence[MeasureFit]
     pairs: Sequence[tuple[str, str, PairComparison]]
     """Hemisphere, added measure, and result."""
@@ -82,7 +83,7 @@ class Analysis:
 
     @property
     def n_participants(self) -> int:
-        """In the model; some may have several rows."""
+        """Number of participants in the model; some may have several rows."""
         return int(self.compared.table[PARTICIPANT].iloc[self.design.rows].nunique())
 
 
@@ -136,11 +137,9 @@ def analyze_cohort(
     if comparison.pair or not design.contrasts:
         design = replace(design, contrasts=with_mean(design))
 
-    def rows_of(design: Design) -> RowModel:
-        if comparison.longitudinal:
-            return longitudinal_model(design, table, time, settings)
-        return RowModel(design)
-
+    rows_of: Callable[[Design], RowModel] = RowModel
+    if comparison.longitudinal:
+        rows_of = partial(longitudinal_model, table=table, time=time, settings=settings)
     rows = rows_of(design)
     check_permutations(rows, settings)
     sides = {

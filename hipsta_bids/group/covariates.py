@@ -14,11 +14,26 @@ from hipsta_bids.group.formula import typed
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
 
-# From the addresses in quality records back to the segmentations on disk.
+#: Number of rows that a message lists.
+_SHOWN = 6
+#: Column of BIDS' sessions.tsv with dates, and columns that are made here.
+_DATE, TIME, FIRST_AGE = "acq_time", "time", "age_first"
+_DAYS_PER_YEAR = 365.25
+
+
+@dataclass(frozen=True)
+class VisitTime:
+    """Visits with their time, for longitudinal models."""
+
+    table: pd.DataFrame
+    column: str | None
+    """Column of the time; None if it is not known."""
+    covariates: tuple[str, ...]
+    """Names of covariates of the default model, with age at the first visit."""
 
 
 def locate_sources(sources: Sequence[str], roots: Sequence[Path]) -> list[Path | None]:
-    """Resolve addresses of segmentations."""
+    """Paths of segmentations, from their addresses in the quality records of datasets."""
     links: dict[Path, Mapping[str, str]] = {}
     result = []
     for source, root in zip(sources, roots, strict=True):
@@ -34,7 +49,7 @@ def relocate(source: str, folders: Sequence[Path]) -> str:
         return source
     inside = PurePosixPath(source.split(":", 2)[2])
     for folder in folders:
-        # The image itself is not needed, only the subject's folder, for what lies beside it.
+        # The image itself is not needed, only the subject's folder with its other files.
         if (folder / inside.parts[0]).is_dir():
             return str(folder / inside)
     return source
@@ -46,9 +61,6 @@ def _resolve(source: str, links: Mapping[str, str]) -> Path | None:
     _, dataset, inside = source.split(":", 2)
     link = links.get(dataset, "")
     return Path(unquote(urlsplit(link).path)) / inside if link.startswith("file:") else None
-
-
-_NAMED = 6
 
 
 def read_covariates(visits: pd.DataFrame, bids_dir: Path, extra: Sequence[Path]) -> pd.DataFrame:
@@ -65,15 +77,15 @@ def read_covariates(visits: pd.DataFrame, bids_dir: Path, extra: Sequence[Path])
     for path in (*tables, *sorted((bids_dir / "phenotype").glob("*.tsv")), *extra):
         table = _read(path)
         if path == main:
-            _check_anybody(joined, table, path)
+            _check_known(joined, table, path)
         joined = _join(joined, table, path)
         if path == main:
             joined = _join_sessions(joined, bids_dir)
     return joined
 
 
-def _check_anybody(visits: pd.DataFrame, table: pd.DataFrame, path: Path) -> None:
-    """Refuse a table of other people: labels may be spelled differently."""
+def _check_known(visits: pd.DataFrame, table: pd.DataFrame, path: Path) -> None:
+    """Refuse a table of other participants: labels may differ."""
     if not set(visits[PARTICIPANT]) & set(table[PARTICIPANT]):
         raise InputError(
             f"{path}: names none of the participants here; it has {table[PARTICIPANT].iloc[0]} ...,"
@@ -92,11 +104,17 @@ def _read(path: Path) -> pd.DataFrame:
     table = pd.DataFrame(rows, dtype=object)
     if PARTICIPANT not in table.columns:
         raise InputError(
-            f"{path}: has no column participant_id; columns are parted by tabs", reason="bad-table"
+            f"{path}: has no column participant_id; columns are separated by tabs",
+            reason="bad-table",
         )
-    table[PARTICIPANT] = [_prefixed(cell, "sub-") for cell in table[PARTICIPANT]]
-    if SESSION in table.columns:
-        table[SESSION] = [_prefixed(cell, "ses-") for cell in table[SESSION]]
+    return _cleaned(table)
+
+
+def _cleaned(table: pd.DataFrame) -> pd.DataFrame:
+    """Add prefixes that labels lack, and mark missing cells."""
+    for column, prefix in ((PARTICIPANT, "sub-"), (SESSION, "ses-")):
+        if column in table.columns:
+            table[column] = [_prefixed(cell, prefix) for cell in table[column]]
     return table.where(table != files.MISSING, None)
 
 
@@ -113,16 +131,14 @@ def _join_sessions(joined: pd.DataFrame, bids_dir: Path) -> pd.DataFrame:
             part = pd.DataFrame(files.read_tsv(path), dtype=object)
             if SESSION not in part.columns:
                 raise InputError(f"{path}: has no column session_id", reason="bad-table")
-            part[SESSION] = [_prefixed(cell, "ses-") for cell in part[SESSION]]
-            part = part.where(part != files.MISSING, None)
-            parts.append(part.assign(**{PARTICIPANT: participant}))
+            parts.append(_cleaned(part).assign(**{PARTICIPANT: participant}))
     if not parts:
         return joined
     return _join(joined, pd.concat(parts, ignore_index=True), bids_dir / "sub-*_sessions.tsv")
 
 
 def _join(joined: pd.DataFrame, table: pd.DataFrame, path: Path) -> pd.DataFrame:
-    """Add the columns of one table, by participant, and by session where it tells sessions."""
+    """Add the columns of one table, by participant, and by session if it has sessions."""
     by_session = SESSION in table.columns and bool(table[SESSION].notna().any())
     keys = [PARTICIPANT, SESSION] if by_session else [PARTICIPANT]
     table = table.drop(columns=[SESSION]) if SESSION in table and not by_session else table
@@ -130,9 +146,9 @@ def _join(joined: pd.DataFrame, table: pd.DataFrame, path: Path) -> pd.DataFrame
     twice = table.loc[table.duplicated(keys), keys].astype(str).agg(" ".join, axis=1)
     if len(twice):
         names = sorted(set(twice))
-        more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+        more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
         raise InputError(
-            f"{path}: {', '.join(names[:_NAMED])}{more} stand more than once; keep one row each",
+            f"{path}: {', '.join(names[:_SHOWN])}{more} occur more than once; keep one row each",
             reason="duplicate-rows",
         )
     indexed = table.set_index(keys)
@@ -149,12 +165,10 @@ def _join(joined: pd.DataFrame, table: pd.DataFrame, path: Path) -> pd.DataFrame
 
 
 def read_icv(sources: Sequence[str], roots: Sequence[Path]) -> list[float | None]:
-    """Find the intracranial volume that the segmentation's own program estimated.
+    """Intracranial volumes in mm^3 as the segmentations' own programs estimated them.
 
     FreeSurfer's ``stats/aseg.stats`` (EstimatedTotalIntraCranialVol) beside the ``mri`` folder, or
     ASHS's ``*_icv.txt`` beside or above the segmentation.
-
-    Returns mm^3.
     """
     paths = locate_sources(sources, roots)
     return [None if path is None else _icv_beside(path) for path in paths]
@@ -182,32 +196,13 @@ def _number(text: str) -> float | None:
     return value if value > 0 else None
 
 
-# The time of visits, for longitudinal models.
-
-
-#: Column of BIDS' sessions.tsv with dates, and columns that are made here.
-_DATE, TIME, FIRST_AGE = "acq_time", "time", "age_first"
-_DAYS_PER_YEAR = 365.25
-
-
-@dataclass(frozen=True)
-class VisitTime:
-    """Visits with their time."""
-
-    table: pd.DataFrame
-    column: str | None
-    """Of the time; None if nothing tells it."""
-    covariates: tuple[str, ...]
-    """Names of covariates of the default model, age being that of the first visit."""
-
-
 def add_time(table: pd.DataFrame, settings: GroupSettings) -> VisitTime:
     """Find the time of each visit, or make it from dates or ages.
 
-    A column of ``longitudinal.time_columns`` that varies between the sessions of somebody; else
+    A column of ``longitudinal.time_columns`` that varies between sessions of a participant; else
     ``acq_time``, in years since the participant's first session; else age, likewise. If age
-    varies between sessions, the age at the first one is added, since the other would take part of
-    the change.
+    varies between sessions, the age at the first one is added, since age itself would explain part
+    of the change.
     """
     covariates = tuple(settings.model.covariates)
     by_name = {str(column).casefold(): str(column) for column in table.columns}
@@ -216,7 +211,7 @@ def add_time(table: pd.DataFrame, settings: GroupSettings) -> VisitTime:
     ages = None
     if age is not None:
         ages = typed(table[age], settings.design)
-        if pd.api.types.is_numeric_dtype(ages) and varies_within(ages, table):
+        if _varies(ages, table):
             first = ages.groupby(table[PARTICIPANT]).transform("first")
             result = result.assign(**{FIRST_AGE: first})
             covariates = tuple(
@@ -235,8 +230,10 @@ def add_time(table: pd.DataFrame, settings: GroupSettings) -> VisitTime:
     return VisitTime(result, column, covariates)
 
 
-def varies_within(values: pd.Series, table: pd.DataFrame) -> bool:
-    """Whether somebody has different values at different sessions."""
+def _varies(values: pd.Series, table: pd.DataFrame) -> bool:
+    """Whether values differ between sessions of a participant."""
+    if not pd.api.types.is_numeric_dtype(values):
+        return False
     own = values.groupby(table[PARTICIPANT])
     return bool((own.transform("min") < own.transform("max")).any())
 
@@ -249,7 +246,7 @@ def _given(
         if column is None:
             continue
         values = typed(table[column], settings.design)
-        if pd.api.types.is_numeric_dtype(values) and varies_within(values, table):
+        if _varies(values, table):
             return column
     return None
 

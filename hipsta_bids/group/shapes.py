@@ -10,17 +10,17 @@ from numpy.typing import NDArray
 from hipsta_bids.derivatives.hemisphere import ResultPlace, fill_from_nearest
 from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.sheet import is_left_handed
-from hipsta_bids.group.analysis import Analysis
+from hipsta_bids.group.analysis import Analysis, mean_of_known, members_of
 from hipsta_bids.group.collect import SheetRecord
 from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float
 from hipsta_bids.group.settings import GroupSettings, ShapeSettings
 from hipsta_bids.group.warps import warp_values
 from hipsta_bids.io import files, gifti
-from hipsta_bids.io.gifti import read_mesh
 
 #: Surfaces of a sheet, in the order of the arrays here.
 LAYERS = ("interior", "midthickness", "exterior")
 _MIDDLE = 1
+_KEYS = ("interior_surface", "midthickness_surface", "exterior_surface")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -38,38 +38,34 @@ class AverageShape:
 def average_shape(
     layers: Float,
     warps: Float,
-    groups: Sequence[str] | NDArray[np.str_],
-    order: Sequence[str],
+    members: Mapping[str, NDArray[np.bool_]],
     settings: ShapeSettings,
 ) -> AverageShape:
     """Average surfaces at registered nodes, after rigid alignment (generalized Procrustes).
 
-    Each middle surface is turned and moved to the mean of all, which is made anew until it stays
-    (Gower 1975); nothing is scaled or mirrored. The walls go along.
-
-    ``layers`` Interior, middle and exterior surface in mm; NaN is missing.
+    Each middle surface is rotated and moved to the mean of all, iteratively (Gower 1975), and the
+    walls with it; nothing is scaled or mirrored. ``layers`` (sheets, 3, x, y, 3) are the surfaces
+    in mm, NaN where missing.
     """
     n, _, nx, ny, _ = layers.shape
     # Along x, so that all other axes count as one.
     flat = np.moveaxis(layers, 2, 1).reshape(n, nx, -1)
     registered = np.moveaxis(warp_values(flat, warps).reshape(n, nx, len(LAYERS), ny, 3), 1, 2)
     middle = registered[:, _MIDDLE].reshape(n, -1, 3)
-    turns, centers, center = align_rigidly(middle, settings)
+    rotations, centers, center = align_rigidly(middle, settings)
     moved = registered.reshape(n, -1, 3) - centers[:, None]
-    moved = (moved @ np.swapaxes(turns, 1, 2) + center).reshape(registered.shape)
-    names = np.asarray(groups)
-    members = {name: names == name for name in order}
+    moved = (moved @ np.swapaxes(rotations, 1, 2) + center).reshape(registered.shape)
     return AverageShape(
-        mean=_mean(moved),
-        by_group={name: _mean(moved[own]) for name, own in members.items() if own.any()},
+        mean=mean_of_known(moved, 0),
+        by_group={name: mean_of_known(moved[own], 0) for name, own in members.items() if own.any()},
         counts={name: int(own.sum()) for name, own in members.items() if own.any()},
     )
 
 
 def align_rigidly(points: Float, settings: ShapeSettings) -> tuple[Float, Float, Float]:
-    """Turn and move shapes so that they lie on their mean.
+    """Rotations (shapes, 3, 3) and centers (shapes, 3) of shapes, and the mean center.
 
-    ``points`` NaN is missing.
+    ``points`` is (shapes, points, 3) in mm, NaN where missing.
     """
     present: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=2))
     common = present.all(axis=0)
@@ -79,21 +75,17 @@ def align_rigidly(points: Float, settings: ShapeSettings) -> tuple[Float, Float,
     centers = np.einsum("sp,spi->si", weights, values) / weights.sum(axis=1)[:, None]
     values = np.where(present[:, :, None], values - centers[:, None], 0.0)
     mean = values[0]
-    turns = np.tile(np.eye(3), (len(values), 1, 1))
+    rotations = np.tile(np.eye(3), (len(values), 1, 1))
     count = np.maximum(present.sum(axis=0), 1)[:, None]
     for _ in range(settings.iterations):
-        turns = _rotations(values, mean)
-        before, mean = mean, np.einsum("sij,spj->pi", turns, values) / count
+        # Rotations of each shape that bring it closest to the mean (Kabsch 1976).
+        rotations = _nearest_rotation(np.einsum("pi,spj->sij", mean, values))
+        before, mean = mean, np.einsum("sij,spj->pi", rotations, values) / count
         if np.abs(mean - before).max() < settings.tolerance:
             break
-    # Turn all back by the mean turn, so that the mean lies as the shapes did.
-    back = _nearest_rotation(turns.mean(axis=0))
-    return back.T @ turns, centers, centers.mean(axis=0)
-
-
-def _rotations(values: Float, mean: Float) -> Float:
-    """Rotations of each shape that bring it closest to the mean (Kabsch 1976)."""
-    return _nearest_rotation(np.einsum("pi,spj->sij", mean, values))
+    # Undo the mean rotation, so that the mean is oriented as the shapes were.
+    back = _nearest_rotation(rotations.mean(axis=0))
+    return back.T @ rotations, centers, centers.mean(axis=0)
 
 
 def _nearest_rotation(matrix: Float) -> Float:
@@ -103,43 +95,18 @@ def _nearest_rotation(matrix: Float) -> Float:
     return np.asarray((left * sign[..., None, :]) @ right, dtype=np.float64)
 
 
-def _mean(shapes: Float) -> Float:
-    """Mean of those known; NaN where nobody is."""
-    known = np.isfinite(shapes)
-    count = known.sum(axis=0)
-    total = np.where(known, shapes, 0.0).sum(axis=0)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
-
-
-# Reads the surfaces of many sheets.
-
-
-_KEYS = ("interior_surface", "midthickness_surface", "exterior_surface")
-
-
-def read_layer_surfaces(
-    places: Sequence[ResultPlace], shape: tuple[int, int]
-) -> tuple[list[int], Float]:
-    """Read interior, middle and exterior surfaces of those sheets that have all of them.
-
-    Returns mm, in the space of each scan.
-    """
+def _read_layers(places: Sequence[ResultPlace], shape: tuple[int, int]) -> tuple[list[int], Float]:
+    """Read the surfaces (sheets, 3, x, y, 3) in mm of the sheets that have all of them."""
     found, layers = [], []
     for i, place in enumerate(places):
         try:
-            surfaces = [read_mesh(place.path(key)).points for key in _KEYS]
+            surfaces = [gifti.read_mesh(place.path(key)).points for key in _KEYS]
         except InputError:  # maps and statistics do without it
             continue
         if all(surface.shape == (shape[0] * shape[1], 3) for surface in surfaces):
             found.append(i)
             layers.append(np.stack(surfaces).reshape(len(_KEYS), *shape, 3))
     return found, np.array(layers, dtype=np.float64).reshape(-1, len(_KEYS), *shape, 3)
-
-
-# Average surfaces of the sheets that were analyzed, read and written.
-
-
-_MIDTHICKNESS = LAYERS.index("midthickness")
 
 
 def average_shapes(
@@ -162,30 +129,20 @@ def average_shapes(
         ]
         chosen = chosen[[key in place_of for key in keys]]
         places = [place_of[key] for key in keys if key in place_of]
-        read, layers = read_layer_surfaces(places, side.registered.shape)
+        read, layers = _read_layers(places, side.registered.shape)
         if not read:
             continue
         own = chosen[read]
-        groups = analysis.groups
-        names = (
-            np.full(len(own), "all")
-            if groups is None
-            else visits[groups.column].iloc[own].astype(str).to_numpy(dtype=np.str_)
-        )
-        shapes[hemi] = average_shape(
-            layers,
-            side.registration.warps[own],
-            names,
-            ("all",) if groups is None else groups.levels,
-            settings.shapes,
-        )
+        members = members_of(analysis, visits.iloc[own])
+        warps = side.registration.warps[own]
+        shapes[hemi] = average_shape(layers, warps, members, settings.shapes)
     return shapes
 
 
 def write_shapes(folder: Path, shapes: Mapping[str, AverageShape]) -> None:
     """Write the average middle surfaces, on which maps of statistics can be drawn."""
     for hemi, shape in shapes.items():
-        points = fill_from_nearest(shape.mean[_MIDTHICKNESS])
+        points = fill_from_nearest(shape.mean[_MIDDLE])
         flip = is_left_handed(np.moveaxis(shape.mean, 0, 2))
         content = gifti.surface_bytes(
             points.reshape(-1, 3),

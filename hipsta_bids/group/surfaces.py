@@ -1,4 +1,4 @@
-"""Other programs' maps with corresponding points (``--maps``): which files, whose, on what."""
+"""Other programs' maps with corresponding points (``--maps``): their files, visits and surfaces."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -10,7 +10,7 @@ import pandas as pd
 
 from hipsta_bids.errors import InputError, NothingToDoError, UsageError
 from hipsta_bids.geometry.catalog import MAPS
-from hipsta_bids.group.data import Cohort, Float, Int, SideMaps
+from hipsta_bids.group.data import Cohort, Int, SideMaps
 from hipsta_bids.group.read import CURVATURE, Measured, Visit
 from hipsta_bids.inputs.maps import Found, check_pattern, fields_of, fill, find, scan
 from hipsta_bids.io.files import entities
@@ -29,33 +29,19 @@ class MapPattern:
     """The same for the surface to draw it on."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ExternalSide:
-    """One map of one hemisphere."""
-
-    visits: tuple[Visit, ...]
-    data: Float
-    """(visits, points)"""
-    unit: str
-    mesh: Mesh | None
-    """``None`` on the regular grid of sheets."""
-    nodes: tuple[int, int]
-    """Nodes along x and y of that grid; (points, 1) on a mesh."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class ExternalFiles:
     """The files of one map."""
 
     request: MapPattern
     root: Path
-    """What patterns are relative to."""
+    """Folder that patterns are relative to."""
     files: Mapping[str, Mapping[Visit, Path]]
     """By hemisphere and visit."""
 
     @property
     def visits(self) -> set[Visit]:
-        """Visits that have it, in either hemisphere."""
+        """Visits with a map of either hemisphere."""
         return {visit for side in self.files.values() for visit in side}
 
 
@@ -64,10 +50,7 @@ def map_patterns(
     surfaces: Sequence[tuple[str | None, str]],
     taken: Sequence[str],
 ) -> tuple[MapPattern, ...]:
-    """Combine and check the options about maps.
-
-    ``surfaces`` Surfaces for one name, or (None) for all that have none of their own.
-    """
+    """Combine and check the options about maps; a surface without a name is for all others."""
     names = [name for name, _ in patterns]
     for name, pattern in patterns:
         if not (name.isalnum() and name.isascii() and name[0].isalpha()):
@@ -99,7 +82,7 @@ def map_patterns(
 
 
 def taken_names(*, with_sheets: bool) -> tuple[str, ...]:
-    """Names that other programs' maps may not have."""
+    """Names that are taken by the maps of the sheets."""
     return tuple(row.name for row in MAPS) if with_sheets else ()
 
 
@@ -109,7 +92,7 @@ def find_maps(
     known: Iterable[Visit],
     is_wanted: Callable[[str, str | None, str], bool],
 ) -> ExternalFiles:
-    """Look for the files of one map."""
+    """Find the files of one map."""
     sessions: dict[str, list[str | None]] = {}
     for subject, session in known:
         sessions.setdefault(subject, []).append(session)
@@ -148,36 +131,44 @@ def _sessions(one: Found, known: Mapping[str, Sequence[str | None]]) -> Sequence
 
 
 def read_maps(
-    found: ExternalFiles, grid: tuple[int, int], *, with_sheets: bool
-) -> dict[str, ExternalSide]:
-    """Read one map of all hemispheres."""
-    return {hemi: _read_side(found, hemi, grid, with_sheets=with_sheets) for hemi in found.files}
+    found: ExternalFiles, visits: Sequence[Visit], grid: tuple[int, int], *, with_sheets: bool
+) -> tuple[dict[str, SideMaps], str]:
+    """Read one map of all hemispheres, by rows of visits, and its unit.
+
+    On the regular grid of sheets there is no mesh; without sheets, files may have their own grid.
+    """
+    row_of = {visit: row for row, visit in enumerate(visits)}
+    name, sides, units = found.request.name, {}, []
+    for hemi, path_of in found.files.items():
+        own = sorted(path_of, key=row_of.__getitem__)
+        paths = [path_of[visit] for visit in own]
+        maps = [read_map(path, name) for path in paths]
+        _refuse_mixed(name, hemi, paths, maps)
+        first, points = maps[0], len(maps[0].values)
+        nodes = first.nodes if first.nodes is not None and not with_sheets else grid
+        mesh = None if first.nodes == nodes else _mesh(found, hemi, points)
+        if mesh is None and points != nodes[0] * nodes[1]:
+            raise InputError(
+                f"--maps {name}, hemisphere {hemi}: no surface of {points} vertices lies beside"
+                f" {paths[0]}, and sheets have {nodes[0]} x {nodes[1]} points; name one by"
+                " --maps-surface",
+                reason="no-surface",
+            )
+        shape = nodes if mesh is None else (points, 1)
+        values = np.stack([one.values.reshape(shape) for one in maps])  # noqa: PD011  (no table)
+        side = _empty(np.array([row_of[visit] for visit in own], dtype=np.int64), shape)
+        sides[hemi] = replace(side, maps={name: values}, mesh=mesh)
+        units.append(first.unit)
+    return sides, units[0]
 
 
-def _read_side(
-    found: ExternalFiles, hemi: str, grid: tuple[int, int], *, with_sheets: bool
-) -> ExternalSide:
-    paths = found.files[hemi]
-    visits = tuple(sorted(paths, key=lambda visit: (visit[0], visit[1] or "")))
-    maps = [read_map(paths[visit], found.request.name) for visit in visits]
-    _refuse_mixed(found.request.name, hemi, [paths[visit] for visit in visits], maps)
-    first = maps[0]
-    points = len(first.values)
-    own = first.nodes if first.nodes is not None and not with_sheets else grid
-    mesh = None if first.nodes == own else _mesh(found, hemi, points)
-    if mesh is None and points != own[0] * own[1]:
-        raise InputError(
-            f"--maps {found.request.name}, hemisphere {hemi}: no surface of {points} vertices lies"
-            f" beside {paths[visits[0]]}, and sheets have {own[0]} x {own[1]} points; name one by"
-            " --maps-surface",
-            reason="no-surface",
-        )
-    return ExternalSide(
-        visits=visits,
-        data=np.stack([one.values for one in maps]),  # noqa: PD011  (no table)
-        unit=first.unit,
-        mesh=mesh,
-        nodes=own if mesh is None else (points, 1),
+def _empty(rows: Int, shape: tuple[int, int]) -> SideMaps:
+    return SideMaps(
+        rows=rows,
+        maps={},
+        subfield=np.full((len(rows), *shape), -1, dtype=np.int8),
+        names=(),
+        summary=pd.DataFrame(index=range(len(rows))),
     )
 
 
@@ -246,17 +237,6 @@ def _belongs(own: Mapping[str, str], surface: Mapping[str, str]) -> bool:
     return "seg" not in surface and all(own.get(key) == surface.get(key) for key in keys)
 
 
-def rows_of(visits: Sequence[Visit], keys: Sequence[Visit]) -> tuple[Int, Int]:
-    """Match visits to rows of the covariates."""
-    row_of = {visit: row for row, visit in enumerate(keys)}
-    rows = np.array([row_of[visit] for visit in visits], dtype=np.int64)
-    places = np.argsort(rows)
-    return rows[places], np.asarray(places, dtype=np.int64)
-
-
-# Other programs' maps beside the sheets, as the models take them.
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ExternalCohorts:
     """Maps of other programs."""
@@ -265,8 +245,6 @@ class ExternalCohorts:
     """Sheets, with the maps that lie on their grid."""
     others: Mapping[str, Cohort]
     """Maps with points of their own, by name; the covariates are the visits only."""
-    names: tuple[str, ...]
-    """Of the maps that lie with the sheets."""
     notes: tuple[str, ...]
 
 
@@ -285,49 +263,47 @@ def find_all(
 def add_external(
     measured: Measured, found: Iterable[ExternalFiles], visits: Sequence[Visit]
 ) -> ExternalCohorts:
-    """Read other programs' maps, and put those on the grid of the sheets to the sheets.
+    """Read other programs' maps, and add those on the grid of the sheets to the sheets.
 
-    Without sheets, maps on the grid take their place if there is a curvature to register them by.
+    Without sheets, maps on a grid replace them if there is a curvature to register them by.
     """
-    grid = len(measured.x), len(measured.y)
-    maps = {
-        one.request.name: read_maps(one, grid, with_sheets=bool(measured.sides)) for one in found
-    }
-    notes = [_found_note(name, sides, len(visits)) for name, sides in maps.items()]
-    units = {name: next(iter(sides.values())).unit for name, sides in maps.items()}
-    measured = replace(measured, units={**measured.units, **units})
+    grid, with_sheets = (len(measured.x), len(measured.y)), bool(measured.sides)
+    maps, units, notes = {}, dict(measured.units), []
+    for one in found:
+        name = one.request.name
+        maps[name], units[name] = read_maps(one, visits, grid, with_sheets=with_sheets)
+        counts = ", ".join(f"{len(side.rows)} {hemi}" for hemi, side in maps[name].items())
+        points = ", ".join(str(np.prod(side.shape)) for side in maps[name].values())
+        notes.append(f"maps {name}: {counts} of {len(visits)} visits, {points} points")
+    measured = replace(measured, units=units)
     flat = {
         name: sides
         for name, sides in maps.items()
         if all(side.mesh is None for side in sides.values())
     }
-    if not measured.sides and CURVATURE in flat:
-        nodes = _nodes(flat[CURVATURE])
-        measured = _on_grid(measured, nodes)
+    if not with_sheets:
+        curvature = flat.get(CURVATURE, {})
+        nodes = _nodes(curvature) if curvature else None
         flat = {name: sides for name, sides in flat.items() if _nodes(sides) == nodes}
-    if measured.sides:
-        sides = {
-            hemi: _with_maps(side, hemi, flat, visits) for hemi, side in measured.sides.items()
-        }
-    elif CURVATURE in flat:
-        sides = _as_sheets(flat, visits)
-    else:
-        sides, flat = {}, {}
-    others = {
-        name: _cohort(measured, name, own, visits) for name, own in maps.items() if name not in flat
-    }
+        sheets = {hemi: replace(side, maps={}) for hemi, side in curvature.items()}
+        measured = replace(_on_grid(measured, nodes) if nodes else measured, sides=sheets)
+    sides = {hemi: _with_maps(side, hemi, flat) for hemi, side in measured.sides.items()}
+    others = {}
+    for name, own in maps.items():
+        if name not in flat:
+            on_mesh = any(side.mesh is not None for side in own.values())
+            axes = measured if on_mesh else _on_grid(measured, _nodes(own))
+            table = measured.visits
+            others[name] = Cohort(table=table, sides=own, x=axes.x, y=axes.y, units=units)
     if others:
         notes.append(f"maps {', '.join(others)}: not registered, their points are to correspond")
     return ExternalCohorts(
-        measured=replace(measured, sides=sides),
-        others=others,
-        names=tuple(flat),
-        notes=tuple(notes),
+        measured=replace(measured, sides=sides), others=others, notes=tuple(notes)
     )
 
 
-def _nodes(sides: Mapping[str, ExternalSide]) -> tuple[int, int]:
-    return next(iter(sides.values())).nodes
+def _nodes(sides: Mapping[str, SideMaps]) -> tuple[int, int]:
+    return next(iter(sides.values())).shape
 
 
 def _on_grid(measured: Measured, nodes: tuple[int, int]) -> Measured:
@@ -339,73 +315,12 @@ def _on_grid(measured: Measured, nodes: tuple[int, int]) -> Measured:
     return replace(measured, x=x, y=y)
 
 
-def _found_note(name: str, sides: Mapping[str, ExternalSide], n_visits: int) -> str:
-    counts = ", ".join(f"{len(side.visits)} {hemi}" for hemi, side in sides.items())
-    points = ", ".join(str(side.data.shape[1]) for side in sides.values())
-    return f"maps {name}: {counts} of {n_visits} visits, {points} points"
-
-
-def _aligned(
-    side: ExternalSide,
-    rows: Int,
-    visits: Sequence[Visit],
-) -> Float:
-    """Values of some rows, in the shape of the sheet; NaN where there is no map."""
-    own = {visit: place for place, visit in enumerate(side.visits)}
-    result = np.full((len(rows), *side.nodes), np.nan)
-    for i, row in enumerate(rows.tolist()):
-        place = own.get(visits[row])
-        if place is not None:
-            result[i] = side.data[place].reshape(side.nodes)
-    return result
-
-
-def _with_maps(
-    side: SideMaps,
-    hemi: str,
-    maps: Mapping[str, Mapping[str, ExternalSide]],
-    visits: Sequence[Visit],
-) -> SideMaps:
+def _with_maps(side: SideMaps, hemi: str, maps: Mapping[str, Mapping[str, SideMaps]]) -> SideMaps:
     """Add maps of the same grid to those of the sheets; they are registered with them."""
-    blank = np.full((len(side.rows), *side.shape), np.nan)
-    more = {
-        name: _aligned(sides[hemi], side.rows, visits) if hemi in sides else blank
-        for name, sides in maps.items()
-    }
-    return replace(side, maps={**side.maps, **more})
-
-
-def _as_sheets(
-    maps: Mapping[str, Mapping[str, ExternalSide]], visits: Sequence[Visit]
-) -> dict[str, SideMaps]:
-    """Sheets of those who have a curvature map."""
-    result = {}
-    for hemi, curvature in maps[CURVATURE].items():
-        rows, _ = rows_of(curvature.visits, visits)
-        result[hemi] = _with_maps(_empty(rows, curvature.nodes), hemi, maps, visits)
-    return result
-
-
-def _empty(rows: Int, nodes: tuple[int, int]) -> SideMaps:
-    return SideMaps(
-        rows=rows,
-        maps={},
-        subfield=np.full((len(rows), *nodes), -1, dtype=np.int8),
-        names=(),
-        summary=pd.DataFrame(index=range(len(rows))),
-    )
-
-
-def _cohort(
-    measured: Measured, name: str, sides: Mapping[str, ExternalSide], visits: Sequence[Visit]
-) -> Cohort:
-    own = {}
-    if all(side.mesh is None for side in sides.values()):
-        measured = _on_grid(measured, _nodes(sides))
-    for hemi, side in sides.items():
-        rows, _ = rows_of(side.visits, visits)
-        values = _aligned(side, rows, visits)
-        own[hemi] = replace(_empty(rows, side.nodes), maps={name: values}, mesh=side.mesh)
-    return Cohort(
-        table=measured.visits, sides=own, x=measured.x, y=measured.y, units=measured.units
-    )
+    added = {}
+    for name, sides in maps.items():
+        added[name] = np.full((len(side.rows), *side.shape), np.nan)
+        if hemi in sides:
+            _, own, other = np.intersect1d(side.rows, sides[hemi].rows, return_indices=True)
+            added[name][own] = sides[hemi].maps[name][other]
+    return replace(side, maps={**side.maps, **added})

@@ -26,7 +26,7 @@ from hipsta_bids.io.files import entities
 UNIT = "mm^3"
 
 Volumes = Mapping[str, Mapping[str, float]]
-"""By hemisphere, then by structure."""
+"""In mm^3 by hemisphere (L, R) and structure."""
 
 _SIDES = {"left": "L", "right": "R", "lh": "L", "rh": "R", "L": "L", "R": "R"}
 _FREESURFER = re.compile(r"(?P<side>[lr]h)\.hippoSfVolumes.*\.txt")
@@ -37,7 +37,7 @@ class VolumeTable:
     """A table of one visit."""
 
     name: str
-    """What its measures are called after: the program, or the user's word."""
+    """Name in those of its measures: the program, or the user's word."""
     visit: str
     """Row of the covariates."""
     path: Path
@@ -76,10 +76,7 @@ _BESIDE: Mapping[str, Callable[[Path], Path | None]] = {
 
 
 def read_volumes(path: Path) -> Volumes:
-    """Read one table, in whichever form it is.
-
-    Returns mm^3 by hemisphere (````L````, ````R````) and structure.
-    """
+    """Read one table of any program."""
     try:
         text = path.read_text(encoding="utf-8-sig")
         found: dict[str, dict[str, float]] = {}
@@ -126,10 +123,7 @@ def _volume(text: str) -> float:
 def join_volumes(
     tables: Iterable[VolumeTable], visits: pd.Index, *, strict: Sequence[str] = ()
 ) -> tuple[dict[str, pd.DataFrame], list[str]]:
-    """Read tables into one measure per structure.
-
-    Returns NaN is missing.
-    """
+    """Read tables into one measure per structure, by hemisphere; NaN where missing."""
     cells: dict[str, dict[str, dict[str, float]]] = {}
     origin: dict[tuple[str, str, str], Path] = {}
     notes = []
@@ -160,9 +154,6 @@ def join_volumes(
     return frames, notes
 
 
-# Volumes from other programs' tables as further summary measures of the sheets.
-
-
 def check_volumes(patterns: Sequence[tuple[str, str]]) -> None:
     """Refuse wrong names and patterns of volume tables."""
     names = [name for name, _ in patterns]
@@ -181,7 +172,7 @@ def add_volumes(
     patterns: Sequence[tuple[str, str]],
     root: Path,
 ) -> tuple[Measured, list[str]]:
-    """Add the volumes found beside the segmentations, and those that the user names."""
+    """Add volumes found beside the segmentations, and from the user's patterns, as summaries."""
     named = [name for name, _ in patterns]
     tables = [table for table in _beside(records) if table.name not in named]
     for name, pattern in patterns:

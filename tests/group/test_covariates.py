@@ -36,7 +36,7 @@ def test_tables_without_participants_or_with_one_twice_are_refused(tmp_path):
     with pytest.raises(InputError, match="no column participant_id"):
         read_covariates(VISITS, tmp_path, [bad])
     twice = write(tmp_path / "b.tsv", "participant_id age\nsub-1 3\n1 4\n")
-    with pytest.raises(InputError, match="sub-1 stand more than once") as caught:
+    with pytest.raises(InputError, match="sub-1 occur more than once") as caught:
         read_covariates(VISITS, tmp_path, [twice])
     assert caught.value.reason == "duplicate-rows"
     # Those who are not in the cohort may stand there as they like.

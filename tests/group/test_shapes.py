@@ -36,10 +36,14 @@ def identity(n):
     return np.tile(np.linspace(0, 1, NODES[0]), (n, 1))
 
 
+def one_group(n):
+    return {"a": np.ones(n, dtype=bool)}
+
+
 def test_copies_of_one_shape_are_averaged_to_that_shape():
     random = np.random.default_rng(0)
     copies = np.array([moved(sheet(), random) for _ in range(12)])
-    found = average_shape(copies, identity(12), ["a"] * 12, ["a"], SETTINGS)
+    found = average_shape(copies, identity(12), one_group(12), SETTINGS)
     # The mean settles to 1e-6 mm.
     np.testing.assert_allclose(distances(found.mean), distances(sheet()), atol=1e-5)
     np.testing.assert_allclose(found.by_group["a"], found.mean, atol=1e-12)
@@ -52,8 +56,8 @@ def test_size_is_kept_and_groups_are_laid_upon_each_other():
     random = np.random.default_rng(1)
     sizes = np.repeat([1.0, 1.2], 10)
     shapes = np.array([moved(size * sheet(), random) for size in sizes])
-    groups = np.repeat(["small", "large"], 10)
-    found = average_shape(shapes, identity(20), groups, ["small", "large"], SETTINGS)
+    groups = {"small": sizes == 1.0, "large": sizes > 1.0}
+    found = average_shape(shapes, identity(20), groups, SETTINGS)
     for name, size in (("small", 1.0), ("large", 1.2)):
         own = distances(found.by_group[name])
         np.testing.assert_allclose(own, size * distances(sheet()), atol=1e-4)
@@ -87,7 +91,7 @@ def test_missing_points_do_not_move_the_others():
     shapes = np.array([moved(sheet(), random) for _ in range(8)])
     shapes[2, :, :3, 0] = np.nan
     shapes[:, :, -1, -1] = np.nan  # nobody has it
-    found = average_shape(shapes, identity(8), ["a"] * 8, ["a"], SETTINGS)
+    found = average_shape(shapes, identity(8), one_group(8), SETTINGS)
     known = np.isfinite(found.mean).all(axis=-1)
     assert not known[:, -1, -1].any()
     assert known.sum() == 3 * (NODES[0] * NODES[1] - 1)
@@ -100,11 +104,11 @@ def test_nodes_are_those_of_registration():
     grid = np.linspace(0, 1, NODES[0])
     shapes = np.array([moved(sheet(), random) for _ in range(6)])
     shift = grid + 0.05 * np.sin(np.pi * grid)
-    found = average_shape(shapes, np.tile(shift, (6, 1)), ["a"] * 6, ["a"], SETTINGS)
+    found = average_shape(shapes, np.tile(shift, (6, 1)), one_group(6), SETTINGS)
     # The node at 0.5 shows what lies before it: the tube's angle there is smaller.
     x = np.interp(0.5, shift, grid)
     place = np.array([np.interp(x, grid, sheet()[1, :, 0, i]) for i in range(3)])
-    plain = average_shape(shapes, identity(6), ["a"] * 6, ["a"], SETTINGS).mean[1, :, 0]
+    plain = average_shape(shapes, identity(6), one_group(6), SETTINGS).mean[1, :, 0]
     expected = np.linalg.norm(place - sheet()[1, 0, 0])
     got = np.linalg.norm(found.mean[1, NODES[0] // 2, 0] - plain[0])
     # Chords between nodes are shorter than arcs, and alignment sees another surface.

@@ -31,7 +31,13 @@ def write_subject(root, subject, version, values, hemi="L", **which):
 
 def find_and_read(root, pattern, *, surfaces=(), known=(), wanted=anybody):
     (request,) = map_patterns([("hipp", pattern)], surfaces, ())
-    return read_maps(find_maps(request, root, known, wanted), GRID, with_sheets=True)
+    found = find_maps(request, root, known, wanted)
+    visits = sorted(found.visits, key=lambda visit: (visit[0], visit[1] or ""))
+    return *read_maps(found, visits, GRID, with_sheets=True), visits
+
+
+def visits_of(side, visits):
+    return [visits[row] for row in side.rows]
 
 
 def test_maps_of_hippunfold_with_the_surface_beside(tmp_path, version):
@@ -40,14 +46,16 @@ def test_maps_of_hippunfold_with_the_surface_beside(tmp_path, version):
         write_subject(tmp_path, subject, version, values * int(subject))
     write_subject(tmp_path, "01", version, values, measure="gyrification")  # another map
     write_subject(tmp_path, "02", version, np.where(values < 1, np.nan, values), hemi="R")
-    sides = find_and_read(tmp_path, PATTERNS[version])
-    assert sides["L"].visits == (("01", None), ("02", None))
+    sides, unit, visits = find_and_read(tmp_path, PATTERNS[version])
+    assert visits_of(sides["L"], visits) == [("01", None), ("02", None)]
     # Single precision is what the files hold.
-    np.testing.assert_allclose(sides["L"].data, [values, 2 * values], rtol=1e-6)
+    left = sides["L"].maps["hipp"][..., 0]
+    np.testing.assert_allclose(left, [values, 2 * values], rtol=1e-6)
     np.testing.assert_allclose(sides["L"].mesh.points, POINTS, rtol=1e-6)
     assert sides["L"].mesh.triangles.shape == TRIANGLES.shape
-    assert sides["L"].unit == "mm"
-    assert np.isnan(sides["R"].data[0]).sum() == (values < 1).sum()
+    assert unit == "mm"
+    assert visits_of(sides["R"], visits) == [("02", None)]
+    assert np.isnan(sides["R"].maps["hipp"]).sum() == (values < 1).sum()
 
 
 def test_sessions_of_the_sheets_decide(tmp_path):
@@ -55,14 +63,14 @@ def test_sessions_of_the_sheets_decide(tmp_path):
     for session in ("a", "b"):
         write_subject(tmp_path, "01", 1, POINTS[:, 0], session=session)
     write_subject(tmp_path, "02", 1, POINTS[:, 0])
-    sides = find_and_read(tmp_path, pattern)
-    assert sides["L"].visits == (("01", "a"), ("01", "b"), ("02", None))
+    sides, _, visits = find_and_read(tmp_path, pattern)
+    assert visits_of(sides["L"], visits) == [("01", "a"), ("01", "b"), ("02", None)]
     known = [("01", "b"), ("02", "x"), ("02", "y")]
-    sides = find_and_read(tmp_path, pattern, known=known)
-    # The second participant's file tells no session: it holds for all.
-    assert sides["L"].visits == (("01", "b"), ("02", "x"), ("02", "y"))
-    sides = find_and_read(tmp_path, pattern, wanted=lambda subject, *_: subject == "02")
-    assert sides["L"].visits == (("02", None),)
+    sides, _, visits = find_and_read(tmp_path, pattern, known=known)
+    # The second participant's file has no session in its name: it holds for all.
+    assert visits_of(sides["L"], visits) == [("01", "b"), ("02", "x"), ("02", "y")]
+    sides, _, visits = find_and_read(tmp_path, pattern, wanted=lambda subject, *_: subject == "02")
+    assert visits_of(sides["L"], visits) == [("02", None)]
 
 
 def test_table_of_the_sheets_grid_needs_no_surface(tmp_path):
@@ -71,10 +79,12 @@ def test_table_of_the_sheets_grid_needs_no_surface(tmp_path):
         [str(i + 1), str(j + 1), "n/a" if i == 0 else f"{i + j}"] for i, j in zip(x, y, strict=True)
     ]
     files.write_tsv(tmp_path / "sub-1_hemi-R_desc-T2_map.tsv", ["x", "y", "T2"], rows)
-    side = find_and_read(tmp_path, "sub-{subject}_hemi-{hemi}_desc-T2_map.tsv")["R"]
+    sides, _, _ = find_and_read(tmp_path, "sub-{subject}_hemi-{hemi}_desc-T2_map.tsv")
+    side = sides["R"]
     assert side.mesh is None
-    assert side.nodes == GRID
-    np.testing.assert_array_equal(side.data[0], np.where(x == 0, np.nan, x + y))
+    assert side.shape == GRID
+    expected = np.where(x == 0, np.nan, x + y).reshape(GRID)
+    np.testing.assert_array_equal(side.maps["hipp"][0], expected)
 
 
 def test_named_surface_and_its_refusals(tmp_path):
@@ -83,8 +93,8 @@ def test_named_surface_and_its_refusals(tmp_path):
     write_surface(tmp_path / "small.surf.gii", *flat_surface(20))
     pattern = "sub-{subject}_{side}.shape.gii"
     for surfaces in ([(None, "flat_hemi-{hemi}.surf.gii")], [("hipp", f"{tmp_path}/flat*")]):
-        side = find_and_read(tmp_path, pattern, surfaces=surfaces)["L"]
-        assert side.nodes == (50, 1)
+        sides, _, _ = find_and_read(tmp_path, pattern, surfaces=surfaces)
+        assert sides["L"].shape == (50, 1)
     with pytest.raises(InputError, match="has 20 vertices, the maps hipp of hemisphere L have 50"):
         find_and_read(tmp_path, pattern, surfaces=[(None, "small.surf.gii")])
     with pytest.raises(InputError, match=r"no file none\.surf\.gii"):

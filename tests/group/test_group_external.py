@@ -65,7 +65,7 @@ def write_hippunfold(data, version):
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("foreign")
+    folder = tmp_path_factory.mktemp("external")
     data, _ = write_dataset(folder)
     for version in (1, 2):
         write_hippunfold(data, version)
@@ -298,7 +298,7 @@ def twice(study):
         (no_surface, [f"hipp={PATTERNS[1]}"], 65, "--maps-surface"),
         (damaged, [f"hipp={PATTERNS[1]}"], 65, "sub-09_hemi-L"),
         (empty_maps, [f"hipp={PATTERNS[1]}"], 65, "no point of the hipp maps"),
-        (twice, [f"hipp={PATTERNS[1]}"], 65, "stand more than once"),
+        (twice, [f"hipp={PATTERNS[1]}"], 65, "occur more than once"),
         (None, ["hipp=nothing/{subject}_{hemi}.gii"], 66, "no file matches"),
         (None, [f"hipp={PATTERNS[1]}", "--maps-surface", "none.gii"], 65, "no file none.gii"),
         (None, [f"thickness={PATTERNS[1]}"], 64, "belongs to the sheets"),
