@@ -6,6 +6,7 @@ from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from hipsta_bids.errors import ProtocolError, SettingsError
 from hipsta_bids.phantom.shape import Body, PhantomSpec, check_rotation
@@ -279,18 +280,8 @@ def _sub_voxels(counts: Int) -> Float:
 
 def _near_borders(codes: NDArray[np.intp]) -> Bool:
     """Voxels that touch (by face, edge or corner) a voxel of another label."""
-    low = high = codes
-    for axis in range(3):
-        low = _extreme(low, axis, np.minimum)
-        high = _extreme(high, axis, np.maximum)
+    low, high = (f(codes, 3, mode="nearest") for f in (minimum_filter, maximum_filter))
     return np.asarray(low != high)
-
-
-def _extreme(codes: NDArray[np.intp], axis: int, choose: np.ufunc) -> NDArray[np.intp]:
-    """Smallest or largest value among a voxel and its two neighbors along an axis."""
-    padded = np.pad(codes, [(1, 1) if i == axis else (0, 0) for i in range(3)], mode="edge")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 3, axis=axis)
-    return np.asarray(choose.reduce(windows, axis=-1))
 
 
 def _majority(labels: NDArray[np.intp], *, per_voxel: int, kinds: int) -> NDArray[np.intp]:

@@ -13,9 +13,9 @@ from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName, partici
 from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.catalog import SUMMARY
 from hipsta_bids.io import files
-from hipsta_bids.reports.maps import MAP_KINDS, make_sprites, read_maps
+from hipsta_bids.reports.maps import make_sprites, read_maps
 from hipsta_bids.reports.page import number, render
-from hipsta_bids.reports.results import Hemisphere, find_results, number_of
+from hipsta_bids.reports.results import Hemisphere, find_results
 from hipsta_bids.types import Float, Status
 
 #: Least number of hemispheres whose range is shown.
@@ -94,17 +94,11 @@ class Cohort:
     """Resolved, by stage."""
     origins: Mapping[str, Origin] = field(default_factory=dict)
     """By title of the hemisphere."""
-    _profiles: dict[str, dict[str, Float]] = field(default_factory=dict, repr=False)
 
     def like(self, name: HemisphereName) -> list[Hemisphere]:
         """Measured hemispheres of the same side, protocol and region."""
-        wanted = name.hemi, name.seg, name.region
-        return [
-            other
-            for other in self.hemispheres
-            if other.measured
-            and (other.place.name.hemi, other.place.name.seg, other.place.name.region) == wanted
-        ]
+        wanted = _kind(name)
+        return [h for h in self.hemispheres if h.measured and _kind(h.place.name) == wanted]
 
     def origin(self, hemisphere: Hemisphere) -> Origin | None:
         """Find the run that measured a hemisphere, if its log is there."""
@@ -112,22 +106,19 @@ class Cohort:
 
     def profiles(self, name: HemisphereName, column: str) -> Float:
         """(N, Nx) means over y of a map, of all hemispheres of the same kind."""
-        found = [self._profile(other) for other in self.like(name)]
-        rows = [profile[column] for profile in found if column in profile]
+        rows = [h.profile[column] for h in self.like(name) if column in h.profile]
         same = [row for row in rows if len(row) == len(rows[0])]
         return np.array(same, dtype=np.float64)
-
-    def _profile(self, hemisphere: Hemisphere) -> dict[str, Float]:
-        title = title_of(hemisphere.place.name)
-        if title not in self._profiles:
-            self._profiles[title] = _read_profile(hemisphere)
-        return self._profiles[title]
 
     def values(self, name: HemisphereName, measure: str) -> Float:
         """Collect a number of all hemispheres of the same kind, without NaN."""
         found = [other.summary.get(measure, np.nan) for other in self.like(name)]
         every = np.array(found, dtype=np.float64)
         return every[np.isfinite(every)]
+
+
+def _kind(name: HemisphereName) -> tuple[str, str, str]:
+    return name.hemi, name.seg, name.region
 
 
 def title_of(name: HemisphereName) -> str:
@@ -143,20 +134,6 @@ def read_cohort(root: Path) -> Cohort:
         settings = {}
     found = tuple(hemisphere for hemisphere in find_results(root) if _is_readable(hemisphere))
     return Cohort(hemispheres=found, settings=settings, origins=_read_origins(root))
-
-
-def _read_profile(hemisphere: Hemisphere) -> dict[str, Float]:
-    """Means over y by column; nothing where the table cannot be read."""
-    try:
-        rows = files.read_tsv(hemisphere.place.path("profile"))
-    except InputError:
-        return {}
-    rows = [row for row in rows if row.get("axis") == "x"]
-    return {
-        column: np.array([number_of(row[column]) for row in rows])
-        for column in (kind.column for kind in MAP_KINDS)
-        if rows and column in rows[0]
-    }
 
 
 def _is_readable(hemisphere: Hemisphere) -> bool:
@@ -210,9 +187,8 @@ def distances(cohort: Cohort, thickness: Mapping[str, Float]) -> dict[str, Dista
     """Measure how far each hemisphere is from those of the same side, protocol and region."""
     kinds: dict[tuple[str, str, str], list[Hemisphere]] = {}
     for hemisphere in cohort.hemispheres:
-        name = hemisphere.place.name
         if hemisphere.measured:
-            kinds.setdefault((name.hemi, name.seg, name.region), []).append(hemisphere)
+            kinds.setdefault(_kind(hemisphere.place.name), []).append(hemisphere)
     found = {}
     for members in kinds.values():
         if len(members) < SMALLEST_COMPARED:
@@ -255,7 +231,7 @@ def cohort_page(cohort: Cohort) -> str | None:
     sprites, grid = make_sprites(hemispheres, maps)
     counts = Counter(str(h.status) for h in hemispheres)
     rows = [
-        _row(h, apart.get(title_of(h.place.name)), grid.places.get(n))
+        _row(h, apart.get(title_of(h.place.name)), grid.tiles.get(n))
         for n, h in enumerate(hemispheres)
     ]
     return render(

@@ -334,14 +334,12 @@ def _mark_subfields(axis: "Axes", hemisphere: Hemisphere) -> None:
     """Name the most frequent subfield of each x above the axes, with ticks where it changes."""
     names = hemisphere.sheet.subfield
     usual = [max(set(row.tolist()), key=row.tolist().count) for row in names]
-    place = np.linspace(0, 100, len(usual))
+    x = np.linspace(0, 100, len(usual))
     changes = [0, *(i for i in range(1, len(usual)) if usual[i] != usual[i - 1]), len(usual)]
     for start, stop in pairwise(changes):
         if start:
-            axis.axvline(
-                (place[start - 1] + place[start]) / 2, color="0.8", linewidth=0.8, zorder=0
-            )
-        middle = (place[start] + place[stop - 1]) / 2
+            axis.axvline((x[start - 1] + x[start]) / 2, color="0.8", linewidth=0.8, zorder=0)
+        middle = (x[start] + x[stop - 1]) / 2
         axis.text(
             middle, 1.01, usual[start], ha="center", va="bottom", fontsize=9, color="0.3",
             transform=axis.get_xaxis_transform(),
@@ -370,7 +368,7 @@ class Grid:
 
     columns: int
     rows: int
-    places: Mapping[int, int]
+    tiles: Mapping[int, int]
     """Number of the tile, by row in the list of hemispheres."""
 
 
@@ -406,7 +404,7 @@ def make_sprites(
     grid = Grid(
         columns=min(_COLUMNS, max(1, len(shown))),
         rows=max(1, -(-len(shown) // _COLUMNS)),
-        places={row: place for place, row in enumerate(shown)},
+        tiles={row: tile for tile, row in enumerate(shown)},
     )
     step = 1 if len(shown) <= _FULL_SIZE else 2
     mirrored = [hemispheres[row].place.name.hemi == "L" for row in shown]
@@ -430,13 +428,13 @@ def _sprites(
     low, high = scale
     width, height = maps[0].shape
     picture = np.full((grid.rows * height, grid.columns * width), _COLORS, dtype=np.uint8)
-    for place, (values, mirror) in enumerate(zip(maps, mirrored, strict=True)):
+    for number, (values, mirror) in enumerate(zip(maps, mirrored, strict=True)):
         share = np.clip((values - low) / (high - low), 0, 1)
         shade = np.where(np.isnan(values), _COLORS, np.nan_to_num(share) * (_COLORS - 1))
         tile = shade.round().astype(np.uint8).T[::-1]
-        row, column = divmod(place, _COLUMNS)
-        place_in = np.s_[row * height : (row + 1) * height, column * width : (column + 1) * width]
-        picture[place_in] = tile[:, ::-1] if mirror else tile
+        row, column = divmod(number, _COLUMNS)
+        window = np.s_[row * height : (row + 1) * height, column * width : (column + 1) * width]
+        picture[window] = tile[:, ::-1] if mirror else tile
     colors = color_table(kind, _COLORS)
     return Sprites(
         name=kind.column,

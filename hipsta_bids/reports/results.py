@@ -119,6 +119,19 @@ class Hemisphere:
         return read_summary(self.place) if self.measured else {}
 
     @cached_property
+    def profile(self) -> Mapping[str, Float]:
+        """(Nx,) means over y by column; empty where the table cannot be read."""
+        try:
+            rows = files.read_tsv(self.place.path("profile"))
+        except InputError:
+            return {}
+        rows = [row for row in rows if row.pop("axis", None) == "x"]
+        return {
+            column: np.array([number_of(row[column]) for row in rows])
+            for column in (rows[0] if rows else ())
+        }
+
+    @cached_property
     def sheet(self) -> SheetTable:
         """Its sheet."""
         rows = files.read_tsv(self.place.path("sheet"))

@@ -101,6 +101,12 @@ class Site:
         """Voxels (I, J, K) of whole cross-sections, ``thickness`` mm along the axis."""
         return np.abs(self.v - position[1]) * self.length <= thickness / 2
 
+    def voxel_axes(self) -> tuple[Float, Float]:
+        """Edges (3,) of a voxel, mm, and the cosines of their angles to the long axis, absolute."""
+        linear = self.volume.affine[:3, :3]
+        edges = np.linalg.norm(linear, axis=0)
+        return np.asarray(edges), np.abs(self.axis @ (linear / edges))
+
     def erased(self, where: Bool) -> Defect:
         """Make voxels background."""
         return self.relabeled(where, Tissue.BACKGROUND, Part.UNKNOWN)
@@ -115,11 +121,15 @@ class Site:
 
     def added(self, where: Bool, position: Position) -> Defect:
         """Give voxels outside the wall the label of the wall at a position."""
-        middle = self.column(position)[len(self.columns[0, 0]) // 2]
-        nearest = np.argmin(np.linalg.norm(self.points[self.wall] - middle, axis=1))
-        tissue = Tissue(int(self.volume.tissue[self.wall][nearest]))
-        part = Part(int(self.volume.part[self.wall][nearest]))
+        tissue, part = self.label(position, self.wall)
         return self.relabeled(where & ~self.wall, tissue, part)
+
+    def label(self, position: Position, among: Bool) -> tuple[Tissue, Part]:
+        """Look up the label nearest to a position among some voxels (I, J, K)."""
+        middle = self.column(position)[self.columns.shape[2] // 2]
+        nearest = np.argmin(np.linalg.norm(self.points[among] - middle, axis=1))
+        tissue, part = self.volume.tissue[among], self.volume.part[among]
+        return Tissue(int(tissue[nearest])), Part(int(part[nearest]))
 
 
 def _refined(points: Float) -> NDArray[np.float64]:
@@ -226,19 +236,17 @@ def _gap_voxels(site: Site, width: float, u: float) -> Bool:
 def _missing_subfield(site: Site, size: float, position: Position) -> Defect:
     """Erase the subfield at the position; size is ignored."""
     del size
-    middle = site.column(position)[site.columns.shape[2] // 2]
-    own = np.isin(site.volume.tissue, site.volume.protocol.sheet)
-    nearest = np.argmin(np.linalg.norm(site.points[own] - middle, axis=1))
-    return site.erased(site.volume.tissue == site.volume.tissue[own][nearest])
+    tissue, _ = site.label(position, np.isin(site.volume.tissue, site.volume.protocol.sheet))
+    return site.erased(site.volume.tissue == tissue)
 
 
 def _missing_slices(site: Site, size: float, position: Position) -> Defect:
     """Erase all labels in the image's own slices; size is the thickness of the gap."""
-    linear = site.volume.affine[:3, :3]
-    edges = np.linalg.norm(linear, axis=0)
-    across = int(np.argmax(np.abs(site.axis @ (linear / edges))))
+    edges, along = site.voxel_axes()
+    across = int(np.argmax(along))
+    affine = site.volume.affine
     middle = site.column(position).mean(axis=0)
-    index = np.linalg.solve(linear, middle - site.volume.affine[:3, 3])[across]
+    index = np.linalg.solve(affine[:3, :3], middle - affine[:3, 3])[across]
     number = np.arange(site.wall.shape[across])
     half = max(0.5 * size / float(edges[across]), 0.5)
     chosen = np.abs(number - index) <= half
@@ -272,9 +280,7 @@ def _notch(site: Site, size: float, position: Position) -> Defect:
 
 def _waist(site: Site, size: float, position: Position) -> Defect:
     """Peel voxels off the wall over 4 mm of the long axis; size is the depth on each side."""
-    depth = ndimage.distance_transform_edt(
-        site.wall, sampling=np.linalg.norm(site.volume.affine[:3, :3], axis=0)
-    )
+    depth = ndimage.distance_transform_edt(site.wall, sampling=site.voxel_axes()[0])
     return site.erased(site.wall & (depth <= size) & site.slab(position, 4.0))
 
 
@@ -282,18 +288,15 @@ def _wrong_voxels(site: Site, size: float, position: Position) -> Defect:
     """Stretch the voxels across the long axis, as a wrong header does; size is the factor."""
     del position
     affine = site.volume.affine.copy()
-    edges = np.linalg.norm(affine[:3, :3], axis=0)
-    along = np.abs(site.axis @ (affine[:3, :3] / edges))
-    affine[:, int(np.argmin(along))] *= size
+    affine[:, int(np.argmin(site.voxel_axes()[1]))] *= size
     return Defect(volume=replace(site.volume, affine=affine), changed=site.points[site.wall])
 
 
 def _at_border(site: Site, size: float, position: Position) -> Defect:
     """Let the image end inside the body; size is what the body loses, mm (0: it just touches)."""
     del position
-    linear = site.volume.affine[:3, :3]
-    edges = np.linalg.norm(linear, axis=0)
-    across = int(np.argmin(np.abs(site.axis @ (linear / edges))))
+    edges, along = site.voxel_axes()
+    across = int(np.argmin(along))
     last = int(site.voxels[:, across].max()) - round(size / float(edges[across]))
     keep: list[slice] = [slice(None)] * 3
     keep[across] = slice(0, last + 1)

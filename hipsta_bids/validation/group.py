@@ -24,7 +24,7 @@ MAX_FALSE, MIN_POWER, MAX_PEAK, MAX_NULL = 0.08, 0.70, 1.5, 0.15
 MIN_FALSE_UNREGISTERED = 0.4
 """Without registration, the shift has to be taken for thinning; else this is no test of it."""
 
-#: Mean thickness across the sheet, mm: a constant, and bumps of height, place and width.
+#: Mean thickness across the sheet, mm: a constant, and bumps of height, position and width.
 _WALL = (1.6, ((0.35, 0.25, 0.10), (-0.30, 0.50, 0.08), (0.30, 0.80, 0.09)))
 #: Mean curvature, 1/mm, in the same way.
 _BEND = (0.10, ((0.20, 0.22, 0.08), (0.30, 0.62, 0.10), (-0.10, 0.85, 0.06)))
