@@ -5,26 +5,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from hipsta_bids.errors import ModelError, UsageError
-from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Int, SideMaps
+from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float, Int, SideMaps
 from hipsta_bids.group.formula import listed
 
 # Differences between two maps of a participant: sessions, and sides.
 
 
-FloatArray = NDArray[np.float64]
-
-
-def paired_difference(
-    first: FloatArray, second: FloatArray, years: FloatArray | None = None
-) -> FloatArray:
+def paired_difference(first: Float, second: Float, years: Float | None = None) -> Float:
     """Change from the first to the second session, to be tested by the linear model.
 
     ``first, second`` NaN is missing.
     """
-    change: FloatArray = second - first
+    change: Float = second - first
     if years is None:
         return change
     bad = np.flatnonzero(~(years > 0))
@@ -37,9 +31,9 @@ def paired_difference(
     return change / years[:, None]
 
 
-def asymmetry(left: FloatArray, right: FloatArray, *, relative: bool) -> FloatArray:
+def asymmetry(left: Float, right: Float, *, relative: bool) -> Float:
     """Left minus right, on sheets whose axes mean the same on both sides."""
-    difference: FloatArray = left - right
+    difference: Float = left - right
     if relative:
         mean = (left + right) / 2
         difference = difference / np.where(mean > 0, mean, np.nan)

@@ -11,8 +11,7 @@ from hipsta_bids.group.analysis import Analysis, mean_of_known, members_of, rows
 from hipsta_bids.group.classify import ClassifierResult, PairComparison, roc_curve
 from hipsta_bids.group.comparison import BOTH
 from hipsta_bids.group.data import Cohort, Float, Int
-from hipsta_bids.group.fit import FittedMaps
-from hipsta_bids.group.glm import PointTest
+from hipsta_bids.group.glm import FittedMaps, PointTest
 from hipsta_bids.group.inference import MapKey
 from hipsta_bids.group.shapes import AverageShape
 from hipsta_bids.reports.plotting import new_figure

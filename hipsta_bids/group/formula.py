@@ -11,6 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from hipsta_bids.errors import ModelError
+from hipsta_bids.group.data import Float
 from hipsta_bids.group.settings import DesignSettings
 
 _VERSION = "1.0.0"
@@ -338,15 +339,12 @@ def listed(items: Iterable[object]) -> str:
 # Linear combinations of coefficients that are tested.
 
 
-FloatArray = NDArray[np.float64]
-
-
 @dataclass(frozen=True)
 class Contrast:
     """One hypothesis: that ``weights @ coefficients`` is zero."""
 
     name: str
-    weights: FloatArray
+    weights: Float
     """(rows, columns of the design); one row is tested by t, several together by F."""
 
     def __post_init__(self) -> None:

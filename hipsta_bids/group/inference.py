@@ -5,22 +5,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from statsmodels.stats.multitest import multipletests
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.adjacency import mesh_edges
-from hipsta_bids.group.data import Float, Int
-from hipsta_bids.group.fit import FittedMaps, RowModel
+from hipsta_bids.group.clusters import edges_of
+from hipsta_bids.group.data import Bool, Float, Int
 from hipsta_bids.group.formula import check_names, listed
+from hipsta_bids.group.glm import FittedMaps, RowModel
 from hipsta_bids.group.permutation import PermutationPart, PermutationTest, permute
 from hipsta_bids.group.settings import GroupSettings, MultiplicitySettings
 
 # False discovery rates over the points of a map.
 
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 #: Share of the smallest p that serves as cut-off when nothing is rejected.
 BELOW_ALL = 0.1
@@ -30,10 +26,10 @@ BELOW_ALL = 0.1
 class Discoveries:
     """Tests that survive, in the shape of the p-values."""
 
-    adjusted: FloatArray
+    adjusted: Float
     """Compare with ``alpha``; of false discovery rates it holds for this level. NaN where there
     was no test."""
-    rejected: BoolArray
+    rejected: Bool
     cutoff: float
     """Largest raw p that is rejected; a tenth of the smallest p if none is (the convention of
     FreeSurfer's ``lme_mass_FDR``), so that nothing lies at or below it; NaN without tests,
@@ -49,7 +45,7 @@ class Discoveries:
         return bool(self.rejected.any()) and self.cutoff > self.alpha
 
 
-def fdr_two_stage(p: FloatArray, alpha: float) -> Discoveries:
+def fdr_two_stage(p: Float, alpha: float) -> Discoveries:
     """Two-stage step-up procedure of Benjamini, Krieger and Yekutieli (2006), "FDR2".
 
     The first stage, at ``alpha / (1 + alpha)``, estimates how many null hypotheses are true; the
@@ -60,7 +56,7 @@ def fdr_two_stage(p: FloatArray, alpha: float) -> Discoveries:
     return _discoveries(p, alpha, "fdr_tsbky")
 
 
-def fdr_benjamini_hochberg(p: FloatArray, alpha: float) -> Discoveries:
+def fdr_benjamini_hochberg(p: Float, alpha: float) -> Discoveries:
     """Step-up procedure of Benjamini and Hochberg (1995); see :func:`fdr_two_stage`."""
     return _discoveries(p, alpha, "fdr_bh")
 
@@ -84,7 +80,7 @@ def families(maps: Iterable[MapKey], scope: str) -> list[list[MapKey]]:
 
 
 def discover(
-    maps: Mapping[MapKey, FloatArray], settings: MultiplicitySettings
+    maps: Mapping[MapKey, Float], settings: MultiplicitySettings
 ) -> dict[MapKey, Discoveries]:
     """Control the false discovery rate of several maps, in families.
 
@@ -104,7 +100,7 @@ def discover(
     return {key: found[key] for key in maps}
 
 
-def _discoveries(p: FloatArray, alpha: float, method: str) -> Discoveries:
+def _discoveries(p: Float, alpha: float, method: str) -> Discoveries:
     valid = np.isfinite(p)
     tests = p[valid]
     adjusted = np.full(p.shape, np.nan)
@@ -117,39 +113,6 @@ def _discoveries(p: FloatArray, alpha: float, method: str) -> Discoveries:
             stage = multipletests(tests, alpha / (1 + alpha), "fdr_bh")[0]
             n_null = int(len(tests) - stage.sum())
     return Discoveries(adjusted, rejected, float(cutoff), len(tests), n_null, alpha)
-
-
-def adjusted_at_any_level(p: FloatArray) -> FloatArray:
-    """Smallest false discovery rate at which the two-stage procedure rejects each test.
-
-    Unlike :attr:`Discoveries.adjusted` the value does not depend on a level chosen before, and
-    can be compared with any. The first stage at rate b = alpha / (1 + alpha) rejects k of m
-    tests if the k-th smallest Benjamini-Hochberg value q is at most b, the second stage test i if
-    q_i (m - k) / m is; so the answer is the least over k of the larger of the two.
-
-    ``p`` NaN is no test.
-    """
-    result = np.full(p.shape, np.nan)
-    valid = np.isfinite(p)
-    m = int(valid.sum())
-    if not m:
-        return result
-    single = np.asarray(multipletests(p[valid], method="fdr_bh")[1], dtype=np.float64)
-    ordered = np.sort(single)
-
-    def rate(k: NDArray[np.int64]) -> FloatArray:
-        return np.maximum(ordered[k - 1], single * (m - k) / m)
-
-    # The first term rises with k and the second falls: look for where they cross by bisection.
-    low, high = np.ones(m, dtype=np.int64), np.full(m, m, dtype=np.int64)
-    while (low < high).any():
-        middle = (low + high) // 2
-        crossed = ordered[middle - 1] >= single * (m - middle) / m
-        high = np.where(crossed, middle, high)
-        low = np.where(crossed, low, np.minimum(middle + 1, high))
-    least = np.minimum(rate(low), rate(np.maximum(low - 1, 1)))
-    result[valid] = np.minimum(least / np.maximum(1 - least, np.finfo(np.float64).tiny), 1.0)
-    return result
 
 
 #: Methods that hold the family-wise error rate.
@@ -173,9 +136,17 @@ def correct(
     blocks = _blocks(model, table, how)
     found: dict[MapKey, Discoveries] = {}
     for keys in families(tests, how.scope):
-        parts = [_part(fitted[key.hemi], key.measure, model) for key in keys]
-        shape = fitted[keys[0].hemi].maps.shape
-        results = permute(parts, tests[keys[0]].contrast, shape, settings=how, blocks=blocks)
+        parts = [
+            PermutationPart(
+                maps=one.values(key.measure),
+                matrix=model.design.matrix[one.rows],
+                subjects=one.rows,
+                edges=edges_of(one.maps, how.neighbors),
+            )
+            for key in keys
+            for one in [fitted[key.hemi]]
+        ]
+        results = permute(parts, tests[keys[0]].contrast, settings=how, blocks=blocks)
         raw = [tests[key].p for key in keys]
         found |= dict(zip(keys, _permuted_discoveries(results, raw, how), strict=True))
     return {key: found[key] for key in tests}
@@ -185,7 +156,7 @@ def check_permutations(model: RowModel, settings: GroupSettings) -> None:
     """Refuse permutations where rows cannot be exchanged."""
     if settings.multiplicity.method not in PERMUTATIONS:
         return
-    if model.participants is not None:
+    if not model.independent:
         raise ModelError(
             "permutations: visits of the same participant cannot be exchanged with those of"
             " others; use --correction fdr2, or --paired",
@@ -211,12 +182,6 @@ def _blocks(model: RowModel, table: pd.DataFrame, how: MultiplicitySettings) -> 
             reason="permutation-blocks",
         )
     return np.asarray(np.unique(own.astype(str), return_inverse=True)[1], dtype=np.int64)
-
-
-def _part(one: FittedMaps, measure: str, model: RowModel) -> PermutationPart:
-    mesh = one.maps.mesh
-    edges = None if mesh is None else mesh_edges(mesh.triangles)
-    return PermutationPart(one.values(measure), model.design.matrix[one.rows], one.rows, edges)
 
 
 def _permuted_discoveries(

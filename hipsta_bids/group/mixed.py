@@ -2,75 +2,75 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
-from scipy import special
 
 from hipsta_bids.errors import ModelError
+from hipsta_bids.group.data import PARTICIPANT, Bool, Float, Int
 from hipsta_bids.group.formula import Contrast
+from hipsta_bids.group.glm import PointwiseFit, RowModel, chunks, t_test
+from hipsta_bids.group.model import Design
 from hipsta_bids.group.random_slope import (
     best_triangles,
     collect_slope_sums,
     slope_freedom,
     solve_slopes,
 )
-from hipsta_bids.group.settings import LongitudinalSettings
+from hipsta_bids.group.settings import GroupSettings, LongitudinalSettings
 
-# Restricted likelihood of a random-intercept model at many points, from sums.
-
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
+#: Sessions of one participant that tell a slope from noise.
+_SLOPE_SESSIONS = 3
 
 
 @dataclass(frozen=True)
 class State:
     """Generalized least squares at one ratio per point, with derivatives for the ratio."""
 
-    information: FloatArray
+    information: Float
     """(points, columns, columns) X' V^-1 X."""
-    first: FloatArray
-    second: FloatArray
-    scores: FloatArray
+    first: Float
+    second: Float
+    scores: Float
     """(points, columns) coefficients."""
-    residual: FloatArray
+    residual: Float
     """(points,) generalized sum of squared residuals Q, its first and second derivative."""
-    residual_first: FloatArray
-    residual_second: FloatArray
-    penalty_first: FloatArray
+    residual_first: Float
+    residual_second: Float
+    penalty_first: Float
     """(points,) derivatives of log |V| + log |X' V^-1 X|."""
-    penalty_second: FloatArray
-    penalty: FloatArray
+    penalty_second: Float
+    penalty: Float
 
 
 @dataclass(frozen=True)
 class Sums:
     """What a likelihood needs to know of the data."""
 
-    n: IntArray
+    n: Int
     """(points,) sessions."""
-    repeated: BoolArray
+    repeated: Bool
     """(points,) whether anybody has two."""
-    squares: FloatArray
+    squares: Float
     """(points, columns, columns)"""
-    products: FloatArray
+    products: Float
     """(points, columns)"""
-    total: FloatArray
+    total: Float
     """(points,) sum of squares."""
-    sizes: FloatArray
+    sizes: Float
     """(sizes,) numbers of sessions that occur."""
-    people: FloatArray
+    people: Float
     """(sizes, points) participants with so many."""
-    own_squares: FloatArray
+    own_squares: Float
     """(sizes, points, columns, columns) squared sums over a participant's sessions."""
-    own_products: FloatArray
+    own_products: Float
     """(sizes, points, columns)"""
-    own_total: FloatArray
+    own_total: Float
     """(sizes, points)"""
 
-    def where(self, usable: BoolArray) -> "Sums":
+    def where(self, usable: Bool) -> "Sums":
         """Replace points that cannot be fitted by harmless ones."""
         columns = self.squares.shape[1]
         return replace(
@@ -84,7 +84,7 @@ class Sums:
             own_total=np.where(usable, self.own_total, 0.0),
         )
 
-    def at(self, ratio: FloatArray) -> State:
+    def at(self, ratio: Float) -> State:
         """Fit with one ratio per point."""
         spread = 1 + self.sizes[:, None] * ratio
         take = (ratio / spread, 1 / spread**2, -2 * self.sizes[:, None] / spread**3)
@@ -121,7 +121,7 @@ class Sums:
         )
 
 
-def collect_sums(maps: FloatArray, basis: FloatArray, participants: IntArray) -> Sums:
+def collect_sums(maps: Float, basis: Float, participants: Int) -> Sums:
     """Sum over sessions and participants.
 
     ``maps`` NaN is missing.
@@ -156,7 +156,7 @@ def collect_sums(maps: FloatArray, basis: FloatArray, participants: IntArray) ->
     )
 
 
-def best_ratio(sums: Sums, settings: LongitudinalSettings) -> FloatArray:
+def best_ratio(sums: Sums, settings: LongitudinalSettings) -> Float:
     """Ratio of variances that maximizes the restricted likelihood at each point.
 
     The best of a grid of correlations r / (1 + r), then halving of the interval around it by
@@ -181,7 +181,7 @@ def best_ratio(sums: Sums, settings: LongitudinalSettings) -> FloatArray:
     return np.where((best == 0) & rises, 0.0, low / (1 - low))
 
 
-def curvature(sums: Sums, state: State) -> tuple[FloatArray, FloatArray]:
+def curvature(sums: Sums, state: State) -> tuple[Float, Float]:
     """Hessian of minus twice the restricted likelihood at the optimum.
 
     Returns Twice for the log variance it is the residual degrees of freedom.
@@ -193,57 +193,15 @@ def curvature(sums: Sums, state: State) -> tuple[FloatArray, FloatArray]:
     )
 
 
-#: Sessions of one participant that tell a slope from noise.
-_SLOPE_SESSIONS = 3
-#: Values in memory at once; bounds the temporaries, and does not change a result.
-_CHUNK = 4_000_000
-
-
-@dataclass(frozen=True)
-class MixedTest:
-    """One contrast of one row at each point; NaN where the model could not be fitted."""
-
-    contrast: Contrast
-    estimate: FloatArray
-    """(points,) in units of the map."""
-    se: FloatArray
-    """(points,)"""
-    t: FloatArray
-    """(points,)"""
-    df: FloatArray
-    """(points,) Satterthwaite's."""
-    p: FloatArray
-    """(points,) two-sided."""
-    limits: FloatArray
-    """(2, points) of the estimate."""
-
-
-@dataclass(frozen=True)
-class MixedFit:
-    """A random-intercept model at each point."""
-
-    coefficients: FloatArray
-    """(columns, points)"""
-    residual_variance: FloatArray
-    """(points,) within participants."""
-    participant_variance: FloatArray
-    """(points,) between them, given the columns; with random slopes, at the mean time."""
-    slope_variance: FloatArray
-    """(points,) of slopes between them, per squared unit of time; NaN without random slopes."""
-    n: IntArray
-    """(points,) sessions with a value."""
-    tests: tuple[MixedTest, ...]
-
-
 def fit_mixed(
-    maps: FloatArray,
-    matrix: FloatArray,
+    maps: Float,
+    matrix: Float,
     participants: Sequence[str] | NDArray[np.str_],
     contrasts: Sequence[Contrast],
     settings: LongitudinalSettings,
     *,
-    times: FloatArray | None = None,
-) -> MixedFit:
+    times: Float | None = None,
+) -> PointwiseFit:
     """Fit ``value = matrix @ coefficients + participant + residual`` at each point.
 
     With times, participants also have a slope of their own, correlated with the intercept.
@@ -265,54 +223,37 @@ def fit_mixed(
         )
     basis, triangle = np.linalg.qr(matrix)
     back = np.linalg.inv(triangle)
-    step = max(1, _CHUNK // (matrix.shape[0] * matrix.shape[1]))
     rotated = np.array([contrast.weights[0] @ back for contrast in contrasts])
     parts = []
-    for start in range(0, max(maps.shape[1], 1), step):
-        values = np.asarray(maps[:, start : start + step], dtype=np.float64)
+    for points in chunks(maps.shape, matrix.shape[1]):
+        values = np.asarray(maps[:, points], dtype=np.float64)
         if times is None:
             parts.append(_fit(values, basis, numbers, rotated, settings))
         else:
-            data = _SlopeData(values, basis, numbers, times)
-            parts.append(_fit_slopes(data, rotated, settings))
-    stacked = {
-        name: np.concatenate([getattr(part, name) for part in parts], axis=-1)
-        for name in ("scores", "residual", "between", "slopes", "n", "estimate", "se", "df")
-    }
-    tests = tuple(
-        _test(contrast, stacked["estimate"][i], stacked["se"][i], stacked["df"][i], settings)
-        for i, contrast in enumerate(contrasts)
+            parts.append(_fit_slopes(values, basis, numbers, rotated, settings, times=times))
+    whole = {name: np.concatenate([part[name] for part in parts], axis=-1) for name in parts[0]}
+    # The standard deviation of single visits: effect sizes are those of independent rows.
+    sigma = np.sqrt(whole["residual"] + whole["participant"])
+    return PointwiseFit(
+        coefficients=back @ whole["scores"],
+        sigma=sigma,
+        n=whole["n"].astype(np.int64),
+        tests=tuple(
+            t_test(contrast, estimate, se, df=df, sigma=sigma, confidence=settings.confidence)
+            for contrast, estimate, se, df in zip(
+                contrasts, whole["estimate"], whole["se"], whole["df"], strict=True
+            )
+        ),
+        variances={name: whole[name] for name in ("residual", "participant", "slope")},
     )
-    return MixedFit(
-        coefficients=back @ stacked["scores"],
-        residual_variance=stacked["residual"],
-        participant_variance=stacked["between"],
-        slope_variance=stacked["slopes"],
-        n=stacked["n"],
-        tests=tests,
-    )
-
-
-@dataclass(frozen=True)
-class _Part:
-    """Results at some points; points last."""
-
-    scores: FloatArray
-    residual: FloatArray
-    between: FloatArray
-    slopes: FloatArray
-    n: IntArray
-    estimate: FloatArray
-    se: FloatArray
-    df: FloatArray
 
 
 def _check(
-    maps: FloatArray,
-    matrix: FloatArray,
+    maps: Float,
+    matrix: Float,
     participants: Sequence[str] | NDArray[np.str_],
     contrasts: Sequence[Contrast],
-) -> IntArray:
+) -> Int:
     """Refuse what cannot be fitted; participants as numbers otherwise."""
     if not len(maps) == len(matrix) == len(participants):
         raise ModelError(
@@ -343,12 +284,13 @@ def _check(
 
 
 def _fit(
-    maps: FloatArray,
-    basis: FloatArray,
-    participants: IntArray,
-    rotated: FloatArray,
+    maps: Float,
+    basis: Float,
+    participants: Int,
+    rotated: Float,
     settings: LongitudinalSettings,
-) -> _Part:
+) -> dict[str, Float]:
+    """Fit intercepts at some points; points last."""
     sums = collect_sums(maps, basis, participants)
     usable = np.linalg.eigvalsh(sums.squares)[:, 0] > settings.min_information
     usable &= (sums.n > basis.shape[1] + 1) & sums.repeated
@@ -363,63 +305,64 @@ def _fit(
     slope = -np.einsum("ci,pij,pjk,pkl,cl->cp", rotated, inverse, state.first, inverse, rotated)
     df = _satterthwaite(form, slope, freedom, ratio, curvature(sums, state))
     blank = np.where(usable, 1.0, np.nan)
-    return _Part(
-        scores=state.scores.T * blank,
-        residual=variance * blank,
-        between=variance * ratio * blank,
-        slopes=np.full(len(blank), np.nan),
-        n=sums.n,
-        estimate=estimate * blank,
-        se=np.sqrt(form * variance) * blank,
-        df=df * blank,
-    )
+    return {
+        "scores": state.scores.T * blank,
+        "residual": variance * blank,
+        "participant": variance * ratio * blank,
+        "slope": np.full(len(blank), np.nan),
+        "n": sums.n.astype(np.float64),
+        "estimate": estimate * blank,
+        "se": np.sqrt(form * variance) * blank,
+        "df": df * blank,
+    }
 
 
-@dataclass(frozen=True)
-class _SlopeData:
-    maps: FloatArray
-    basis: FloatArray
-    participants: IntArray
-    times: FloatArray
-
-
-def _fit_slopes(data: _SlopeData, rotated: FloatArray, settings: LongitudinalSettings) -> _Part:
-    unit = float(data.times.std())
-    standard = (data.times - data.times.mean()) / unit
-    sums = collect_slope_sums(data.maps, data.basis, data.participants, standard)
+def _fit_slopes(
+    maps: Float,
+    basis: Float,
+    participants: Int,
+    rotated: Float,
+    settings: LongitudinalSettings,
+    *,
+    times: Float,
+) -> dict[str, Float]:
+    """Fit intercepts and slopes at some points; points last."""
+    unit = float(times.std())
+    standard = (times - times.mean()) / unit
+    sums = collect_slope_sums(maps, basis, participants, standard)
     usable = np.linalg.eigvalsh(sums.squares)[:, 0] > settings.min_information
     usable &= sums.moments[0].max(axis=1) >= _SLOPE_SESSIONS
-    usable &= sums.n > data.basis.shape[1] + _SLOPE_SESSIONS
+    usable &= sums.n > basis.shape[1] + _SLOPE_SESSIONS
     kept = sums.take(np.flatnonzero(usable))
     triangles = best_triangles(kept, settings)
     state = solve_slopes(kept, triangles)
-    variance = state.residual / (kept.n - data.basis.shape[1])
+    variance = state.residual / (kept.n - basis.shape[1])
     form = np.einsum("ci,pij,cj->cp", rotated, state.inverse, rotated)
 
-    def spread(values: FloatArray) -> FloatArray:
+    def spread(values: Float) -> Float:
         full = np.full((*values.shape[:-1], len(usable)), np.nan)
         full[..., usable] = values
         return full
 
-    return _Part(
-        scores=spread(state.scores.T),
-        residual=spread(variance),
-        between=spread(variance * triangles[:, 0] ** 2),
-        slopes=spread(variance * np.sum(triangles[:, 1:] ** 2, axis=1) / unit**2),
-        n=sums.n,
-        estimate=spread(np.einsum("cj,pj->cp", rotated, state.scores)),
-        se=spread(np.sqrt(form * variance)),
-        df=spread(slope_freedom(kept, triangles, rotated)),
-    )
+    return {
+        "scores": spread(state.scores.T),
+        "residual": spread(variance),
+        "participant": spread(variance * triangles[:, 0] ** 2),
+        "slope": spread(variance * np.sum(triangles[:, 1:] ** 2, axis=1) / unit**2),
+        "n": sums.n.astype(np.float64),
+        "estimate": spread(np.einsum("cj,pj->cp", rotated, state.scores)),
+        "se": spread(np.sqrt(form * variance)),
+        "df": spread(slope_freedom(kept, triangles, rotated)),
+    }
 
 
 def _satterthwaite(
-    form: FloatArray,
-    slope: FloatArray,
-    freedom: FloatArray,
-    ratio: FloatArray,
-    hessian: tuple[FloatArray, FloatArray],
-) -> FloatArray:
+    form: Float,
+    slope: Float,
+    freedom: Float,
+    ratio: Float,
+    hessian: tuple[Float, Float],
+) -> Float:
     """Degrees of freedom of contrasts: 2 f^2 / Var(f), f the estimated variance of one.
 
     With s the logarithm of the residual variance and r the ratio, f = exp(s) form(r), so its
@@ -437,21 +380,56 @@ def _satterthwaite(
     return np.broadcast_to(found, form.shape)
 
 
-def _test(
-    contrast: Contrast,
-    estimate: FloatArray,
-    se: FloatArray,
-    df: FloatArray,
-    settings: LongitudinalSettings,
-) -> MixedTest:
-    t = estimate / se
-    reach = special.stdtrit(df, (1 + settings.confidence) / 2) * se
-    return MixedTest(
-        contrast=contrast,
-        estimate=estimate,
-        se=se,
-        t=t,
-        df=df,
-        p=np.asarray(2 * special.stdtr(df, -np.abs(t)), dtype=np.float64),
-        limits=np.stack([estimate - reach, estimate + reach]),
-    )
+@dataclass(frozen=True, eq=False)
+class RepeatedRows(RowModel):
+    """A mixed model of a design in which participants have several rows."""
+
+    participants: NDArray[np.str_]
+    """(rows,)"""
+    times: Float | None
+    """(rows,) of each visit, for random slopes; else random intercepts."""
+    independent: ClassVar[bool] = False
+
+    def fit(
+        self, values: Float, rows: Int, contrasts: tuple[Contrast, ...], settings: GroupSettings
+    ) -> PointwiseFit:
+        """Fit some rows of the design at each point."""
+        return fit_mixed(
+            values,
+            self.design.matrix[rows],
+            self.participants[rows],
+            contrasts,
+            settings.longitudinal,
+            times=None if self.times is None else self.times[rows],
+        )
+
+    def fit_measures(
+        self, values: Float, rows: Int, contrasts: tuple[Contrast, ...], settings: GroupSettings
+    ) -> PointwiseFit:
+        """Fit some rows of the design to each summary measure, as if it were a point."""
+        return self.fit(values, rows, contrasts, settings)
+
+
+def longitudinal_model(
+    design: Design, table: pd.DataFrame, time: str | None, settings: GroupSettings
+) -> RepeatedRows:
+    """Assign visits to participants, with their times if slopes are random."""
+    if settings.glm.covariance != "ordinary":
+        raise ModelError(
+            "longitudinal model: it assumes equal variances; set glm.covariance to ordinary",
+            reason="longitudinal-covariance",
+        )
+    own = table.iloc[design.rows]
+    times = None
+    if settings.longitudinal.random == "slope":
+        if time is None:
+            raise ModelError(
+                "longitudinal model: random slopes need the time of each session; give a column"
+                f" {settings.longitudinal.time_columns[0]} or acq_time in sessions.tsv",
+                reason="no-time",
+            )
+        times = own[time].to_numpy(dtype=np.float64)
+        if not np.isfinite(times).all():
+            lacking = ", ".join(map(str, own.index[~np.isfinite(times)][:8]))
+            raise ModelError(f"longitudinal model: no {time} of {lacking}", reason="no-time")
+    return RepeatedRows(design, own[PARTICIPANT].to_numpy(dtype=np.str_), times)

@@ -10,34 +10,28 @@ from numpy.typing import NDArray
 from scipy import special
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float, Int, Measures
-from hipsta_bids.group.design import build_design
-from hipsta_bids.group.fit import most_frequent
+from hipsta_bids.group.data import PARTICIPANT, SESSION, Bool, Cohort, Float, Int, Measures
 from hipsta_bids.group.formula import ModelSpec, check_names, listed
-from hipsta_bids.group.glm import chunks, fit_block
+from hipsta_bids.group.glm import chunks, fit_block, most_frequent
+from hipsta_bids.group.model import build_design
 from hipsta_bids.group.settings import GlmSettings, GroupSettings
 from hipsta_bids.group.summaries import hemispheres, summary_values
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class NormativeScores:
     """Scores of all subjects at all points; NaN where a value or the model is missing."""
 
-    w: FloatArray
+    w: Float
     """(subjects, points) observed minus expected, in residual standard deviations of the reference
     group (Jack et al. 1997)."""
-    p: FloatArray
+    p: Float
     """(subjects, points) two-sided, with the uncertainty of the expectation."""
     n_reference: NDArray[np.int64]
     """(points,) reference subjects with a value."""
 
 
-def w_scores(
-    maps: FloatArray, matrix: FloatArray, reference: BoolArray, settings: GlmSettings
-) -> NormativeScores:
+def w_scores(maps: Float, matrix: Float, reference: Bool, settings: GlmSettings) -> NormativeScores:
     """Score each subject against a reference group, adjusted for covariates.
 
     Members of the reference group are scored against the others: as if the model had been
@@ -83,10 +77,10 @@ def w_scores(
 
 
 def _score(
-    maps: FloatArray,
-    rotated: FloatArray,
-    basis: FloatArray,
-    reference: BoolArray,
+    maps: Float,
+    rotated: Float,
+    basis: Float,
+    reference: Bool,
     settings: GlmSettings,
 ) -> NormativeScores:
     fit = fit_block(maps[reference], basis, settings)

@@ -8,25 +8,25 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from hipsta_bids.errors import ModelError
+from hipsta_bids.group.data import Bool, Float
 from hipsta_bids.group.settings import RegistrationSettings
-from hipsta_bids.group.template import (
+from hipsta_bids.group.warps import (
     Template,
+    WarpBasis,
     fit_template,
+    fit_warps,
     inner_knots,
     make_basis,
     subject_curves,
+    warp_values,
 )
-from hipsta_bids.group.warps import WarpBasis, fit_warps, warp_values
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class Registration:
     """Warps of all subjects, and what they did."""
 
-    warps: FloatArray
+    warps: Float
     """(subjects, nodes) registered coordinate of each node, 0..1."""
     template: Template | None
     """None without registration."""
@@ -35,9 +35,9 @@ class Registration:
     explained_before: float
     """Share of the variance of all profile values that the mean profile explains."""
     explained_after: float
-    displacement: FloatArray
+    displacement: Float
     """(subjects,) root mean square of warp minus identity, in grid nodes."""
-    extreme: BoolArray
+    extreme: Bool
     """(subjects,) whose displacement is out of line."""
 
 
@@ -73,7 +73,7 @@ class _Method:
         )
 
 
-def register(profiles: FloatArray, settings: RegistrationSettings) -> Registration:
+def register(profiles: Float, settings: RegistrationSettings) -> Registration:
     """Register profiles to a template that is made from them.
 
     ``registr`` takes turns: each profile is warped onto its own approximation by the mean and
@@ -125,7 +125,7 @@ def register(profiles: FloatArray, settings: RegistrationSettings) -> Registrati
 
 
 def register_to(
-    profiles: FloatArray, template: Template, settings: RegistrationSettings
+    profiles: Float, template: Template, settings: RegistrationSettings
 ) -> Registration:
     """Register profiles to a template that does not change; each subject is on its own."""
     if template.align != settings.align:
@@ -140,7 +140,7 @@ def register_to(
     return _finish(profiles, warps, template, settings, template.turns, converged=True)
 
 
-def _fit_to(scaled: FloatArray, template: Template, settings: RegistrationSettings) -> FloatArray:
+def _fit_to(scaled: Float, template: Template, settings: RegistrationSettings) -> Float:
     """Warps to a template that does not change, by as many turns as it was made with."""
     basis = WarpBasis.make(scaled.shape[1], _Method.choose(settings).warp_splines)
     curves = np.tile(template.mean, (len(scaled), 1))
@@ -156,18 +156,18 @@ def _fit_to(scaled: FloatArray, template: Template, settings: RegistrationSettin
     return fit.warps
 
 
-def _identity(profiles: FloatArray) -> FloatArray:
+def _identity(profiles: Float) -> Float:
     return np.tile(np.linspace(0.0, 1.0, profiles.shape[1]), (len(profiles), 1))
 
 
-def _after_inverse(warps: FloatArray, common: FloatArray) -> FloatArray:
+def _after_inverse(warps: Float, common: Float) -> Float:
     """Follow all warps by the inverse of one; by their mean's, it becomes the identity."""
     grid = np.linspace(0.0, 1.0, warps.shape[1])
     back = np.interp(warps.ravel(), common, grid)
     return np.asarray(back.reshape(warps.shape), dtype=np.float64)
 
 
-def _check_finite(profiles: FloatArray) -> None:
+def _check_finite(profiles: Float) -> None:
     rows = np.flatnonzero(~np.isfinite(profiles).all(axis=1))
     if len(rows):
         raise ModelError(
@@ -176,7 +176,7 @@ def _check_finite(profiles: FloatArray) -> None:
         )
 
 
-def _check(profiles: FloatArray, settings: RegistrationSettings) -> float:
+def _check(profiles: Float, settings: RegistrationSettings) -> float:
     """Refuse what gives no template; the profiles' standard deviation otherwise."""
     _check_finite(profiles)
     if len(profiles) < settings.min_subjects:
@@ -195,8 +195,8 @@ def _check(profiles: FloatArray, settings: RegistrationSettings) -> float:
 
 
 def _finish(
-    profiles: FloatArray,
-    warps: FloatArray,
+    profiles: Float,
+    warps: Float,
     template: Template | None,
     settings: RegistrationSettings,
     iterations: int,
@@ -219,7 +219,7 @@ def _finish(
     )
 
 
-def _explained(profiles: FloatArray) -> float:
+def _explained(profiles: Float) -> float:
     """Share of the variance that the mean profile explains."""
     return 1 - float(np.mean(profiles.var(axis=0))) / max(float(profiles.var()), 1e-300)
 
@@ -231,14 +231,14 @@ def _explained(profiles: FloatArray) -> float:
 class GroupShift:
     """By how much a group was displaced."""
 
-    mean: FloatArray
+    mean: Float
     """(nodes,) registered minus original position, in grid nodes; positive is lateral."""
-    se: FloatArray
+    se: Float
     """(nodes,)"""
     n: int
 
 
-def mean_profiles(maps: FloatArray, settings: RegistrationSettings) -> FloatArray:
+def mean_profiles(maps: Float, settings: RegistrationSettings) -> Float:
     """Profiles along x: means over y, with gaps filled linearly.
 
     ``maps`` Curvature, NaN where missing.

@@ -18,7 +18,7 @@ from hipsta_bids.group.model import choose_references, folder_name, model_docume
 from hipsta_bids.group.read import GroupOptions, read_inputs
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.shapes import average_shapes, write_shapes
-from hipsta_bids.group.template import templates_from_json
+from hipsta_bids.group.warps import templates_from_json
 from hipsta_bids.group.write import draw, write_results
 from hipsta_bids.io import files
 from hipsta_bids.reports.group import write_group_report

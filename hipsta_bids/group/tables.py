@@ -7,10 +7,10 @@ import pandas as pd
 
 from hipsta_bids.group.analysis import Analysis, mean_of_known, members_of, rows_of, spread_of_known
 from hipsta_bids.group.classify import ClassifierResult, roc_curve
+from hipsta_bids.group.clusters import Frame, edges_of, frame_of, peak_table
 from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float, ResultTable
 from hipsta_bids.group.glm import PointTest
 from hipsta_bids.group.inference import Discoveries, MapKey
-from hipsta_bids.group.peaks import Frame, frame_of, peak_table
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.summaries import hemispheres, summary_values
 
@@ -131,8 +131,7 @@ def mean_table(cohort: Cohort, analysis: Analysis) -> pd.DataFrame:
     parts = []
     for hemi, one in analysis.fitted.items():
         frame = frame_of(cohort, one)
-        points = np.arange(frame.shape[0] * frame.shape[1])
-        place = {**frame.number(points), **frame.place(points)}
+        place = {**frame.number, **frame.position}
         members = members_of(analysis, rows_of(analysis, one))
         for measure in one.fits:
             values = one.values(measure)
@@ -294,14 +293,13 @@ def _map(
     test: PointTest,
     found: Discoveries,
 ) -> pd.DataFrame:
-    points = np.arange(frame.shape[0] * frame.shape[1])
     single = test.kind == "t"
-    blank = np.full(len(points), np.nan)
+    blank = np.full(len(n), np.nan)
     return pd.DataFrame(
         {
-            **frame.number(points),
-            **frame.place(points),
-            "subfield": frame.subfield.ravel(),
+            **frame.number,
+            **frame.position,
+            "subfield": frame.subfield,
             "n": n,
             "estimate": test.estimate[0] if single else blank,
             "se": test.se[0] if single else blank,
@@ -323,11 +321,11 @@ def _map(
 def _peaks(cohort: Cohort, analysis: Analysis, settings: GroupSettings) -> pd.DataFrame:
     parts = []
     for hemi, one in analysis.fitted.items():
-        frame = frame_of(cohort, one)
+        frame, edges = frame_of(cohort, one), edges_of(one.maps, settings.multiplicity.neighbors)
         for measure, fit in one.fits.items():
             for test in fit.tests:
                 found = analysis.found[MapKey(measure, test.contrast.name, hemi)]
-                part = peak_table(test, found, frame, settings.multiplicity.neighbors)
+                part = peak_table(test, found, frame, edges)
                 part.insert(0, "hemi", hemi)
                 part.insert(0, "measure", measure)
                 parts.append(part)

@@ -28,7 +28,7 @@ from hipsta_bids.group.tables import (
     point_tables,
     result_tables,
 )
-from hipsta_bids.group.template import templates_to_json
+from hipsta_bids.group.warps import templates_to_json
 from hipsta_bids.io import files, gifti
 
 # Writes the results of one model: all of them or none.

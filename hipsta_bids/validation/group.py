@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from hipsta_bids.group.data import Float, SideMaps
-from hipsta_bids.group.design import Design
-from hipsta_bids.group.fit import RowModel, fit_maps
 from hipsta_bids.group.formula import Contrast
-from hipsta_bids.group.glm import PointTest, fit_points
+from hipsta_bids.group.glm import PointTest, RowModel, fit_maps, fit_points
 from hipsta_bids.group.inference import MapKey, correct, fdr_two_stage
+from hipsta_bids.group.model import Design
 from hipsta_bids.group.registration import mean_profiles, register
 from hipsta_bids.group.settings import CORRECTIONS, GroupSettings
 from hipsta_bids.group.warps import warp_values
