@@ -346,7 +346,8 @@ def fit_measures(
         for table, contrast in zip(tables, contrasts, strict=True):
             rows = found.t_test(contrast.weights)
             whole = rows if contrast.n_rows == 1 else found.f_test(contrast.weights)
-            table[:, i] = np.hstack([whole.statistic.ravel(), whole.pvalue, rows.effect, rows.sd])
+            values_of = (whole.statistic, whole.pvalue, rows.effect, rows.sd)
+            table[:, i] = np.concatenate([np.ravel(one) for one in values_of])
             if not tested[i]:
                 table[[0, 1, *range(2 + contrast.n_rows, len(table))], i] = np.nan
     tests = tuple(
