@@ -27,170 +27,137 @@ _SLOPE_SESSIONS = 3
 
 @dataclass(frozen=True)
 class State:
-    """Generalized least squares at one ratio per point, with derivatives for the ratio."""
+    """Generalized least squares at one ratio of variances per point."""
 
-    information: Float
-    """(points, columns, columns) X' V^-1 X."""
-    first: Float
-    second: Float
     scores: Float
     """(points, columns) coefficients."""
-    residual: Float
-    """(points,) generalized sum of squared residuals Q, its first and second derivative."""
-    residual_first: Float
-    residual_second: Float
-    penalty_first: Float
-    """(points,) derivatives of log |V| + log |X' V^-1 X|."""
-    penalty_second: Float
-    penalty: Float
+    inverse: Float
+    """(points, columns, columns) of X' V^-1 X."""
+    information_first: Float
+    """(points, columns, columns) derivative of X' V^-1 X for the ratio."""
+    residual: tuple[Float, Float, Float]
+    """(points,) generalized sum of squared residuals, its first and second derivative."""
+    penalty: tuple[Float, Float, Float]
+    """(points,) log |V| + log |X' V^-1 X|, its first and second derivative."""
 
 
 @dataclass(frozen=True)
 class Sums:
-    """What a likelihood needs to know of the data."""
+    """What the likelihood depends on: sums of products of columns, the values being the last."""
 
     n: Int
     """(points,) sessions."""
     repeated: Bool
-    """(points,) whether anybody has two."""
+    """(points,) whether any participant has two."""
     squares: Float
-    """(points, columns, columns)"""
-    products: Float
-    """(points, columns)"""
-    total: Float
-    """(points,) sum of squares."""
+    """(points, columns + 1, columns + 1) over sessions."""
     sizes: Float
-    """(sizes,) numbers of sessions that occur."""
+    """(sizes,) numbers of sessions of a participant that occur."""
     people: Float
-    """(sizes, points) participants with so many."""
+    """(sizes, points) participants with that number."""
     own_squares: Float
-    """(sizes, points, columns, columns) squared sums over a participant's sessions."""
-    own_products: Float
-    """(sizes, points, columns)"""
-    own_total: Float
-    """(sizes, points)"""
+    """(sizes, points, columns + 1, columns + 1) of each participant's sums, over participants."""
 
     def where(self, usable: Bool) -> "Sums":
         """Replace points that cannot be fitted by harmless ones."""
-        columns = self.squares.shape[1]
+        size = self.squares.shape[1]
+        kept = usable[:, None, None]
         return replace(
             self,
-            n=np.where(usable, self.n, columns + 2),
-            squares=np.where(usable[:, None, None], self.squares, np.eye(columns)),
-            total=np.where(usable, self.total, 1.0),
-            products=np.where(usable[:, None], self.products, 0.0),
-            own_squares=np.where(usable[:, None, None], self.own_squares, 0.0),
-            own_products=np.where(usable[:, None], self.own_products, 0.0),
-            own_total=np.where(usable, self.own_total, 0.0),
+            n=np.where(usable, self.n, size + 1),
+            squares=np.where(kept, self.squares, np.eye(size)),
+            own_squares=np.where(kept, self.own_squares, 0.0),
         )
 
     def at(self, ratio: Float) -> State:
         """Fit with one ratio per point."""
-        spread = 1 + self.sizes[:, None] * ratio
-        take = (ratio / spread, 1 / spread**2, -2 * self.sizes[:, None] / spread**3)
-        squares = [np.einsum("kp,kpij->pij", c, self.own_squares) for c in take]
-        products = [np.einsum("kp,kpi->pi", c, self.own_products) for c in take]
-        totals = [np.einsum("kp,kp->p", c, self.own_total) for c in take]
-        information = self.squares - squares[0]
-        right = self.products - products[0]
-        inverse = np.linalg.inv(information)
-        scores = np.einsum("pij,pj->pi", inverse, right)
-        first, second = -squares[1], -squares[2]
-        moved = np.einsum("pij,pj->pi", first, scores)
-        change = np.einsum("pij,pj->pi", inverse, -products[1] - moved)
-        residual = self.total - totals[0] - np.einsum("pi,pi->p", scores, right)
-        residual_first = -totals[1] + np.einsum("pi,pi->p", scores, 2 * products[1] + moved)
-        bent = np.einsum("pij,pj->pi", second, scores)
-        residual_second = -totals[2] + np.einsum("pi,pi->p", scores, 2 * products[2] + bent)
-        residual_second -= 2 * np.einsum("pi,pij,pj->p", change, information, change)
-        turned = inverse @ first
-        share = self.sizes[:, None] / spread
+        sizes = self.sizes[:, None]
+        spread = 1 + sizes * ratio
+        take = (ratio / spread, 1 / spread**2, -2 * sizes / spread**3)
+        off, first, second = (-np.einsum("kp,kpij->pij", one, self.own_squares) for one in take)
+        whole = self.squares + off
+        inverse = np.linalg.inv(whole[:, :-1, :-1])
+        scores = np.einsum("pij,pj->pi", inverse, whole[:, :-1, -1])
+        # What is left of the values: minus the scores times the columns, plus the values.
+        left = np.column_stack([-scores, np.ones(len(scores))])
+        moved = np.einsum("pij,pj->pi", first, left)
+        change = np.einsum("pij,pj->pi", inverse, moved[:, :-1])
+        ahead, bent = (np.einsum("pij,pj->pi", one, left) for one in (whole, second))
+        residual_second = np.einsum("pi,pi->p", left, bent)
+        residual_second -= 2 * np.einsum("pi,pi->p", change, moved[:, :-1])
+        relative = inverse @ first[:, :-1, :-1]
+        bend = inverse @ second[:, :-1, :-1] - relative @ relative
+        share = sizes / spread
+        log_spread = np.sum(self.people * np.log(spread), axis=0)
         return State(
-            information=information,
-            first=first,
-            second=second,
             scores=scores,
-            residual=residual,
-            residual_first=residual_first,
-            residual_second=residual_second,
-            penalty=np.sum(self.people * np.log(spread), axis=0)
-            + np.linalg.slogdet(information)[1],
-            penalty_first=np.sum(self.people * share, axis=0) + np.trace(turned, axis1=1, axis2=2),
-            penalty_second=-np.sum(self.people * share**2, axis=0)
-            + np.trace(inverse @ second - turned @ turned, axis1=1, axis2=2),
+            inverse=inverse,
+            information_first=first[:, :-1, :-1],
+            residual=(
+                np.einsum("pi,pi->p", left, ahead),
+                np.einsum("pi,pi->p", left, moved),
+                residual_second,
+            ),
+            penalty=(
+                log_spread - np.linalg.slogdet(inverse)[1],
+                np.sum(self.people * share, axis=0) + np.trace(relative, axis1=1, axis2=2),
+                np.trace(bend, axis1=1, axis2=2) - np.sum(self.people * share**2, axis=0),
+            ),
         )
 
 
 def collect_sums(maps: Float, basis: Float, participants: Int) -> Sums:
-    """Sum over sessions and participants.
-
-    ``maps`` NaN is missing.
-    """
+    """Sum over sessions and participants."""
     present = np.isfinite(maps)
-    weight = present.astype(np.float64)
-    values = np.where(present, maps, 0.0)
     order = np.argsort(participants, kind="stable")
     starts = np.searchsorted(participants[order], np.arange(participants.max() + 1))
-    counts = np.add.reduceat(weight[order], starts, axis=0)
-    sums_x = np.add.reduceat(weight[order][:, :, None] * basis[order][:, None, :], starts, axis=0)
-    sums_y = np.add.reduceat(values[order], starts, axis=0)
-    products = (basis[:, :, None] * basis[:, None, :]).reshape(len(basis), -1)
-    columns = basis.shape[1]
+    counts = np.add.reduceat(present[order].astype(np.float64), starts, axis=0)
+    columns = np.empty((*maps.shape, basis.shape[1] + 1))
+    columns[..., :-1] = present[:, :, None] * basis[:, None, :]
+    columns[..., -1] = np.where(present, maps, 0.0)
+    own = np.add.reduceat(columns[order], starts, axis=0)
     sizes = np.unique(counts[counts > 0])
     chosen = [np.where(counts == size, 1.0, 0.0) for size in sizes]
+
+    def squares(rows: Float, weight: Float) -> Float:
+        weighted = np.moveaxis(rows * weight[:, :, None], 0, 2)
+        return np.asarray(weighted @ np.swapaxes(rows, 0, 1))
+
     return Sums(
         n=present.sum(axis=0),
         repeated=np.asarray((counts > 1).any(axis=0)),
-        squares=(weight.T @ products).reshape(-1, columns, columns),
-        products=values.T @ basis,
-        total=np.einsum("sp,sp->p", values, values),
+        squares=squares(columns, np.ones(maps.shape)),
         sizes=sizes,
         people=np.array([who.sum(axis=0) for who in chosen]),
-        own_squares=np.array(
-            [np.einsum("gp,gpi,gpj->pij", who, sums_x, sums_x, optimize=True) for who in chosen]
-        ),
-        own_products=np.array(
-            [np.einsum("gp,gp,gpi->pi", who, sums_y, sums_x, optimize=True) for who in chosen]
-        ),
-        own_total=np.array([np.einsum("gp,gp->p", who, sums_y**2) for who in chosen]),
+        own_squares=np.array([squares(own, who) for who in chosen]),
     )
 
 
 def best_ratio(sums: Sums, settings: LongitudinalSettings) -> Float:
-    """Ratio of variances that maximizes the restricted likelihood at each point.
+    """Ratio r of variances that maximizes the restricted likelihood at each point.
 
-    The best of a grid of correlations r / (1 + r), then halving of the interval around it by
-    the sign of the derivative. Zero if the likelihood falls from there.
+    The best of a grid of correlations r / (1 + r), then halving of the interval around it by the
+    sign of the derivative.
     """
-    freedom = sums.n - sums.squares.shape[1]
+    freedom = sums.n - sums.squares.shape[1] + 1
     grid = np.linspace(0.0, settings.max_correlation, settings.grid)
-    ratios = grid / (1 - grid)
     losses = []
-    for ratio in ratios:
+    for ratio in grid / (1 - grid):
         state = sums.at(np.full(len(sums.n), ratio))
-        losses.append(freedom * np.log(state.residual) + state.penalty)
+        losses.append(freedom * np.log(state.residual[0]) + state.penalty[0])
     best = np.argmin(losses, axis=0)
+
+    def rising(correlation: Float) -> Float:
+        state = sums.at(correlation / (1 - correlation))
+        return np.asarray(freedom * state.residual[1] / state.residual[0] + state.penalty[1])
+
     low, high = grid[np.maximum(best - 1, 0)], grid[np.minimum(best + 1, len(grid) - 1)]
     for _ in range(settings.halvings):
         middle = (low + high) / 2
-        state = sums.at(middle / (1 - middle))
-        rising = freedom * state.residual_first / state.residual + state.penalty_first > 0
-        low, high = np.where(rising, low, middle), np.where(rising, middle, high)
-    at_zero = sums.at(np.zeros(len(sums.n)))
-    rises = freedom * at_zero.residual_first / at_zero.residual + at_zero.penalty_first >= 0
-    return np.where((best == 0) & rises, 0.0, low / (1 - low))
-
-
-def curvature(sums: Sums, state: State) -> tuple[Float, Float]:
-    """Hessian of minus twice the restricted likelihood at the optimum.
-
-    Returns Twice for the log variance it is the residual degrees of freedom.
-    """
-    variance = state.residual / (sums.n - sums.squares.shape[1])
-    return (
-        -state.residual_first / variance,
-        state.penalty_second + state.residual_second / variance,
-    )
+        beyond = rising(middle) > 0
+        low, high = np.where(beyond, low, middle), np.where(beyond, middle, high)
+    at_bound = (best == 0) & (rising(np.zeros(len(sums.n))) >= 0)
+    return np.where(at_bound, 0.0, low / (1 - low))
 
 
 def fit_mixed(
@@ -211,14 +178,12 @@ def fit_mixed(
     Satterthwaite's, from the curvature of the likelihood at the optimum, as in R's ``lmerTest``
     (Kuznetsova et al. 2017); where no variance between participants is found they are those of
     the linear model.
-
-    ``maps`` NaN is missing.
     """
     numbers = _check(maps, matrix, participants, contrasts)
     if times is not None and np.bincount(numbers).max() < _SLOPE_SESSIONS:
         raise ModelError(
-            "longitudinal model: nobody has three sessions, so that slopes cannot be told from"
-            " noise; use random intercepts",
+            "longitudinal model: no participant has three sessions, so that slopes cannot be"
+            " separated from noise; use random intercepts",
             reason="few-sessions",
         )
     basis, triangle = np.linalg.qr(matrix)
@@ -277,7 +242,7 @@ def _check(
     )
     if counts.max() == 1:
         raise ModelError(
-            "longitudinal model: nobody has two sessions; use a linear model",
+            "longitudinal model: no participant has two sessions; use a linear model",
             reason="one-session",
         )
     return np.asarray(numbers, dtype=np.int64)
@@ -292,18 +257,18 @@ def _fit(
 ) -> dict[str, Float]:
     """Fit intercepts at some points; points last."""
     sums = collect_sums(maps, basis, participants)
-    usable = np.linalg.eigvalsh(sums.squares)[:, 0] > settings.min_information
-    usable &= (sums.n > basis.shape[1] + 1) & sums.repeated
+    columns = basis.shape[1]
+    usable = np.linalg.eigvalsh(sums.squares[:, :-1, :-1])[:, 0] > settings.min_information
+    usable &= (sums.n > columns + 1) & sums.repeated
     sums = sums.where(usable)
     ratio = best_ratio(sums, settings)
     state = sums.at(ratio)
-    freedom = sums.n - basis.shape[1]
-    variance = state.residual / freedom
-    inverse = np.linalg.inv(state.information)
-    estimate = np.einsum("cj,pj->cp", rotated, state.scores)
-    form = np.einsum("ci,pij,cj->cp", rotated, inverse, rotated)
-    slope = -np.einsum("ci,pij,pjk,pkl,cl->cp", rotated, inverse, state.first, inverse, rotated)
-    df = _satterthwaite(form, slope, freedom, ratio, curvature(sums, state))
+    freedom = sums.n - columns
+    variance = state.residual[0] / freedom
+    form = np.einsum("ci,pij,cj->cp", rotated, state.inverse, rotated)
+    moved = state.inverse @ state.information_first @ state.inverse
+    slope = -np.einsum("ci,pij,cj->cp", rotated, moved, rotated)
+    df = _satterthwaite(form, slope, freedom, ratio, state)
     blank = np.where(usable, 1.0, np.nan)
     return {
         "scores": state.scores.T * blank,
@@ -311,7 +276,7 @@ def _fit(
         "participant": variance * ratio * blank,
         "slope": np.full(len(blank), np.nan),
         "n": sums.n.astype(np.float64),
-        "estimate": estimate * blank,
+        "estimate": np.einsum("cj,pj->cp", rotated, state.scores) * blank,
         "se": np.sqrt(form * variance) * blank,
         "df": df * blank,
     }
@@ -356,28 +321,21 @@ def _fit_slopes(
     }
 
 
-def _satterthwaite(
-    form: Float,
-    slope: Float,
-    freedom: Float,
-    ratio: Float,
-    hessian: tuple[Float, Float],
-) -> Float:
+def _satterthwaite(form: Float, slope: Float, freedom: Int, ratio: Float, state: State) -> Float:
     """Degrees of freedom of contrasts: 2 f^2 / Var(f), f the estimated variance of one.
 
     With s the logarithm of the residual variance and r the ratio, f = exp(s) form(r), so its
     gradient is f (1, slope / form); the covariance of (s, r) is twice the inverse of the Hessian
-    of minus twice the restricted likelihood.
+    of minus twice the restricted likelihood, whose entry for s is the residual ``freedom``.
     """
-    mixed, second = hessian
-    inner = ratio > 0
+    variance = state.residual[0] / freedom
+    mixed, second = -state.residual[1] / variance, state.penalty[2] + state.residual[2] / variance
     determinant = freedom * second - mixed**2
-    safe = inner & (determinant > 0)
-    scale = np.where(safe, determinant, 1.0)
+    safe = (ratio > 0) & (determinant > 0)
     relative = slope / form
     spread = second - 2 * mixed * relative + freedom * relative**2
-    found = np.where(safe, scale / np.where(safe, spread, 1.0), freedom)
-    return np.broadcast_to(found, form.shape)
+    found = np.where(safe, determinant, 1.0) / np.where(safe, spread, 1.0)
+    return np.where(safe, found, freedom.astype(np.float64))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,8 @@
-"""Registration of curvature profiles, so that the same grid node means the same place."""
+"""Registration of curvature profiles, so that a grid node means the same position in all."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,39 +39,14 @@ class Registration:
     displacement: Float
     """(subjects,) root mean square of warp minus identity, in grid nodes."""
     extreme: Bool
-    """(subjects,) whose displacement is out of line."""
+    """(subjects,) whose displacement is an outlier."""
 
 
-@dataclass(frozen=True)
-class _Method:
-    """The numbers of one of the two methods."""
-
-    template_splines: int
-    warp_splines: int
-    components: int
-    iterations: int
-    tolerance: float
-    variance: float
-
-    @classmethod
-    def choose(cls, settings: RegistrationSettings) -> "_Method":
-        if settings.align == "penalized":
-            return cls(
-                settings.penalized_template_splines,
-                settings.penalized_warp_splines,
-                settings.penalized_components,
-                settings.penalized_iterations,
-                settings.penalized_tolerance,
-                settings.penalized_start_sd**2,
-            )
-        return cls(
-            settings.template_splines,
-            settings.warp_splines,
-            settings.components,
-            settings.iterations,
-            settings.tolerance,
-            np.inf,
-        )
+def _numbers(settings: RegistrationSettings) -> dict[str, Any]:
+    """Take the settings of the chosen method."""
+    prefix = "penalized_" if settings.align == "penalized" else ""
+    names = ("template_splines", "warp_splines", "components", "iterations", "tolerance")
+    return {name: getattr(settings, prefix + name) for name in names}
 
 
 def register(profiles: Float, settings: RegistrationSettings) -> Registration:
@@ -86,15 +62,16 @@ def register(profiles: Float, settings: RegistrationSettings) -> Registration:
     if settings.align == "none":
         return _finish(profiles, _identity(profiles), None, settings, 0, converged=True)
     scale = _check(profiles, settings)
-    method = _Method.choose(settings)
+    chosen = _numbers(settings)
     scaled = profiles / scale
-    basis = WarpBasis.make(profiles.shape[1], method.warp_splines)
+    basis = WarpBasis.make(profiles.shape[1], chosen["warp_splines"])
     warps = _identity(profiles)
-    knots = inner_knots(warps, method.template_splines)
+    knots = inner_knots(warps, chosen["template_splines"])
     mean = np.linalg.lstsq(make_basis(knots)(warps[0]), scaled.mean(axis=0), rcond=None)[0]
     curves = np.tile(mean, (len(profiles), 1))
     parameters = np.zeros((len(profiles), len(basis.identity)))
-    variance, noise = method.variance, 1.0
+    variance = settings.penalized_start_sd**2 if settings.align == "penalized" else np.inf
+    noise = 1.0
     turn = 0
     while True:
         fit = fit_warps(
@@ -107,12 +84,12 @@ def register(profiles: Float, settings: RegistrationSettings) -> Registration:
         if settings.center:
             warps = _after_inverse(warps, warps.mean(axis=0))
         template, curves = fit_template(
-            scaled, warps, method.template_splines, method.components, settings
+            scaled, warps, chosen["template_splines"], chosen["components"], settings
         )
         knots, noise = template.knots, template.noise
         change = float(np.mean((warps - before) ** 2))
         # The first warps are to the mean of profiles that were not registered.
-        if turn == method.iterations or (turn and change <= method.tolerance):
+        if turn == chosen["iterations"] or (turn and change <= chosen["tolerance"]):
             break
         turn += 1
     template = replace(
@@ -121,7 +98,9 @@ def register(profiles: Float, settings: RegistrationSettings) -> Registration:
     if settings.center:
         center = _fit_to(scaled, template, settings).mean(axis=0)
         template = replace(template, center=center)
-    return _finish(profiles, warps, template, settings, turn, converged=change <= method.tolerance)
+    return _finish(
+        profiles, warps, template, settings, turn, converged=change <= chosen["tolerance"]
+    )
 
 
 def register_to(
@@ -142,7 +121,7 @@ def register_to(
 
 def _fit_to(scaled: Float, template: Template, settings: RegistrationSettings) -> Float:
     """Warps to a template that does not change, by as many turns as it was made with."""
-    basis = WarpBasis.make(scaled.shape[1], _Method.choose(settings).warp_splines)
+    basis = WarpBasis.make(scaled.shape[1], _numbers(settings)["warp_splines"])
     curves = np.tile(template.mean, (len(scaled), 1))
     parameters = np.zeros((len(scaled), len(basis.identity)))
     penalty = template.noise / template.warp_variance
@@ -177,7 +156,7 @@ def _check_finite(profiles: Float) -> None:
 
 
 def _check(profiles: Float, settings: RegistrationSettings) -> float:
-    """Refuse what gives no template; the profiles' standard deviation otherwise."""
+    """Refuse what makes no template; else return the profiles' standard deviation."""
     _check_finite(profiles)
     if len(profiles) < settings.min_subjects:
         raise ModelError(
@@ -224,9 +203,6 @@ def _explained(profiles: Float) -> float:
     return 1 - float(np.mean(profiles.var(axis=0))) / max(float(profiles.var()), 1e-300)
 
 
-# Profiles along x before registration, and displacements of groups after it.
-
-
 @dataclass(frozen=True)
 class GroupShift:
     """By how much a group was displaced."""
@@ -239,10 +215,7 @@ class GroupShift:
 
 
 def mean_profiles(maps: Float, settings: RegistrationSettings) -> Float:
-    """Profiles along x: means over y, with gaps filled linearly.
-
-    ``maps`` Curvature, NaN where missing.
-    """
+    """Profiles of curvature along x: means over y, with gaps filled linearly."""
     present = np.isfinite(maps)
     counts = present.sum(axis=2)
     sums = np.where(present, maps, 0.0).sum(axis=2)
