@@ -449,10 +449,7 @@ def compare_pairs(
     *,
     order: Sequence[str],
 ) -> list[PairComparison]:
-    """Compare the two models in each pair of groups, on the same complete subjects.
-
-    ``base`` NaN is missing.
-    """
+    """Compare the two models in each pair of groups, on the same complete subjects."""
     if unknown := sorted(set(order) - set(groups.tolist())):
         raise ModelError(
             f"classification: no participant is in group {', '.join(unknown)}; known are"

@@ -142,10 +142,7 @@ class PointBlock:
 def fit_points(
     maps: Float, matrix: Float, contrasts: Sequence[Contrast], settings: GlmSettings
 ) -> PointwiseFit:
-    """Fit the same linear model to each column of a table, with values missing anywhere.
-
-    ``maps`` NaN is missing.
-    """
+    """Fit the same linear model to each column of a table, with values missing anywhere."""
     _check(maps, matrix, contrasts)
     basis, triangle = np.linalg.qr(matrix)
     back = np.linalg.inv(triangle)
@@ -201,8 +198,6 @@ def fit_block(maps: Float, basis: Float, settings: GlmSettings) -> PointBlock:
 
     There the equations of a complete point are the identity, and those of others stay well
     conditioned unless the missing subjects really carried a column.
-
-    ``maps`` NaN is missing.
     """
     present = np.isfinite(maps)
     values = np.where(present, maps, 0.0)

@@ -15,11 +15,10 @@ from hipsta_bids.group.glm import FittedMaps, RowModel
 from hipsta_bids.group.permutation import PermutationPart, PermutationTest, permute
 from hipsta_bids.group.settings import GroupSettings, MultiplicitySettings
 
-# False discovery rates over the points of a map.
-
-
 #: Share of the smallest p that serves as cut-off when nothing is rejected.
 BELOW_ALL = 0.1
+#: Methods that hold the family-wise error rate.
+PERMUTATIONS = ("permutation-tfce", "permutation-max")
 
 
 @dataclass(frozen=True)
@@ -35,8 +34,6 @@ class Discoveries:
     FreeSurfer's ``lme_mass_FDR``), so that nothing lies at or below it; NaN without tests,
     and where clusters decide."""
     n_tests: int
-    n_null: int
-    """Estimated number of true null hypotheses; but for ``fdr2`` the number of tests."""
     alpha: float
 
     @property
@@ -45,20 +42,21 @@ class Discoveries:
         return bool(self.rejected.any()) and self.cutoff > self.alpha
 
 
-def fdr_two_stage(p: Float, alpha: float) -> Discoveries:
-    """Two-stage step-up procedure of Benjamini, Krieger and Yekutieli (2006), "FDR2".
+def control_fdr(p: Float, alpha: float, method: str = "fdr2") -> Discoveries:
+    """Control the false discovery rate of tests; NaN is no test.
 
-    The first stage, at ``alpha / (1 + alpha)``, estimates how many null hypotheses are true; the
-    second allows for that many only.
-
-    ``p`` NaN is no test.
+    ``bh`` is the step-up procedure of Benjamini and Hochberg (1995), ``fdr2`` the two-stage one of
+    Benjamini, Krieger and Yekutieli (2006): the first stage, at ``alpha / (1 + alpha)``, estimates
+    how many null hypotheses are true, and the second allows for that number only.
     """
-    return _discoveries(p, alpha, "fdr_tsbky")
-
-
-def fdr_benjamini_hochberg(p: Float, alpha: float) -> Discoveries:
-    """Step-up procedure of Benjamini and Hochberg (1995); see :func:`fdr_two_stage`."""
-    return _discoveries(p, alpha, "fdr_bh")
+    valid = np.isfinite(p)
+    tests = p[valid]
+    adjusted, rejected, cutoff = np.full(p.shape, np.nan), np.zeros(p.shape, dtype=bool), np.nan
+    if len(tests):
+        name = "fdr_bh" if method == "bh" else "fdr_tsbky"
+        rejected[valid], adjusted[valid], *_ = multipletests(tests, alpha, name)
+        cutoff = tests[rejected[valid]].max() if rejected.any() else tests.min() * BELOW_ALL
+    return Discoveries(adjusted, rejected, float(cutoff), len(tests), alpha)
 
 
 @dataclass(frozen=True, order=True)
@@ -82,41 +80,16 @@ def families(maps: Iterable[MapKey], scope: str) -> list[list[MapKey]]:
 def discover(
     maps: Mapping[MapKey, Float], settings: MultiplicitySettings
 ) -> dict[MapKey, Discoveries]:
-    """Control the false discovery rate of several maps, in families.
-
-    ``maps`` NaN is no test.
-    """
-    method = fdr_benjamini_hochberg if settings.method == "bh" else fdr_two_stage
+    """Control the false discovery rate of several maps (points,), in families."""
     found = {}
     for keys in families(maps, settings.scope):
-        together = method(np.concatenate([maps[key].ravel() for key in keys]), settings.alpha)
-        ends = np.cumsum([maps[key].size for key in keys])[:-1]
+        p = np.concatenate([maps[key] for key in keys])
+        together = control_fdr(p, settings.alpha, settings.method)
+        ends = np.cumsum([len(maps[key]) for key in keys])[:-1]
         adjusted, rejected = np.split(together.adjusted, ends), np.split(together.rejected, ends)
         for key, values, flags in zip(keys, adjusted, rejected, strict=True):
-            shape = maps[key].shape
-            found[key] = replace(
-                together, adjusted=values.reshape(shape), rejected=flags.reshape(shape)
-            )
+            found[key] = replace(together, adjusted=values, rejected=flags)
     return {key: found[key] for key in maps}
-
-
-def _discoveries(p: Float, alpha: float, method: str) -> Discoveries:
-    valid = np.isfinite(p)
-    tests = p[valid]
-    adjusted = np.full(p.shape, np.nan)
-    rejected = np.zeros(p.shape, dtype=bool)
-    cutoff, n_null = np.nan, len(tests)
-    if len(tests):
-        rejected[valid], adjusted[valid], *_ = multipletests(tests, alpha, method)
-        cutoff = tests[rejected[valid]].max() if rejected.any() else tests.min() * BELOW_ALL
-        if method == "fdr_tsbky":
-            stage = multipletests(tests, alpha / (1 + alpha), "fdr_bh")[0]
-            n_null = int(len(tests) - stage.sum())
-    return Discoveries(adjusted, rejected, float(cutoff), len(tests), n_null, alpha)
-
-
-#: Methods that hold the family-wise error rate.
-PERMUTATIONS = ("permutation-tfce", "permutation-max")
 
 
 def correct(
@@ -170,7 +143,7 @@ def check_permutations(model: RowModel, settings: GroupSettings) -> None:
 
 
 def _blocks(model: RowModel, table: pd.DataFrame, how: MultiplicitySettings) -> Int | None:
-    """Give the number of each row's block."""
+    """Return the number of each row's block, or None without blocks."""
     if not how.blocks:
         return None
     check_names([how.blocks], table.columns)
@@ -196,6 +169,6 @@ def _permuted_discoveries(
         own, survive = np.concatenate(raw), np.concatenate(rejected)
         cutoff = own[survive].max() if survive.any() else np.nanmin(own) * BELOW_ALL
     return [
-        Discoveries(p, flags, float(cutoff), n_tests, n_tests, how.alpha)
+        Discoveries(p, flags, float(cutoff), n_tests, how.alpha)
         for p, flags in zip(corrected, rejected, strict=True)
     ]

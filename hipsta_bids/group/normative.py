@@ -1,4 +1,4 @@
-"""How far each subject is from what a reference group would have, given the covariates."""
+"""w-scores: how far maps and measures are from those of a reference group, given covariates."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -16,6 +16,9 @@ from hipsta_bids.group.glm import chunks, fit_block, most_frequent
 from hipsta_bids.group.model import build_design
 from hipsta_bids.group.settings import GlmSettings, GroupSettings
 from hipsta_bids.group.summaries import hemispheres, summary_values
+
+#: Region of a score that is the mean over the whole sheet.
+WHOLE = "all"
 
 
 @dataclass(frozen=True)
@@ -37,8 +40,6 @@ def w_scores(maps: Float, matrix: Float, reference: Bool, settings: GlmSettings)
     Members of the reference group are scored against the others: as if the model had been
     fitted without them (from their leverage, so that nothing is fitted again). Their scores
     thus mean the same as those of everybody else.
-
-    ``maps`` NaN is missing.
     """
     if settings.covariance != "ordinary":
         raise ModelError(
@@ -106,13 +107,6 @@ def _score(
     return NormativeScores(w, np.asarray(p, dtype=np.float64), fit.n)
 
 
-# Each participant against a reference group: w-scores of maps and of summary measures.
-
-
-#: Region of a score that is the mean over the whole sheet.
-WHOLE = "all"
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScoredMaps:
     """Scores of one hemisphere."""
@@ -152,7 +146,7 @@ def score_cohort(
     measures: Measures,
     references: Mapping[str, str],
 ) -> Scores:
-    """Score everybody who has the covariates of a model, whatever their group."""
+    """Score all participants who have the covariates of a model, whatever their group."""
     factor, level = normative
     formula = _without(model.formula, factor)
     known = {str(name) for name in Formula(formula).required_variables}
@@ -164,7 +158,7 @@ def score_cohort(
     reference = (column.astype(str) == level).to_numpy()
     if not reference.any():
         raise ModelError(
-            f"w-scores: nobody with the covariates has {factor!r} {level!r}; there are"
+            f"w-scores: no participant with the covariates has {factor!r} {level!r}; there are"
             f" {listed(sorted(column.dropna().astype(str).unique()))}",
             reason="unknown-level",
         )
@@ -213,7 +207,7 @@ def _without(formula: str, factor: str) -> str:
 def _map_rows(
     cohort: Cohort, sides: Mapping[str, ScoredMaps], settings: GroupSettings
 ) -> Iterator[pd.DataFrame]:
-    """Means over the sheet and over each subfield, and how many points are out of line."""
+    """Means over the sheet and over each subfield, and the share of points that are outliers."""
     alpha = 1 - settings.glm.confidence
     for hemi, side in sides.items():
         fields = side.subfield.ravel()
@@ -224,16 +218,9 @@ def _map_rows(
             for region, points in regions.items():
                 if not points.any():
                     continue
-                scored = np.isfinite(found.w[:, points])
-                count = np.where(scored.any(axis=1), scored.sum(axis=1), np.nan)
-
-                def share(
-                    flags: NDArray[np.bool_],
-                    points: NDArray[np.bool_] = points,
-                    count: Float = count,
-                ) -> Float:
-                    return np.asarray(flags[:, points].sum(axis=1) / count)
-
+                w = found.w[:, points]
+                count = np.isfinite(w).sum(axis=1).astype(np.float64)
+                count[count == 0] = np.nan
                 yield _rows(
                     cohort,
                     side.rows,
@@ -241,10 +228,10 @@ def _map_rows(
                     measure=measure,
                     region=region,
                     reference=side.reference,
-                    w=np.where(scored, found.w[:, points], 0.0).sum(axis=1) / count,
+                    w=np.nansum(w, axis=1) / count,
                     p=np.nan,
-                    low=share(out & (found.w < 0)),
-                    high=share(out & (found.w > 0)),
+                    low=(out[:, points] & (w < 0)).sum(axis=1) / count,
+                    high=(out[:, points] & (w > 0)).sum(axis=1) / count,
                 )
 
 

@@ -28,16 +28,14 @@ _CONSTANT = 1e-6
 class PermutationTest:
     """Corrected p-values; the family is all points of all parts."""
 
+    p_uncorrected: Float
+    """(points,) of each point alone."""
     p_max: Float
     """(points,) of the statistic itself (maximum over the sheet)."""
     p_enhanced: Float
     """(points,) of the cluster-enhanced statistic; NaN with ``permutation-max``."""
-    p_uncorrected: Float
-    """(points,) of each point alone."""
     statistic: Float
     """(points,) t, or F."""
-    enhanced: Float
-    """(points,) threshold-free cluster enhancement of t, or of the square root of F."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,23 +139,15 @@ class _Run:
 
     def result(self) -> PermutationTest:
         """Turn counts into p-values."""
-        missing = np.isnan(self.observed[0])
-        p = np.where(missing, np.nan, self.counts / self.settings.permutations)
-        enhanced = np.where(missing, np.nan, self.enhanced[0])
+        t = self.observed[0]
+        p = np.where(np.isnan(t), np.nan, self.counts / self.settings.permutations)
         if self.settings.method == _MAXIMUM:
-            p[2], enhanced = np.nan, np.full(len(missing), np.nan)
-        single = self.contrast.n_rows == 1
-        return PermutationTest(
-            p_uncorrected=p[0],
-            p_max=p[1],
-            p_enhanced=p[2],
-            statistic=self.observed[0] if single else self.observed[0] ** 2,
-            enhanced=enhanced,
-        )
+            p[2] = np.nan
+        return PermutationTest(p[0], p[1], p[2], t if self.contrast.n_rows == 1 else t**2)
 
 
 def _check_blocks(tested: Float, blocks: Int, contrast: Contrast) -> None:
-    """Refuse blocks inside which what is tested does not vary: shuffling would not undo it."""
+    """Refuse blocks inside which what is tested does not vary: shuffling cannot break it up."""
     numbers = np.unique(blocks, return_inverse=True)[1]
     sizes = np.bincount(numbers)
     means = np.stack([np.bincount(numbers, column) for column in tested.T], axis=1) / sizes[:, None]

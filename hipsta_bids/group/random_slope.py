@@ -76,10 +76,7 @@ class SlopeState:
 
 
 def collect_slope_sums(maps: Float, basis: Float, participants: Int, times: Float) -> SlopeSums:
-    """Sum over each participant's sessions.
-
-    ``maps`` NaN is missing.
-    """
+    """Sum over each participant's sessions."""
     present = np.isfinite(maps)
     weight = present.astype(np.float64)
     values = np.where(present, maps, 0.0)

@@ -26,7 +26,7 @@ _ARRAYS, _INFINITE = ("knots", "mean", "components", "center"), "warp_variance"
 
 
 def inner_knots(values: Float, splines: int) -> Float:
-    """Knots at quantiles of the values, so many that there are ``splines`` functions."""
+    """Knots at quantiles of the values, for ``splines`` functions."""
     shares = np.linspace(0.0, 1.0, splines - _DEGREE + 1)[1:-1]
     return np.asarray(np.quantile(values, shares), dtype=np.float64)
 
@@ -60,7 +60,7 @@ class Template:
     warp_variance: float
     """Of the logarithms of local stretch; infinite without a penalty."""
     turns: int
-    """Turns of template and warps, which new subjects take as well."""
+    """Iterations of template and warps, which new subjects take as well."""
     center: Float
     """(nodes,) mean warp of the subjects that made it, when they are registered to it as new ones
     are; warps are followed by its inverse."""
@@ -134,17 +134,14 @@ def fit_template(
 
 
 def subject_curves(template: Template, profiles: Float, warps: Float) -> Float:
-    """Each subject's own template, given one that is not to change."""
+    """Each subject's own curve, by a template that does not change."""
     moments = _Moments.collect(profiles, warps, template.knots)
     scores = _expect(moments, template.mean, template.components, template.noise)
     return template.mean + scores.mean @ template.components.T
 
 
 def _start(moments: _Moments, mean: Float, components: int) -> Float:
-    """Principal components of the residuals on the grid.
-
-    The steps end at the same place from other starts.
-    """
+    """Principal components of the residuals on the grid; the steps do not depend on the start."""
     residuals = moments.profiles - moments.basis @ mean
     _, size, axes = np.linalg.svd(residuals, full_matrices=False)
     grid = moments.basis.mean(axis=0)
@@ -185,7 +182,7 @@ def _maximize(moments: _Moments, scores: _Scores) -> tuple[Float, Float]:
 
 
 def templates_to_json(templates: Mapping[str, Template]) -> dict[str, Any]:
-    """Spell templates by hemisphere."""
+    """Write templates by hemisphere as a JSON object."""
     entries = {}
     for hemi, template in templates.items():
         entry = {
@@ -199,7 +196,7 @@ def templates_to_json(templates: Mapping[str, Template]) -> dict[str, Any]:
 
 
 def templates_from_json(content: Mapping[str, Any], where: str) -> dict[str, Template]:
-    """Read templates by hemisphere."""
+    """Read what :func:`templates_to_json` wrote."""
     try:
         found = {}
         for hemi, entry in content["Hemispheres"].items():
@@ -370,10 +367,7 @@ def fit_warps(
 
 
 def warp_values(maps: Float, warps: Float) -> Float:
-    """Carry maps of values to registered coordinates, linearly.
-
-    ``maps`` NaN is missing, and makes missing what would need it.
-    """
+    """Carry maps of values to registered coordinates, linearly; NaN where a value lacks."""
     carried = np.empty(maps.shape)
     for block in _blocks(len(maps)):
         left, weight = _sources(warps[block])

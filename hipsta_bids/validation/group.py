@@ -11,7 +11,7 @@ from scipy import ndimage
 from hipsta_bids.group.data import Float, SideMaps
 from hipsta_bids.group.formula import Contrast
 from hipsta_bids.group.glm import PointTest, RowModel, fit_maps, fit_points
-from hipsta_bids.group.inference import MapKey, correct, fdr_two_stage
+from hipsta_bids.group.inference import MapKey, control_fdr, correct
 from hipsta_bids.group.model import Design
 from hipsta_bids.group.registration import mean_profiles, register
 from hipsta_bids.group.settings import CORRECTIONS, GroupSettings
@@ -163,7 +163,7 @@ def run_simulation(
 
 
 def _judge(test: PointTest, cohort: SimulatedCohort, plan: SimulationPlan, alpha: float) -> Finding:
-    found = fdr_two_stage(test.p, alpha).rejected.reshape(cohort.affected.shape)
+    found = control_fdr(test.p, alpha).rejected.reshape(cohort.affected.shape)
     count = int(found.sum())
     peak = int(np.nanargmax(np.abs(test.statistic))) // plan.nodes[1]
     return Finding(

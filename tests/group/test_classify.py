@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import optimize, special, stats
+from sklearn.calibration import calibration_curve
 from statsmodels.discrete.discrete_model import Logit
 
 from hipsta_bids.errors import ModelError
@@ -15,7 +16,9 @@ from hipsta_bids.group.classify import (
     cross_validate,
     delong,
     fit_logistic,
+    fit_overlapping_or_firth,
     is_separated,
+    roc_curve,
 )
 from hipsta_bids.group.settings import ClassificationSettings
 
@@ -198,6 +201,41 @@ def test_cross_validation_survives_a_level_that_a_fold_lacks():
     rare[[3, 7]] = 1.0
     matrix = np.column_stack([base, added, rare])
     assert np.isfinite(cross_validate(matrix, case, replace(SETTINGS, repeats=5)).auc)
+
+
+def test_groups_of_calibration_are_quantiles():
+    """Where the size of the sample allows groups of one size, scikit-learn makes the same."""
+    random = np.random.default_rng(8)
+    score = random.normal(0, 1.5, 400)
+    case = random.random(400) < special.expit(score)
+    found = calibrate(score, case, SETTINGS)
+    chance = special.expit(score)
+    observed, predicted = calibration_curve(case, chance, n_bins=10, strategy="quantile")
+    np.testing.assert_allclose(found.predicted, predicted, rtol=1e-12)
+    np.testing.assert_allclose(found.observed, observed, rtol=1e-12)
+    assert found.brier == pytest.approx(np.mean((chance - case) ** 2), rel=1e-12)
+
+
+def test_curve_steps_at_each_score():
+    score = np.array([1.0, 2.0, 2.0, 3.0, 0.0])
+    case = np.array([False, True, False, True, True])
+    wrong, right = roc_curve(score, case)
+    np.testing.assert_allclose(wrong, [0, 0, 1 / 2, 1, 1], rtol=1e-12)
+    np.testing.assert_allclose(right, [0, 1 / 3, 2 / 3, 2 / 3, 1], rtol=1e-12)
+    assert delong(score, case, 0.95).area == 3.5 / 6  # 2 > 1, 2 = 2, 3 > 1, 3 > 2 of six pairs
+
+
+def test_firth_is_used_where_and_only_where_groups_are_separated():
+    """Small samples, near separation and beyond; the linear program decides."""
+    random = np.random.default_rng(9)
+    separated = []
+    for _ in range(80):
+        matrix = np.column_stack([np.ones(12), random.standard_normal((12, 2))])
+        case = random.random(12) < special.expit(4 * matrix[:, 1])
+        if 1 < case.sum() < 11:
+            separated.append(is_separated(matrix, case))
+            assert fit_overlapping_or_firth(matrix, case, SETTINGS).firth == separated[-1]
+    assert 20 < sum(separated) < len(separated) - 10
 
 
 def test_calibration_of_right_and_of_exaggerated_chances():
