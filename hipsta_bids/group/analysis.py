@@ -17,12 +17,11 @@ from hipsta_bids.group.comparison import (
     modeled_table,
 )
 from hipsta_bids.group.data import PARTICIPANT, Cohort, Float, Measures, SideMaps
-from hipsta_bids.group.design import Design, build_design
-from hipsta_bids.group.fit import FittedMaps, RowModel, fit_maps, longitudinal_model, with_mean
 from hipsta_bids.group.formula import ModelSpec
-from hipsta_bids.group.glm import PointTest
+from hipsta_bids.group.glm import FittedMaps, PointTest, RowModel, fit_maps, with_mean
 from hipsta_bids.group.inference import Discoveries, MapKey, check_permutations, correct
-from hipsta_bids.group.model import Groups
+from hipsta_bids.group.mixed import longitudinal_model
+from hipsta_bids.group.model import Design, Groups, build_design
 from hipsta_bids.group.normative import Scores, score_cohort
 from hipsta_bids.group.registration import (
     GroupShift,
@@ -34,8 +33,7 @@ from hipsta_bids.group.registration import (
 )
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.summaries import MeasureFit, classify_groups, fit_summaries
-from hipsta_bids.group.template import Template
-from hipsta_bids.group.warps import warp_labels, warp_values
+from hipsta_bids.group.warps import Template, warp_labels, warp_values
 
 #: Group of all, where there are no groups.
 ALL = "all"

@@ -1,23 +1,207 @@
-"""How well measures tell two groups apart, beyond a base model."""
+"""How well measures tell two groups apart, beyond a base model: logistic models and their curves.
 
+Logistic regression is by maximum likelihood (statsmodels), or by Firth's method where a model
+separates the groups.
+"""
+
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize, special, stats
+from sklearn import config_context, metrics
 from sklearn.model_selection import RepeatedStratifiedKFold
+from statsmodels.discrete.discrete_model import Logit
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.logistic import LogisticFit, fit_logistic, is_separated
+from hipsta_bids.group.data import Bool, Float
 from hipsta_bids.group.settings import ClassificationSettings
 
-# Receiver operating characteristics: areas with DeLong intervals, and their difference.
+#: Largest sum of margins, per subject, that still counts as rounding of the linear program.
+_NO_MARGIN = 1e-7
+#: Where all fitted chances are farther from 0 and 1 than this, groups are not separated.
+_INSIDE = 1e-3
+#: Maximum likelihood has converged when coefficients of unit columns change by less.
+_CONVERGED = 1e-10
+#: Longest step of Firth's method, in standard deviations of a column, as in ``logistf``.
+_LONGEST_STEP = 5.0
+#: A step must gain at least this share of what the slope promises, or it is halved.
+_SHARE = 0.1
+#: Log likelihoods differ by rounding by no more than this, relatively.
+_ROUNDING = 1e-12
+#: Halvings of a step that does not gain.
+_HALVINGS = 30
+#: Directions of a training set with less than this share of the largest are no columns.
+_RANK = 1e-9
+#: Subjects in a group of the table of calibration, or there are fewer groups.
+_LEAST_IN_BIN = 5
 
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+@dataclass(frozen=True)
+class LogisticFit:
+    """One logistic model."""
+
+    coefficients: Float
+    """Log odds per unit of each column."""
+    se: Float
+    """From the inverse of Fisher's information at the estimate."""
+    log_likelihood: float
+    """With Firth the penalized one: half the log determinant of the information comes on top."""
+    firth: bool
+    """Whether Firth's penalty was used."""
+
+
+def is_separated(matrix: Float, case: Bool) -> bool:
+    """Whether a combination of the columns tells the groups apart without overlap.
+
+    Then maximum-likelihood estimates are infinite (Albert and Anderson 1984). Found exactly, by
+    a linear program (Konis 2007): the largest sum of margins under which none is negative.
+    """
+    scale = np.abs(matrix).max(axis=0)
+    margins = np.where(case, 1.0, -1.0)[:, None] * matrix / np.where(scale > 0, scale, 1.0)
+    solution = optimize.linprog(
+        -margins.sum(axis=0), A_ub=-margins, b_ub=np.zeros(len(margins)), bounds=(-1, 1)
+    )
+    return bool(margins.sum(axis=0) @ solution.x > _NO_MARGIN * len(margins))
+
+
+def fit_logistic(
+    matrix: Float,
+    case: Bool,
+    settings: ClassificationSettings,
+    *,
+    firth: bool,
+    free: Bool | None = None,
+) -> LogisticFit:
+    """Fit a logistic regression by maximum likelihood, or by Firth's method.
+
+    Of Firth's, columns that are not ``free`` stay zero but count in the penalty, as the penalized
+    likelihood-ratio test needs it (Heinze and Schemper 2002).
+    """
+    if firth:
+        return _fit_firth(matrix, case, settings, free)
+    fit = _fit_maximum(matrix, case, settings)
+    if fit is None:
+        raise _no_convergence(settings.iterations)
+    return fit
+
+
+def fit_overlapping_or_firth(
+    matrix: Float, case: Bool, settings: ClassificationSettings
+) -> LogisticFit:
+    """Fit by maximum likelihood if the groups overlap, else by Firth's method."""
+    fit = _fit_maximum(matrix, case, settings)
+    if fit is not None:
+        # A maximum inside proves overlap; only near the edge must the linear program decide.
+        chance = special.expit(matrix @ fit.coefficients)
+        if min(chance.min(), 1 - chance.max()) > _INSIDE:
+            return fit
+    if is_separated(matrix, case):
+        return _fit_firth(matrix, case, settings)
+    if fit is None:
+        raise _no_convergence(settings.iterations)
+    return fit
+
+
+def _no_convergence(limit: int) -> ModelError:
+    return ModelError(
+        f"logistic model: no convergence in {limit} steps; the groups may be separated, or columns"
+        " nearly the same",
+        reason="logistic-convergence",
+    )
+
+
+def _scales(matrix: Float) -> Float:
+    """Take standard deviations of columns, and the size of those that are constant."""
+    spread = matrix.std(axis=0)
+    size = np.maximum(np.abs(matrix).max(axis=0), 1e-300)
+    return np.asarray(np.where(spread > 0, spread, size), dtype=np.float64)
+
+
+def _fit_maximum(matrix: Float, case: Bool, settings: ClassificationSettings) -> LogisticFit | None:
+    """Maximize the likelihood by statsmodels; None if that does not converge."""
+    scale = _scales(matrix)
+    model = Logit(case.astype(np.float64), matrix / scale, check_rank=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of separation, which the caller looks for
+        try:
+            found = model.fit(
+                method="newton",
+                maxiter=settings.iterations,
+                tol=_CONVERGED,
+                disp=False,
+                warn_convergence=False,
+            )
+        except np.linalg.LinAlgError:
+            return None
+    if not found.mle_retvals["converged"]:
+        return None
+    return LogisticFit(found.params / scale, found.bse / scale, float(found.llf), firth=False)
+
+
+def _fit_firth(
+    matrix: Float, case: Bool, settings: ClassificationSettings, free: Bool | None = None
+) -> LogisticFit:
+    """Penalize the likelihood by the root of the information's determinant (Firth 1993).
+
+    This is Jeffreys' prior: estimates are finite under separation, and less biased.
+    """
+    scale = _scales(matrix)
+    scaled = matrix / scale
+    kept = np.ones(matrix.shape[1], dtype=bool) if free is None else free
+    beta = np.zeros(matrix.shape[1])
+    value = _penalized(scaled, case, beta)
+    for _ in range(settings.firth_iterations):
+        step, promised = _firth_step(scaled, case, beta, kept)
+        for halving in range(_HALVINGS):
+            new = _penalized(scaled, case, beta + step)
+            least = _SHARE * promised / 2**halving - _ROUNDING * (1 + abs(value))
+            if new >= value + least:
+                break
+            step = step / 2
+        beta, value = beta + step, new
+        if promised < settings.tolerance:
+            break
+    else:
+        raise _no_convergence(settings.firth_iterations)
+    covariance = np.linalg.inv(_information(scaled, beta))
+    return LogisticFit(
+        coefficients=beta / scale,
+        se=np.sqrt(np.diagonal(covariance)) / scale,
+        # The penalty is that of the columns as given.
+        log_likelihood=value + float(np.log(scale).sum()),
+        firth=True,
+    )
+
+
+def _information(matrix: Float, beta: Float) -> Float:
+    chance = special.expit(matrix @ beta)
+    weighted: Float = matrix.T @ (matrix * (chance * (1 - chance))[:, None])
+    return weighted
+
+
+def _penalized(matrix: Float, case: Bool, beta: Float) -> float:
+    """Penalized log likelihood."""
+    margin = np.where(case, 1.0, -1.0) * (matrix @ beta)
+    penalty = 0.5 * float(np.linalg.slogdet(_information(matrix, beta))[1])
+    return float(special.log_expit(margin).sum()) + penalty
+
+
+def _firth_step(matrix: Float, case: Bool, beta: Float, kept: Bool) -> tuple[Float, float]:
+    """Newton's next step, and the gain that the slope promises."""
+    chance = special.expit(matrix @ beta)
+    information = _information(matrix, beta)
+    leverage = np.sum(matrix @ np.linalg.pinv(information) * matrix, axis=1)
+    residual = case - chance + chance * (1 - chance) * leverage * (0.5 - chance)
+    score = (matrix.T @ residual)[kept]
+    step = np.zeros(len(beta))
+    step[kept] = np.linalg.pinv(information[np.ix_(kept, kept)], hermitian=True) @ score
+    step *= min(1.0, _LONGEST_STEP / max(float(np.abs(step).max()), 1e-300))
+    return step, float(score @ step[kept])
 
 
 @dataclass(frozen=True)
@@ -32,66 +216,25 @@ class Area:
     high: float
 
 
-@dataclass(frozen=True)
-class AreaDifference:
-    """Comparison of two scores of the same subjects."""
+def delong(score: Float, case: Bool, confidence: float) -> Area:
+    """Area under the curve with its interval (DeLong, DeLong and Clarke-Pearson 1988).
 
-    difference: float
-    """First minus second."""
-    z: float
-    p: float
-    """Two-sided. Not valid between nested models fitted to these data: there the statistic is
-    not normal (Demler et al. 2012); use the likelihood-ratio test."""
-
-
-def delong(score: FloatArray, case: BoolArray, confidence: float) -> Area:
-    """Area under the curve with its interval (DeLong, DeLong and Clarke-Pearson 1988)."""
-    areas, covariance = _components(np.atleast_2d(score), case)
-    area, se = float(areas[0]), float(np.sqrt(covariance[0, 0]))
+    From mid-ranks (Sun and Xu 2014).
+    """
+    cases, controls = score[case], score[~case]
+    ranks = stats.rankdata(np.concatenate([cases, controls]))
+    of_cases = (ranks[: len(cases)] - stats.rankdata(cases)) / len(controls)
+    of_controls = 1 - (ranks[len(cases) :] - stats.rankdata(controls)) / len(cases)
+    area = float(of_cases.mean())
+    se = float(np.sqrt(of_cases.var(ddof=1) / len(cases) + of_controls.var(ddof=1) / len(controls)))
     reach = float(stats.norm.ppf((1 + confidence) / 2)) * se
     return Area(area, se, max(area - reach, 0.0), min(area + reach, 1.0))
 
 
-def roc_curve(score: FloatArray, case: BoolArray) -> tuple[FloatArray, FloatArray]:
+def roc_curve(score: Float, case: Bool) -> tuple[Float, Float]:
     """Shares of controls and of cases at or above each score, from none to all."""
-    cuts = np.concatenate([[np.inf], np.unique(score)[::-1]])
-    controls, cases = np.sort(score[~case]), np.sort(score[case])
-    above = [1 - np.searchsorted(part, cuts) / len(part) for part in (controls, cases)]
-    return above[0], above[1]
-
-
-def area_under(score: FloatArray, case: BoolArray) -> float:
-    """Chance that a case scores higher than a control, ties counted half (Mann and Whitney)."""
-    cases = int(case.sum())
-    ranks = float(stats.rankdata(score)[case].sum())
-    return (ranks - cases * (cases + 1) / 2) / (cases * (len(case) - cases))
-
-
-def delong_difference(first: FloatArray, second: FloatArray, case: BoolArray) -> AreaDifference:
-    """Compare two areas of the same subjects (DeLong, DeLong and Clarke-Pearson 1988)."""
-    areas, covariance = _components(np.stack([first, second]), case)
-    weights = np.array([1.0, -1.0])
-    difference = float(weights @ areas)
-    se = float(np.sqrt(weights @ covariance @ weights))
-    z = difference / se if se > 0 else 0.0
-    return AreaDifference(difference, z, float(2 * stats.norm.sf(abs(z))))
-
-
-def _components(scores: FloatArray, case: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Areas and their covariance, from mid-ranks (Sun and Xu 2014)."""
-    cases, controls = scores[:, case], scores[:, ~case]
-    m, n = cases.shape[1], controls.shape[1]
-    ranks = stats.rankdata(np.hstack([cases, controls]), axis=1)
-    of_cases = (ranks[:, :m] - stats.rankdata(cases, axis=1)) / n
-    of_controls = 1 - (ranks[:, m:] - stats.rankdata(controls, axis=1)) / m
-    spread = np.atleast_2d(np.cov(of_cases)) / m + np.atleast_2d(np.cov(of_controls)) / n
-    return of_cases.mean(axis=1), np.asarray(spread, dtype=np.float64)
-
-
-#: Directions of a training set with less than this share of the largest are no columns.
-_RANK = 1e-9
-#: Subjects in a group of the table of calibration, or there are fewer groups.
-_LEAST_IN_BIN = 5
+    wrong, right, _ = metrics.roc_curve(case, score, drop_intermediate=False)
+    return wrong, right
 
 
 @dataclass(frozen=True)
@@ -102,7 +245,7 @@ class CrossValidation:
     """Mean over folds and repeats."""
     auc_sd: float
     """Standard deviation of the repeats' means."""
-    score: FloatArray
+    score: Float
     """(subjects,) log odds, mean over repeats."""
     folds: int
 
@@ -117,9 +260,9 @@ class Calibration:
     """Below one if predictions are too extreme (Cox 1958)."""
     brier: float
     """Mean squared error of the predicted chance."""
-    predicted: FloatArray
+    predicted: Float
     """(bins,) mean predicted chance in groups of equal size."""
-    observed: FloatArray
+    observed: Float
     """(bins,) share of cases in them."""
 
 
@@ -128,7 +271,7 @@ class ClassifierResult:
     """One logistic model as a classifier."""
 
     fit: LogisticFit
-    score: FloatArray
+    score: Float
     """(subjects,) fitted log odds."""
     auc: Area
     """Of the subjects fitted: optimistic."""
@@ -152,7 +295,7 @@ class ModelComparison:
 
 
 def compare_models(
-    base: FloatArray, added: FloatArray, case: BoolArray, settings: ClassificationSettings
+    base: Float, added: Float, case: Bool, settings: ClassificationSettings
 ) -> ModelComparison:
     """Test whether measures add to a base model, and tell how well both classify.
 
@@ -184,7 +327,7 @@ def compare_models(
 
 
 def classify(
-    matrix: FloatArray, case: BoolArray, settings: ClassificationSettings, *, firth: bool
+    matrix: Float, case: Bool, settings: ClassificationSettings, *, firth: bool
 ) -> ClassifierResult:
     """Fit one model and tell how well it classifies; see :func:`compare_models`."""
     _check(matrix, case)
@@ -200,7 +343,7 @@ def classify(
     )
 
 
-def _check(matrix: FloatArray, case: BoolArray) -> None:
+def _check(matrix: Float, case: Bool) -> None:
     if not np.isfinite(matrix).all():
         raise ModelError(
             "classification: values are missing; keep complete rows only", reason="design-missing"
@@ -218,70 +361,71 @@ def _check(matrix: FloatArray, case: BoolArray) -> None:
         )
 
 
-def cross_validate(
-    matrix: FloatArray, case: BoolArray, settings: ClassificationSettings
-) -> CrossValidation:
+def cross_validate(matrix: Float, case: Bool, settings: ClassificationSettings) -> CrossValidation:
     """Area under the curve by repeated stratified cross-validation.
 
-    Separation is looked for, and answered by Firth's method, in each training set anew.
+    In each training set separation is looked for, and answered by Firth's method.
     """
+    return _cross_validated(matrix.tobytes(), matrix.shape[1], case.tobytes(), settings)
+
+
+@lru_cache(maxsize=128)
+def _cross_validated(
+    values: bytes, columns: int, cases: bytes, settings: ClassificationSettings
+) -> CrossValidation:
+    """Keep results: the base model is the same for each measure that is added."""
+    matrix, case = np.frombuffer(values).reshape(-1, columns), np.frombuffer(cases, dtype=bool)
     folds = min(settings.folds, int(case.sum()), int((~case).sum()))
     splits = RepeatedStratifiedKFold(
         n_splits=folds, n_repeats=settings.repeats, random_state=settings.seed
     )
     total, areas = np.zeros(len(case)), []
-    for train, test in splits.split(matrix, case):
-        score = _predict(matrix[train], case[train], matrix[test], settings)
-        total[test] += score
-        areas.append(area_under(score, case[test]))
+    with config_context(assume_finite=True, skip_parameter_validation=True):
+        for train, test in splits.split(matrix, case):
+            score = _predict(matrix[train], case[train], matrix[test], settings)
+            total[test] += score
+            areas.append(metrics.roc_auc_score(case[test], score))
     means = np.reshape(areas, (settings.repeats, folds)).mean(axis=1)
     spread = float(means.std(ddof=1)) if settings.repeats > 1 else float("nan")
     return CrossValidation(float(means.mean()), spread, total / settings.repeats, folds)
 
 
-def _predict(
-    train: FloatArray, case: BoolArray, test: FloatArray, settings: ClassificationSettings
-) -> FloatArray:
-    """Log odds of new subjects; a level that the training set lacks has no say."""
+def _predict(train: Float, case: Bool, test: Float, settings: ClassificationSettings) -> Float:
+    """Log odds of new subjects; a level that the training set lacks has no effect."""
     scale = np.abs(train).max(axis=0)
     scale = np.where(scale > 0, scale, 1.0)
     _, size, axes = np.linalg.svd(train / scale, full_matrices=False)
     axes = axes[size > _RANK * size[0]].T
-    known = train / scale @ axes
-    fit = fit_logistic(known, case, settings, firth=is_separated(known, case))
-    score: FloatArray = test / scale @ axes @ fit.coefficients
+    fit = fit_overlapping_or_firth(train / scale @ axes, case, settings)
+    score: Float = test / scale @ axes @ fit.coefficients
     return score
 
 
-def calibrate(score: FloatArray, case: BoolArray, settings: ClassificationSettings) -> Calibration:
+def calibrate(score: Float, case: Bool, settings: ClassificationSettings) -> Calibration:
     """Compare predicted chances with what happened."""
     line = np.column_stack([np.ones(len(score)), score])
     slope = np.nan
     if np.ptp(score) > 0:
-        apart = is_separated(line, case)
-        slope = float(fit_logistic(line, case, settings, firth=apart).coefficients[1])
+        slope = float(fit_overlapping_or_firth(line, case, settings).coefficients[1])
     chance = special.expit(score)
     count = min(settings.bins, max(len(score) // _LEAST_IN_BIN, 2))
     bins = np.array_split(np.argsort(score, kind="stable"), count)
     return Calibration(
         intercept=_shift(score, case),
         slope=slope,
-        brier=float(np.mean((chance - case) ** 2)),
+        brier=float(metrics.brier_score_loss(case, chance)),
         predicted=np.array([chance[members].mean() for members in bins]),
         observed=np.array([case[members].mean() for members in bins]),
     )
 
 
-def _shift(score: FloatArray, case: BoolArray) -> float:
+def _shift(score: Float, case: Bool) -> float:
     """Log odds to add for the predicted number of cases to be right."""
     reach = float(np.abs(score).max()) + 2 * float(np.log(len(score))) + 1
     cases = float(case.sum())
     return float(
         optimize.brentq(lambda add: special.expit(score + add).sum() - cases, -reach, reach)
     )
-
-
-# Classification of each pair of groups, as in the paper's tables.
 
 
 @dataclass(frozen=True)
@@ -299,19 +443,16 @@ class PairComparison:
 
 def compare_pairs(
     groups: NDArray[np.str_],
-    base: FloatArray,
-    added: FloatArray,
+    base: Float,
+    added: Float,
     settings: ClassificationSettings,
     *,
     order: Sequence[str],
 ) -> list[PairComparison]:
-    """Compare the two models in each pair of groups, on the same complete subjects.
-
-    ``base`` NaN is missing.
-    """
+    """Compare the two models in each pair of groups, on the same complete subjects."""
     if unknown := sorted(set(order) - set(groups.tolist())):
         raise ModelError(
-            f"classification: nobody is in group {', '.join(unknown)}; known are"
+            f"classification: no participant is in group {', '.join(unknown)}; known are"
             f" {', '.join(sorted(set(groups.tolist())))}",
             reason="unknown-level",
         )

@@ -5,49 +5,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from hipsta_bids.errors import ModelError, UsageError
-from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Int, SideMaps
+from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float, Int, SideMaps
 from hipsta_bids.group.formula import listed
 
-# Differences between two maps of a participant: sessions, and sides.
+#: Both sides of a participant, in names of hemispheres.
+BOTH = "LR"
 
 
-FloatArray = NDArray[np.float64]
-
-
-def paired_difference(
-    first: FloatArray, second: FloatArray, years: FloatArray | None = None
-) -> FloatArray:
-    """Change from the first to the second session, to be tested by the linear model.
-
-    ``first, second`` NaN is missing.
-    """
-    change: FloatArray = second - first
-    if years is None:
-        return change
-    bad = np.flatnonzero(~(years > 0))
-    if len(bad):
-        raise ModelError(
-            f"paired difference: rows {', '.join(map(str, bad[:8]))} have no positive time between"
-            " their sessions; correct the dates or the order",
-            reason="session-order",
-        )
-    return change / years[:, None]
-
-
-def asymmetry(left: FloatArray, right: FloatArray, *, relative: bool) -> FloatArray:
+def asymmetry(left: Float, right: Float, *, relative: bool) -> Float:
     """Left minus right, on sheets whose axes mean the same on both sides."""
-    difference: FloatArray = left - right
+    difference: Float = left - right
     if relative:
         mean = (left + right) / 2
         difference = difference / np.where(mean > 0, mean, np.nan)
     return difference
-
-
-#: Both sides of a participant, in names of hemispheres.
-BOTH = "LR"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +51,7 @@ class Comparison:
             )
         if self.longitudinal and self.normative:
             raise UsageError(
-                "w-scores want one visit per participant, as others of the same participant would"
+                "w-scores need one visit per participant, as others of the same participant would"
                 " be in the reference; leave --longitudinal out, or use --paired",
                 reason="session-choice",
             )
@@ -93,7 +66,12 @@ def choose_visits(cohort: Cohort, comparison: Comparison) -> tuple[Cohort, Mappi
         keep = ~table[PARTICIPANT].duplicated().to_numpy()
         why = pd.Series("the first session of each participant is analyzed", index=table.index)
     else:
-        _check_sessions(table, comparison.pair)
+        known = sorted(table[SESSION].dropna().unique())
+        if unknown := sorted(set(comparison.pair) - set(known)):
+            raise ModelError(
+                f"there is no session {listed(unknown)}, only {listed(known) or 'none'}",
+                reason="unknown-level",
+            )
         asked = table[SESSION].isin(comparison.pair)
         both = asked.groupby(table[PARTICIPANT]).transform("sum") == len(comparison.pair)
         keep = (asked & both).to_numpy()
@@ -101,19 +79,11 @@ def choose_visits(cohort: Cohort, comparison: Comparison) -> tuple[Cohort, Mappi
         why[~asked] = f"sessions {' and '.join(comparison.pair)} are compared"
         if not keep.any():
             raise ModelError(
-                f"nobody has both sessions {' and '.join(comparison.pair)}; choose two others",
+                f"no participant has both sessions {' and '.join(comparison.pair)}; choose two"
+                " others",
                 reason="one-session",
             )
     return cohort.take(keep), dict(why[~keep])
-
-
-def _check_sessions(table: pd.DataFrame, pair: Sequence[str]) -> None:
-    known = sorted(table[SESSION].dropna().unique())
-    if unknown := sorted(set(pair) - set(known)):
-        raise ModelError(
-            f"there is no session {listed(unknown)}, only {listed(known) or 'none'}",
-            reason="unknown-level",
-        )
 
 
 def modeled_table(table: pd.DataFrame, comparison: Comparison) -> pd.DataFrame:
@@ -155,7 +125,7 @@ def _change(side: SideMaps, rows: Int, first: Int, second: Int) -> SideMaps:
     return replace(
         side,
         rows=rows,
-        maps={name: paired_difference(m[first], m[second]) for name, m in side.maps.items()},
+        maps={name: m[second] - m[first] for name, m in side.maps.items()},
         subfield=side.subfield[first],
         summary=pd.DataFrame(summary, columns=side.summary.columns),
     )
@@ -182,8 +152,9 @@ def asymmetry_maps(cohort: Cohort, measures: Sequence[str], relative: Sequence[s
         )
     rows, a, b = np.intersect1d(left.rows, right.rows, return_indices=True)
     if not len(rows):
-        raise ModelError("asymmetry: nobody has both hemispheres", reason="no-hemisphere")
+        raise ModelError("asymmetry: no participant has both hemispheres", reason="no-hemisphere")
     names = tuple(dict.fromkeys((*left.names, *right.names)))
+    codes = np.array([*(names.index(name) for name in left.names), -1], dtype=np.int8)
     return SideMaps(
         rows=rows,
         maps={
@@ -192,15 +163,8 @@ def asymmetry_maps(cohort: Cohort, measures: Sequence[str], relative: Sequence[s
             )
             for name in measures
         },
-        subfield=_recoded(left, names)[a],
+        subfield=codes[left.subfield[a]],
         names=names,
         summary=pd.DataFrame(index=range(len(rows))),
         mesh=left.mesh,
     )
-
-
-def _recoded(
-    side: SideMaps, names: Sequence[str]
-) -> np.ndarray[tuple[int, ...], np.dtype[np.int8]]:
-    codes = np.array([*(names.index(name) for name in side.names), -1], dtype=np.int8)
-    return np.asarray(codes[side.subfield], dtype=np.int8)

@@ -11,6 +11,7 @@ from hipsta_bids.types import Mesh
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
+Bool = NDArray[np.bool_]
 
 #: Columns that identify visits, with the prefixes of BIDS.
 PARTICIPANT, SESSION = "participant_id", "session_id"

@@ -13,8 +13,7 @@ import numpy as np
 from hipsta_bids.group.analysis import Analysis, mean_of_known, members_of, rows_of, spread_of_known
 from hipsta_bids.group.classify import ClassifierResult, PairComparison, roc_curve
 from hipsta_bids.group.data import Cohort, Float, Int
-from hipsta_bids.group.fit import FittedMaps
-from hipsta_bids.group.glm import PointTest
+from hipsta_bids.group.glm import FittedMaps, PointTest
 from hipsta_bids.group.inference import MapKey
 from hipsta_bids.group.shapes import AverageShape
 from hipsta_bids.reports.group_maps import (

@@ -1,4 +1,4 @@
-"""What is to be fitted and tested: BIDS Stats Models 1.0.0, one dataset-level node."""
+"""What is fitted and tested, by BIDS Stats Models 1.0.0 or a formula, and the variables of it."""
 
 import difflib
 import re
@@ -11,6 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from hipsta_bids.errors import ModelError
+from hipsta_bids.group.data import Float
 from hipsta_bids.group.settings import DesignSettings
 
 _VERSION = "1.0.0"
@@ -21,6 +22,39 @@ _TERM = re.compile(
 )
 
 
+#: Texts that mean a missing value, besides what pandas takes for one.
+_MISSING = ("n/a", "NA", "N/A", "nan", "NaN", "")
+#: Numbers from here on overflow when they are squared and summed.
+_LARGEST = 1e100
+#: Rows that a message names.
+_NAMED = 8
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """One hypothesis: that ``weights @ coefficients`` is zero."""
+
+    name: str
+    weights: Float
+    """(rows, columns of the design); one row is tested by t, several together by F."""
+
+    def __post_init__(self) -> None:
+        weights = np.atleast_2d(np.array(self.weights, dtype=np.float64))
+        if np.linalg.matrix_rank(weights) < weights.shape[0]:
+            raise ModelError(
+                f"contrast {self.name!r}: its rows say the same thing twice, or one is all zero;"
+                " leave out the redundant row",
+                reason="contrast-redundant",
+            )
+        weights.flags.writeable = False
+        object.__setattr__(self, "weights", weights)
+
+    @property
+    def n_rows(self) -> int:
+        """Degrees of freedom of the hypothesis."""
+        return int(self.weights.shape[0])
+
+
 @dataclass(frozen=True)
 class ContrastSpec:
     """A contrast by the names of what it combines."""
@@ -29,7 +63,7 @@ class ContrastSpec:
     conditions: tuple[str, ...]
     """Columns of the design, or levels such as ``group[CU]``: then means of the model there."""
     weights: tuple[tuple[float, ...], ...]
-    """Rows; one for t, one or more for F."""
+    """Rows; one for t, several for F."""
     test: str
     """``t`` or ``F``."""
 
@@ -64,11 +98,7 @@ def model_from_shortcut(formula: str, contrasts: Sequence[str], name: str) -> di
 
 
 def parse_model(document: Mapping[str, Any]) -> ModelSpec:
-    """Read a BIDS Stats Model.
-
-    ``document`` One node at dataset level, type ````glm````, with ````Model.X```` (1, names of
-    columns, and ````a*b```` or ````a:b````) or ````Model.Formula````.
-    """
+    """Read a BIDS Stats Model: one node at dataset level, with ``Model.X`` or ``Model.Formula``."""
     nodes = document.get("Nodes")
     if not isinstance(nodes, list) or len(nodes) != 1 or not isinstance(nodes[0], Mapping):
         raise _refusal("needs exactly one node, at dataset level")
@@ -187,27 +217,6 @@ def _formula(model: Mapping[str, Any]) -> str:
 
 def _refusal(what: str) -> ModelError:
     return ModelError(f"model file {what} (BIDS Stats Models {_VERSION})", reason="model-file")
-
-
-# Variables of a model: which rows are complete, what is a number and what a factor.
-
-
-#: Texts that mean a missing value, besides what pandas takes for one.
-_MISSING = ("n/a", "NA", "N/A", "nan", "NaN", "")
-#: Numbers from here on overflow when they are squared and summed.
-_LARGEST = 1e100
-#: Rows that a message names.
-_NAMED = 8
-
-
-def check_unique(table: pd.DataFrame, keys: list[str]) -> None:
-    """Refuse a table in which a participant (or session) stands twice."""
-    twice = table.loc[table.duplicated(keys), keys].astype(str).agg(" ".join, axis=1)
-    if len(twice):
-        raise ModelError(
-            f"table: {listed(sorted(set(twice)))} stand more than once; keep one row each",
-            reason="duplicate-rows",
-        )
 
 
 def check_names(names: Iterable[str], columns: pd.Index) -> None:
@@ -333,34 +342,3 @@ def listed(items: Iterable[object]) -> str:
     texts = [str(item) for item in items]
     more = f" and {len(texts) - _NAMED} more" if len(texts) > _NAMED else ""
     return ", ".join(texts[:_NAMED]) + more
-
-
-# Linear combinations of coefficients that are tested.
-
-
-FloatArray = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Contrast:
-    """One hypothesis: that ``weights @ coefficients`` is zero."""
-
-    name: str
-    weights: FloatArray
-    """(rows, columns of the design); one row is tested by t, several together by F."""
-
-    def __post_init__(self) -> None:
-        weights = np.atleast_2d(np.array(self.weights, dtype=np.float64))
-        if np.linalg.matrix_rank(weights) < weights.shape[0]:
-            raise ModelError(
-                f"contrast {self.name!r}: its rows say the same thing twice, or one is all zero;"
-                " leave out the redundant row",
-                reason="contrast-redundant",
-            )
-        weights.flags.writeable = False
-        object.__setattr__(self, "weights", weights)
-
-    @property
-    def n_rows(self) -> int:
-        """Degrees of freedom of the hypothesis."""
-        return int(self.weights.shape[0])

@@ -1,39 +1,41 @@
-"""The general linear model at every point of a map."""
+"""The general linear model at every point of a map, and for single measures."""
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 from scipy.optimize import elementwise
+from statsmodels.regression.linear_model import OLS
 
 from hipsta_bids.errors import ModelError
+from hipsta_bids.group.data import Bool, Float, Int, SideMaps
 from hipsta_bids.group.formula import Contrast
-from hipsta_bids.group.settings import GlmSettings
+from hipsta_bids.group.model import Design
+from hipsta_bids.group.settings import GlmSettings, GroupSettings
 
-# Confidence limits of standardized effects, by inverting non-central distributions.
-
-
-FloatArray = NDArray[np.float64]
-
+#: Contrast of what all rows have in common.
+MEAN = "mean"
+#: Values in memory at once; bounds the temporaries, and does not change a result.
+_CHUNK = 4_000_000
 #: SciPy's inverse is exact to some 1e-5 only; the root is looked for this far around it.
 _BRACKET = 0.01
 #: SciPy's inverse for F goes no farther than 10000; beyond it the root is looked for between a
-#: tenth of this and so many times the numerator's sum.
+#: tenth of this and this many times the numerator's sum.
 _FARTHEST, _WIDEST = 9990.0, 20.0
 
 
-def t_limits(t: FloatArray, df: FloatArray, confidence: float) -> tuple[FloatArray, FloatArray]:
-    """Limits of the non-centrality of a t statistic.
+def t_limits(t: Float, df: Float, confidence: float) -> tuple[Float, Float]:
+    """Limits of the non-centrality of t statistics (Steiger 2004).
 
-    ``t, df`` Statistics and degrees of freedom, of one shape. Returns Non-centralities at which the
-    statistic is the upper, or lower, ````(1 - confidence) / 2```` quantile (Steiger 2004).
+    At the lower and upper limit, ``t`` is the upper and lower ``(1 - confidence) / 2`` quantile.
     """
     tail = (1 - confidence) / 2
 
-    def limit(probability: float) -> FloatArray:
-        def excess(center: FloatArray, t: FloatArray, df: FloatArray) -> FloatArray:
+    def limit(probability: float) -> Float:
+        def excess(center: Float, t: Float, df: Float) -> Float:
             return _floats(special.nctdtr(df, center, t)) - probability
 
         return _root(excess, _floats(special.nctdtrinc(df, probability, t)), t, df)
@@ -41,19 +43,13 @@ def t_limits(t: FloatArray, df: FloatArray, confidence: float) -> tuple[FloatArr
     return limit(1 - tail), limit(tail)
 
 
-def f_limits(
-    f: FloatArray, df1: int, df2: FloatArray, confidence: float
-) -> tuple[FloatArray, FloatArray]:
-    """Limits of the non-centrality of an F statistic.
-
-    ``f, df2`` Statistics and denominator degrees of freedom, of one shape; ``df1`` Numerator
-    degrees of freedom.
-    """
+def f_limits(f: Float, df1: int, df2: Float, confidence: float) -> tuple[Float, Float]:
+    """Limits of the non-centrality of F statistics, as :func:`t_limits`."""
     tail = (1 - confidence) / 2
     first = float(df1)
 
-    def limit(probability: float) -> FloatArray:
-        def excess(center: FloatArray, f: FloatArray, df: FloatArray) -> FloatArray:
+    def limit(probability: float) -> Float:
+        def excess(center: Float, f: Float, df: Float) -> Float:
             at = np.maximum(center, 0.0)
             return _floats(special.ncfdtr(first, df, at, f)) - probability
 
@@ -71,23 +67,15 @@ def f_limits(
     return limit(1 - tail), limit(tail)
 
 
-def _root(
-    function: Callable[..., FloatArray], start: FloatArray, statistic: FloatArray, df: FloatArray
-) -> FloatArray:
+def _root(function: Callable[..., Float], start: Float, statistic: Float, df: Float) -> Float:
     """Polish approximate roots; keep those that cannot be bracketed."""
     reach = _BRACKET * (1 + np.abs(start))
     found = elementwise.find_root(function, (start - reach, start + reach), args=(statistic, df))
     return np.where(found.success, found.x, start)
 
 
-def _floats(values: object) -> FloatArray:
+def _floats(values: object) -> Float:
     return np.asarray(values, dtype=np.float64)
-
-
-IntArray = NDArray[np.int64]
-
-#: Values in memory at once; bounds the temporaries, and does not change a result.
-_CHUNK = 4_000_000
 
 
 @dataclass(frozen=True)
@@ -95,23 +83,23 @@ class PointTest:
     """One contrast at each point; NaN where the model could not be fitted."""
 
     contrast: Contrast
-    statistic: FloatArray
+    statistic: Float
     """(points,) t, or F for contrasts of several rows."""
-    p: FloatArray
+    p: Float
     """(points,) two-sided."""
-    df: FloatArray
+    df: Float
     """(points,) residual degrees of freedom."""
-    estimate: FloatArray
+    estimate: Float
     """(rows, points) in units of the map."""
-    se: FloatArray
+    se: Float
     """(rows, points) standard errors."""
-    cohen_d: FloatArray
+    cohen_d: Float
     """(points,) estimate over residual standard deviation; NaN for several rows."""
-    cohen_d_limits: FloatArray
+    cohen_d_limits: Float
     """(2, points)"""
-    eta_squared: FloatArray
+    eta_squared: Float
     """(points,) partial: share of the variance that the covariates leave."""
-    eta_squared_limits: FloatArray
+    eta_squared_limits: Float
     """(2, points)"""
 
     @property
@@ -122,39 +110,39 @@ class PointTest:
 
 @dataclass(frozen=True)
 class PointwiseFit:
-    """A linear model at each point."""
+    """A linear or mixed model at each point."""
 
-    coefficients: FloatArray
+    coefficients: Float
     """(columns, points) in units of the map per unit of the column."""
-    sigma: FloatArray
-    """(points,) residual standard deviation."""
-    n: IntArray
-    """(points,) subjects with a value."""
+    sigma: Float
+    """(points,) residual standard deviation; of a mixed model that of single visits."""
+    n: Int
+    """(points,) rows with a value."""
     tests: tuple[PointTest, ...]
     """In the order of the contrasts."""
+    variances: Mapping[str, Float] = field(default_factory=dict)
+    """(points,) components of a mixed model: ``residual`` within participants, ``participant``
+    between them (with random slopes, at the mean time), and ``slope`` per squared unit of time."""
 
 
 @dataclass(frozen=True)
 class PointBlock:
     """The fit at some points, in coordinates in which the complete design is orthonormal."""
 
-    scores: FloatArray
+    scores: Float
     """(points, columns)"""
-    covariance: FloatArray
+    covariance: Float
     """(points, columns, columns)"""
-    sigma: FloatArray
+    sigma: Float
     """(points,) NaN where the model cannot be fitted."""
-    n: IntArray
+    n: Int
     """(points,) subjects with a value."""
 
 
 def fit_points(
-    maps: FloatArray, matrix: FloatArray, contrasts: Sequence[Contrast], settings: GlmSettings
+    maps: Float, matrix: Float, contrasts: Sequence[Contrast], settings: GlmSettings
 ) -> PointwiseFit:
-    """Fit the same linear model to each column of a table, with values missing anywhere.
-
-    ``maps`` NaN is missing.
-    """
+    """Fit the same linear model to each column of a table, with values missing anywhere."""
     _check(maps, matrix, contrasts)
     basis, triangle = np.linalg.qr(matrix)
     back = np.linalg.inv(triangle)
@@ -162,20 +150,17 @@ def fit_points(
         fit_block(np.asarray(maps[:, part], dtype=np.float64), basis, settings)
         for part in chunks(maps.shape, matrix.shape[1])
     ]
-    fit = PointBlock(
-        scores=np.concatenate([block.scores for block in blocks]),
-        covariance=np.concatenate([block.covariance for block in blocks]),
-        sigma=np.concatenate([block.sigma for block in blocks]),
-        n=np.concatenate([block.n for block in blocks]),
-    )
+    names = ("scores", "covariance", "sigma", "n")
+    fit = PointBlock(*(np.concatenate([getattr(one, name) for one in blocks]) for name in names))
     df = np.where(np.isfinite(fit.sigma), fit.n - matrix.shape[1], np.nan)
     tests = tuple(
-        _test(contrast, contrast.weights @ back, fit, df, settings) for contrast in contrasts
+        _test(contrast, contrast.weights @ back, fit, df, settings.confidence)
+        for contrast in contrasts
     )
     return PointwiseFit(back @ fit.scores.T, fit.sigma, fit.n, tests)
 
 
-def _check(maps: FloatArray, matrix: FloatArray, contrasts: Sequence[Contrast]) -> None:
+def _check(maps: Float, matrix: Float, contrasts: Sequence[Contrast]) -> None:
     if maps.ndim != 2 or matrix.ndim != 2 or maps.shape[0] != matrix.shape[0]:  # noqa: PLR2004 -- tables
         raise ModelError(
             f"model: maps of shape {maps.shape} do not fit a design of shape {matrix.shape};"
@@ -208,13 +193,11 @@ def chunks(shape: tuple[int, ...], columns: int) -> Iterator[slice]:
     return (slice(start, start + step) for start in range(0, max(shape[1], 1), step))
 
 
-def fit_block(maps: FloatArray, basis: FloatArray, settings: GlmSettings) -> PointBlock:
+def fit_block(maps: Float, basis: Float, settings: GlmSettings) -> PointBlock:
     """Solve least squares at some points, by normal equations in orthonormal coordinates.
 
     There the equations of a complete point are the identity, and those of others stay well
     conditioned unless the missing subjects really carried a column.
-
-    ``maps`` NaN is missing.
     """
     present = np.isfinite(maps)
     values = np.where(present, maps, 0.0)
@@ -249,7 +232,7 @@ def fit_block(maps: FloatArray, basis: FloatArray, settings: GlmSettings) -> Poi
     )
 
 
-def _hc3(residuals: FloatArray, basis: FloatArray, inverse: FloatArray) -> FloatArray:
+def _hc3(residuals: Float, basis: Float, inverse: Float) -> Float:
     """Sandwich covariance with residuals over (1 - leverage) (MacKinnon and White 1985).
 
     NaN where one subject alone determines a coefficient.
@@ -259,38 +242,66 @@ def _hc3(residuals: FloatArray, basis: FloatArray, inverse: FloatArray) -> Float
     weights = np.where(alone, np.nan, residuals / np.where(alone, 1.0, 1 - leverage)) ** 2
     products = (basis[:, :, None] * basis[:, None, :]).reshape(len(basis), -1)
     meat = (weights.T @ products).reshape(inverse.shape)
-    sandwich: FloatArray = inverse @ meat @ inverse
+    sandwich: Float = inverse @ meat @ inverse
     return sandwich
 
 
 def _test(
-    contrast: Contrast, rotated: FloatArray, fit: PointBlock, df: FloatArray, settings: GlmSettings
+    contrast: Contrast, rotated: Float, fit: PointBlock, df: Float, confidence: float
 ) -> PointTest:
     """Wald test of a contrast at each point."""
     estimate = fit.scores @ rotated.T
     spread = rotated @ fit.covariance @ rotated.T
-    rows = contrast.n_rows
     se = np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
+    if contrast.n_rows == 1:
+        return t_test(
+            contrast, estimate[:, 0], se[:, 0], df=df, sigma=fit.sigma, confidence=confidence
+        )
+    f = _wald(estimate, spread)
+    p = np.asarray(special.fdtrc(float(contrast.n_rows), df, f), dtype=np.float64)
+    where = {"df": df, "estimate": estimate.T, "se": se.T, "sigma": fit.sigma}
+    return with_effects(contrast, f, p, **where, confidence=confidence)
+
+
+def t_test(
+    contrast: Contrast, estimate: Float, se: Float, *, df: Float, sigma: Float, confidence: float
+) -> PointTest:
+    """Test one row of weights, by estimates and standard errors at each point."""
+    t = estimate / se
+    p = np.asarray(2 * special.stdtr(df, -np.abs(t)), dtype=np.float64)
+    where = {"df": df, "estimate": estimate[None], "se": se[None], "sigma": sigma}
+    return with_effects(contrast, t, p, **where, confidence=confidence)
+
+
+def with_effects(
+    contrast: Contrast,
+    statistic: Float,
+    p: Float,
+    *,
+    df: Float,
+    estimate: Float,
+    se: Float,
+    sigma: Float,
+    confidence: float,
+) -> PointTest:
+    """Add Cohen's d (of t) and partial eta squared, with limits, to tests at each point."""
+    rows = contrast.n_rows
     if rows == 1:
-        statistic = estimate[:, 0] / se[:, 0]
-        p = 2 * special.stdtr(df, -np.abs(statistic))
         squared = statistic**2
-        cohen_d = estimate[:, 0] / fit.sigma
-        unit = se[:, 0] / fit.sigma
-        d_limits = np.stack(t_limits(statistic, df, settings.confidence)) * unit
+        cohen_d = estimate[0] / sigma
+        d_limits = np.stack(t_limits(statistic, df, confidence)) * (se[0] / sigma)
     else:
-        squared = statistic = _wald(estimate, spread)
-        p = special.fdtrc(float(rows), df, statistic)
+        squared = statistic
         cohen_d = np.full(len(df), np.nan)
         d_limits = np.full((2, len(df)), np.nan)
-    eta_limits = np.stack(f_limits(squared, rows, df, settings.confidence))
+    eta_limits = np.stack(f_limits(squared, rows, df, confidence))
     return PointTest(
         contrast=contrast,
         statistic=statistic,
-        p=np.asarray(p, dtype=np.float64),
+        p=p,
         df=df,
-        estimate=estimate.T,
-        se=se.T,
+        estimate=estimate,
+        se=se,
         cohen_d=cohen_d,
         cohen_d_limits=d_limits,
         eta_squared=squared * rows / (squared * rows + df),
@@ -298,10 +309,153 @@ def _test(
     )
 
 
-def _wald(estimate: FloatArray, spread: FloatArray) -> FloatArray:
+def _wald(estimate: Float, spread: Float) -> Float:
     """F statistic of several combinations at once, at each point."""
     rows = estimate.shape[1]
     valid = np.asarray(np.isfinite(spread).all(axis=(1, 2)))
     safe = np.where(valid[:, None, None], spread, np.eye(rows))
     solved = np.linalg.solve(safe, estimate[:, :, None])[:, :, 0]
     return np.where(valid, np.sum(estimate * solved, axis=1) / rows, np.nan)
+
+
+def fit_measures(
+    values: Float, matrix: Float, contrasts: Sequence[Contrast], settings: GlmSettings
+) -> PointwiseFit:
+    """Fit the model of :func:`fit_points` by statsmodels, one column of values after the other.
+
+    A column is left out by the same rules, and effect sizes are the same.
+    """
+    _check(values, matrix, contrasts)
+    block = fit_block(values, np.linalg.qr(matrix)[0], settings)
+    tested: Bool = np.asarray(np.isfinite(block.covariance).all(axis=(1, 2)))
+    n_points = values.shape[1]
+    coefficients = np.full((matrix.shape[1], n_points), np.nan)
+    sigma, df = np.full((2, n_points), np.nan)
+    # Per contrast: statistic, p, estimates of the rows, and their standard errors.
+    tables = [np.full((2 + 2 * contrast.n_rows, n_points), np.nan) for contrast in contrasts]
+    kind = "HC3" if settings.covariance == "hc3" else "nonrobust"
+    for i in np.flatnonzero(np.isfinite(block.sigma)):
+        own = np.isfinite(values[:, i])
+        found = OLS(values[own, i], matrix[own]).fit(cov_type=kind, use_t=True)
+        coefficients[:, i], sigma[i], df[i] = found.params, np.sqrt(found.scale), found.df_resid
+        for table, contrast in zip(tables, contrasts, strict=True):
+            rows = found.t_test(contrast.weights)
+            whole = rows if contrast.n_rows == 1 else found.f_test(contrast.weights)
+            values_of = (whole.statistic, whole.pvalue, rows.effect, rows.sd)
+            table[:, i] = np.concatenate([np.ravel(one) for one in values_of])
+            if not tested[i]:
+                table[[0, 1, *range(2 + contrast.n_rows, len(table))], i] = np.nan
+    tests = tuple(
+        with_effects(
+            contrast,
+            table[0],
+            table[1],
+            df=df,
+            estimate=table[2 : 2 + contrast.n_rows],
+            se=table[2 + contrast.n_rows :],
+            sigma=sigma,
+            confidence=settings.confidence,
+        )
+        for contrast, table in zip(contrasts, tables, strict=True)
+    )
+    return PointwiseFit(coefficients, sigma, block.n, tests)
+
+
+@dataclass(frozen=True, eq=False)
+class RowModel:
+    """A linear model of independent rows of a design."""
+
+    design: Design
+    independent: ClassVar[bool] = True
+
+    def fit(
+        self, values: Float, rows: Int, contrasts: tuple[Contrast, ...], settings: GroupSettings
+    ) -> PointwiseFit:
+        """Fit some rows of the design at each point."""
+        return fit_points(values, self.design.matrix[rows], contrasts, settings.glm)
+
+    def fit_measures(
+        self, values: Float, rows: Int, contrasts: tuple[Contrast, ...], settings: GroupSettings
+    ) -> PointwiseFit:
+        """Fit some rows of the design to each summary measure."""
+        return fit_measures(values, self.design.matrix[rows], contrasts, settings.glm)
+
+
+def with_mean(design: Design) -> tuple[Contrast, ...]:
+    """Contrasts of a design, with that of the model's mean over all rows in front."""
+    mean = Contrast(MEAN, design.matrix.mean(axis=0))
+    same = [
+        one
+        for one in design.contrasts
+        if one.name == MEAN or (one.n_rows == 1 and np.allclose(one.weights, mean.weights))
+    ]
+    return design.contrasts if same else (mean, *design.contrasts)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FittedMaps:
+    """What was fitted, and the fit."""
+
+    maps: SideMaps
+    """Of all rows of the model's table that have them."""
+    used: Int
+    """Sheets that the model is fitted to, as places in ``maps``."""
+    rows: Int
+    """Rows of the design of the sheets used."""
+    subfield: Int
+    """(x, y) most frequent subfield, place in ``maps.names``; -1 where there is none."""
+    fits: Mapping[str, PointwiseFit]
+    """By measure."""
+
+    def values(self, measure: str) -> Float:
+        """(sheets used, points) of one measure."""
+        return _values(self.maps.maps[measure], self.used)
+
+
+def fit_maps(
+    hemi: str,
+    side: SideMaps,
+    model: RowModel,
+    settings: GroupSettings,
+    *,
+    contrasts: tuple[Contrast, ...] | None = None,
+) -> FittedMaps:
+    """Fit a model at each point of all maps of a hemisphere."""
+    _, used, rows = np.intersect1d(
+        side.rows, model.design.rows, assume_unique=True, return_indices=True
+    )
+    tested = model.design.contrasts if contrasts is None else contrasts
+    try:
+        fits = {
+            name: model.fit(_values(maps, used), rows, tested, settings)
+            for name, maps in side.maps.items()
+        }
+    except ModelError as error:
+        raise ModelError(f"hemisphere {hemi}: {error}", reason=error.reason) from error
+    for name, fit in fits.items():
+        if not np.isfinite(fit.sigma).any():
+            raise ModelError(
+                f"hemisphere {hemi}: no point of the {name} maps has enough values for the model;"
+                " look at the sheets, or use a smaller model",
+                reason="all-points-invalid",
+            )
+    return FittedMaps(
+        maps=side,
+        used=np.asarray(used, dtype=np.int64),
+        rows=np.asarray(rows, dtype=np.int64),
+        subfield=most_frequent(side.subfield[used], len(side.names)),
+        fits=fits,
+    )
+
+
+def _values(maps: Float, used: Int) -> Float:
+    own = maps if len(used) == len(maps) else maps[used]
+    return own.reshape(len(used), -1)
+
+
+def most_frequent(labels: NDArray[np.int8], count: int) -> Int:
+    """Most frequent label at each point."""
+    if not count:
+        return np.full(labels.shape[1:], -1, dtype=np.int64)
+    votes = np.stack([(labels == label).sum(axis=0) for label in range(count)])
+    return np.where(votes.max(axis=0) > 0, votes.argmax(axis=0), -1).astype(np.int64)

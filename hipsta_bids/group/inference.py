@@ -5,42 +5,35 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from statsmodels.stats.multitest import multipletests
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.adjacency import mesh_edges
-from hipsta_bids.group.data import Float, Int
-from hipsta_bids.group.fit import FittedMaps, RowModel
+from hipsta_bids.group.clusters import edges_of
+from hipsta_bids.group.data import Bool, Float, Int
 from hipsta_bids.group.formula import check_names, listed
+from hipsta_bids.group.glm import FittedMaps, RowModel
 from hipsta_bids.group.permutation import PermutationPart, PermutationTest, permute
 from hipsta_bids.group.settings import GroupSettings, MultiplicitySettings
 
-# False discovery rates over the points of a map.
-
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-
 #: Share of the smallest p that serves as cut-off when nothing is rejected.
 BELOW_ALL = 0.1
+#: Methods that hold the family-wise error rate.
+PERMUTATIONS = ("permutation-tfce", "permutation-max")
 
 
 @dataclass(frozen=True)
 class Discoveries:
     """Tests that survive, in the shape of the p-values."""
 
-    adjusted: FloatArray
+    adjusted: Float
     """Compare with ``alpha``; of false discovery rates it holds for this level. NaN where there
     was no test."""
-    rejected: BoolArray
+    rejected: Bool
     cutoff: float
     """Largest raw p that is rejected; a tenth of the smallest p if none is (the convention of
     FreeSurfer's ``lme_mass_FDR``), so that nothing lies at or below it; NaN without tests,
     and where clusters decide."""
     n_tests: int
-    n_null: int
-    """Estimated number of true null hypotheses; but for ``fdr2`` the number of tests."""
     alpha: float
 
     @property
@@ -49,20 +42,21 @@ class Discoveries:
         return bool(self.rejected.any()) and self.cutoff > self.alpha
 
 
-def fdr_two_stage(p: FloatArray, alpha: float) -> Discoveries:
-    """Two-stage step-up procedure of Benjamini, Krieger and Yekutieli (2006), "FDR2".
+def control_fdr(p: Float, alpha: float, method: str = "fdr2") -> Discoveries:
+    """Control the false discovery rate of tests; NaN is no test.
 
-    The first stage, at ``alpha / (1 + alpha)``, estimates how many null hypotheses are true; the
-    second allows for that many only.
-
-    ``p`` NaN is no test.
+    ``bh`` is the step-up procedure of Benjamini and Hochberg (1995), ``fdr2`` the two-stage one of
+    Benjamini, Krieger and Yekutieli (2006): the first stage, at ``alpha / (1 + alpha)``, estimates
+    how many null hypotheses are true, and the second allows for that number only.
     """
-    return _discoveries(p, alpha, "fdr_tsbky")
-
-
-def fdr_benjamini_hochberg(p: FloatArray, alpha: float) -> Discoveries:
-    """Step-up procedure of Benjamini and Hochberg (1995); see :func:`fdr_two_stage`."""
-    return _discoveries(p, alpha, "fdr_bh")
+    valid = np.isfinite(p)
+    tests = p[valid]
+    adjusted, rejected, cutoff = np.full(p.shape, np.nan), np.zeros(p.shape, dtype=bool), np.nan
+    if len(tests):
+        name = "fdr_bh" if method == "bh" else "fdr_tsbky"
+        rejected[valid], adjusted[valid], *_ = multipletests(tests, alpha, name)
+        cutoff = tests[rejected[valid]].max() if rejected.any() else tests.min() * BELOW_ALL
+    return Discoveries(adjusted, rejected, float(cutoff), len(tests), alpha)
 
 
 @dataclass(frozen=True, order=True)
@@ -84,76 +78,18 @@ def families(maps: Iterable[MapKey], scope: str) -> list[list[MapKey]]:
 
 
 def discover(
-    maps: Mapping[MapKey, FloatArray], settings: MultiplicitySettings
+    maps: Mapping[MapKey, Float], settings: MultiplicitySettings
 ) -> dict[MapKey, Discoveries]:
-    """Control the false discovery rate of several maps, in families.
-
-    ``maps`` NaN is no test.
-    """
-    method = fdr_benjamini_hochberg if settings.method == "bh" else fdr_two_stage
+    """Control the false discovery rate of several maps (points,), in families."""
     found = {}
     for keys in families(maps, settings.scope):
-        together = method(np.concatenate([maps[key].ravel() for key in keys]), settings.alpha)
-        ends = np.cumsum([maps[key].size for key in keys])[:-1]
+        p = np.concatenate([maps[key] for key in keys])
+        together = control_fdr(p, settings.alpha, settings.method)
+        ends = np.cumsum([len(maps[key]) for key in keys])[:-1]
         adjusted, rejected = np.split(together.adjusted, ends), np.split(together.rejected, ends)
         for key, values, flags in zip(keys, adjusted, rejected, strict=True):
-            shape = maps[key].shape
-            found[key] = replace(
-                together, adjusted=values.reshape(shape), rejected=flags.reshape(shape)
-            )
+            found[key] = replace(together, adjusted=values, rejected=flags)
     return {key: found[key] for key in maps}
-
-
-def _discoveries(p: FloatArray, alpha: float, method: str) -> Discoveries:
-    valid = np.isfinite(p)
-    tests = p[valid]
-    adjusted = np.full(p.shape, np.nan)
-    rejected = np.zeros(p.shape, dtype=bool)
-    cutoff, n_null = np.nan, len(tests)
-    if len(tests):
-        rejected[valid], adjusted[valid], *_ = multipletests(tests, alpha, method)
-        cutoff = tests[rejected[valid]].max() if rejected.any() else tests.min() * BELOW_ALL
-        if method == "fdr_tsbky":
-            stage = multipletests(tests, alpha / (1 + alpha), "fdr_bh")[0]
-            n_null = int(len(tests) - stage.sum())
-    return Discoveries(adjusted, rejected, float(cutoff), len(tests), n_null, alpha)
-
-
-def adjusted_at_any_level(p: FloatArray) -> FloatArray:
-    """Smallest false discovery rate at which the two-stage procedure rejects each test.
-
-    Unlike :attr:`Discoveries.adjusted` the value does not depend on a level chosen before, and
-    can be compared with any. The first stage at rate b = alpha / (1 + alpha) rejects k of m
-    tests if the k-th smallest Benjamini-Hochberg value q is at most b, the second stage test i if
-    q_i (m - k) / m is; so the answer is the least over k of the larger of the two.
-
-    ``p`` NaN is no test.
-    """
-    result = np.full(p.shape, np.nan)
-    valid = np.isfinite(p)
-    m = int(valid.sum())
-    if not m:
-        return result
-    single = np.asarray(multipletests(p[valid], method="fdr_bh")[1], dtype=np.float64)
-    ordered = np.sort(single)
-
-    def rate(k: NDArray[np.int64]) -> FloatArray:
-        return np.maximum(ordered[k - 1], single * (m - k) / m)
-
-    # The first term rises with k and the second falls: look for where they cross by bisection.
-    low, high = np.ones(m, dtype=np.int64), np.full(m, m, dtype=np.int64)
-    while (low < high).any():
-        middle = (low + high) // 2
-        crossed = ordered[middle - 1] >= single * (m - middle) / m
-        high = np.where(crossed, middle, high)
-        low = np.where(crossed, low, np.minimum(middle + 1, high))
-    least = np.minimum(rate(low), rate(np.maximum(low - 1, 1)))
-    result[valid] = np.minimum(least / np.maximum(1 - least, np.finfo(np.float64).tiny), 1.0)
-    return result
-
-
-#: Methods that hold the family-wise error rate.
-PERMUTATIONS = ("permutation-tfce", "permutation-max")
 
 
 def correct(
@@ -173,9 +109,17 @@ def correct(
     blocks = _blocks(model, table, how)
     found: dict[MapKey, Discoveries] = {}
     for keys in families(tests, how.scope):
-        parts = [_part(fitted[key.hemi], key.measure, model) for key in keys]
-        shape = fitted[keys[0].hemi].maps.shape
-        results = permute(parts, tests[keys[0]].contrast, shape, settings=how, blocks=blocks)
+        parts = [
+            PermutationPart(
+                maps=one.values(key.measure),
+                matrix=model.design.matrix[one.rows],
+                subjects=one.rows,
+                edges=edges_of(one.maps, how.neighbors),
+            )
+            for key in keys
+            for one in [fitted[key.hemi]]
+        ]
+        results = permute(parts, tests[keys[0]].contrast, settings=how, blocks=blocks)
         raw = [tests[key].p for key in keys]
         found |= dict(zip(keys, _permuted_discoveries(results, raw, how), strict=True))
     return {key: found[key] for key in tests}
@@ -185,7 +129,7 @@ def check_permutations(model: RowModel, settings: GroupSettings) -> None:
     """Refuse permutations where rows cannot be exchanged."""
     if settings.multiplicity.method not in PERMUTATIONS:
         return
-    if model.participants is not None:
+    if not model.independent:
         raise ModelError(
             "permutations: visits of the same participant cannot be exchanged with those of"
             " others; use --correction fdr2, or --paired",
@@ -199,7 +143,7 @@ def check_permutations(model: RowModel, settings: GroupSettings) -> None:
 
 
 def _blocks(model: RowModel, table: pd.DataFrame, how: MultiplicitySettings) -> Int | None:
-    """Give the number of each row's block."""
+    """Return the number of each row's block, or None without blocks."""
     if not how.blocks:
         return None
     check_names([how.blocks], table.columns)
@@ -211,12 +155,6 @@ def _blocks(model: RowModel, table: pd.DataFrame, how: MultiplicitySettings) -> 
             reason="permutation-blocks",
         )
     return np.asarray(np.unique(own.astype(str), return_inverse=True)[1], dtype=np.int64)
-
-
-def _part(one: FittedMaps, measure: str, model: RowModel) -> PermutationPart:
-    mesh = one.maps.mesh
-    edges = None if mesh is None else mesh_edges(mesh.triangles)
-    return PermutationPart(one.values(measure), model.design.matrix[one.rows], one.rows, edges)
 
 
 def _permuted_discoveries(
@@ -231,6 +169,6 @@ def _permuted_discoveries(
         own, survive = np.concatenate(raw), np.concatenate(rejected)
         cutoff = own[survive].max() if survive.any() else np.nanmin(own) * BELOW_ALL
     return [
-        Discoveries(p, flags, float(cutoff), n_tests, n_tests, how.alpha)
+        Discoveries(p, flags, float(cutoff), n_tests, how.alpha)
         for p, flags in zip(corrected, rejected, strict=True)
     ]

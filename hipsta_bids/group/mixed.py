@@ -2,248 +2,173 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
-from scipy import special
 
 from hipsta_bids.errors import ModelError
+from hipsta_bids.group.data import PARTICIPANT, Bool, Float, Int
 from hipsta_bids.group.formula import Contrast
+from hipsta_bids.group.glm import PointwiseFit, RowModel, chunks, t_test
+from hipsta_bids.group.model import Design
 from hipsta_bids.group.random_slope import (
     best_triangles,
     collect_slope_sums,
     slope_freedom,
     solve_slopes,
 )
-from hipsta_bids.group.settings import LongitudinalSettings
+from hipsta_bids.group.settings import GroupSettings, LongitudinalSettings
 
-# Restricted likelihood of a random-intercept model at many points, from sums.
-
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
+#: Sessions of one participant that tell a slope from noise.
+_SLOPE_SESSIONS = 3
 
 
 @dataclass(frozen=True)
 class State:
-    """Generalized least squares at one ratio per point, with derivatives for the ratio."""
+    """Generalized least squares at one ratio of variances per point."""
 
-    information: FloatArray
-    """(points, columns, columns) X' V^-1 X."""
-    first: FloatArray
-    second: FloatArray
-    scores: FloatArray
+    scores: Float
     """(points, columns) coefficients."""
-    residual: FloatArray
-    """(points,) generalized sum of squared residuals Q, its first and second derivative."""
-    residual_first: FloatArray
-    residual_second: FloatArray
-    penalty_first: FloatArray
-    """(points,) derivatives of log |V| + log |X' V^-1 X|."""
-    penalty_second: FloatArray
-    penalty: FloatArray
+    inverse: Float
+    """(points, columns, columns) of X' V^-1 X."""
+    information_first: Float
+    """(points, columns, columns) derivative of X' V^-1 X for the ratio."""
+    residual: tuple[Float, Float, Float]
+    """(points,) generalized sum of squared residuals, its first and second derivative."""
+    penalty: tuple[Float, Float, Float]
+    """(points,) log |V| + log |X' V^-1 X|, its first and second derivative."""
 
 
 @dataclass(frozen=True)
 class Sums:
-    """What a likelihood needs to know of the data."""
+    """What the likelihood depends on: sums of products of columns, the values being the last."""
 
-    n: IntArray
+    n: Int
     """(points,) sessions."""
-    repeated: BoolArray
-    """(points,) whether anybody has two."""
-    squares: FloatArray
-    """(points, columns, columns)"""
-    products: FloatArray
-    """(points, columns)"""
-    total: FloatArray
-    """(points,) sum of squares."""
-    sizes: FloatArray
-    """(sizes,) numbers of sessions that occur."""
-    people: FloatArray
-    """(sizes, points) participants with so many."""
-    own_squares: FloatArray
-    """(sizes, points, columns, columns) squared sums over a participant's sessions."""
-    own_products: FloatArray
-    """(sizes, points, columns)"""
-    own_total: FloatArray
-    """(sizes, points)"""
+    repeated: Bool
+    """(points,) whether any participant has two."""
+    squares: Float
+    """(points, columns + 1, columns + 1) over sessions."""
+    sizes: Float
+    """(sizes,) numbers of sessions of a participant that occur."""
+    people: Float
+    """(sizes, points) participants with that number."""
+    own_squares: Float
+    """(sizes, points, columns + 1, columns + 1) of each participant's sums, over participants."""
 
-    def where(self, usable: BoolArray) -> "Sums":
+    def where(self, usable: Bool) -> "Sums":
         """Replace points that cannot be fitted by harmless ones."""
-        columns = self.squares.shape[1]
+        size = self.squares.shape[1]
+        kept = usable[:, None, None]
         return replace(
             self,
-            n=np.where(usable, self.n, columns + 2),
-            squares=np.where(usable[:, None, None], self.squares, np.eye(columns)),
-            total=np.where(usable, self.total, 1.0),
-            products=np.where(usable[:, None], self.products, 0.0),
-            own_squares=np.where(usable[:, None, None], self.own_squares, 0.0),
-            own_products=np.where(usable[:, None], self.own_products, 0.0),
-            own_total=np.where(usable, self.own_total, 0.0),
+            n=np.where(usable, self.n, size + 1),
+            squares=np.where(kept, self.squares, np.eye(size)),
+            own_squares=np.where(kept, self.own_squares, 0.0),
         )
 
-    def at(self, ratio: FloatArray) -> State:
+    def at(self, ratio: Float) -> State:
         """Fit with one ratio per point."""
-        spread = 1 + self.sizes[:, None] * ratio
-        take = (ratio / spread, 1 / spread**2, -2 * self.sizes[:, None] / spread**3)
-        squares = [np.einsum("kp,kpij->pij", c, self.own_squares) for c in take]
-        products = [np.einsum("kp,kpi->pi", c, self.own_products) for c in take]
-        totals = [np.einsum("kp,kp->p", c, self.own_total) for c in take]
-        information = self.squares - squares[0]
-        right = self.products - products[0]
-        inverse = np.linalg.inv(information)
-        scores = np.einsum("pij,pj->pi", inverse, right)
-        first, second = -squares[1], -squares[2]
-        moved = np.einsum("pij,pj->pi", first, scores)
-        change = np.einsum("pij,pj->pi", inverse, -products[1] - moved)
-        residual = self.total - totals[0] - np.einsum("pi,pi->p", scores, right)
-        residual_first = -totals[1] + np.einsum("pi,pi->p", scores, 2 * products[1] + moved)
-        bent = np.einsum("pij,pj->pi", second, scores)
-        residual_second = -totals[2] + np.einsum("pi,pi->p", scores, 2 * products[2] + bent)
-        residual_second -= 2 * np.einsum("pi,pij,pj->p", change, information, change)
-        turned = inverse @ first
-        share = self.sizes[:, None] / spread
+        sizes = self.sizes[:, None]
+        spread = 1 + sizes * ratio
+        take = (ratio / spread, 1 / spread**2, -2 * sizes / spread**3)
+        off, first, second = (-np.einsum("kp,kpij->pij", one, self.own_squares) for one in take)
+        whole = self.squares + off
+        inverse = np.linalg.inv(whole[:, :-1, :-1])
+        scores = np.einsum("pij,pj->pi", inverse, whole[:, :-1, -1])
+        # What is left of the values: minus the scores times the columns, plus the values.
+        left = np.column_stack([-scores, np.ones(len(scores))])
+        moved = np.einsum("pij,pj->pi", first, left)
+        change = np.einsum("pij,pj->pi", inverse, moved[:, :-1])
+        ahead, bent = (np.einsum("pij,pj->pi", one, left) for one in (whole, second))
+        residual_second = np.einsum("pi,pi->p", left, bent)
+        residual_second -= 2 * np.einsum("pi,pi->p", change, moved[:, :-1])
+        relative = inverse @ first[:, :-1, :-1]
+        bend = inverse @ second[:, :-1, :-1] - relative @ relative
+        share = sizes / spread
+        log_spread = np.sum(self.people * np.log(spread), axis=0)
         return State(
-            information=information,
-            first=first,
-            second=second,
             scores=scores,
-            residual=residual,
-            residual_first=residual_first,
-            residual_second=residual_second,
-            penalty=np.sum(self.people * np.log(spread), axis=0)
-            + np.linalg.slogdet(information)[1],
-            penalty_first=np.sum(self.people * share, axis=0) + np.trace(turned, axis1=1, axis2=2),
-            penalty_second=-np.sum(self.people * share**2, axis=0)
-            + np.trace(inverse @ second - turned @ turned, axis1=1, axis2=2),
+            inverse=inverse,
+            information_first=first[:, :-1, :-1],
+            residual=(
+                np.einsum("pi,pi->p", left, ahead),
+                np.einsum("pi,pi->p", left, moved),
+                residual_second,
+            ),
+            penalty=(
+                log_spread - np.linalg.slogdet(inverse)[1],
+                np.sum(self.people * share, axis=0) + np.trace(relative, axis1=1, axis2=2),
+                np.trace(bend, axis1=1, axis2=2) - np.sum(self.people * share**2, axis=0),
+            ),
         )
 
 
-def collect_sums(maps: FloatArray, basis: FloatArray, participants: IntArray) -> Sums:
-    """Sum over sessions and participants.
-
-    ``maps`` NaN is missing.
-    """
+def collect_sums(maps: Float, basis: Float, participants: Int) -> Sums:
+    """Sum over sessions and participants."""
     present = np.isfinite(maps)
-    weight = present.astype(np.float64)
-    values = np.where(present, maps, 0.0)
     order = np.argsort(participants, kind="stable")
     starts = np.searchsorted(participants[order], np.arange(participants.max() + 1))
-    counts = np.add.reduceat(weight[order], starts, axis=0)
-    sums_x = np.add.reduceat(weight[order][:, :, None] * basis[order][:, None, :], starts, axis=0)
-    sums_y = np.add.reduceat(values[order], starts, axis=0)
-    products = (basis[:, :, None] * basis[:, None, :]).reshape(len(basis), -1)
-    columns = basis.shape[1]
+    counts = np.add.reduceat(present[order].astype(np.float64), starts, axis=0)
+    columns = np.empty((*maps.shape, basis.shape[1] + 1))
+    columns[..., :-1] = present[:, :, None] * basis[:, None, :]
+    columns[..., -1] = np.where(present, maps, 0.0)
+    own = np.add.reduceat(columns[order], starts, axis=0)
     sizes = np.unique(counts[counts > 0])
     chosen = [np.where(counts == size, 1.0, 0.0) for size in sizes]
+
+    def squares(rows: Float, weight: Float) -> Float:
+        weighted = np.moveaxis(rows * weight[:, :, None], 0, 2)
+        return np.asarray(weighted @ np.swapaxes(rows, 0, 1))
+
     return Sums(
         n=present.sum(axis=0),
         repeated=np.asarray((counts > 1).any(axis=0)),
-        squares=(weight.T @ products).reshape(-1, columns, columns),
-        products=values.T @ basis,
-        total=np.einsum("sp,sp->p", values, values),
+        squares=squares(columns, np.ones(maps.shape)),
         sizes=sizes,
         people=np.array([who.sum(axis=0) for who in chosen]),
-        own_squares=np.array(
-            [np.einsum("gp,gpi,gpj->pij", who, sums_x, sums_x, optimize=True) for who in chosen]
-        ),
-        own_products=np.array(
-            [np.einsum("gp,gp,gpi->pi", who, sums_y, sums_x, optimize=True) for who in chosen]
-        ),
-        own_total=np.array([np.einsum("gp,gp->p", who, sums_y**2) for who in chosen]),
+        own_squares=np.array([squares(own, who) for who in chosen]),
     )
 
 
-def best_ratio(sums: Sums, settings: LongitudinalSettings) -> FloatArray:
-    """Ratio of variances that maximizes the restricted likelihood at each point.
+def best_ratio(sums: Sums, settings: LongitudinalSettings) -> Float:
+    """Ratio r of variances that maximizes the restricted likelihood at each point.
 
-    The best of a grid of correlations r / (1 + r), then halving of the interval around it by
-    the sign of the derivative. Zero if the likelihood falls from there.
+    The best of a grid of correlations r / (1 + r), then halving of the interval around it by the
+    sign of the derivative.
     """
-    freedom = sums.n - sums.squares.shape[1]
+    freedom = sums.n - sums.squares.shape[1] + 1
     grid = np.linspace(0.0, settings.max_correlation, settings.grid)
-    ratios = grid / (1 - grid)
     losses = []
-    for ratio in ratios:
+    for ratio in grid / (1 - grid):
         state = sums.at(np.full(len(sums.n), ratio))
-        losses.append(freedom * np.log(state.residual) + state.penalty)
+        losses.append(freedom * np.log(state.residual[0]) + state.penalty[0])
     best = np.argmin(losses, axis=0)
+
+    def rising(correlation: Float) -> Float:
+        state = sums.at(correlation / (1 - correlation))
+        return np.asarray(freedom * state.residual[1] / state.residual[0] + state.penalty[1])
+
     low, high = grid[np.maximum(best - 1, 0)], grid[np.minimum(best + 1, len(grid) - 1)]
     for _ in range(settings.halvings):
         middle = (low + high) / 2
-        state = sums.at(middle / (1 - middle))
-        rising = freedom * state.residual_first / state.residual + state.penalty_first > 0
-        low, high = np.where(rising, low, middle), np.where(rising, middle, high)
-    at_zero = sums.at(np.zeros(len(sums.n)))
-    rises = freedom * at_zero.residual_first / at_zero.residual + at_zero.penalty_first >= 0
-    return np.where((best == 0) & rises, 0.0, low / (1 - low))
-
-
-def curvature(sums: Sums, state: State) -> tuple[FloatArray, FloatArray]:
-    """Hessian of minus twice the restricted likelihood at the optimum.
-
-    Returns Twice for the log variance it is the residual degrees of freedom.
-    """
-    variance = state.residual / (sums.n - sums.squares.shape[1])
-    return (
-        -state.residual_first / variance,
-        state.penalty_second + state.residual_second / variance,
-    )
-
-
-#: Sessions of one participant that tell a slope from noise.
-_SLOPE_SESSIONS = 3
-#: Values in memory at once; bounds the temporaries, and does not change a result.
-_CHUNK = 4_000_000
-
-
-@dataclass(frozen=True)
-class MixedTest:
-    """One contrast of one row at each point; NaN where the model could not be fitted."""
-
-    contrast: Contrast
-    estimate: FloatArray
-    """(points,) in units of the map."""
-    se: FloatArray
-    """(points,)"""
-    t: FloatArray
-    """(points,)"""
-    df: FloatArray
-    """(points,) Satterthwaite's."""
-    p: FloatArray
-    """(points,) two-sided."""
-    limits: FloatArray
-    """(2, points) of the estimate."""
-
-
-@dataclass(frozen=True)
-class MixedFit:
-    """A random-intercept model at each point."""
-
-    coefficients: FloatArray
-    """(columns, points)"""
-    residual_variance: FloatArray
-    """(points,) within participants."""
-    participant_variance: FloatArray
-    """(points,) between them, given the columns; with random slopes, at the mean time."""
-    slope_variance: FloatArray
-    """(points,) of slopes between them, per squared unit of time; NaN without random slopes."""
-    n: IntArray
-    """(points,) sessions with a value."""
-    tests: tuple[MixedTest, ...]
+        beyond = rising(middle) > 0
+        low, high = np.where(beyond, low, middle), np.where(beyond, middle, high)
+    at_bound = (best == 0) & (rising(np.zeros(len(sums.n))) >= 0)
+    return np.where(at_bound, 0.0, low / (1 - low))
 
 
 def fit_mixed(
-    maps: FloatArray,
-    matrix: FloatArray,
+    maps: Float,
+    matrix: Float,
     participants: Sequence[str] | NDArray[np.str_],
     contrasts: Sequence[Contrast],
     settings: LongitudinalSettings,
     *,
-    times: FloatArray | None = None,
-) -> MixedFit:
+    times: Float | None = None,
+) -> PointwiseFit:
     """Fit ``value = matrix @ coefficients + participant + residual`` at each point.
 
     With times, participants also have a slope of their own, correlated with the intercept.
@@ -253,66 +178,47 @@ def fit_mixed(
     Satterthwaite's, from the curvature of the likelihood at the optimum, as in R's ``lmerTest``
     (Kuznetsova et al. 2017); where no variance between participants is found they are those of
     the linear model.
-
-    ``maps`` NaN is missing.
     """
     numbers = _check(maps, matrix, participants, contrasts)
     if times is not None and np.bincount(numbers).max() < _SLOPE_SESSIONS:
         raise ModelError(
-            "longitudinal model: nobody has three sessions, so that slopes cannot be told from"
-            " noise; use random intercepts",
+            "longitudinal model: no participant has three sessions, so that slopes cannot be"
+            " separated from noise; use random intercepts",
             reason="few-sessions",
         )
     basis, triangle = np.linalg.qr(matrix)
     back = np.linalg.inv(triangle)
-    step = max(1, _CHUNK // (matrix.shape[0] * matrix.shape[1]))
     rotated = np.array([contrast.weights[0] @ back for contrast in contrasts])
     parts = []
-    for start in range(0, max(maps.shape[1], 1), step):
-        values = np.asarray(maps[:, start : start + step], dtype=np.float64)
+    for points in chunks(maps.shape, matrix.shape[1]):
+        values = np.asarray(maps[:, points], dtype=np.float64)
         if times is None:
             parts.append(_fit(values, basis, numbers, rotated, settings))
         else:
-            data = _SlopeData(values, basis, numbers, times)
-            parts.append(_fit_slopes(data, rotated, settings))
-    stacked = {
-        name: np.concatenate([getattr(part, name) for part in parts], axis=-1)
-        for name in ("scores", "residual", "between", "slopes", "n", "estimate", "se", "df")
-    }
-    tests = tuple(
-        _test(contrast, stacked["estimate"][i], stacked["se"][i], stacked["df"][i], settings)
-        for i, contrast in enumerate(contrasts)
+            parts.append(_fit_slopes(values, basis, numbers, rotated, settings, times=times))
+    whole = {name: np.concatenate([part[name] for part in parts], axis=-1) for name in parts[0]}
+    # The standard deviation of single visits: effect sizes are those of independent rows.
+    sigma = np.sqrt(whole["residual"] + whole["participant"])
+    return PointwiseFit(
+        coefficients=back @ whole["scores"],
+        sigma=sigma,
+        n=whole["n"].astype(np.int64),
+        tests=tuple(
+            t_test(contrast, estimate, se, df=df, sigma=sigma, confidence=settings.confidence)
+            for contrast, estimate, se, df in zip(
+                contrasts, whole["estimate"], whole["se"], whole["df"], strict=True
+            )
+        ),
+        variances={name: whole[name] for name in ("residual", "participant", "slope")},
     )
-    return MixedFit(
-        coefficients=back @ stacked["scores"],
-        residual_variance=stacked["residual"],
-        participant_variance=stacked["between"],
-        slope_variance=stacked["slopes"],
-        n=stacked["n"],
-        tests=tests,
-    )
-
-
-@dataclass(frozen=True)
-class _Part:
-    """Results at some points; points last."""
-
-    scores: FloatArray
-    residual: FloatArray
-    between: FloatArray
-    slopes: FloatArray
-    n: IntArray
-    estimate: FloatArray
-    se: FloatArray
-    df: FloatArray
 
 
 def _check(
-    maps: FloatArray,
-    matrix: FloatArray,
+    maps: Float,
+    matrix: Float,
     participants: Sequence[str] | NDArray[np.str_],
     contrasts: Sequence[Contrast],
-) -> IntArray:
+) -> Int:
     """Refuse what cannot be fitted; participants as numbers otherwise."""
     if not len(maps) == len(matrix) == len(participants):
         raise ModelError(
@@ -336,122 +242,152 @@ def _check(
     )
     if counts.max() == 1:
         raise ModelError(
-            "longitudinal model: nobody has two sessions; use a linear model",
+            "longitudinal model: no participant has two sessions; use a linear model",
             reason="one-session",
         )
     return np.asarray(numbers, dtype=np.int64)
 
 
 def _fit(
-    maps: FloatArray,
-    basis: FloatArray,
-    participants: IntArray,
-    rotated: FloatArray,
+    maps: Float,
+    basis: Float,
+    participants: Int,
+    rotated: Float,
     settings: LongitudinalSettings,
-) -> _Part:
+) -> dict[str, Float]:
+    """Fit intercepts at some points; points last."""
     sums = collect_sums(maps, basis, participants)
-    usable = np.linalg.eigvalsh(sums.squares)[:, 0] > settings.min_information
-    usable &= (sums.n > basis.shape[1] + 1) & sums.repeated
+    columns = basis.shape[1]
+    usable = np.linalg.eigvalsh(sums.squares[:, :-1, :-1])[:, 0] > settings.min_information
+    usable &= (sums.n > columns + 1) & sums.repeated
     sums = sums.where(usable)
     ratio = best_ratio(sums, settings)
     state = sums.at(ratio)
-    freedom = sums.n - basis.shape[1]
-    variance = state.residual / freedom
-    inverse = np.linalg.inv(state.information)
-    estimate = np.einsum("cj,pj->cp", rotated, state.scores)
-    form = np.einsum("ci,pij,cj->cp", rotated, inverse, rotated)
-    slope = -np.einsum("ci,pij,pjk,pkl,cl->cp", rotated, inverse, state.first, inverse, rotated)
-    df = _satterthwaite(form, slope, freedom, ratio, curvature(sums, state))
+    freedom = sums.n - columns
+    variance = state.residual[0] / freedom
+    form = np.einsum("ci,pij,cj->cp", rotated, state.inverse, rotated)
+    moved = state.inverse @ state.information_first @ state.inverse
+    slope = -np.einsum("ci,pij,cj->cp", rotated, moved, rotated)
+    df = _satterthwaite(form, slope, freedom, ratio, state)
     blank = np.where(usable, 1.0, np.nan)
-    return _Part(
-        scores=state.scores.T * blank,
-        residual=variance * blank,
-        between=variance * ratio * blank,
-        slopes=np.full(len(blank), np.nan),
-        n=sums.n,
-        estimate=estimate * blank,
-        se=np.sqrt(form * variance) * blank,
-        df=df * blank,
-    )
+    return {
+        "scores": state.scores.T * blank,
+        "residual": variance * blank,
+        "participant": variance * ratio * blank,
+        "slope": np.full(len(blank), np.nan),
+        "n": sums.n.astype(np.float64),
+        "estimate": np.einsum("cj,pj->cp", rotated, state.scores) * blank,
+        "se": np.sqrt(form * variance) * blank,
+        "df": df * blank,
+    }
 
 
-@dataclass(frozen=True)
-class _SlopeData:
-    maps: FloatArray
-    basis: FloatArray
-    participants: IntArray
-    times: FloatArray
-
-
-def _fit_slopes(data: _SlopeData, rotated: FloatArray, settings: LongitudinalSettings) -> _Part:
-    unit = float(data.times.std())
-    standard = (data.times - data.times.mean()) / unit
-    sums = collect_slope_sums(data.maps, data.basis, data.participants, standard)
+def _fit_slopes(
+    maps: Float,
+    basis: Float,
+    participants: Int,
+    rotated: Float,
+    settings: LongitudinalSettings,
+    *,
+    times: Float,
+) -> dict[str, Float]:
+    """Fit intercepts and slopes at some points; points last."""
+    unit = float(times.std())
+    standard = (times - times.mean()) / unit
+    sums = collect_slope_sums(maps, basis, participants, standard)
     usable = np.linalg.eigvalsh(sums.squares)[:, 0] > settings.min_information
     usable &= sums.moments[0].max(axis=1) >= _SLOPE_SESSIONS
-    usable &= sums.n > data.basis.shape[1] + _SLOPE_SESSIONS
+    usable &= sums.n > basis.shape[1] + _SLOPE_SESSIONS
     kept = sums.take(np.flatnonzero(usable))
     triangles = best_triangles(kept, settings)
     state = solve_slopes(kept, triangles)
-    variance = state.residual / (kept.n - data.basis.shape[1])
+    variance = state.residual / (kept.n - basis.shape[1])
     form = np.einsum("ci,pij,cj->cp", rotated, state.inverse, rotated)
 
-    def spread(values: FloatArray) -> FloatArray:
+    def spread(values: Float) -> Float:
         full = np.full((*values.shape[:-1], len(usable)), np.nan)
         full[..., usable] = values
         return full
 
-    return _Part(
-        scores=spread(state.scores.T),
-        residual=spread(variance),
-        between=spread(variance * triangles[:, 0] ** 2),
-        slopes=spread(variance * np.sum(triangles[:, 1:] ** 2, axis=1) / unit**2),
-        n=sums.n,
-        estimate=spread(np.einsum("cj,pj->cp", rotated, state.scores)),
-        se=spread(np.sqrt(form * variance)),
-        df=spread(slope_freedom(kept, triangles, rotated)),
-    )
+    return {
+        "scores": spread(state.scores.T),
+        "residual": spread(variance),
+        "participant": spread(variance * triangles[:, 0] ** 2),
+        "slope": spread(variance * np.sum(triangles[:, 1:] ** 2, axis=1) / unit**2),
+        "n": sums.n.astype(np.float64),
+        "estimate": spread(np.einsum("cj,pj->cp", rotated, state.scores)),
+        "se": spread(np.sqrt(form * variance)),
+        "df": spread(slope_freedom(kept, triangles, rotated)),
+    }
 
 
-def _satterthwaite(
-    form: FloatArray,
-    slope: FloatArray,
-    freedom: FloatArray,
-    ratio: FloatArray,
-    hessian: tuple[FloatArray, FloatArray],
-) -> FloatArray:
+def _satterthwaite(form: Float, slope: Float, freedom: Int, ratio: Float, state: State) -> Float:
     """Degrees of freedom of contrasts: 2 f^2 / Var(f), f the estimated variance of one.
 
     With s the logarithm of the residual variance and r the ratio, f = exp(s) form(r), so its
     gradient is f (1, slope / form); the covariance of (s, r) is twice the inverse of the Hessian
-    of minus twice the restricted likelihood.
+    of minus twice the restricted likelihood, whose entry for s is the residual ``freedom``.
     """
-    mixed, second = hessian
-    inner = ratio > 0
+    variance = state.residual[0] / freedom
+    mixed, second = -state.residual[1] / variance, state.penalty[2] + state.residual[2] / variance
     determinant = freedom * second - mixed**2
-    safe = inner & (determinant > 0)
-    scale = np.where(safe, determinant, 1.0)
+    safe = (ratio > 0) & (determinant > 0)
     relative = slope / form
     spread = second - 2 * mixed * relative + freedom * relative**2
-    found = np.where(safe, scale / np.where(safe, spread, 1.0), freedom)
-    return np.broadcast_to(found, form.shape)
+    found = np.where(safe, determinant, 1.0) / np.where(safe, spread, 1.0)
+    return np.where(safe, found, freedom.astype(np.float64))
 
 
-def _test(
-    contrast: Contrast,
-    estimate: FloatArray,
-    se: FloatArray,
-    df: FloatArray,
-    settings: LongitudinalSettings,
-) -> MixedTest:
-    t = estimate / se
-    reach = special.stdtrit(df, (1 + settings.confidence) / 2) * se
-    return MixedTest(
-        contrast=contrast,
-        estimate=estimate,
-        se=se,
-        t=t,
-        df=df,
-        p=np.asarray(2 * special.stdtr(df, -np.abs(t)), dtype=np.float64),
-        limits=np.stack([estimate - reach, estimate + reach]),
-    )
+@dataclass(frozen=True, eq=False)
+class RepeatedRows(RowModel):
+    """A mixed model of a design in which participants have several rows."""
+
+    participants: NDArray[np.str_]
+    """(rows,)"""
+    times: Float | None
+    """(rows,) of each visit, for random slopes; else random intercepts."""
+    independent: ClassVar[bool] = False
+
+    def fit(
+        self, values: Float, rows: Int, contrasts: tuple[Contrast, ...], settings: GroupSettings
+    ) -> PointwiseFit:
+        """Fit some rows of the design at each point."""
+        return fit_mixed(
+            values,
+            self.design.matrix[rows],
+            self.participants[rows],
+            contrasts,
+            settings.longitudinal,
+            times=None if self.times is None else self.times[rows],
+        )
+
+    def fit_measures(
+        self, values: Float, rows: Int, contrasts: tuple[Contrast, ...], settings: GroupSettings
+    ) -> PointwiseFit:
+        """Fit some rows of the design to each summary measure, as if it were a point."""
+        return self.fit(values, rows, contrasts, settings)
+
+
+def longitudinal_model(
+    design: Design, table: pd.DataFrame, time: str | None, settings: GroupSettings
+) -> RepeatedRows:
+    """Assign visits to participants, with their times if slopes are random."""
+    if settings.glm.covariance != "ordinary":
+        raise ModelError(
+            "longitudinal model: it assumes equal variances; set glm.covariance to ordinary",
+            reason="longitudinal-covariance",
+        )
+    own = table.iloc[design.rows]
+    times = None
+    if settings.longitudinal.random == "slope":
+        if time is None:
+            raise ModelError(
+                "longitudinal model: random slopes need the time of each session; give a column"
+                f" {settings.longitudinal.time_columns[0]} or acq_time in sessions.tsv",
+                reason="no-time",
+            )
+        times = own[time].to_numpy(dtype=np.float64)
+        if not np.isfinite(times).all():
+            lacking = ", ".join(map(str, own.index[~np.isfinite(times)][:8]))
+            raise ModelError(f"longitudinal model: no {time} of {lacking}", reason="no-time")
+    return RepeatedRows(design, own[PARTICIPANT].to_numpy(dtype=np.str_), times)

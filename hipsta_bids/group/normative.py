@@ -1,4 +1,4 @@
-"""How far each subject is from what a reference group would have, given the covariates."""
+"""w-scores: how far maps and measures are from those of a reference group, given covariates."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -10,41 +10,36 @@ from numpy.typing import NDArray
 from scipy import special
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float, Int, Measures
-from hipsta_bids.group.design import build_design
-from hipsta_bids.group.fit import most_frequent
+from hipsta_bids.group.data import PARTICIPANT, SESSION, Bool, Cohort, Float, Int, Measures
 from hipsta_bids.group.formula import ModelSpec, check_names, listed
-from hipsta_bids.group.glm import chunks, fit_block
+from hipsta_bids.group.glm import chunks, fit_block, most_frequent
+from hipsta_bids.group.model import build_design
 from hipsta_bids.group.settings import GlmSettings, GroupSettings
 from hipsta_bids.group.summaries import hemispheres, summary_values
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+#: Region of a score that is the mean over the whole sheet.
+WHOLE = "all"
 
 
 @dataclass(frozen=True)
 class NormativeScores:
     """Scores of all subjects at all points; NaN where a value or the model is missing."""
 
-    w: FloatArray
+    w: Float
     """(subjects, points) observed minus expected, in residual standard deviations of the reference
     group (Jack et al. 1997)."""
-    p: FloatArray
+    p: Float
     """(subjects, points) two-sided, with the uncertainty of the expectation."""
     n_reference: NDArray[np.int64]
     """(points,) reference subjects with a value."""
 
 
-def w_scores(
-    maps: FloatArray, matrix: FloatArray, reference: BoolArray, settings: GlmSettings
-) -> NormativeScores:
+def w_scores(maps: Float, matrix: Float, reference: Bool, settings: GlmSettings) -> NormativeScores:
     """Score each subject against a reference group, adjusted for covariates.
 
     Members of the reference group are scored against the others: as if the model had been
     fitted without them (from their leverage, so that nothing is fitted again). Their scores
     thus mean the same as those of everybody else.
-
-    ``maps`` NaN is missing.
     """
     if settings.covariance != "ordinary":
         raise ModelError(
@@ -83,10 +78,10 @@ def w_scores(
 
 
 def _score(
-    maps: FloatArray,
-    rotated: FloatArray,
-    basis: FloatArray,
-    reference: BoolArray,
+    maps: Float,
+    rotated: Float,
+    basis: Float,
+    reference: Bool,
     settings: GlmSettings,
 ) -> NormativeScores:
     fit = fit_block(maps[reference], basis, settings)
@@ -110,13 +105,6 @@ def _score(
     freedom = np.where(member, df - 1, df)
     p = 2 * special.stdtr(freedom, -np.abs(w) / np.sqrt(1 + spread))
     return NormativeScores(w, np.asarray(p, dtype=np.float64), fit.n)
-
-
-# Each participant against a reference group: w-scores of maps and of summary measures.
-
-
-#: Region of a score that is the mean over the whole sheet.
-WHOLE = "all"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -158,7 +146,7 @@ def score_cohort(
     measures: Measures,
     references: Mapping[str, str],
 ) -> Scores:
-    """Score everybody who has the covariates of a model, whatever their group."""
+    """Score all participants who have the covariates of a model, whatever their group."""
     factor, level = normative
     formula = _without(model.formula, factor)
     known = {str(name) for name in Formula(formula).required_variables}
@@ -170,7 +158,7 @@ def score_cohort(
     reference = (column.astype(str) == level).to_numpy()
     if not reference.any():
         raise ModelError(
-            f"w-scores: nobody with the covariates has {factor!r} {level!r}; there are"
+            f"w-scores: no participant with the covariates has {factor!r} {level!r}; there are"
             f" {listed(sorted(column.dropna().astype(str).unique()))}",
             reason="unknown-level",
         )
@@ -219,7 +207,7 @@ def _without(formula: str, factor: str) -> str:
 def _map_rows(
     cohort: Cohort, sides: Mapping[str, ScoredMaps], settings: GroupSettings
 ) -> Iterator[pd.DataFrame]:
-    """Means over the sheet and over each subfield, and how many points are out of line."""
+    """Means over the sheet and over each subfield, and the share of points that are outliers."""
     alpha = 1 - settings.glm.confidence
     for hemi, side in sides.items():
         fields = side.subfield.ravel()
@@ -230,16 +218,9 @@ def _map_rows(
             for region, points in regions.items():
                 if not points.any():
                     continue
-                scored = np.isfinite(found.w[:, points])
-                count = np.where(scored.any(axis=1), scored.sum(axis=1), np.nan)
-
-                def share(
-                    flags: NDArray[np.bool_],
-                    points: NDArray[np.bool_] = points,
-                    count: Float = count,
-                ) -> Float:
-                    return np.asarray(flags[:, points].sum(axis=1) / count)
-
+                w = found.w[:, points]
+                count = np.isfinite(w).sum(axis=1).astype(np.float64)
+                count[count == 0] = np.nan
                 yield _rows(
                     cohort,
                     side.rows,
@@ -247,10 +228,10 @@ def _map_rows(
                     measure=measure,
                     region=region,
                     reference=side.reference,
-                    w=np.where(scored, found.w[:, points], 0.0).sum(axis=1) / count,
+                    w=np.nansum(w, axis=1) / count,
                     p=np.nan,
-                    low=share(out & (found.w < 0)),
-                    high=share(out & (found.w > 0)),
+                    low=(out[:, points] & (w < 0)).sum(axis=1) / count,
+                    high=(out[:, points] & (w > 0)).sum(axis=1) / count,
                 )
 
 

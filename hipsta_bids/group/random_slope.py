@@ -11,12 +11,9 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hipsta_bids.group.data import Float, Int
 from hipsta_bids.group.settings import LongitudinalSettings
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 #: Step of numerical derivatives of the three numbers; times have a standard deviation of 1.
 _STEP = 1e-4
@@ -35,22 +32,22 @@ class SlopeSums:
     Where nothing is missing, all points share moments and columns, which then have one point.
     """
 
-    n: IntArray
+    n: Int
     """(points,)"""
-    squares: FloatArray
+    squares: Float
     """(points, columns, columns)"""
-    products: FloatArray
+    products: Float
     """(points, columns)"""
-    total: FloatArray
+    total: Float
     """(points,)"""
-    moments: FloatArray
+    moments: Float
     """(3, points or 1, participants) sessions, sums of times and of their squares."""
-    own_columns: FloatArray
+    own_columns: Float
     """(2, points or 1, participants, columns) sums of columns, plain and times time."""
-    own_values: FloatArray
+    own_values: Float
     """(2, points, participants) the same of the values."""
 
-    def take(self, points: IntArray) -> "SlopeSums":
+    def take(self, points: Int) -> "SlopeSums":
         """Keep some points."""
         shared = self.moments.shape[1] == 1
         return SlopeSums(
@@ -68,23 +65,18 @@ class SlopeSums:
 class SlopeState:
     """Generalized least squares at given triangles."""
 
-    scores: FloatArray
+    scores: Float
     """(points, columns)"""
-    inverse: FloatArray
+    inverse: Float
     """(points, columns, columns) covariance of the scores over the residual variance."""
-    residual: FloatArray
+    residual: Float
     """(points,) generalized sum of squared residuals."""
-    penalty: FloatArray
+    penalty: Float
     """(points,) log |V| + log |X' V^-1 X|."""
 
 
-def collect_slope_sums(
-    maps: FloatArray, basis: FloatArray, participants: IntArray, times: FloatArray
-) -> SlopeSums:
-    """Sum over each participant's sessions.
-
-    ``maps`` NaN is missing.
-    """
+def collect_slope_sums(maps: Float, basis: Float, participants: Int, times: Float) -> SlopeSums:
+    """Sum over each participant's sessions."""
     present = np.isfinite(maps)
     weight = present.astype(np.float64)
     values = np.where(present, maps, 0.0)
@@ -94,7 +86,7 @@ def collect_slope_sums(
     products = (basis[:, :, None] * basis[:, None, :]).reshape(len(basis), -1)
     columns = basis.shape[1]
 
-    def per_person(table: FloatArray) -> FloatArray:
+    def per_person(table: Float) -> Float:
         return np.moveaxis(np.add.reduceat(table[order], starts, axis=0), 0, 1)
 
     shown = weight[:, :1] if present.all() else weight
@@ -114,7 +106,7 @@ def collect_slope_sums(
     )
 
 
-def solve_slopes(sums: SlopeSums, triangles: FloatArray) -> SlopeState:
+def solve_slopes(sums: SlopeSums, triangles: Float) -> SlopeState:
     """Fit with one triangle (intercept, covariance, slope) per point."""
     a, b, c = triangles.T[:, :, None]
     n, s, q = sums.moments
@@ -137,9 +129,7 @@ def solve_slopes(sums: SlopeSums, triangles: FloatArray) -> SlopeState:
     return SlopeState(scores, np.asarray(inverse, dtype=np.float64), residual, penalty)
 
 
-def _products(
-    x: FloatArray, z: FloatArray, plain: FloatArray, mixed: FloatArray, timed: FloatArray
-) -> FloatArray:
+def _products(x: Float, z: Float, plain: Float, mixed: Float, timed: Float) -> Float:
     """Sum products of columns over participants, weighted (points, columns, columns)."""
     if len(x) != 1:
         left = np.swapaxes(x, 1, 2) @ (plain[:, :, None] * x + mixed[:, :, None] * z)
@@ -154,21 +144,21 @@ def _products(
     return np.asarray(total, dtype=np.float64).reshape(-1, columns, columns)
 
 
-def _sums(x: FloatArray, values: FloatArray) -> FloatArray:
+def _sums(x: Float, values: Float) -> Float:
     """Sum columns times values over participants (points, columns)."""
     if len(x) != 1:
         return np.asarray((values[:, None, :] @ x)[:, 0])
     return np.asarray(values @ x[0])
 
 
-def best_triangles(sums: SlopeSums, settings: LongitudinalSettings) -> FloatArray:
+def best_triangles(sums: SlopeSums, settings: LongitudinalSettings) -> Float:
     """Triangles (points, 3) that maximize the restricted likelihood.
 
     The best of a few starts, then damped Newton steps with numerical derivatives.
     """
     starts = [np.array(start) for start in product((0.2, 1.0, 3.0), (0.0,), (0.05, 0.3, 1.0))]
     losses = [_loss(sums, np.tile(start, (len(sums.n), 1))) for start in starts]
-    best: FloatArray = np.array(starts)[np.argmin(losses, axis=0)]
+    best: Float = np.array(starts)[np.argmin(losses, axis=0)]
     active = np.arange(len(sums.n))
     damping = np.full(len(best), _DAMPING)
     for _ in range(settings.slope_steps):
@@ -191,9 +181,7 @@ def best_triangles(sums: SlopeSums, settings: LongitudinalSettings) -> FloatArra
     return best
 
 
-def slope_freedom(
-    sums: SlopeSums, triangles: FloatArray, weights: Sequence[FloatArray] | FloatArray
-) -> FloatArray:
+def slope_freedom(sums: SlopeSums, triangles: Float, weights: Sequence[Float] | Float) -> Float:
     """Satterthwaite's degrees of freedom of contrasts (contrasts, points).
 
     From the Hessian of minus twice the restricted likelihood for the logarithm of the residual
@@ -225,23 +213,23 @@ def slope_freedom(
     return np.asarray(1 / np.einsum("cpj,pj->cp", turned**2, inverse), dtype=np.float64)
 
 
-def _fixed_variance(state: SlopeState, variance: FloatArray) -> FloatArray:
+def _fixed_variance(state: SlopeState, variance: Float) -> Float:
     return np.asarray(state.penalty + state.residual / variance)
 
 
-def _forms(state: SlopeState, rows: FloatArray) -> FloatArray:
+def _forms(state: SlopeState, rows: Float) -> Float:
     """Variances of contrasts over the residual variance."""
     return np.asarray(np.einsum("ci,pij,cj->cp", rows, state.inverse, rows))
 
 
-def _loss(sums: SlopeSums, triangles: FloatArray) -> FloatArray:
+def _loss(sums: SlopeSums, triangles: Float) -> Float:
     """Minus twice the restricted likelihood, but for a constant."""
     state = solve_slopes(sums, triangles)
     freedom = sums.n - sums.squares.shape[1]
     return np.asarray(freedom * np.log(state.residual) + state.penalty)
 
 
-def _derivatives(sums: SlopeSums, at: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _derivatives(sums: SlopeSums, at: Float) -> tuple[Float, Float, Float]:
     """Loss, gradient and Hessian by central differences."""
     shifts = _STEP * np.eye(3)
     ups = np.stack([_loss(sums, at + shift) for shift in shifts], axis=1)
@@ -250,7 +238,7 @@ def _derivatives(sums: SlopeSums, at: FloatArray) -> tuple[FloatArray, FloatArra
     return _loss(sums, at), (ups - downs) / (2 * _STEP), hessian
 
 
-def _second(function: Callable[[FloatArray], FloatArray], at: FloatArray) -> FloatArray:
+def _second(function: Callable[[Float], Float], at: Float) -> Float:
     """Second derivatives for the three numbers, by central differences of a wider step."""
     step = 10 * _STEP
     shifts = step * np.eye(3)

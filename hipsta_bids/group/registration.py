@@ -1,32 +1,33 @@
-"""Registration of curvature profiles, so that the same grid node means the same place."""
+"""Registration of curvature profiles, so that a grid node means the same position in all."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
 from hipsta_bids.errors import ModelError
+from hipsta_bids.group.data import Bool, Float
 from hipsta_bids.group.settings import RegistrationSettings
-from hipsta_bids.group.template import (
+from hipsta_bids.group.warps import (
     Template,
+    WarpBasis,
     fit_template,
+    fit_warps,
     inner_knots,
     make_basis,
     subject_curves,
+    warp_values,
 )
-from hipsta_bids.group.warps import WarpBasis, fit_warps, warp_values
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class Registration:
     """Warps of all subjects, and what they did."""
 
-    warps: FloatArray
+    warps: Float
     """(subjects, nodes) registered coordinate of each node, 0..1."""
     template: Template | None
     """None without registration."""
@@ -35,45 +36,20 @@ class Registration:
     explained_before: float
     """Share of the variance of all profile values that the mean profile explains."""
     explained_after: float
-    displacement: FloatArray
+    displacement: Float
     """(subjects,) root mean square of warp minus identity, in grid nodes."""
-    extreme: BoolArray
-    """(subjects,) whose displacement is out of line."""
+    extreme: Bool
+    """(subjects,) whose displacement is an outlier."""
 
 
-@dataclass(frozen=True)
-class _Method:
-    """The numbers of one of the two methods."""
-
-    template_splines: int
-    warp_splines: int
-    components: int
-    iterations: int
-    tolerance: float
-    variance: float
-
-    @classmethod
-    def choose(cls, settings: RegistrationSettings) -> "_Method":
-        if settings.align == "penalized":
-            return cls(
-                settings.penalized_template_splines,
-                settings.penalized_warp_splines,
-                settings.penalized_components,
-                settings.penalized_iterations,
-                settings.penalized_tolerance,
-                settings.penalized_start_sd**2,
-            )
-        return cls(
-            settings.template_splines,
-            settings.warp_splines,
-            settings.components,
-            settings.iterations,
-            settings.tolerance,
-            np.inf,
-        )
+def _numbers(settings: RegistrationSettings) -> dict[str, Any]:
+    """Take the settings of the chosen method."""
+    prefix = "penalized_" if settings.align == "penalized" else ""
+    names = ("template_splines", "warp_splines", "components", "iterations", "tolerance")
+    return {name: getattr(settings, prefix + name) for name in names}
 
 
-def register(profiles: FloatArray, settings: RegistrationSettings) -> Registration:
+def register(profiles: Float, settings: RegistrationSettings) -> Registration:
     """Register profiles to a template that is made from them.
 
     ``registr`` takes turns: each profile is warped onto its own approximation by the mean and
@@ -86,15 +62,16 @@ def register(profiles: FloatArray, settings: RegistrationSettings) -> Registrati
     if settings.align == "none":
         return _finish(profiles, _identity(profiles), None, settings, 0, converged=True)
     scale = _check(profiles, settings)
-    method = _Method.choose(settings)
+    chosen = _numbers(settings)
     scaled = profiles / scale
-    basis = WarpBasis.make(profiles.shape[1], method.warp_splines)
+    basis = WarpBasis.make(profiles.shape[1], chosen["warp_splines"])
     warps = _identity(profiles)
-    knots = inner_knots(warps, method.template_splines)
+    knots = inner_knots(warps, chosen["template_splines"])
     mean = np.linalg.lstsq(make_basis(knots)(warps[0]), scaled.mean(axis=0), rcond=None)[0]
     curves = np.tile(mean, (len(profiles), 1))
     parameters = np.zeros((len(profiles), len(basis.identity)))
-    variance, noise = method.variance, 1.0
+    variance = settings.penalized_start_sd**2 if settings.align == "penalized" else np.inf
+    noise = 1.0
     turn = 0
     while True:
         fit = fit_warps(
@@ -107,12 +84,12 @@ def register(profiles: FloatArray, settings: RegistrationSettings) -> Registrati
         if settings.center:
             warps = _after_inverse(warps, warps.mean(axis=0))
         template, curves = fit_template(
-            scaled, warps, method.template_splines, method.components, settings
+            scaled, warps, chosen["template_splines"], chosen["components"], settings
         )
         knots, noise = template.knots, template.noise
         change = float(np.mean((warps - before) ** 2))
         # The first warps are to the mean of profiles that were not registered.
-        if turn == method.iterations or (turn and change <= method.tolerance):
+        if turn == chosen["iterations"] or (turn and change <= chosen["tolerance"]):
             break
         turn += 1
     template = replace(
@@ -121,11 +98,13 @@ def register(profiles: FloatArray, settings: RegistrationSettings) -> Registrati
     if settings.center:
         center = _fit_to(scaled, template, settings).mean(axis=0)
         template = replace(template, center=center)
-    return _finish(profiles, warps, template, settings, turn, converged=change <= method.tolerance)
+    return _finish(
+        profiles, warps, template, settings, turn, converged=change <= chosen["tolerance"]
+    )
 
 
 def register_to(
-    profiles: FloatArray, template: Template, settings: RegistrationSettings
+    profiles: Float, template: Template, settings: RegistrationSettings
 ) -> Registration:
     """Register profiles to a template that does not change; each subject is on its own."""
     if template.align != settings.align:
@@ -140,9 +119,9 @@ def register_to(
     return _finish(profiles, warps, template, settings, template.turns, converged=True)
 
 
-def _fit_to(scaled: FloatArray, template: Template, settings: RegistrationSettings) -> FloatArray:
+def _fit_to(scaled: Float, template: Template, settings: RegistrationSettings) -> Float:
     """Warps to a template that does not change, by as many turns as it was made with."""
-    basis = WarpBasis.make(scaled.shape[1], _Method.choose(settings).warp_splines)
+    basis = WarpBasis.make(scaled.shape[1], _numbers(settings)["warp_splines"])
     curves = np.tile(template.mean, (len(scaled), 1))
     parameters = np.zeros((len(scaled), len(basis.identity)))
     penalty = template.noise / template.warp_variance
@@ -156,18 +135,18 @@ def _fit_to(scaled: FloatArray, template: Template, settings: RegistrationSettin
     return fit.warps
 
 
-def _identity(profiles: FloatArray) -> FloatArray:
+def _identity(profiles: Float) -> Float:
     return np.tile(np.linspace(0.0, 1.0, profiles.shape[1]), (len(profiles), 1))
 
 
-def _after_inverse(warps: FloatArray, common: FloatArray) -> FloatArray:
+def _after_inverse(warps: Float, common: Float) -> Float:
     """Follow all warps by the inverse of one; by their mean's, it becomes the identity."""
     grid = np.linspace(0.0, 1.0, warps.shape[1])
     back = np.interp(warps.ravel(), common, grid)
     return np.asarray(back.reshape(warps.shape), dtype=np.float64)
 
 
-def _check_finite(profiles: FloatArray) -> None:
+def _check_finite(profiles: Float) -> None:
     rows = np.flatnonzero(~np.isfinite(profiles).all(axis=1))
     if len(rows):
         raise ModelError(
@@ -176,8 +155,8 @@ def _check_finite(profiles: FloatArray) -> None:
         )
 
 
-def _check(profiles: FloatArray, settings: RegistrationSettings) -> float:
-    """Refuse what gives no template; the profiles' standard deviation otherwise."""
+def _check(profiles: Float, settings: RegistrationSettings) -> float:
+    """Refuse what makes no template; else return the profiles' standard deviation."""
     _check_finite(profiles)
     if len(profiles) < settings.min_subjects:
         raise ModelError(
@@ -195,8 +174,8 @@ def _check(profiles: FloatArray, settings: RegistrationSettings) -> float:
 
 
 def _finish(
-    profiles: FloatArray,
-    warps: FloatArray,
+    profiles: Float,
+    warps: Float,
     template: Template | None,
     settings: RegistrationSettings,
     iterations: int,
@@ -219,30 +198,24 @@ def _finish(
     )
 
 
-def _explained(profiles: FloatArray) -> float:
+def _explained(profiles: Float) -> float:
     """Share of the variance that the mean profile explains."""
     return 1 - float(np.mean(profiles.var(axis=0))) / max(float(profiles.var()), 1e-300)
-
-
-# Profiles along x before registration, and displacements of groups after it.
 
 
 @dataclass(frozen=True)
 class GroupShift:
     """By how much a group was displaced."""
 
-    mean: FloatArray
+    mean: Float
     """(nodes,) registered minus original position, in grid nodes; positive is lateral."""
-    se: FloatArray
+    se: Float
     """(nodes,)"""
     n: int
 
 
-def mean_profiles(maps: FloatArray, settings: RegistrationSettings) -> FloatArray:
-    """Profiles along x: means over y, with gaps filled linearly.
-
-    ``maps`` Curvature, NaN where missing.
-    """
+def mean_profiles(maps: Float, settings: RegistrationSettings) -> Float:
+    """Profiles of curvature along x: means over y, with gaps filled linearly."""
     present = np.isfinite(maps)
     counts = present.sum(axis=2)
     sums = np.where(present, maps, 0.0).sum(axis=2)

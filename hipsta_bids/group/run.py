@@ -49,8 +49,8 @@ from hipsta_bids.group.surfaces import (
     map_patterns,
     taken_names,
 )
-from hipsta_bids.group.template import templates_from_json
 from hipsta_bids.group.volumes import add_volumes, check_volumes
+from hipsta_bids.group.warps import templates_from_json
 from hipsta_bids.group.write import draw, write_results
 from hipsta_bids.io import files
 from hipsta_bids.protocols.toml import resolve

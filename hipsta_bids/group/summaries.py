@@ -11,11 +11,9 @@ from hipsta_bids.errors import ModelError
 from hipsta_bids.group.classify import PairComparison, compare_pairs
 from hipsta_bids.group.comparison import BOTH
 from hipsta_bids.group.data import Cohort, Float
-from hipsta_bids.group.design import Design, build_design
-from hipsta_bids.group.fit import MEAN, RowModel, with_mean
 from hipsta_bids.group.formula import Contrast, ModelSpec, check_names, typed
-from hipsta_bids.group.glm import PointwiseFit
-from hipsta_bids.group.model import Groups
+from hipsta_bids.group.glm import MEAN, PointwiseFit, RowModel, with_mean
+from hipsta_bids.group.model import Design, Groups, build_design
 from hipsta_bids.group.settings import GroupSettings
 
 
@@ -101,7 +99,7 @@ def _fit(
     if not varying:
         return []
     maps: Float = own[list(varying)].to_numpy(dtype=np.float64)[present]
-    fit = model.fit(maps, present, model.design.contrasts, settings)
+    fit = model.fit_measures(maps, present, model.design.contrasts, settings)
     return [MeasureFit(hemi=hemi, measures=varying, formula=formula, fit=fit)]
 
 

@@ -16,8 +16,8 @@ from hipsta_bids.group.analysis import (
     tested_maps,
 )
 from hipsta_bids.group.classify import ClassifierResult, roc_curve
+from hipsta_bids.group.clusters import edges_of, frame_of, peak_table
 from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort
-from hipsta_bids.group.peaks import Frame, frame_of, peak_table
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.summaries import hemispheres, summary_values
 
@@ -192,20 +192,15 @@ def _stacked(blocks: Iterable[Columns]) -> pd.DataFrame:
     return pd.concat([pd.DataFrame(block) for block in blocks], ignore_index=True)
 
 
-def _points(frame: Frame) -> dict[str, np.ndarray]:
-    """Numbers and positions of all points, by column."""
-    points = np.arange(frame.shape[0] * frame.shape[1])
-    return {**frame.number(points), **frame.place(points)}
-
-
 def _statistics(cohort: Cohort, analysis: Analysis) -> Iterator[Named]:
     for key, test, found in tested_maps(analysis):
         one = analysis.fitted[key.hemi]
         frame = frame_of(cohort, one)
         single = test.kind == "t"
         columns = {
-            **_points(frame),
-            "subfield": frame.subfield.ravel(),
+            **frame.number,
+            **frame.position,
+            "subfield": frame.subfield,
             "n": one.fits[key.measure].n,
             "estimate": test.estimate[0] if single else np.nan,
             "se": test.se[0] if single else np.nan,
@@ -226,15 +221,16 @@ def _statistics(cohort: Cohort, analysis: Analysis) -> Iterator[Named]:
 
 def _peaks(cohort: Cohort, analysis: Analysis, settings: GroupSettings) -> Iterator[Columns]:
     for key, test, found in tested_maps(analysis):
-        frame = frame_of(cohort, analysis.fitted[key.hemi])
-        peaks = peak_table(test, found, frame, settings.multiplicity.neighbors)
+        one = analysis.fitted[key.hemi]
+        edges = edges_of(one.maps, settings.multiplicity.neighbors)
+        peaks = peak_table(test, found, frame_of(cohort, one), edges)
         yield {"measure": key.measure, "hemi": key.hemi, **peaks}
 
 
 def _means(cohort: Cohort, analysis: Analysis) -> Iterator[Columns]:
     """Means and standard deviations of groups at each point of the maps that were fitted."""
     for hemi, one in analysis.fitted.items():
-        points = _points(frame_of(cohort, one))
+        frame = frame_of(cohort, one)
         members = members_of(analysis, rows_of(analysis, one))
         for measure in one.fits:
             values = one.values(measure)
@@ -244,7 +240,8 @@ def _means(cohort: Cohort, analysis: Analysis) -> Iterator[Columns]:
                     "unit": cohort.units.get(measure, "1"),
                     "hemi": hemi,
                     "group": group,
-                    **points,
+                    **frame.number,
+                    **frame.position,
                     "n": np.isfinite(values[own]).sum(axis=0),
                     "mean": mean_of_known(values[own], 0),
                     "sd": spread_of_known(values[own]),

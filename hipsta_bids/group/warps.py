@@ -1,21 +1,218 @@
-"""Monotone warps of the sheet along x: their fit to curves, and their use on maps."""
+"""Monotone warps of the sheet along x, and the template of profiles that they are fitted to.
 
-from dataclasses import dataclass
+Warps are fitted to curves and applied to maps. A template is a mean profile and principal
+components, estimated by expectation-maximization, and can be kept as JSON.
+"""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.interpolate import BSpline
 
+from hipsta_bids.errors import ModelError
+from hipsta_bids.group.data import Float, Int
 from hipsta_bids.group.settings import RegistrationSettings
-from hipsta_bids.group.template import inner_knots, make_basis
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-
+#: Cubic B-splines on the unit interval, clamped at its ends.
+_DEGREE = 3
 #: Damping of the first step, its factor when a step fails or succeeds, and its limits.
 _DAMPING, _FACTOR, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 5.0, 1e-9, 1e9
-
 #: Subjects in memory at once; does not change a result.
 _BLOCK = 2000
+#: Fields of a template that are arrays, and the one that JSON has no infinity for.
+_ARRAYS, _INFINITE = ("knots", "mean", "components", "center"), "warp_variance"
+
+
+def inner_knots(values: Float, splines: int) -> Float:
+    """Knots at quantiles of the values, for ``splines`` functions."""
+    shares = np.linspace(0.0, 1.0, splines - _DEGREE + 1)[1:-1]
+    return np.asarray(np.quantile(values, shares), dtype=np.float64)
+
+
+def make_basis(knots: Float) -> BSpline[np.float64]:
+    """All B-splines of the inner knots as one function, of shape (..., splines)."""
+    ends = np.repeat([0.0, 1.0], _DEGREE + 1)
+    padded = np.concatenate([ends[: _DEGREE + 1], knots, ends[_DEGREE + 1 :]])
+    return BSpline(padded, np.eye(len(padded) - _DEGREE - 1), _DEGREE)
+
+
+@dataclass(frozen=True)
+class Template:
+    """A mean profile and the directions in which single ones differ from it.
+
+    Frozen, it takes in new subjects without changing those before.
+    """
+
+    knots: Float
+    """Inner knots on 0..1, medial to lateral."""
+    mean: Float
+    """(splines,) coefficients, in units of ``scale``."""
+    components: Float
+    """(splines, components), times scores of variance 1."""
+    noise: float
+    """Variance of what is left, in squares of ``scale``."""
+    scale: float
+    """Standard deviation of the profiles that made it, in their unit."""
+    align: str
+    """How it was made."""
+    warp_variance: float
+    """Of the logarithms of local stretch; infinite without a penalty."""
+    turns: int
+    """Iterations of template and warps, which new subjects take as well."""
+    center: Float
+    """(nodes,) mean warp of the subjects that made it, when they are registered to it as new ones
+    are; warps are followed by its inverse."""
+
+    def curves(self, at: Float) -> Float:
+        """Mean profile at coordinates 0..1, in the profiles' unit."""
+        return np.asarray(make_basis(self.knots)(at) @ self.mean, dtype=np.float64) * self.scale
+
+
+@dataclass(frozen=True)
+class _Moments:
+    """What the steps need to know of the profiles at their registered coordinates."""
+
+    basis: Float
+    """(subjects, nodes, splines)"""
+    squares: Float
+    """(subjects, splines, splines)"""
+    products: Float
+    """(subjects, splines)"""
+    profiles: Float
+
+    @classmethod
+    def collect(cls, profiles: Float, warps: Float, knots: Float) -> "_Moments":
+        basis = np.asarray(make_basis(knots)(warps), dtype=np.float64)
+        squares = np.swapaxes(basis, 1, 2) @ basis
+        products = np.einsum("sdk,sd->sk", basis, profiles)
+        return cls(basis, squares, products, profiles)
+
+
+@dataclass(frozen=True)
+class _Scores:
+    mean: Float
+    """(subjects, components)"""
+    covariance: Float
+    """(subjects, components, components)"""
+    squares: Float
+    """(subjects, components, components) of the components at the subject's nodes."""
+    projection: Float
+    """(subjects, components)"""
+
+
+def fit_template(
+    profiles: Float,
+    warps: Float,
+    splines: int,
+    components: int,
+    settings: RegistrationSettings,
+) -> tuple[Template, Float]:
+    """Estimate mean, components and noise of profiles at given warps.
+
+    Probabilistic principal components with spline coefficients (Tipping and Bishop 1999; Wrobel
+    et al. 2018), all subjects at once.
+    """
+    knots = inner_knots(warps, splines)
+    moments = _Moments.collect(profiles, warps, knots)
+    mean = np.linalg.solve(moments.squares.sum(axis=0), moments.products.sum(axis=0))
+    parts = _start(moments, mean, components)
+    noise = 1.0
+    for _ in range(settings.em_iterations - 1):
+        scores = _expect(moments, mean, parts, noise)
+        new_mean, new_parts = _maximize(moments, scores)
+        new_noise = _noise(moments, mean, scores)
+        change = np.sum((new_parts - parts) ** 2) + np.sum((new_mean - mean) ** 2)
+        change += (new_noise - noise) ** 2
+        mean, parts, noise = new_mean, new_parts, new_noise
+        if change < settings.em_tolerance:
+            break
+    grid = np.linspace(0.0, 1.0, warps.shape[1])
+    template = Template(knots, mean, parts, noise, 1.0, "none", np.inf, 0, grid)
+    return template, mean + scores.mean @ parts.T
+
+
+def subject_curves(template: Template, profiles: Float, warps: Float) -> Float:
+    """Each subject's own curve, by a template that does not change."""
+    moments = _Moments.collect(profiles, warps, template.knots)
+    scores = _expect(moments, template.mean, template.components, template.noise)
+    return template.mean + scores.mean @ template.components.T
+
+
+def _start(moments: _Moments, mean: Float, components: int) -> Float:
+    """Principal components of the residuals on the grid; the steps do not depend on the start."""
+    residuals = moments.profiles - moments.basis @ mean
+    _, size, axes = np.linalg.svd(residuals, full_matrices=False)
+    grid = moments.basis.mean(axis=0)
+    parts = np.linalg.lstsq(grid, axes[:components].T, rcond=None)[0]
+    return np.asarray(parts * size[:components] / np.sqrt(len(residuals)), dtype=np.float64)
+
+
+def _expect(moments: _Moments, mean: Float, parts: Float, noise: float) -> _Scores:
+    """Posterior of the scores."""
+    squares = parts.T @ moments.squares @ parts
+    covariance = np.linalg.inv(squares / noise + np.eye(parts.shape[1]))
+    projection = (moments.products - moments.squares @ mean) @ parts
+    scores = np.einsum("spq,sq->sp", covariance, projection) / noise
+    return _Scores(scores, np.asarray(covariance, dtype=np.float64), squares, projection)
+
+
+def _noise(moments: _Moments, mean: Float, scores: _Scores) -> float:
+    """Mean square, as expected, of what the subjects' templates leave."""
+    total = float(np.sum((moments.profiles - moments.basis @ mean) ** 2))
+    total -= 2 * float(np.sum(scores.mean * scores.projection))
+    second = scores.covariance + scores.mean[:, :, None] * scores.mean[:, None, :]
+    total += float(np.sum(scores.squares * second))
+    return total / moments.profiles.size
+
+
+def _maximize(moments: _Moments, scores: _Scores) -> tuple[Float, Float]:
+    """Mean and components that fit the profiles best, given the scores' posterior."""
+    subjects, components = scores.mean.shape
+    first = np.column_stack([scores.mean, np.ones(subjects)])
+    second = first[:, :, None] * first[:, None, :]
+    second[:, :components, :components] += scores.covariance
+    splines = moments.squares.shape[1]
+    size = splines * (components + 1)
+    system = np.einsum("sij,spq->ipjq", moments.squares, second, optimize=True)
+    right = np.einsum("si,sp->ip", moments.products, first)
+    found = np.linalg.solve(system.reshape(size, size), right.ravel()).reshape(splines, -1)
+    return found[:, components], found[:, :components]
+
+
+def templates_to_json(templates: Mapping[str, Template]) -> dict[str, Any]:
+    """Write templates by hemisphere as a JSON object."""
+    entries = {}
+    for hemi, template in templates.items():
+        entry = {
+            name: value.tolist() if name in _ARRAYS else value
+            for name, value in asdict(template).items()
+        }
+        if not np.isfinite(template.warp_variance):
+            entry[_INFINITE] = None
+        entries[hemi] = entry
+    return {"Description": "template of curvature profiles along x", "Hemispheres": entries}
+
+
+def templates_from_json(content: Mapping[str, Any], where: str) -> dict[str, Template]:
+    """Read what :func:`templates_to_json` wrote."""
+    try:
+        found = {}
+        for hemi, entry in content["Hemispheres"].items():
+            values = {field.name: entry[field.name] for field in fields(Template)}
+            for name in _ARRAYS:
+                values[name] = np.array(values[name], dtype=np.float64)
+            if values[_INFINITE] is None:
+                values[_INFINITE] = np.inf
+            found[str(hemi)] = Template(**values)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise ModelError(
+            f"{where}: not a template ({type(error).__name__}: {error}); use the template.json of"
+            " another analysis",
+            reason="template-file",
+        ) from error
+    return found
 
 
 @dataclass(frozen=True)
@@ -26,9 +223,9 @@ class WarpBasis:
     of as many parameters as there are steps: monotone for any parameters.
     """
 
-    at_nodes: FloatArray
+    at_nodes: Float
     """(nodes, splines)"""
-    identity: FloatArray
+    identity: Float
     """(steps,) logarithms of the increments of the identity."""
 
     @classmethod
@@ -39,7 +236,7 @@ class WarpBasis:
         coefficients = np.linalg.lstsq(at_nodes, grid, rcond=None)[0]
         return cls(at_nodes, np.log(np.diff(coefficients)))
 
-    def evaluate(self, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def evaluate(self, parameters: Float) -> tuple[Float, Float]:
         """Warps (subjects, nodes) and their derivatives (subjects, nodes, steps)."""
         logs = self.identity + parameters
         steps = np.exp(logs - logs.max(axis=1, keepdims=True))
@@ -50,7 +247,7 @@ class WarpBasis:
         slopes = lower * steps[:, None, :] - sums[:, :, None] * steps[:, None, :]
         return warps, self.at_nodes[:, 1:] @ slopes
 
-    def lifted(self, parameters: FloatArray, least: float) -> FloatArray:
+    def lifted(self, parameters: Float, least: float) -> Float:
         """Parameters whose increments are all at least ``least``.
 
         An increment of nearly zero has no slope, and could never grow again.
@@ -68,35 +265,33 @@ class WarpBasis:
 class WarpFit:
     """Warps of all subjects."""
 
-    parameters: FloatArray
+    parameters: Float
     """(subjects, steps)"""
-    warps: FloatArray
+    warps: Float
     """(subjects, nodes) registered coordinate of each node, 0..1."""
-    uncertainty: FloatArray
+    uncertainty: Float
     """(subjects,) mean posterior variance of the parameters, over the noise variance."""
 
 
 @dataclass(frozen=True)
 class _State:
-    parameters: FloatArray
-    warps: FloatArray
-    slopes: FloatArray
-    residuals: FloatArray
-    loss: FloatArray
+    parameters: Float
+    warps: Float
+    slopes: Float
+    residuals: Float
+    loss: Float
 
 
 @dataclass(frozen=True)
 class _Problem:
     """Fits of warps, whatever the subjects."""
 
-    knots: FloatArray
+    knots: Float
     basis: WarpBasis
     penalty: float
     settings: RegistrationSettings
 
-    def solve(
-        self, profiles: FloatArray, coefficients: FloatArray, parameters: FloatArray
-    ) -> WarpFit:
+    def solve(self, profiles: Float, coefficients: Float, parameters: Float) -> WarpFit:
         """Damped Gauss-Newton steps; subjects that are done drop out."""
         best = self.basis.lifted(parameters, self.settings.least_stretch)
         # Adding a constant to all parameters changes nothing: keep their sum.
@@ -126,9 +321,7 @@ class _Problem:
         uncertainty = np.trace(spread, axis1=1, axis2=2) / matrix.shape[1]
         return WarpFit(best, last.warps, np.asarray(uncertainty, dtype=np.float64))
 
-    def _state(
-        self, parameters: FloatArray, profiles: FloatArray, coefficients: FloatArray
-    ) -> _State:
+    def _state(self, parameters: Float, profiles: Float, coefficients: Float) -> _State:
         warps, slopes = self.basis.evaluate(parameters)
         expected = np.einsum("sdk,sk->sd", make_basis(self.knots)(warps), coefficients)
         residuals = profiles - expected
@@ -136,7 +329,7 @@ class _Problem:
         loss += 0.5 * self.penalty * np.sum(parameters**2, axis=1)
         return _State(parameters, warps, slopes, residuals, loss)
 
-    def _normal(self, now: _State, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _normal(self, now: _State, coefficients: Float) -> tuple[Float, Float]:
         """Matrix and right-hand side of a Gauss-Newton step."""
         slope = make_basis(self.knots).derivative()
         along = np.einsum("sdk,sk->sd", slope(now.warps), coefficients)
@@ -147,11 +340,11 @@ class _Problem:
 
 
 def fit_warps(
-    profiles: FloatArray,
-    knots: FloatArray,
-    coefficients: FloatArray,
+    profiles: Float,
+    knots: Float,
+    coefficients: Float,
     basis: WarpBasis,
-    parameters: FloatArray,
+    parameters: Float,
     *,
     penalty: float,
     settings: RegistrationSettings,
@@ -173,11 +366,8 @@ def fit_warps(
     )
 
 
-def warp_values(maps: FloatArray, warps: FloatArray) -> FloatArray:
-    """Carry maps of values to registered coordinates, linearly.
-
-    ``maps`` NaN is missing, and makes missing what would need it.
-    """
+def warp_values(maps: Float, warps: Float) -> Float:
+    """Carry maps of values to registered coordinates, linearly; NaN where a value lacks."""
     carried = np.empty(maps.shape)
     for block in _blocks(len(maps)):
         left, weight = _sources(warps[block])
@@ -190,14 +380,14 @@ def warp_values(maps: FloatArray, warps: FloatArray) -> FloatArray:
     return carried
 
 
-def warp_labels(labels: IntArray, warps: FloatArray) -> IntArray:
+def warp_labels(labels: Int, warps: Float) -> Int:
     """Carry maps of labels to registered coordinates, from the nearest node."""
     left, weight = _sources(warps)
     rows = np.arange(len(labels))[:, None]
     return np.asarray(labels[rows, left + (weight >= 0.5)])  # noqa: PLR2004 -- nearest
 
 
-def _sources(warps: FloatArray) -> tuple[IntArray, FloatArray]:
+def _sources(warps: Float) -> tuple[Int, Float]:
     """For each registered node the original node before it, and the way to the next, 0..1."""
     nodes = warps.shape[1]
     grid = np.linspace(0.0, 1.0, nodes)

@@ -16,7 +16,7 @@ from hipsta_bids.group.analysis import Analysis, tested_maps
 from hipsta_bids.group.collect import Exclusion
 from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float, Int, SideMaps
 from hipsta_bids.group.figures import draw_figures
-from hipsta_bids.group.fit import FittedMaps
+from hipsta_bids.group.glm import FittedMaps
 from hipsta_bids.group.methods import methods_text
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.shapes import AverageShape
@@ -28,7 +28,7 @@ from hipsta_bids.group.tables import (
     point_tables,
     result_tables,
 )
-from hipsta_bids.group.template import templates_to_json
+from hipsta_bids.group.warps import templates_to_json
 from hipsta_bids.io import files, gifti
 
 #: Folder of all models, in the output dataset.

@@ -8,10 +8,10 @@ import pandas as pd
 from scipy import ndimage
 
 from hipsta_bids.group.data import SideMaps
-from hipsta_bids.group.design import Design
-from hipsta_bids.group.fit import RowModel, fit_maps
 from hipsta_bids.group.formula import Contrast
+from hipsta_bids.group.glm import RowModel, fit_maps
 from hipsta_bids.group.inference import MapKey, correct
+from hipsta_bids.group.model import Design
 from hipsta_bids.group.registration import mean_profiles, register
 from hipsta_bids.group.settings import CORRECTIONS, GroupSettings
 from hipsta_bids.group.warps import warp_values

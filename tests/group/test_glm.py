@@ -6,7 +6,7 @@ from scipy import stats
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.formula import Contrast
-from hipsta_bids.group.glm import f_limits, fit_points, t_limits
+from hipsta_bids.group.glm import f_limits, fit_measures, fit_points, t_limits
 from hipsta_bids.group.settings import GlmSettings
 
 SETTINGS = GlmSettings()
@@ -103,6 +103,62 @@ def test_missing_values_give_the_fit_of_those_present(settings):
                 np.testing.assert_allclose(
                     getattr(test, name)[point], getattr(one, name)[0], rtol=1e-9, equal_nan=True
                 )
+
+
+@pytest.mark.parametrize("settings", [SETTINGS, HC3], ids=["ordinary", "hc3"])
+def test_fit_agrees_with_statsmodels(settings):
+    """All that is reported: of t and F, with values missing at random, and where none can be."""
+    random, matrix, maps = random_case(7)
+    maps[random.random(maps.shape) < 0.2] = np.nan
+    maps[matrix[:, 1] == 1, 1] = np.nan  # a whole group
+    maps[5:, 2] = np.nan  # 5 subjects, 3 columns
+    maps[:, 3] = 2.0  # no variance
+    maps[1, 4] = 2.5
+    maps[3::2, 4] = np.nan  # one subject of a group is left: no HC3
+    contrasts = [*single(3), Contrast("both", np.eye(3)[1:])]
+    ours = fit_points(maps, matrix, contrasts, settings)
+    library = fit_measures(maps, matrix, contrasts, settings)
+    np.testing.assert_array_equal(ours.n, library.n)
+    assert np.isfinite(library.tests[1].p).sum() == maps.shape[1] - 3 - (settings is HC3)
+    # Rounding of two ways to solve the equations; limits are roots that are found by bisection.
+    np.testing.assert_allclose(ours.coefficients, library.coefficients, rtol=1e-9)
+    np.testing.assert_allclose(ours.sigma, library.sigma, rtol=1e-9)
+    for one, other in zip(ours.tests, library.tests, strict=True):
+        assert one.contrast is other.contrast
+        for name in ("statistic", "p", "df", "estimate", "se", "cohen_d", "eta_squared"):
+            np.testing.assert_allclose(
+                getattr(one, name), getattr(other, name), rtol=1e-9, err_msg=name
+            )
+        for name in ("cohen_d_limits", "eta_squared_limits"):
+            np.testing.assert_allclose(
+                getattr(one, name), getattr(other, name), rtol=1e-7, atol=1e-12, err_msg=name
+            )
+
+
+def test_effect_sizes_of_a_small_sample_by_hand():
+    """Groups (1, 2, 3) and (4, 6, 8): difference 4, pooled variance 5/2, t = 4 / sqrt(5/3)."""
+    y = np.array([1.0, 2.0, 3.0, 4.0, 6.0, 8.0])[:, None]
+    matrix = np.column_stack([np.ones(6), np.repeat([0.0, 1.0], 3)])
+    contrasts = [Contrast("t", np.eye(2)[1]), Contrast("F", np.eye(2))]
+    settings = GlmSettings(confidence=0.9)
+    for fit in (fit_points, fit_measures):
+        t, f = fit(y, matrix, contrasts, settings).tests
+        assert t.statistic[0] == pytest.approx(4 / np.sqrt(5 / 3), rel=1e-12)
+        assert t.cohen_d[0] == pytest.approx(4 / np.sqrt(5 / 2), rel=1e-12)
+        assert t.eta_squared[0] == pytest.approx(24 / 34, rel=1e-12)  # of 34, 24 lie between
+        # The limits are those of t and of F, in units of d and of eta squared.
+        low, high = t.cohen_d_limits[:, 0] / np.sqrt(2 / 3)
+        assert stats.nct.cdf(t.statistic[0], 4, low) == pytest.approx(0.95, abs=1e-9)
+        assert stats.nct.cdf(t.statistic[0], 4, high) == pytest.approx(0.05, abs=1e-9)
+        # Sum of squares of both means around zero: 3 (2^2 + 6^2) = 120, of the rest 10.
+        assert f.statistic[0] == pytest.approx(120 / 2 / (10 / 4), rel=1e-12)
+        assert f.eta_squared[0] == pytest.approx(120 / 130, rel=1e-12)
+        assert np.isnan([f.cohen_d[0], *f.cohen_d_limits[:, 0]]).all()
+        for test, df1, statistic in ((t, 1, 9.6), (f, 2, 24.0)):
+            eta = test.eta_squared_limits[:, 0]
+            for limit, share in zip(4 * eta / (1 - eta), (0.95, 0.05), strict=True):
+                chance = stats.ncf.cdf(statistic, df1, 4, limit)
+                assert chance == pytest.approx(share, abs=1e-9)
 
 
 def test_two_groups_give_students_t_and_hc3_gives_the_definition():

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy import stats
+from statsmodels.regression.linear_model import OLS
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.normative import w_scores
@@ -42,6 +43,20 @@ def test_every_subject_is_scored_against_others_only(missing):
         np.testing.assert_allclose(found.w[subject], expected, rtol=1e-8)  # rounding
     np.testing.assert_array_equal(found.n_reference, np.isfinite(maps[reference]).sum(axis=0))
     np.testing.assert_array_equal(np.isnan(found.w), np.isnan(maps))
+
+
+def test_p_values_are_those_of_statsmodels():
+    """Of members, externally studentized residuals; of others, the error of a prediction."""
+    _, matrix, maps, reference = case(5)
+    found = w_scores(maps, matrix, reference, SETTINGS)
+    for point in range(maps.shape[1]):
+        fit = OLS(maps[reference, point], matrix[reference]).fit()
+        inside = fit.get_influence().resid_studentized_external
+        new = fit.get_prediction(matrix[~reference])
+        outside = (maps[~reference, point] - new.predicted_mean) / new.se_obs
+        expected = [2 * stats.t.sf(abs(inside), 26), 2 * stats.t.sf(abs(outside), 27)]
+        np.testing.assert_allclose(found.p[reference, point], expected[0], rtol=1e-9)
+        np.testing.assert_allclose(found.p[~reference, point], expected[1], rtol=1e-9)
 
 
 def test_a_subject_cannot_hide_in_the_reference_group():

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.adjacency import enhance, find_clusters
+from hipsta_bids.group.clusters import sheet_edges
 from hipsta_bids.group.formula import Contrast
 from hipsta_bids.group.glm import fit_points
 from hipsta_bids.group.permutation import PermutationPart
@@ -21,8 +21,8 @@ GROUP = Contrast("group", np.array([0.0, 1.0, 0.0]))
 
 def permute(maps, matrix, contrast, shape, *, settings, blocks=None):
     """One part."""
-    part = PermutationPart(maps, matrix, np.arange(len(maps)))
-    (found,) = permute_parts([part], contrast, shape, settings=settings, blocks=blocks)
+    part = PermutationPart(maps, matrix, np.arange(len(maps)), sheet_edges(*shape))
+    (found,) = permute_parts([part], contrast, settings=settings, blocks=blocks)
     return found
 
 
@@ -129,32 +129,5 @@ def test_seed_repeats_and_missing_points_stay_missing():
     np.testing.assert_array_equal(one.p_enhanced, two.p_enhanced)
     assert np.isnan(one.p_max[7])
     assert np.isfinite(np.delete(one.p_max, 7)).all()
-    with pytest.raises(ModelError, match="sheet of 9 x 8"):
+    with pytest.raises(ModelError, match="edges between 72 points"):
         permute(maps, matrix, GROUP, (9, 8), settings=SETTINGS)
-
-
-def test_enhancement_of_a_plateau_is_the_sum_of_its_heights():
-    sheet = np.zeros((1, 6, 5))
-    sheet[0, 1:3, 1:4] = 1.0  # six points of height 1
-    sheet[0, 4, 0] = -0.5
-    settings = MultiplicitySettings(tfce_step=0.25)
-    raised = enhance(sheet, settings)[0]
-    heights = np.array([0.25, 0.5, 0.75, 1.0])
-    assert raised[1, 1] == pytest.approx(np.sqrt(6) * (heights**2).sum() * 0.25)
-    assert raised[4, 0] == pytest.approx(-(heights[:2] ** 2).sum() * 0.25)
-    assert np.count_nonzero(raised) == 7
-
-
-def test_clusters_are_split_by_sign_and_by_neighbors():
-    significant = np.zeros((5, 5), dtype=bool)
-    significant[[0, 1, 2, 2], [0, 1, 1, 2]] = True
-    statistic = np.ones((5, 5))
-    statistic[2, 2] = -4
-    statistic[1, 1] = 3
-    names = np.where(np.arange(25).reshape(5, 5) < 5, "CA1", "CA2")
-    eight = find_clusters(significant, statistic, names, 8)
-    assert [cluster.extent for cluster in eight] == [3, 1]
-    assert eight[0].peak == (1, 1)
-    assert eight[0].shares == {"CA1": pytest.approx(1 / 3), "CA2": pytest.approx(2 / 3)}
-    assert eight[1].peak == (2, 2)
-    assert [c.extent for c in find_clusters(significant, statistic, names, 4)] == [2, 1, 1]

@@ -9,8 +9,14 @@ from scipy.optimize import minimize
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.registration import mean_profiles, register, register_to, shift_by_group
 from hipsta_bids.group.settings import RegistrationSettings
-from hipsta_bids.group.template import inner_knots, make_basis
-from hipsta_bids.group.warps import WarpBasis, fit_warps, warp_labels, warp_values
+from hipsta_bids.group.warps import (
+    WarpBasis,
+    fit_warps,
+    inner_knots,
+    make_basis,
+    warp_labels,
+    warp_values,
+)
 
 NODES = 41
 GRID = np.linspace(0, 1, NODES)

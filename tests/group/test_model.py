@@ -1,4 +1,4 @@
-"""Formulas, BIDS Stats Models and contrasts; and what is said when a design is impossible."""
+"""Formulas, BIDS Stats Models, contrasts, impossible designs, and the default model."""
 
 import json
 
@@ -8,17 +8,13 @@ import pytest
 from scipy import stats
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.design import build_design
-from hipsta_bids.group.formula import (
-    check_unique,
-    model_from_shortcut,
-    parse_expression,
-    parse_model,
-)
+from hipsta_bids.group.formula import model_from_shortcut, parse_expression, parse_model
 from hipsta_bids.group.glm import fit_points
-from hipsta_bids.group.settings import DesignSettings, GlmSettings
+from hipsta_bids.group.model import build_design, default_formula, find_groups, folder_name
+from hipsta_bids.group.settings import DesignSettings, GlmSettings, GroupSettings
 
 SETTINGS = DesignSettings()
+DEFAULTS = GroupSettings()
 
 
 def participants(n=60, seed=0):
@@ -158,9 +154,6 @@ def test_more_refusals():
         design("group + age", ["group[CU]-group[DTA]"])
     with pytest.raises(ModelError, match="which is no factor"):
         design("group", references={"sex": "F"})
-    keys = pd.DataFrame({"participant": ["sub-1"] * 3, "session": ["ses-1", "ses-2", "ses-2"]})
-    with pytest.raises(ModelError, match="sub-1 ses-2 stand more than once"):
-        check_unique(keys, ["participant", "session"])
 
 
 def test_expressions():
@@ -235,3 +228,56 @@ def test_refuses_models_that_say_something_else():
         with pytest.raises(ModelError) as caught:
             parse_model(case)
         assert caught.value.reason == "model-file"
+
+
+@pytest.mark.parametrize(
+    ("levels", "reference"),
+    [
+        (["MCI", "AD", "CN"], "CN"),
+        (["patients", "Controls"], "Controls"),
+        (["a", "b", "b"], "b"),  # the most frequent one
+        (["b", "a"], "a"),  # equally frequent
+        (["HC", "CU", "CU"], "CU"),  # the settings' order
+    ],
+)
+def test_reference_level(levels, reference):
+    groups = find_groups(pd.DataFrame({"Diagnosis": levels}), DEFAULTS)
+    assert groups.column == "Diagnosis"
+    assert groups.reference == reference
+    assert groups.levels[1:] == tuple(sorted(set(levels) - {reference}))
+
+
+def test_contrasts_are_positive_where_the_reference_has_more():
+    groups = find_groups(pd.DataFrame({"group": ["CN", "AD", "MCI"]}), DEFAULTS)
+    assert groups.contrasts() == [
+        "CN-AD = group[CN] - group[AD]",
+        "CN-MCI = group[CN] - group[MCI]",
+    ]
+
+
+def test_covariates_that_do_not_vary_or_are_missing_are_left_out():
+    table = pd.DataFrame(
+        {"group": ["a", "b"], "Age": ["61", "72"], "sex": ["F", "F"], "site": ["x", "n/a"]}
+    )
+    groups = find_groups(table, DEFAULTS)
+    assert default_formula(table, groups, DEFAULTS) == "group + Age"
+
+
+def test_one_level_is_no_group_and_numbers_are_no_names():
+    assert find_groups(pd.DataFrame({"group": ["a", "a", None]}), DEFAULTS) is None
+    assert find_groups(pd.DataFrame({"age": ["1", "2"]}), DEFAULTS) is None
+    with pytest.raises(ModelError) as caught:
+        find_groups(pd.DataFrame({"group": ["0", "1"]}), DEFAULTS)
+    assert caught.value.reason == "group-numeric"
+
+
+def test_different_models_have_different_folders():
+    formulas = (
+        "group + age",
+        "group * age",
+        "group:age",
+        "group + age - 1",
+        "~ group + np.log(age)",
+    )
+    assert len({folder_name(formula) for formula in formulas}) == len(formulas)
+    assert folder_name("thickness ~ group + age") == "group-age"

@@ -3,18 +3,21 @@
 import numpy as np
 import pytest
 from scipy import optimize, special, stats
+from sklearn.calibration import calibration_curve
 from statsmodels.discrete.discrete_model import Logit
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.classify import (
-    area_under,
     calibrate,
     compare_models,
+    compare_pairs,
     cross_validate,
     delong,
-    delong_difference,
+    fit_logistic,
+    fit_overlapping_or_firth,
+    is_separated,
+    roc_curve,
 )
-from hipsta_bids.group.logistic import fit_logistic, is_separated
 from hipsta_bids.group.settings import ClassificationSettings
 
 SETTINGS = ClassificationSettings(repeats=2, folds=5)
@@ -56,9 +59,6 @@ def test_agrees_with_r(oracle, r_data, name):
     check(found.base.auc.se, "se0")
     check(found.full.auc.se, "se1auc")
     np.testing.assert_allclose(found.full.fit.se, list(expected["se1"].values()), rtol=1e-6)
-    difference = delong_difference(found.base.score, found.full.score, case)
-    check(difference.z, "delong_Z")
-    check(difference.p, "delong_p")
 
 
 def test_firth_agrees_with_r(oracle, r_data):
@@ -167,7 +167,6 @@ def test_area_counts_pairs():
     assert found.area == pytest.approx((pairs + 1).mean() / 2, rel=1e-12)
     assert found.low < found.area < found.high
     assert delong(case.astype(float), case, 0.95).high == 1.0
-    assert delong_difference(score, score, case).p == 1.0
 
 
 def test_delong_interval_covers():
@@ -202,6 +201,41 @@ def test_cross_validation_survives_a_level_that_a_fold_lacks():
     assert np.isfinite(cross_validate(matrix, case, SETTINGS.changed(repeats=5)).auc)
 
 
+def test_groups_of_calibration_are_quantiles():
+    """Where the size of the sample allows groups of one size, scikit-learn makes the same."""
+    random = np.random.default_rng(8)
+    score = random.normal(0, 1.5, 400)
+    case = random.random(400) < special.expit(score)
+    found = calibrate(score, case, SETTINGS)
+    chance = special.expit(score)
+    observed, predicted = calibration_curve(case, chance, n_bins=10, strategy="quantile")
+    np.testing.assert_allclose(found.predicted, predicted, rtol=1e-12)
+    np.testing.assert_allclose(found.observed, observed, rtol=1e-12)
+    assert found.brier == pytest.approx(np.mean((chance - case) ** 2), rel=1e-12)
+
+
+def test_curve_steps_at_each_score():
+    score = np.array([1.0, 2.0, 2.0, 3.0, 0.0])
+    case = np.array([False, True, False, True, True])
+    wrong, right = roc_curve(score, case)
+    np.testing.assert_allclose(wrong, [0, 0, 1 / 2, 1, 1], rtol=1e-12)
+    np.testing.assert_allclose(right, [0, 1 / 3, 2 / 3, 2 / 3, 1], rtol=1e-12)
+    assert delong(score, case, 0.95).area == 3.5 / 6  # 2 > 1, 2 = 2, 3 > 1, 3 > 2 of six pairs
+
+
+def test_firth_is_used_where_and_only_where_groups_are_separated():
+    """Small samples, near separation and beyond; the linear program decides."""
+    random = np.random.default_rng(9)
+    separated = []
+    for _ in range(80):
+        matrix = np.column_stack([np.ones(12), random.standard_normal((12, 2))])
+        case = random.random(12) < special.expit(4 * matrix[:, 1])
+        if 1 < case.sum() < 11:
+            separated.append(is_separated(matrix, case))
+            assert fit_overlapping_or_firth(matrix, case, SETTINGS).firth == separated[-1]
+    assert 20 < sum(separated) < len(separated) - 10
+
+
 def test_calibration_of_right_and_of_exaggerated_chances():
     random = np.random.default_rng(6)
     score = random.normal(0, 1.5, 4000)
@@ -231,8 +265,45 @@ def test_refuses_what_cannot_be_compared():
         assert caught.value.reason == reason
 
 
-def test_area_by_ranks_counts_pairs_and_half_of_ties():
-    score = np.array([1.0, 2.0, 2.0, 3.0, 0.0])
-    case = np.array([False, True, False, True, True])
-    # Six pairs: 2 > 1, 2 = 2, 3 > 1, 3 > 2, 0 < 1, 0 < 2.
-    assert area_under(score, case) == 3.5 / 6
+PAIRS = ClassificationSettings(folds=3, repeats=1)
+ORDER = ["CU", "MCI", "DAT"]
+
+
+def three_groups():
+    random = np.random.default_rng(0)
+    groups = np.array(ORDER)[np.arange(120) % 3]
+    rank = np.arange(120) % 3
+    volume = 2.0 - 0.3 * rank + 0.4 * random.standard_normal(120)
+    thickness = 1.8 - 0.2 * rank + 0.2 * random.standard_normal(120)
+    return groups, volume[:, None], thickness[:, None]
+
+
+def test_each_pair_is_the_comparison_of_its_subjects():
+    groups, volume, thickness = three_groups()
+    volume[[0, 4]] = np.nan
+    thickness[[0, 5]] = np.nan
+    found = compare_pairs(groups, volume, thickness, PAIRS, order=ORDER)
+    assert [(pair.control, pair.case) for pair in found] == [
+        ("CU", "MCI"),
+        ("CU", "DAT"),
+        ("MCI", "DAT"),
+    ]
+    assert [pair.n_incomplete for pair in found] == [2, 2, 2]
+    used = np.isin(groups, ["CU", "DAT"]) & np.isfinite(volume + thickness)[:, 0]
+    base = np.column_stack([np.ones(used.sum()), volume[used]])
+    alone = compare_models(base, thickness[used], groups[used] == "DAT", PAIRS)
+    assert found[1].comparison.likelihood_ratio == alone.likelihood_ratio
+    assert found[1].comparison.n == used.sum()
+    # Groups two steps apart are easier to tell than neighbors.
+    areas = [pair.comparison.full.auc.area for pair in found]
+    assert areas[1] > max(areas[0], areas[2])
+    assert found[1].comparison.full.fit.coefficients[2] < 0  # cases are thinner
+
+
+def test_names_the_pair_that_cannot_be_compared():
+    groups, volume, thickness = three_groups()
+    thickness[groups == "DAT"] = np.nan
+    with pytest.raises(ModelError, match="CU against DAT"):
+        compare_pairs(groups, volume, thickness, PAIRS, order=ORDER)
+    with pytest.raises(ModelError, match="no participant is in group SCD"):
+        compare_pairs(groups, volume, thickness, PAIRS, order=["CU", "SCD"])
