@@ -30,10 +30,10 @@ _NEW_PATHS = frozenset({"output_dir", "work_dir", "bids_database_dir"})
 _CONVERTERS: Mapping[str, Entry] = {
     "Path": {"type": "File"},
     "_folder": {"type": "File"},
-    "_named_path": {"type": "File"},
-    "_positive_int": {"type": "Number", "integer": True, "minimum": 1},
+    "named_path": {"type": "File"},
+    "positive_int": {"type": "Number", "integer": True, "minimum": 1},
     "int": {"type": "Number", "integer": True},
-    "_positive_float": {"type": "Number", "minimum": 0, "exclusive-minimum": True},
+    "positive_float": {"type": "Number", "minimum": 0, "exclusive-minimum": True},
     "float": {"type": "Number"},
     "_hemi": {"type": "String", "value-choices": ["L", "R"]},
 }

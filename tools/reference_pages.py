@@ -8,9 +8,9 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
+from hipsta_bids.cli.commands import phantom_parser, surrogate_parser, validate_parser
 from hipsta_bids.cli.group import group_parser
 from hipsta_bids.cli.participant import build_parser
-from hipsta_bids.cli.phantom import phantom_parser, surrogate_parser, validate_parser
 from hipsta_bids.derivatives.hemisphere import LAYERS, NODES, PLACE, STATE
 from hipsta_bids.derivatives.names import (
     DATASET_FILES,
