@@ -80,7 +80,7 @@ def test_jobs_on_dask_end_as_in_the_pool(tmp_path):
 
 def test_a_single_worker_is_replaced_when_it_has_died_or_waited_for_too_long(tmp_path):
     worker = Worker(
-        WorkerPlan(work=work, n_workers=1, timeout=30.0, log=tmp_path / "log"), patience=0.2
+        WorkerPlan(work=work, n_workers=1, timeout=30.0, log=tmp_path / "log", patience=0.2)
     )
     assert worker("square 3") == 9
     first = worker._slot.process
