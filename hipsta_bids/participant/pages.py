@@ -131,8 +131,14 @@ def reports_after(plan: PagePlan, visits: Sequence[Visit]) -> Generator[Pages]:
 
 
 def _try_all(plan: PagePlan, visits: Sequence[Visit], problems: list[str]) -> None:
+    """Make the pages that are older than the records they are about."""
     root = plan.root
-    stale = [visit for visit in dict.fromkeys(visits) if not _is_current(root, visit)]
+    stale = []
+    for subject, session in dict.fromkeys(visits):
+        folder = f"sub-{subject}/{f'ses-{session}/' if session else ''}anat"
+        page = root / participant_report(subject, session)
+        if not _is_newer(page, root, f"{folder}/*{_RECORD}"):
+            stale.append((subject, session))
     if not stale and (not plan.cohort or _is_newer(root / _COHORT, root, *_RECORDS)):
         return
     try:
@@ -142,14 +148,8 @@ def _try_all(plan: PagePlan, visits: Sequence[Visit], problems: list[str]) -> No
         problems.append(f"not made ({type(error).__name__}: {error})")
 
 
-def _is_current(root: Path, visit: Visit) -> bool:
-    """Whether a page is newer than all records that it is about."""
-    subject, session = visit
-    folder = f"sub-{subject}/{f'ses-{session}/' if session else ''}anat"
-    return _is_newer(root / participant_report(*visit), root, f"{folder}/*{_RECORD}")
-
-
 def _is_newer(page: Path, root: Path, *patterns: str) -> bool:
+    """Return whether a page is newer than all records of some patterns."""
     try:
         made = page.stat().st_mtime_ns
         records = [path for pattern in patterns for path in root.glob(pattern)]
