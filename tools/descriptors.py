@@ -11,9 +11,6 @@ from hipsta_bids.cli.group import group_parser
 from hipsta_bids.cli.participant import build_parser
 from hipsta_bids.errors import EXIT_MEANINGS, ExitCode
 
-# Options of argparse as inputs and groups of a Boutiques descriptor.
-
-
 Entry = dict[str, Any]
 
 #: Positions and keys that ``bosh validate --bids`` asks for; other keys are longer, so that text
@@ -30,10 +27,10 @@ _NEW_PATHS = frozenset({"output_dir", "work_dir", "bids_database_dir"})
 _CONVERTERS: Mapping[str, Entry] = {
     "Path": {"type": "File"},
     "_folder": {"type": "File"},
-    "_named_path": {"type": "File"},
-    "_positive_int": {"type": "Number", "integer": True, "minimum": 1},
+    "named_path": {"type": "File"},
+    "positive_int": {"type": "Number", "integer": True, "minimum": 1},
     "int": {"type": "Number", "integer": True},
-    "_positive_float": {"type": "Number", "minimum": 0, "exclusive-minimum": True},
+    "positive_float": {"type": "Number", "minimum": 0, "exclusive-minimum": True},
     "float": {"type": "Number"},
     "_hemi": {"type": "String", "value-choices": ["L", "R"]},
 }
@@ -43,36 +40,14 @@ _DISABLES = {"model": ("formula", "contrast")}
 
 
 def inputs_of(parser: argparse.ArgumentParser) -> list[Entry]:
-    """Describe all arguments of a parser.
-
-    Parameters
-    ----------
-    parser : ArgumentParser
-        Of one level.
-
-    Returns
-    -------
-    list of dict
-        Boutiques inputs; positional arguments first, then options in the order of the help.
-    """
+    """Describe all arguments of a parser."""
     actions = list(_arguments(_actions(parser)))
     known = {action.dest for action in actions}
     return [_input(action, known) for action in actions]
 
 
 def groups_of(parser: argparse.ArgumentParser) -> list[Entry]:
-    """List the sections of the help, and the options that exclude each other.
-
-    Parameters
-    ----------
-    parser : ArgumentParser
-        Of one level.
-
-    Returns
-    -------
-    list of dict
-        Boutiques groups.
-    """
+    """List the sections of the help, and the options that exclude each other."""
     groups = []
     # argparse shows nothing of this in public
     for section in parser._action_groups[2:]:  # noqa: SLF001
@@ -93,23 +68,7 @@ def groups_of(parser: argparse.ArgumentParser) -> list[Entry]:
 
 
 def merge_inputs(levels: Mapping[str, Sequence[Entry]]) -> list[Entry]:
-    """Join the inputs of several levels into one list, in which the level switches them.
-
-    Parameters
-    ----------
-    levels : mapping of str to sequence of dict
-        Inputs by level; the same option takes the same kind of value at all levels.
-
-    Returns
-    -------
-    list of dict
-        Boutiques inputs; ``analysis_level`` disables what its level does not have.
-
-    Raises
-    ------
-    ValueError
-        If two levels give one option different kinds of value.
-    """
+    """Join the inputs of several levels into one list, in which the level switches them."""
     merged: dict[str, Entry] = {}
     texts: dict[str, dict[str, str]] = {}
     for level, inputs in levels.items():
@@ -202,9 +161,6 @@ def _values(action: argparse.Action) -> Entry:
     return kind
 
 
-# What a run leaves behind, as output files of a Boutiques descriptor.
-
-
 _ROOT = "[OUTPUT_DIR]"
 
 #: Files of the output dataset: name, description.
@@ -259,13 +215,9 @@ def output_folder() -> Entry:
 
 
 def participant_outputs() -> list[Entry]:
-    """List what the participant level writes.
+    """List what the participant level writes, of hemispheres with and without sessions.
 
-    Returns
-    -------
-    list of dict
-        Boutiques output files. Those of hemispheres are there twice, with and without sessions,
-        since a wildcard stays within one folder.
+    A wildcard of Boutiques stays within one folder.
     """
     outputs = [output_folder()]
     for key, (name, text) in _DATASET.items():
@@ -282,13 +234,7 @@ def participant_outputs() -> list[Entry]:
 
 
 def group_outputs() -> list[Entry]:
-    """List what the group level writes.
-
-    Returns
-    -------
-    list of dict
-        Boutiques output files; the folder of a model is named after its formula or by ``--name``.
-    """
+    """List what the group level writes; a model's folder has its formula's name or --name."""
     models = _output("models", f"{_ROOT}/group/*", "one folder per model", optional=False)
     outputs = [output_folder(), models]
     for key, (name, text, optional) in _MODEL.items():
@@ -344,19 +290,7 @@ _NOWHERE = {"bids_dir": "no-such-folder", "output_dir": "no-such-output"}
 
 
 def describe(level: str | None = None) -> Entry:
-    """Describe the command line.
-
-    Parameters
-    ----------
-    level : str, optional
-        ``participant`` or ``group``, which the command then has built in; else both levels, with
-        the level as an input.
-
-    Returns
-    -------
-    dict
-        A descriptor of Boutiques' schema 0.5.
-    """
+    """Describe the command line of one level, or of both with the level as an input."""
     levels = [level] if level else list(_PARSERS)
     name = next(key for key, value in DESCRIPTORS.items() if value == level)
     inputs, groups = _both() if level is None else _one(level)
@@ -391,18 +325,7 @@ def describe(level: str | None = None) -> Entry:
 
 
 def descriptor_text(level: str | None = None) -> str:
-    """Spell a descriptor as the text of its file.
-
-    Parameters
-    ----------
-    level : str, optional
-        See :func:`describe`.
-
-    Returns
-    -------
-    str
-        JSON with a line feed at its end.
-    """
+    """Return the text of a descriptor's file."""
     return json.dumps(describe(level), indent=2, ensure_ascii=False) + "\n"
 
 
@@ -428,7 +351,7 @@ def _both() -> tuple[list[Entry], list[Entry]]:
 
 
 def _mount() -> Entry:
-    """Give the output folder as a file, too, as ``bosh validate --bids`` demands.
+    """Describe the output folder as a file, too, as ``bosh validate --bids`` demands.
 
     The key is that of ``output_dir``, which is required and comes first, so that the command line
     always has its value. In the other order, or if both were optional as in Boutiques' template
@@ -466,7 +389,7 @@ def _resources(levels: Sequence[str]) -> dict[str, float]:
 
 
 def _tests(level: str, *, choose: bool) -> list[Entry]:
-    """Give examples for ``bosh test``.
+    """List examples for ``bosh test``.
 
     They run in a folder in which ``hipsta-bids demo-data demo/bids`` and ``hipsta-bids phantom
     cohort`` have been run, and the participant level on the latter.
@@ -487,7 +410,7 @@ def _test(name: str, invocation: Entry, code: ExitCode, *outputs: str) -> Entry:
 
 
 def _custom(outputs: Sequence[Entry]) -> Entry:
-    """Tell CBRAIN what to keep.
+    """Return the settings of CBRAIN: what it keeps.
 
     The output dataset is saved whole, so its parts are not saved again; and it is saved even if
     some hemisphere failed.

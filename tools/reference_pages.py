@@ -6,9 +6,9 @@ import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 
+from hipsta_bids.cli.commands import phantom_parser, surrogate_parser, validate_parser
 from hipsta_bids.cli.group import group_parser
 from hipsta_bids.cli.participant import build_parser
-from hipsta_bids.cli.phantom import phantom_parser, surrogate_parser, validate_parser
 from hipsta_bids.derivatives.hemisphere import LAYERS, NODES, PLACE, STATE
 from hipsta_bids.derivatives.names import (
     DATASET_FILES,

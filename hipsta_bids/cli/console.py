@@ -1,9 +1,9 @@
-"""What a run says on the terminal."""
+"""What a run prints on the terminal."""
 
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 from hipsta_bids import __version__
 
@@ -19,13 +19,13 @@ def echo(text: str) -> None:
 
 
 def warn(text: str) -> None:
-    """Print one line about what went wrong."""
+    """Print one line about what went wrong, to the standard error."""
     sys.stderr.write(" ".join(text.split()) + "\n")
     sys.stderr.flush()
 
 
 def echo_start(level: str, bids_dir: Path) -> None:
-    """Say at once what runs: finding the inputs can take a while."""
+    """Print at once what runs: finding the inputs can take a while."""
     echo(f"hipsta_bids {__version__}, {level} level of {bids_dir}")
 
 
@@ -41,6 +41,13 @@ class Progress:
             tqdm.monitor_interval = 0  # its thread would keep workers from being forked
             self._bar = tqdm(total=total, unit="hemisphere", file=sys.stderr, leave=False)
 
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.close()
+
     def report(self, outcome: "Outcome") -> None:
         """Show one outcome."""
         if self._bar is not None:
@@ -54,14 +61,9 @@ class Progress:
         if self._bar is not None:
             self._bar.update()
 
-    def close(self) -> None:
-        """Take the bar away."""
-        if self._bar is not None:
-            self._bar.close()
-
 
 def summary_line(outcome: "Outcome") -> str:
-    """Sum up one hemisphere: whose, status, mean thickness, time, and what to know."""
+    """Summarize one hemisphere: name, status, mean thickness, time, and remarks."""
     name = outcome.job.place.name
     parts = [f"{name.stem}_{name.protocol}", str(outcome.status)]
     if outcome.thickness is not None:
@@ -80,7 +82,7 @@ def summary_line(outcome: "Outcome") -> str:
 
 
 def echo_result(result: "RunResult", out_dir: Path) -> None:
-    """Say where the outputs are and how many hemispheres ended how."""
+    """Print where the outputs are and how many hemispheres ended with which status."""
     counts = ", ".join(f"{n} {status}" for status, n in sorted(result.counts.items()))
     missing = result.n_requested - len(result.outcomes)
     counts += f", {missing} not run" if missing else ""
@@ -98,7 +100,7 @@ def echo_result(result: "RunResult", out_dir: Path) -> None:
 
 
 def echo_table(rows: Sequence[Mapping[str, str]]) -> None:
-    """Print rows as aligned columns; a column that is empty throughout is left out."""
+    """Print rows as aligned columns; empty columns are left out."""
     columns = [c for c in (rows[0] if rows else ()) if any(row[c] for row in rows)]
     widths = {c: max(len(c), *(len(row[c]) for row in rows)) for c in columns}
     for row in [{c: c for c in columns}, *rows]:

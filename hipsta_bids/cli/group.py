@@ -1,4 +1,4 @@
-"""What the group level's command line looks like. Loads nothing heavy."""
+"""The group level: its options, and the run. Loads nothing heavy for ``--help``."""
 
 import argparse
 import os
@@ -7,13 +7,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hipsta_bids import __version__
-from hipsta_bids.cli.participant import Parser, named_pattern, rebuild_group_reports
-from hipsta_bids.errors import ExitCode, UsageError
+from hipsta_bids.cli.console import echo, echo_start, warn
+from hipsta_bids.cli.parser import (
+    Parser,
+    adder,
+    bids_label,
+    factor_level,
+    from_namespace,
+    named_pattern,
+)
+from hipsta_bids.errors import ExitCode, NothingToDoError, UsageError
 
 if TYPE_CHECKING:
     from hipsta_bids.group.run import GroupOptions
     from hipsta_bids.group.settings import GroupSettings
-
 
 LEVEL = "group"
 
@@ -34,8 +41,6 @@ def group_parser() -> Parser:
         usage="hipsta-bids BIDS_DIR OUT_DIR group [options]",
         description="compare maps and summary measures of participants",
         epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
     )
     parser.add_argument("bids_dir", type=Path, help="the BIDS dataset, with participants.tsv")
     parser.add_argument("output_dir", type=Path, help="the participant level's output dataset")
@@ -50,237 +55,157 @@ def group_parser() -> Parser:
 
 
 def _add_sheets(parser: Parser) -> None:
-    add = parser.add_argument_group("which hemispheres").add_argument
+    add = adder(parser.add_argument_group("which hemispheres"))
     add(
-        "-d",
-        "--derivatives",
-        nargs="+",
-        action="extend",
-        default=[],
+        "-d --derivatives",
+        "NAME=PATH...",
+        "output datasets of the participant level, as of several sites (default: OUT_DIR)",
         type=_folder,
-        metavar="NAME=PATH",
-        help="output datasets of the participant level, as of several sites (default: OUT_DIR)",
     )
     add(
         "--segmentations",
-        nargs="+",
-        action="extend",
-        default=[],
-        type=Path,
-        metavar="DIR",
-        help="folders of FreeSurfer, ASHS or HippUnfold, if they have moved since the participant"
+        "DIR...",
+        "folders of FreeSurfer, ASHS or HippUnfold, if they have moved since the participant"
         " level: for the intracranial and other volumes beside the segmentations",
     )
     add(
         "--maps",
-        nargs="+",
-        action="extend",
-        default=[],
-        type=named_pattern,
-        metavar="NAME=PATTERN",
-        help="other programs' maps with corresponding points, GIFTI or TSV, with sheets or alone:"
+        "NAME=PATTERN...",
+        "other programs' maps with corresponding points, GIFTI or TSV, with sheets or alone:"
         " path (also in BIDS_DIR) with {subject}, {session}, {hemi} or {side} (lh, rh), *",
+        type=named_pattern,
     )
     add(
         "--maps-surface",
-        "--maps_surface",
-        nargs="+",
-        action="extend",
-        default=[],
-        type=_maybe_named,
-        metavar="[NAME=]PATTERN",
-        help="surfaces (.surf.gii) whose vertices these points are (default: HippUnfold's unfolded"
+        "[NAME=]PATTERN...",
+        "surfaces (.surf.gii) whose vertices these points are (default: HippUnfold's unfolded"
         " surface beside a map, or the grid of the sheets)",
+        type=_maybe_named,
     )
-    add("--seg", metavar="NAME", help="segmentation protocol, where there are several")
-    for what in ("participant", "session"):
+    add("--seg", "NAME", "segmentation protocol, where there are several")
+    for what, prefix in (("participant", "sub-"), ("session", "ses-")):
         add(
             f"--{what}-label",
-            f"--{what}_label",
-            nargs="+",
-            default=[],
-            metavar="LABEL",
-            type=_label,
-            help="only these, with or without prefix",
+            "LABEL...",
+            "only these, with or without prefix",
+            type=bids_label(prefix),
         )
-    add(
-        "--exclude-flagged",
-        "--exclude_flagged",
-        action="store_true",
-        help="leave out hemispheres that the participant level flagged",
-    )
+    add("--exclude-flagged", "", "leave out hemispheres that the participant level flagged")
     add(
         "--exclude-qc",
-        "--exclude_qc",
-        metavar="EXPRESSION",
-        help="leave out by quality metrics, as 'filled_fraction > 0.01 or voxels_across < 3'",
+        "EXPRESSION",
+        "leave out by quality metrics, as 'filled_fraction > 0.01 or voxels_across < 3'",
     )
     add(
         "--exclude",
-        type=Path,
-        metavar="FILE.tsv",
-        help="leave out: columns participant_id, perhaps session_id, hemi, reason",
+        "FILE.tsv",
+        "leave out: columns participant_id, perhaps session_id, hemi, reason",
     )
 
 
 def _add_model(parser: Parser) -> None:
-    add = parser.add_argument_group("model").add_argument
+    add = adder(parser.add_argument_group("model"))
     add(
         "--covariates",
-        nargs="+",
-        action="extend",
-        default=[],
-        type=Path,
-        metavar="FILE.tsv",
-        help="more tables with participant_id (participants.tsv, sessions.tsv and phenotype/*.tsv"
+        "FILE.tsv...",
+        "more tables with participant_id (participants.tsv, sessions.tsv and phenotype/*.tsv"
         " are read anyway)",
     )
     add(
         "--volumes",
-        nargs="+",
-        action="extend",
-        default=[],
-        type=named_pattern,
-        metavar="NAME=PATTERN",
-        help="tables of volumes as FreeSurfer, ASHS or HippUnfold write them: path (also in"
+        "NAME=PATTERN...",
+        "tables of volumes as FreeSurfer, ASHS or HippUnfold write them: path (also in"
         " BIDS_DIR) with {subject}, {session}, {hemi} or {side} (lh, rh), * (those beside the"
         " segmentations are found anyway)",
+        type=named_pattern,
     )
-    add("--model", type=Path, metavar="FILE.json", help="BIDS Stats Model with one dataset node")
-    add("--formula", metavar="TEXT", help='such as "thickness ~ group + age + sex"')
+    add("--model", "FILE.json", "BIDS Stats Model with one dataset node")
+    add("--formula", "TEXT", 'such as "thickness ~ group + age + sex"')
     add(
         "--contrast",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="TEXT",
-        help='such as "group[CU]-group[DAT]"; rows of an F test are parted by commas',
+        "TEXT...",
+        'such as "group[CU]-group[DAT]"; rows of an F test are separated by commas',
     )
-    add(
-        "--reference",
-        nargs="+",
-        action="extend",
-        default=[],
-        type=_reference,
-        metavar="FACTOR=LEVEL",
-        help="reference levels",
-    )
+    add("--reference", "FACTOR=LEVEL...", "reference levels", type=factor_level)
     add(
         "--measures",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="NAME",
-        help="maps (columns of the sheet table, maps sampled by --map) or summary measures to fit"
+        "NAME...",
+        "maps (columns of the sheet table, maps sampled by --map) or summary measures to fit"
         " the model to, as does the left side of a formula (default: thickness curvature, and all"
         " summary measures)",
     )
-    add("--name", type=_name, metavar="NAME", help="folder of the results (default: the formula)")
+    add("--name", "NAME", "folder of the results (default: the formula)", type=_name)
 
 
 def _add_comparison(parser: Parser) -> None:
-    add = parser.add_argument_group("sessions and sides (default: first sessions)").add_argument
+    add = adder(parser.add_argument_group("sessions and sides (default: first sessions)"))
     add(
         "--longitudinal",
+        "",
+        "all sessions, by a mixed model in which participants have an intercept (default) or"
+        " also a slope of their own",
         nargs="?",
         const="intercept",
         choices=["intercept", "slope"],
-        help="all sessions, by a mixed model in which participants have an intercept (default) or"
-        " also a slope of their own",
     )
-    add(
-        "--paired",
-        nargs=2,
-        type=_session,
-        metavar=("SES1", "SES2"),
-        help="the second session minus the first",
-    )
-    add("--asymmetry", action="store_true", help="also maps of left minus right")
+    add("--paired", "SES1 SES2", "the second session minus the first", type=bids_label("ses-"))
+    add("--asymmetry", "", "also maps of left minus right")
     add(
         "--normative",
-        type=_reference,
-        metavar="FACTOR=LEVEL",
-        help="score each participant against these, as group=CN (w-scores)",
+        "FACTOR=LEVEL",
+        "score each participant against these, as group=CN (w-scores)",
+        type=factor_level,
     )
 
 
 def _add_methods(parser: Parser) -> None:
-    add = parser.add_argument_group("methods").add_argument
+    add = adder(parser.add_argument_group("methods"))
     add(
         "--align",
+        "",
+        "registration of curvature profiles (default: registr)",
         choices=["registr", "penalized", "penalised", "none"],
-        help="registration of curvature profiles (default: registr)",
     )
-    add(
-        "--template",
-        type=Path,
-        metavar="FILE",
-        help="register to the template.json of another analysis",
-    )
+    add("--template", "FILE", "register to the template.json of another analysis")
     add(
         "--correction",
-        choices=["fdr2", "bh", "permutation-tfce", "permutation-max"],
-        help="for the number of points: false discovery rate (fdr2, the default; bh), or"
+        "",
+        "for the number of points: false discovery rate (fdr2, the default; bh), or"
         " family-wise error by permutation of residuals (permutation-tfce, permutation-max)",
+        choices=["fdr2", "bh", "permutation-tfce", "permutation-max"],
     )
-    add("--permutations", type=int, metavar="N", help="the data as they are included; default 5000")
-    add("--blocks", metavar="COLUMN", help="permute inside its levels only, as those of site")
+    add("--permutations", "N", "the data as they are included; default 5000", type=int)
+    add("--blocks", "COLUMN", "permute inside its levels only, as those of site")
     add(
         "--fdr-scope",
-        "--fdr_scope",
+        "",
+        "what is one family of tests, for permutations too (default: map)",
         choices=["map", "hemispheres"],
-        help="what is one family of tests, for permutations too (default: map)",
     )
     add(
         "--base",
-        nargs="+",
-        default=[],
-        metavar="MEASURE",
-        help="measures and covariates of the base model of classification (default: volume)",
+        "MEASURE...",
+        "measures and covariates of the base model of classification (default: volume)",
     )
     add(
-        "--settings",
-        type=Path,
-        metavar="FILE.toml",
-        help="settings that change results (see `hipsta-bids settings group`)",
+        "--settings", "FILE.toml", "settings that change results (see `hipsta-bids settings group`)"
     )
 
 
 def _add_reports(parser: Parser) -> None:
     group = parser.add_argument_group("report")
-    add = group.add_mutually_exclusive_group().add_argument
-    add(
-        "--no-reports",
-        "--no_reports",
-        action="store_true",
-        help="make no page to look at (OUT_DIR/group/MODEL.html)",
-    )
+    add = adder(group.add_mutually_exclusive_group())
+    add("--no-reports", "", "make no page to look at (OUT_DIR/group/MODEL.html)")
     add(
         "--reports-only",
-        "--reports_only",
-        action="store_true",
-        help="make these pages anew from the results that are there, of all analyses or that of"
+        "",
+        "make these pages again from the results that are there, of all analyses or that of"
         " --name, and end",
     )
 
 
-def _session(text: str) -> str:
-    return f"ses-{_label(text)}"
-
-
-def _label(text: str) -> str:
-    return text.removeprefix("sub-").removeprefix("ses-")
-
-
 def _folder(text: str) -> Path:
     return Path(text.partition("=")[2] or text)
-
-
-def _reference(text: str) -> tuple[str, str]:
-    factor, equals, level = text.partition("=")
-    if not (factor and equals and level):
-        raise argparse.ArgumentTypeError(f"{text!r} is not of the form FACTOR=LEVEL")
-    return factor, level
 
 
 def _maybe_named(text: str) -> tuple[str | None, str]:
@@ -294,9 +219,6 @@ def _name(text: str) -> str:
     return text
 
 
-# The group level's command line: its options as a request, and the run.
-
-
 def is_group_level(arguments: Sequence[str]) -> bool:
     """Tell a call of the group level from others, whatever folders are called."""
     if arguments[2:3]:
@@ -304,7 +226,7 @@ def is_group_level(arguments: Sequence[str]) -> bool:
             return True
         if arguments[2] == "participant":
             return False
-    # Positions may be taken by options; "settings group" is another command.
+    # Options may precede the positions; "settings group" is another command.
     return LEVEL in arguments[2:] and "participant" not in arguments
 
 
@@ -314,12 +236,10 @@ def run_group_level(arguments: Sequence[str]) -> ExitCode:
     if parsed.model is not None and (parsed.formula or parsed.contrast):
         raise UsageError("give --model, or --formula and --contrast", reason="usage")
     if parsed.reports_only:
-        return rebuild_group_reports(parsed.output_dir, parsed.name)
+        return _rebuild_reports(parsed.output_dir, parsed.name)
     # Thousands of tiny fits: threads of the linear algebra would only get in each other's way.
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
-    from hipsta_bids.cli.console import echo, echo_start, warn  # noqa: PLC0415  (start-up time)
-
     echo_start(LEVEL, parsed.bids_dir)
     from hipsta_bids.group.run import run_group  # noqa: PLC0415  (heavy)
     from hipsta_bids.io.files import check_scratch  # noqa: PLC0415  (heavy)
@@ -337,25 +257,49 @@ def run_group_level(arguments: Sequence[str]) -> ExitCode:
     return ExitCode.OK
 
 
+def _rebuild_reports(root: Path, name: str | None) -> ExitCode:
+    """Make the pages of analyses again from their files, of all or of one."""
+    from hipsta_bids.derivatives.names import group_report  # noqa: PLC0415  (start-up time)
+    from hipsta_bids.io.files import check_writable  # noqa: PLC0415  (start-up time)
+    from hipsta_bids.reports.group import group_models, write_group_report  # noqa: PLC0415  (heavy)
+
+    models = [model for model in group_models(root) if name in {None, model}]
+    if not models:
+        raise NothingToDoError(
+            f"{root}: no analysis{f' of the name {name}' if name else ''}; run the group level"
+            " without --reports-only first",
+            reason="nothing-to-report",
+        )
+    check_writable(root)
+    problems = [write_group_report(root, model) for model in models]
+    for model, problem in zip(models, problems, strict=True):
+        if problem is None:
+            echo(f"report: {root / group_report(model)}")
+        else:
+            warn(f"report: {problem}")
+    return ExitCode.INTERNAL if any(problems) else ExitCode.OK
+
+
 def _settings(parsed: argparse.Namespace) -> "GroupSettings":
+    """Read the settings, and put those in that have an option of their own."""
     from hipsta_bids.group.settings import load_group_settings  # noqa: PLC0415  (start-up time)
 
-    settings = load_group_settings(parsed.settings)
-    if parsed.align is not None:
-        align = parsed.align.replace("penalised", "penalized")
-        settings = settings.changed(registration={"align": align})
-    given = {
-        "method": parsed.correction,
-        "scope": parsed.fdr_scope,
-        "permutations": parsed.permutations,
-        "blocks": parsed.blocks,
+    align = parsed.align and parsed.align.replace("penalised", "penalized")
+    chosen = {
+        "registration": {"align": align},
+        "multiplicity": {
+            "method": parsed.correction,
+            "scope": parsed.fdr_scope,
+            "permutations": parsed.permutations,
+            "blocks": parsed.blocks,
+        },
+        "longitudinal": {"random": parsed.longitudinal},
+        "classification": {"base": tuple(parsed.base) or None},
     }
-    chosen = {name: value for name, value in given.items() if value is not None}
-    settings = settings.changed(multiplicity=chosen)
-    if parsed.longitudinal is not None:
-        settings = settings.changed(longitudinal={"random": parsed.longitudinal})
-    if parsed.base:
-        settings = settings.changed(classification={"base": parsed.base})
+    settings = load_group_settings(parsed.settings)
+    for section, options in chosen.items():
+        given = {name: value for name, value in options.items() if value is not None}
+        settings = settings.changed(**{section: given})
     return settings
 
 
@@ -366,38 +310,35 @@ def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOpti
     from hipsta_bids.group.run import GroupOptions  # noqa: PLC0415  (heavy)
 
     condition = None if parsed.exclude_qc is None else QualityCondition(parsed.exclude_qc)
-    return GroupOptions(
-        bids_dir=parsed.bids_dir,
+    sheets = from_namespace(
+        GroupRequest,
+        parsed,
+        roots=tuple(dict.fromkeys(parsed.derivatives)) or (parsed.output_dir,),
+        subjects=tuple(parsed.participant_label),
+        sessions=tuple(parsed.session_label),
+        exclude_quality=condition,
+        exclude_table=parsed.exclude,
+    )
+    model = from_namespace(
+        ModelRequest,
+        parsed,
+        file=parsed.model,
+        contrasts=tuple(parsed.contrast),
+        references=tuple(parsed.reference),
+    )
+    pair = parsed.paired and (f"ses-{parsed.paired[0]}", f"ses-{parsed.paired[1]}")
+    comparison = from_namespace(
+        Comparison, parsed, longitudinal=parsed.longitudinal is not None, pair=pair
+    )
+    return from_namespace(
+        GroupOptions,
+        parsed,
         out_dir=parsed.output_dir,
-        sheets=GroupRequest(
-            roots=tuple(dict.fromkeys(parsed.derivatives)) or (parsed.output_dir,),
-            seg=parsed.seg,
-            subjects=tuple(parsed.participant_label),
-            sessions=tuple(parsed.session_label),
-            exclude_flagged=parsed.exclude_flagged,
-            exclude_quality=condition,
-            exclude_table=parsed.exclude,
-            segmentations=tuple(parsed.segmentations),
-        ),
-        model=ModelRequest(
-            file=parsed.model,
-            formula=parsed.formula,
-            contrasts=tuple(parsed.contrast),
-            references=tuple(parsed.reference),
-            name=parsed.name,
-        ),
-        covariates=tuple(parsed.covariates),
-        maps=tuple(parsed.maps),
+        sheets=sheets,
+        model=model,
+        comparison=comparison,
         surfaces=tuple(parsed.maps_surface),
-        volumes=tuple(parsed.volumes),
         measures=tuple(dict.fromkeys(parsed.measures)),
-        template=parsed.template,
-        comparison=Comparison(
-            longitudinal=parsed.longitudinal is not None,
-            pair=None if parsed.paired is None else tuple(parsed.paired),
-            asymmetry=parsed.asymmetry,
-            normative=parsed.normative,
-        ),
         reports=not parsed.no_reports,
         command=("hipsta-bids", *arguments),
     )

@@ -1,4 +1,4 @@
-"""Dask as the engine: the same jobs, on workers of a cluster.
+"""Many machines: Dask as the engine of the same jobs, and equal parts of a dataset (shards).
 
 Each Dask worker hands its jobs to a process of its own, as the pool does on one machine, so that a
 crash or a time limit costs one job and not the worker. Where a whole worker is lost, with its
@@ -12,7 +12,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Generator, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from itertools import islice
 from pathlib import Path
@@ -26,6 +26,10 @@ _PATIENCE = 60.0  # s that an idle process stays, should the run have died
 _ANSWER_TIME = 30  # s that a scheduler gets to answer
 _WINDOW = 5000  # jobs at the scheduler at a time: more than there are workers, less than it minds
 _JOB_MEMORY = "1 GB"  # of a SLURM job: a hemisphere, and Dask's own worker
+
+FROM_SLURM = "slurm"
+"""Value of ``--shard`` that takes the part from SLURM's array job."""
+_ARRAY = "SLURM_ARRAY_TASK_"
 
 #: In a Dask worker: the processes that measure, for all of its threads, and those without a job.
 _WORKERS: list[Worker] = []
@@ -48,7 +52,7 @@ def check_cluster(cluster: Cluster) -> None:
     if cluster.scheduler is not None and cluster.slurm is not None:
         raise UsageError("give --dask-scheduler or --slurm, not both", reason="usage")
     try:
-        # Workers that come and go are no news; what they cost is told as the fate of jobs.
+        # Workers that come and go are no news; what was lost is reported per job.
         import_module("dask").config.set({"logging.distributed": "error"})
         import_module("distributed")
         if cluster.slurm is not None:
@@ -68,7 +72,7 @@ def run_on_cluster(
     check_cluster(cluster)
     with contextlib.ExitStack() as stack:
         client = _connect(cluster, plan, stack)
-        yield from _work_off(client, plan, jobs)
+        yield from _work_off(client, replace(plan, patience=_PATIENCE), jobs)
 
 
 def _connect(cluster: Cluster, plan: WorkerPlan, stack: contextlib.ExitStack) -> Any:  # noqa: ANN401  (Dask is optional)
@@ -81,7 +85,7 @@ def _connect(cluster: Cluster, plan: WorkerPlan, stack: contextlib.ExitStack) ->
         return stack.enter_context(connect(**given, timeout=_ANSWER_TIME))
     except (OSError, ValueError) as error:
         raise UsageError(
-            f"--dask-scheduler {address}: no answer ({_one_line(error)}); give its address as"
+            f"--dask-scheduler {address}: no answer ({error}); give its address as"
             " tcp://HOST:PORT, or the file that `dask scheduler --scheduler-file` writes",
             reason="no-scheduler",
         ) from error
@@ -89,7 +93,7 @@ def _connect(cluster: Cluster, plan: WorkerPlan, stack: contextlib.ExitStack) ->
 
 @contextlib.contextmanager
 def _slurm(options: str, plan: WorkerPlan) -> Generator[Any]:
-    """Have SLURM run workers, and end them in the end."""
+    """Have SLURM run workers, and end them when the block ends."""
     with import_module("dask_jobqueue").SLURMCluster(
         cores=1,
         processes=1,
@@ -107,7 +111,7 @@ def _slurm(options: str, plan: WorkerPlan) -> Generator[Any]:
 
 
 def _check_script(script: str) -> None:
-    """Ask SLURM whether it would run a job, since Dask would try it again and again."""
+    """Ask SLURM whether it would run a job: Dask would submit it over and over."""
     try:
         subprocess.run(
             ["sbatch", "--test-only"],  # noqa: S607  (where it is differs)
@@ -161,25 +165,20 @@ def _result(future: Any) -> Any:  # noqa: ANN401  (Dask is optional)
     if isinstance(error, HipstaError):
         raise error
     raise UsageError(
-        f"Dask's workers cannot do this job ({type(error).__name__}: {_one_line(error)}); they need"
+        f"Dask's workers cannot do this job ({type(error).__name__}: {error}); they need"
         f" hipsta_bids {__version__} and the same folders",
         reason="workers-differ",
     ) from error
 
 
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())
-
-
 def _answer(version: str, plan: WorkerPlan, job: Any) -> Any:  # noqa: ANN401  (jobs are the caller's)
-    """Run in a Dask worker: have a process of its own do the job."""
+    """Run in a Dask worker: let a separate process do the job."""
     if version != __version__:
         raise UsageError(
             f"Dask's workers have hipsta_bids {__version__}, this run has {version}",
             reason="workers-differ",
         )
-    # Dask's workers are daemons, which may have no children, since those would outlive them. Ours
-    # do not.
+    # Dask's workers are daemons, which may have no children: those would outlive them. Ours do not.
     multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]  # noqa: SLF001
     worker = _take(plan)
     try:
@@ -195,7 +194,7 @@ def _take(plan: WorkerPlan) -> Worker:
             if worker.plan == plan:
                 _IDLE.remove(worker)
                 return worker
-        worker = Worker(plan, patience=_PATIENCE)
+        worker = Worker(plan)
         _WORKERS.append(worker)
         return worker
 
@@ -207,18 +206,9 @@ def _dismiss(plan: WorkerPlan) -> None:
             worker.kill()
 
 
-# Equal parts of a dataset, for as many runs into one folder.
-
-
-FROM_SLURM = "slurm"
-"""Says that SLURM's array job tells which part."""
-
-_ARRAY = "SLURM_ARRAY_TASK_"
-
-
 @dataclass(frozen=True, kw_only=True)
 class Shard:
-    """One of some equal parts."""
+    """One of ``count`` equal parts of a dataset, each for a run of its own into one folder."""
 
     index: int
     """From 1."""
@@ -233,7 +223,7 @@ class Shard:
 
     @property
     def name(self) -> str:
-        """For file names."""
+        """The part as file names have it."""
         return f"{self.index}of{self.count}"
 
     def take(self, subjects: Iterable[str]) -> tuple[str, ...]:
@@ -256,7 +246,7 @@ def parse_shard(text: str, environment: Mapping[str, str]) -> Shard:
 
 
 def _from_array(environment: Mapping[str, str]) -> Shard:
-    """Find the place of this task in its array, whatever that begins with and its step."""
+    """Find the position of this task in its array, whatever its first number and its step."""
     try:
         task, first, last, count, step = (
             int(environment[f"{_ARRAY}{name}"]) for name in ("ID", "MIN", "MAX", "COUNT", "STEP")

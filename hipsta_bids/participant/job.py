@@ -1,4 +1,4 @@
-"""What is to be done with one hemisphere, and what an earlier run has done with it."""
+"""One hemisphere from files to files, as workers run it: read, measure, write, and what it cost."""
 
 import contextlib
 import hashlib
@@ -7,7 +7,7 @@ import resource
 import sys
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,11 @@ from hipsta_bids.protocols.load import for_region
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import BodyMask, Status
 
+INTERNAL = "internal-error"
+"""Reason of a failure that is a bug."""
+
+_MEGABYTE = 1e6
+
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
@@ -44,11 +49,11 @@ class Job:
     """Input datasets by name."""
     write_meshes: bool
     force: bool = False
-    """Redo it even if an earlier run has done it just so."""
+    """Redo it even if an earlier run has done the same."""
 
     @property
     def title(self) -> str:
-        """What its messages are headed by."""
+        """Name in messages."""
         return f"{self.place.name.stem}_{self.place.name.protocol}"
 
 
@@ -101,12 +106,12 @@ def recorded(job: Job) -> Outcome | None:
 
 
 def finished(job: Job) -> Outcome | None:
-    """Recognize a hemisphere that an earlier run has done just so."""
+    """Return the outcome of a hemisphere that an earlier run has done with the same inputs."""
     outcome = None if job.force else recorded(job)
     if outcome is None or outcome.status == Status.FAILED:
         return None
     try:
-        digest, _ = hash_inputs(job)
+        digest, _ = hash_inputs(job, base_record(job))
     except (InputError, ProtocolError):
         return None
     return outcome if outcome.input_hash == digest else None
@@ -136,24 +141,20 @@ def base_record(job: Job) -> dict[str, Any]:
     }
 
 
-def hash_inputs(job: Job) -> tuple[str, dict[str, list[dict[str, str]]]]:
-    """Hash the input files and how they are read."""
-    item, sources = job.item, dict(job.sources)
+def hash_inputs(job: Job, record: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+    """Hash the input files and how they are read; return entries of a record with hashes, too."""
+    item = job.item
     region = for_region(item.protocol, job.settings.body.region)
-    hashes = [
-        {"file": source_address(path, sources), "sha256": files.sha256_of(path)}
-        for path in item.files
+    inputs = [
+        entry | {"sha256": files.sha256_of(path)}
+        for entry, path in zip(record["inputs"], item.files, strict=True)
     ]
     edited = [
-        {
-            "what": edit.kind,
-            "file": source_address(edit.path, sources),
-            "sha256": files.sha256_of(edit.path),
-        }
-        for edit in item.edits
+        entry | {"sha256": files.sha256_of(edit.path)}
+        for entry, edit in zip(record["edited"], item.edits, strict=True)
     ]
     reading = [
-        [entry["sha256"] for entry in hashes],
+        [entry["sha256"] for entry in inputs],
         # The wording of the protocols (titles, citations) does not change what is read.
         [
             [label.code, int(label.tissue), int(label.part)]
@@ -170,13 +171,7 @@ def hash_inputs(job: Job) -> tuple[str, dict[str, list[dict[str, str]]]]:
         *signal_hash(item),
     ]
     digest = hashlib.sha256(json.dumps(reading).encode()).hexdigest()
-    return digest, {"inputs": hashes, "edited": edited}
-
-
-# What one hemisphere costs: time per stage, processor time, memory.
-
-
-_MEGABYTE = 1e6
+    return digest, {"inputs": inputs, "edited": edited}
 
 
 class CostClock:
@@ -199,7 +194,7 @@ class CostClock:
             self._stages[stage] = self._stages.get(stage, 0.0) + spent
 
     def spent(self) -> dict[str, Any]:
-        """Give what was spent so far: seconds per stage and in all, and peak memory in MB."""
+        """Return what was spent so far: seconds per stage and in all, and peak memory in MB."""
         return {
             "stages": dict(self._stages),
             "seconds": time.perf_counter() - self._start,
@@ -211,9 +206,12 @@ class CostClock:
 def cpu_seconds() -> float:
     """Processor time of this process and its helpers, running or ended, in s."""
     ended = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return (
-        time.process_time() + ended.ru_utime + ended.ru_stime + sum(map(_cpu_of_helper, helpers()))
-    )
+    total = time.process_time() + ended.ru_utime + ended.ru_stime
+    for process in helpers():
+        # Of its main thread alone, but in ns; TetGen has no other.
+        with contextlib.suppress(OSError, ValueError, IndexError):
+            total += int(Path(f"/proc/{process}/schedstat").read_text().split()[0]) * 1e-9
+    return total
 
 
 def helpers() -> list[str]:
@@ -242,21 +240,6 @@ def peak_memory(process: str = "self") -> float:
     return float(peak if sys.platform == "darwin" else 1024 * peak)  # getrusage(2): bytes, or KiB
 
 
-def _cpu_of_helper(process: str) -> float:
-    """Processor time of a running process in s, 0 if it is gone."""
-    # Its main thread's alone, but in ns; TetGen has no other.
-    with contextlib.suppress(OSError, ValueError, IndexError):
-        return int(Path(f"/proc/{process}/schedstat").read_text().split()[0]) * 1e-9
-    return 0.0
-
-
-# One hemisphere from files to files: read, measure, write. This is what workers run.
-
-
-INTERNAL = "internal-error"
-"""Reason of a failure that is a bug."""
-
-
 def warm_up() -> None:
     """Load the libraries, so that no hemisphere's time includes it."""
     import hipsta_bids.inputs.labels  # noqa: PLC0415  (loaded in workers only)
@@ -266,7 +249,7 @@ def warm_up() -> None:
 def run_job(job: Job) -> Outcome:
     """Measure one hemisphere and write its results; never raises a foreseen error.
 
-    Where another run is just doing the same, it is waited for, and its results are taken.
+    If another run is doing the same, its results are awaited and taken.
     """
     try:
         with locked(job.place.root, job.title):
@@ -284,15 +267,15 @@ def _measure(job: Job) -> Outcome:
     hashed, volume = None, None
     try:
         with clock("read"):
-            hashed, hashes = hash_inputs(job)
-            record |= {"input_hash": hashed} | hashes
+            hashed, entries = hash_inputs(job, record)
+            record |= {"input_hash": hashed} | entries
             volume = read_label_volume(job.item, job.settings.body.region)
         maps = measure_hemisphere(volume, job.item.hemi, job.settings, clock)
         mapped = Mapped()
         if job.item.maps or job.item.regions:
             with clock("maps"):
                 maps, mapped = add_signals(job.item, maps, job.settings.maps, dict(job.sources))
-                record |= mapped.record or {}
+                record |= mapped.record
         with clock("write"):
             hemisphere.write_results(
                 job.place,
@@ -303,19 +286,12 @@ def _measure(job: Job) -> Outcome:
                 write_more=lambda: write_signals(job.place, maps, mapped),
             )
     except Exception as error:  # noqa: BLE001  (one hemisphere's bug must not end the others)
-        foreseen = foresee(error, job.place.root)
-        trace = None if foreseen else traceback.format_exc()
+        explained = _explain(error, job.place.root)
+        trace = traceback.format_exc() if explained.reason == INTERNAL else None
         body = None
         if volume is not None and isinstance(error, GeometryError):
             body = find_body(volume, job.settings)
-        return fail(
-            job,
-            foreseen or unforeseen(error),
-            trace=trace,
-            record=record,
-            body=body,
-            **clock.spent(),
-        )
+        return fail(job, explained, trace=trace, record=record, body=body, **clock.spent())
     status, reason, message = hemisphere.verdict(maps)
     return Outcome(
         job=job,
@@ -356,8 +332,8 @@ def fail(
     )
 
 
-def foresee(error: Exception, root: Path) -> HipstaError | None:
-    """Tell what a user can act on from a bug."""
+def _explain(error: Exception, root: Path) -> HipstaError:
+    """Return an error as a user can act on it; a bug, whose traceback goes to the log, as such."""
     if isinstance(error, HipstaError):
         return error
     if isinstance(error, MemoryError):
@@ -367,10 +343,5 @@ def foresee(error: Exception, root: Path) -> HipstaError | None:
         )
     if isinstance(error, OSError) and files.is_disk_full(error):
         return files.output_error(Path(error.filename) if error.filename else root, error)
-    return None
-
-
-def unforeseen(error: Exception) -> HipstaError:
-    """Word a bug as an error; its traceback goes to the log."""
     what = " ".join(f"{type(error).__name__}: {error}".split())
     return HipstaError(f"internal error ({what}); please report it with the log", reason=INTERNAL)

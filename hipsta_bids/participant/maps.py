@@ -1,10 +1,10 @@
-"""What a hemisphere carries besides its shape: other volumes on the sheet, and regions drawn on it.
+"""Other volumes sampled on a hemisphere's sheet, and regions drawn on it.
 
 Nothing here can fail a hemisphere: what cannot be used is a flag, and its shape is unharmed.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +28,13 @@ from hipsta_bids.io import files, gifti
 from hipsta_bids.settings import MapSettings
 from hipsta_bids.types import Flag, Float, HemisphereMaps
 
+_REGION_DIGITS = 6
 
-def column_names(name: str, count: int) -> list[str]:
+#: Maps of every hemisphere that are summarized in regions, and their units.
+_SHAPE_UNITS = {row.name: row.unit for row in MAPS}
+
+
+def _column_names(name: str, count: int) -> list[str]:
     """Name the columns of a map: by its name alone, or numbered from 1 if there are several."""
     return [name] if count == 1 else [f"{name}_{number}" for number in range(1, count + 1)]
 
@@ -41,7 +46,7 @@ def write_map(
     nx, ny, count = sampled.values.shape
     flat = sampled.values.reshape(nx * ny, count)
     x, y = np.divmod(np.arange(nx * ny), ny)
-    names = column_names(source.name, count)
+    names = _column_names(source.name, count)
     digits = 7 if source.interpolation == "linear" else 15
     cells = [_cells(column, digits) for column in flat.T]
     files.write_tsv(
@@ -63,16 +68,12 @@ def write_map(
     )
 
 
-def _cells(values: Float, digits: int) -> list[str]:
+def _cells(values: Float, digits: int = 7) -> list[str]:
+    """Format numbers of unknown size."""
     return [f"{v:.{digits}g}" if np.isfinite(v) else files.MISSING for v in values.tolist()]
 
 
-_REGION_DIGITS = 6
-
-
-def write_regions(
-    table: Path, sidecar: Path, regions: Regions, found: RegionStatistics, units: Mapping[str, str]
-) -> None:
+def _write_regions(place: ResultPlace, regions: Regions, found: RegionStatistics) -> None:
     """Write one row per region, and the sidecar."""
     definitions: dict[str, dict[str, object]] = {
         "region": {"Description": "region, as the user named it"},
@@ -82,8 +83,8 @@ def write_regions(
     }
     columns: dict[str, list[str]] = {
         "region": list(regions.names),
-        "n_points": _region_cells(found.n_points),
-        "n_valid": _region_cells(found.n_valid),
+        "n_points": _cells(found.n_points),
+        "n_valid": _cells(found.n_valid),
         "area": hemisphere.format_column(found.area, _REGION_DIGITS),
     }
     parts = (
@@ -93,24 +94,15 @@ def write_regions(
     )
     for suffix, text, values in parts:
         for name, column in values.items():
-            unit = {"Units": units[name]} if name in units else {}
-            definitions[f"{name}_{suffix}"] = {"Description": text.format(name), **unit}
-            columns[f"{name}_{suffix}"] = (
-                hemisphere.format_column(column, _REGION_DIGITS)
-                if name in units
-                else _region_cells(column)
-            )
-    files.write_tsv(table, list(columns), zip(*columns.values(), strict=True))
-    files.write_json(sidecar, definitions)
-
-
-def _region_cells(values: Float) -> list[str]:
-    """Numbers of unknown size, to seven digits."""
-    return [f"{v:.7g}" if np.isfinite(v) else files.MISSING for v in values.tolist()]
-
-
-#: Maps of every hemisphere that are summed up in regions, and their units.
-SHAPE_MAPS = {row.name: row.unit for row in MAPS}
+            key = f"{name}_{suffix}"
+            definitions[key] = {"Description": text.format(name)}
+            if name in _SHAPE_UNITS:
+                definitions[key]["Units"] = _SHAPE_UNITS[name]
+                columns[key] = hemisphere.format_column(column, _REGION_DIGITS)
+            else:
+                columns[key] = _cells(column)
+    files.write_tsv(place.path("roi"), list(columns), zip(*columns.values(), strict=True))
+    files.write_json(place.path("roi_sidecar"), definitions)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -119,13 +111,12 @@ class Mapped:
 
     maps: tuple[tuple[MapSource, SampledMap], ...] = ()
     regions: Regions | None = None
-    flags: tuple[Flag, ...] = ()
-    record: Mapping[str, Any] | None = None
+    record: Mapping[str, Any] = field(default_factory=dict)
     """For the quality record."""
 
 
 def signal_hash(item: HemisphereInput) -> list[object]:
-    """Tell what decides about maps and regions: their files' contents and how they are read."""
+    """List what decides about maps and regions: their files' contents and how they are read."""
     maps = [
         [source.name, source.sampling, source.interpolation, _content(source.path)]
         for source in item.maps
@@ -136,7 +127,7 @@ def signal_hash(item: HemisphereInput) -> list[object]:
 def _content(path: Path | None) -> str | None:
     try:
         return None if path is None else files.sha256_of(path)
-    except InputError:  # it will be tried again, and flagged
+    except InputError:  # reading it will be tried again, and flagged
         return None
 
 
@@ -148,7 +139,12 @@ def add_signals(
     flags = []
     entries: list[dict[str, Any]] = []
     for source in item.maps:
-        entry = _entry(source, sources)
+        entry: dict[str, Any] = {
+            "name": source.name,
+            "source": None if source.path is None else source_address(source.path, sources),
+            "sampling": source.sampling,
+            "interpolation": source.interpolation,
+        }
         entries.append(entry)
         if source.path is None:
             entry["note"] = source.missing
@@ -160,41 +156,28 @@ def add_signals(
             entry["problem"] = str(error)
             continue
         done.append((source, sampled))
-        entry |= _shares(sampled)
+        entry |= {
+            "volumes": sampled.values.shape[2],
+            "outside": sampled.outside,
+            "unknown": sampled.unknown,
+            "missing": sampled.missing,
+        }
         if sampled.outside > settings.flag_outside:
-            flags.append(_outside(source, sampled))
-    regions, trouble = _regions(item, maps)
+            message = (
+                f"map {source.name}: {sampled.outside:.0%} of the sheet lies outside of"
+                f" {source.path}; is it in the space of the labels?"
+            )
+            flags.append(Flag(reason="map-outside", message=message))
+    regions = None
+    if item.regions is not None:
+        nx, ny = maps.thickness.shape
+        try:
+            regions = read_regions(item.regions, (nx, ny))
+        except InputError as error:
+            flags.append(Flag(reason="roi-unusable", message=f"regions: {error}"))
     record = {"maps": entries, "regions": str(item.regions) if item.regions else None}
-    mapped = Mapped(maps=tuple(done), regions=regions, flags=(*flags, *trouble), record=record)
-    return replace(maps, flags=(*maps.flags, *mapped.flags)), mapped
-
-
-def write_signals(place: ResultPlace, maps: HemisphereMaps, mapped: Mapped) -> None:
-    """Write the tables and GIFTI files of what was sampled."""
-    numbers: dict[str, Float] = {name: maps.maps[name] for name in SHAPE_MAPS}
-    labels: dict[str, Float] = {}
-    entries = {entry["name"]: entry for entry in (mapped.record or {}).get("maps", ())}
-    for source, sampled in mapped.maps:
-        about = {_camel(key): value for key, value in entries[source.name].items()}
-        write_map(place, source, sampled, about)
-        columns = column_names(source.name, sampled.values.shape[2])
-        kind = numbers if source.interpolation == "linear" else labels
-        kind |= {name: sampled.values[:, :, k] for k, name in enumerate(columns)}
-    if mapped.regions is not None:
-        found = summarize_regions(mapped.regions, maps.sheet, numbers, labels)
-        write_regions(
-            place.path("roi"), place.path("roi_sidecar"), mapped.regions, found, SHAPE_MAPS
-        )
-
-
-def is_complete(place: ResultPlace, record: Mapping[str, Any]) -> bool:
-    """Say whether the files of maps and regions that a record speaks of are there."""
-    maps = [entry for entry in record.get("maps") or () if "outside" in entry]
-    wanted = [place.path("map_table", entry["name"]) for entry in maps]
-    usable = not any(f.get("reason") == "roi-unusable" for f in record.get("flags") or ())
-    if record.get("regions") and usable:
-        wanted.append(place.path("roi"))
-    return all(path.exists() for path in wanted)
+    mapped = Mapped(maps=tuple(done), regions=regions, record=record)
+    return replace(maps, flags=(*maps.flags, *flags)), mapped
 
 
 def _sample(
@@ -202,9 +185,8 @@ def _sample(
 ) -> SampledMap:
     from hipsta_bids.io.volumes import read_scalars  # noqa: PLC0415  (nibabel, in workers only)
 
-    volume = read_scalars(path, maps.sheet.points.reshape(-1, 3))
     return sample_on_sheet(
-        volume,
+        read_scalars(path, maps.sheet.points.reshape(-1, 3)),
         maps.layers if source.sampling == "depth" else maps.sheet,
         settings,
         sampling=source.sampling,
@@ -212,41 +194,27 @@ def _sample(
     )
 
 
-def _regions(item: HemisphereInput, maps: HemisphereMaps) -> tuple[Regions | None, list[Flag]]:
-    if item.regions is None:
-        return None, []
-    nx, ny = maps.thickness.shape
-    try:
-        return read_regions(item.regions, (nx, ny)), []
-    except InputError as error:
-        return None, [Flag(reason="roi-unusable", message=f"regions: {error}")]
+def write_signals(place: ResultPlace, maps: HemisphereMaps, mapped: Mapped) -> None:
+    """Write the tables and GIFTI files of what was sampled."""
+    numbers: dict[str, Float] = {name: maps.maps[name] for name in _SHAPE_UNITS}
+    labels: dict[str, Float] = {}
+    entries = {entry["name"]: entry for entry in mapped.record.get("maps", ())}
+    for source, sampled in mapped.maps:
+        about = {key.capitalize(): value for key, value in entries[source.name].items()}
+        write_map(place, source, sampled, about)
+        columns = _column_names(source.name, sampled.values.shape[2])
+        kind = numbers if source.interpolation == "linear" else labels
+        kind |= {name: sampled.values[:, :, k] for k, name in enumerate(columns)}
+    if mapped.regions is not None:
+        found = summarize_regions(mapped.regions, maps.sheet, numbers, labels)
+        _write_regions(place, mapped.regions, found)
 
 
-def _outside(source: MapSource, sampled: SampledMap) -> Flag:
-    return Flag(
-        reason="map-outside",
-        message=f"map {source.name}: {sampled.outside:.0%} of the sheet lies outside of"
-        f" {source.path}; is it in the space of the labels?",
-    )
-
-
-def _entry(source: MapSource, sources: Mapping[str, Path]) -> dict[str, Any]:
-    return {
-        "name": source.name,
-        "source": None if source.path is None else source_address(source.path, sources),
-        "sampling": source.sampling,
-        "interpolation": source.interpolation,
-    }
-
-
-def _shares(sampled: SampledMap) -> dict[str, float]:
-    return {
-        "volumes": sampled.values.shape[2],
-        "outside": sampled.outside,
-        "unknown": sampled.unknown,
-        "missing": sampled.missing,
-    }
-
-
-def _camel(key: str) -> str:
-    return key.capitalize()
+def is_complete(place: ResultPlace, record: Mapping[str, Any]) -> bool:
+    """Return whether the files of maps and regions that a record names exist."""
+    maps = [entry for entry in record.get("maps") or () if "outside" in entry]
+    wanted = [place.path("map_table", entry["name"]) for entry in maps]
+    usable = not any(f.get("reason") == "roi-unusable" for f in record.get("flags") or ())
+    if record.get("regions") and usable:
+        wanted.append(place.path("roi"))
+    return all(path.exists() for path in wanted)

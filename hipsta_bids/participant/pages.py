@@ -23,6 +23,9 @@ from hipsta_bids.participant.pool import WorkerLost, WorkerPlan, run_jobs
 from hipsta_bids.reports.cohort import Cohort, read_cohort
 
 _TIMEOUT = 600.0  # s for one page
+_COHORT = DATASET_FILES["report"]
+_RECORD = "_desc-qc_metrics.json"
+_RECORDS = tuple(f"{folder}/*{_RECORD}" for folder in ("sub-*/anat", "sub-*/ses-*/anat"))
 _LOGGER = logging.getLogger(__name__)
 
 Visit = tuple[str, str | None]
@@ -31,12 +34,12 @@ Visit = tuple[str, str | None]
 
 @dataclass
 class Pages:
-    """What becomes of the pages of a run."""
+    """The pages of a run."""
 
     problems: list[str] = field(default_factory=list)
     """A line per page that could not be made."""
     wanted: bool = True
-    """Not where nothing can be written."""
+    """False where nothing can be written."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +49,7 @@ class PageJob:
     root: Path
     """The output dataset."""
     visit: Visit | None
-    """Whose page it is; ``None`` is that of the cohort."""
+    """The visit that the page is about; ``None`` for that of the cohort."""
 
     @property
     def path(self) -> Path:
@@ -65,7 +68,7 @@ class PagePlan:
     log: Path
     """Receives tracebacks and what libraries print."""
     cohort: bool = True
-    """Whether the page of all is made, too."""
+    """Whether the page of the cohort is made, too."""
     cluster: Cluster | None = None
     """Workers elsewhere; ``None`` is this machine."""
 
@@ -76,22 +79,13 @@ class Problem:
 
     message: str
     fatal: bool = False
-    """The others would fail just so."""
-
-
-_COHORT = DATASET_FILES["report"]
-_RECORD = "_desc-qc_metrics.json"
-_RECORDS = tuple(f"{folder}/*{_RECORD}" for folder in ("sub-*/anat", "sub-*/ses-*/anat"))
+    """Whether the others would fail likewise."""
 
 
 def visits_of(root: Path) -> list[Visit]:
     """List the visits of which there is a record."""
-    found = set()
-    for pattern in _RECORDS:
-        for path in root.glob(pattern):
-            name = name_of_record(path.name)
-            if name is not None:
-                found.add((name.subject, name.session))
+    names = (name_of_record(path.name) for pattern in _RECORDS for path in root.glob(pattern))
+    found = {(name.subject, name.session) for name in names if name is not None}
     return sorted(found, key=lambda visit: (visit[0], visit[1] or ""))
 
 
@@ -124,10 +118,11 @@ def write_reports(plan: PagePlan, visits: Iterable[Visit]) -> Iterator[Problem]:
 
 
 @contextlib.contextmanager
-def reports_after(plan: PagePlan, visits: Sequence[Visit], pages: Pages) -> Generator[None]:
+def reports_after(plan: PagePlan, visits: Sequence[Visit]) -> Generator[Pages]:
     """Make pages when the block ends, also by an error; not when the user stops the run."""
+    pages = Pages()
     try:
-        yield
+        yield pages
     except Exception:
         _try_all(plan, visits, pages.problems)
         raise
@@ -136,8 +131,14 @@ def reports_after(plan: PagePlan, visits: Sequence[Visit], pages: Pages) -> Gene
 
 
 def _try_all(plan: PagePlan, visits: Sequence[Visit], problems: list[str]) -> None:
+    """Make the pages that are older than the records they are about."""
     root = plan.root
-    stale = [visit for visit in dict.fromkeys(visits) if not _is_current(root, visit)]
+    stale = []
+    for subject, session in dict.fromkeys(visits):
+        folder = f"sub-{subject}/{f'ses-{session}/' if session else ''}anat"
+        page = root / participant_report(subject, session)
+        if not _is_newer(page, root, f"{folder}/*{_RECORD}"):
+            stale.append((subject, session))
     if not stale and (not plan.cohort or _is_newer(root / _COHORT, root, *_RECORDS)):
         return
     try:
@@ -147,14 +148,8 @@ def _try_all(plan: PagePlan, visits: Sequence[Visit], problems: list[str]) -> No
         problems.append(f"not made ({type(error).__name__}: {error})")
 
 
-def _is_current(root: Path, visit: Visit) -> bool:
-    """Whether a page is newer than all records that it is about."""
-    subject, session = visit
-    folder = f"sub-{subject}/{f'ses-{session}/' if session else ''}anat"
-    return _is_newer(root / participant_report(*visit), root, f"{folder}/*{_RECORD}")
-
-
 def _is_newer(page: Path, root: Path, *patterns: str) -> bool:
+    """Return whether a page is newer than all records of some patterns."""
     try:
         made = page.stat().st_mtime_ns
         records = [path for pattern in patterns for path in root.glob(pattern)]
@@ -193,5 +188,5 @@ def make_page(job: PageJob) -> Problem | None:
 
 @cache
 def _cohort(root: Path) -> Cohort:
-    """Read everybody's numbers once per worker."""
+    """Read the numbers of all participants once per worker."""
     return read_cohort(root)

@@ -1,8 +1,11 @@
-"""Worker processes of which any may die without harm to the others.
+"""Worker processes of which any may die without harm to the others. Knows nothing of hemispheres.
 
-The standard library's executors lose every pending job when one worker is killed. Here each
-worker has a pipe of its own: an abort in a mesh library, an out-of-memory kill or a time limit
-costs that worker's job only, and a fresh worker takes its place. Knows nothing of hemispheres.
+Each worker has a pipe of its own: an abort in a mesh library, an out-of-memory kill or a time limit
+costs that worker's job only. The standard library's executors lose every pending job then. Pebble's
+pool (5.2) does not, but its workers share one pipe and one lock, so that a kill at the wrong moment
+stops all; a time limit kills the worker and leaves its helper processes (TetGen); limits follow the
+wall clock, which may be set during a run; nothing ends a busy worker if the parent is killed; and
+its threads forbid forking, so that each worker would load all libraries itself.
 """
 
 import contextlib
@@ -22,10 +25,8 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
-# One thread per process: hemispheres are the unit of parallel work, not matrices.
-
-
-#: Read by the numerical libraries when they load, so they have to be set before.
+#: Read by the numerical libraries when they load, so they have to be set before. One thread per
+#: process: hemispheres are the unit of parallel work, not matrices.
 THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
@@ -33,6 +34,12 @@ THREAD_VARIABLES = (
     "VECLIB_MAXIMUM_THREADS",
     "NUMEXPR_NUM_THREADS",
 )
+
+_PR_SET_PDEATHSIG = 1  # linux/prctl.h
+_OOM_SCORE = "500"  # of -1000 to 1000: if memory runs out, a worker is lost and not the run
+_GRACE = 5.0  # s that an idle worker gets to end by itself
+_START_TIME = 300.0  # s that a worker gets to load its libraries, on a slow network disk
+_STARTS = 3  # a worker that never gets ready is a broken installation, not bad luck
 
 
 def pin_threads() -> None:
@@ -42,13 +49,6 @@ def pin_threads() -> None:
     order. A process without threads can also be forked.
     """
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
-
-
-_PR_SET_PDEATHSIG = 1  # linux/prctl.h
-_FIRST_TO_GO = "500"  # of -1000 to 1000: if memory runs out, a worker is lost and not the run
-_GRACE = 5.0  # s that an idle worker gets to end by itself
-_START_TIME = 300.0  # s that a worker gets to load its libraries, on a slow network disk
-_STARTS = 3  # a worker that never gets ready is a broken installation, not bad luck
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,6 +66,8 @@ class WorkerPlan:
     """Importable function that loads libraries before the clock of the first job starts."""
     environment: tuple[tuple[str, str], ...] = ()
     """Further environment variables."""
+    patience: float | None = None
+    """Seconds that an idle worker waits for a job before it ends; ``None`` is forever."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,21 +80,23 @@ class WorkerLost:
 
     @property
     def cause(self) -> str:
-        """For people: the signal's name or the exit code."""
+        """The signal's name or the exit code, for messages."""
         code = self.exit_code
         if code is None:
             return "its machine or allocation was lost several times"
-        if code is not None and code < 0:
-            with contextlib.suppress(ValueError):
-                return signal.Signals(-code).name
+        with contextlib.suppress(ValueError):
+            return signal.Signals(-code).name
         return f"exit code {code}"
 
 
 @dataclass(eq=False)
 class _Slot:
+    """A worker process, as its parent knows it."""
+
     process: BaseProcess
     connection: Connection
     ready: bool = False
+    """Whether it has loaded everything, which its first message says."""
     job: Any = None
     started: float = field(default_factory=time.monotonic)
 
@@ -101,6 +105,37 @@ class _Slot:
         if not self.ready:
             return self.started + _START_TIME
         return self.started + timeout if self.job is not None else math.inf
+
+    def give(self, job: Any) -> None:  # noqa: ANN401  (jobs are the caller's)
+        """Send a job; ``None`` ends the worker."""
+        self.job, self.started = job, time.monotonic()
+        # A worker that died idle is noticed when it is polled.
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+            self.connection.send(job)
+
+    def lose(self, *, timed_out: bool) -> WorkerLost:
+        """End a worker that died or took too long, and say how it ended."""
+        if not timed_out:
+            # The pipe breaks a moment before the process ends; its exit code tells more than ours.
+            wait([self.process.sentinel], _GRACE)
+        self.kill()
+        seconds = time.monotonic() - self.started
+        return WorkerLost(timed_out=timed_out, exit_code=self.process.exitcode, seconds=seconds)
+
+    def kill_group(self) -> None:
+        """Kill a worker and the helpers it started, which share its process group.
+
+        It must not have been waited for before: until then its number cannot be another's.
+        """
+        with contextlib.suppress(ProcessLookupError, PermissionError, TypeError):
+            os.killpg(self.process.pid, signal.SIGKILL)  # type: ignore[arg-type]  # None: TypeError
+
+    def kill(self) -> None:
+        """End a worker and its helpers, and wait for it."""
+        self.kill_group()
+        self.process.kill()
+        self.process.join()
+        self.connection.close()
 
 
 def run_jobs(plan: WorkerPlan, jobs: Iterable[Any]) -> Generator[tuple[Any, Any]]:
@@ -113,22 +148,21 @@ def run_jobs(plan: WorkerPlan, jobs: Iterable[Any]) -> Generator[tuple[Any, Any]
         while waiting is not None or any(slot.job is not None for slot in slots):
             for slot in slots:
                 if waiting is not None and slot.ready and slot.job is None:
-                    _give(slot, waiting)
+                    slot.give(waiting)
                     waiting = next(queue, None)
             if waiting is not None and len(slots) < plan.n_workers:
                 slots.append(_start(plan))
                 continue
             for slot, message in _poll(slots, plan.timeout):
-                if isinstance(message, _Ready):
-                    slot.ready = True
-                    failed_starts = 0
-                    continue
-                job, slot.job = slot.job, None
                 if isinstance(message, WorkerLost):
                     slots.remove(slot)
                     failed_starts += not slot.ready
                     if failed_starts >= _STARTS:
                         raise RuntimeError(f"worker processes do not start; see {plan.log}")
+                elif not slot.ready:
+                    slot.ready, failed_starts = True, 0
+                    continue
+                job, slot.job = slot.job, None
                 if job is not None:
                     yield job, message
     finally:
@@ -138,42 +172,38 @@ def run_jobs(plan: WorkerPlan, jobs: Iterable[Any]) -> Generator[tuple[Any, Any]
 class Worker:
     """One worker process, for callers that hand out jobs themselves; replaced when it dies."""
 
-    def __init__(self, plan: WorkerPlan, *, patience: float) -> None:
+    def __init__(self, plan: WorkerPlan) -> None:
         self.plan = plan
-        self._patience = patience
         self._slot: _Slot | None = None
 
     def __call__(self, job: Any) -> Any:  # noqa: ANN401  (jobs are the caller's)
         """Do one job."""
         slot = self._ready()
-        _give(slot, job)
-        answer = self._heard(slot)
+        slot.give(job)
+        answer = self._listen(slot)
         slot.job = None
         return answer
 
     def kill(self) -> None:
         """End the process, whatever it is doing; may be called by another thread."""
         slot = self._slot
-        if slot is None:
-            return
-        if slot.job is None:
-            _kill(slot)
-        else:
-            _kill_group(slot)  # who waits for it sees to the rest
+        if slot is not None and slot.job is None:
+            slot.kill()
+        elif slot is not None:
+            slot.kill_group()  # the thread that waits for the answer does the rest
 
     def _ready(self) -> _Slot:
         for _ in range(_STARTS):
             if self._slot is not None and not self._slot.process.is_alive():
-                _kill(self._slot)
+                self._slot.kill()
                 self._slot = None
-            self._slot = self._slot or _start(self.plan, self._patience)
-            slot = self._slot
-            if slot.ready or isinstance(self._heard(slot), _Ready):
+            slot = self._slot = self._slot or _start(self.plan)
+            if slot.ready or not isinstance(self._listen(slot), WorkerLost):
                 slot.ready = True
                 return slot
         raise RuntimeError(f"worker processes do not start; see {self.plan.log}")
 
-    def _heard(self, slot: _Slot) -> Any:  # noqa: ANN401  (jobs are the caller's)
+    def _listen(self, slot: _Slot) -> Any:  # noqa: ANN401  (jobs are the caller's)
         events: list[tuple[_Slot, Any]] = []
         while not events:
             events = _poll([slot], self.plan.timeout)
@@ -181,25 +211,6 @@ class Worker:
         if isinstance(message, WorkerLost):
             self._slot = None
         return message
-
-
-class _Ready:
-    """Message of a worker that has loaded everything."""
-
-
-class _Enough:
-    """Message to a worker that there are no more jobs."""
-
-
-def _give(slot: _Slot, job: Any) -> None:  # noqa: ANN401  (jobs are the caller's)
-    slot.job, slot.started = job, time.monotonic()
-    _tell(slot, job)
-
-
-def _tell(slot: _Slot, message: Any) -> None:  # noqa: ANN401  (jobs are the caller's)
-    # A worker that died idle is noticed when it is polled.
-    with contextlib.suppress(BrokenPipeError, ConnectionResetError):
-        slot.connection.send(message)
 
 
 def _poll(slots: list[_Slot], timeout: float) -> list[tuple[_Slot, Any]]:
@@ -213,35 +224,21 @@ def _poll(slots: list[_Slot], timeout: float) -> list[tuple[_Slot, Any]]:
             try:
                 events.append((slot, slot.connection.recv()))
             except (EOFError, OSError):
-                events.append((slot, _lose(slot, timed_out=False)))
+                events.append((slot, slot.lose(timed_out=False)))
         elif time.monotonic() >= slot.deadline(timeout):
-            events.append((slot, _lose(slot, timed_out=True)))
+            events.append((slot, slot.lose(timed_out=True)))
     return events
 
 
-def _lose(slot: _Slot, *, timed_out: bool) -> WorkerLost:
-    if not timed_out:
-        # The pipe breaks a moment before the process ends; its exit code tells more than ours.
-        wait([slot.process.sentinel], _GRACE)
-    _kill(slot)
-    return WorkerLost(
-        timed_out=timed_out,
-        exit_code=slot.process.exitcode,
-        seconds=time.monotonic() - slot.started,
-    )
-
-
-def _start(plan: WorkerPlan, patience: float | None = None) -> _Slot:
+def _start(plan: WorkerPlan) -> _Slot:
     context = _context()
     if plan.warm_up is not None and context.get_start_method() == "fork":
-        # Once for all workers. What is wrong with it shows again in them, and in the log.
+        # Once for all workers. An error shows again in them, and in the log.
         with contextlib.suppress(Exception):
             plan.warm_up()
     ours, theirs = context.Pipe()
     # Not daemonic: stages may start helper processes of their own.
-    process = context.Process(
-        target=_serve, args=(theirs, plan, os.getpid(), patience), daemon=False
-    )
+    process = context.Process(target=_serve, args=(theirs, plan, os.getpid()), daemon=False)
     with _inherited(plan):
         process.start()
     theirs.close()
@@ -249,7 +246,7 @@ def _start(plan: WorkerPlan, patience: float | None = None) -> _Slot:
 
 
 def _context() -> Any:  # noqa: ANN401  (the contexts have no common type that can start processes)
-    """Fork, so that nothing is loaded twice, unless threads or the system make that unsafe."""
+    """Choose fork, so that nothing is loaded twice, unless threads or the system make it unsafe."""
     with contextlib.suppress(OSError):
         if len(os.listdir("/proc/self/task")) == 1:  # noqa: PTH208  (a count, not paths)
             return multiprocessing.get_context("fork")
@@ -258,7 +255,7 @@ def _context() -> Any:  # noqa: ANN401  (the contexts have no common type that c
 
 @contextlib.contextmanager
 def _inherited(plan: WorkerPlan) -> Iterator[None]:
-    """Set what a new process takes over: one thread each, and no reaction to Ctrl-C.
+    """Set what a new process inherits: one thread per library, and no reaction to Ctrl-C.
 
     The terminal sends Ctrl-C to every process; it is this one that stops the workers.
     """
@@ -279,35 +276,19 @@ def _inherited(plan: WorkerPlan) -> Iterator[None]:
             signal.signal(signal.SIGINT, handler)
 
 
-def _kill(slot: _Slot) -> None:
-    """End a worker and the helpers it started, which share its process group.
-
-    The worker must not have been waited for before: until then its number cannot be another's.
-    """
-    _kill_group(slot)
-    slot.process.kill()
-    slot.process.join()
-    slot.connection.close()
-
-
-def _kill_group(slot: _Slot) -> None:
-    with contextlib.suppress(ProcessLookupError, PermissionError, TypeError):
-        os.killpg(slot.process.pid, signal.SIGKILL)  # type: ignore[arg-type]  # None: TypeError
-
-
 def _stop(slots: list[_Slot]) -> None:
-    """Let idle workers end by themselves, so that they tidy up; then kill all that is left."""
+    """Let idle workers end by themselves, so that they tidy up; then kill the others."""
     idle = [slot for slot in slots if slot.ready and slot.job is None]
     for slot in idle:
-        _tell(slot, _Enough())
+        slot.give(None)
     for slot in idle:
         wait([slot.process.sentinel], _GRACE)
     for slot in slots:
-        _kill(slot)
+        slot.kill()
     slots.clear()
 
 
-def _serve(connection: Connection, plan: WorkerPlan, parent: int, patience: float | None) -> None:
+def _serve(connection: Connection, plan: WorkerPlan, parent: int) -> None:
     """Run in the worker: answer jobs until there are no more, or none comes for too long."""
     _separate(parent)
     _redirect(plan.log)
@@ -316,13 +297,13 @@ def _serve(connection: Connection, plan: WorkerPlan, parent: int, patience: floa
     if plan.warm_up is not None:
         plan.warm_up()
     with threadpool_limits(1):
-        connection.send(_Ready())
-        while connection.poll(patience):
+        connection.send(None)  # ready
+        while connection.poll(plan.patience):
             try:
                 job = connection.recv()
             except EOFError:
                 return
-            if isinstance(job, _Enough):
+            if job is None:
                 return
             connection.send(plan.work(job))
 
@@ -334,7 +315,7 @@ def _separate(parent: int) -> None:
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     if sys.platform == "linux":
         with contextlib.suppress(OSError):
-            Path("/proc/self/oom_score_adj").write_text(_FIRST_TO_GO)
+            Path("/proc/self/oom_score_adj").write_text(_OOM_SCORE)
         with contextlib.suppress(OSError, AttributeError):
             ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent:

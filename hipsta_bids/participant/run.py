@@ -1,13 +1,13 @@
-"""Runs hemispheres side by side, keeps going after a failure, and keeps the books."""
+"""Runs hemispheres side by side, goes on after a failure, and writes the log and ``status.tsv``."""
 
 import contextlib
 import logging
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from os import getpid
 from pathlib import Path
@@ -46,43 +46,46 @@ from hipsta_bids.participant.job import (
 )
 from hipsta_bids.participant.pages import PagePlan, Pages, reports_after
 from hipsta_bids.participant.pool import WorkerLost, WorkerPlan, run_jobs
-from hipsta_bids.protocols.protocol import Protocol
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Status
 
-# The books of a run: rows of ``status.tsv`` and a log file, right at any moment.
-
+WORKER_GB = 0.6
+"""Memory that one worker may need, GB: 500 MB for a hemisphere, and its helper process."""
 
 _LOG_FORMAT = "%(asctime)s %(levelname)s %(message)s"
 _CHEAP_WRITE = 0.1  # s; quicker writes are never put off
 _LOGGER = logging.getLogger(__name__)
 
 
-class Books:
-    """The table and the log, written as hemispheres end."""
+class StatusTable:
+    """``status.tsv`` as a view of the quality records, right at any moment of a run.
+
+    It adds what records do not have: what a run has not come to, and times and memory, which would
+    make records differ from run to run. A row that agrees with its record is kept for these.
+    """
 
     def __init__(self, root: Path, shard: str | None = None) -> None:
         self._root, self._shard = root, shard
-        rows = read_table(root / table_path(shard))
-        self._known = {row_key(row): row.get("status") for row in rows}
-        self._pending: list[dict[str, str]] = []
+        own = {row_key(row): row for row in read_table(root / table_path(shard))}
+        # The table of the whole dataset takes up those of its parts.
+        rows = own.values() if shard else read_status(root)
+        self._known = {row_key(row): row for row in rows}
+        self._pending = {key: row for key, row in self._known.items() if row != own.get(key)}
         self._next_write = 0.0
 
     def expect(self, jobs: Sequence[Job]) -> None:
         """Make the table right for the case that this process ends at any moment from here on."""
-        for row in map(status_row, map(not_finished, jobs)):
-            self._pending.append(row)
-            self._known[row_key(row)] = row["status"]
+        self._pending |= {row_key(row): row for row in map(status_row, map(not_finished, jobs))}
+        self._known |= self._pending
         self.close()
 
-    def enter(self, outcome: Outcome) -> None:
-        """Write one outcome to the log and to the table."""
-        _log(outcome)
+    def add(self, outcome: Outcome) -> None:
+        """Take in one outcome."""
         row = status_row(outcome)
-        # Rows that are there already also have the times, which the quality record has not.
-        if outcome.skipped and self._known.get(row_key(row)) == row["status"]:
+        known = self._known.get(row_key(row), {})
+        if outcome.seconds is None and all(known.get(cell) == row[cell] for cell in RECORDED):
             return
-        self._pending.append(row)
+        self._pending[row_key(row)] = row
         try:
             if time.monotonic() >= self._next_write:
                 self.close()
@@ -91,29 +94,25 @@ class Books:
                 raise
             # The hemisphere's own error says more, and ends the run; the table keeps the row that
             # calls it not finished.
-            self._pending = []
+            self._pending = {}
 
     def close(self) -> None:
         """Write what has not been written yet."""
         if not self._pending:
             return
         start = time.monotonic()
-        update_status(self._root, self._pending, shard=self._shard)
-        self._pending = []
+        update_status(self._root, self._pending.values(), shard=self._shard)
+        self._pending = {}
         cost = time.monotonic() - start
         # Tables of many thousand rows may take a twentieth of the time, not more.
-        wait = 0.0 if cost < _CHEAP_WRITE else 20 * cost
-        self._next_write = time.monotonic() + wait
+        self._next_write = time.monotonic() + (0.0 if cost < _CHEAP_WRITE else 20 * cost)
 
 
 def not_finished(job: Job) -> Outcome:
-    """Say of a hemisphere that no run has come to its end with it."""
-    error = HipstaError(
-        "the run ended before this hemisphere; run the same command again", reason=NOT_FINISHED
-    )
-    return Outcome(
-        job=job, status=Status.FAILED, reason=error.reason, message=str(error), error=error
-    )
+    """Outcome of a hemisphere that no run has finished."""
+    message = "the run ended before this hemisphere; run the same command again"
+    error = HipstaError(message, reason=NOT_FINISHED)
+    return Outcome(job=job, status=Status.FAILED, reason=error.reason, message=message, error=error)
 
 
 def _log(outcome: Outcome) -> None:
@@ -131,7 +130,7 @@ def _log(outcome: Outcome) -> None:
 
 
 def status_row(outcome: Outcome) -> dict[str, str]:
-    """Spell one row of ``status.tsv``."""
+    """Row of ``status.tsv``."""
     measured = {
         "seconds": outcome.seconds,
         "cpu_seconds": outcome.cpu_seconds,
@@ -188,10 +187,6 @@ class _QuietHandler(logging.FileHandler):
         del record
 
 
-WORKER_GB = 0.6
-"""Memory that one worker may need, GB: 500 MB for a hemisphere, and its helper process."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class RunOptions:
     """What never changes a result."""
@@ -237,10 +232,9 @@ class RunResult:
 
     @property
     def exit_code(self) -> ExitCode:
-        """The gravest of what happened.
+        """The gravest of what happened: a disk that is full, a bug, bad data, failed hemispheres.
 
-        A disk that cannot be written outranks a bug, a bug outranks failed hemispheres. When
-        every hemisphere failed because of its input, the data are to blame.
+        The data are to blame if every hemisphere failed because of its input.
         """
         failed = [outcome for outcome in self.outcomes if outcome.status == Status.FAILED]
         if any(isinstance(outcome.error, OutputError) for outcome in failed):
@@ -292,22 +286,55 @@ def run_participants(
     UsageError
         If it is a dataset of other software.
     """
-    jobs = prepare(items, out_dir, settings, options)
+    return _run(items, out_dir, settings, options, report=report, outcomes_of=_measured)
+
+
+def collect(
+    items: Sequence[HemisphereInput], out_dir: Path, settings: Settings, options: RunOptions
+) -> RunResult:
+    """Bring together what runs of parts of a dataset have done; measures nothing.
+
+    ``status.tsv`` gets a row for each hemisphere, from its quality record, with times from the
+    tables of the runs. Pages that are missing are made, and that of all hemispheres.
+    """
+    options = replace(options, stop_on_first_crash=False)
+    return _run(items, out_dir, settings, options, report=lambda _: None, outcomes_of=_collected)
+
+
+def _run(
+    items: Sequence[HemisphereInput],
+    out_dir: Path,
+    settings: Settings,
+    options: RunOptions,
+    *,
+    report: Callable[[Outcome], None],
+    outcomes_of: Callable[[list[Job], StatusTable, RunOptions, Path], Generator[Outcome]],
+) -> RunResult:
+    """Log, report and tabulate outcomes as they come, then make the pages."""
+    jobs = _prepare(items, out_dir, settings, options)
     shard = None if options.shard is None else options.shard.name
+    outcomes: list[Outcome] = []
     with log_file(out_dir, options.verbosity, shard) as log:
         _LOGGER.info("hipsta_bids %s, %d hemispheres", __version__, len(jobs))
         if options.command:
             _LOGGER.info("command: %s", options.command)
-        books = Books(out_dir, shard)
-        pages = Pages()
+        table = StatusTable(out_dir, shard)
         # Closed at once, whatever ends the loop, so that no worker outlives it.
         with (
-            pages_after(jobs, out_dir, options, log, pages),
-            contextlib.closing(books),
-            contextlib.closing(_outcomes(jobs, books, options, log)) as found,
+            _pages_after(jobs, out_dir, options, log) as pages,
+            contextlib.closing(table),
+            contextlib.closing(outcomes_of(jobs, table, options, log)) as found,
         ):
-            outcomes = _run(found, books, options, report)
-            pages.wanted = not any(isinstance(one.error, OutputError) for one in outcomes)
+            for outcome in found:
+                _log(outcome)
+                table.add(outcome)
+                outcomes.append(outcome)
+                report(outcome)
+                if isinstance(outcome.error, OutputError):
+                    pages.wanted = False
+                    break  # the next one would fail just so
+                if options.stop_on_first_crash and outcome.status == Status.FAILED:
+                    break
         result = RunResult(
             outcomes=tuple(outcomes),
             n_requested=len(jobs),
@@ -318,14 +345,16 @@ def run_participants(
     return result
 
 
-def prepare(
+def _prepare(
     items: Sequence[HemisphereInput], out_dir: Path, settings: Settings, options: RunOptions
 ) -> list[Job]:
-    """Write what describes the dataset as a whole, and say what is to be done.
-
-    Parameters, and what is raised, are those of :func:`run_participants`.
-    """
-    sources = _source_names(items)
+    """Write what describes the dataset as a whole, and list what is to be done."""
+    origins = [(item.source, item.source_path) for item in items]
+    origins += [(edit.source, edit.source_path) for item in items for edit in item.edits]
+    origins += [("bids", m.source_path) for item in items for m in item.maps if m.source_path]
+    sources = dataset.source_names(origins)
+    both = [p for item in items for p in (item.protocol, item.parts_protocol) if p is not None]
+    protocols = {protocol.name: protocol for protocol in both}
     dataset.check_own_dataset(out_dir)
     files.check_writable(out_dir)
     with locked(out_dir, DATASET) as alone:
@@ -334,12 +363,21 @@ def prepare(
         digest = dataset.settle_settings(out_dir, settings)
         dataset.write_description(out_dir, sources)
         if options.shard is None or not (out_dir / DATASET_FILES["citation"]).exists():
-            dataset.write_citation(out_dir, settings, _protocols(items))
+            dataset.write_citation(out_dir, settings, [protocols[k] for k in sorted(protocols)])
         write_sidecar(out_dir)
     return [
         Job(
             item=item,
-            place=ResultPlace(root=out_dir, name=hemisphere_name(item, settings)),
+            place=ResultPlace(
+                root=out_dir,
+                name=HemisphereName(
+                    subject=item.subject,
+                    session=item.session,
+                    hemi=item.hemi,
+                    seg=item.protocol.name,
+                    region=settings.body.region,
+                ),
+            ),
             settings=settings,
             settings_hash=digest,
             sources=tuple(sources.items()),
@@ -350,31 +388,12 @@ def prepare(
     ]
 
 
-def _run(
-    outcomes: Iterable[Outcome],
-    books: Books,
-    options: RunOptions,
-    report: Callable[[Outcome], None],
-) -> list[Outcome]:
-    """Book and report outcomes as they come, until all are there or one ends the run."""
-    kept = []
-    for outcome in outcomes:
-        books.enter(outcome)
-        kept.append(outcome)
-        report(outcome)
-        if isinstance(outcome.error, OutputError):
-            break  # the next one would fail just so
-        if options.stop_on_first_crash and outcome.status == Status.FAILED:
-            break
-    return kept
-
-
-def pages_after(
-    jobs: Sequence[Job], out_dir: Path, options: RunOptions, log: Path, pages: Pages
-) -> AbstractContextManager[None]:
+def _pages_after(
+    jobs: Sequence[Job], out_dir: Path, options: RunOptions, log: Path
+) -> AbstractContextManager[Pages]:
     """Make pages when a block ends, if they are wanted; that of all if this is no part."""
     if not options.reports:
-        return contextlib.nullcontext()
+        return contextlib.nullcontext(Pages())
     visits = [(job.place.name.subject, job.place.name.session) for job in jobs]
     plan = PagePlan(
         root=out_dir,
@@ -383,30 +402,25 @@ def pages_after(
         cohort=options.shard is None,
         cluster=options.cluster,
     )
-    return reports_after(plan, visits, pages)
-
-
-def hemisphere_name(item: HemisphereInput, settings: Settings) -> HemisphereName:
-    """Name the results of one input."""
-    return HemisphereName(
-        subject=item.subject,
-        session=item.session,
-        hemi=item.hemi,
-        seg=item.protocol.name,
-        region=settings.body.region,
-    )
+    return reports_after(plan, visits)
 
 
 def n_workers(options: RunOptions, n_jobs: int) -> int:
-    """How many workers the limits on processes and memory allow, at least one."""
+    """Return how many workers the limits on processes and memory allow, at least one."""
     by_memory = math.inf if options.mem_gb is None else options.mem_gb // WORKER_GB
     return int(max(1, min(options.n_procs, by_memory, n_jobs)))
 
 
-def _outcomes(
-    jobs: Sequence[Job], books: Books, options: RunOptions, log: Path
+def _collected(jobs: list[Job], *_: object) -> Generator[Outcome]:
+    """Read the outcomes of all hemispheres from their records."""
+    for job in jobs:
+        yield recorded(job) or not_finished(job)
+
+
+def _measured(
+    jobs: list[Job], table: StatusTable, options: RunOptions, log: Path
 ) -> Generator[Outcome]:
-    """Give the outcomes of all hemispheres: first what is done already, then the others."""
+    """Return the outcomes of all hemispheres: first what is done already, then the others."""
     todo = []
     for job in jobs:
         earlier = finished(job)
@@ -414,12 +428,19 @@ def _outcomes(
             todo.append(job)
         else:
             yield earlier
-    books.expect(todo)
+    table.expect(todo)
     for job in todo:
         if job.item.problem is not None:
             yield fail(job, job.item.problem)
     able = [job for job in todo if job.item.problem is None]
-    plan = _plan(options, len(able), log)
+    plan = WorkerPlan(
+        work=run_job,
+        n_workers=n_workers(options, len(able)),
+        timeout=options.timeout,
+        log=log,
+        warm_up=warm_up,
+        environment=() if options.work_dir is None else (("TMPDIR", str(options.work_dir)),),
+    )
     if options.cluster is None or not able:
         pool = run_jobs(plan, able)
     else:
@@ -443,20 +464,8 @@ def _remove_unfinished(job: Job) -> None:
                 hemisphere.remove_results(job.place)
 
 
-def _plan(options: RunOptions, n_jobs: int, log: Path) -> WorkerPlan:
-    scratch = () if options.work_dir is None else (("TMPDIR", str(options.work_dir)),)
-    return WorkerPlan(
-        work=run_job,
-        n_workers=n_workers(options, n_jobs),
-        timeout=options.timeout,
-        log=log,
-        warm_up=warm_up,
-        environment=scratch,
-    )
-
-
 def _lost(job: Job, loss: WorkerLost, options: RunOptions) -> Outcome:
-    """Turn the loss of a worker into a failure of its hemisphere."""
+    """Outcome of a hemisphere whose worker was lost."""
     if loss.timed_out:
         error = HipstaError(
             f"not done within {options.timeout:g} s; look at the segmentation, or raise --timeout",
@@ -471,51 +480,3 @@ def _lost(job: Job, loss: WorkerLost, options: RunOptions) -> Outcome:
     # Another run may have been at it, and for that one it may have gone well.
     with locked(job.place.root, job.title):
         return finished(job) or fail(job, error, seconds=loss.seconds)
-
-
-def _source_names(items: Sequence[HemisphereInput]) -> dict[str, Path]:
-    """Name the datasets that inputs come from."""
-    origins = [(item.source, item.source_path) for item in items]
-    origins += [(edit.source, edit.source_path) for item in items for edit in item.edits]
-    origins += [("bids", m.source_path) for item in items for m in item.maps if m.source_path]
-    return dataset.source_names(origins)
-
-
-def _protocols(items: Sequence[HemisphereInput]) -> list[Protocol]:
-    """List the protocols in use, each once."""
-    found = {}
-    for item in items:
-        for protocol in (item.protocol, item.parts_protocol):
-            if protocol is not None:
-                found[protocol.name] = protocol
-    return [found[name] for name in sorted(found)]
-
-
-# Brings together what runs side by side have done, each with a part of the dataset.
-
-
-def collect(
-    items: Sequence[HemisphereInput], out_dir: Path, settings: Settings, options: RunOptions
-) -> RunResult:
-    """Make ``status.tsv`` complete: a row for each hemisphere, from its quality record.
-
-    Nothing is measured. Times come from the tables of the runs. Pages that are missing are made,
-    and that of all hemispheres.
-    """
-    jobs = prepare(items, out_dir, settings, options)
-    outcomes = tuple(recorded(job) or not_finished(job) for job in jobs)
-    rows = {row_key(row): row for row in read_status(out_dir)}
-    for row in map(status_row, outcomes):
-        known = rows.get(row_key(row), {})
-        if any(known.get(key) != row[key] for key in RECORDED):
-            rows[row_key(row)] = row
-    update_status(out_dir, rows.values())
-    with log_file(out_dir, options.verbosity) as log:
-        pages = Pages()
-        with pages_after(jobs, out_dir, options, log, pages):
-            pass
-        result = RunResult(
-            outcomes=outcomes, n_requested=len(jobs), log=log, page_problems=tuple(pages.problems)
-        )
-        _LOGGER.info("collected: %s, exit code %d", dict(result.counts), result.exit_code)
-    return result

@@ -10,7 +10,8 @@ from stand_ins import make_input, stand_in_job
 
 from hipsta_bids import __version__
 from hipsta_bids.cli import main
-from hipsta_bids.cli.participant import EPILOG, build_parser
+from hipsta_bids.cli.main import EPILOG
+from hipsta_bids.cli.participant import build_parser
 from hipsta_bids.errors import ExitCode, NothingToDoError
 from hipsta_bids.inputs import search
 from hipsta_bids.inputs.request import InputRequest
@@ -76,6 +77,20 @@ def test_installed_command_runs():
     command = Path(sys.executable).with_name("hipsta-bids")
     done = subprocess.run([command, "--version"], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (0, f"hipsta_bids {__version__}\n")
+
+
+def test_the_package_is_a_command():
+    done = python("-m", "hipsta_bids.cli", "--version")
+    assert (done.returncode, done.stdout) == (0, f"hipsta_bids {__version__}\n")
+
+
+@pytest.mark.parametrize("command", main.COMMANDS)
+def test_every_command_has_help_and_is_loaded_by_its_name(command, capsys):
+    with pytest.raises(SystemExit) as end:
+        main.main([command, "--help"])
+    assert end.value.code == 0
+    assert "usage: hipsta-bids" in capsys.readouterr().out
+    assert f"hipsta-bids {command}" in EPILOG or f"also: {command}" in EPILOG
 
 
 def test_defaults(seen, tmp_path):
@@ -151,6 +166,9 @@ def test_everything_reaches_its_place(seen, tmp_path):
         ("--skip_bids_validation", "skip_bids_validation", True),
         ("--edited_dir e", "edited_dir", Path("e")),
         ("--bids_filter_file j", "bids_filter_file", Path("j")),
+        ("--protocol p_1.toml", "scheme", Path("p_1.toml")),
+        ("--work_dir=a_b", "work_dir", Path("a_b")),
+        ("--participant-label 01 --participant_label 02", "participant_label", ["01", "02"]),
     ],
 )
 def test_spellings_of_other_bids_apps(alias, field, value):
@@ -176,10 +194,10 @@ def test_spellings_of_other_bids_apps(alias, field, value):
         ("in out participant --forc", "unrecognized arguments: --forc"),
         ("in in participant", "the output folder is the BIDS dataset itself"),
         ("in out participant --settings none.toml", "settings cannot be read"),
-        ("schemes x", "schemes takes no arguments"),
-        ("settings x", "settings takes no arguments"),
-        ("demo", "demo takes one folder"),
-        ("demo-data a b", "demo-data takes one folder"),
+        ("protocols x", "unrecognized arguments: x (see hipsta-bids protocols --help)"),
+        ("settings x", "argument level: invalid choice: 'x'"),
+        ("demo", "the following arguments are required: DIR"),
+        ("demo-data a b", "unrecognized arguments: b"),
     ],
 )
 @pytest.mark.usefixtures("seen")
@@ -315,8 +333,9 @@ def test_settings_print_as_toml(capsys, tmp_path):
     assert load_settings(path) == Settings()
 
 
-def test_schemes_are_listed(capsys):
-    assert main.main(["schemes"]) == 0
+@pytest.mark.parametrize("command", ["schemes", "protocols"])
+def test_protocols_are_listed(command, capsys):
+    assert main.main([command]) == 0
     said = capsys.readouterr().out
     assert "freesurferCA" in said
     assert "ashsUtrecht7T" in said

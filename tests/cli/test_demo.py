@@ -9,7 +9,7 @@ import pytest
 from nilearn.surface import load_surf_data, load_surf_mesh
 
 from hipsta_bids.cli import main
-from hipsta_bids.cli.phantom import compare_with_truth
+from hipsta_bids.cli.commands import compare_with_truth
 from hipsta_bids.derivatives.names import OUTPUTS, HemisphereName, output_path
 from hipsta_bids.errors import ExitCode
 

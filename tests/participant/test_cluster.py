@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from pool_jobs import work
 
-from hipsta_bids.cli.participant import build_parser, join_slurm
+from hipsta_bids.cli.participant import build_parser
 from hipsta_bids.errors import UsageError
 from hipsta_bids.participant import cluster
 from hipsta_bids.participant.cluster import Cluster, check_cluster, run_on_cluster
@@ -80,7 +80,7 @@ def test_jobs_on_dask_end_as_in_the_pool(tmp_path):
 
 def test_a_single_worker_is_replaced_when_it_has_died_or_waited_for_too_long(tmp_path):
     worker = Worker(
-        WorkerPlan(work=work, n_workers=1, timeout=30.0, log=tmp_path / "log"), patience=0.2
+        WorkerPlan(work=work, n_workers=1, timeout=30.0, log=tmp_path / "log", patience=0.2)
     )
     assert worker("square 3") == 9
     first = worker._slot.process
@@ -121,5 +121,5 @@ def test_what_slurm_refuses_is_told(tmp_path, monkeypatch):
 @pytest.mark.parametrize("options", ["-p short", "--time=1:00", "-p short --mem=2G", "-pshort"])
 def test_options_of_sbatch_may_begin_with_dashes(options):
     arguments = ["in", "out", "participant", "--slurm", options, "--n-procs", "3"]
-    parsed = build_parser().parse_args(join_slurm(arguments))
+    parsed = build_parser().parse_args(arguments)
     assert (parsed.slurm, parsed.n_procs) == (options, 3)

@@ -116,7 +116,8 @@ def data_files(out):
     return found, rows
 
 
-def test_parts_collected_are_as_if_one_run_had_done_all(command, tmp_path, capsys):
+@pytest.mark.parametrize("last", ["collect", "participant"])
+def test_parts_collected_are_as_if_one_run_had_done_all(last, command, tmp_path, capsys):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     assert command("whole", "participant") == ExitCode.SOME_FAILED
     codes = [command("parts", "participant", "--shard", f"{k}/4") for k in (3, 1, 4, 2)]
@@ -126,7 +127,7 @@ def test_parts_collected_are_as_if_one_run_had_done_all(command, tmp_path, capsy
     assert len(list((parts / "logs").glob("run-*_shard-*of4.log"))) == 4
     assert data_files(parts) == data_files(whole)  # the tables of the parts are read as one
     capsys.readouterr()
-    assert command("parts", "collect") == ExitCode.SOME_FAILED
+    assert command("parts", last) == ExitCode.SOME_FAILED
     assert "5 hemispheres: 1 failed, 1 flagged, 3 ok" in capsys.readouterr().out
     assert data_files(parts) == data_files(whole)
     rows = read_table(parts / "status.tsv")

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from hipsta_bids.cli import main
-from hipsta_bids.cli.phantom import PHANTOM_EPILOG
+from hipsta_bids.cli.commands import PHANTOM_EPILOG
 from hipsta_bids.errors import ExitCode, UsageError
 from hipsta_bids.inputs.request import InputRequest
 from hipsta_bids.inputs.search import find_hemispheres

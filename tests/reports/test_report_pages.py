@@ -187,10 +187,10 @@ def test_a_page_that_cannot_be_made_is_a_warning(copy, monkeypatch):
     assert problem.message == "sub-01.html: not made (ZeroDivisionError: division by zero)"
 
 
-def run_block(root, error=None, **changes):
+def run_block(root, error=None, *, wanted=True):
     plan = reporting.PagePlan(root=root, n_workers=1, log=root / "log")
-    pages = reporting.Pages(**changes)
-    with reporting.reports_after(plan, [("01", None)], pages):
+    with reporting.reports_after(plan, [("01", None)]) as pages:
+        pages.wanted = wanted
         if error:
             raise error
     return pages.problems

@@ -2,7 +2,7 @@
 
 import pytest
 
-from hipsta_bids.cli.phantom import validate_parser
+from hipsta_bids.cli.commands import validate_parser
 from hipsta_bids.validation import group
 from hipsta_bids.validation.group import SimulationResult
 

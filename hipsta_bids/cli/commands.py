@@ -1,0 +1,272 @@
+"""The other commands: protocols, settings, the demonstration, phantoms, and checks of accuracy."""
+
+import argparse
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from hipsta_bids.cli.console import echo, echo_table, warn
+from hipsta_bids.cli.parser import Parser, adder, from_namespace
+from hipsta_bids.cli.participant import (
+    LEVELS,
+    add_segmentations,
+    add_selection,
+    build_parser,
+    check_folders,
+    check_output_is_no_input,
+    input_request,
+    run_participant_level,
+)
+from hipsta_bids.errors import ExitCode
+
+_DEMO_PROTOCOL = "freesurfer"  # the layout that the demo dataset has
+
+PHANTOM_EPILOG = """\
+regions: presubiculum, subiculum, CA1, CA2-3 or all, alone or with -anterior or -posterior
+
+what is written:
+  derivatives/LAYOUT/       segmentations, for the participant level
+  participants.tsv          group, age, sex, intracranial volume, site
+  phantom_truth.tsv         true thickness, extents, areas and volume of each hemisphere
+                            and region
+  phantom_maps/             true maps of each hemisphere
+  phantom_effect.tsv        where the effect was planted, and how large it is
+"""
+
+
+def phantom_parser() -> Parser:
+    """Describe ``hipsta-bids phantom``."""
+    parser = Parser(
+        prog="hipsta-bids phantom",
+        description="write a synthetic BIDS dataset of hippocampal bodies with known truth",
+        epilog=PHANTOM_EPILOG,
+    )
+    add = adder(parser)
+    parser.add_argument(
+        "out", type=Path, metavar="OUT", help="new folder, or one of phantoms to replace"
+    )
+    add(
+        "--layout",
+        "NAME",
+        "freesurfer (default), ashs (the atlas ABC-3T) or ashsPMC",
+        default="freesurfer",
+    )
+    add("--n-subjects", "N", "in all groups (default: 20)", default=20)
+    add(
+        "--groups",
+        "NAME",
+        "the first has no effect, the second has it once, the third twice"
+        " (default: control patient)",
+        nargs="+",
+        default=["control", "patient"],
+    )
+    add(
+        "--thinning",
+        "MM",
+        "planted effect: by how much the wall is thinner in the region (default: 0.3)",
+        default=0.3,
+    )
+    add("--region", "NAME", "where (default: CA1-anterior), see below", default="CA1-anterior")
+    add(
+        "--shift",
+        "MM",
+        "planted shift along x, to lateral, of the wall's pattern and subfields (default: 0)",
+        default=0.0,
+    )
+    add("--kind", "", "slab, arc, spiral (default), s-shape or tight", default="spiral")
+    add(
+        "--cortex",
+        "MM",
+        "neighboring cortex beside the subiculum, for --region extended and entorhinal"
+        " of the participant level; needs a layout of ASHS (default: 0)",
+        default=0.0,
+    )
+    add("--thickness", "MM", "cohort mean (default: 1.8)", default=1.8)
+    add(
+        "--voxel-size",
+        "MM",
+        "left-right, superior-inferior, anterior-posterior (default: 0.4 0.4 0.4)",
+        nargs=3,
+        type=float,
+        default=[0.4, 0.4, 0.4],
+    )
+    add("--seed", "", "the same seed gives the same files (default: 0)", default=0)
+    return parser
+
+
+def surrogate_parser() -> Parser:
+    """Describe ``hipsta-bids surrogate``."""
+    parser = Parser(
+        prog="hipsta-bids surrogate",
+        description="measure thickness in single slices, without a mesh, and compare it with"
+        " the\nsheet if OUT_DIR has one",
+        epilog="exit codes are those of the participant level; the setting surrogate.positions"
+        " says\nwhich slices are taken (default: the middle of the body)",
+    )
+    parser.add_argument("bids_dir", type=Path, metavar="BIDS_DIR", help="a BIDS dataset")
+    parser.add_argument(
+        "output_dir", type=Path, metavar="OUT_DIR", help="the output dataset, new or with results"
+    )
+    add_selection(parser)
+    add_segmentations(parser)
+    adder(parser)("--settings", "FILE.toml", "those of the results in OUT_DIR")
+    return parser
+
+
+def validate_parser() -> Parser:
+    """Describe ``hipsta-bids validate``."""
+    parser = Parser(
+        prog="hipsta-bids validate",
+        description="measure phantoms with known truth; write tables and figures",
+        epilog="the exit code is 0 whether or not targets are met: the report says which are",
+    )
+    add = adder(parser)
+    add("--full", "", "all cases, minutes instead of a quick selection")
+    add(
+        "--out", "DIR", "folder for validation.md and images/ (default: docs)", default=Path("docs")
+    )
+    add("--suite", "NAME", "only these suites", nargs="+", default=[])
+    add(
+        "--group",
+        "",
+        "only the group level: simulated cohorts",
+        action="append_const",
+        dest="suite",
+        const="group",
+    )
+    add(
+        "--labels",
+        "BIDS_DIR",
+        "a dataset with fine segmentations, to be measured in thick slices as well",
+        type=Path,
+    )
+    return parser
+
+
+def list_protocols(arguments: Sequence[str]) -> ExitCode:
+    """List the protocols that are known."""
+    Parser("hipsta-bids protocols", "list the segmentation protocols").parse_args(arguments)
+    from hipsta_bids.protocols.load import protocol_table  # noqa: PLC0415  (heavy)
+
+    echo_table(protocol_table())
+    return ExitCode.OK
+
+
+def print_settings(arguments: Sequence[str]) -> ExitCode:
+    """Print the default settings of a level as TOML."""
+    parser = Parser("hipsta-bids settings", "print all settings with their meaning, as TOML")
+    parser.add_argument("level", nargs="?", choices=["group"], help="whose settings")
+    group = parser.parse_args(arguments).level == "group"
+    from hipsta_bids.group.settings import GroupSettings  # noqa: PLC0415  (start-up time)
+    from hipsta_bids.protocols.toml import settings_toml  # noqa: PLC0415  (start-up time)
+    from hipsta_bids.settings import Settings  # noqa: PLC0415  (start-up time)
+
+    echo(settings_toml(GroupSettings() if group else Settings()).rstrip())
+    return ExitCode.OK
+
+
+def write_demo_data(arguments: Sequence[str]) -> ExitCode:
+    """Write the demo dataset."""
+    folder = _demo_folder("demo-data", "write a synthetic dataset with known thickness", arguments)
+    _write_demo(folder)
+    echo(f"demo dataset: {folder}")
+    return ExitCode.OK
+
+
+def run_demo(arguments: Sequence[str]) -> ExitCode:
+    """Write the demo dataset, run on it, and print true beside measured thickness."""
+    text = "write a synthetic dataset, run on it, and compare with the truth"
+    folder = _demo_folder("demo", text, arguments)
+    data, out = folder / "bids", folder / "out"
+    _write_demo(data)
+    code = run_participant_level(build_parser().parse_args([str(data), str(out), LEVELS[0]]))
+    for line in compare_with_truth(data, out):
+        echo(line)
+    return code
+
+
+def _demo_folder(command: str, text: str, arguments: Sequence[str]) -> Path:
+    parser = Parser(f"hipsta-bids {command}", text)
+    parser.add_argument("folder", type=Path, metavar="DIR", help="new folder, or one of a demo")
+    folder: Path = parser.parse_args(arguments).folder
+    return folder
+
+
+def _write_demo(folder: Path) -> None:
+    """Write the demo dataset, never into a folder that holds something else."""
+    from hipsta_bids.phantom import refuse_taken, write_demo_dataset  # noqa: PLC0415  (heavy)
+
+    refuse_taken(folder, "a demo dataset")
+    write_demo_dataset(folder)
+
+
+def compare_with_truth(data: Path, out: Path) -> Iterator[str]:
+    """Compare measured with true mean thickness, one line per hemisphere."""
+    from hipsta_bids.derivatives.names import HemisphereName, output_path  # noqa: PLC0415  (heavy)
+    from hipsta_bids.derivatives.status import identity, read_status, row_key  # noqa: PLC0415  (heavy)
+    from hipsta_bids.io import files  # noqa: PLC0415  (heavy)
+    from hipsta_bids.phantom import TRUTH_TABLE  # noqa: PLC0415  (heavy)
+
+    ended = {row_key(row): row for row in read_status(out)}
+    for row in files.read_tsv(data / TRUTH_TABLE):
+        subject = row["subject"].removeprefix("sub-")
+        name = HemisphereName(subject=subject, session=None, hemi=row["hemi"], seg=_DEMO_PROTOCOL)
+        title = f"{row['subject']} {row['hemi']} ({row['kind']})"
+        status = ended.get(row_key(identity(name)), {}).get("status", "not run")
+        true = float(row["thickness_mean"])
+        summary = out / output_path(name, "summary")
+        if not summary.exists():
+            yield f"{title}: true mean thickness {true:.3f} mm, not measured ({status})"
+            continue
+        (values,) = files.read_tsv(summary)
+        measured = float(values["thickness_mean"])
+        yield (
+            f"{title}: true mean thickness {true:.3f} mm, measured {measured:.3f} mm,"
+            f" difference {measured - true:+.3f} mm ({status})"
+        )
+
+
+def write_phantoms(arguments: Sequence[str]) -> ExitCode:
+    """Write a cohort of phantoms."""
+    options = phantom_parser().parse_args(arguments)
+    from hipsta_bids.phantom.cohort import CohortPlan, write_cohort  # noqa: PLC0415  (heavy)
+
+    plan = from_namespace(CohortPlan, options)
+    write_cohort(options.out, plan, layout=options.layout, voxel_size=tuple(options.voxel_size))
+    echo(f"synthetic dataset of {plan.n_subjects} subjects: {options.out}")
+    return ExitCode.OK
+
+
+def run_surrogate(arguments: Sequence[str]) -> ExitCode:
+    """Measure thickness in single slices."""
+    given = surrogate_parser().parse_args(arguments)
+    # Options of the participant level that this command lacks have their defaults.
+    defaults = build_parser().parse_args([str(given.bids_dir), str(given.output_dir), LEVELS[0]])
+    options = argparse.Namespace(**vars(defaults) | vars(given))
+    check_folders(options)
+    from hipsta_bids.settings import load_settings  # noqa: PLC0415  (start-up time)
+
+    settings = load_settings(options.settings)
+    from hipsta_bids.inputs.search import dataset_notes, find_inputs, selection_table  # noqa: PLC0415  (heavy)
+    from hipsta_bids.validation.slice_thickness import crosscheck  # noqa: PLC0415  (heavy)
+
+    request = input_request(options)
+    found = find_inputs(request)
+    for note in (*dataset_notes(request, found.items), *found.notes):
+        echo(f"note: {note}")
+    if options.dry_run:
+        echo_table(selection_table(found.items))
+        return ExitCode.OK
+    check_output_is_no_input(options.output_dir, found.items)
+    return crosscheck(found.items, options.output_dir, settings, echo, warn)
+
+
+def run_validation(arguments: Sequence[str]) -> ExitCode:
+    """Run the validation suites and write their report."""
+    options = validate_parser().parse_args(arguments)
+    from hipsta_bids.validation.report import PAGE, validate  # noqa: PLC0415  (heavy)
+
+    missed = validate(
+        options.out, full=options.full, names=options.suite, labels=options.labels, report=echo
+    )
+    echo(f"targets missed: {missed}; report: {options.out / PAGE}")
+    return ExitCode.OK

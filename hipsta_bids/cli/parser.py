@@ -1,0 +1,146 @@
+"""The parser of every command, and the way from its options to a dataclass."""
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
+
+from hipsta_bids.errors import UsageError
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+    Request = TypeVar("Request", bound=DataclassInstance)
+
+#: Values that are paths, by what they are called in the help.
+_PATHS = ("DIR", "FILE", "FILE.tsv", "FILE.toml", "FILE.json")
+
+
+class Parser(argparse.ArgumentParser):
+    """Accepts underscores for hyphens in options; raises instead of exiting."""
+
+    def __init__(self, prog: str, description: str, **options: Any) -> None:  # noqa: ANN401  (argparse's)
+        super().__init__(
+            prog=prog,
+            description=description,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            allow_abbrev=False,
+            **options,
+        )
+
+    def parse_known_args(self, args: Sequence[str], namespace: Any = None) -> Any:  # type: ignore[override]  # noqa: ANN401  (as in argparse, but without its overloads)
+        """Parse options in either spelling; the value of ``--slurm`` may begin with a dash."""
+        spelled: list[str] = []
+        for text in args:
+            name, equals, value = text.partition("=")
+            if spelled and spelled[-1] == "--slurm":
+                spelled[-1] += f"={text}"
+            elif text.startswith("--"):
+                spelled.append(name.replace("_", "-") + equals + value)
+            else:
+                spelled.append(text)
+        return super().parse_known_args(spelled, namespace)
+
+    def error(self, message: str) -> NoReturn:
+        """Turn argparse's message into the package's own error."""
+        raise UsageError(f"{message} (see {self.prog} --help)", reason="usage")
+
+
+def adder(group: argparse._ActionsContainer) -> Callable[..., None]:
+    """Return a function that adds an option to a group: spellings, value, text, and more.
+
+    Without a value it is a switch; ``A B`` takes two values; ``A...`` takes several, and more when
+    it is repeated. Paths are recognized by the value's name, numbers by the default.
+    """
+
+    def add(flags: str, value: str, text: str, **options: Any) -> None:  # noqa: ANN401  (argparse's)
+        if value.endswith("..."):
+            value = value.removesuffix("...")
+            options |= {"nargs": "+", "action": "extend", "default": []}
+        if " " in value:
+            options |= {"metavar": tuple(value.split()), "nargs": len(value.split())}
+        elif value:
+            options["metavar"] = value
+        elif not options:
+            options["action"] = "store_true"
+        if value in _PATHS:
+            options["type"] = Path
+        elif isinstance(options.get("default"), int | float) and "action" not in options:
+            options.setdefault("type", type(options["default"]))
+        group.add_argument(*flags.split(), help=text, **options)
+
+    return add
+
+
+def from_namespace(
+    kind: "type[Request]",
+    options: argparse.Namespace,
+    **more: Any,  # noqa: ANN401  (fields of any type)
+) -> "Request":
+    """Fill a dataclass with the options of the same names, lists as tuples, and further fields."""
+    names = {field.name for field in fields(kind)} - more.keys()
+    given = {name: value for name, value in vars(options).items() if name in names}
+    frozen = {name: tuple(v) if isinstance(v, list) else v for name, v in given.items()}
+    return kind(**frozen, **more)
+
+
+# Converters of values; `tools/descriptors.py` knows them by name.
+
+
+def bids_label(prefix: str) -> Callable[[str], str]:
+    """Return a converter that reads a BIDS label with or without its prefix."""
+
+    def convert(text: str) -> str:
+        label = text.removeprefix(prefix)
+        if not label.isalnum():
+            raise argparse.ArgumentTypeError(f"{text!r} is not a BIDS label (letters and digits)")
+        return label
+
+    return convert
+
+
+def named_pattern(text: str) -> tuple[str, str]:
+    """Read ``NAME=PATTERN``."""
+    return _pair(text, "NAME=PATTERN")
+
+
+def factor_level(text: str) -> tuple[str, str]:
+    """Read ``FACTOR=LEVEL``."""
+    return _pair(text, "FACTOR=LEVEL")
+
+
+def _pair(text: str, form: str) -> tuple[str, str]:
+    name, _, value = text.partition("=")
+    if not (name and value):
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form {form}")
+    return name, value
+
+
+def named_path(text: str) -> tuple[str, Path]:
+    """Read ``NAME=PATH``, or a path, whose last part is then the name."""
+    name, equals, path = text.partition("=")
+    if equals and name and path:
+        return name, Path(path)
+    folder = Path(text)
+    if equals or not folder.name:
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form NAME=PATH")
+    return folder.name, folder
+
+
+def positive_int(text: str) -> int:
+    """Read a whole number above 0."""
+    if not text.isascii() or not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above 0")
+    return int(text)
+
+
+def positive_float(text: str) -> float:
+    """Read a finite number above 0."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
+    return value
