@@ -8,7 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hipsta_bids import __version__
-from hipsta_bids.cli.participant import Parser, named_pattern, rebuild_group_reports
+from hipsta_bids.cli.participant import (
+    REGIONS,
+    Parser,
+    named_pattern,
+    rebuild_group_reports,
+)
 from hipsta_bids.errors import ExitCode, UsageError
 from hipsta_bids.group.settings import CORRECTIONS
 
@@ -95,6 +100,12 @@ def _add_sheets(parser: Parser) -> None:
         " surface beside a map, or the grid of the sheets)",
     )
     add("--seg", metavar="NAME", help="segmentation protocol, where there are several")
+    add(
+        "--region",
+        choices=REGIONS,
+        default=REGIONS[0],
+        help="what the participant level measured (default: body)",
+    )
     for what in ("participant", "session"):
         add(
             f"--{what}-label",
@@ -376,6 +387,7 @@ def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOpti
         sheets=GroupRequest(
             roots=tuple(dict.fromkeys(parsed.derivatives)) or (parsed.output_dir,),
             seg=parsed.seg,
+            region=parsed.region,
             subjects=tuple(parsed.participant_label),
             sessions=tuple(parsed.session_label),
             exclude_flagged=parsed.exclude_flagged,

@@ -315,6 +315,12 @@ def output_path(name: HemisphereName, key: str, desc: str | None = None) -> Pure
     return name.folder / output_name(name, key, desc)
 
 
+def output_pattern(key: str) -> str:
+    """Glob pattern of one output of all hemispheres."""
+    output = _BY_KEY[key]
+    return f"*_{f'desc-{output.desc}_' if output.desc else ''}{output.suffix}{output.extension}"
+
+
 def name_of_record(file_name: str) -> HemisphereName | None:
     """Tell whose quality record a file is, the reverse of :func:`output_name`."""
     match = _RECORD.fullmatch(file_name)

@@ -3,20 +3,24 @@
 import ast
 import difflib
 import operator
-import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
-from pyarrow import csv
 
 from hipsta_bids.derivatives.hemisphere import ResultPlace
 from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName
+from hipsta_bids.derivatives.read import (
+    list_results,
+    read_record,
+    read_sheet,
+    read_summary,
+    read_units,
+)
 from hipsta_bids.derivatives.status import NOT_FINISHED, name_of, read_status
 from hipsta_bids.errors import InputError, NothingToDoError, UsageError
 from hipsta_bids.geometry.catalog import MAPS
@@ -152,12 +156,6 @@ class QualityCondition:
         return UsageError(f"--exclude-qc {self.text!r} {what}", reason="quality-condition")
 
 
-_RECORD = re.compile(
-    r"sub-(?P<subject>[^_]+)(?:_ses-(?P<session>[^_]+))?_hemi-(?P<hemi>[LR])_seg-(?P<seg>[^_]+)"
-    r"_desc-qc_metrics\.json"
-)
-
-
 @dataclass(frozen=True, kw_only=True)
 class GroupRequest:
     """What the user asked for."""
@@ -166,6 +164,8 @@ class GroupRequest:
     """Output datasets of the participant level."""
     seg: str | None = None
     """Segmentation protocol; ``None`` if there is but one."""
+    region: str = "body"
+    """What was measured: ``body``, ``extended`` or ``entorhinal``."""
     subjects: tuple[str, ...] = ()
     """Labels without ``sub-``; empty is all."""
     sessions: tuple[str, ...] = ()
@@ -223,16 +223,18 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
         if not folder.is_dir():
             raise InputError(f"{folder}: no such folder; check --segmentations", reason="no-folder")
     roots = [root for root in request.roots if root.is_dir() or not may_lack]
-    found = [entry for root in roots for entry in _quality_files(root, request)]
+    everything = [place for root in roots for place in _wanted_results(root, request)]
+    found = [place for place in everything if place.name.region == request.region]
+    notes = _other_regions(everything, request)
     if may_lack and not found:
-        return _nothing()
-    seg = _one_protocol(found, request)
+        return _nothing(notes)
+    seg = _one_protocol(found, everything, request)
     found = [place for place in found if place.name.seg == seg]
     _refuse_twice(found)
     unwanted = read_exclusions(request.exclude_table)
     kept: list[SheetRecord] = []
     left_out: list[Exclusion] = []
-    for place in sorted(found, key=_order):
+    for place in sorted(found, key=_key):
         entry = _judge(place, request, unwanted)
         if isinstance(entry, Exclusion):
             left_out.append(entry)
@@ -252,17 +254,21 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
         settings=_settings_of(kept[0].place.root),
         settings_hash=digest,
         versions=tuple(sorted({record.version for record in kept})),
-        notes=lost_exclusions(request.exclude_table, unwanted, [place.name for place in found]),
+        notes=(
+            *notes,
+            *lost_exclusions(request.exclude_table, unwanted, [place.name for place in found]),
+        ),
     )
 
 
-def _nothing() -> Collection:
+def _nothing(notes: tuple[str, ...]) -> Collection:
     return Collection(
         records=(),
         exclusions=(),
         settings=resolve(Settings()),
         settings_hash=settings_hash(Settings()),
         versions=(),
+        notes=notes,
     )
 
 
@@ -281,40 +287,48 @@ def wanted_by(request: GroupRequest) -> Callable[[str, str | None, str], bool]:
     return is_wanted
 
 
-def _quality_files(root: Path, request: GroupRequest) -> Iterator[ResultPlace]:
+def _wanted_results(root: Path, request: GroupRequest) -> list[ResultPlace]:
     if not root.is_dir():
         raise InputError(
             f"{root}: no such folder; run the participant level first", reason="no-derivatives"
         )
-    for pattern in ("sub-*/anat", "sub-*/ses-*/anat"):
-        for path in root.glob(f"{pattern}/*_desc-qc_metrics.json"):
-            match = _RECORD.fullmatch(path.name)
-            if match is None:
-                continue
-            name = HemisphereName(**match.groupdict())
-            if request.subjects and name.subject not in request.subjects:
-                continue
-            if request.sessions and name.session not in request.sessions:
-                continue
-            yield ResultPlace(root=root, name=name)
+    return [
+        place
+        for place in list_results(root)
+        if (not request.subjects or place.name.subject in request.subjects)
+        and (not request.sessions or place.name.session in request.sessions)
+    ]
 
 
-def _order(place: ResultPlace) -> tuple[str, str, str]:
+def _other_regions(everything: Sequence[ResultPlace], request: GroupRequest) -> tuple[str, ...]:
+    """Say which results are left out because another region was asked for."""
+    counts = Counter(
+        place.name.region for place in everything if request.seg in {None, place.name.seg}
+    )
+    return tuple(
+        f"{count} hemispheres of region {region} are not in this analysis;"
+        f" --region {region} takes them"
+        for region, count in sorted(counts.items())
+        if region != request.region
+    )
+
+
+def _key(place: ResultPlace) -> tuple[str, str, str]:
     return place.name.subject, place.name.session or "", place.name.hemi
 
 
-def _one_protocol(found: Sequence[ResultPlace], request: GroupRequest) -> str:
+def _one_protocol(
+    found: Sequence[ResultPlace], everything: Sequence[ResultPlace], request: GroupRequest
+) -> str:
     counts = Counter(place.name.seg for place in found)
-    if request.seg is not None and request.seg not in counts:
-        known = ", ".join(sorted(counts)) or "nothing"
+    if not counts or request.seg not in {None, *counts}:
+        asked = f" with --seg {request.seg}" if request.seg else " as asked for"
+        asked += f" --region {request.region}" if request.region != "body" else ""
+        kinds = sorted({(place.name.seg, place.name.region) for place in everything})
+        there = [seg if region == "body" else f"{seg} --region {region}" for seg, region in kinds]
+        hint = f"there is {', '.join(there)}" if there else "run the participant level first"
         raise NothingToDoError(
-            f"{request.roots[0]}: no hemisphere with --seg {request.seg}; there is {known}",
-            reason="no-hemisphere",
-        )
-    if not counts:
-        raise NothingToDoError(
-            f"{request.roots[0]}: no hemisphere as asked for; run the participant level first",
-            reason="no-hemisphere",
+            f"{request.roots[0]}: no hemisphere{asked}; {hint}", reason="no-hemisphere"
         )
     if request.seg is None and len(counts) > 1:
         names = ", ".join(f"{name} ({n})" for name, n in sorted(counts.items()))
@@ -328,7 +342,7 @@ def _one_protocol(found: Sequence[ResultPlace], request: GroupRequest) -> str:
 def _refuse_twice(found: Sequence[ResultPlace]) -> None:
     first: dict[tuple[str, str, str], Path] = {}
     for place in found:
-        other = first.setdefault(_order(place), place.root)
+        other = first.setdefault(_key(place), place.root)
         if other != place.root:
             raise InputError(
                 f"{place.name.stem} is in {other} and in {place.root}; participants of different"
@@ -340,7 +354,7 @@ def _refuse_twice(found: Sequence[ResultPlace]) -> None:
 def _judge(
     place: ResultPlace, request: GroupRequest, unwanted: Sequence[Mapping[str, str]]
 ) -> SheetRecord | Exclusion:
-    record = files.read_json(place.path("qc"))
+    record = read_record(place)
     status = record.get("status")
     reason, message = record.get("reason") or str(status), record.get("message") or ""
     listed = next((row for row in unwanted if is_listed(place.name, row)), None)
@@ -390,7 +404,7 @@ def _refuse_unfinished(
                 not request.sessions or name.session in request.sessions
             )
             listed = any(is_listed(name, one) for one in unwanted)
-            same = name.seg == seg and name.region == "body"  # the body alone is read here
+            same = (name.seg, name.region) == (seg, request.region)
             if row.get("reason") == NOT_FINISHED and same and asked and not listed:
                 pending.append(name.stem)
     if pending:
@@ -502,10 +516,7 @@ def _sampled(records: Sequence[SheetRecord]) -> list[str]:
 
 
 def _summary_names(records: Sequence[SheetRecord]) -> tuple[str, ...]:
-    if not records:
-        return ()
-    rows: Sequence[Mapping[str, str]] = files.read_tsv(records[0].place.path("summary"))
-    return tuple(rows[0]) if rows else ()
+    return tuple(read_summary(records[0].place)) if records else ()
 
 
 # Reads the participant level's tables of many hemispheres into arrays.
@@ -556,7 +567,8 @@ def read_sheets(
         sides=sides,
         x=_coordinates(grid["x_extent"], shape[0]),
         y=_coordinates(grid["y_extent"], shape[1]),
-        units=_units(records) | {n: ARBITRARY for n in names if n not in SHEET_MAPS},
+        units=(read_units(records[0].place) if records else {})
+        | {n: ARBITRARY for n in names if n not in SHEET_MAPS},
         sources={
             visit_name(r.place.name.subject, r.place.name.session): (r.source, r.place.root)
             for r in reversed(records)
@@ -601,88 +613,21 @@ def _read_side(
     codes: dict[str, int] = {}
     summaries = []
     for i, record in enumerate(records):
-        table = _read_columns(record.place.path("sheet"), shape, measured, ["subfield"])
-        for name in measured:
-            maps[name][i] = table.column(name).to_numpy().reshape(shape)
+        columns = read_sheet(record.place.path("sheet"), measured, ["subfield"], shape)
         for name in sampled:
             path = record.place.path("map_table", sampled_desc(name))
             if path.is_file():
-                column = _read_columns(path, shape, [name]).column(name)
-                maps[name][i] = column.to_numpy().reshape(shape)
-        subfield[i] = _encode(table.column("subfield"), codes).reshape(shape)
-        summaries.append(_read_summary(record.place.path("summary")))
+                columns |= read_sheet(path, [name], shape=shape)
+        for name in maps.keys() & columns.keys():
+            maps[name][i] = columns[name]
+        subfield[i] = _encode(columns["subfield"], codes)
+        summaries.append(read_summary(record.place))
     summary = pd.DataFrame(summaries).astype(np.float64)
     return SideMaps(rows=rows, maps=maps, subfield=subfield, names=tuple(codes), summary=summary)
 
 
-def _read_columns(
-    path: Path, shape: tuple[int, int], numbers: Sequence[str], words: Sequence[str] = ()
-) -> pa.Table:
-    try:
-        table = csv.read_csv(
-            path,
-            read_options=csv.ReadOptions(use_threads=False),
-            parse_options=csv.ParseOptions(delimiter="\t"),
-            convert_options=csv.ConvertOptions(
-                include_columns=["x", "y", *numbers, *words],
-                column_types={
-                    **dict.fromkeys(numbers, pa.float64()),
-                    **dict.fromkeys(words, pa.string()),
-                },
-                null_values=[files.MISSING],
-                strings_can_be_null=True,
-            ),
-        )
-    except (OSError, pa.ArrowInvalid, pa.ArrowKeyError, KeyError) as error:
-        first = str(error).partition("\n")[0]
-        raise InputError(
-            f"{path}: not readable as a sheet ({first}); run the participant level again with"
-            " --force",
-            reason="unreadable-table",
-        ) from error
-    x, y = (table.column(name).to_numpy() for name in "xy")
-    expected = np.divmod(np.arange(shape[0] * shape[1]), shape[1])
-    if len(x) != len(expected[0]) or any(
-        (given != wanted + 1).any() for given, wanted in zip((x, y), expected, strict=True)
-    ):
-        raise InputError(
-            f"{path}: not a sheet of {shape[0]} x {shape[1]} nodes, as the settings say; run the"
-            " participant level again with --force",
-            reason="mixed-grids",
-        )
-    return table
-
-
-def _encode(column: pa.ChunkedArray, codes: dict[str, int]) -> np.ndarray[Any, Any]:
+def _encode(words: np.ndarray[Any, Any], codes: dict[str, int]) -> np.ndarray[Any, Any]:
     """Numbers instead of names, new names at the end; -1 where missing."""
-    encoded = column.combine_chunks().dictionary_encode()
-    names = encoded.dictionary.to_pylist()
-    numbers = np.array([codes.setdefault(name, len(codes)) for name in names] + [-1])
-    places = encoded.indices.fill_null(len(names)).to_numpy()
-    return np.asarray(numbers[places], dtype=np.int8)
-
-
-def _read_summary(path: Path) -> dict[str, float]:
-    rows = files.read_tsv(path)
-    try:
-        (row,) = rows
-        return {
-            name: float("nan") if cell == files.MISSING else float(cell)
-            for name, cell in row.items()
-        }
-    except ValueError as error:
-        raise InputError(
-            f"{path}: not one row of numbers; run the participant level again with --force",
-            reason="bad-table",
-        ) from error
-
-
-def _units(records: Sequence[SheetRecord]) -> dict[str, str]:
-    """Units of maps and summary columns, from the sidecars of the first hemisphere."""
-    units = {}
-    paths = [r.place.path(key) for r in records[:1] for key in ("sheet_sidecar", "summary_sidecar")]
-    for path in paths:
-        for name, entry in files.read_json(path).items():
-            if isinstance(entry, Mapping) and "Units" in entry:
-                units[name] = str(entry["Units"])
-    return units
+    numbers, names = pd.factorize(words.ravel())
+    known = np.array([codes.setdefault(name, len(codes)) if name else -1 for name in names])
+    return np.asarray(known[numbers], dtype=np.int8).reshape(words.shape)

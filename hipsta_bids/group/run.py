@@ -78,6 +78,7 @@ def record_of(
             "settings_hash": found.settings_hash,
             "versions": found.versions,
             "seg": found.records[0].place.name.seg if found.records else None,
+            "region": options.sheets.region,
             "maps": dict(options.maps),
             "volumes": dict(options.volumes),
             "covariates": [str(path) for path in options.covariates],
@@ -174,11 +175,14 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
     exclusions = [*read.exclusions, *_incomplete(analysis)]
     name = options.model.name
     name = name or folder_name(model.formula, read.wanted) + options.comparison.suffix
+    region = options.sheets.region
+    if region != "body" and not options.model.name:
+        name += f"_{region}"
     notes = [*read.notes, *notes_of(read.found, analysis, n_other_visits=read.n_other_visits)]
     shapes = average_shapes(read.found.records, cohort, analysis, settings)
     _describe(options)
     with write.model_folder(options.out_dir, name) as folder:
-        write_results(folder, cohort, analysis, settings, exclusions, others=others)
+        write_results(folder, cohort, analysis, settings, exclusions, others=others, region=region)
         files.write_json(folder / "model.json", document)
         write_shapes(folder, shapes)
         if analysis.sides and read.found.records and not shapes:

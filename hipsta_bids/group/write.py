@@ -315,6 +315,7 @@ def write_results(
     exclusions: Sequence[Exclusion],
     *,
     others: Mapping[str, tuple[Cohort, Analysis]],
+    region: str = "body",
 ) -> None:
     """Write tables, maps and text."""
     for table in result_tables(cohort, analysis, settings):
@@ -355,7 +356,9 @@ def write_results(
         files.write_json(folder / "template.json", templates_to_json(templates))
     _write_gifti(folder, cohort, analysis)
     _write_scores(folder, cohort, analysis)
-    text = methods_text(cohort, analysis, settings, len(exclusions), tuple(others))
+    text = methods_text(
+        cohort, analysis, settings, len(exclusions), others=tuple(others), region=region
+    )
     files.write_text(folder / "methods.md", text)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from hipsta_bids.derivatives import dataset, hemisphere
 from hipsta_bids.derivatives.hemisphere import ResultPlace
 from hipsta_bids.derivatives.names import HemisphereName
+from hipsta_bids.derivatives.read import read_sheet
 from hipsta_bids.errors import (
     ExitCode,
     GeometryError,
@@ -140,16 +141,9 @@ def _measure(item: HemisphereInput, place: ResultPlace, settings: Settings) -> I
 def _read_sheet(place: ResultPlace) -> _Sheet | None:
     """Read the sheet that the participant level measured, if it did."""
     with suppress(InputError):
-        rows = files.read_tsv(place.path("sheet"))
-        columns = {
-            name: np.array([np.nan if row[name] == files.MISSING else row[name] for row in rows])
-            for name in ("r", "a", "s", "thickness")
-        }
-        values = {name: column.astype(np.float64) for name, column in columns.items()}
-        return _Sheet(
-            points=np.stack([values["r"], values["a"], values["s"]], axis=-1),
-            thickness=values["thickness"],
-        )
+        names = ("r", "a", "s", "thickness")
+        *axes, thickness = (v.ravel() for v in read_sheet(place.path("sheet"), names).values())
+        return _Sheet(points=np.stack(axes, axis=-1), thickness=thickness)
     return None
 
 
