@@ -1,7 +1,7 @@
-"""The only writer of results, and small readers of what it wrote.
+"""Reading and atomic writing of text, JSON and BIDS tables; names, hashes and locks of files.
 
-A file appears whole or not at all: it is written aside, flushed to the disk, then renamed over
-its final name. The same values give the same bytes.
+A written file appears whole or not at all: it is written aside, flushed to the disk, then renamed
+over its final name. The same values give the same bytes.
 """
 
 import contextlib
@@ -30,6 +30,11 @@ MISSING = "n/a"
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _FORBIDDEN = {errno.EROFS, errno.EACCES, errno.EPERM}
 _TEMPORARY = ".tmp"
+
+DATASET = "dataset"
+"""Name of the lock on the files of the whole dataset."""
+
+_LOCK_FILE = ".lock"
 
 
 def is_disk_full(error: OSError) -> bool:
@@ -239,25 +244,16 @@ def sha256_of(path: Path) -> str:
         ) from error
 
 
-# Turns between runs into one folder, on one machine or many.
-
-
-DATASET = "dataset"
-"""Name of the lock on the files of the whole dataset."""
-
-_FILE = ".lock"
-
-
 @contextlib.contextmanager
 def locked(root: Path, what: str) -> Iterator[bool]:
-    """Let one process at a time work on something; others wait.
+    """Let one process at a time work on something, on one machine or many; others wait.
 
-    A process may hold one lock at a time: with POSIX's record locks, to let go of one is to let go
-    of all that it has on the same file.
+    Yields whether the file system knows locks. A process may hold one lock at a time: with POSIX's
+    record locks, releasing one releases all that it has on the same file.
     """
     folder = root / LOGS
     make_folder(folder)
-    path = folder / _FILE
+    path = folder / _LOCK_FILE
     digest = hashlib.blake2b(what.encode(), digest_size=7).digest()
     try:
         handle = path.open("ab")
@@ -273,7 +269,10 @@ def locked(root: Path, what: str) -> Iterator[bool]:
 
 
 def entities(name: str) -> dict[str, str]:
-    """Split a BIDS file name."""
+    """Split a BIDS file name; keys are as in the name (``sub``), with ``suffix`` and ``extension``.
+
+    pybids takes 30 times as long and seconds to import; a test compares the two.
+    """
     stem, dot, extension = name.partition(".")
     *parts, suffix = stem.split("_")
     pairs = dict(part.split("-", 1) for part in parts if "-" in part)

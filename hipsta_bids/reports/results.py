@@ -160,7 +160,7 @@ def _finding(kind: str, message: str) -> Finding:
 
 def _surface_points(place: ResultPlace, name: str, shape: tuple[int, ...]) -> Float:
     path = place.path(f"{name}_surface")
-    points = gifti.read_points(path)
+    points = gifti.read_mesh(path).points
     if len(points) != shape[0] * shape[1]:
         raise InputError(
             f"{path}: has {len(points)} vertices, the sheet {shape[0]} x {shape[1]} nodes; run the"
