@@ -13,9 +13,8 @@ from pathlib import Path
 from hipsta_bids.errors import HipstaError, InputError
 from hipsta_bids.inputs.request import Edit, HemisphereInput, InputRequest
 from hipsta_bids.inputs.scan import Selection, Visit, list_visits, subject_folders
-from hipsta_bids.inputs.tables import read_table
+from hipsta_bids.inputs.tables import table_protocol
 from hipsta_bids.io.files import entities
-from hipsta_bids.protocols.load import protocol_from_names
 
 #: Names under which ``--edited-dir`` and the output dataset appear in addresses.
 _EDITED, _OUTPUT = "edited", "output"
@@ -189,9 +188,7 @@ def _described(item: HemisphereInput) -> HemisphereInput:
     if not table.exists():
         return item
     try:
-        protocol = protocol_from_names(
-            read_table(table), name=item.protocol.name, origin=table.name
-        )
+        protocol = table_protocol(table, item.protocol.name)
     except HipstaError as error:
         return replace(item, problem=item.problem or error)
     # The citation is that of the protocol; a table has none.

@@ -103,7 +103,7 @@ def test_an_unknown_atlas_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("values", "scheme"), [(ABC, "ashsABC3T"), (PMC, "ashsPMC"), (UTRECHT, "ashsUtrecht7T")]
+    ("values", "protocol"), [(ABC, "ashsABC3T"), (PMC, "ashsPMC"), (UTRECHT, "ashsUtrecht7T")]
 )
 def test_values_decide_if_one_atlas_only_fits(tmp_path, values, protocol):
     left(tmp_path, values=values)

@@ -60,7 +60,7 @@ def test_the_full_hierarchy_comes_before_all_others(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("kinds", "taken", "scheme"),
+    ("kinds", "taken", "protocol"),
     [
         ([".CA", ".HBT"], [".CA", ".HBT"], "freesurferCA"),
         ([".FS60", ".HBT"], [".FS60", ".HBT"], "freesurferFS60"),
