@@ -139,7 +139,7 @@ def _source(folder: Path) -> dict[str, str]:
 
 
 def source_names(folders: Iterable[tuple[str, Path]]) -> dict[str, Path]:
-    """Give each source dataset a name of its own."""
+    """Choose a unique name for each source dataset."""
     names: dict[str, Path] = {}
     for wanted, folder in dict.fromkeys(folders):
         base = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "-" for c in wanted)
@@ -151,7 +151,7 @@ def source_names(folders: Iterable[tuple[str, Path]]) -> dict[str, Path]:
 
 
 def source_address(path: Path, sources: Mapping[str, Path]) -> str:
-    """Spell an input file as a BIDS address, ``bids:<dataset>:<path in it>``."""
+    """Write the path of an input file as a BIDS address, ``bids:<dataset>:<path in it>``."""
     for name, folder in sources.items():
         if path.is_relative_to(folder):
             return f"bids:{name}:{path.relative_to(folder).as_posix()}"
@@ -196,7 +196,7 @@ REFERENCES: dict[str, str] = {
 
 
 def citation_text(settings: Settings, protocols: Sequence[Protocol]) -> str:
-    """Word the methods paragraph."""
+    """Compose the methods paragraph, with all settings and the references."""
     entries = list(REFERENCES.values())
     entries += [protocol.citation for protocol in protocols if protocol.citation not in entries]
     number = {entry: i for i, entry in enumerate(entries, start=1)}

@@ -30,7 +30,7 @@ NODES: dict[str, tuple[str, str | None]] = {
     "x": ("node number along x, 1 at the medial end (subiculum)", None),
     "y": ("node number along y, 1 at the posterior end", None),
 }
-_POSITION: dict[str, tuple[str, str | None]] = {
+POSITION: dict[str, tuple[str, str | None]] = {
     "r": ("position on the mid-surface, scanner RAS, left to right", "mm"),
     "a": ("position on the mid-surface, scanner RAS, posterior to anterior", "mm"),
     "s": ("position on the mid-surface, scanner RAS, inferior to superior", "mm"),
@@ -40,19 +40,19 @@ STATE: dict[str, tuple[str, str | None]] = {
     "valid": ("true where measured directly, false where filled or missing", None),
     "repaired": ("true where a repair of the labels' topology touched the column", None),
 }
-_LAYERS: dict[str, tuple[str, str | None]] = {
+LAYERS: dict[str, tuple[str, str | None]] = {
     **NODES,
     "layer": ("number of the layer, 1 on the interior and the last on the exterior wall", None),
     "depth": ("distance from the interior wall along the column", "mm"),
     "relative_depth": ("the same over the length of the column", None),
     **{
         axis: (definition.replace("on the mid-surface", "of the point"), unit)
-        for axis, (definition, unit) in _POSITION.items()
+        for axis, (definition, unit) in POSITION.items()
     },
 }
 
 #: Columns of the sheet table, in order.
-SHEET_COLUMNS = (*NODES, *_POSITION, *(row.name for row in MAPS), *STATE)
+SHEET_COLUMNS = (*NODES, *POSITION, *(row.name for row in MAPS), *STATE)
 
 #: What all of these tables are about, whatever the columns.
 _MEASURED_REGION = (
@@ -62,7 +62,7 @@ _MEASURED_REGION = (
 
 _MILLIMETER_DIGITS = 4
 
-#: Workbench's word for a surface, where it has one that fits.
+#: Names of surfaces in Workbench, where there is one that fits.
 _SECONDARY = {"interior": None, "midthickness": "MidThickness", "exterior": None}
 
 
@@ -137,7 +137,7 @@ def _write_sheet(place: ResultPlace, maps: HemisphereMaps, protocol: Protocol) -
         "valid": _truths(maps.sheet.valid),
         "repaired": _truths(maps.repaired),
     }
-    definitions = _definitions(NODES | _POSITION)
+    definitions = _definitions(NODES | POSITION)
     definitions |= {row.name: _measure(row) for row in MAPS} | _definitions(STATE)
     definitions["subfield"]["Levels"] = {
         label.abbreviation: label.name for label in labels.values()
@@ -201,7 +201,7 @@ def _write_layers(place: ResultPlace, layers: Sheet) -> None:
         "relative_depth": format_column(depth / length, _MILLIMETER_DIGITS),
         **_positions(layers.points),
     }
-    _write_table(place, "layers", columns, _definitions(_LAYERS))
+    _write_table(place, "layers", columns, _definitions(LAYERS))
 
 
 def _numbers(axes: Iterable[str], shape: tuple[int, ...]) -> dict[str, list[str]]:
@@ -212,7 +212,7 @@ def _numbers(axes: Iterable[str], shape: tuple[int, ...]) -> dict[str, list[str]
 
 def _positions(points: Float) -> dict[str, list[str]]:
     return {
-        axis: format_column(points[..., k], _MILLIMETER_DIGITS) for k, axis in enumerate(_POSITION)
+        axis: format_column(points[..., k], _MILLIMETER_DIGITS) for k, axis in enumerate(POSITION)
     }
 
 

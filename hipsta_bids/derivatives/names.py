@@ -1,4 +1,4 @@
-"""The one table of outputs, and the one function that spells their paths.
+"""The table of outputs, and the names and paths of results.
 
 Entities follow the order of BIDS 1.11 (``sub ses hemi space seg label desc``). What the standard
 has no rule for is listed in ``.bidsignore`` from the same table.
@@ -41,7 +41,7 @@ class HemisphereName:
 
     @property
     def stem(self) -> str:
-        """What all file names of this hemisphere's subject and session begin with."""
+        """Subject, session and side, with which all file names begin."""
         session = f"_ses-{self.session}" if self.session else ""
         return f"sub-{self.subject}{session}_hemi-{self.hemi}"
 
@@ -201,7 +201,7 @@ def output_name(name: HemisphereName, key: str, desc: str | None = None) -> str:
 
 
 def output_path(name: HemisphereName, key: str, desc: str | None = None) -> PurePosixPath:
-    """Spell the path of one output, relative to the output dataset.
+    """Path of one output, relative to the output dataset.
 
     Parameters
     ----------
@@ -227,7 +227,7 @@ def output_pattern(key: str) -> str:
 
 
 def name_of_record(file_name: str) -> HemisphereName | None:
-    """Tell whose quality record a file is: the reverse of :func:`output_name`."""
+    """Identify whose quality record a file is: the reverse of :func:`output_name`."""
     match = _RECORD.fullmatch(file_name)
     if match is None:
         return None

@@ -164,7 +164,7 @@ def _empty(path: Path) -> InputError:
 
 
 def _bounding_box(inside: Bool, affine: Float, path: Path) -> _Box:
-    """Find the box round all true voxels, and add the margin as far as the image goes."""
+    """Bounding box of all true voxels, with the margin as far as the image goes."""
     if not inside.any():
         raise _empty(path)
     # Each axis is projected on its own; ranges of indices are all that is kept.

@@ -178,6 +178,7 @@ def list_sources(request: InputRequest) -> tuple[Source, ...]:
 def _candidates(request: InputRequest) -> Iterator[Source]:
     top, _ = list_folder(request.bids_dir)
     options = (request.freesurfer_dir, request.ashs_dir, request.hippunfold_dir)
+    named: list[tuple[str, Path, tuple[str, ...]]]
     named = [(name, path, LAYOUTS) for name, path in request.derivatives.items()]
     named += [(name, path, (name,)) for name, path in zip(LAYOUTS, options, strict=False) if path]
     for name, path, layouts in named:
@@ -230,7 +231,7 @@ class Selection:
     """The user's protocol."""
 
     def wants_folder(self, folder: SubjectFolder) -> bool:
-        """Say whether a subject's folder has to be looked into."""
+        """Check whether a subject's folder has to be looked into."""
         return (
             (not self.subjects or folder.subject in self.subjects)
             and (not self.sessions or folder.session is None or folder.session in self.sessions)
@@ -238,7 +239,7 @@ class Selection:
         )
 
     def wants_visit(self, visit: Visit) -> bool:
-        """Say whether a session of a subject is wanted."""
+        """Check whether a session of a subject is wanted."""
         asked = not self.sessions or visit.session in self.sessions
         return asked and self._passes("session", visit.session)
 
@@ -247,7 +248,7 @@ class Selection:
         return tuple(hemi for hemi in HEMIS if hemi in self.hemis and self._passes("hemi", hemi))
 
     def wants_file(self, path: Path) -> bool:
-        """Say whether a file with BIDS entities in its name is wanted."""
+        """Check whether a file with BIDS entities in its name is wanted."""
         if not self.rules:
             return True
         found = _parse(path)

@@ -138,7 +138,7 @@ def selection_table(items: Iterable[HemisphereInput]) -> list[dict[str, str]]:
 
 
 def dataset_notes(request: InputRequest, items: Iterable[HemisphereInput]) -> tuple[str, ...]:
-    """Say what a user should know about the dataset as a whole."""
+    """List what a user should know about the dataset as a whole."""
     notes = []
     if read_description(request.bids_dir) is None:
         notes.append(
@@ -188,7 +188,7 @@ def _without_clashes(
 
 
 def _check_analysis(found: list[HemisphereInput], request: InputRequest) -> None:
-    """Refuse an analysis that no hemisphere has: it is a slip of the pen."""
+    """Refuse an analysis that no hemisphere has: a typing error."""
     asked = [item for item in found if item.protocol.tool == "freesurfer"]
     missing = [
         item.problem for item in asked if item.problem and item.problem.reason == "analysis-missing"
@@ -201,7 +201,7 @@ def _check_analysis(found: list[HemisphereInput], request: InputRequest) -> None
 
 
 def _nothing(request: InputRequest, sources: tuple[Source, ...]) -> NothingToDoError:
-    """Say what was looked for, and where."""
+    """Describe what was looked for, and where."""
     searched = ", ".join(str(source.path) for source in sources)
     restricted = (
         *(f"--participant-label {label}" for label in request.participant_labels[:_SHOWN]),

@@ -37,13 +37,13 @@ _STRUCTURE = {"L": "HippocampusLeft", "R": "HippocampusRight"}
 #: Names of the harmonic coordinates as point data of the tetrahedral mesh, in their order.
 COORDINATE_NAMES = ("medial_lateral", "posterior_anterior", "interior_exterior")
 
-#: Unit of maps that do not say theirs.
+#: Unit of maps whose file names none.
 ARBITRARY = "arbitrary"
 
 #: Units of what HippUnfold measures per vertex, by the suffix of its files.
 _UNITS = {"thickness": "mm", "surfarea": "mm^2", "gyrification": "1"}
 
-#: Columns of a table that say where a row is.
+#: Columns of a table that hold the position of a row.
 _POSITIONS = ("x", "y", "node_x", "node_y", "vertex", "index", "point")
 
 
@@ -145,7 +145,7 @@ def read_map(path: Path, name: str) -> PointMap:
     return PointMap(values=_finite(arrays[0].data), unit=str(unit))
 
 
-def _finite(values: Any) -> Float:  # noqa: ANN401  (whatever nibabel gives)
+def _finite(values: Any) -> Float:  # noqa: ANN401  ((as nibabel returns them))
     numbers = np.asarray(values, dtype=np.float64)
     return np.where(np.isfinite(numbers), numbers, np.nan)
 

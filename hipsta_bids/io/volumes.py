@@ -59,7 +59,7 @@ def read_voxels(path: Path) -> tuple[NDArray[Any], Float]:
 
 
 def read_scalars(path: Path, points: Float) -> ScalarVolume:
-    """Read what an image holds round some points, (..., 3) RAS mm."""
+    """Read the part of an image around some points, (..., 3) RAS mm."""
     with _opened(path) as image:
         _check_scalar(image, path)
         affine: Float = np.asarray(image.affine, dtype=np.float64)
@@ -96,7 +96,7 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def _format(path: Path, start: bytes) -> type[Any]:
-    """Tell the format by the file's name and, between the versions of NIfTI, its first bytes."""
+    """Choose the format by the file's name and, between the versions of NIfTI, its first bytes."""
     if path.suffix in {".mgz", ".mgh"}:
         return nib.MGHImage
     # NIfTI begins with the size of its header, which tells the versions apart.
