@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from hipsta_bids.cli.commands import phantom_parser, surrogate_parser, validate_parser
 from hipsta_bids.cli.group import group_parser
 from hipsta_bids.cli.participant import build_parser
-from hipsta_bids.derivatives.hemisphere import LAYERS, NODES, PLACE, STATE
+from hipsta_bids.derivatives.hemisphere import LAYERS, NODES, POSITION, STATE
 from hipsta_bids.derivatives.names import (
     DATASET_FILES,
     EXTRA_OUTPUTS,
@@ -74,7 +74,7 @@ _DATASET_FILES = {
 
 def outputs_page() -> str:
     """Write the page of files and columns."""
-    place = [(name, unit, words) for name, (words, unit) in (NODES | PLACE).items()]
+    place = [(name, unit, words) for name, (words, unit) in (NODES | POSITION).items()]
     state = [(name, unit, words) for name, (words, unit) in STATE.items()]
     layers = [(name, unit, words) for name, (words, unit) in LAYERS.items()]
     columns = ("column", "unit", "what it is")

@@ -16,6 +16,7 @@ from hipsta_bids.cli.parser import (
     from_namespace,
     named_pattern,
 )
+from hipsta_bids.cli.participant import REGIONS
 from hipsta_bids.errors import ExitCode, NothingToDoError, UsageError
 
 if TYPE_CHECKING:
@@ -83,6 +84,13 @@ def _add_sheets(parser: Parser) -> None:
         type=_maybe_named,
     )
     add("--seg", "NAME", "segmentation protocol, where there are several")
+    add(
+        "--region",
+        "",
+        "what the participant level measured (default: body)",
+        choices=REGIONS,
+        default=REGIONS[0],
+    )
     for what, prefix in (("participant", "sub-"), ("session", "ses-")):
         add(
             f"--{what}-label",

@@ -1,4 +1,4 @@
-"""The files of the output dataset as a whole: description, settings, what to cite."""
+"""The files of a dataset as a whole: description, settings, methods text with references."""
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
@@ -38,14 +38,21 @@ def check_own_dataset(root: Path) -> None:
         )
 
 
-def generated_by(description: Mapping[str, Any]) -> list[str]:
+def read_description(root: Path) -> dict[str, Any] | None:
+    """Read ``dataset_description.json``: ``None`` if there is none, empty if it is unreadable."""
+    path = root / DATASET_FILES["description"]
+    try:
+        return files.read_json(path)
+    except InputError:
+        return {} if path.exists() else None
+
+
+def generated_by(description: Mapping[str, Any] | None) -> list[str]:
     """Names of the software that a dataset description says it was made by."""
-    entries = description.get("GeneratedBy")
-    return [
-        str(entry.get("Name"))
-        for entry in (entries if isinstance(entries, list) else [])
-        if isinstance(entry, Mapping)
-    ]
+    entries = (description or {}).get("GeneratedBy")
+    if not isinstance(entries, list):
+        entries = [(description or {}).get("PipelineDescription")]  # BIDS before 1.4
+    return [str(e["Name"]) for e in entries if isinstance(e, Mapping) and "Name" in e]
 
 
 def settle_settings(root: Path, settings: Settings) -> str:
@@ -122,12 +129,9 @@ def write_description(root: Path, sources: Mapping[str, Path]) -> None:
 
 
 def _source(folder: Path) -> dict[str, str]:
-    """Where a source dataset is, with its identifier and version if its description has them."""
+    """Describe where a source dataset is, with its identifier and version if these are known."""
     entry = {"URL": folder.resolve().as_uri()}
-    try:
-        description = files.read_json(folder / DATASET_FILES["description"])
-    except InputError:  # most FreeSurfer and ASHS folders have none
-        return entry
+    description = read_description(folder) or {}  # most FreeSurfer and ASHS folders have none
     for key, theirs in (("DOI", "DatasetDOI"), ("Version", "DatasetVersion")):
         if isinstance(description.get(theirs), str):
             entry[key] = description[theirs]
@@ -135,10 +139,10 @@ def _source(folder: Path) -> dict[str, str]:
 
 
 def source_names(folders: Iterable[tuple[str, Path]]) -> dict[str, Path]:
-    """Give each source dataset a name of its own."""
+    """Choose a unique name for each source dataset."""
     names: dict[str, Path] = {}
-    for wish, folder in dict.fromkeys(folders):
-        base = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "-" for c in wish)
+    for wanted, folder in dict.fromkeys(folders):
+        base = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "-" for c in wanted)
         name, number = base, 2
         while names.get(name, folder) != folder:
             name, number = f"{base}-{number}", number + 1
@@ -147,7 +151,7 @@ def source_names(folders: Iterable[tuple[str, Path]]) -> dict[str, Path]:
 
 
 def source_address(path: Path, sources: Mapping[str, Path]) -> str:
-    """Spell an input file as a BIDS address, ``bids:<dataset>:<path in it>``."""
+    """Write the path of an input file as a BIDS address, ``bids:<dataset>:<path in it>``."""
     for name, folder in sources.items():
         if path.is_relative_to(folder):
             return f"bids:{name}:{path.relative_to(folder).as_posix()}"
@@ -157,9 +161,6 @@ def source_address(path: Path, sources: Mapping[str, Path]) -> str:
 def write_citation(root: Path, settings: Settings, protocols: Sequence[Protocol]) -> None:
     """Write ``CITATION.md``: a methods paragraph with this run's settings, and the references."""
     files.write_text(root / DATASET_FILES["citation"], citation_text(settings, protocols))
-
-
-# Wording of ``CITATION.md``: a methods paragraph that says what was done, with references.
 
 
 _LAYER_RULES = {
@@ -195,7 +196,7 @@ REFERENCES: dict[str, str] = {
 
 
 def citation_text(settings: Settings, protocols: Sequence[Protocol]) -> str:
-    """Word the methods paragraph."""
+    """Compose the methods paragraph, with all settings and the references."""
     entries = list(REFERENCES.values())
     entries += [protocol.citation for protocol in protocols if protocol.citation not in entries]
     number = {entry: i for i, entry in enumerate(entries, start=1)}

@@ -1,11 +1,11 @@
-"""The one table of outputs, and the one function that spells their paths.
+"""The table of outputs, and the names and paths of results.
 
 Entities follow the order of BIDS 1.11 (``sub ses hemi space seg label desc``). What the standard
 has no rule for is listed in ``.bidsignore`` from the same table.
 """
 
 import re
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from pathlib import PurePosixPath
 
 from hipsta_bids.geometry.catalog import MAPS
@@ -41,7 +41,7 @@ class HemisphereName:
 
     @property
     def stem(self) -> str:
-        """What all file names of this hemisphere's subject and session begin with."""
+        """Subject, session and side, with which all file names begin."""
         session = f"_ses-{self.session}" if self.session else ""
         return f"sub-{self.subject}{session}_hemi-{self.hemi}"
 
@@ -52,7 +52,7 @@ class HemisphereName:
         return PurePosixPath(f"sub-{self.subject}", *session, "anat")
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Output:
     """One row of the output table."""
 
@@ -60,6 +60,7 @@ class Output:
     suffix: str
     extension: str
     description: str
+    _: KW_ONLY
     desc: str | None = None
     space: str | None = None
     optional: bool = False
@@ -68,196 +69,100 @@ class Output:
     """Whether BIDS 1.11 has a rule for this name."""
 
 
-_SURFACES = ("interior", "midthickness", "exterior")
+def _table(
+    key: str, description: str, *, called: str | None = None, note: str = "", optional: bool = False
+) -> tuple[Output, Output]:
+    """Describe a table of one hemisphere, and its sidecar."""
+    sidecar = f"columns, units and definitions of {called or f'the {key} table'}{note}"
+    return (
+        Output(key, "morph", ".tsv", description + note, desc=key, optional=optional),
+        Output(f"{key}_sidecar", "morph", ".json", sidecar, desc=key, optional=optional),
+    )
+
+
+_SURFACES = {
+    "surface": ("surface of the sheet in the scanner space of the subject", None),
+    "unfold": ("surface laid flat: medial to lateral, posterior to anterior", "unfold"),
+}
+_MESHES = " (`--write-meshes`)"
 
 #: Every file of one hemisphere. The quality record comes last: it is written when all else is
 #: there, so that its presence means that the set is complete.
 OUTPUTS: tuple[Output, ...] = (
-    Output(
-        key="sheet",
-        desc="sheet",
-        suffix="morph",
-        extension=".tsv",
-        description="one row per sheet point: position, thickness, curvatures, extents, subfield",
+    *_table("sheet", "one row per sheet point: position, thickness, curvatures, extents, subfield"),
+    *_table(
+        "summary",
+        "one row: means of thickness, curvatures and cross-sections, extents, volume, areas and"
+        " their ratios; some per subfield",
     ),
-    Output(
-        key="sheet_sidecar",
-        desc="sheet",
-        suffix="morph",
-        extension=".json",
-        description="columns, units and definitions of the sheet table",
-    ),
-    Output(
-        key="summary",
-        desc="summary",
-        suffix="morph",
-        extension=".tsv",
-        description="one row: means of thickness, curvatures and cross-sections, extents, volume,"
-        " areas and their ratios; some per subfield",
-    ),
-    Output(
-        key="summary_sidecar",
-        desc="summary",
-        suffix="morph",
-        extension=".json",
-        description="columns, units and definitions of the summary table",
-    ),
+    *_table("profile", "means along the sheet: one row per x (over y), then one per y (over x)"),
+    *_table("sections", "one row per cross-section: lengths, area, ratio, shape index"),
     *(
-        row
-        for table, description in (
-            ("profile", "means along the sheet: one row per x (over y), then one per y (over x)"),
-            ("sections", "one row per cross-section: lengths, area, ratio, shape index"),
-        )
-        for row in (
-            Output(
-                key=table, desc=table, suffix="morph", extension=".tsv", description=description
-            ),
-            Output(
-                key=f"{table}_sidecar",
-                desc=table,
-                suffix="morph",
-                extension=".json",
-                description=f"columns, units and definitions of the {table} table",
-            ),
-        )
+        Output(f"{name}_{kind}", name, ".surf.gii", f"{name} {description}", space=space)
+        for kind, (description, space) in _SURFACES.items()
+        for name in ("interior", "midthickness", "exterior")
     ),
     *(
         Output(
-            key=f"{name}_surface",
-            suffix=name,
-            extension=".surf.gii",
-            description=f"{name} surface of the sheet in the scanner space of the subject",
-        )
-        for name in _SURFACES
-    ),
-    *(
-        Output(
-            key=f"{name}_unfold",
-            suffix=name,
-            space="unfold",
-            extension=".surf.gii",
-            description=f"{name} surface laid flat: medial to lateral, posterior to anterior",
-        )
-        for name in _SURFACES
-    ),
-    *(
-        Output(
-            key=row.name,
+            row.name,
+            row.suffix,
+            ".shape.gii",
+            f"{row.definition}; per surface vertex, {row.unit}",
             desc=row.desc,
-            suffix=row.suffix,
-            extension=".shape.gii",
-            description=f"{row.definition}; per surface vertex, {row.unit}",
         )
         for row in MAPS
     ),
+    Output("subfields", "dseg", ".label.gii", "subfield per surface vertex", in_standard=True),
     Output(
-        key="subfields",
-        suffix="dseg",
-        extension=".label.gii",
-        description="subfield per surface vertex",
-        in_standard=True,
-    ),
-    Output(
-        key="body_mask",
+        "body_mask",
+        "mask",
+        ".nii.gz",
+        "the measured body on the grid of the labels; edit a copy to correct it",
         desc="body",
-        suffix="mask",
-        extension=".nii.gz",
-        description="the measured body on the grid of the labels; edit a copy to correct it",
     ),
-    Output(
-        key="layers",
-        desc="layers",
-        suffix="morph",
-        extension=".tsv",
-        description="one row per point of the three-dimensional grid: layer, depth, position"
-        " (`--write-meshes`)",
+    *_table(
+        "layers",
+        "one row per point of the three-dimensional grid: layer, depth, position",
+        note=_MESHES,
         optional=True,
     ),
     Output(
-        key="layers_sidecar",
-        desc="layers",
-        suffix="morph",
-        extension=".json",
-        description="columns, units and definitions of the layers table (`--write-meshes`)",
-        optional=True,
-    ),
-    Output(
-        key="mesh",
+        "mesh",
+        "mesh",
+        ".vtu",
+        f"tetrahedral mesh with its three coordinates{_MESHES}",
         desc="tet",
-        suffix="mesh",
-        extension=".vtu",
-        description="tetrahedral mesh with its three coordinates (`--write-meshes`)",
         optional=True,
     ),
     Output(
-        key="qc",
+        "qc",
+        "metrics",
+        ".json",
+        "status, reason, flags, inputs, and every number that says whether to trust the maps",
         desc="qc",
-        suffix="metrics",
-        extension=".json",
-        description="status, reason, flags, inputs, and every number that says whether to trust"
-        " the maps",
     ),
+)
+
+_SAMPLED = (
+    ("table", ".tsv", "another volume at each sheet point, one column per volume (`--map`)"),
+    ("sidecar", ".json", "its source, how it was sampled, and how much of it is missing"),
+    ("shape", ".shape.gii", "the same per surface vertex"),
+    ("series", ".func.gii", "the same per surface vertex, where there are several volumes"),
 )
 
 #: Files of one hemisphere that come with an option or another command. A ``*`` stands for the name
 #: that the user gave.
 EXTRA_OUTPUTS: tuple[Output, ...] = (
-    Output(
-        key="map_table",
-        desc="*",
-        suffix="map",
-        extension=".tsv",
-        description="another volume at each sheet point, one column per volume (`--map`)",
+    *(Output(f"map_{key}", "map", end, text, desc="*") for key, end, text in _SAMPLED),
+    *_table(
+        "roi",
+        "one row per region drawn on the sheet: points, area, mean and SD of the maps (`--roi`)",
+        called="the region table",
     ),
-    Output(
-        key="map_sidecar",
-        desc="*",
-        suffix="map",
-        extension=".json",
-        description="its source, how it was sampled, and how much of it is missing",
-    ),
-    Output(
-        key="map_shape",
-        desc="*",
-        suffix="map",
-        extension=".shape.gii",
-        description="the same per surface vertex",
-    ),
-    Output(
-        key="map_series",
-        desc="*",
-        suffix="map",
-        extension=".func.gii",
-        description="the same per surface vertex, where there are several volumes",
-    ),
-    Output(
-        key="roi",
-        desc="roi",
-        suffix="morph",
-        extension=".tsv",
-        description="one row per region drawn on the sheet: points, area, mean and SD of the maps"
-        " (`--roi`)",
-    ),
-    Output(
-        key="roi_sidecar",
-        desc="roi",
-        suffix="morph",
-        extension=".json",
-        description="columns, units and definitions of the region table",
-    ),
-    Output(
-        key="surrogate",
-        desc="surrogate",
-        suffix="morph",
-        extension=".tsv",
-        description="thickness from the medial axis of single slices (`hipsta-bids surrogate`)",
-    ),
-    Output(
-        key="surrogate_sidecar",
-        desc="surrogate",
-        suffix="morph",
-        extension=".json",
-        description="columns, units and definitions of that table",
+    *_table(
+        "surrogate",
+        "thickness from the medial axis of single slices (`hipsta-bids surrogate`)",
+        called="that table",
     ),
 )
 
@@ -283,7 +188,7 @@ _BY_KEY = {output.key: output for output in (*OUTPUTS, *EXTRA_OUTPUTS)}
 
 
 def output_name(name: HemisphereName, key: str, desc: str | None = None) -> str:
-    """Spell the file name of one output."""
+    """File name of one output; ``desc`` is the name that the user gave a map."""
     output = _BY_KEY[key]
     entities = [
         name.stem,
@@ -296,7 +201,7 @@ def output_name(name: HemisphereName, key: str, desc: str | None = None) -> str:
 
 
 def output_path(name: HemisphereName, key: str, desc: str | None = None) -> PurePosixPath:
-    """Spell the path of one output, relative to the output dataset.
+    """Path of one output, relative to the output dataset.
 
     Parameters
     ----------
@@ -305,7 +210,7 @@ def output_path(name: HemisphereName, key: str, desc: str | None = None) -> Pure
     key : str
         A key of :data:`OUTPUTS` or :data:`EXTRA_OUTPUTS`.
     desc : str, optional
-        See :func:`output_name`.
+        The user's name of a map.
 
     Returns
     -------
@@ -315,8 +220,14 @@ def output_path(name: HemisphereName, key: str, desc: str | None = None) -> Pure
     return name.folder / output_name(name, key, desc)
 
 
+def output_pattern(key: str) -> str:
+    """Glob pattern of one output of all hemispheres."""
+    output = _BY_KEY[key]
+    return f"*_{f'desc-{output.desc}_' if output.desc else ''}{output.suffix}{output.extension}"
+
+
 def name_of_record(file_name: str) -> HemisphereName | None:
-    """Tell whose quality record a file is, the reverse of :func:`output_name`."""
+    """Identify whose quality record a file is: the reverse of :func:`output_name`."""
     match = _RECORD.fullmatch(file_name)
     if match is None:
         return None
@@ -325,12 +236,12 @@ def name_of_record(file_name: str) -> HemisphereName | None:
 
 
 def participant_report(subject: str, session: str | None) -> str:
-    """Spell the name of the page about one visit, in the root of the output dataset."""
+    """File name of the page about one visit, in the root of the output dataset."""
     return f"sub-{subject}{f'_ses-{session}' if session else ''}.html"
 
 
 def group_report(model: str) -> str:
-    """Spell the path of the page about one analysis of the group level, in the output dataset."""
+    """Path of the page about one analysis of the group level, in the output dataset."""
     return f"{DATASET_FILES['group']}/{model}.html"
 
 

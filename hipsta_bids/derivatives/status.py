@@ -35,7 +35,7 @@ COLUMNS: dict[str, str] = {
 }
 
 NOT_FINISHED = "not-finished"
-"""Reason of a hemisphere that a run has not come to yet."""
+"""Reason of a hemisphere that a run has not reached yet."""
 
 _KEY = ("subject", "session", "hemi", "seg")
 
@@ -46,7 +46,7 @@ _SHARD_TABLE = "status_shard-*.tsv"
 
 
 def identity(name: HemisphereName) -> dict[str, str]:
-    """Cells that say whose row it is."""
+    """Cells that identify the hemisphere of a row."""
     return {
         "subject": f"sub-{name.subject}",
         "session": f"ses-{name.session}" if name.session else files.MISSING,
@@ -57,24 +57,23 @@ def identity(name: HemisphereName) -> dict[str, str]:
 
 
 def row_key(row: Row) -> tuple[str, ...]:
-    """Cells that tell rows apart."""
+    """Cells that distinguish rows."""
     region = row.get("region", files.MISSING)
     # Rows of a table without that column are about the body.
     return *(row[key] for key in _KEY), "body" if region == files.MISSING else region
 
 
 def table_path(shard: str | None = None) -> str:
-    """Spell the path of the table, or of that of one part of a dataset, in the output dataset."""
+    """Path in the output dataset of the table, or of that of one shard."""
     if shard is None:
         return DATASET_FILES["status"]
     return f"{DATASET_FILES['logs']}/{_SHARD_TABLE.replace('*', shard)}"
 
 
 def read_status(root: Path) -> list[dict[str, str]]:
-    """Read the rows of all runs so far, also of those that did parts of the dataset.
+    """Read the rows of all runs so far, shards included.
 
-    Where several have a row of the same hemisphere, the one is taken that its quality record
-    bears out.
+    Of several rows of the same hemisphere, the one that agrees with the quality record is taken.
     """
     shards = sorted((root / DATASET_FILES["logs"]).glob(_SHARD_TABLE))
     found: dict[tuple[str, ...], list[dict[str, str]]] = {}
@@ -82,12 +81,12 @@ def read_status(root: Path) -> list[dict[str, str]]:
         for row in read_table(path):
             found.setdefault(row_key(row), []).append(row)
     return [
-        rows[0] if len(rows) == 1 else _borne_out(root, rows) for _, rows in sorted(found.items())
+        rows[0] if len(rows) == 1 else _current(root, rows) for _, rows in sorted(found.items())
     ]
 
 
 def read_table(path: Path) -> list[dict[str, str]]:
-    """Read one table; empty if there is none, or not a readable one."""
+    """Read one table; empty if there is none, or if it is unreadable."""
     try:
         rows = files.read_tsv(path)
     except InputError:
@@ -95,7 +94,7 @@ def read_table(path: Path) -> list[dict[str, str]]:
     return [row for row in rows if all(key in row for key in _KEY)]
 
 
-def _borne_out(root: Path, rows: Sequence[dict[str, str]]) -> dict[str, str]:
+def _current(root: Path, rows: Sequence[dict[str, str]]) -> dict[str, str]:
     """Choose among rows of the same hemisphere."""
     try:
         record = files.read_json(root / output_path(name_of(rows[0]), "qc"))
@@ -105,7 +104,7 @@ def _borne_out(root: Path, rows: Sequence[dict[str, str]]) -> dict[str, str]:
     def rank(row: Row) -> tuple[bool, bool, bool]:
         return (
             agrees(row, record),
-            # Without any that agrees, one run has not come to its end.
+            # If none agrees, one run has not finished.
             row.get("reason") == NOT_FINISHED,
             row.get("seconds", files.MISSING) != files.MISSING,
         )
@@ -114,12 +113,12 @@ def _borne_out(root: Path, rows: Sequence[dict[str, str]]) -> dict[str, str]:
 
 
 def agrees(row: Row, record: Mapping[str, Any]) -> bool:
-    """Say whether a row tells what a quality record says."""
+    """Check whether a row agrees with a quality record."""
     return all(row.get(key) == (record.get(key) or files.MISSING) for key in RECORDED)
 
 
 def name_of(row: Row) -> HemisphereName:
-    """Say whose row it is: the inverse of :func:`identity`."""
+    """Identify whose row it is: the inverse of :func:`identity`."""
     *_, seg, region = row_key(row)
     session = row["session"].removeprefix("ses-")
     return HemisphereName(

@@ -3,9 +3,8 @@
 import ast
 import difflib
 import operator
-import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -13,6 +12,10 @@ from typing import Any
 
 from hipsta_bids.derivatives.hemisphere import ResultPlace
 from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName
+from hipsta_bids.derivatives.read import (
+    list_results,
+    read_record,
+)
 from hipsta_bids.derivatives.status import NOT_FINISHED, name_of, read_status
 from hipsta_bids.errors import InputError, NothingToDoError, UsageError
 from hipsta_bids.group.covariates import relocate
@@ -139,12 +142,6 @@ class QualityCondition:
         return UsageError(f"--exclude-qc {self.text!r} {what}", reason="quality-condition")
 
 
-_RECORD = re.compile(
-    r"sub-(?P<subject>[^_]+)(?:_ses-(?P<session>[^_]+))?_hemi-(?P<hemi>[LR])_seg-(?P<seg>[^_]+)"
-    r"_desc-qc_metrics\.json"
-)
-
-
 @dataclass(frozen=True, kw_only=True)
 class GroupRequest:
     """What the user asked for."""
@@ -153,6 +150,8 @@ class GroupRequest:
     """Output datasets of the participant level."""
     seg: str | None = None
     """Segmentation protocol; ``None`` if there is but one."""
+    region: str = "body"
+    """What was measured: ``body``, ``extended`` or ``entorhinal``."""
     subjects: tuple[str, ...] = ()
     """Labels without ``sub-``; empty is all."""
     sessions: tuple[str, ...] = ()
@@ -210,16 +209,20 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
         if not folder.is_dir():
             raise InputError(f"{folder}: no such folder; check --segmentations", reason="no-folder")
     roots = [root for root in request.roots if root.is_dir() or not may_lack]
-    found = [entry for root in roots for entry in _quality_files(root, request)]
+    everything = [place for root in roots for place in _wanted_results(root, request)]
+    found = [place for place in everything if place.name.region == request.region]
+    notes = _other_regions(everything, request)
     if may_lack and not found:
-        return Collection(settings=resolve(Settings()), settings_hash=settings_hash(Settings()))
-    seg = _one_protocol(found, request)
+        return Collection(
+            settings=resolve(Settings()), settings_hash=settings_hash(Settings()), notes=notes
+        )
+    seg = _one_protocol(found, everything, request)
     found = [place for place in found if place.name.seg == seg]
     _refuse_twice(found)
     unwanted = read_exclusions(request.exclude_table)
     kept: list[SheetRecord] = []
     left_out: list[Exclusion] = []
-    for place in sorted(found, key=_order):
+    for place in sorted(found, key=_key):
         entry = _judge(place, request, unwanted)
         if isinstance(entry, Exclusion):
             left_out.append(entry)
@@ -239,7 +242,10 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
         settings=_settings_of(kept[0].place.root),
         settings_hash=digest,
         versions=tuple(sorted({record.version for record in kept})),
-        notes=lost_exclusions(request.exclude_table, unwanted, [place.name for place in found]),
+        notes=(
+            *notes,
+            *lost_exclusions(request.exclude_table, unwanted, [place.name for place in found]),
+        ),
     )
 
 
@@ -258,40 +264,48 @@ def wanted_by(request: GroupRequest) -> Callable[[str, str | None, str], bool]:
     return is_wanted
 
 
-def _quality_files(root: Path, request: GroupRequest) -> Iterator[ResultPlace]:
+def _wanted_results(root: Path, request: GroupRequest) -> list[ResultPlace]:
     if not root.is_dir():
         raise InputError(
             f"{root}: no such folder; run the participant level first", reason="no-derivatives"
         )
-    for pattern in ("sub-*/anat", "sub-*/ses-*/anat"):
-        for path in root.glob(f"{pattern}/*_desc-qc_metrics.json"):
-            match = _RECORD.fullmatch(path.name)
-            if match is None:
-                continue
-            name = HemisphereName(**match.groupdict())
-            if request.subjects and name.subject not in request.subjects:
-                continue
-            if request.sessions and name.session not in request.sessions:
-                continue
-            yield ResultPlace(root=root, name=name)
+    return [
+        place
+        for place in list_results(root)
+        if (not request.subjects or place.name.subject in request.subjects)
+        and (not request.sessions or place.name.session in request.sessions)
+    ]
 
 
-def _order(place: ResultPlace) -> tuple[str, str, str]:
+def _other_regions(everything: Sequence[ResultPlace], request: GroupRequest) -> tuple[str, ...]:
+    """Say which results are left out because another region was asked for."""
+    counts = Counter(
+        place.name.region for place in everything if request.seg in {None, place.name.seg}
+    )
+    return tuple(
+        f"{count} hemispheres of region {region} are not in this analysis;"
+        f" --region {region} takes them"
+        for region, count in sorted(counts.items())
+        if region != request.region
+    )
+
+
+def _key(place: ResultPlace) -> tuple[str, str, str]:
     return place.name.subject, place.name.session or "", place.name.hemi
 
 
-def _one_protocol(found: Sequence[ResultPlace], request: GroupRequest) -> str:
+def _one_protocol(
+    found: Sequence[ResultPlace], everything: Sequence[ResultPlace], request: GroupRequest
+) -> str:
     counts = Counter(place.name.seg for place in found)
-    if request.seg is not None and request.seg not in counts:
-        known = ", ".join(sorted(counts)) or "nothing"
+    if not counts or request.seg not in {None, *counts}:
+        asked = f" with --seg {request.seg}" if request.seg else " as asked for"
+        asked += f" --region {request.region}" if request.region != "body" else ""
+        kinds = sorted({(place.name.seg, place.name.region) for place in everything})
+        there = [seg if region == "body" else f"{seg} --region {region}" for seg, region in kinds]
+        hint = f"there is {', '.join(there)}" if there else "run the participant level first"
         raise NothingToDoError(
-            f"{request.roots[0]}: no hemisphere with --seg {request.seg}; there is {known}",
-            reason="no-hemisphere",
-        )
-    if not counts:
-        raise NothingToDoError(
-            f"{request.roots[0]}: no hemisphere as asked for; run the participant level first",
-            reason="no-hemisphere",
+            f"{request.roots[0]}: no hemisphere{asked}; {hint}", reason="no-hemisphere"
         )
     if request.seg is None and len(counts) > 1:
         names = ", ".join(f"{name} ({n})" for name, n in sorted(counts.items()))
@@ -305,7 +319,7 @@ def _one_protocol(found: Sequence[ResultPlace], request: GroupRequest) -> str:
 def _refuse_twice(found: Sequence[ResultPlace]) -> None:
     first: dict[tuple[str, str, str], Path] = {}
     for place in found:
-        other = first.setdefault(_order(place), place.root)
+        other = first.setdefault(_key(place), place.root)
         if other != place.root:
             raise InputError(
                 f"{place.name.stem} is in {other} and in {place.root}; participants of different"
@@ -317,7 +331,7 @@ def _refuse_twice(found: Sequence[ResultPlace]) -> None:
 def _judge(
     place: ResultPlace, request: GroupRequest, unwanted: Sequence[Mapping[str, str]]
 ) -> SheetRecord | Exclusion:
-    record = files.read_json(place.path("qc"))
+    record = read_record(place)
     status = record.get("status")
     reason, message = record.get("reason") or str(status), record.get("message") or ""
     listed = next((row for row in unwanted if is_listed(place.name, row)), None)
@@ -367,7 +381,7 @@ def _refuse_unfinished(
                 not request.sessions or name.session in request.sessions
             )
             listed = any(is_listed(name, one) for one in unwanted)
-            same = name.seg == seg and name.region == "body"  # the body alone is read here
+            same = (name.seg, name.region) == (seg, request.region)
             if row.get("reason") == NOT_FINISHED and same and asked and not listed:
                 pending.append(name.stem)
     if pending:

@@ -50,13 +50,22 @@ REFERENCES: Mapping[str, str] = {
     " regression. Statistics in Medicine 2002;21(16):2409-2419. doi:10.1002/sim.1047",
 }
 
+#: What was measured, by region.
+_MEASURED = {
+    "body": "the hippocampus",
+    "extended": "the hippocampus and the neighboring cortex",
+    "entorhinal": "the cortex beside the hippocampus",
+}
+
 
 def methods_text(
     cohort: Cohort,
     analysis: Analysis,
     settings: GroupSettings,
     n_out: int,
+    *,
     others: Sequence[str] = (),
+    region: str = "body",
 ) -> str:
     """Word what was done and what came out."""
     cited: list[str] = []
@@ -67,6 +76,7 @@ def methods_text(
         return f"[{cited.index(key) + 1}]"
 
     paragraphs = [_sample(cohort, analysis, n_out, cite("method"), others)]
+    paragraphs[0] = paragraphs[0].replace("the hippocampus", _MEASURED[region], 1)
     if analysis.sides or others:
         paragraphs.append(_alignment(analysis, settings, cite, others))
     paragraphs.append(_models(analysis, settings, cite))

@@ -8,14 +8,12 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
-from pyarrow import csv
 
+from hipsta_bids.derivatives.read import read_sheet, read_summary, read_units
 from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.group.collect import SheetRecord
 from hipsta_bids.group.data import PARTICIPANT, SESSION, Float, Measures, SideMaps
-from hipsta_bids.io import files
 
 #: Map that registration rests on.
 CURVATURE = "curvature"
@@ -83,10 +81,7 @@ def _sampled(records: Sequence[SheetRecord]) -> list[str]:
 
 
 def _summary_names(records: Sequence[SheetRecord]) -> tuple[str, ...]:
-    if not records:
-        return ()
-    rows: Sequence[Mapping[str, str]] = files.read_tsv(records[0].place.path("summary"))
-    return tuple(rows[0]) if rows else ()
+    return tuple(read_summary(records[0].place)) if records else ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,7 +128,8 @@ def read_sheets(
         sides=sides,
         x=_coordinates(grid["x_extent"], shape[0]),
         y=_coordinates(grid["y_extent"], shape[1]),
-        units=_units(records) | {n: ARBITRARY for n in names if n not in SHEET_MAPS},
+        units=(read_units(records[0].place) if records else {})
+        | {n: ARBITRARY for n in names if n not in SHEET_MAPS},
         sources={
             visit_name(r.place.name.subject, r.place.name.session): (r.source, r.place.root)
             for r in reversed(records)
@@ -169,16 +165,15 @@ def _read_side(
     codes: dict[str, int] = {}
     summaries = []
     for i, record in enumerate(records):
-        table = _read_columns(record.place.path("sheet"), shape, measured, ["subfield"])
-        for name in measured:
-            maps[name][i] = table.column(name).to_numpy().reshape(shape)
+        columns = read_sheet(record.place.path("sheet"), measured, ["subfield"], shape)
         for name in sampled:
             path = _sampled_table(record, name)
             if path.is_file():
-                column = _read_columns(path, shape, [name]).column(name)
-                maps[name][i] = column.to_numpy().reshape(shape)
-        subfield[i] = _encode(table.column("subfield"), codes).reshape(shape)
-        summaries.append(_read_summary(record.place.path("summary")))
+                columns |= read_sheet(path, [name], shape=shape)
+        for name in maps.keys() & columns.keys():
+            maps[name][i] = columns[name]
+        subfield[i] = _encode(columns["subfield"], codes)
+        summaries.append(read_summary(record.place))
     summary = pd.DataFrame(summaries).astype(np.float64)
     return SideMaps(rows=rows, maps=maps, subfield=subfield, names=tuple(codes), summary=summary)
 
@@ -188,74 +183,8 @@ def _sampled_table(record: SheetRecord, name: str) -> Path:
     return record.place.path("map_table", name.partition("_")[0])
 
 
-def _read_columns(
-    path: Path, shape: tuple[int, int], numbers: Sequence[str], words: Sequence[str] = ()
-) -> pa.Table:
-    try:
-        table = csv.read_csv(
-            path,
-            read_options=csv.ReadOptions(use_threads=False),
-            parse_options=csv.ParseOptions(delimiter="\t"),
-            convert_options=csv.ConvertOptions(
-                include_columns=["x", "y", *numbers, *words],
-                column_types={
-                    **dict.fromkeys(numbers, pa.float64()),
-                    **dict.fromkeys(words, pa.string()),
-                },
-                null_values=[files.MISSING],
-                strings_can_be_null=True,
-            ),
-        )
-    except (OSError, pa.ArrowInvalid, pa.ArrowKeyError, KeyError) as error:
-        first = str(error).partition("\n")[0]
-        raise InputError(
-            f"{path}: not readable as a sheet ({first}); run the participant level again with"
-            " --force",
-            reason="unreadable-table",
-        ) from error
-    x, y = (table.column(name).to_numpy() for name in "xy")
-    expected = np.divmod(np.arange(shape[0] * shape[1]), shape[1])
-    if len(x) != len(expected[0]) or any(
-        (given != wanted + 1).any() for given, wanted in zip((x, y), expected, strict=True)
-    ):
-        raise InputError(
-            f"{path}: not a sheet of {shape[0]} x {shape[1]} nodes, as the settings say; run the"
-            " participant level again with --force",
-            reason="mixed-grids",
-        )
-    return table
-
-
-def _encode(column: pa.ChunkedArray, codes: dict[str, int]) -> np.ndarray[Any, Any]:
+def _encode(words: np.ndarray[Any, Any], codes: dict[str, int]) -> np.ndarray[Any, Any]:
     """Replace names by numbers, new names at the end; -1 where missing."""
-    encoded = column.combine_chunks().dictionary_encode()
-    names = encoded.dictionary.to_pylist()
-    numbers = np.array([codes.setdefault(name, len(codes)) for name in names] + [-1])
-    indices = encoded.indices.fill_null(len(names)).to_numpy()
-    return np.asarray(numbers[indices], dtype=np.int8)
-
-
-def _read_summary(path: Path) -> dict[str, float]:
-    rows = files.read_tsv(path)
-    try:
-        (row,) = rows
-        return {
-            name: float("nan") if cell == files.MISSING else float(cell)
-            for name, cell in row.items()
-        }
-    except ValueError as error:
-        raise InputError(
-            f"{path}: not one row of numbers; run the participant level again with --force",
-            reason="bad-table",
-        ) from error
-
-
-def _units(records: Sequence[SheetRecord]) -> dict[str, str]:
-    """Units of maps and summary columns, from the sidecars of the first hemisphere."""
-    units = {}
-    paths = [r.place.path(key) for r in records[:1] for key in ("sheet_sidecar", "summary_sidecar")]
-    for path in paths:
-        for name, entry in files.read_json(path).items():
-            if isinstance(entry, Mapping) and "Units" in entry:
-                units[name] = str(entry["Units"])
-    return units
+    numbers, names = pd.factorize(words.ravel())
+    known = np.array([codes.setdefault(name, len(codes)) if name else -1 for name in names])
+    return np.asarray(known[numbers], dtype=np.int8).reshape(words.shape)

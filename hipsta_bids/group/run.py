@@ -181,12 +181,14 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
     analysis = replace(analysis, found=found)
     exclusions = [*inputs.exclusions, *_incomplete(analysis)]
     wanted = wanted_measures(options.model, options.measures)
-    name = options.model.name or folder_name(model.formula, wanted) + options.comparison.suffix
+    region = options.sheets.region
+    name = folder_name(model.formula, wanted) + options.comparison.suffix
+    name = options.model.name or (name if region == "body" else f"{name}_{region}")
     notes = [*inputs.notes, *_notes(inputs, analysis)]
     shapes = average_shapes(inputs.found.records, cohort, analysis, settings)
     _describe(options)
     with write.model_folder(options.out_dir, name) as folder:
-        write_results(folder, cohort, analysis, settings, exclusions, others=others)
+        write_results(folder, cohort, analysis, settings, exclusions, others=others, region=region)
         files.write_json(folder / "model.json", document)
         write_shapes(folder, shapes)
         if analysis.sides and inputs.found.records and not shapes:
@@ -353,6 +355,7 @@ def _record(
             "settings_hash": found.settings_hash,
             "versions": found.versions,
             "seg": found.records[0].place.name.seg if found.records else None,
+            "region": options.sheets.region,
             "maps": dict(options.maps),
             "volumes": dict(options.volumes),
             "covariates": [str(path) for path in options.covariates],

@@ -82,6 +82,7 @@ def write_results(
     exclusions: Sequence[Exclusion],
     *,
     others: Mapping[str, tuple[Cohort, Analysis]],
+    region: str = "body",
 ) -> None:
     """Write tables, maps and text."""
     for name, table in result_tables(cohort, analysis, settings):
@@ -109,7 +110,9 @@ def write_results(
     for one in ((cohort, analysis), *others.values()):
         _write_gifti(folder, *one)
         _write_scores(folder, *one)
-    text = methods_text(cohort, analysis, settings, len(exclusions), tuple(others))
+    text = methods_text(
+        cohort, analysis, settings, len(exclusions), others=tuple(others), region=region
+    )
     files.write_text(folder / "methods.md", text)
 
 

@@ -13,9 +13,8 @@ from pathlib import Path
 from hipsta_bids.errors import HipstaError, InputError
 from hipsta_bids.inputs.request import Edit, HemisphereInput, InputRequest
 from hipsta_bids.inputs.scan import Selection, Visit, list_visits, subject_folders
-from hipsta_bids.inputs.tables import read_table
+from hipsta_bids.inputs.tables import table_protocol
 from hipsta_bids.io.files import entities
-from hipsta_bids.protocols.load import protocol_from_names
 
 #: Names under which ``--edited-dir`` and the output dataset appear in addresses.
 _EDITED, _OUTPUT = "edited", "output"
@@ -43,7 +42,7 @@ class EditedFile:
 
 
 def is_edited(name: str) -> bool:
-    """Say whether a file name is that of edited labels or an edited mask."""
+    """Check whether a file name is that of edited labels or an edited mask."""
     if "desc-edited" not in name:
         return False
     pairs = entities(name)
@@ -68,7 +67,7 @@ def list_edits(request: InputRequest, selection: Selection) -> list[EditedFile]:
     found = []
     if request.edited_dir is not None:
         found += _edits_of_dataset(request.edited_dir, _EDITED, selection)
-    # Whether it can be read is for those to say who write there.
+    # Whether the output folder can be used is checked where results are written.
     with contextlib.suppress(InputError):
         if request.output_dir is not None:
             found += _edits_of_dataset(request.output_dir, _OUTPUT, selection)
@@ -92,7 +91,7 @@ def each_once(edited: Iterable[EditedFile]) -> list[EditedFile]:
 def attach_edits(
     items: Iterable[HemisphereInput], edited: Iterable[EditedFile], selection: Selection
 ) -> tuple[tuple[HemisphereInput, ...], tuple[str, ...]]:
-    """Give each hemisphere the files that correct it."""
+    """Attach the files that correct each hemisphere, and note those that correct none."""
     found = list(items)
     corrections: dict[int, list[EditedFile]] = {}
     notes = []
@@ -130,7 +129,7 @@ def _corrects(file: EditedFile, item: HemisphereInput) -> bool:
 
 
 def _misnamed(file: EditedFile) -> str | None:
-    """Say what is wrong with a name, if anything."""
+    """Describe what is wrong with a name, if anything."""
     names = file.names
     if names.get("hemi") not in ("L", "R"):
         return "its name has no hemi-L or hemi-R"
@@ -141,7 +140,7 @@ def _misnamed(file: EditedFile) -> str | None:
 
 
 def _why_not(file: EditedFile, items: list[HemisphereInput]) -> str:
-    """Say why a file corrects nothing."""
+    """Explain why a file corrects nothing."""
     misnamed = _misnamed(file)
     if misnamed:
         return misnamed
@@ -189,9 +188,7 @@ def _described(item: HemisphereInput) -> HemisphereInput:
     if not table.exists():
         return item
     try:
-        protocol = protocol_from_names(
-            read_table(table), name=item.protocol.name, origin=table.name
-        )
+        protocol = table_protocol(table, item.protocol.name)
     except HipstaError as error:
         return replace(item, problem=item.problem or error)
     # The citation is that of the protocol; a table has none.

@@ -61,7 +61,7 @@ class Analysis:
         return self.longitudinal, scans, -(self.version or 0)
 
     def answers(self, wanted: "Analysis") -> bool:
-        """Say whether this is the wanted analysis (of any version, if none is wanted)."""
+        """Check whether this is the wanted analysis (of any version, if none is wanted)."""
         return (
             self.scans == wanted.scans
             and self.longitudinal == wanted.longitudinal

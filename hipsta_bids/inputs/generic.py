@@ -3,17 +3,15 @@
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 
 from hipsta_bids.errors import HipstaError, InputError, ProtocolError
 from hipsta_bids.inputs.edits import is_edited
 from hipsta_bids.inputs.hippunfold import is_hippunfold
-from hipsta_bids.inputs.request import HemisphereInput
+from hipsta_bids.inputs.request import HemisphereInput, unknown_protocol
 from hipsta_bids.inputs.scan import Selection, Source, Visit
-from hipsta_bids.inputs.tables import find_table, read_table
+from hipsta_bids.inputs.tables import find_table, table_protocol
 from hipsta_bids.io.files import entities
-from hipsta_bids.protocols.load import protocol_from_names
 from hipsta_bids.protocols.protocol import Protocol
 
 _IMAGES = {".nii.gz", ".nii", ".mgz", ".mgh"}
@@ -72,7 +70,8 @@ def _choose(files: list[_File], visit: Visit, hemi: str, source: Source) -> Hemi
         subject=visit.subject,
         session=visit.session,
         hemi=hemi,
-        protocol=chosen.protocol or _placeholder(chosen.path),
+        protocol=chosen.protocol
+        or unknown_protocol("unknown", f"Labels of {chosen.path.name}, not described"),
         files=(chosen.path,),
         source=source.name,
         source_path=source.path,
@@ -117,23 +116,12 @@ def _describe(
         )
         return _File(path=path, space=space, protocol=None, origin="", problem=problem)
     try:
-        protocol = _protocol(table, _protocol_name(pairs, source))
+        protocol = table_protocol(table, _protocol_name(pairs, source))
     except (InputError, ProtocolError) as error:
         if error.reason == "unclear-names":
             return None
         return _File(path=path, space=space, protocol=None, origin=table.name, problem=error)
     return _File(path=path, space=space, protocol=protocol, origin=table.name)
-
-
-# One table at the top of a dataset describes all of its files.
-@lru_cache(maxsize=64)
-def _protocol(table: Path, name: str) -> Protocol:
-    return protocol_from_names(read_table(table), name=name, origin=table.name)
-
-
-def forget_tables() -> None:
-    """Read tables anew from now on."""
-    _protocol.cache_clear()
 
 
 def _protocol_name(pairs: dict[str, str], source: Source) -> str:
@@ -143,15 +131,3 @@ def _protocol_name(pairs: dict[str, str], source: Source) -> str:
         if plain:
             return plain
     return "labels"
-
-
-def _placeholder(path: Path) -> Protocol:
-    return Protocol(
-        name="unknown",
-        title=f"Labels of {path.name}, not described",
-        citation="",
-        sheet=(),
-        layer=(),
-        interior=(),
-        labels=(),
-    )

@@ -42,7 +42,7 @@ class _File:
 
 
 def is_hippunfold(name: str, source: Source) -> bool:
-    """Say whether a file is HippUnfold's segmentation of hippocampal subfields."""
+    """Check whether a file is HippUnfold's segmentation of hippocampal subfields."""
     if "desc-subfields" not in name or "_hemi-" not in name:
         return False
     if source.generators and "hippunfold" not in source.generators:

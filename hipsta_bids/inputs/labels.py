@@ -1,4 +1,4 @@
-"""Segmentations as label volumes."""
+"""Segmentations as label volumes, with what a person corrected: labels, and the body's mask."""
 
 from pathlib import Path
 from typing import Any
@@ -15,85 +15,21 @@ from hipsta_bids.protocols.load import for_region, load_protocol, protocol_names
 from hipsta_bids.protocols.protocol import OUTSIDE, Part, Protocol, Tissue, translate
 from hipsta_bids.types import Bool, EditedMask, Float, LabelVolume
 
-# Body masks: what a person corrected, brought to the grid of the labels, and what is written.
+#: Kept around the hippocampal labels [mm], where the image extends that far.
+MARGIN = 5.0
 
+#: How far the affines of files that are combined may differ [mm, and 1 per voxel].
+_SAME_GRID = 1e-3
+
+#: Least share of edited labels that has to lie where the original labels are.
+_SAME_PLACE = 0.5
 
 #: A voxel belongs to a mask of another grid if this much of it does, by linear interpolation; a
 #: little less than a half, so that rounding does not decide where borders coincide.
 _HALF = 0.5 - 1e-6
 
-
-def sample_mask(
-    data: NDArray[Any], own: Float, affine: Float, shape: tuple[int, ...], path: Path
-) -> EditedMask:
-    """Bring an edited mask to the grid of the labels.
-
-    ``own, affine`` Of the mask and of the labels, voxel index to RAS mm.
-    """
-    values = np.unique(data)
-    if len(values) > 2 or not np.isfinite(values).all() or (len(values) == 2 and 0 not in values):  # noqa: PLR2004 (two)
-        raise InputError(
-            f"{path}: a mask has the value 0 and one other, this has {_some(values)}; save edited "
-            "labels as desc-edited_dseg instead",
-            reason="edited-mask-not-binary",
-        )
-    if not values.any():
-        raise InputError(
-            f"{path}: the edited mask is empty; delete it, or save it again",
-            reason="edited-mask-empty",
-        )
-    inside = data != 0
-    index = np.argwhere(inside)
-    # A border of zeros, so that interpolation ends beside the mask.
-    low = index.min(axis=0) - 1
-    size = index.max(axis=0) + 2 - low
-    crop = np.zeros(size, dtype=np.float32)
-    crop[tuple((index - low).T)] = 1
-    to_mask = np.linalg.inv(own) @ affine
-    sampled = ndimage.affine_transform(
-        crop, to_mask[:3, :3], to_mask[:3, 3] - low, output_shape=shape, order=1, mode="constant"
-    )
-    return EditedMask(inside=sampled >= _HALF, voxel=in_plane_voxel(own))
-
-
-def sample_nearest(
-    data: NDArray[Any], own: Float, affine: Float, shape: tuple[int, ...]
-) -> NDArray[Any]:
-    """Take labels at the nearest voxels of another grid; 0 outside of it.
-
-    ``own, affine`` Of the labels, and of the grid that is wanted, voxel index to RAS mm.
-    """
-    to_own = np.linalg.inv(own) @ affine
-    sampled: NDArray[Any] = ndimage.affine_transform(
-        data, to_own[:3, :3], to_own[:3, 3], output_shape=shape, order=0, mode="constant"
-    )
-    return sampled
-
-
-def within(mask: Bool, affine: Float, box: tuple[slice, ...], own: Float) -> float:
-    """Tell which share of a mask lies in a box of another grid.
-
-    ``affine, own`` Of the mask, and of the grid of the box, voxel index to RAS mm.
-    """
-    to_own = np.linalg.inv(own) @ affine
-    index = np.argwhere(mask) @ to_own[:3, :3].T + to_own[:3, 3]
-    low, high = ([getattr(side, name) for side in box] for name in ("start", "stop"))
-    return float(((index >= low) & (index < high)).all(axis=1).mean()) if len(index) else 0.0
-
-
-def _some(values: NDArray[Any]) -> str:
-    more = ", ..." if len(values) > 5 else ""  # noqa: PLR2004 (enough to recognize them)
-    return ", ".join(f"{value:g}" for value in values[:5].tolist()) + more
-
-
-#: Kept around the hippocampal labels [mm], where the image extends that far.
-MARGIN = 5.0
-
-#: How far the affines of files that are combined may differ [mm, and 1 per voxel].
-SAME_GRID = 1e-3
-
-#: Least share of edited labels that has to lie where the original labels are.
-SAME_PLACE = 0.5
+#: How many values an error message lists.
+_SHOWN = 5
 
 _Box = tuple[slice, slice, slice]
 
@@ -110,12 +46,14 @@ def read_label_volume(item: HemisphereInput, region: str = "body") -> LabelVolum
     Parameters
     ----------
     item : HemisphereInput
+        Which files, and the protocol of their codes.
     region : str
         What is going to be measured (``body.region`` of the settings).
 
     Returns
     -------
     LabelVolume
+        Tissues and parts per voxel, with the affine to RAS mm.
 
     Raises
     ------
@@ -124,7 +62,7 @@ def read_label_volume(item: HemisphereInput, region: str = "body") -> LabelVolum
     InputError
         ``unreadable-image``, ``not-3d``, ``bad-affine``, ``bad-voxel-size``,
         ``non-integer-labels``, ``empty-labels``, ``grid-mismatch``, or, of edited files,
-        ``edited-elsewhere`` or what :func:`~hipsta_bids.bids.masks.sample_mask` raises.
+        ``edited-elsewhere``, ``edited-mask-not-binary`` or ``edited-mask-empty``.
     ProtocolError
         ``unknown-labels`` or ``wrong-scheme``; ``no-cortex-labels`` if the protocol has none.
     """
@@ -150,7 +88,8 @@ def read_label_volume(item: HemisphereInput, region: str = "body") -> LabelVolum
     hippocampal = ~np.isin(tissue, tuple(OUTSIDE.difference(sheet)))
     inner = _bounding_box(hippocampal, affine, path)
     start = np.array([a.start + b.start for a, b in zip(box, inner, strict=True)])
-    cropped = _shift(affine, start)
+    cropped = affine.copy()
+    cropped[:3, 3] += affine[:3, :3] @ start
     if labels:
         _check_same_place(hippocampal[inner], cropped, item, path)
     return LabelVolume(
@@ -159,7 +98,7 @@ def read_label_volume(item: HemisphereInput, region: str = "body") -> LabelVolum
         affine=cropped,
         protocol=item.protocol,
         edited_mask=(
-            sample_mask(*read_voxels(mask.path), cropped, tissue[inner].shape, mask.path)
+            _sample_mask(*read_voxels(mask.path), cropped, tissue[inner].shape, mask.path)
             if mask
             else None
         ),
@@ -169,14 +108,18 @@ def read_label_volume(item: HemisphereInput, region: str = "body") -> LabelVolum
 
 
 def _beside(
-    other: Path, path: Path, shape: tuple[int, ...], affine: NDArray[np.float64], *, edited: bool
+    other: Path, path: Path, shape: tuple[int, ...], affine: Float, *, edited: bool
 ) -> NDArray[Any]:
-    """Read a second file on the grid of the first, which may be another's only if edited."""
+    """Read a second file on the grid of the first, at nearest voxels if that one was edited."""
     data, own = read_voxels(other)
-    if data.shape == shape and np.allclose(own, affine, rtol=0, atol=SAME_GRID):
+    if data.shape == shape and np.allclose(own, affine, rtol=0, atol=_SAME_GRID):
         return data
     if edited:
-        return sample_nearest(_integers(data, other), own, affine, shape)
+        to_own = np.linalg.inv(own) @ affine
+        sampled: NDArray[Any] = ndimage.affine_transform(
+            _integers(data, other), to_own[:3, :3], to_own[:3, 3], output_shape=shape, order=0
+        )
+        return sampled
     raise InputError(
         f"{other}: its grid differs from that of {path.name}, with which it is combined; "
         "use files of the same run",
@@ -184,9 +127,7 @@ def _beside(
     )
 
 
-def _check_same_place(
-    hippocampal: NDArray[np.bool_], affine: NDArray[np.float64], item: HemisphereInput, path: Path
-) -> None:
+def _check_same_place(hippocampal: Bool, affine: Float, item: HemisphereInput, path: Path) -> None:
     """Refuse edited labels that lie elsewhere than those which they correct."""
     original = item.files[0]
     try:
@@ -194,8 +135,11 @@ def _check_same_place(
         box = _bounding_box(data != 0, own, original)
     except InputError:  # that may be why a person made others
         return
-    share = within(hippocampal, affine, box, own)
-    if share < SAME_PLACE:
+    to_own = np.linalg.inv(own) @ affine
+    index = np.argwhere(hippocampal) @ to_own[:3, :3].T + to_own[:3, 3]
+    low, high = ([getattr(side, name) for side in box] for name in ("start", "stop"))
+    share = float(((index >= low) & (index < high)).all(axis=1).mean())
+    if share < _SAME_PLACE:
         raise InputError(
             f"{path}: {1 - share:.0%} of the edited labels lie elsewhere than those of "
             f"{original.name}; keep the orientation and position of the image that was edited",
@@ -219,8 +163,8 @@ def _empty(path: Path) -> InputError:
     )
 
 
-def _bounding_box(inside: NDArray[np.bool_], affine: NDArray[np.float64], path: Path) -> _Box:
-    """Find the box round all true voxels, and add the margin as far as the image goes."""
+def _bounding_box(inside: Bool, affine: Float, path: Path) -> _Box:
+    """Bounding box of all true voxels, with the margin as far as the image goes."""
     if not inside.any():
         raise _empty(path)
     # Each axis is projected on its own; ranges of indices are all that is kept.
@@ -281,8 +225,33 @@ def _translate(
         raise ProtocolError(f"{path}: {error}{hint}", reason=error.reason) from error
 
 
-def _shift(affine: NDArray[np.float64], start: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Give the affine of a crop that begins at a voxel index."""
-    moved = affine.copy()
-    moved[:3, 3] += affine[:3, :3] @ start
-    return moved
+def _sample_mask(
+    data: NDArray[Any], own: Float, affine: Float, shape: tuple[int, ...], path: Path
+) -> EditedMask:
+    """Bring an edited mask from its own affine to the grid of the labels."""
+    values = np.unique(data)
+    shown = ", ".join(f"{value:g}" for value in values[:_SHOWN].tolist())
+    shown += ", ..." if len(values) > _SHOWN else ""
+    if len(values) > 2 or not np.isfinite(values).all() or (len(values) == 2 and 0 not in values):  # noqa: PLR2004 (two)
+        raise InputError(
+            f"{path}: a mask has the value 0 and one other, this has {shown}; save edited "
+            "labels as desc-edited_dseg instead",
+            reason="edited-mask-not-binary",
+        )
+    if not values.any():
+        raise InputError(
+            f"{path}: the edited mask is empty; delete it, or save it again",
+            reason="edited-mask-empty",
+        )
+    inside = data != 0
+    index = np.argwhere(inside)
+    # A border of zeros, so that interpolation ends beside the mask.
+    low = index.min(axis=0) - 1
+    size = index.max(axis=0) + 2 - low
+    crop = np.zeros(size, dtype=np.float32)
+    crop[tuple((index - low).T)] = 1
+    to_mask = np.linalg.inv(own) @ affine
+    sampled = ndimage.affine_transform(
+        crop, to_mask[:3, :3], to_mask[:3, 3] - low, output_shape=shape, order=1, mode="constant"
+    )
+    return EditedMask(inside=sampled >= _HALF, voxel=in_plane_voxel(own))

@@ -1,10 +1,13 @@
-"""Other volumes to be sampled on the sheet (``--map``): which files, and what is written."""
+"""Files that users name: volumes to sample (``--map``), regions (``--roi``), paths with labels.
+
+Paths have placeholders, such as ``{subject}``, that stand for the labels of each hemisphere.
+"""
 
 import glob
 import re
 import string
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,19 +21,27 @@ from hipsta_bids.geometry.sampling import Regions
 from hipsta_bids.inputs.request import HemisphereInput, MapSource
 from hipsta_bids.io import files
 
-# Tables of regions drawn on the sheet (``--roi``), and of what the maps are in them.
-
-
-#: Columns of a region file: node numbers as in the sheet table, and the region's name.
+#: Columns of a file of regions: node numbers as in the sheet table, and the region's name.
 COLUMNS = ("x", "y", "region")
+
+#: What a pattern may contain; the side is the hemisphere as FreeSurfer spells it.
+PLACEHOLDERS = ("subject", "session", "hemi", "side")
+
+_SIDES = {"L": "lh", "R": "rh"}
+_HEMIS = {side: hemi for hemi, side in _SIDES.items()}
+
+#: A session's part of a path, which goes where there are no sessions.
+_SESSION = re.compile(r"(?:^|(?<=/))ses-\{session\}/|_ses-\{session\}|\{session\}")
+
+#: What a placeholder stands for.
+_LABELS = {"subject": "[A-Za-z0-9]+", "session": "[A-Za-z0-9]+", "hemi": "[LR]", "side": "[lr]h"}
+#: Wildcards as regular expressions; the others mean the same in both.
+_WILDCARDS = {"**/": "(?:[^/]+/)*", "**": ".*", "*": "[^/]*", "?": "[^/]"}
+_WILDCARD = re.compile(r"(\*\*/|\*\*|\*|\?|\[[^\]]+\])")
 
 
 def read_regions(path: Path, shape: tuple[int, int]) -> Regions:
-    """Read regions drawn on the sheet.
-
-    ``path`` TSV with the columns ````x````, ````y```` (node numbers, from 1, as in the sheet table)
-    and ````region````.
-    """
+    """Read regions drawn on the sheet, one row per point and region."""
     rows = files.read_tsv(path)
     columns = tuple(rows[0]) if rows else ()
     lacking = [name for name in COLUMNS if name not in columns]
@@ -80,25 +91,6 @@ def _nodes(
     return np.array([[int(row["x"]) - 1, int(row["y"]) - 1] for row in rows], dtype=np.intp)
 
 
-# Paths with placeholders, by which users say where other files of each hemisphere are.
-
-
-#: What a pattern may contain; the side is the hemisphere as FreeSurfer spells it.
-PLACEHOLDERS = ("subject", "session", "hemi", "side")
-
-_SIDES = {"L": "lh", "R": "rh"}
-_HEMIS = {side: hemi for hemi, side in _SIDES.items()}
-
-#: A session's part of a path, which goes where there are no sessions.
-_SESSION = re.compile(r"(?:^|(?<=/))ses-\{session\}/|_ses-\{session\}|\{session\}")
-
-#: What a placeholder stands for.
-_LABELS = {"subject": "[A-Za-z0-9]+", "session": "[A-Za-z0-9]+", "hemi": "[LR]", "side": "[lr]h"}
-#: Wildcards as regular expressions; the others mean the same in both.
-_WILDCARDS = {"**/": "(?:[^/]+/)*", "**": ".*", "*": "[^/]*", "?": "[^/]"}
-_WILDCARD = re.compile(r"(\*\*/|\*\*|\*|\?|\[[^\]]+\])")
-
-
 @dataclass(frozen=True, kw_only=True)
 class Found:
     """A file, and whose it is as far as its path says."""
@@ -146,43 +138,37 @@ def scan(pattern: str, root: Path) -> list[Found]:
     for variant in dict.fromkeys((pattern, _SESSION.sub("", pattern))):
         expression = re.compile(_expression(variant))
         name = "".join(
-            glob_part + ("" if field is None else "*")
-            for glob_part, field, _, _ in string.Formatter().parse(variant)
+            literal + ("" if field is None else "*")
+            for literal, field, _, _ in string.Formatter().parse(variant)
         )
         for path in find(name, root):
-            text = path.as_posix() if Path(variant).is_absolute() else _inside(path, root)
-            if (match := expression.fullmatch(text)) and path.is_file():
-                found.setdefault(path, _whose(path, match.groupdict()))
+            text = path if Path(variant).is_absolute() else path.relative_to(root)
+            if (match := expression.fullmatch(text.as_posix())) and path.is_file():
+                labels = match.groupdict()
+                whose = Found(
+                    path=path,
+                    subject=labels["subject"],
+                    session=labels.get("session"),
+                    hemi=labels.get("hemi") or _HEMIS.get(labels.get("side", "")),
+                )
+                found.setdefault(path, whose)
     return sorted(found.values(), key=lambda one: str(one.path))
-
-
-def _inside(path: Path, root: Path) -> str:
-    return str(path)[len(str(root)) :].lstrip("/") if str(root) != "." else str(path)
-
-
-def _whose(path: Path, labels: dict[str, str]) -> Found:
-    hemi = labels.get("hemi") or _HEMIS.get(labels.get("side", ""))
-    return Found(path=path, subject=labels["subject"], session=labels.get("session"), hemi=hemi)
 
 
 def _expression(pattern: str) -> str:
     """Regular expression with a group per placeholder; further ones of a kind must be equal."""
-    return "".join(_parts(pattern))
-
-
-def _parts(pattern: str) -> Iterator[str]:
+    expression = ""
     seen: set[str] = set()
     for literal, field, _, _ in string.Formatter().parse(pattern):
         for part in _WILDCARD.split(literal):
             is_set = part.startswith("[") and part.endswith("]")
-            yield _WILDCARDS.get(part) or (_set(part) if is_set else re.escape(part))
+            expression += _WILDCARDS.get(part) or (
+                part.replace("[!", "[^", 1) if is_set else re.escape(part)
+            )
         if field is not None:
-            yield f"(?P={field})" if field in seen else f"(?P<{field}>{_LABELS[field]})"
+            expression += f"(?P={field})" if field in seen else f"(?P<{field}>{_LABELS[field]})"
             seen.add(field)
-
-
-def _set(part: str) -> str:
-    return f"[^{part[2:]}" if part.startswith("[!") else part
+    return expression
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,11 +187,7 @@ def map_requests(
     samplings: Sequence[tuple[str | None, str]],
     interpolations: Sequence[tuple[str | None, str]],
 ) -> tuple[MapRequest, ...]:
-    """Combine and check the options about maps.
-
-    ``samplings, interpolations`` Choices for one name, or (None) for all that have no choice of
-    their own.
-    """
+    """Combine and check the options about maps; choices without a name are for all other maps."""
     names = [name for name, _ in patterns]
     taken = {row.desc for row in (*OUTPUTS, *EXTRA_OUTPUTS)} | {"x", "y", *(m.name for m in MAPS)}
     for name, pattern in patterns:
@@ -238,17 +220,19 @@ def attach(
     regions: Path | None,
     bids_dir: Path,
 ) -> tuple[tuple[HemisphereInput, ...], tuple[str, ...]]:
-    """Look for the volumes of each hemisphere."""
+    """Look for the volumes of each hemisphere, and count them in one note per map."""
     found = tuple(
         replace(
-            item, maps=tuple(_source(item, wish, bids_dir) for wish in requests), regions=regions
+            item,
+            maps=tuple(_source(item, request, bids_dir) for request in requests),
+            regions=regions,
         )
         for item in items
     )
     notes = []
-    for number, wish in enumerate(requests):
+    for number, request in enumerate(requests):
         without = [item for item in found if item.maps[number].path is None]
-        line = f"map {wish.name}: {len(found) - len(without)} of {len(found)} hemispheres"
+        line = f"map {request.name}: {len(found) - len(without)} of {len(found)} hemispheres"
         if without:
             first = without[0]
             line += (
@@ -259,19 +243,19 @@ def attach(
     return found, tuple(notes)
 
 
-def _source(item: HemisphereInput, wish: MapRequest, bids_dir: Path) -> MapSource:
-    name = fill(wish.pattern, item.subject, item.session, item.hemi)
+def _source(item: HemisphereInput, request: MapRequest, bids_dir: Path) -> MapSource:
+    name = fill(request.pattern, item.subject, item.session, item.hemi)
     matches = find(name, bids_dir)
-    missing, inside = None, not Path(wish.pattern).is_absolute()
+    missing = None
     if not matches:
         missing = f"no file {name}"
     elif len(matches) > 1:
         missing = f"{len(matches)} files match {name}: {matches[0]}, {matches[1]}"
     return MapSource(
-        name=wish.name,
-        sampling=wish.sampling,
-        interpolation=wish.interpolation,
+        name=request.name,
+        sampling=request.sampling,
+        interpolation=request.interpolation,
         path=None if missing else matches[0],
         missing=missing,
-        source_path=bids_dir if inside else None,
+        source_path=None if Path(request.pattern).is_absolute() else bids_dir,
     )

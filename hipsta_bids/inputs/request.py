@@ -41,6 +41,11 @@ class InputRequest:
     bids_database_dir: Path | None = None
 
 
+def unknown_protocol(name: str, title: str) -> Protocol:
+    """Stand in where codes are not understood: the hemisphere fails, but has a name in outputs."""
+    return Protocol(name=name, title=title, citation="", sheet=(), layer=(), interior=(), labels=())
+
+
 @dataclass(frozen=True, kw_only=True)
 class Edit:
     """A file that a person corrected."""

@@ -1,15 +1,19 @@
-"""Listing folders, once each, without opening a file."""
+"""Which datasets to search, which subjects and sessions they hold, and which of these are wanted.
+
+Folders are listed once each, and no image is opened.
+"""
 
 import difflib
 import json
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+from hipsta_bids.derivatives.dataset import NAME, generated_by, read_description
 from hipsta_bids.errors import InputError, UsageError
 from hipsta_bids.inputs.request import HEMIS, InputRequest
 from hipsta_bids.protocols.load import load_protocol
@@ -23,6 +27,20 @@ _SESSION = re.compile(r"ses-(?P<session>[A-Za-z0-9+]+)")
 
 #: Folders below a subject or a session that can hold segmentations.
 _INNER = re.compile(r"anat|mri|final|seg\w*")
+
+LAYOUTS = ("freesurfer", "ashs", "hippunfold", "named")
+"""Kinds of folders that can be searched; ``named`` is any ``_hemi-?_..._dseg`` file with names."""
+
+#: The entry of the filter file that applies to segmentations.
+_QUERY = "dseg"
+
+#: Never indexed: nothing in them says who takes part.
+_IGNORED = tuple(
+    re.compile(rf"^/{name}(/|$)")
+    for name in ("derivatives", "sourcedata", "code", "stimuli", r"\.\w+")
+)
+
+_Wanted = Callable[[str | None], bool]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,41 +142,6 @@ def _inner_folders(folder: SubjectFolder) -> Iterator[tuple[str | None, Folder]]
                 waiting.append((session, path / name, False))
 
 
-def read_description(root: Path) -> dict[str, Any] | None:
-    """Read a dataset's ``dataset_description.json``.
-
-    Returns an empty one if it cannot be understood (nothing depends on it).
-    """
-    try:
-        contents = json.loads((root / "dataset_description.json").read_text("utf-8"))
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError):
-        return {}
-    return contents if isinstance(contents, dict) else {}
-
-
-def generators(description: dict[str, Any] | None) -> frozenset[str]:
-    """Name the software that a dataset says it was made with, in lower case."""
-    entries = (description or {}).get("GeneratedBy")
-    if not isinstance(entries, list):
-        entries = [(description or {}).get("PipelineDescription")]  # BIDS before 1.4
-    return frozenset(
-        str(entry["Name"]).lower()
-        for entry in entries
-        if isinstance(entry, dict) and "Name" in entry
-    )
-
-
-# Which datasets to search, and in which order.
-
-
-LAYOUTS = ("freesurfer", "ashs", "hippunfold", "named")
-"""Kinds of folders that can be searched; ``named`` is any ``_hemi-?_..._dseg`` file with names."""
-
-_OURSELVES = "hipsta_bids"
-
-
 @dataclass(frozen=True, kw_only=True)
 class Source:
     """A dataset that may hold segmentations."""
@@ -174,7 +157,7 @@ class Source:
 
 
 def list_sources(request: InputRequest) -> tuple[Source, ...]:
-    """List the datasets to search, first come first served.
+    """List the datasets to search; earlier ones take precedence.
 
     What the user names comes first (``-d``, then ``--freesurfer-dir``, ``--ashs-dir`` and
     ``--hippunfold-dir``), then ``BIDS_DIR/derivatives``, ``BIDS_DIR/sourcedata``, and ``BIDS_DIR``
@@ -185,29 +168,22 @@ def list_sources(request: InputRequest) -> tuple[Source, ...]:
     sources: dict[Path, Source] = {}
     for source in _candidates(request):
         description = read_description(source.path)
-        made_by = generators(description)
+        made_by = frozenset(name.lower() for name in generated_by(description))
         key = source.path.resolve()
-        if _OURSELVES not in {name.replace("-", "_") for name in made_by} and key not in sources:
-            sources[key] = Source(
-                name=source.name,
-                path=source.path,
-                explicit=source.explicit,
-                layouts=source.layouts,
-                generators=made_by,
-            )
+        if NAME not in {name.replace("-", "_") for name in made_by} and key not in sources:
+            sources[key] = replace(source, generators=made_by)
     return tuple(sources.values())
 
 
 def _candidates(request: InputRequest) -> Iterator[Source]:
     top, _ = list_folder(request.bids_dir)
-    for name, path in request.derivatives.items():
-        for root in _datasets(path, depth=1) or [path]:
-            yield Source(name=name, path=root, explicit=True)
     options = (request.freesurfer_dir, request.ashs_dir, request.hippunfold_dir)
-    for layout, option in zip(LAYOUTS, options, strict=False):
-        if option is not None:
-            for root in _datasets(option, depth=1) or [option]:
-                yield Source(name=layout, path=root, explicit=True, layouts=(layout,))
+    named: list[tuple[str, Path, tuple[str, ...]]]
+    named = [(name, path, LAYOUTS) for name, path in request.derivatives.items()]
+    named += [(name, path, (name,)) for name, path in zip(LAYOUTS, options, strict=False) if path]
+    for name, path, layouts in named:
+        for root in _datasets(path, depth=1) or [path]:
+            yield Source(name=name, path=root, explicit=True, layouts=layouts)
     for folder in ("derivatives", "sourcedata"):
         if folder in top:
             for root in _datasets(request.bids_dir / folder, depth=2, lenient=True):
@@ -215,15 +191,14 @@ def _candidates(request: InputRequest) -> Iterator[Source]:
     # A dataset without a description may be a bare folder of subjects.
     description = read_description(request.bids_dir)
     derived = description is None or description.get("DatasetType") == "derivative"
-    if derived or generators(description):
+    if derived or generated_by(description):
         yield Source(name=request.bids_dir.resolve().name, path=request.bids_dir, explicit=False)
 
 
 def _datasets(root: Path, *, depth: int, lenient: bool = False) -> list[Path]:
     """Find the folders that hold ``sub-*`` folders.
 
-    ``lenient`` leaves out what cannot be listed: nobody asked for it (``sourcedata`` is often
-    closed to all but a few).
+    ``lenient`` leaves out what cannot be listed: ``sourcedata`` is often closed to all but a few.
     """
     try:
         folders, _ = list_folder(root)
@@ -238,15 +213,6 @@ def _datasets(root: Path, *, depth: int, lenient: bool = False) -> list[Path]:
     for name in inner:
         found += _datasets(root / name, depth=depth - 1, lenient=lenient)
     return found
-
-
-# Which subjects, sessions and files are wanted: labels, and fMRIPrep's filter files.
-
-
-#: The entry of the filter file that applies to segmentations.
-_QUERY = "dseg"
-
-_Wanted = Callable[[str | None], bool]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -265,7 +231,7 @@ class Selection:
     """The user's protocol."""
 
     def wants_folder(self, folder: SubjectFolder) -> bool:
-        """Say whether a subject's folder has to be looked into."""
+        """Check whether a subject's folder has to be looked into."""
         return (
             (not self.subjects or folder.subject in self.subjects)
             and (not self.sessions or folder.session is None or folder.session in self.sessions)
@@ -273,17 +239,16 @@ class Selection:
         )
 
     def wants_visit(self, visit: Visit) -> bool:
-        """Say whether a session of a subject is wanted."""
-        return (
-            not self.sessions or (visit.session is not None and visit.session in self.sessions)
-        ) and self._passes("session", visit.session)
+        """Check whether a session of a subject is wanted."""
+        asked = not self.sessions or visit.session in self.sessions
+        return asked and self._passes("session", visit.session)
 
     def wanted_hemis(self) -> tuple[str, ...]:
         """List the hemispheres that are wanted."""
         return tuple(hemi for hemi in HEMIS if hemi in self.hemis and self._passes("hemi", hemi))
 
     def wants_file(self, path: Path) -> bool:
-        """Say whether a file with BIDS entities in its name is wanted."""
+        """Check whether a file with BIDS entities in its name is wanted."""
         if not self.rules:
             return True
         found = _parse(path)
@@ -382,16 +347,6 @@ def _parse(path: Path) -> dict[str, str]:
 
     found = parse_file_entities(str(path), entities=list(_entities().values()))
     return {key: str(value) for key, value in found.items()}
-
-
-# Who is in the BIDS dataset itself, whether or not there is a segmentation.
-
-
-#: Never indexed: nothing in them says who takes part.
-_IGNORED = tuple(
-    re.compile(rf"^/{name}(/|$)")
-    for name in ("derivatives", "sourcedata", "code", "stimuli", r"\.\w+")
-)
 
 
 def list_participants(request: InputRequest) -> frozenset[str]:

@@ -1,34 +1,33 @@
 """Finding the segmentations of each hemisphere.
 
-The flow: which datasets to search (``sources``), which subjects and sessions they hold (``scan``),
-which files are segmentations (one module per layout: ``freesurfer``, ``ashs``, ``hippunfold``,
-``named``), and which of several to take. No image is opened, except where ASHS's atlas can only be
-told from the labels.
+The flow: which datasets to search, and which subjects and sessions they hold (``scan``), which
+files are segmentations (one module per layout: ``freesurfer``, ``ashs``, ``hippunfold``,
+``generic``), and which of several to take. No image is opened, except where ASHS's atlas can only
+be told from the labels.
 """
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from hipsta_bids.derivatives.dataset import read_description
 from hipsta_bids.errors import NothingToDoError, UsageError
 from hipsta_bids.inputs.ashs import AtlasFinder, choose_atlas, find_ashs, sample_files
 from hipsta_bids.inputs.edits import EditedFile, attach_edits, each_once, edits_of_visit, list_edits
 from hipsta_bids.inputs.freesurfer import find_freesurfer
-from hipsta_bids.inputs.generic import find_named, forget_tables
+from hipsta_bids.inputs.generic import find_named
 from hipsta_bids.inputs.hippunfold import find_hippunfold
 from hipsta_bids.inputs.request import HEMIS, HemisphereInput, InputRequest
 from hipsta_bids.inputs.scan import (
     Selection,
     Source,
-    Visit,
     list_participants,
     list_sources,
     list_visits,
     make_selection,
-    read_description,
     subject_folders,
 )
-from hipsta_bids.inputs.tables import forget_folders
+from hipsta_bids.inputs.tables import forget_tables
 from hipsta_bids.protocols.protocol import Protocol
 
 __all__ = [
@@ -63,20 +62,34 @@ class Findings:
 
 
 def find_hemispheres(request: InputRequest) -> tuple[HemisphereInput, ...]:
-    """Find all segmentations that are asked for: the items of :func:`find_inputs`."""
+    """Find all segmentations that are asked for.
+
+    Different protocols of one hemisphere (say, FreeSurfer's and ASHS's) are separate inputs. Where
+    two datasets offer the same protocol, the one that the user named takes precedence, then
+    ``derivatives`` over ``sourcedata``; usable comes before unusable.
+
+    Parameters
+    ----------
+    request : InputRequest
+        Where to look, and for what.
+
+    Returns
+    -------
+    tuple of HemisphereInput
+        Sorted by subject, session, hemisphere, protocol. Some may have a ``problem``.
+
+    Raises
+    ------
+    HipstaError
+        If there is none, or if folders, labels or files that the user named are not right.
+    """
     return find_inputs(request).items
 
 
 def find_inputs(request: InputRequest) -> Findings:
-    """Find all segmentations that are asked for, and what a person corrected in them.
-
-    Different protocols of one hemisphere (say, FreeSurfer's and ASHS's) are separate inputs. Where
-    two datasets offer the same protocol, the one that the user named comes first, then the order
-    of :func:`~hipsta_bids.bids.sources.list_sources`; usable comes before unusable.
-    """
+    """Find all segmentations that are asked for, and the edited files that correct none."""
     selection = make_selection(request)
     option = choose_atlas(request)
-    forget_folders()
     forget_tables()
     sources = list_sources(request)
     edited = list_edits(request, selection)
@@ -91,10 +104,7 @@ def find_inputs(request: InputRequest) -> Findings:
 
 
 def list_subjects(request: InputRequest) -> tuple[str, ...]:
-    """List the subjects that are asked for and have a folder in any dataset to be searched.
-
-    Takes one listing per dataset: what is in the folders is not looked at.
-    """
+    """List the subjects that are asked for and have a folder in any dataset to be searched."""
     selection = make_selection(request)
     return tuple(
         sorted(
@@ -128,7 +138,7 @@ def selection_table(items: Iterable[HemisphereInput]) -> list[dict[str, str]]:
 
 
 def dataset_notes(request: InputRequest, items: Iterable[HemisphereInput]) -> tuple[str, ...]:
-    """Say what a user should know about the dataset as a whole."""
+    """List what a user should know about the dataset as a whole."""
     notes = []
     if read_description(request.bids_dir) is None:
         notes.append(
@@ -143,33 +153,21 @@ def dataset_notes(request: InputRequest, items: Iterable[HemisphereInput]) -> tu
 
 
 def _search(
-    source: Source,
-    selection: Selection,
-    option: Protocol | None,
-    edited: list[EditedFile],
+    source: Source, selection: Selection, option: Protocol | None, edited: list[EditedFile]
 ) -> Iterator[HemisphereInput]:
     """Search one dataset for all kinds of segmentations, and add the edited files beside them."""
     folders = [folder for folder in subject_folders(source.path) if selection.wants_folder(folder)]
     atlases = AtlasFinder(source.path, option, sample_files(source))
     for visit in filter(selection.wants_visit, list_visits(folders)):
         edited += edits_of_visit(visit, source.path, source.name, beside=True)
-        yield from _search_visit(visit, source, selection, atlases)
-
-
-def _search_visit(
-    visit: Visit,
-    source: Source,
-    selection: Selection,
-    atlases: AtlasFinder,
-) -> Iterator[HemisphereInput]:
-    if "freesurfer" in source.layouts:
-        yield from find_freesurfer(visit, source, selection)
-    if "ashs" in source.layouts:
-        yield from find_ashs(visit, source, atlases, selection)
-    if "hippunfold" in source.layouts:
-        yield from find_hippunfold(visit, source, selection)
-    if "named" in source.layouts:
-        yield from find_named(visit, source, selection)
+        if "freesurfer" in source.layouts:
+            yield from find_freesurfer(visit, source, selection)
+        if "ashs" in source.layouts:
+            yield from find_ashs(visit, source, atlases, selection)
+        if "hippunfold" in source.layouts:
+            yield from find_hippunfold(visit, source, selection)
+        if "named" in source.layouts:
+            yield from find_named(visit, source, selection)
 
 
 def _without_clashes(
@@ -190,7 +188,7 @@ def _without_clashes(
 
 
 def _check_analysis(found: list[HemisphereInput], request: InputRequest) -> None:
-    """Refuse an analysis that no hemisphere has: it is a slip of the pen."""
+    """Refuse an analysis that no hemisphere has: a typing error."""
     asked = [item for item in found if item.protocol.tool == "freesurfer"]
     missing = [
         item.problem for item in asked if item.problem and item.problem.reason == "analysis-missing"
@@ -203,7 +201,7 @@ def _check_analysis(found: list[HemisphereInput], request: InputRequest) -> None
 
 
 def _nothing(request: InputRequest, sources: tuple[Source, ...]) -> NothingToDoError:
-    """Say what was looked for, and where."""
+    """Describe what was looked for, and where."""
     searched = ", ".join(str(source.path) for source in sources)
     restricted = (
         *(f"--participant-label {label}" for label in request.participant_labels[:_SHOWN]),

@@ -3,13 +3,14 @@
 import csv
 import re
 from collections.abc import Mapping
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 from hipsta_bids.errors import InputError
 from hipsta_bids.inputs.scan import list_folder
 from hipsta_bids.io.files import entities
-from hipsta_bids.protocols.load import NamedCode
+from hipsta_bids.protocols.load import NamedCode, protocol_from_names
+from hipsta_bids.protocols.protocol import Protocol
 
 #: IDX R G B A VIS MSH "LABEL" (the header of ITK-SNAP's label description files).
 _SNAP_LINE = re.compile(
@@ -20,25 +21,29 @@ _SNAP_NAME = "snaplabels.txt"
 
 
 def find_table(image: Path, root: Path) -> Path | None:
-    """Find the label table that applies to an image.
-
-    Returns.
-    """
+    """Find the label table that applies to an image, beside it or above it in the dataset."""
     own = entities(image.name)
     for folder in (image.parent, *image.parent.parents):
         specific = [
             (len(pairs), name)
-            for name, pairs in _tables_in(folder).items()
+            for name, pairs in _tables_in(folder)[0].items()
             if all(own.get(key) == value for key, value in pairs.items())
         ]
         if specific:
             return folder / max(specific)[1]
-        for snap in (folder / _SNAP_NAME, folder / "snap" / _SNAP_NAME):
-            if snap.name in _snap_in(snap.parent):
-                return snap
+        for inner in (folder, folder / "snap"):
+            if _tables_in(inner)[1]:
+                return inner / _SNAP_NAME
         if folder == root:
             break
     return None
+
+
+# One table at the top of a dataset describes all of its files.
+@lru_cache(maxsize=64)
+def table_protocol(path: Path, name: str) -> Protocol:
+    """Derive a protocol from the names in a label table."""
+    return protocol_from_names(read_table(path), name=name, origin=path.name)
 
 
 def read_table(path: Path) -> tuple[NamedCode, ...]:
@@ -91,32 +96,24 @@ def _text(row: Mapping[str, str | None], key: str) -> str:
     return "" if value == "n/a" else value
 
 
-def forget_folders() -> None:
-    """List folders anew from now on."""
+def forget_tables() -> None:
+    """List folders and read tables again from now on."""
     _tables_in.cache_clear()
-    _snap_in.cache_clear()
+    table_protocol.cache_clear()
 
 
 # The same few folders are asked for again for every image below them.
 @cache
-def _tables_in(folder: Path) -> dict[str, dict[str, str]]:
-    """List the ``dseg.tsv`` tables of a folder with the entities that they require."""
-    names = (name for name in _files(folder) if name.endswith("dseg.tsv"))
-    parsed = {name: entities(name) for name in names}
-    return {
+def _tables_in(folder: Path) -> tuple[dict[str, dict[str, str]], bool]:
+    """List a folder's ``dseg.tsv`` tables by the entities they require, and look for ITK-SNAP's."""
+    try:
+        names = list_folder(folder)[1]
+    except InputError:  # no such folder, which is the usual case for "snap"
+        return {}, False
+    parsed = {name: entities(name) for name in names if name.endswith("dseg.tsv")}
+    tables = {
         name: {key: value for key, value in pairs.items() if key not in {"suffix", "extension"}}
         for name, pairs in parsed.items()
         if pairs["suffix"] == "dseg"
     }
-
-
-@cache
-def _snap_in(folder: Path) -> frozenset[str]:
-    return frozenset(name for name in _files(folder) if name == _SNAP_NAME)
-
-
-def _files(folder: Path) -> list[str]:
-    try:
-        return list_folder(folder)[1]
-    except InputError:  # no such folder, which is the usual case for "snap"
-        return []
+    return tables, _SNAP_NAME in names

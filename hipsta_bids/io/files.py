@@ -1,7 +1,7 @@
-"""The only writer of results, and small readers of what it wrote.
+"""Reading and atomic writing of text, JSON and BIDS tables; names, hashes and locks of files.
 
-A file appears whole or not at all: it is written aside, flushed to the disk, then renamed over
-its final name. The same values give the same bytes.
+A written file appears whole or not at all: it is written aside, flushed to the disk, then renamed
+over its final name. The same values give the same bytes.
 """
 
 import contextlib
@@ -25,35 +25,39 @@ LOGS = "logs"
 """Folder of an output dataset that holds the run logs, and the file whose bytes are the locks."""
 
 MISSING = "n/a"
-"""How BIDS tables spell a missing value."""
+"""A missing value in BIDS tables."""
 
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _FORBIDDEN = {errno.EROFS, errno.EACCES, errno.EPERM}
 _TEMPORARY = ".tmp"
 
+DATASET = "dataset"
+"""Name of the lock on the files of the whole dataset."""
+
+_LOCK_FILE = ".lock"
+
 
 def is_disk_full(error: OSError) -> bool:
-    """Say whether a system error means that no space is left (or no quota, or a size limit)."""
+    """Check whether a system error means that no space is left (or no quota, or a size limit)."""
     return error.errno in _FULL
 
 
 def output_error(path: Path, error: OSError) -> OutputError:
     """Translate a system error on writing into one that a user can act on."""
+    said = error.strerror or error
     if is_disk_full(error):
-        return OutputError(
-            f"{path}: no space left ({error.strerror}); free some and run the same command again",
-            reason="disk-full",
+        reason = "disk-full"
+        problem = f"no space left ({said}); free some and run the same command again"
+    elif error.errno in _FORBIDDEN:
+        reason = "read-only"
+        problem = (
+            f"not allowed to write there ({said}); choose another output folder or change its"
+            " permissions"
         )
-    if error.errno in _FORBIDDEN:
-        return OutputError(
-            f"{path}: not allowed to write there ({error.strerror}); choose another output folder"
-            " or change its permissions",
-            reason="read-only",
-        )
-    return OutputError(
-        f"{path}: cannot be written ({error.strerror or error}); choose another output folder",
-        reason="not-writable",
-    )
+    else:
+        reason = "not-writable"
+        problem = f"cannot be written ({said}); choose another output folder"
+    return OutputError(f"{path}: {problem}", reason=reason)
 
 
 def make_folder(path: Path) -> None:
@@ -110,7 +114,7 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 
 def _aside(path: Path) -> Path:
-    """Name a file to write into before it is renamed, that no process elsewhere has as well."""
+    """Name a file to write into before it is renamed, that no other process uses."""
     return path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}{_TEMPORARY}")
 
 
@@ -123,7 +127,7 @@ def _write_through(path: Path, content: bytes) -> None:
 
 
 def hide_home(text: str) -> str:
-    """Spell the home folder, which names a person, as ``~``."""
+    """Write the home folder, which names a person, as ``~``."""
     home = os.path.expanduser("~")  # noqa: PTH111  (Path.home() fails where there is none)
     return text.replace(f"{home}/", "~/") if len(home) > 1 else text
 
@@ -222,7 +226,7 @@ def read_tsv(path: Path) -> list[dict[str, str]]:
         )
     if twice := sorted({name for name in header if header.count(name) > 1}):
         raise InputError(
-            f"{path}: column {twice[0]!r} stands there more than once; keep one", reason="bad-table"
+            f"{path}: column {twice[0]!r} occurs more than once; keep one", reason="bad-table"
         )
     return [dict(zip(header, row, strict=True)) for row in rows]
 
@@ -239,25 +243,16 @@ def sha256_of(path: Path) -> str:
         ) from error
 
 
-# Turns between runs into one folder, on one machine or many.
-
-
-DATASET = "dataset"
-"""Name of the lock on the files of the whole dataset."""
-
-_FILE = ".lock"
-
-
 @contextlib.contextmanager
 def locked(root: Path, what: str) -> Iterator[bool]:
-    """Let one process at a time work on something; others wait.
+    """Let one process at a time work on something, on one machine or many; others wait.
 
-    A process may hold one lock at a time: with POSIX's record locks, to let go of one is to let go
-    of all that it has on the same file.
+    Yields whether the file system knows locks. A process may hold one lock at a time: with POSIX's
+    record locks, releasing one releases all that it has on the same file.
     """
     folder = root / LOGS
     make_folder(folder)
-    path = folder / _FILE
+    path = folder / _LOCK_FILE
     digest = hashlib.blake2b(what.encode(), digest_size=7).digest()
     try:
         handle = path.open("ab")
@@ -273,7 +268,10 @@ def locked(root: Path, what: str) -> Iterator[bool]:
 
 
 def entities(name: str) -> dict[str, str]:
-    """Split a BIDS file name."""
+    """Split a BIDS file name; keys are as in the name (``sub``), with ``suffix`` and ``extension``.
+
+    pybids takes 30 times as long and seconds to import; a test compares the two.
+    """
     stem, dot, extension = name.partition(".")
     *parts, suffix = stem.split("_")
     pairs = dict(part.split("-", 1) for part in parts if "-" in part)

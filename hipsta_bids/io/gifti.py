@@ -1,4 +1,4 @@
-"""GIFTI files of the sheet that Workbench, nilearn and nibabel load.
+"""Surfaces and maps on them as GIFTI, which Workbench, nilearn and nibabel load; meshes as VTU.
 
 Structure names are those of Connectome Workbench's ``StructureEnum``, which knows
 ``HippocampusLeft`` and ``HippocampusRight``; the metadata keys are those of the GIFTI 1.0
@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 from xml.parsers.expat import ExpatError
 
-import meshio
 import nibabel as nib
 import numpy as np
 from nibabel.filebasedimages import ImageFileError
@@ -35,6 +34,18 @@ from hipsta_bids.types import Coordinates, Float, Int, Mesh, TetMesh
 
 _STRUCTURE = {"L": "HippocampusLeft", "R": "HippocampusRight"}
 
+#: Names of the harmonic coordinates as point data of the tetrahedral mesh, in their order.
+COORDINATE_NAMES = ("medial_lateral", "posterior_anterior", "interior_exterior")
+
+#: Unit of maps whose file names none.
+ARBITRARY = "arbitrary"
+
+#: Units of what HippUnfold measures per vertex, by the suffix of its files.
+_UNITS = {"thickness": "mm", "surfarea": "mm^2", "gyrification": "1"}
+
+#: Columns of a table that hold the position of a row.
+_POSITIONS = ("x", "y", "node_x", "node_y", "vertex", "index", "point")
+
 
 def sheet_triangles(nx: int, ny: int, *, flip: bool = False) -> Int:
     """Triangulate a regular grid, two triangles per cell."""
@@ -48,75 +59,36 @@ def sheet_triangles(nx: int, ny: int, *, flip: bool = False) -> Int:
 def surface_bytes(
     points: Float, triangles: Int, *, hemi: str, secondary: str | None, unfolded: bool
 ) -> bytes:
-    """Encode a surface.
-
-    ``points`` Vertices in mm: scanner RAS, or the plane of the unfolded sheet.
-    """
+    """Encode a surface, (N, 3) vertices in mm: scanner RAS, or the plane of the unfolded sheet."""
     meta = {
         "AnatomicalStructurePrimary": _STRUCTURE[hemi],
         "GeometricType": "Flat" if unfolded else "Anatomical",
     }
     if secondary:
         meta["AnatomicalStructureSecondary"] = secondary
+    vertices = _array(points, "POINTSET", meta)
     space = "NIFTI_XFORM_UNKNOWN" if unfolded else "NIFTI_XFORM_SCANNER_ANAT"
-    vertices = GiftiDataArray(
-        points.astype(np.float32),
-        intent="NIFTI_INTENT_POINTSET",
-        datatype="NIFTI_TYPE_FLOAT32",
-        coordsys=GiftiCoordSystem(space, space, np.eye(4)),
-        meta=GiftiMetaData(meta),
-    )
-    faces = GiftiDataArray(
-        triangles.astype(np.int32),
-        intent="NIFTI_INTENT_TRIANGLE",
-        datatype="NIFTI_TYPE_INT32",
-        meta=GiftiMetaData({"TopologicalType": "Open"}),
-    )
+    vertices.coordsys = GiftiCoordSystem(space, space, np.eye(4))
+    faces = _array(triangles, "TRIANGLE", {"TopologicalType": "Open"})
     return _encode([vertices, faces], hemi)
 
 
 def shape_bytes(values: Float, *, hemi: str, name: str, unit: str) -> bytes:
-    """Encode one number per vertex.
-
-    ``values`` NaN where missing.
-    """
-    array = GiftiDataArray(
-        values.astype(np.float32),
-        intent="NIFTI_INTENT_SHAPE",
-        datatype="NIFTI_TYPE_FLOAT32",
-        meta=GiftiMetaData({"Name": name, "Units": unit}),
-    )
-    return _encode([array], hemi)
+    """Encode one number per vertex, NaN where missing."""
+    return _encode([_array(values, "SHAPE", {"Name": name, "Units": unit})], hemi)
 
 
 def maps_bytes(values: Float, *, hemi: str, names: Sequence[str], series: bool = True) -> bytes:
-    """Encode one or several numbers per vertex, of unknown unit.
-
-    ``values`` NaN where missing.
-    """
-    kind = "NIFTI_INTENT_SHAPE" if len(names) == 1 or not series else "NIFTI_INTENT_TIME_SERIES"
-    arrays = [
-        GiftiDataArray(
-            column.astype(np.float32),
-            intent=kind,
-            datatype="NIFTI_TYPE_FLOAT32",
-            meta=GiftiMetaData({"Name": name}),
-        )
-        for name, column in zip(names, values.T, strict=True)
-    ]
+    """Encode one or several numbers per vertex, (N, maps), of unknown unit, NaN where missing."""
+    kind = "TIME_SERIES" if series and len(names) > 1 else "SHAPE"
+    arrays = [_array(v, kind, {"Name": name}) for name, v in zip(names, values.T, strict=True)]
     return _encode(arrays, hemi)
 
 
 def label_bytes(
     keys: NDArray[np.uint8], *, hemi: str, name: str, table: Mapping[int, tuple[str, str]]
 ) -> bytes:
-    """Encode one label per vertex."""
-    array = GiftiDataArray(
-        keys.astype(np.int32),
-        intent="NIFTI_INTENT_LABEL",
-        datatype="NIFTI_TYPE_INT32",
-        meta=GiftiMetaData({"Name": name}),
-    )
+    """Encode one label per vertex; the table has names and colors (``#rrggbb``) by key."""
     labels = GiftiLabelTable()
     # Workbench calls the unlabeled key "???" and expects it to be transparent.
     for key, (title, color) in {0: ("???", ""), **table}.items():
@@ -124,47 +96,26 @@ def label_bytes(
         label = GiftiLabel(key, *rgba)
         label.label = title  # type: ignore[attr-defined]  # nibabel sets it from outside, too
         labels.labels.append(label)
-    return _encode([array], hemi, labels)
+    return _encode([_array(keys, "LABEL", {"Name": name})], hemi, labels)
+
+
+def _array(values: NDArray[Any], intent: str, meta: Mapping[str, str]) -> GiftiDataArray:
+    """Prepare values, as 32-bit floats or, of triangles and labels, integers."""
+    integers = intent in {"TRIANGLE", "LABEL"}
+    return GiftiDataArray(
+        values.astype(np.int32 if integers else np.float32),
+        intent=f"NIFTI_INTENT_{intent}",
+        datatype="NIFTI_TYPE_INT32" if integers else "NIFTI_TYPE_FLOAT32",
+        meta=GiftiMetaData(dict(meta)),
+    )
 
 
 def _encode(
-    arrays: Sequence[GiftiDataArray],
-    hemi: str,
-    labels: GiftiLabelTable | None = None,
+    arrays: Sequence[GiftiDataArray], hemi: str, labels: GiftiLabelTable | None = None
 ) -> bytes:
     meta = GiftiMetaData({"AnatomicalStructurePrimary": _STRUCTURE[hemi]})
-    image = GiftiImage(meta=meta, darrays=list(arrays), labeltable=labels)
-    content: bytes = image.to_bytes()
+    content: bytes = GiftiImage(meta=meta, darrays=list(arrays), labeltable=labels).to_bytes()
     return content
-
-
-def read_points(path: Path) -> Float:
-    """Read the vertices of a surface.
-
-    Returns RAS mm.
-    """
-    try:
-        image = GiftiImage.from_bytes(path.read_bytes())
-        points = image.agg_data("NIFTI_INTENT_POINTSET")
-        return np.asarray(points, dtype=np.float64).reshape(-1, 3)
-    except (OSError, ValueError, TypeError, ExpatError) as error:
-        raise InputError(
-            f"{path}: not readable as a surface ({error}); run the participant level again with"
-            " --force",
-            reason="unreadable-surface",
-        ) from error
-
-
-# Reads maps and surfaces that other programs wrote: GIFTI, or tables.
-
-
-#: Unit of maps that do not say theirs.
-ARBITRARY = "arbitrary"
-
-#: Units of what HippUnfold measures per vertex, by the suffix of its files.
-_UNITS = {"thickness": "mm", "surfarea": "mm^2", "gyrification": "1"}
-#: Columns of a table that say where a row is.
-_PLACES = ("x", "y", "node_x", "node_y", "vertex", "index", "point")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -194,7 +145,7 @@ def read_map(path: Path, name: str) -> PointMap:
     return PointMap(values=_finite(arrays[0].data), unit=str(unit))
 
 
-def _finite(values: Any) -> Float:  # noqa: ANN401  (whatever nibabel gives)
+def _finite(values: Any) -> Float:  # noqa: ANN401  ((as nibabel returns them))
     numbers = np.asarray(values, dtype=np.float64)
     return np.where(np.isfinite(numbers), numbers, np.nan)
 
@@ -202,7 +153,7 @@ def _finite(values: Any) -> Float:  # noqa: ANN401  (whatever nibabel gives)
 def _from_table(path: Path, name: str) -> PointMap:
     rows = files.read_tsv(path)
     columns = list(rows[0]) if rows else []
-    others = [column for column in columns if column not in _PLACES]
+    others = [column for column in columns if column not in _POSITIONS]
     column = name if name in columns else others[0] if len(others) == 1 else None
     if column is None:
         what = f"columns {', '.join(others)}" if others else "no column of values"
@@ -281,26 +232,17 @@ def _load(path: Path) -> GiftiImage:
     return image
 
 
-# The tetrahedral mesh as a VTU file that ParaView and meshio read.
-
-
-#: Names of the harmonic coordinates as point data, in their order.
-COORDINATE_NAMES = ("medial_lateral", "posterior_anterior", "interior_exterior")
-
-
 def mesh_bytes(mesh: TetMesh, coordinates: Coordinates) -> bytes:
-    """Encode a tetrahedral mesh with its coordinates.
+    """Encode a tetrahedral mesh and its coordinates as VTU (XML with compressed binary data)."""
+    import meshio  # noqa: PLC0415  (slow to load, and seldom needed)
 
-    ``mesh`` Vertices in RAS mm. Returns A ````.vtu```` file (XML, compressed binary data).
-    """
+    values = zip(COORDINATE_NAMES, coordinates.values.T, strict=True)
     data = meshio.Mesh(
         mesh.vertices,
         [("tetra", mesh.tetrahedra)],
-        point_data={
-            name: coordinates.values[:, axis].copy() for axis, name in enumerate(COORDINATE_NAMES)
-        },
+        point_data={name: column.copy() for name, column in values},
     )
-    # meshio writes to paths only; the result still reaches its place through one writer.
+    # meshio writes to paths only; results are written in one way.
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "mesh.vtu"
         meshio.write(path, data, file_format="vtu")

@@ -1,4 +1,4 @@
-"""The only place where images are opened for reading."""
+"""Images: label volumes, masks and maps, opened for reading here only."""
 
 import contextlib
 import gzip
@@ -42,10 +42,7 @@ _SPACE = 3
 
 
 def read_voxels(path: Path) -> tuple[NDArray[Any], Float]:
-    """Read a 3-D image of labels or a mask.
-
-    Returns Voxel index to RAS mm.
-    """
+    """Read a 3-D image of labels or a mask, and its affine from voxel index to RAS mm."""
     with _opened(path) as image:
         data = np.asanyarray(image.dataobj)
         affine = np.asarray(image.affine, dtype=np.float64)
@@ -62,10 +59,7 @@ def read_voxels(path: Path) -> tuple[NDArray[Any], Float]:
 
 
 def read_scalars(path: Path, points: Float) -> ScalarVolume:
-    """Read what an image holds round some points.
-
-    ``points`` RAS mm.
-    """
+    """Read the part of an image around some points, (..., 3) RAS mm."""
     with _opened(path) as image:
         _check_scalar(image, path)
         affine: Float = np.asarray(image.affine, dtype=np.float64)
@@ -85,7 +79,7 @@ def read_scalars(path: Path, points: Float) -> ScalarVolume:
 
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """Open an image for as long as its voxels are read, and word what goes wrong meanwhile."""
+    """Open an image for as long as its voxels are read; errors meanwhile name the file."""
     try:
         # nibabel leaves files open on some of its paths; a stream that is closed here is not.
         with ImageOpener(str(path)) as stream:
@@ -102,7 +96,7 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def _format(path: Path, start: bytes) -> type[Any]:
-    """Tell the format by the file's name and, between the versions of NIfTI, its first bytes."""
+    """Choose the format by the file's name and, between the versions of NIfTI, its first bytes."""
     if path.suffix in {".mgz", ".mgh"}:
         return nib.MGHImage
     # NIfTI begins with the size of its header, which tells the versions apart.

@@ -11,11 +11,8 @@ from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 
-from hipsta_bids.derivatives.names import (
-    DATASET_FILES,
-    name_of_record,
-    participant_report,
-)
+from hipsta_bids.derivatives.names import DATASET_FILES, participant_report
+from hipsta_bids.derivatives.read import list_results
 from hipsta_bids.errors import HipstaError, OutputError
 from hipsta_bids.io import files
 from hipsta_bids.participant.cluster import Cluster, run_on_cluster
@@ -84,9 +81,8 @@ class Problem:
 
 def visits_of(root: Path) -> list[Visit]:
     """List the visits of which there is a record."""
-    names = (name_of_record(path.name) for pattern in _RECORDS for path in root.glob(pattern))
-    found = {(name.subject, name.session) for name in names if name is not None}
-    return sorted(found, key=lambda visit: (visit[0], visit[1] or ""))
+    names = (place.name for place in list_results(root))
+    return list(dict.fromkeys((name.subject, name.session) for name in names))
 
 
 def write_reports(plan: PagePlan, visits: Iterable[Visit]) -> Iterator[Problem]:

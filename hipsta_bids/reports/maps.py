@@ -16,11 +16,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import pyarrow as pa
 from numpy.typing import NDArray
-from pyarrow import csv
 
-from hipsta_bids.io import files
+from hipsta_bids.derivatives.read import read_sheet
+from hipsta_bids.errors import InputError
 from hipsta_bids.reports.results import Hemisphere
 from hipsta_bids.types import Float, Status
 
@@ -374,21 +373,9 @@ class Grid:
 
 def read_maps(hemisphere: Hemisphere) -> dict[str, Float]:
     """Read the maps that are shown, faster than the whole sheet."""
-    names = [kind.column for kind in MAP_KINDS]
     try:
-        table = csv.read_csv(
-            hemisphere.place.path("sheet"),
-            read_options=csv.ReadOptions(use_threads=False),
-            parse_options=csv.ParseOptions(delimiter="\t"),
-            convert_options=csv.ConvertOptions(
-                include_columns=["x", "y", *names],
-                column_types=dict.fromkeys(names, pa.float64()),
-                null_values=[files.MISSING],
-            ),
-        )
-        shape = (int(table.column("x")[-1].as_py()), int(table.column("y")[-1].as_py()))
-        return {name: table.column(name).to_numpy().reshape(shape) for name in names}
-    except (OSError, ValueError, IndexError, KeyError, pa.ArrowException):
+        return read_sheet(hemisphere.place.path("sheet"), [kind.column for kind in MAP_KINDS])
+    except InputError:
         return {}
 
 

@@ -13,7 +13,8 @@ from nibabel.orientations import apply_orientation, inv_ornt_aff, io_orientation
 from numpy.typing import NDArray
 
 from hipsta_bids.derivatives.hemisphere import ResultPlace
-from hipsta_bids.derivatives.names import DATASET_FILES, name_of_record
+from hipsta_bids.derivatives.names import DATASET_FILES
+from hipsta_bids.derivatives.read import list_results, read_record, read_sheet, read_summary
 from hipsta_bids.errors import HipstaError, InputError
 from hipsta_bids.io import files, gifti
 from hipsta_bids.io.volumes import read_voxels
@@ -134,49 +135,29 @@ class Hemisphere:
     @cached_property
     def sheet(self) -> SheetTable:
         """Its sheet."""
-        rows = files.read_tsv(self.place.path("sheet"))
-        try:
-            return _sheet(rows, self.place)
-        except (KeyError, ValueError) as error:
-            raise InputError(
-                f"{self.place.path('sheet')}: not a sheet ({error}); run the participant level"
-                " again with --force",
-                reason="bad-table",
-            ) from error
+        words = ("subfield", "valid", "repaired")
+        columns = read_sheet(self.place.path("sheet"), words=words)
+        subfield, valid, repaired = (columns.pop(name) for name in words)
+        return SheetTable(
+            columns=columns,
+            subfield=subfield.astype(np.str_),
+            valid=valid == "true",
+            repaired=repaired == "true",
+            points={name: _surface_points(self.place, name, valid.shape) for name in SURFACES},
+        )
 
 
 def find_results(
     root: Path, subject: str | None = None, session: str | None = None
 ) -> Iterator[Hemisphere]:
     """Find the hemispheres of an output dataset."""
-    if subject is None:
-        folders = ["sub-*/anat", "sub-*/ses-*/anat"]
-    else:
-        folders = [f"sub-{subject}/{f'ses-{session}/' if session else ''}anat"]
-    found = [
-        ResultPlace(root=root, name=name)
-        for folder in folders
-        for path in root.glob(f"{folder}/*_desc-qc_metrics.json")
-        if (name := name_of_record(path.name)) is not None
-    ]
-    for place in sorted(found, key=_order):
+    for place in list_results(root, subject, session):
         try:
-            record = files.read_json(place.path("qc"))
+            record = read_record(place)
             Status(record.get("status", ""))
         except (InputError, ValueError):
             continue
         yield Hemisphere(place, record)
-
-
-def _order(place: ResultPlace) -> tuple[str, ...]:
-    name = place.name
-    return name.subject, name.session or "", name.seg, name.region, name.hemi
-
-
-def read_summary(place: ResultPlace) -> dict[str, float]:
-    """Read the summary's row of numbers."""
-    rows = files.read_tsv(place.path("summary"))
-    return {name: number_of(cell) for name, cell in rows[0].items()} if rows else {}
 
 
 def _finding(kind: str, message: str) -> Finding:
@@ -185,38 +166,24 @@ def _finding(kind: str, message: str) -> Finding:
     return Finding(kind=kind, message=_FOLDERS.sub("", message), point=point)
 
 
+def _surface_points(place: ResultPlace, name: str, shape: tuple[int, ...]) -> Float:
+    path = place.path(f"{name}_surface")
+    points = gifti.read_mesh(path).points
+    if len(points) != shape[0] * shape[1]:
+        raise InputError(
+            f"{path}: has {len(points)} vertices, the sheet {shape[0]} x {shape[1]} nodes; run the"
+            " participant level again with --force",
+            reason="unreadable-surface",
+        )
+    return points.reshape(*shape, 3)
+
+
 def number_of(cell: str) -> float:
     """Read a cell; NaN where it is no number."""
     try:
         return float(cell)
     except ValueError:
         return float("nan")
-
-
-def _sheet(rows: list[dict[str, str]], place: ResultPlace) -> SheetTable:
-    """Shape the table's rows, which are sorted by x, then y, as the grid."""
-    shape = (int(rows[-1]["x"]), int(rows[-1]["y"]))
-
-    def column(name: str) -> NDArray[np.str_]:
-        return np.array([row[name] for row in rows]).reshape(shape)
-
-    words = {"x", "y", "subfield", "valid", "repaired"}
-    missing = files.MISSING
-    subfield = column("subfield")
-    return SheetTable(
-        columns={
-            name: np.vectorize(number_of, otypes=[np.float64])(column(name))
-            for name in rows[0]
-            if name not in words
-        },
-        subfield=np.where(subfield == missing, "", subfield),
-        valid=column("valid") == "true",
-        repaired=column("repaired") == "true",
-        points={
-            name: gifti.read_points(place.path(f"{name}_surface")).reshape(*shape, 3)
-            for name in SURFACES
-        },
-    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

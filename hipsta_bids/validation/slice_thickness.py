@@ -11,6 +11,7 @@ import numpy as np
 from hipsta_bids.derivatives import dataset, hemisphere
 from hipsta_bids.derivatives.hemisphere import ResultPlace
 from hipsta_bids.derivatives.names import HemisphereName
+from hipsta_bids.derivatives.read import read_sheet
 from hipsta_bids.errors import (
     ExitCode,
     GeometryError,
@@ -146,10 +147,9 @@ def _measure(item: HemisphereInput, place: ResultPlace, settings: Settings) -> l
 def _read_sheet(place: ResultPlace) -> tuple[Float, Float] | None:
     """Read points (M, 3), RAS mm, and thickness (M,), mm, that the participant level measured."""
     with suppress(InputError):
-        rows = files.read_tsv(place.path("sheet"))
-        cells = [[row[name] for name in ("r", "a", "s", "thickness")] for row in rows]
-        values = np.where(np.array(cells) == files.MISSING, "nan", cells).astype(np.float64)
-        return values[:, :3], values[:, 3]
+        names = ("r", "a", "s", "thickness")
+        *axes, thickness = (v.ravel() for v in read_sheet(place.path("sheet"), names).values())
+        return np.stack(axes, axis=-1), thickness
     return None
 
 

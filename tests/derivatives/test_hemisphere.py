@@ -10,7 +10,6 @@ from stand_ins import NAME, NX, NY, THICKNESS, TISSUES, make_maps, make_scheme
 
 from hipsta_bids.derivatives.hemisphere import (
     SHEET_COLUMNS,
-    SUMMARY_COLUMNS,
     ResultPlace,
     fill_from_nearest,
     format_column,
@@ -21,7 +20,7 @@ from hipsta_bids.derivatives.hemisphere import (
 )
 from hipsta_bids.derivatives.names import OUTPUTS, HemisphereName
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry.catalog import DIERS, MAPS, SECTIONS
+from hipsta_bids.geometry.catalog import DIERS, MAPS, SECTIONS, SUMMARY
 from hipsta_bids.io.gifti import COORDINATE_NAMES
 from hipsta_bids.types import Flag
 
@@ -164,7 +163,7 @@ def test_sidecar_says_what_subfields_are(written):
 def test_summary_table(written):
     place, _ = written
     table = pd.read_csv(place.path("summary"), sep="\t")
-    assert list(table.columns)[: len(SUMMARY_COLUMNS)] == list(SUMMARY_COLUMNS)
+    assert list(table.columns)[: len(SUMMARY)] == [row.name for row in SUMMARY]
     assert table.thickness_mean.tolist() == [THICKNESS]
     assert table.volume_CA1.isna().all()
 

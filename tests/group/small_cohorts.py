@@ -27,8 +27,8 @@ COLUMNS = ["x", "y", "thickness", "curvature", "subfield"]
 GROUPS = ("CN", "AD")
 
 
-def place_of(root, subject, hemi, *, session=None, seg="demo"):
-    name = HemisphereName(subject=subject, session=session, hemi=hemi, seg=seg)
+def place_of(root, subject, hemi, *, session=None, seg="demo", region="body"):
+    name = HemisphereName(subject=subject, session=session, hemi=hemi, seg=seg, region=region)
     return ResultPlace(root=root, name=name)
 
 
@@ -61,7 +61,7 @@ def write_hemisphere(place, thickness, curvature, *, volume=500.0, **record):
     files.write_json(place.path("qc"), content | record)
 
 
-def write_dataset(folder, *, session=None):
+def write_dataset(folder, *, session=None, region="body"):
     """A BIDS dataset and the participant level's output; the second group is thinner."""
     data, out = folder / "bids", folder / "out"
     out.mkdir(parents=True)
@@ -73,7 +73,7 @@ def write_dataset(folder, *, session=None):
     for i in range(len(left.age)):
         subject = f"{i + 1:02d}"
         for hemi, cohort in cohorts.items():
-            place = place_of(out, subject, hemi, session=session)
+            place = place_of(out, subject, hemi, session=session, region=region)
             volume = 500 + 10 * np.sin(i) - 5 * left.group[i]
             write_hemisphere(place, cohort.thickness[i], cohort.curvature[i], volume=volume)
         sex = "F" if left.sex[i] else "M"

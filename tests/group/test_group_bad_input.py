@@ -160,7 +160,7 @@ def no_values(study):
         (header_only, [], 65, "has no rows"),
         (other_encoding, [], 65, "no UTF-8 text"),
         (with_commas, [], 65, "separated by tabs"),
-        (column_twice, [], 65, "'age' stands there more than once"),
+        (column_twice, [], 65, "'age' occurs more than once"),
         (no_dataset, [], 65, "no such folder"),
         (None, ["--formula", " "], 64, "--formula is empty"),
         (None, ["--formula", "group + my age"], 65, "backticks"),

@@ -158,3 +158,24 @@ def test_names_that_the_locale_cannot_spell_keep_their_bytes(tmp_path):
     name = "ıİß".encode().decode("ascii", errors="surrogateescape")  # as in LC_ALL=C
     files.write_text(tmp_path / "text", name)
     assert (tmp_path / "text").read_text(encoding="utf-8") == "ıİß"
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "sub-01_T1w.nii.gz",
+        "sub-01_ses-pre_acq-mprage_run-2_T2w.nii",
+        "sub-01_hemi-L_space-cropT1w_desc-subfields_atlas-bigbrain_dseg.nii.gz",
+        "sub-01_ses-02_hemi-R_seg-freesurfer_label-extended_desc-sheet_morph.tsv",
+        "sub-01_hemi-L_space-T1w_den-0p5mm_label-hipp_thickness.shape.gii",
+        "sub-01_hemi-L_desc-edited_mask.nii.gz",
+        "dseg.tsv",
+    ],
+)
+def test_names_are_split_as_by_pybids(name):
+    pybids = pytest.importorskip("bids.layout")
+    known = [e for c in ("bids", "derivatives") for e in pybids.Config.load(c).entities.values()]
+    keys = {"subject": "sub", "session": "ses", "acquisition": "acq", "density": "den"}
+    keys["segmentation"] = "seg"
+    theirs = pybids.parse_file_entities(f"/{name}", entities=known)
+    assert files.entities(name) == {keys.get(key, key): str(v) for key, v in theirs.items()}
