@@ -17,7 +17,7 @@ from typing import Any
 
 from report import write_report
 
-from hipsta_bids.inputs.request import InputRequest
+from hipsta_bids.inputs.scan import InputRequest
 from hipsta_bids.inputs.search import dataset_notes, find_inputs, list_subjects
 from hipsta_bids.participant.cluster import Shard
 from hipsta_bids.participant.job import peak_memory

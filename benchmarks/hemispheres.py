@@ -24,7 +24,7 @@ from report import print_table, write_report
 from threadpoolctl import threadpool_limits
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.inputs.request import HemisphereInput, InputRequest
+from hipsta_bids.inputs.scan import HemisphereInput, InputRequest
 from hipsta_bids.inputs.search import find_hemispheres
 from hipsta_bids.participant.job import (
     cpu_seconds,

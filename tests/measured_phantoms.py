@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from hipsta_bids.derivatives.dataset import identity, read_status, row_key
 from hipsta_bids.derivatives.names import HemisphereName, output_path
-from hipsta_bids.derivatives.status import identity, read_status, row_key
 from hipsta_bids.io import files
 from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.phantom import Phantom, PhantomSpec

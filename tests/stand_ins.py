@@ -13,7 +13,7 @@ import numpy as np
 from hipsta_bids.derivatives.names import HemisphereName
 from hipsta_bids.errors import GeometryError, InputError
 from hipsta_bids.geometry.catalog import MAPS, SECTIONS, average_profiles
-from hipsta_bids.inputs.request import HemisphereInput
+from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.participant.job import run_job
 from hipsta_bids.protocols.protocol import Label, Part, Protocol, Tissue
 from hipsta_bids.types import BodyMask, Coordinates, Flag, HemisphereMaps, Sheet, TetMesh

@@ -9,8 +9,8 @@ from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY, 
 from hipsta_bids.geometry.measures import away_from_edges, column_area
 from hipsta_bids.geometry.sheet import sample_sheet, whole_body
 from hipsta_bids.phantom import Phantom, PhantomTruth
+from hipsta_bids.phantom.phantom import cut_sections
 from hipsta_bids.phantom.shape import placement
-from hipsta_bids.phantom.truth import cut_sections
 from hipsta_bids.protocols.protocol import Protocol
 from hipsta_bids.settings import MeasureSettings, Settings
 from hipsta_bids.types import Float, HemisphereMaps, Sheet

@@ -201,8 +201,8 @@ def _write_demo(folder: Path) -> None:
 
 def compare_with_truth(data: Path, out: Path) -> Iterator[str]:
     """Compare measured with true mean thickness, one line per hemisphere."""
+    from hipsta_bids.derivatives.dataset import identity, read_status, row_key  # noqa: PLC0415  (heavy)
     from hipsta_bids.derivatives.names import HemisphereName, output_path  # noqa: PLC0415  (heavy)
-    from hipsta_bids.derivatives.status import identity, read_status, row_key  # noqa: PLC0415  (heavy)
     from hipsta_bids.io import files  # noqa: PLC0415  (heavy)
     from hipsta_bids.phantom import TRUTH_TABLE  # noqa: PLC0415  (heavy)
 

@@ -28,7 +28,7 @@ from hipsta_bids.participant.pool import pin_threads
 if TYPE_CHECKING:
     from argparse import Namespace
 
-    from hipsta_bids.inputs.request import HemisphereInput, InputRequest
+    from hipsta_bids.inputs.scan import HemisphereInput, InputRequest
     from hipsta_bids.inputs.search import Findings
     from hipsta_bids.participant.run import RunOptions
 
@@ -375,7 +375,7 @@ def check_output_is_no_input(out_dir: Path, items: "Sequence[HemisphereInput]") 
 
 def input_request(options: "Namespace") -> "InputRequest":
     """Collect the options that say which inputs are asked for."""
-    from hipsta_bids.inputs.request import InputRequest  # noqa: PLC0415  (heavy)
+    from hipsta_bids.inputs.scan import InputRequest  # noqa: PLC0415  (heavy)
 
     derivatives = dict(options.derivatives)
     if len(derivatives) != len(options.derivatives):

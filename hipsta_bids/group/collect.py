@@ -10,13 +10,13 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from hipsta_bids.derivatives.dataset import NOT_FINISHED, name_of, read_status
 from hipsta_bids.derivatives.hemisphere import ResultPlace
 from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName
 from hipsta_bids.derivatives.read import (
     list_results,
     read_record,
 )
-from hipsta_bids.derivatives.status import NOT_FINISHED, name_of, read_status
 from hipsta_bids.errors import InputError, NothingToDoError, UsageError
 from hipsta_bids.group.covariates import relocate
 from hipsta_bids.io import files

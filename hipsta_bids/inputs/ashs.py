@@ -12,10 +12,18 @@ from functools import cached_property
 from pathlib import Path
 
 from hipsta_bids.errors import HipstaError, InputError, ProtocolError
+from hipsta_bids.inputs.generic import find_table, read_table, table_protocol
 from hipsta_bids.inputs.labels import label_values
-from hipsta_bids.inputs.request import HemisphereInput, InputRequest, unknown_protocol
-from hipsta_bids.inputs.scan import Selection, Source, Visit, list_visits, subject_folders
-from hipsta_bids.inputs.tables import find_table, read_table, table_protocol
+from hipsta_bids.inputs.scan import (
+    HemisphereInput,
+    InputRequest,
+    Selection,
+    Source,
+    Visit,
+    list_visits,
+    subject_folders,
+    unknown_protocol,
+)
 from hipsta_bids.protocols.load import agrees, load_protocol, protocol_names
 from hipsta_bids.protocols.protocol import Protocol
 

@@ -11,9 +11,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hipsta_bids.errors import HipstaError, InputError
-from hipsta_bids.inputs.request import Edit, HemisphereInput, InputRequest
-from hipsta_bids.inputs.scan import Selection, Visit, list_visits, subject_folders
-from hipsta_bids.inputs.tables import table_protocol
+from hipsta_bids.inputs.generic import table_protocol
+from hipsta_bids.inputs.scan import (
+    Edit,
+    HemisphereInput,
+    InputRequest,
+    Selection,
+    Visit,
+    list_visits,
+    subject_folders,
+)
 from hipsta_bids.io.files import entities
 
 #: Names under which ``--edited-dir`` and the output dataset appear in addresses.

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hipsta_bids.errors import HipstaError, InputError
-from hipsta_bids.inputs.request import HemisphereInput
-from hipsta_bids.inputs.scan import Selection, Source, Visit
+from hipsta_bids.inputs.scan import HemisphereInput, Selection, Source, Visit
 from hipsta_bids.protocols.load import load_protocol
 
 _NAME = re.compile(

@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from hipsta_bids.errors import InputError, ProtocolError
 from hipsta_bids.geometry.grid import in_plane_voxel
-from hipsta_bids.inputs.request import HemisphereInput
+from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.io.volumes import read_voxels
 from hipsta_bids.protocols.load import for_region, load_protocol, protocol_names
 from hipsta_bids.protocols.protocol import OUTSIDE, Part, Protocol, Tissue, translate

@@ -18,7 +18,7 @@ from hipsta_bids.derivatives.names import EXTRA_OUTPUTS, OUTPUTS
 from hipsta_bids.errors import InputError, UsageError
 from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.geometry.sampling import Regions
-from hipsta_bids.inputs.request import HemisphereInput, MapSource
+from hipsta_bids.inputs.scan import HemisphereInput, MapSource
 from hipsta_bids.io import files
 
 #: Columns of a file of regions: node numbers as in the sheet table, and the region's name.

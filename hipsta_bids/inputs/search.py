@@ -15,10 +15,12 @@ from hipsta_bids.errors import NothingToDoError, UsageError
 from hipsta_bids.inputs.ashs import AtlasFinder, choose_atlas, find_ashs, sample_files
 from hipsta_bids.inputs.edits import EditedFile, attach_edits, each_once, edits_of_visit, list_edits
 from hipsta_bids.inputs.freesurfer import find_freesurfer
-from hipsta_bids.inputs.generic import find_named
+from hipsta_bids.inputs.generic import find_named, forget_tables
 from hipsta_bids.inputs.hippunfold import find_hippunfold
-from hipsta_bids.inputs.request import HEMIS, HemisphereInput, InputRequest
 from hipsta_bids.inputs.scan import (
+    HEMIS,
+    HemisphereInput,
+    InputRequest,
     Selection,
     Source,
     list_participants,
@@ -27,7 +29,6 @@ from hipsta_bids.inputs.scan import (
     make_selection,
     subject_folders,
 )
-from hipsta_bids.inputs.tables import forget_tables
 from hipsta_bids.protocols.protocol import Protocol
 
 __all__ = [

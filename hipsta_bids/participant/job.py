@@ -17,7 +17,7 @@ from hipsta_bids.derivatives import hemisphere
 from hipsta_bids.derivatives.dataset import source_address
 from hipsta_bids.derivatives.hemisphere import ResultPlace
 from hipsta_bids.errors import GeometryError, HipstaError, InputError, OutputError, ProtocolError
-from hipsta_bids.inputs.request import HemisphereInput
+from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.io import files
 from hipsta_bids.io.files import locked
 from hipsta_bids.participant.maps import (

@@ -23,7 +23,7 @@ from hipsta_bids.geometry.sampling import (
     summarize_regions,
 )
 from hipsta_bids.inputs.maps import read_regions
-from hipsta_bids.inputs.request import HemisphereInput, MapSource
+from hipsta_bids.inputs.scan import HemisphereInput, MapSource
 from hipsta_bids.io import files, gifti
 from hipsta_bids.settings import MapSettings
 from hipsta_bids.types import Flag, Float, HemisphereMaps

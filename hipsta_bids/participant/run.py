@@ -15,9 +15,7 @@ from socket import gethostname
 
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset, hemisphere
-from hipsta_bids.derivatives.hemisphere import ResultPlace
-from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName
-from hipsta_bids.derivatives.status import (
+from hipsta_bids.derivatives.dataset import (
     NOT_FINISHED,
     RECORDED,
     STAGE_PREFIX,
@@ -29,8 +27,10 @@ from hipsta_bids.derivatives.status import (
     update_status,
     write_sidecar,
 )
+from hipsta_bids.derivatives.hemisphere import ResultPlace
+from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName
 from hipsta_bids.errors import ExitCode, HipstaError, InputError, OutputError, ProtocolError
-from hipsta_bids.inputs.request import HemisphereInput
+from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.io import files
 from hipsta_bids.io.files import DATASET, locked
 from hipsta_bids.participant.cluster import Cluster, Shard, run_on_cluster

@@ -9,9 +9,8 @@ from hipsta_bids.phantom.dataset import (
     write_demo_dataset,
 )
 from hipsta_bids.phantom.labels import encode
-from hipsta_bids.phantom.phantom import Phantom
+from hipsta_bids.phantom.phantom import Phantom, PhantomTruth
 from hipsta_bids.phantom.shape import KINDS, PhantomSpec, Thinning
-from hipsta_bids.phantom.truth import PhantomTruth
 
 __all__ = [
     "KINDS",

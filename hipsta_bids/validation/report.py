@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 SUITES: Mapping[str, str] = MappingProxyType(
     {
         "accuracy": "accuracy:run",
-        "limits": "convergence:run_limits",
+        "limits": "accuracy:run_limits",
         "slices": "invariance:run_slices",
-        "convergence": "convergence:run",
+        "convergence": "accuracy:run_convergence",
         "invariance": "invariance:run",
         "defects": "defects:run",
         "group": "group:run",

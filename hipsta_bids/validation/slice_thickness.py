@@ -28,7 +28,7 @@ from hipsta_bids.geometry.surrogate import (
     surrogate_profiles,
 )
 from hipsta_bids.inputs.labels import read_label_volume
-from hipsta_bids.inputs.request import HemisphereInput
+from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.inputs.search import InputRequest, find_hemispheres
 from hipsta_bids.io import files
 from hipsta_bids.phantom import Phantom, PhantomSpec

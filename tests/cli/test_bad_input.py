@@ -17,9 +17,8 @@ import numpy as np
 import pytest
 
 from hipsta_bids.cli import main
-from hipsta_bids.derivatives.dataset import settle_settings
+from hipsta_bids.derivatives.dataset import read_status, settle_settings
 from hipsta_bids.derivatives.names import OUTPUTS, HemisphereName, output_path
-from hipsta_bids.derivatives.status import read_status
 from hipsta_bids.errors import ExitCode
 from hipsta_bids.io import files
 from hipsta_bids.phantom import Hemisphere, PhantomSpec, write_dataset

@@ -14,7 +14,7 @@ from hipsta_bids.cli.main import EPILOG
 from hipsta_bids.cli.participant import build_parser
 from hipsta_bids.errors import ExitCode, NothingToDoError
 from hipsta_bids.inputs import search
-from hipsta_bids.inputs.request import InputRequest
+from hipsta_bids.inputs.scan import InputRequest
 from hipsta_bids.inputs.search import Findings
 from hipsta_bids.participant import run as runner
 from hipsta_bids.participant.run import RunOptions

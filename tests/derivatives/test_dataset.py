@@ -6,8 +6,8 @@ from stand_ins import make_scheme
 
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset
+from hipsta_bids.derivatives.dataset import COLUMNS, read_status, update_status, write_sidecar
 from hipsta_bids.derivatives.names import DATASET_FILES
-from hipsta_bids.derivatives.status import COLUMNS, read_status, update_status, write_sidecar
 from hipsta_bids.errors import InputError, SettingsError, UsageError
 from hipsta_bids.settings import BodySettings, Settings
 

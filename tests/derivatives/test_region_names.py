@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 
 from hipsta_bids.derivatives import dataset
+from hipsta_bids.derivatives.dataset import identity, read_status, update_status
 from hipsta_bids.derivatives.hemisphere import ResultPlace, remove_results
 from hipsta_bids.derivatives.names import (
     DATASET_FILES,
@@ -13,7 +14,6 @@ from hipsta_bids.derivatives.names import (
     ignore_patterns,
     output_name,
 )
-from hipsta_bids.derivatives.status import identity, read_status, update_status
 from hipsta_bids.errors import SettingsError
 from hipsta_bids.io import files
 from hipsta_bids.settings import BodySettings, Settings

@@ -16,7 +16,7 @@ from small_cohorts import (
 )
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.derivatives.status import identity, update_status
+from hipsta_bids.derivatives.dataset import identity, update_status
 from hipsta_bids.io import files
 
 

@@ -14,7 +14,7 @@ from hipsta_bids.geometry.sampling import SampledMap
 from hipsta_bids.group import write
 from hipsta_bids.group.formula import left_side
 from hipsta_bids.group.tables import COLUMNS
-from hipsta_bids.inputs.request import MapSource
+from hipsta_bids.inputs.scan import MapSource
 from hipsta_bids.io import files
 from hipsta_bids.participant.maps import write_map
 

@@ -6,7 +6,7 @@ import pytest
 from small_cohorts import PLAN, place_of, write_dataset
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.derivatives.status import identity, update_status
+from hipsta_bids.derivatives.dataset import identity, update_status
 
 QUICK = ["group", "--align", "none", "--measures", "thickness", "--formula", "group", "--contrast"]
 QUICK += ["group[CN]-group[AD]"]

@@ -5,7 +5,7 @@ from input_cases import AFFINE, save
 
 from hipsta_bids.errors import InputError, ProtocolError
 from hipsta_bids.inputs.labels import MARGIN, label_values, read_label_volume
-from hipsta_bids.inputs.request import HemisphereInput
+from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Part, Tissue
 

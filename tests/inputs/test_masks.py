@@ -7,7 +7,7 @@ from input_cases import AFFINE, save
 
 from hipsta_bids.errors import HipstaError
 from hipsta_bids.inputs.labels import read_label_volume
-from hipsta_bids.inputs.request import Edit, HemisphereInput
+from hipsta_bids.inputs.scan import Edit, HemisphereInput
 from hipsta_bids.io.volumes import mask_bytes
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Part, Tissue

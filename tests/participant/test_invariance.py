@@ -9,7 +9,7 @@ from measured_phantoms import measure, measured, middle, spiral
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.inputs.labels import read_label_volume
-from hipsta_bids.inputs.request import HemisphereInput
+from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.phantom import Phantom, encode, rigid_motion
 from hipsta_bids.protocols.load import load_protocol
 

@@ -10,8 +10,8 @@ import pandas as pd
 import pytest
 
 from hipsta_bids.cli import main
+from hipsta_bids.derivatives.dataset import read_status
 from hipsta_bids.derivatives.names import EXTRA_OUTPUTS, HemisphereName, output_name, output_path
-from hipsta_bids.derivatives.status import read_status
 from hipsta_bids.errors import ExitCode, InputError
 from hipsta_bids.inputs.maps import read_regions
 from hipsta_bids.phantom import Hemisphere, PhantomSpec, write_dataset

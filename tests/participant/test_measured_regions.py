@@ -10,8 +10,8 @@ from measured_phantoms import Results, measure
 
 from hipsta_bids.cli import main
 from hipsta_bids.cli.participant import REGIONS
+from hipsta_bids.derivatives.dataset import read_status
 from hipsta_bids.derivatives.names import HemisphereName, output_path
-from hipsta_bids.derivatives.status import read_status
 from hipsta_bids.errors import ExitCode, GeometryError, ProtocolError
 from hipsta_bids.io import files
 from hipsta_bids.phantom import Hemisphere, Phantom, PhantomSpec, rigid_motion, write_dataset

@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 from stand_ins import THICKNESS, make_input, stand_in_job, thread_job
 
+from hipsta_bids.derivatives.dataset import COLUMNS, read_status
 from hipsta_bids.derivatives.names import OUTPUTS
-from hipsta_bids.derivatives.status import COLUMNS, read_status
 from hipsta_bids.errors import ExitCode, InputError, OutputError, SettingsError
-from hipsta_bids.inputs.request import Edit
+from hipsta_bids.inputs.scan import Edit
 from hipsta_bids.io import files
 from hipsta_bids.participant import pool
 from hipsta_bids.participant import run as runner

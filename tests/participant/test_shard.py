@@ -8,10 +8,10 @@ import pytest
 from stand_ins import make_input, stand_in_job
 
 from hipsta_bids.cli import main
-from hipsta_bids.derivatives.status import read_status, read_table, table_path, update_status
+from hipsta_bids.derivatives.dataset import read_status, read_table, table_path, update_status
 from hipsta_bids.errors import ExitCode, NothingToDoError, UsageError
 from hipsta_bids.inputs import search
-from hipsta_bids.inputs.request import InputRequest
+from hipsta_bids.inputs.scan import InputRequest
 from hipsta_bids.inputs.search import Findings, list_subjects
 from hipsta_bids.participant import run
 from hipsta_bids.participant.cluster import Shard, parse_shard

@@ -9,8 +9,8 @@ from measured_phantoms import results
 from nilearn.surface import load_surf_data, load_surf_mesh
 
 from hipsta_bids.cli import main
+from hipsta_bids.derivatives.dataset import read_status
 from hipsta_bids.derivatives.names import OUTPUTS
-from hipsta_bids.derivatives.status import read_status
 from hipsta_bids.errors import ExitCode
 
 DATA = Path(__file__).parents[2] / ".." / "shared" / "data" / "cobralab"

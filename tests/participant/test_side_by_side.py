@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from stand_ins import make_input, stand_in_job
 
-from hipsta_bids.derivatives.status import read_status
+from hipsta_bids.derivatives.dataset import read_status
 from hipsta_bids.io.files import locked
 from hipsta_bids.participant import run as runner
 from hipsta_bids.participant.pool import WorkerLost

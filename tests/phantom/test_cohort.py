@@ -7,7 +7,7 @@ import pytest
 from hipsta_bids.cli import main
 from hipsta_bids.cli.commands import PHANTOM_EPILOG
 from hipsta_bids.errors import ExitCode, UsageError
-from hipsta_bids.inputs.request import InputRequest
+from hipsta_bids.inputs.scan import InputRequest
 from hipsta_bids.inputs.search import find_hemispheres
 from hipsta_bids.io import files
 from hipsta_bids.phantom import TRUTH_TABLE, Phantom

@@ -8,7 +8,7 @@ import pytest
 
 from hipsta_bids.errors import OutputError, SettingsError
 from hipsta_bids.inputs.labels import read_label_volume
-from hipsta_bids.inputs.request import InputRequest
+from hipsta_bids.inputs.scan import InputRequest
 from hipsta_bids.inputs.search import find_hemispheres
 from hipsta_bids.io import files
 from hipsta_bids.phantom import (

@@ -6,8 +6,8 @@ from test_phantom_truth import _curvature_by_differences
 
 from hipsta_bids.errors import SettingsError
 from hipsta_bids.phantom import Phantom, PhantomSpec, Thinning
+from hipsta_bids.phantom.phantom import SURFACES, curvatures
 from hipsta_bids.phantom.shape import Body, window_jet
-from hipsta_bids.phantom.truth import SURFACES, curvatures
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Tissue
 

@@ -7,13 +7,8 @@ import pytest
 
 from hipsta_bids.phantom import KINDS, Phantom, PhantomSpec
 from hipsta_bids.phantom.labels import SUBFIELD_STARTS
+from hipsta_bids.phantom.phantom import SURFACES, curvatures, cut_sections, summarize
 from hipsta_bids.phantom.shape import START_ANGLE, Body
-from hipsta_bids.phantom.truth import (
-    SURFACES,
-    curvatures,
-    cut_sections,
-    summarize,
-)
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Tissue
 
