@@ -9,7 +9,7 @@ from scipy import ndimage
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.boundaries import Boundaries
-from hipsta_bids.geometry.fem import HarmonicSolver
+from hipsta_bids.geometry.fem import Laplace
 from hipsta_bids.geometry.measures import labels_at
 from hipsta_bids.settings import SheetSettings
 from hipsta_bids.types import Bool, Coordinates, Flag, Float, Sheet, TetMesh
@@ -204,19 +204,16 @@ def _filled(points: Float) -> Float:
 # The intrinsic coordinate system: three harmonic functions on the body.
 
 
-def solve_coordinates(
-    mesh: TetMesh, boundaries: Boundaries, solver: HarmonicSolver | None = None
-) -> Coordinates:
+def solve_coordinates(laplace: Laplace, boundaries: Boundaries) -> Coordinates:
     """Solve Laplace's equation between each pair of opposite boundaries.
 
     Each function is -1 on the first boundary (medial, posterior, interior), 1 on the second, and
     has no flux through the rest of the surface (Diers et al. 2023, section 2.1.4).
     """
-    solver = solver or HarmonicSolver(mesh)
     values = (
-        solver.between(boundaries.medial, boundaries.lateral),
-        solver.between(boundaries.posterior, boundaries.anterior),
-        solver.between(boundaries.interior, boundaries.exterior, few=True),
+        laplace.between(boundaries.medial, boundaries.lateral),
+        laplace.between(boundaries.posterior, boundaries.anterior),
+        laplace.between(boundaries.interior, boundaries.exterior),
     )
     return Coordinates(values=np.column_stack(values))
 

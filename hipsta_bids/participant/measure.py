@@ -27,7 +27,7 @@ from hipsta_bids.geometry.checks import (
     find_contacts,
     name_subfields,
 )
-from hipsta_bids.geometry.fem import HarmonicSolver
+from hipsta_bids.geometry.fem import volume_laplace
 from hipsta_bids.geometry.grid import in_plane_voxel, resample_body
 from hipsta_bids.geometry.measures import bending_angle, subfield_areas, subfield_volumes
 from hipsta_bids.geometry.quality import Evidence, find_flags, quality_metrics
@@ -98,10 +98,10 @@ def measure_hemisphere(
     with clock("tetrahedra"):
         surface, mesh, smoothed = _filled(solid, surface, settings)
     with clock("boundaries"):
-        solver = HarmonicSolver(mesh)
-        boundaries = find_boundaries(surface, mesh, body, settings.boundaries, solver)
+        laplace = volume_laplace(mesh, settings.boundaries.solver)
+        boundaries = find_boundaries(surface, laplace, body, settings.boundaries)
     with clock("coordinates"):
-        coordinates = solve_coordinates(mesh, boundaries, solver)
+        coordinates = solve_coordinates(laplace, boundaries)
         order = check_label_order(mesh, coordinates, body, settings.checks)
     with clock("sheet"):
         sheet = sample_sheet(mesh, coordinates, settings.sheet)
