@@ -181,7 +181,7 @@ class _Finder:
         self._step = settings.strip_step * thickness
         links = edge_graph(wall.edges, np.ones(len(wall.edges)), len(wall.vertices))
         self._normals = _unit((links + sparse.eye_array(len(wall.vertices))) @ wall.normals)
-        self._centers = cKDTree(laplace.points[laplace.cells].mean(axis=1))
+        self._centers = cKDTree(laplace.points[laplace.cells.T].mean(axis=0))
 
     def strip(self, starts: Float, inward: Float, line: Bool, limit: Bool) -> Bool:
         """Vertices (V,) within a limit that face away from the sheet, with a line among them."""

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from hipsta_bids.geometry.body import Body
+from hipsta_bids.geometry.tetra import tetra_volumes
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import MeasureSettings
 from hipsta_bids.types import Bool, Float, Sheet, TetMesh
@@ -325,9 +326,8 @@ def subfield_areas(whole: Sheet, body: Body) -> dict[Tissue, float]:
 
 def subfield_volumes(mesh: TetMesh, body: Body) -> dict[Tissue, float]:
     """Volume in each subfield, mm3; the volumes add up to that of the mesh."""
-    corners = mesh.vertices[mesh.tetrahedra]
-    volume = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6
-    return _sums(labels_at(corners.mean(axis=1), body), volume)
+    centers = mesh.vertices[mesh.tetrahedra.T].mean(axis=0)
+    return _sums(labels_at(centers, body), tetra_volumes(mesh.vertices, mesh.tetrahedra))
 
 
 def _between(start: Float, end: Float, at: Float) -> Float:

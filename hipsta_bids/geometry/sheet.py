@@ -11,6 +11,7 @@ from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.boundaries import Boundaries
 from hipsta_bids.geometry.fem import Laplace
 from hipsta_bids.geometry.measures import labels_at
+from hipsta_bids.geometry.tetra import cross, tetra_volumes
 from hipsta_bids.settings import SheetSettings
 from hipsta_bids.types import Bool, Coordinates, Flag, Float, Sheet, TetMesh
 
@@ -56,10 +57,8 @@ def folded_fraction(mesh: TetMesh, coordinates: Coordinates) -> float:
 
     The common orientation is that of the majority.
     """
-    edges = mesh.vertices[mesh.tetrahedra[:, 1:]] - mesh.vertices[mesh.tetrahedra[:, :1]]
-    volume = np.linalg.det(edges) / 6
-    turned = coordinates.values[mesh.tetrahedra]
-    inner = np.linalg.det(turned[:, 1:] - turned[:, :1])
+    volume = tetra_volumes(mesh.vertices, mesh.tetrahedra)
+    inner = tetra_volumes(coordinates.values, mesh.tetrahedra)
     sign = np.sign((volume * inner).sum())
     return float(volume[inner * sign < 0].sum() / volume.sum())
 
@@ -132,13 +131,14 @@ def _invert(mesh: TetMesh, values: Float, axes: tuple[Float, Float, Float]) -> F
     first = np.array([axis[0] for axis in axes])
     step = np.array([(axis[-1] - axis[0]) / (len(axis) - 1) for axis in axes])
     nodes = (values - first) / step
-    corners = nodes[mesh.tetrahedra]
+    corners = nodes[mesh.tetrahedra.T]
     slack = 1e-6  # nodes on the outer faces must not fall out by rounding
-    low = np.maximum(np.ceil(corners.min(axis=1) - slack), 0).astype(int)
-    high = np.minimum(np.floor(corners.max(axis=1) + slack), np.array(shape) - 1).astype(int)
+    low = np.maximum(np.ceil(corners.min(axis=0) - slack), 0).astype(int)
+    high = np.minimum(np.floor(corners.max(axis=0) + slack), np.array(shape) - 1).astype(int)
     count = np.maximum(high - low + 1, 0)
-    hits = np.flatnonzero(count.prod(axis=1))
-    number = count[hits].prod(axis=1)
+    number = count[:, 0] * count[:, 1] * count[:, 2]
+    hits = np.flatnonzero(number)
+    number = number[hits]
     cell = np.repeat(hits, number)
     rank = np.arange(len(cell)) - np.repeat(np.cumsum(number) - number, number)
     node = np.column_stack(
@@ -149,8 +149,8 @@ def _invert(mesh: TetMesh, values: Float, axes: tuple[Float, Float, Float]) -> F
         ]
     )
     node += low[cell]
-    weights, known = _barycentric(corners[cell], node.astype(float))
-    worst = np.where(known, weights.min(axis=1), -np.inf)
+    weights, known = _barycentric(corners[:, cell], node.astype(float))
+    worst = np.where(known, weights.min(axis=0), -np.inf)
     flat = np.ravel_multi_index(tuple(node.T), shape)
     inside = worst > -1e-3  # noqa: PLR2004 -- a thousandth of a tetrahedron bridges rounding gaps
     # Where folds make two tetrahedra claim a node, the one that holds it most centrally wins.
@@ -160,24 +160,20 @@ def _invert(mesh: TetMesh, values: Float, axes: tuple[Float, Float, Float]) -> F
     last = np.append(owner[1:] != owner[:-1], True)
     winner, owner = winner[last], owner[last]
     points = np.full((int(np.prod(shape)), 3), np.nan)
-    places = mesh.vertices[mesh.tetrahedra[cell[winner]]]
-    points[owner] = np.einsum("ni,nid->nd", weights[winner], places)
+    around = mesh.vertices[mesh.tetrahedra[cell[winner]]]
+    points[owner] = np.einsum("in,nid->nd", weights[:, winner], around)
     return points.reshape(*shape, 3)
 
 
 def _barycentric(corners: Float, points: Float) -> tuple[Float, Bool]:
-    """Barycentric weights (N, 4), and whether the tetrahedron is not flat."""
-    edges = corners[:, 1:] - corners[:, :1]
-    a, b, c = edges[:, 0], edges[:, 1], edges[:, 2]
-    local = points - corners[:, 0]
-    det = np.einsum("ij,ij->i", a, np.cross(b, c))
+    """Weights (4, N) of corners (4, N, 3), and whether the tetrahedron is not flat."""
+    a, b, c = corners[1:] - corners[0]
+    faces = np.stack([cross(b, c), cross(c, a), cross(a, b)])
+    det = np.einsum("ij,ij->i", a, faces[0])
     known = np.abs(det) > 1e-12  # noqa: PLR2004 -- grid steps cubed
-    safe = np.where(known, det, 1.0)
-    weights = np.empty((len(points), 4))
-    weights[:, 1] = np.einsum("ij,ij->i", local, np.cross(b, c)) / safe
-    weights[:, 2] = np.einsum("ij,ij->i", local, np.cross(c, a)) / safe
-    weights[:, 3] = np.einsum("ij,ij->i", local, np.cross(a, b)) / safe
-    weights[:, 0] = 1 - weights[:, 1:].sum(axis=1)
+    weights = np.empty((4, len(points)))
+    weights[1:] = np.einsum("ij,kij->ki", points - corners[0], faces) / np.where(known, det, 1.0)
+    weights[0] = 1 - weights[1:].sum(axis=0)
     return weights, known
 
 

@@ -15,6 +15,18 @@ from hipsta_bids.settings import BoundarySettings
 from hipsta_bids.types import Bool, Float, Int, Surface
 
 
+class _Mesh(TriaMesh):  # type: ignore[misc]  # LaPy is untyped
+    """LaPy's mesh, whose curvature spends half of its time on ``edges`` of LaPy 1.7."""
+
+    def edges(self, with_boundary: bool = False) -> tuple[Int, Int]:  # noqa: ARG002  (as in LaPy)
+        """Inner edges (E, 2) and the triangles (E, 2) along and against which they run."""
+        inner = sparse.triu(self.adj_dir.multiply(self.adj_dir.T), format="csr")
+        inner.sort_indices()
+        triangle = self.construct_adj_dir_tidx()
+        beside = [inner.multiply(side).tocsr().data for side in (triangle, triangle.T)]
+        return np.stack(inner.nonzero(), axis=1), np.stack(beside, axis=1).astype(np.int32) - 1
+
+
 class Wall:
     """The surface without its caps, with vertices of its own numbering."""
 
@@ -48,7 +60,7 @@ class Wall:
         divided by that and a factor (see the settings). On outward triangles it is negative where
         the surface is convex.
         """
-        mesh = TriaMesh(self.vertices, self.triangles)
+        mesh = _Mesh(self.vertices, self.triangles)
         across, along, least, _ = mesh.curvature_tria(settings.curvature_smoothing)
         bend = -least / (settings.lapy_curvature * float(self.lengths.mean()))
         excess = np.maximum(bend - settings.sharp_bend, 0)
