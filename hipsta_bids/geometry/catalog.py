@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.measures import (
     CrossSections,
     at_columns,
@@ -22,32 +23,47 @@ from hipsta_bids.geometry.measures import (
     gaussian_curvature,
     mean_curvature,
     measure_thickness,
+    subfield_areas,
+    subfield_volumes,
     wall_area,
 )
+from hipsta_bids.geometry.surface import signed_volume
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import Settings
-from hipsta_bids.types import Bool, Float, Sheet
+from hipsta_bids.types import Bool, Float, Sheet, Surface, TetMesh
 
 # One hemisphere's sheet with what several measures share.
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Measured:
-    """One hemisphere's sheet, and what several measures share."""
+    """One hemisphere's body and sheet, and what several measures share."""
 
+    body: Body
+    surface: Surface
+    mesh: TetMesh
     sheet: Sheet
     """Where maps are measured."""
     subfield: NDArray[np.uint8]
     """(Nx, Ny) values of Tissue."""
     whole: Sheet
-    """The same body from rim to rim, end to end and wall to wall."""
-    areas: Mapping[Tissue, float]
-    """Of the mid-surface from rim to rim in each subfield, mm2."""
-    volumes: Mapping[Tissue, float]
-    """Of the mesh in each subfield, mm3."""
-    volume: float
-    """Of the mesh, mm3."""
+    """The same body from its medial to its lateral edge, end to end and wall to wall."""
     settings: Settings
+
+    @cached_property
+    def areas(self) -> dict[Tissue, float]:
+        """Area of the whole mid-surface in each subfield, mm2."""
+        return subfield_areas(self.whole, self.body)
+
+    @cached_property
+    def volumes(self) -> dict[Tissue, float]:
+        """Volume of the mesh in each subfield, mm3."""
+        return subfield_volumes(self.mesh, self.body)
+
+    @cached_property
+    def volume(self) -> float:
+        """Volume of the mesh, mm3."""
+        return signed_volume(self.surface.vertices, self.surface.triangles)
 
     @cached_property
     def thickness(self) -> Float:

@@ -78,7 +78,7 @@ def is_left_handed(points: Float) -> bool:
     return bool(np.nansum(volume) < 0)
 
 
-def is_turned(sheet: Sheet, hemi: str) -> bool:
+def is_flipped(sheet: Sheet, hemi: str) -> bool:
     """Say whether interior and exterior of a sheet are exchanged for its hemisphere.
 
     The interior side of the cortex is the one that continues the interior side of the hippocampus:
@@ -90,9 +90,9 @@ def is_turned(sheet: Sheet, hemi: str) -> bool:
     return is_left_handed(sheet.points) == (hemi == "L")
 
 
-def check_turned(sheet: Sheet, hemi: str) -> list[Flag]:
+def check_flipped(sheet: Sheet, hemi: str) -> list[Flag]:
     """Flag a sheet whose interior side, told by labels, is not that of its hemisphere."""
-    if not is_turned(sheet, hemi):
+    if not is_flipped(sheet, hemi):
         return []
     text = "the labels of the dentate gyrus lie on the exterior side of the sheet: look at the map"
     return [Flag(reason="side-doubtful", message=text)]
