@@ -1,4 +1,7 @@
-"""The sheet: the body on a regular grid of its own coordinates."""
+"""Three harmonic coordinates of the body, and the sheet: a regular grid in these coordinates.
+
+Layers of the sheet may be spaced evenly or by volume.
+"""
 
 from dataclasses import replace
 
@@ -19,8 +22,8 @@ from hipsta_bids.types import Bool, Coordinates, Flag, Float, Sheet, TetMesh
 def sample_sheet(mesh: TetMesh, coordinates: Coordinates, settings: SheetSettings) -> Sheet:
     """Find the points of the body that have the grid's coordinates.
 
-    Each tetrahedron is also one in coordinate space; a grid node inside it lies at the same
-    barycentric place in the body.
+    Each tetrahedron is also one in coordinate space; a grid node inside it has the same
+    barycentric coordinates in the body.
     """
     axes = sheet_levels(settings)
     points = _invert(mesh, coordinates.values, axes)
@@ -45,30 +48,26 @@ def sheet_levels(settings: SheetSettings) -> tuple[Float, Float, Float]:
 
 
 def whole_body(settings: SheetSettings) -> SheetSettings:
-    """Describe the grid that reaches from rim to rim, end to end and wall to wall.
+    """Describe the grid from medial to lateral edge, end to end and wall to wall.
 
-    Columns on the rims themselves have no thickness, but lengths and areas need them.
+    Columns on the edges themselves have no thickness, but lengths and areas need them.
     """
     return replace(settings, x_extent=1.0, y_extent=1.0, z_extent=1.0, z_nodes=5, max_filled=1.0)
 
 
 def folded_fraction(mesh: TetMesh, coordinates: Coordinates) -> float:
-    """Fraction of the body's volume whose coordinates are turned inside out.
-
-    The common orientation is that of the majority.
-    """
+    """Fraction of the body's volume in which the coordinates' orientation is not the usual one."""
     volume = tetra_volumes(mesh.vertices, mesh.tetrahedra)
-    inner = tetra_volumes(coordinates.values, mesh.tetrahedra)
+    corners = coordinates.values[mesh.tetrahedra]
+    inner = np.linalg.det(corners[:, 1:] - corners[:, :1])
     sign = np.sign((volume * inner).sum())
     return float(volume[inner * sign < 0].sum() / volume.sum())
 
 
 def is_left_handed(points: Float) -> bool:
-    """Say whether x cross y points from exterior to interior on most of a sheet.
+    """Whether x cross y points from exterior to interior on most of a sheet (Nx, Ny, Nz, 3).
 
     The two hemispheres are mirror images, so that one of them always is.
-
-    ``points`` Sheet points in mm, NaN where undefined.
     """
     middle = points[:, :, points.shape[2] // 2]
     along_x = middle[1:, :-1] - middle[:-1, :-1]
@@ -79,7 +78,7 @@ def is_left_handed(points: Float) -> bool:
 
 
 def is_flipped(sheet: Sheet, hemi: str) -> bool:
-    """Say whether interior and exterior of a sheet are exchanged for its hemisphere.
+    """Whether interior and exterior of a sheet are exchanged for its hemisphere.
 
     The interior side of the cortex is the one that continues the interior side of the hippocampus:
     its outer (pial) surface. Bending does not tell, since the cortex bends round its white matter
@@ -91,7 +90,7 @@ def is_flipped(sheet: Sheet, hemi: str) -> bool:
 
 
 def check_flipped(sheet: Sheet, hemi: str) -> list[Flag]:
-    """Flag a sheet whose interior side, told by labels, is not that of its hemisphere."""
+    """Flag a sheet whose interior side, found by labels, is not that of its hemisphere."""
     if not is_flipped(sheet, hemi):
         return []
     text = "the labels of the dentate gyrus lie on the exterior side of the sheet: look at the map"
@@ -178,7 +177,7 @@ def _barycentric(corners: Float, points: Float) -> tuple[Float, Bool]:
 
 
 def _filled(points: Float) -> Float:
-    """Replace missing points by normalised averages of their neighbors in the same z level."""
+    """Replace missing points by normalized averages of their neighbors in the same z level."""
     missing = np.asarray(~np.isfinite(points).all(axis=-1))
     if not missing.any():
         return points
@@ -197,9 +196,6 @@ def _filled(points: Float) -> Float:
     return np.where(missing[..., None], np.nan, values)
 
 
-# The intrinsic coordinate system: three harmonic functions on the body.
-
-
 def solve_coordinates(laplace: Laplace, boundaries: Boundaries) -> Coordinates:
     """Solve Laplace's equation between each pair of opposite boundaries.
 
@@ -212,9 +208,6 @@ def solve_coordinates(laplace: Laplace, boundaries: Boundaries) -> Coordinates:
         laplace.between(boundaries.interior, boundaries.exterior),
     )
     return Coordinates(values=np.column_stack(values))
-
-
-# Layers: where along its columns the sheet is sampled.
 
 
 def equal_volume_layers(sheet: Sheet) -> tuple[Sheet, Bool]:
@@ -265,7 +258,7 @@ def layer_depth(layers: Sheet) -> Float:
 
 
 def _column_areas(points: Float) -> Float:
-    """Area of each layer per column, (Nx, Ny, Nz), mm2; negative where the layer is turned over."""
+    """Area of each layer per column, (Nx, Ny, Nz), mm2; negative where the layer is flipped."""
     along_x, along_y = np.gradient(points, axis=(0, 1))
     across = points[:, :, -1:] - points[:, :, :1]
     area = (np.cross(along_x, along_y) * across).sum(axis=-1)
