@@ -1,4 +1,4 @@
-"""What a hemisphere costs, stage by stage, at several spacings of the working grid.
+"""What a hemisphere costs, stage by stage, at several spacings and with LaPy's own solver.
 
 Measures every hemisphere that ``hipsta-bids`` finds in a BIDS dataset, or four phantoms if none is
 given, in this process and TetGen's, with one thread each as in a worker::
@@ -34,7 +34,7 @@ from hipsta_bids.participant.job import (
     warm_up,
 )
 from hipsta_bids.phantom import write_demo_dataset
-from hipsta_bids.settings import GridSettings, Settings
+from hipsta_bids.settings import BoundarySettings, GridSettings, Settings
 from hipsta_bids.types import LabelVolume
 
 #: mm; the middle one is the default.
@@ -114,18 +114,22 @@ def benchmark(items: Sequence[HemisphereInput], spacings: Sequence[float], repea
 
     measure(read_label_volume(items[0]), items[0].hemi, Settings(), 1)  # starts TetGen's process
     reading: list[float] = []
-    costs: dict[float, dict[str, Cost | None]] = {spacing: {} for spacing in spacings}
+    variants = {
+        f"spacing {spacing:g} mm": Settings(grid=GridSettings(spacing=spacing))
+        for spacing in spacings
+    }
+    variants["LaPy's solver"] = Settings(boundaries=BoundarySettings(solver="lapy"))
+    costs: dict[str, dict[str, Cost | None]] = {title: {} for title in variants}
     for item in items:
         start = cpu_seconds()
         volume = read_label_volume(item)
         reading.append(cpu_seconds() - start)
-        for spacing, found in costs.items():
-            settings = Settings(grid=GridSettings(spacing=spacing))
-            found[name(item)] = measure(volume, item.hemi, settings, repeats)
+        for title, settings in variants.items():
+            costs[title][name(item)] = measure(volume, item.hemi, settings, repeats)
     print(f"\nreading: median {np.median(reading):.3f} CPU s")
     return {
         "reading": float(np.median(reading)),
-        "spacings": {spacing: report(spacing, found) for spacing, found in costs.items()},
+        "variants": {title: report(title, found) for title, found in costs.items()},
     }
 
 
@@ -134,17 +138,17 @@ def name(item: HemisphereInput) -> str:
     return f"sub-{item.subject} {item.hemi} {item.protocol.name}"
 
 
-def report(spacing: float, costs: dict[str, Cost | None]) -> Any:  # noqa: ANN401  (JSON)
+def report(title: str, costs: dict[str, Cost | None]) -> Any:  # noqa: ANN401  (JSON)
     """Print a row per hemisphere and the medians; return them for JSON."""
-    measured = {title: cost for title, cost in costs.items() if cost is not None}
-    print(f"\nspacing {spacing:g} mm: CPU s per stage and in all, wall s, peak memory MB")
+    measured = {item: cost for item, cost in costs.items() if cost is not None}
+    print(f"\n{title}: CPU s per stage and in all, wall s, peak memory MB")
     if not measured:
         print("every hemisphere was refused")
         return {}
     stages = list(next(iter(measured.values())).stages)
     header = ["", *stages, "all", "wall", "memory", "TetGen's", "tetrahedra"]
     rows = {
-        title: [
+        item: [
             *(cost.stages[stage] for stage in stages),
             cost.cpu,
             cost.wall,
@@ -152,14 +156,14 @@ def report(spacing: float, costs: dict[str, Cost | None]) -> Any:  # noqa: ANN40
             cost.helper_memory,
             cost.tetrahedra,
         ]
-        for title, cost in measured.items()
+        for item, cost in measured.items()
     }
     rows["median"] = np.median(list(rows.values()), axis=0).tolist()
     print_table(header, rows)
-    refused = [title for title, cost in costs.items() if cost is None]
+    refused = [item for item, cost in costs.items() if cost is None]
     if refused:
         print("refused:", ", ".join(refused))
-    return {title: dict(zip(header[1:], row, strict=True)) for title, row in rows.items()}
+    return {item: dict(zip(header[1:], row, strict=True)) for item, row in rows.items()}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

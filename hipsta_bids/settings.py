@@ -209,6 +209,8 @@ class TetraSettings(SettingsTable):
 class BoundarySettings(SettingsTable):
     """Medial and lateral boundary strips, and which side is interior."""
 
+    solver: Literal["two-level", "lapy"] = "two-level"
+    """What solves Laplace's equation, for boundaries and coordinates; ``lapy`` is slower."""
     sharp_bend: NonNegativeFloat = 0.5
     """Convex bends with less curvature than this do not slow diffusion, 1/mm."""
     anisotropy: NonNegativeFloat = 8.0

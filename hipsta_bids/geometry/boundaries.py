@@ -1,4 +1,8 @@
-"""Medial and lateral boundary of the sheet, and its two sides, on the surface of the body."""
+"""Where the coordinates are fixed: medial and lateral strip, both sides and both ends of the sheet.
+
+Two rules find the curves along the sheet's medial and lateral edge: zero lines of an eigenfunction
+on the wall, and lines guided by distances inside the body (named ``rims`` in outputs and settings).
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,38 +15,37 @@ from scipy.spatial import cKDTree
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.checks import name_place
-from hipsta_bids.geometry.fem import (
-    HarmonicSolver,
-    gradients,
-    smallest_eigenfunctions,
-    solve_dirichlet,
-)
-from hipsta_bids.geometry.mesh import mean_wall_thickness, signed_volume, unique_edges
-from hipsta_bids.geometry.wall import Wall, edge_graph, end_to_end, vertex_normals
+from hipsta_bids.geometry.fem import Laplace
+from hipsta_bids.geometry.mesh import mean_wall_thickness, signed_volume
+from hipsta_bids.geometry.wall import Wall, edge_graph, end_to_end
 from hipsta_bids.settings import BoundarySettings
-from hipsta_bids.types import Bool, Float, Int, Surface, TetMesh
+from hipsta_bids.types import Bool, Float, Int, Surface
 
-# The rims of the sheet, found by distances inside the body.
+#: Medial and lateral, or the other way round.
+Pair = tuple[Float, Float]
+Paths = tuple[NDArray[np.intp], NDArray[np.intp]]
+
+_SLICES = 40  # along the body, in each of which the rim is sought
 
 
 def rim_paths(
-    wall: Wall, mesh: TetMesh, body: Body, settings: BoundarySettings
-) -> tuple[tuple[NDArray[np.intp], NDArray[np.intp]], tuple[Float, Float]]:
-    """Paths from end to end along which the wall is farthest from the opposite rim.
+    wall: Wall, laplace: Laplace, body: Body, settings: BoundarySettings
+) -> tuple[Paths, Pair]:
+    """Medial and lateral path from end to end where the wall is farthest from the opposite rim.
 
     Distances run inside the volume and mostly across the long axis, as steps along it are
     stretched. The first ones start from the sheet's most lateral labels.
 
-    Returns How much nearer than the rim of their slice the wall's vertices are to the opposite rim,
-    mm.
+    Also returns how much nearer to the opposite rim each vertex of the wall lies than the rim of
+    its slice, (V,) each, mm.
     """
-    edges = unique_edges(mesh.tetrahedra)
-    steps = np.diff(mesh.vertices[edges], axis=1)[:, 0]
+    points, edges = laplace.points, laplace.edges
+    steps = np.diff(points[edges], axis=1)[:, 0]
     along = steps @ body.ends.axis
     stretch = settings.axial_stretch**2 - 1
     lengths = np.sqrt(np.einsum("ij,ij->i", steps, steps) + stretch * along**2)
-    graph = edge_graph(edges, lengths, len(mesh.vertices))
-    start = _most_lateral(mesh, body, settings)
+    graph = edge_graph(edges, lengths, len(points))
+    start = _most_lateral(points, body, settings)
     paths: list[NDArray[np.intp]] = []
     depths: list[Float] = []
     for _ in range(3):  # medial from labels, lateral from medial, medial again from lateral
@@ -56,16 +59,12 @@ def rim_paths(
 
 
 def guided_curves(
-    wall: Wall,
-    paths: tuple[NDArray[np.intp], NDArray[np.intp]],
-    depths: tuple[Float, Float],
-    thickness: float,
-    settings: BoundarySettings,
-) -> tuple[Float, Float] | None:
-    """Middle lines between the two sides within the zones at the rims.
+    wall: Wall, paths: Paths, depths: Pair, thickness: float, settings: BoundarySettings
+) -> Pair | None:
+    """Middle lines between the two sides within zones along both paths.
 
-    Without the rim zones the wall falls into its two sides. The zero line of the harmonic
-    function between them, with the same curvature-aware diffusion, runs along the rims.
+    Without these zones the wall falls into its two sides. The zero line of the harmonic function
+    between them, with the same curvature-aware diffusion, runs along the edges of the sheet.
     """
     zones = [
         (_below_rim(depth, path, wall) < settings.rim_zone * thickness)
@@ -75,10 +74,8 @@ def guided_curves(
     return middle_lines(wall, zones)
 
 
-def center_curves(
-    wall: Wall, curves: tuple[Float, Float], thickness: float, settings: BoundarySettings
-) -> tuple[Float, Float]:
-    """Move curves to the middle of the rims.
+def center_curves(wall: Wall, curves: Pair, thickness: float, settings: BoundarySettings) -> Pair:
+    """Move curves to the middle of the sheet's edges, which may be rounded.
 
     The middle lines are found again in ever narrower bands of equal width on both sides: a side
     that bends more, or reaches farther into a zone, pulls the line towards itself.
@@ -89,33 +86,35 @@ def center_curves(
     return curves
 
 
-def middle_lines(wall: Wall, zones: Sequence[Bool]) -> tuple[Float, Float] | None:
-    """Zero lines, within zones at the rims, of the harmonic function between the two sides."""
+def middle_lines(wall: Wall, zones: Sequence[Bool]) -> Pair | None:
+    """Zero lines, within two zones, of the harmonic function between the two sides."""
     sides = wall.sides(zones[0] | zones[1])
     if sides is None:
         return None
     fixed = np.flatnonzero(sides[0] | sides[1])
     values = np.where(sides[1][fixed], 1.0, -1.0)
-    return end_to_end(wall, solve_dirichlet(wall.evenly_aware, fixed, values))
+    return end_to_end(wall, wall.evenly_aware.solve(fixed, values))
 
 
-def _most_lateral(mesh: TetMesh, body: Body, settings: BoundarySettings) -> NDArray[np.intp]:
+def _most_lateral(points: Float, body: Body, settings: BoundarySettings) -> NDArray[np.intp]:
     """Vertices whose surroundings carry the most lateral labels."""
-    _, points = body.inside_points()
-    count = min(settings.label_neighbors, len(points))
-    asked = np.arange(0, len(mesh.vertices), settings.label_stride)
-    _, nearest = cKDTree(points).query(mesh.vertices[asked], k=count)
+    _, labeled = body.inside_points()
+    count = min(settings.label_neighbors, len(labeled))
+    asked = np.arange(0, len(points), settings.label_stride)
+    _, nearest = cKDTree(labeled).query(points[asked], k=count)
     mean = body.lateral[nearest].mean(axis=1)
     return np.asarray(asked[mean >= np.quantile(mean, 1 - settings.lateral_share)])
 
 
 def _rim_path(depth: Float, wall: Wall, settings: BoundarySettings) -> NDArray[np.intp]:
-    """Cheapest path from end to end; being away from the rim costs."""
+    """Cheapest path from end to end; depth below the rim costs."""
     cost = wall.lengths * (
         settings.rim_floor + (np.maximum(depth, 0)[wall.edges].mean(axis=1)) ** 2
     )
-    start = _lowest(depth, wall.posterior)
-    end = _lowest(depth, wall.anterior)
+    start, end = (
+        int(np.flatnonzero(where)[np.argmin(depth[where])])
+        for where in (wall.posterior, wall.anterior)
+    )
     graph = edge_graph(wall.edges, cost, len(depth))
     _, before, _ = sparse.csgraph.dijkstra(
         graph, indices=np.array([start]), return_predecessors=True, min_only=True
@@ -126,56 +125,39 @@ def _rim_path(depth: Float, wall: Wall, settings: BoundarySettings) -> NDArray[n
     return np.array(path)
 
 
-def _lowest(depth: Float, where: Bool) -> int:
-    return int(np.flatnonzero(where)[np.argmin(depth[where])])
-
-
 def _below_top(values: Float, share: Float) -> Float:
-    """How far values lie below the largest of their slice."""
-    count = 40
-    slices = np.minimum((share * count).astype(int), count - 1)
-    top = np.full(count, -np.inf)
-    np.maximum.at(top, slices, values)
-    centers = (np.arange(count) + 0.5) / count
+    """How far values (V,) lie below the largest of their slice."""
+    top = np.full(_SLICES, -np.inf)
+    np.maximum.at(top, np.minimum((share * _SLICES).astype(int), _SLICES - 1), values)
+    centers = (np.arange(_SLICES) + 0.5) / _SLICES
     known = np.isfinite(top)
     top = ndimage.median_filter(np.interp(centers, centers[known], top[known]), 5, mode="nearest")
     return np.asarray(np.interp(share, centers, top) - values)
 
 
 def _below_rim(depth: Float, path: NDArray[np.intp], wall: Wall) -> Float:
-    """Depth below the rim path of the same slice, mm."""
+    """Depth (V,) below a rim path at the same share of the body's length, mm."""
     order = np.argsort(wall.share[path], kind="stable")
     return np.asarray(depth - np.interp(wall.share, wall.share[path][order], depth[path][order]))
 
 
-# The boundary strips: the part of the wall that closes the sheet at its rims.
-
-
-Pair = tuple[Float, Float]
-
-
 def facing_strips(
-    wall: Wall, solver: HarmonicSolver, curves: Pair, thickness: float, settings: BoundarySettings
+    wall: Wall, laplace: Laplace, curves: Pair, thickness: float, settings: BoundarySettings
 ) -> tuple[tuple[Bool, Bool], Pair]:
     """Find the parts of the wall near two curves that face along the sheet, away from it.
 
-    A flat rim is such a part from edge to edge; of a round one, it is the middle. The direction
+    A flat rim is such a part from corner to corner; of a round one, it is the middle. The direction
     of the sheet at its rim is that of a harmonic function from rim to rim, continued from inside
     the sheet, where it does not depend on where exactly the curves lie. The middle lines of the
     strips replace the curves, and the same is done again.
-
-    ``curves`` Medial and lateral, or the other way round, RAS mm; ``thickness`` Of the sheet, mm.
     """
-    mesh = solver.mesh
-    finder = _Finder(wall, mesh, thickness, settings)
-    starts, function = curves, None
+    finder = _Finder(wall, laplace, thickness, settings)
+    starts = curves
     strips = _near(wall, curves, settings.first_strip * thickness)
     for reach in settings.strip_reach:
         lines = _near(wall, curves, settings.least_strip * thickness)
         limits = _near(wall, curves, reach * thickness)
-        ends = wall.index[strips[0]], wall.index[strips[1]]
-        function = solver.between(*ends, guess=function)
-        flow = gradients(mesh.vertices, mesh.tetrahedra, function)
+        flow = laplace.gradient(laplace.between(wall.index[strips[0]], wall.index[strips[1]]))
         strips = (
             finder.strip(starts[0], flow, lines[0], limits[0]),
             finder.strip(starts[1], -flow, lines[1], limits[1]),
@@ -193,13 +175,13 @@ class _Finder:
     """Finds the vertices that face away from the sheet."""
 
     def __init__(
-        self, wall: Wall, mesh: TetMesh, thickness: float, settings: BoundarySettings
+        self, wall: Wall, laplace: Laplace, thickness: float, settings: BoundarySettings
     ) -> None:
         self._wall, self._settings = wall, settings
         self._step = settings.strip_step * thickness
         links = edge_graph(wall.edges, np.ones(len(wall.edges)), len(wall.vertices))
-        self._normals = _unit((links + sparse.eye_array(len(wall.vertices))) @ vertex_normals(wall))
-        self._centers = cKDTree(mesh.vertices[mesh.tetrahedra].mean(axis=1))
+        self._normals = _unit((links + sparse.eye_array(len(wall.vertices))) @ wall.normals)
+        self._centers = cKDTree(laplace.points[laplace.cells.T].mean(axis=0))
 
     def strip(self, starts: Float, inward: Float, line: Bool, limit: Bool) -> Bool:
         """Vertices (V,) within a limit that face away from the sheet, with a line among them."""
@@ -216,20 +198,20 @@ class _Finder:
     def _direction_at_rim(self, starts: Float, inward: Float) -> Float:
         """Direction (N, 3) of the sheet at its rim.
 
-        Three steps are made into the sheet; a line through the directions found there gives the
-        one at the rim, since the sheet may bend.
+        Three steps are made into the sheet; a line through the directions found there is continued
+        to the rim, since the sheet may bend.
         """
-        place, direction = starts, self._mean(starts, inward)
+        points, direction = starts, self._mean(starts, inward)
         found = []
         for _ in range(3):
-            place = place + self._step * direction
-            direction = self._mean(place, inward)
+            points = points + self._step * direction
+            direction = self._mean(points, inward)
             found.append(direction)
         # Least squares through steps 1, 2 and 3, continued to 0.
         return _unit((4 * found[0] + found[1] - 2 * found[2]) / 3)
 
-    def _mean(self, places: Float, flow: Float) -> Float:
-        _, nearest = self._centers.query(places, k=self._settings.strip_neighbors)
+    def _mean(self, points: Float, flow: Float) -> Float:
+        _, nearest = self._centers.query(points, k=self._settings.strip_neighbors)
         return _unit(flow[nearest].mean(axis=1))
 
 
@@ -251,15 +233,15 @@ class Boundaries:
     """(N, 3) points of the boundary curve, RAS mm."""
     lateral_curve: Float
     rule: str
-    """``eigenfunction`` (surface, anisotropic) or ``ridge`` (volume)."""
+    """``eigenfunction`` (of the wall) or ``rims`` (guided by distances inside the body)."""
     distance: float
     """Mean distance between the curves of the two rules, the worse of the two, mm; NaN if only one
     rule gives curves."""
     rim_distance: float
     """Mean distance of the curves from the rim paths, the worse of the two, mm."""
     side_rule: str
-    """What told interior from exterior: ``labels``, or, decided on the sheet, ``bending``; where
-    cortex is measured, ``continuity`` with the hippocampus takes the place of bending."""
+    """What tells interior from exterior: ``labels``, or, decided on the sheet, ``bending`` or,
+    where cortex is measured, ``continuity`` with the hippocampus."""
     side_margin: float
     """Difference of the shares of outward probes that hit interior labels; NaN without labels."""
     strip_width: float
@@ -269,21 +251,17 @@ class Boundaries:
 
 
 def find_boundaries(
-    surface: Surface,
-    mesh: TetMesh,
-    body: Body,
-    settings: BoundarySettings,
-    solver: HarmonicSolver | None = None,
+    surface: Surface, laplace: Laplace, body: Body, settings: BoundarySettings
 ) -> Boundaries:
-    """Find the boundary strips, sides and caps of the sheet.
+    """Find the boundary strips, sides and caps of the sheet; the operator is that of its volume.
 
     The zero lines of the first curvature-aware anisotropic Laplace-Beltrami eigenfunction of the
     wall are the medial and lateral boundary (Diers et al. 2023, section 2.1.3). An independent
-    answer comes from the first eigenfunction of the volume: along the sheet's rims it is extreme.
+    answer comes from distances inside the volume, which are largest along the sheet's edges.
     """
     wall = Wall(surface, body, settings)
     thickness = mean_wall_thickness(surface)
-    paths, depths = rim_paths(wall, mesh, body, settings)
+    paths, depths = rim_paths(wall, laplace, body, settings)
     rims = (wall.vertices[paths[0]], wall.vertices[paths[1]])
     guided = guided_curves(wall, paths, depths, thickness, settings)
     curves = _eigenfunction_curves(wall)
@@ -296,7 +274,7 @@ def find_boundaries(
     ]
     if not distance <= settings.max_distance:
         attempts.reverse()
-    found = _separating(wall, solver or HarmonicSolver(mesh), attempts, thickness, settings)
+    found = _separating(wall, laplace, attempts, thickness, settings)
     if found is None:
         raise _inseparable(rims, body)
     rule, pair, strips, sides = found
@@ -328,19 +306,18 @@ def find_boundaries(
 
 def _separating(
     wall: Wall,
-    solver: HarmonicSolver,
-    attempts: list[tuple[str, tuple[Float, Float] | None]],
+    laplace: Laplace,
+    attempts: list[tuple[str, Pair | None]],
     thickness: float,
     settings: BoundarySettings,
-) -> tuple[str, tuple[Float, Float], tuple[Bool, Bool], tuple[Bool, Bool]] | None:
+) -> tuple[str, Pair, tuple[Bool, Bool], tuple[Bool, Bool]] | None:
     """Take the first pair of curves whose strips separate the wall into two sides, if any."""
     for rule, pair in attempts:
         if pair is None:
             continue
-        reach = settings.first_strip * thickness
-        plain = (wall.near(pair[0], reach), wall.near(pair[1], reach))
+        plain = _near(wall, pair, settings.first_strip * thickness)
         for strips, middle in (
-            facing_strips(wall, solver, pair, thickness, settings),
+            facing_strips(wall, laplace, pair, thickness, settings),
             (plain, pair),
         ):
             sides = wall.sides(strips[0] | strips[1])
@@ -349,26 +326,26 @@ def _separating(
     return None
 
 
-def _inseparable(rims: tuple[Float, Float], body: Body) -> GeometryError:
-    """Say where the rims come closest to each other."""
+def _inseparable(rims: Pair, body: Body) -> GeometryError:
+    """Say where the two paths come closest to each other."""
     gap, nearest = (np.asarray(found) for found in cKDTree(rims[1]).query(rims[0]))
     closest = int(gap.argmin())
-    place = name_place(np.stack([rims[0][closest], rims[1][nearest[closest]]]), body)
+    position = name_place(np.stack([rims[0][closest], rims[1][nearest[closest]]]), body)
     return GeometryError(
         "the medial and lateral boundary do not separate the interior from the exterior side: "
-        f"check the labels for folds that touch each other, first near {place}, where the "
-        f"two rims are only {gap[closest]:.1f} mm apart",
+        f"check the labels for folds that touch each other, first near {position}, where the "
+        f"sheet's medial and lateral edge are only {gap[closest]:.1f} mm apart",
         reason="boundaries",
     )
 
 
-def _eigenfunction_curves(wall: Wall) -> tuple[Float, Float] | None:
+def _eigenfunction_curves(wall: Wall) -> Pair | None:
     """Zero lines of the first anisotropic eigenfunction, if exactly two run from end to end."""
-    _, functions = smallest_eigenfunctions(wall.bend_aware, wall.mass, 1)
+    _, functions = wall.bend_aware.eigenfunctions(1)
     return end_to_end(wall, functions[:, 0])
 
 
-def _curve_distance(first: tuple[Float, Float], second: tuple[Float, Float]) -> float:
+def _curve_distance(first: Pair, second: Pair) -> float:
     """Mean distance of the curves of one pair from those of the other, the worse of the two."""
     gaps = np.array([[_gap(a, b) for b in second] for a in first])
     straight, crossed = np.diag(gaps), np.diag(gaps[:, ::-1])
@@ -393,11 +370,10 @@ def _interior_first(
     """Order the sides by how often probes outward from them hit labels of the interior side."""
     if body.region == "entorhinal":  # no such label touches it
         return sides, "bending", float("nan")
-    normals = vertex_normals(wall)
     target = body.interior & (body.tissue == 0)
-    hit = np.zeros(len(normals), dtype=bool)
+    hit = np.zeros(len(wall.vertices), dtype=bool)
     for reach in settings.probe_distances:
-        probe = body.to_voxels(wall.vertices + reach * normals)
+        probe = body.to_voxels(wall.vertices + reach * wall.normals)
         voxel = np.clip(np.rint(probe).astype(int), 0, np.array(target.shape) - 1)
         hit |= target[tuple(voxel.T)]
     share = [float(hit[side].mean()) for side in sides]

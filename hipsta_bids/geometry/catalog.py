@@ -12,6 +12,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.measures import (
     CrossSections,
     at_columns,
@@ -23,11 +24,14 @@ from hipsta_bids.geometry.measures import (
     gaussian_curvature,
     mean_curvature,
     measure_thickness,
+    subfield_areas,
+    subfield_volumes,
     wall_area,
 )
+from hipsta_bids.geometry.mesh import signed_volume
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import Settings
-from hipsta_bids.types import Bool, Float, Sheet
+from hipsta_bids.types import Bool, Float, Sheet, Surface, TetMesh
 
 DIERS = "Diers et al. 2023, NeuroImage 276:120182, section 2.2"
 DO_CARMO = "do Carmo 1976, Differential Geometry of Curves and Surfaces, section 3.3"
@@ -36,22 +40,34 @@ OURS = "this software"
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Measured:
-    """One hemisphere's sheet, and what several measures share."""
+    """One hemisphere's body and sheet, and what several measures share."""
 
+    body: Body
+    surface: Surface
+    mesh: TetMesh
     sheet: Sheet
     """Sheet on which maps are measured."""
     subfield: NDArray[np.uint8]
     """(Nx, Ny) values of Tissue."""
     whole: Sheet
     """Sheet of the same body from its medial to its lateral edge, end to end and wall to wall."""
-    areas: Mapping[Tissue, float]
-    """Area of the whole mid-surface in each subfield, mm2."""
-    volumes: Mapping[Tissue, float]
-    """Volume of the mesh in each subfield, mm3."""
-    volume: float
-    """Volume of the mesh, mm3."""
     settings: Settings
     """Settings of the participant level."""
+
+    @cached_property
+    def areas(self) -> dict[Tissue, float]:
+        """Area of the whole mid-surface in each subfield, mm2."""
+        return subfield_areas(self.whole, self.body)
+
+    @cached_property
+    def volumes(self) -> dict[Tissue, float]:
+        """Volume of the mesh in each subfield, mm3."""
+        return subfield_volumes(self.mesh, self.body)
+
+    @cached_property
+    def volume(self) -> float:
+        """Volume of the mesh, mm3."""
+        return signed_volume(self.surface.vertices, self.surface.triangles)
 
     @cached_property
     def thickness(self) -> Float:

@@ -1,37 +1,180 @@
-"""Linear finite elements on tetrahedra: stiffness, Dirichlet problems, eigenfunctions."""
+"""The Laplace operator of a mesh: LaPy's matrices of linear finite elements, and their solution."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cached_property
 
 import numpy as np
+from lapy import Solver, TetMesh, TriaMesh
+from lapy.diffgeo import compute_gradient
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse import linalg
 
+from hipsta_bids import types
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry.mesh import cross, tetra_volumes
-from hipsta_bids.types import Bool, Float, Int, TetMesh
+from hipsta_bids.types import Bool, Float, Int
 
-# Conjugate gradients for the Laplace problems of the volume, faster than a factorization.
-
-
+_MANY = 4000  # vertices of a volume from which on iterating is faster than factorizing
 _RESIDUAL = 1e-11  # of the right-hand side; it leaves errors of 1e-9 mm in the sheet
 _MAX_STEPS = 1000  # bodies take 100 to 150
 _GROUPS = 2.0  # times the root of the number of unknowns: a step's two levels cost about the same
 
 
-def compact_groups(points: Float) -> NDArray[np.intp]:
-    """Part points into compact groups of equal size by halving along the longest side.
+class Laplace:
+    """The Laplace operator on triangles or tetrahedra; the matrices are made once.
 
-    Returns their number is a power of two near 2 sqrt(N).
+    LaPy (Reuter et al. 2006, Computer-Aided Design 38:342-366) makes them. With the solver
+    ``lapy`` it also solves its own equations. ``two-level`` takes less time: it iterates where most
+    vertices of a large volume are free, factorizes symmetric matrices as such, and asks ARPACK for
+    no more vectors than it needs, none of which can be told to ``Solver.poisson`` or
+    ``Solver.eigs``.
+    """
+
+    def __init__(
+        self,
+        mesh: TriaMesh | TetMesh,
+        solver: str = "two-level",
+        diffusion: tuple[Float, Float, Float] | None = None,
+    ) -> None:
+        """Make the matrices; diffusion is two directions (T, 3) and the speeds (T, 2) across them.
+
+        Anisotropic diffusion as in Andreux et al. 2014 (ECCV workshops, LNCS 8928:299-312).
+        """
+        self.points: Float = mesh.v
+        self.cells: Int = mesh.t
+        self._mesh, self._solver = mesh, solver
+        if diffusion is None:
+            self._fem = Solver(mesh, lump=True)
+        else:  # LaPy's constructor knows no other speeds than exponentials of curvature
+            self._fem = Solver.__new__(Solver)
+            self._fem.use_cholmod = False
+            matrices = Solver._fem_tria_aniso(mesh, *diffusion, lump=True)  # noqa: SLF001
+            self._fem.stiffness, self._fem.mass = matrices
+        symmetric = self._fem.stiffness
+        if symmetric.shape[0] != len(self.points):
+            raise _unsolvable()  # the last vertex belongs to no cell
+        self.stiffness = sparse.csr_array(
+            (symmetric.data, symmetric.indices, symmetric.indptr), shape=symmetric.shape
+        )
+
+    @cached_property
+    def edges(self) -> Int:
+        """(E, 2), lower vertex first, in order."""
+        neighbors = self._mesh.adj_sym
+        first = np.repeat(np.arange(len(self.points), dtype=np.int32), np.diff(neighbors.indptr))
+        once = neighbors.indices > first
+        return np.column_stack([first[once], neighbors.indices[once]])
+
+    def solve(self, fixed: NDArray[np.integer], values: Float) -> Float:
+        """Harmonic function (V,) with given values at some vertices and no flux elsewhere."""
+        result, free = np.zeros(len(self.points)), np.ones(len(self.points), dtype=bool)
+        result[fixed], free[fixed] = values, False
+        with _solvable():
+            if self._solver == "lapy":
+                known = np.flatnonzero(~free)
+                result = self._fem.poisson(0.0, (known, result[known]))
+            else:
+                result += self._rest(-(self.stiffness @ result), free)
+        if not np.isfinite(result).all():
+            raise _unsolvable()
+        return result
+
+    def between(self, first: Int, second: Int) -> Float:
+        """Harmonic function (V,) from -1 to 1 between two sets of vertices."""
+        values = np.repeat([-1.0, 1.0], [len(first), len(second)])
+        return self.solve(np.concatenate([first, second]), values)
+
+    def gradient(self, values: Float) -> Float:
+        """Gradient (T, 3) of a piecewise linear function (V,), per mm."""
+        flow: Float = compute_gradient(self._mesh, values)
+        # LaPy 1.7 returns the negative gradient on tetrahedra; the true one rises along edges.
+        start, stop = self.cells[:, 0], self.cells[:, 1]
+        rise = (flow * (self.points[stop] - self.points[start])).sum(axis=1)
+        return flow if rise @ (values[stop] - values[start]) >= 0 else -flow
+
+    def eigenfunctions(self, count: int) -> tuple[Float, Float]:
+        """Eigenvalues (count,) and eigenfunctions (V, count) above the constant one, in order."""
+        size, matrix, mass = len(self.points), self._fem.stiffness, self._fem.mass
+        shift = -1e-2 * float(matrix.trace() / mass.sum()) / size
+        start = np.cos(
+            np.arange(size, dtype=np.float64)
+        )  # any fixed vector: results repeat exactly
+        with _solvable():
+            if self._solver == "lapy":
+                values, functions = self._fem.eigs(count + 1, sigma=shift, v0=start)
+                return values[1:], functions[:, 1:]
+            solve = _factor(matrix - shift * mass).solve
+        values, functions = linalg.eigsh(
+            matrix,
+            k=count + 1,
+            M=mass,
+            sigma=shift,
+            OPinv=linalg.LinearOperator((size, size), matvec=solve, dtype=np.float64),
+            v0=start,
+            ncv=min(2 * count + 8, size),  # the default of 20 means twice as many solutions
+            tol=1e-6,
+        )
+        order = np.argsort(values)[1:]
+        return values[order], functions[:, order]
+
+    def _rest(self, right: Float, free: Bool) -> Float:
+        """Solve for the free vertices; zero at the others."""
+        volume = self.cells.shape[1] == 4  # noqa: PLR2004 -- corners of a tetrahedron
+        if volume and len(free) > _MANY and free.mean() > 0.5:  # noqa: PLR2004 -- most
+            return solve_two_level(self.stiffness, right, free, self._groups)
+        result = np.zeros(len(free))
+        result[free] = _factor(self.stiffness[free][:, free].tocsc()).solve(right[free])
+        return result
+
+    @cached_property
+    def _groups(self) -> NDArray[np.intp]:
+        return compact_groups(self.points)
+
+
+def volume_laplace(mesh: types.TetMesh, solver: str = "two-level") -> Laplace:
+    """Make the Laplace operator of a volume, without flux through its surface."""
+    return Laplace(TetMesh(mesh.vertices, mesh.tetrahedra), solver)
+
+
+def _factor(matrix: sparse.csc_array) -> linalg.SuperLU:
+    """Factorize a symmetric positive definite matrix."""
+    return linalg.splu(
+        matrix,
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
+
+
+@contextmanager
+def _solvable() -> Iterator[None]:
+    """Turn SciPy's error for a singular matrix into a reason."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise _unsolvable() from error
+
+
+def _unsolvable() -> GeometryError:
+    return GeometryError(
+        "a Laplace problem has no solution: the mesh is broken or not connected", reason="laplace"
+    )
+
+
+def compact_groups(points: Float) -> NDArray[np.intp]:
+    """Group number (N,) of points: about 2 sqrt(N) compact groups of equal size.
+
+    Their number is a power of two, as each is cut in halves across its longest side.
     """
     levels = round(math.log2(_GROUPS * math.sqrt(len(points))))
     size = -(-len(points) // 2**levels) * 2**levels
     members = np.arange(size)[None] % len(points)  # some points twice, so that halves are equal
     for _ in range(levels):
-        place = points[members]
-        longest = np.ptp(place, axis=1).argmax(axis=1)
-        along = np.take_along_axis(place, longest[:, None, None], axis=2)[..., 0]
+        position = points[members]
+        longest = np.ptp(position, axis=1).argmax(axis=1)
+        along = np.take_along_axis(position, longest[:, None, None], axis=2)[..., 0]
         half = members.shape[1] // 2
         order = np.argpartition(along, half, axis=1)
         members = np.take_along_axis(members, order, axis=1).reshape(-1, half)
@@ -41,11 +184,7 @@ def compact_groups(points: Float) -> NDArray[np.intp]:
 
 
 def solve_two_level(
-    matrix: sparse.csr_array,
-    right: Float,
-    free: Bool,
-    groups: NDArray[np.intp],
-    guess: Float | None = None,
+    matrix: sparse.csr_array, right: Float, free: Bool, groups: NDArray[np.intp]
 ) -> Float:
     """Solve a symmetric positive definite system on some of the unknowns.
 
@@ -71,14 +210,13 @@ def solve_two_level(
         sums = coarse @ np.bincount(groups, root * rest, len(coarse))
         return np.asarray(rest + root * sums[groups])
 
-    start = np.zeros(len(right)) if guess is None else root * guess
-    return inverse * _conjugate_gradients(scaled, inverse * right, start, both_levels)
+    return inverse * _conjugate_gradients(scaled, inverse * right, both_levels)
 
 
 def _conjugate_gradients(
-    matrix: sparse.csr_array, right: Float, start: Float, precondition: Callable[[Float], Float]
+    matrix: sparse.csr_array, right: Float, precondition: Callable[[Float], Float]
 ) -> Float:
-    result, rest = start.copy(), right - matrix @ start
+    result, rest = np.zeros(len(right)), right.copy()
     step = precondition(rest)
     size = float(rest @ step)
     limit = _RESIDUAL * float(np.linalg.norm(right))
@@ -96,12 +234,6 @@ def _conjugate_gradients(
     raise _unsolvable()
 
 
-def _unsolvable() -> GeometryError:
-    return GeometryError(
-        "a Laplace problem has no solution: the mesh is broken or not connected", reason="laplace"
-    )
-
-
 def _coarse_inverse(matrix: sparse.csr_array, free: Bool, groups: NDArray[np.intp]) -> Float:
     """Inverse of the matrix for functions that are constant on each group, dense."""
     count = int(groups.max()) + 1
@@ -115,149 +247,3 @@ def _coarse_inverse(matrix: sparse.csr_array, free: Bool, groups: NDArray[np.int
         return np.asarray(np.linalg.inv(coarse))
     except np.linalg.LinAlgError as error:
         raise _unsolvable() from error
-
-
-def stiffness(vertices: Float, tetrahedra: Int, tensor: Float | None = None) -> sparse.csc_array:
-    """Stiffness matrix of linear elements.
-
-    Entries are the integrals of grad(i) . D grad(j) of the hat functions (Reuter et al. 2006,
-    Computer-Aided Design 38:342-366, for the Laplace case). The same matrix as LaPy's, made in
-    one step for all elements.
-    """
-    a, b, c = (vertices[tetrahedra[:, k]] - vertices[tetrahedra[:, 0]] for k in (1, 2, 3))
-    gradients = np.empty((len(tetrahedra), 4, 3))
-    gradients[:, 1], gradients[:, 2], gradients[:, 3] = cross(b, c), cross(c, a), cross(a, b)
-    volumes = np.einsum("td,td->t", a, gradients[:, 1]) / 6
-    gradients[:, 0] = -gradients[:, 1:].sum(axis=1)
-    gradients /= 6 * volumes[:, None, None]
-    flux = gradients if tensor is None else gradients @ tensor
-    local = np.einsum("tid,tjd->tij", flux, gradients) * volumes[:, None, None]
-    return _assemble(local, tetrahedra, len(vertices))
-
-
-def triangle_stiffness(
-    vertices: Float, triangles: Int, directions: Float, diffusion: Float
-) -> sparse.csc_array:
-    """Stiffness matrix of linear elements on a surface, slowed along one direction.
-
-    The operator of Andreux et al. 2014 (ECCV workshops, LNCS 8928:299-312), as in LaPy's
-    anisotropic solver, whose weights are exponentials of curvature only.
-    """
-    corners = vertices[triangles]
-    opposite = corners[:, [2, 0, 1]] - corners[:, [1, 2, 0]]
-    normal = np.cross(opposite[:, 0], opposite[:, 1])
-    double = np.linalg.norm(normal, axis=1)
-    gradients = np.cross((normal / double[:, None])[:, None], opposite) / double[:, None, None]
-    along = np.einsum("tid,td->ti", gradients, directions)
-    local = np.einsum("tid,tjd->tij", gradients, gradients)
-    local -= (1 - diffusion)[:, None, None] * along[:, :, None] * along[:, None]
-    return _assemble(local * (double / 2)[:, None, None], triangles, len(vertices))
-
-
-def gradients(vertices: Float, tetrahedra: Int, values: Float) -> Float:
-    """Gradient (T, 3) of a piecewise linear function (V,), per mm."""
-    steps = vertices[tetrahedra[:, 1:]] - vertices[tetrahedra[:, :1]]
-    rise = values[tetrahedra[:, 1:]] - values[tetrahedra[:, :1]]
-    gradient: Float = np.linalg.solve(steps, rise[..., None])[..., 0].astype(np.float64)
-    return gradient
-
-
-def lumped_mass(vertices: Float, tetrahedra: Int) -> Float:
-    """Diagonal of the lumped mass matrix, (V,), mm3."""
-    share = np.repeat(tetra_volumes(vertices, tetrahedra) / 4, 4)
-    return np.bincount(tetrahedra.ravel(), share, minlength=len(vertices)).astype(np.float64)
-
-
-def solve_dirichlet(
-    matrix: sparse.csc_array,
-    fixed: NDArray[np.intp],
-    values: Float,
-    groups: NDArray[np.intp] | None = None,
-    guess: Float | None = None,
-) -> Float:
-    """Harmonic function with given values at some vertices and free boundary elsewhere."""
-    count = matrix.shape[0]
-    free = np.ones(count, dtype=bool)
-    free[fixed] = False
-    result = np.zeros(count)
-    result[fixed] = values
-    right = -(matrix @ result)
-    if groups is not None:
-        result += solve_two_level(matrix.tocsr(), right, free, groups, guess)
-    else:
-        result[free] = _factor(matrix[free][:, free].tocsc()).solve(right[free])
-    if not np.isfinite(result).all():
-        raise GeometryError(
-            "a Laplace problem has no finite solution: the mesh is broken", reason="laplace"
-        )
-    return result
-
-
-class HarmonicSolver:
-    """Harmonic functions on a mesh, from -1 to 1; the matrix is assembled once."""
-
-    _MANY = 4000  # vertices from which on iterating is faster than factorizing
-
-    def __init__(self, mesh: TetMesh) -> None:
-        self.mesh = mesh
-        self._matrix = stiffness(mesh.vertices, mesh.tetrahedra)
-        self._groups = compact_groups(mesh.vertices) if len(mesh.vertices) > self._MANY else None
-
-    def between(
-        self, first: Int, second: Int, *, few: bool = False, guess: Float | None = None
-    ) -> Float:
-        """Solve Laplace's equation between two sets of vertices, without flux elsewhere."""
-        return solve_dirichlet(
-            self._matrix,
-            np.concatenate([first, second]),
-            np.repeat([-1.0, 1.0], [len(first), len(second)]),
-            None if few else self._groups,
-            guess,
-        )
-
-
-def smallest_eigenfunctions(
-    matrix: sparse.csc_array, mass: Float, count: int
-) -> tuple[Float, Float]:
-    """Eigenvalues (count,) and eigenfunctions (V, count) above the constant one, in order."""
-    size = matrix.shape[0]
-    shift = -1e-2 * float(matrix.diagonal().sum() / mass.sum()) / size
-    factor = _factor((matrix - shift * sparse.diags_array(mass, format="csc")).tocsc())
-    operator = linalg.LinearOperator((size, size), matvec=factor.solve, dtype=np.float64)
-    start = np.cos(np.arange(size, dtype=np.float64))  # any fixed vector: results repeat exactly
-    values, functions = linalg.eigsh(
-        matrix,
-        k=count + 1,
-        M=sparse.diags_array(mass, format="csc"),
-        sigma=shift,
-        OPinv=operator,
-        v0=start,
-        ncv=min(2 * count + 8, size),  # the default of 20 means twice as many solutions
-        tol=1e-6,
-    )
-    order = np.argsort(values)[1:]
-    return values[order], functions[:, order]
-
-
-def _assemble(local: Float, cells: Int, count: int) -> sparse.csc_array:
-    """Sum symmetric element matrices (N, K, K) of cells (N, K), whose rows sum to zero."""
-    first, second = np.triu_indices(cells.shape[1], k=1)
-    rows, columns = cells[:, first].ravel(), cells[:, second].ravel()
-    low, high = np.minimum(rows, columns), np.maximum(rows, columns)
-    above = sparse.csc_array((local[:, first, second].ravel(), (low, high)), shape=(count, count))
-    apart = above + above.T.tocsc()
-    return sparse.csc_array(apart - sparse.diags_array(apart.sum(axis=0), format="csc"))
-
-
-def _factor(matrix: sparse.csc_array) -> linalg.SuperLU:
-    try:
-        return linalg.splu(
-            matrix,
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
-        )
-    except RuntimeError as error:  # exactly singular
-        raise GeometryError(
-            "a Laplace problem has no solution: the mesh is not connected", reason="laplace"
-        ) from error

@@ -1,4 +1,4 @@
-"""Thickness, curvature and areas of a sheet, point by point."""
+"""Measures of a sheet: by point, by line, by cross-section, and by subfield."""
 
 import math
 from dataclasses import dataclass
@@ -9,11 +9,13 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from hipsta_bids.geometry.body import Body
+from hipsta_bids.geometry.mesh import tetra_volumes
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import MeasureSettings
 from hipsta_bids.types import Bool, Float, Sheet, TetMesh
 
-# Smoothed derivatives of values on a regular grid.
+#: Points per cell along x and y, about a tenth of a millimeter apart along x on the default grid.
+_POINTS = 4
 
 
 def differentiate(values: Float, window: int, degree: int, times: int, axis: int) -> Float:
@@ -35,13 +37,13 @@ def _weights(count: int, window: int, degree: int, times: int) -> Float:
     result = np.zeros((count, count))
     if times > degree:
         return result
-    place = np.arange(window)
-    steps = place - place[:, None]  # from each place in the window to all of it
+    position = np.arange(window)
+    steps = position - position[:, None]  # from each position in the window to all of it
     powers = steps[..., None] ** np.arange(degree + 1.0)
     rows = math.factorial(times) * np.linalg.pinv(powers)[:, times]
     node = np.arange(count)
     first = np.clip(node - window // 2, 0, count - window)
-    result[node[:, None], first[:, None] + place] = rows[node - first]
+    result[node[:, None], first[:, None] + position] = rows[node - first]
     return result
 
 
@@ -132,7 +134,7 @@ def _principal_curvatures(
 ) -> tuple[Float, Float]:
     """Both principal curvatures (Nx, Ny), 1/mm, for the normal that points to the interior.
 
-    They are bounded: where lines of the sheet meet or turn back, next to rims and ends, the
+    They are bounded: where lines of the sheet meet or turn back, next to its edges and ends, the
     formulas divide by nearly zero.
     """
     degree, bound = settings.curvature_order, settings.max_curvature
@@ -163,11 +165,8 @@ def _derivative(
     return points
 
 
-# Lengths and areas of the walls and the mid-surface, line by line.
-
-
 def extent_x(whole: Sheet) -> Float:
-    """Length of each mid-surface line from rim to rim, (Ny,), mm."""
+    """Length of each mid-surface line from medial to lateral edge, (Ny,), mm."""
     return np.asarray(_steps(whole, whole.middle, 0).sum(axis=0))
 
 
@@ -177,13 +176,13 @@ def extent_y(whole: Sheet) -> Float:
 
 
 def wall_length(whole: Sheet, level: int, settings: MeasureSettings) -> Float:
-    """Length of each line of a wall from rim to rim, (Ny,), mm."""
+    """Length of each line of a wall from medial to lateral edge, (Ny,), mm."""
     steps, middle = _steps(whole, level, 0), _steps(whole, whole.middle, 0)
     return np.asarray(_continued(steps, middle, settings).sum(axis=0))
 
 
 def wall_area(whole: Sheet, level: int, settings: MeasureSettings) -> float:
-    """Area of a wall from rim to rim and end to end, mm2; parameters as for lengths."""
+    """Area of a wall from medial to lateral edge and end to end, mm2."""
     cells = layer_area(whole.points[:, :, level])
     middle = layer_area(whole.points[:, :, whole.middle])
     return float(_continued(cells, middle, settings).sum())
@@ -200,7 +199,7 @@ def _steps(sheet: Sheet, level: int, axis: int) -> Float:
 
 
 def _continued(wall: Float, middle: Float, settings: MeasureSettings) -> Float:
-    """Replace steps (Nx - 1, M) of a wall next to the rims."""
+    """Replace steps (Nx - 1, M) of a wall next to the sheet's edges by scaled middle ones."""
     count = len(wall)
     rim = round((1 - settings.rim_start) / 2 * count)
     window = max(round(settings.rim_window / 2 * count), 1)
@@ -215,12 +214,12 @@ def _continued(wall: Float, middle: Float, settings: MeasureSettings) -> Float:
     return result
 
 
-# Cross-sections of the body: what is measured where y is constant (Diers et al. 2023, 2.2).
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CrossSections:
-    """One value per cross-section, all (Ny,), from posterior to anterior."""
+    """One value per cross-section, where y is constant (Diers et al. 2023, section 2.2).
+
+    All are (Ny,), from posterior to anterior.
+    """
 
     position: Float
     """Distance from the posterior end plane along the mid-surface, mean over x, mm."""
@@ -256,10 +255,7 @@ class CrossSections:
 
 
 def cut_sections(whole: Sheet, thickness: Float, settings: MeasureSettings) -> CrossSections:
-    """Measure the cross-sections of a body.
-
-    ``thickness`` Mean of each section, mm.
-    """
+    """Measure the cross-sections of a body, given the mean thickness (Ny,) of each."""
     middle = whole.points[:, :, whole.middle]
     steps = np.linalg.norm(np.diff(middle, axis=1), axis=-1).mean(axis=0)
     return CrossSections(
@@ -291,43 +287,35 @@ def _polygon_area(points: Float) -> Float:
     return np.asarray(0.5 * np.linalg.norm(np.cross(first, second).sum(axis=(1, 2)), axis=-1))
 
 
-# Which subfield a place belongs to, and how much of the mid-surface and of the volume each has.
-
-
-#: Places per cell along x and y, about a tenth of a millimeter apart along x on the default grid.
-_PLACES = 4
-
-
 def labels_at(points: Float, body: Body) -> NDArray[np.uint8]:
     """Tissue (N,) at points (N, 3), RAS mm: that of the body's voxel there, or else the nearest."""
     voxel = np.rint(body.to_voxels(points)).astype(np.intp)
     last = np.array(body.inside.shape) - 1
-    place = tuple(np.clip(voxel, 0, last).T)
-    labels = body.tissue[place]
-    beside = np.flatnonzero(~body.inside[place] | ((voxel < 0) | (voxel > last)).any(axis=1))
+    index = tuple(np.clip(voxel, 0, last).T)
+    labels = body.tissue[index]
+    beside = np.flatnonzero(~body.inside[index] | ((voxel < 0) | (voxel > last)).any(axis=1))
     if len(beside):
-        index, centers = body.inside_points()
+        voxels, centers = body.inside_points()
         _, nearest = cKDTree(centers).query(points[beside])
-        labels[beside] = body.tissue[tuple(index[nearest].T)]
+        labels[beside] = body.tissue[tuple(voxels[nearest].T)]
     return np.asarray(labels, dtype=np.uint8)
 
 
 def subfield_areas(whole: Sheet, body: Body) -> dict[Tissue, float]:
     """Area of the mid-surface in each subfield that it has, mm2."""
-    at = (np.arange(_PLACES) + 0.5) / _PLACES
+    at = (np.arange(_POINTS) + 0.5) / _POINTS
     inner = whole.points[:, :, 1:-1]  # walls lie beside the voxels as often as in them
     along_x = _between(inner[:-1], inner[1:], at)
-    places = _between(along_x[:, :, :-1], along_x[:, :, 1:], at)
-    shares = layer_area(whole.points[:, :, whole.middle])[..., None] / places[..., 0, 0, :, 0].size
-    weights = np.broadcast_to(shares, places.shape[:-1])
-    return _sums(labels_at(places.reshape(-1, 3), body), weights.ravel())
+    points = _between(along_x[:, :, :-1], along_x[:, :, 1:], at)
+    shares = layer_area(whole.points[:, :, whole.middle])[..., None] / points[..., 0, 0, :, 0].size
+    weights = np.broadcast_to(shares, points.shape[:-1])
+    return _sums(labels_at(points.reshape(-1, 3), body), weights.ravel())
 
 
 def subfield_volumes(mesh: TetMesh, body: Body) -> dict[Tissue, float]:
     """Volume in each subfield, mm3; the volumes add up to that of the mesh."""
-    corners = mesh.vertices[mesh.tetrahedra]
-    volume = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6
-    return _sums(labels_at(corners.mean(axis=1), body), volume)
+    centers = mesh.vertices[mesh.tetrahedra.T].mean(axis=0)
+    return _sums(labels_at(centers, body), tetra_volumes(mesh.vertices, mesh.tetrahedra))
 
 
 def _between(start: Float, end: Float, at: Float) -> Float:

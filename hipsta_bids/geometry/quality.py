@@ -1,18 +1,17 @@
-"""What a map rests on: numbers that say whether to trust it, and flags."""
+"""Numbers that say whether to trust a map, and flags."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
-from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.boundaries import Boundaries
+from hipsta_bids.geometry.catalog import Measured
 from hipsta_bids.geometry.checks import check_cross_sections, check_image, check_labels, check_rows
 from hipsta_bids.geometry.mesh import tetra_quality
 from hipsta_bids.geometry.topology import SolidField
 from hipsta_bids.protocols.protocol import Tissue
-from hipsta_bids.settings import Settings
-from hipsta_bids.types import Flag, Float, Sheet, Surface, TetMesh
+from hipsta_bids.types import Bool, Flag, Float
 
 #: What every protocol labels along the sheet, from medial to lateral.
 _PARTS = {
@@ -24,33 +23,31 @@ _PARTS = {
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Evidence:
-    """What the stages of one hemisphere found out on their way."""
+    """One hemisphere's sheet, and what the stages found out on their way to it."""
 
-    body: Body
+    measured: Measured
     side: float
     """How far the medial subfields lie medially of CA1, mm."""
     solid: SolidField
-    surface: Surface
     voxels_across: float
     smoothed: int
     """How often the surface was smoothed more because TetGen could not fill it."""
-    mesh: TetMesh
     boundaries: Boundaries
     label_order: float
     """Rank correlation of x with the labels' order."""
-    sheet: Sheet
     bending: float
-    """Turn round the interior side, rad."""
+    """Angle by which the sheet bends round its interior side, rad."""
     folded: float
-    """Fraction of the volume whose coordinates are turned inside out."""
+    """Fraction of the volume in which the coordinates have the opposite orientation."""
 
 
-def find_flags(evidence: Evidence, settings: Settings) -> list[Flag]:
+def find_flags(evidence: Evidence) -> list[Flag]:
     """List what a person should look at before using the map."""
+    measured, solid, boundaries = evidence.measured, evidence.solid, evidence.boundaries
+    body, sheet, settings = measured.body, measured.sheet, measured.settings
     checks = settings.checks
-    solid, boundaries = evidence.solid, evidence.boundaries
-    filled = 1 - float(evidence.sheet.valid.mean())
-    present = set(np.unique(evidence.body.tissue[evidence.body.inside]).tolist())
+    filled = 1 - float(sheet.valid.mean())
+    present = set(np.unique(body.tissue[body.inside]).tolist())
     rows: list[tuple[bool, str, str]] = [
         (repair.large, "large-repair", f"{repair}: a large repair, look at the labels there")
         for repair in solid.repairs
@@ -62,7 +59,7 @@ def find_flags(evidence: Evidence, settings: Settings) -> list[Flag]:
             f"the body has no {name}: the sheet ends there; look at the labels",
         )
         for name, tissues in _PARTS.items()
-        if evidence.body.region != "entorhinal"
+        if body.region != "entorhinal"
     ]
     rows += [
         (
@@ -77,7 +74,7 @@ def find_flags(evidence: Evidence, settings: Settings) -> list[Flag]:
         ),
         (
             # The cortex beside the body bends the other way.
-            evidence.body.region == "body"
+            body.region == "body"
             and boundaries.side_rule == "labels"
             and evidence.bending < -checks.flag_bending,
             "side-doubtful",
@@ -97,21 +94,22 @@ def find_flags(evidence: Evidence, settings: Settings) -> list[Flag]:
     found = [Flag(reason=reason, message=message) for wrong, reason, message in rows if wrong]
     return [
         *found,
-        *check_image(evidence.body, checks),
-        *check_labels(evidence.body, checks),
-        *check_cross_sections(
-            solid.field, evidence.body, checks, solid.touched & (solid.field.values < 0)
-        ),
-        *check_rows(evidence.sheet, checks),
+        *check_image(body, checks),
+        *check_labels(body, checks),
+        *check_cross_sections(solid.field, body, checks, solid.touched & (solid.field.values < 0)),
+        *check_rows(sheet, checks),
     ]
 
 
-def quality_metrics(evidence: Evidence) -> dict[str, Any]:
-    """Numbers and words that say whether to trust the map, JSON-serializable."""
-    body, ends, solid = evidence.body, evidence.body.ends, evidence.solid
-    surface, boundaries = evidence.surface, evidence.boundaries
-    quality = tetra_quality(evidence.mesh)
-    valid = evidence.sheet.valid
+def quality_metrics(evidence: Evidence, repaired: Bool) -> dict[str, Any]:
+    """Numbers and words that say whether to trust the map, JSON-serializable.
+
+    ``repaired`` marks the columns (Nx, Ny) that a repair touched.
+    """
+    measured, solid, boundaries = evidence.measured, evidence.solid, evidence.boundaries
+    body, ends, surface = measured.body, measured.body.ends, measured.surface
+    quality = tetra_quality(measured.mesh)
+    valid = measured.sheet.valid
     return {
         "region": body.region,
         "voxel_size_mm": np.linalg.norm(body.affine[:3, :3], axis=0).round(4).tolist(),
@@ -131,7 +129,7 @@ def quality_metrics(evidence: Evidence) -> dict[str, Any]:
         "posterior_cap_vertices": int(surface.posterior_cap.sum()),
         "anterior_cap_vertices": int(surface.anterior_cap.sum()),
         "extra_smoothing": evidence.smoothed,
-        "tetrahedra": len(evidence.mesh.tetrahedra),
+        "tetrahedra": len(measured.mesh.tetrahedra),
         "tetra_quality_median": float(np.median(quality)),
         "tetra_quality_p01": float(np.quantile(quality, 0.01)),
         "boundary_rule": boundaries.rule,
@@ -147,6 +145,8 @@ def quality_metrics(evidence: Evidence) -> dict[str, Any]:
         "filled_fraction": float(1 - valid.mean()),
         "thickness_expected_mm": boundaries.sheet_thickness,
         "regions_outside": "head and tail (as in Diers et al. 2023)",
+        "repaired_fraction": float(repaired.mean()),
+        **({"mask_change": asdict(body.mask_change)} if body.mask_change else {}),
     }
 
 

@@ -1,4 +1,7 @@
-"""The sheet: the body on a regular grid of its own coordinates."""
+"""Three harmonic coordinates of the body, and the sheet: a regular grid in these coordinates.
+
+Layers of the sheet may be spaced evenly or by volume.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,8 +10,9 @@ from scipy import ndimage
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.boundaries import Boundaries
-from hipsta_bids.geometry.fem import HarmonicSolver
+from hipsta_bids.geometry.fem import Laplace
 from hipsta_bids.geometry.measures import labels_at
+from hipsta_bids.geometry.mesh import cross, tetra_volumes
 from hipsta_bids.settings import SheetSettings
 from hipsta_bids.types import Bool, Coordinates, Flag, Float, Sheet, TetMesh
 
@@ -16,8 +20,8 @@ from hipsta_bids.types import Bool, Coordinates, Flag, Float, Sheet, TetMesh
 def sample_sheet(mesh: TetMesh, coordinates: Coordinates, settings: SheetSettings) -> Sheet:
     """Find the points of the body that have the grid's coordinates.
 
-    Each tetrahedron is also one in coordinate space; a grid node inside it lies at the same
-    barycentric place in the body.
+    Each tetrahedron is also one in coordinate space; a grid node inside it has the same
+    barycentric coordinates in the body.
     """
     axes = sheet_levels(settings)
     points = _invert(mesh, coordinates.values, axes)
@@ -42,33 +46,27 @@ def sheet_levels(settings: SheetSettings) -> tuple[Float, Float, Float]:
 
 
 def whole_body(settings: SheetSettings) -> SheetSettings:
-    """Describe the grid that reaches from rim to rim, end to end and wall to wall.
+    """Describe the grid from medial to lateral edge, end to end and wall to wall.
 
-    Columns on the rims themselves have no thickness, but lengths and areas need them.
+    Columns on the edges themselves have no thickness, but lengths and areas need them.
     """
     whole = {"x_extent": 1.0, "y_extent": 1.0, "z_extent": 1.0}
     return settings.changed(**whole, z_nodes=5, max_filled=1.0)
 
 
 def folded_fraction(mesh: TetMesh, coordinates: Coordinates) -> float:
-    """Fraction of the body's volume whose coordinates are turned inside out.
-
-    The common orientation is that of the majority.
-    """
-    edges = mesh.vertices[mesh.tetrahedra[:, 1:]] - mesh.vertices[mesh.tetrahedra[:, :1]]
-    volume = np.linalg.det(edges) / 6
-    turned = coordinates.values[mesh.tetrahedra]
-    inner = np.linalg.det(turned[:, 1:] - turned[:, :1])
+    """Fraction of the body's volume in which the coordinates' orientation is not the usual one."""
+    volume = tetra_volumes(mesh.vertices, mesh.tetrahedra)
+    corners = coordinates.values[mesh.tetrahedra]
+    inner = np.linalg.det(corners[:, 1:] - corners[:, :1])
     sign = np.sign((volume * inner).sum())
     return float(volume[inner * sign < 0].sum() / volume.sum())
 
 
 def is_left_handed(points: Float) -> bool:
-    """Say whether x cross y points from exterior to interior on most of a sheet.
+    """Whether x cross y points from exterior to interior on most of a sheet (Nx, Ny, Nz, 3).
 
     The two hemispheres are mirror images, so that one of them always is.
-
-    ``points`` Sheet points in mm, NaN where undefined.
     """
     middle = points[:, :, points.shape[2] // 2]
     along_x = middle[1:, :-1] - middle[:-1, :-1]
@@ -78,8 +76,8 @@ def is_left_handed(points: Float) -> bool:
     return bool(np.nansum(volume) < 0)
 
 
-def is_turned(sheet: Sheet, hemi: str) -> bool:
-    """Say whether interior and exterior of a sheet are exchanged for its hemisphere.
+def is_flipped(sheet: Sheet, hemi: str) -> bool:
+    """Whether interior and exterior of a sheet are exchanged for its hemisphere.
 
     The interior side of the cortex is the one that continues the interior side of the hippocampus:
     its outer (pial) surface. Bending does not tell, since the cortex bends round its white matter
@@ -90,9 +88,9 @@ def is_turned(sheet: Sheet, hemi: str) -> bool:
     return is_left_handed(sheet.points) == (hemi == "L")
 
 
-def check_turned(sheet: Sheet, hemi: str) -> list[Flag]:
-    """Flag a sheet whose interior side, told by labels, is not that of its hemisphere."""
-    if not is_turned(sheet, hemi):
+def check_flipped(sheet: Sheet, hemi: str) -> list[Flag]:
+    """Flag a sheet whose interior side, found by labels, is not that of its hemisphere."""
+    if not is_flipped(sheet, hemi):
         return []
     text = "the labels of the dentate gyrus lie on the exterior side of the sheet: look at the map"
     return [Flag(reason="side-doubtful", message=text)]
@@ -131,13 +129,14 @@ def _invert(mesh: TetMesh, values: Float, axes: tuple[Float, Float, Float]) -> F
     first = np.array([axis[0] for axis in axes])
     step = np.array([(axis[-1] - axis[0]) / (len(axis) - 1) for axis in axes])
     nodes = (values - first) / step
-    corners = nodes[mesh.tetrahedra]
+    corners = nodes[mesh.tetrahedra.T]
     slack = 1e-6  # nodes on the outer faces must not fall out by rounding
-    low = np.maximum(np.ceil(corners.min(axis=1) - slack), 0).astype(int)
-    high = np.minimum(np.floor(corners.max(axis=1) + slack), np.array(shape) - 1).astype(int)
+    low = np.maximum(np.ceil(corners.min(axis=0) - slack), 0).astype(int)
+    high = np.minimum(np.floor(corners.max(axis=0) + slack), np.array(shape) - 1).astype(int)
     count = np.maximum(high - low + 1, 0)
-    hits = np.flatnonzero(count.prod(axis=1))
-    number = count[hits].prod(axis=1)
+    number = count[:, 0] * count[:, 1] * count[:, 2]
+    hits = np.flatnonzero(number)
+    number = number[hits]
     cell = np.repeat(hits, number)
     rank = np.arange(len(cell)) - np.repeat(np.cumsum(number) - number, number)
     node = np.column_stack(
@@ -148,8 +147,8 @@ def _invert(mesh: TetMesh, values: Float, axes: tuple[Float, Float, Float]) -> F
         ]
     )
     node += low[cell]
-    weights, known = _barycentric(corners[cell], node.astype(float))
-    worst = np.where(known, weights.min(axis=1), -np.inf)
+    weights, known = _barycentric(corners[:, cell], node.astype(float))
+    worst = np.where(known, weights.min(axis=0), -np.inf)
     flat = np.ravel_multi_index(tuple(node.T), shape)
     inside = worst > -1e-3  # noqa: PLR2004 -- a thousandth of a tetrahedron bridges rounding gaps
     # Where folds make two tetrahedra claim a node, the one that holds it most centrally wins.
@@ -159,24 +158,20 @@ def _invert(mesh: TetMesh, values: Float, axes: tuple[Float, Float, Float]) -> F
     last = np.append(owner[1:] != owner[:-1], True)
     winner, owner = winner[last], owner[last]
     points = np.full((int(np.prod(shape)), 3), np.nan)
-    places = mesh.vertices[mesh.tetrahedra[cell[winner]]]
-    points[owner] = np.einsum("ni,nid->nd", weights[winner], places)
+    around = mesh.vertices[mesh.tetrahedra[cell[winner]]]
+    points[owner] = np.einsum("in,nid->nd", weights[:, winner], around)
     return points.reshape(*shape, 3)
 
 
 def _barycentric(corners: Float, points: Float) -> tuple[Float, Bool]:
-    """Barycentric weights (N, 4), and whether the tetrahedron is not flat."""
-    edges = corners[:, 1:] - corners[:, :1]
-    a, b, c = edges[:, 0], edges[:, 1], edges[:, 2]
-    local = points - corners[:, 0]
-    det = np.einsum("ij,ij->i", a, np.cross(b, c))
+    """Weights (4, N) of corners (4, N, 3), and whether the tetrahedron is not flat."""
+    a, b, c = corners[1:] - corners[0]
+    faces = np.stack([cross(b, c), cross(c, a), cross(a, b)])
+    det = np.einsum("ij,ij->i", a, faces[0])
     known = np.abs(det) > 1e-12  # noqa: PLR2004 -- grid steps cubed
-    safe = np.where(known, det, 1.0)
-    weights = np.empty((len(points), 4))
-    weights[:, 1] = np.einsum("ij,ij->i", local, np.cross(b, c)) / safe
-    weights[:, 2] = np.einsum("ij,ij->i", local, np.cross(c, a)) / safe
-    weights[:, 3] = np.einsum("ij,ij->i", local, np.cross(a, b)) / safe
-    weights[:, 0] = 1 - weights[:, 1:].sum(axis=1)
+    weights = np.empty((4, len(points)))
+    weights[1:] = np.einsum("ij,kij->ki", points - corners[0], faces) / np.where(known, det, 1.0)
+    weights[0] = 1 - weights[1:].sum(axis=0)
     return weights, known
 
 
@@ -200,27 +195,18 @@ def _filled(points: Float) -> Float:
     return np.where(missing[..., None], np.nan, values)
 
 
-# The intrinsic coordinate system: three harmonic functions on the body.
-
-
-def solve_coordinates(
-    mesh: TetMesh, boundaries: Boundaries, solver: HarmonicSolver | None = None
-) -> Coordinates:
+def solve_coordinates(laplace: Laplace, boundaries: Boundaries) -> Coordinates:
     """Solve Laplace's equation between each pair of opposite boundaries.
 
     Each function is -1 on the first boundary (medial, posterior, interior), 1 on the second, and
     has no flux through the rest of the surface (Diers et al. 2023, section 2.1.4).
     """
-    solver = solver or HarmonicSolver(mesh)
     values = (
-        solver.between(boundaries.medial, boundaries.lateral),
-        solver.between(boundaries.posterior, boundaries.anterior),
-        solver.between(boundaries.interior, boundaries.exterior, few=True),
+        laplace.between(boundaries.medial, boundaries.lateral),
+        laplace.between(boundaries.posterior, boundaries.anterior),
+        laplace.between(boundaries.interior, boundaries.exterior),
     )
     return Coordinates(values=np.column_stack(values))
-
-
-# Layers: where along its columns the sheet is sampled.
 
 
 def equal_volume_layers(sheet: Sheet) -> tuple[Sheet, Bool]:
@@ -271,7 +257,7 @@ def layer_depth(layers: Sheet) -> Float:
 
 
 def _column_areas(points: Float) -> Float:
-    """Area of each layer per column, (Nx, Ny, Nz), mm2; negative where the layer is turned over."""
+    """Area of each layer per column, (Nx, Ny, Nz), mm2; negative where the layer is flipped."""
     along_x, along_y = np.gradient(points, axis=(0, 1))
     across = points[:, :, -1:] - points[:, :, :1]
     area = (np.cross(along_x, along_y) * across).sum(axis=-1)

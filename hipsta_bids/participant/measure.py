@@ -6,7 +6,7 @@ tetrahedra, boundaries, coordinates, sheet, measures.
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body, check_mask, check_side, extract_body
@@ -27,17 +27,17 @@ from hipsta_bids.geometry.checks import (
     find_contacts,
     name_subfields,
 )
-from hipsta_bids.geometry.fem import HarmonicSolver
+from hipsta_bids.geometry.fem import volume_laplace
 from hipsta_bids.geometry.grid import in_plane_voxel, resample_body
-from hipsta_bids.geometry.measures import bending_angle, subfield_areas, subfield_volumes
-from hipsta_bids.geometry.mesh import extract_surface, signed_volume, tetrahedralize
+from hipsta_bids.geometry.measures import bending_angle
+from hipsta_bids.geometry.mesh import extract_surface, tetrahedralize
 from hipsta_bids.geometry.quality import Evidence, find_flags, quality_metrics
 from hipsta_bids.geometry.sheet import (
+    check_flipped,
     check_layers,
-    check_turned,
     equal_volume_layers,
     folded_fraction,
-    is_turned,
+    is_flipped,
     label_sheet,
     sample_sheet,
     solve_coordinates,
@@ -97,53 +97,51 @@ def measure_hemisphere(
     with clock("tetrahedra"):
         surface, mesh, smoothed = _filled(solid, surface, settings)
     with clock("boundaries"):
-        solver = HarmonicSolver(mesh)
-        boundaries = find_boundaries(surface, mesh, body, settings.boundaries, solver)
+        laplace = volume_laplace(mesh, settings.boundaries.solver)
+        boundaries = find_boundaries(surface, laplace, body, settings.boundaries)
     with clock("coordinates"):
-        coordinates = solve_coordinates(mesh, boundaries, solver)
+        coordinates = solve_coordinates(laplace, boundaries)
         order = check_label_order(mesh, coordinates, body, settings.checks)
     with clock("sheet"):
         sheet = sample_sheet(mesh, coordinates, settings.sheet)
         bending = bending_angle(sheet, settings.measures)
         if body.region != "body" and boundaries.side_rule == "bending":
             boundaries = replace(boundaries, side_rule="continuity")
-        wrong = {"bending": bending < 0, "continuity": is_turned(sheet, hemi), "labels": False}
-        if wrong[boundaries.side_rule]:
-            sheet, coordinates, boundaries = _turned(sheet, coordinates, boundaries)
+        if _sides_exchanged(sheet, boundaries.side_rule, bending, hemi):
+            sheet, coordinates, boundaries = _flipped(sheet, coordinates, boundaries)
             bending = -bending
         whole = sample_sheet(mesh, coordinates, whole_body(settings.sheet))
         subfield = label_sheet(sheet, body)
-    evidence = Evidence(
-        body=body,
-        side=side,
-        solid=solid,
-        surface=surface,
-        voxels_across=across,
-        smoothed=smoothed,
-        mesh=mesh,
-        boundaries=boundaries,
-        label_order=order,
-        sheet=sheet,
-        bending=bending,
-        folded=folded_fraction(mesh, coordinates),
-    )
+        folded = folded_fraction(mesh, coordinates)
     with clock("measures"):
         measured = Measured(
+            body=body,
+            surface=surface,
+            mesh=mesh,
             sheet=sheet,
             subfield=subfield,
             whole=whole,
-            areas=subfield_areas(whole, body),
-            volumes=subfield_volumes(mesh, body),
-            volume=signed_volume(surface.vertices, surface.triangles),
             settings=settings,
         )
-        doubts = check_end_labels(volume, body, settings.checks)
-        doubts += check_thickness(measured.thickness, boundaries.sheet_thickness, settings.checks)
-        doubts += check_ridges(sheet, measured.thickness, settings.checks)
-        doubts += check_turned(sheet, hemi) if body.region == "extended" else []
-        doubts += _mask_doubts(volume, body, settings)
-        repaired = repaired_columns(sheet, solid, settings.measures)
+        evidence = Evidence(
+            measured=measured,
+            side=side,
+            solid=solid,
+            voxels_across=across,
+            smoothed=smoothed,
+            boundaries=boundaries,
+            label_order=order,
+            bending=bending,
+            folded=folded,
+        )
+        flags = check_end_labels(volume, body, settings.checks)
+        flags += check_thickness(measured.thickness, boundaries.sheet_thickness, settings.checks)
+        flags += check_ridges(sheet, measured.thickness, settings.checks)
+        flags += check_flipped(sheet, hemi) if body.region == "extended" else []
+        flags += _check_edited_mask(volume, body, settings)
+        flags += find_flags(evidence)
         layers, folds = _layers(sheet, settings)
+        repaired = repaired_columns(sheet, solid, settings.measures)
         maps = measure_maps(measured)
         return HemisphereMaps(
             sheet=sheet,
@@ -155,11 +153,9 @@ def measure_hemisphere(
             repaired=repaired,
             body_mask=volume.in_file(body.inside),
             summary=summarize(measured, for_region(volume.protocol, body.region).sheet),
-            qc=quality_metrics(evidence)
-            | {"repaired_fraction": float(repaired.mean())}
-            | ({"mask_change": asdict(body.mask_change)} if body.mask_change else {}),
+            qc=quality_metrics(evidence, repaired),
             repairs=tuple(map(str, solid.repairs)),
-            flags=(*doubts, *find_flags(evidence, settings), *folds),
+            flags=(*flags, *folds),
             mesh=mesh,
             coordinates=coordinates,
         )
@@ -174,7 +170,7 @@ def find_body(volume: LabelVolume, settings: Settings) -> BodyMask | None:
     return volume.in_file(body.inside)
 
 
-def _mask_doubts(volume: LabelVolume, body: Body, settings: Settings) -> list[Flag]:
+def _check_edited_mask(volume: LabelVolume, body: Body, settings: Settings) -> list[Flag]:
     if volume.edited_mask is None or body.mask_change is None:
         return []
     voxel = in_plane_voxel(body.affine)
@@ -184,7 +180,7 @@ def _mask_doubts(volume: LabelVolume, body: Body, settings: Settings) -> list[Fl
 def _filled(
     solid: SolidField, surface: Surface, settings: Settings
 ) -> tuple[Surface, TetMesh, int]:
-    """Fill the surface; smooth it more where TetGen cannot, and say how often."""
+    """Fill the surface; smooth it more while TetGen cannot, and count how often."""
     for extra in range(settings.surface.untangle_tries):
         try:
             return surface, tetrahedralize(surface, settings.tetra), extra
@@ -197,14 +193,21 @@ def _filled(
 
 
 def _layers(sheet: Sheet, settings: Settings) -> tuple[Sheet, list[Flag]]:
-    """Space layers as the settings say, and flag where that cannot be."""
+    """Space layers as the settings say, and flag where that is not possible."""
     if settings.sheet.depths == "distance":
         return sheet, []
     layers, folded = equal_volume_layers(sheet)
     return layers, check_layers(folded)
 
 
-def _turned(
+def _sides_exchanged(sheet: Sheet, rule: str, bending: float, hemi: str) -> bool:
+    """Decide whether interior and exterior have to be exchanged; labels have decided already."""
+    if rule == "continuity":
+        return is_flipped(sheet, hemi)
+    return rule == "bending" and bending < 0
+
+
+def _flipped(
     sheet: Sheet, coordinates: Coordinates, boundaries: Boundaries
 ) -> tuple[Sheet, Coordinates, Boundaries]:
     """Exchange interior and exterior."""

@@ -9,6 +9,7 @@ from scipy import ndimage
 from hipsta_bids.geometry.body import Body, extract_body
 from hipsta_bids.geometry.boundaries import Boundaries, find_boundaries
 from hipsta_bids.geometry.ends import EndPlanes
+from hipsta_bids.geometry.fem import Laplace, volume_laplace
 from hipsta_bids.geometry.grid import Field, WedgeGrid, resample_body
 from hipsta_bids.geometry.mesh import extract_surface, tetrahedralize
 from hipsta_bids.geometry.sheet import sample_sheet, solve_coordinates
@@ -30,6 +31,7 @@ class Case:
     solid: SolidField
     surface: Surface
     mesh: TetMesh
+    laplace: Laplace
     boundaries: Boundaries
     coordinates: Coordinates
     sheet: Sheet
@@ -44,8 +46,9 @@ def solve_case(phantom, *, protocol="freesurfer", settings=None, **drawing):
     solid = repair_topology(field, chosen.topology)
     surface = extract_surface(solid.field, chosen.surface)
     mesh = tetrahedralize(surface, chosen.tetra)
-    boundaries = find_boundaries(surface, mesh, body, chosen.boundaries)
-    coordinates = solve_coordinates(mesh, boundaries)
+    laplace = volume_laplace(mesh)
+    boundaries = find_boundaries(surface, laplace, body, chosen.boundaries)
+    coordinates = solve_coordinates(laplace, boundaries)
     return Case(
         phantom=phantom,
         volume=volume,
@@ -54,6 +57,7 @@ def solve_case(phantom, *, protocol="freesurfer", settings=None, **drawing):
         solid=solid,
         surface=surface,
         mesh=mesh,
+        laplace=laplace,
         boundaries=boundaries,
         coordinates=coordinates,
         sheet=sample_sheet(mesh, coordinates, chosen.sheet),

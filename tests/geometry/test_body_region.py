@@ -7,7 +7,7 @@ from geometry_cases import plain_body
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body, check_reach, extract_body, join_cortex
 from hipsta_bids.geometry.ends import EndPlanes
-from hipsta_bids.geometry.sheet import check_turned, is_turned
+from hipsta_bids.geometry.sheet import check_flipped, is_flipped
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import BodySettings
@@ -89,12 +89,12 @@ def test_sides_follow_from_the_hemisphere_whatever_the_bend(curl):
     sheet = curled_sheet(curl)
     mirrored = Sheet(points=sheet.points * [-1, 1, 1], valid=sheet.valid)
     turned = Sheet(points=sheet.points[:, :, ::-1], valid=sheet.valid)
-    assert not is_turned(sheet, "L")
-    assert not is_turned(mirrored, "R")
-    assert is_turned(sheet, "R")
-    assert is_turned(turned, "L")
-    assert check_turned(sheet, "L") == []
-    assert [flag.reason for flag in check_turned(turned, "L")] == ["side-doubtful"]
+    assert not is_flipped(sheet, "L")
+    assert not is_flipped(mirrored, "R")
+    assert is_flipped(sheet, "R")
+    assert is_flipped(turned, "L")
+    assert check_flipped(sheet, "L") == []
+    assert [flag.reason for flag in check_flipped(turned, "L")] == ["side-doubtful"]
 
 
 def test_lateral_is_near_the_hippocampus_in_cortex_alone():

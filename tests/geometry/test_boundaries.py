@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.boundaries import find_boundaries
+from hipsta_bids.geometry.fem import volume_laplace
 from hipsta_bids.geometry.measures import bending_angle
 from hipsta_bids.geometry.mesh import lateral_triangles
 from hipsta_bids.geometry.sheet import sample_sheet, solve_coordinates
@@ -113,7 +114,7 @@ def test_interior_is_told_by_labels(case):
 
 def without_labels(case):
     body = replace(case.body, interior=np.zeros_like(case.body.interior))
-    return find_boundaries(case.surface, case.mesh, body, SETTINGS)
+    return find_boundaries(case.surface, case.laplace, body, SETTINGS)
 
 
 def test_without_interior_labels_bending_has_to_decide(case):
@@ -142,7 +143,9 @@ def test_labels_on_the_other_side_change_sides(arc):
     _, _, n = arc.phantom.body.locate(points, hemi="L", reach=3.0).T
     interior = np.zeros_like(outside)
     interior[tuple(index[n > 1.0].T)] = True
-    found = find_boundaries(arc.surface, arc.mesh, replace(arc.body, interior=interior), SETTINGS)
+    found = find_boundaries(
+        arc.surface, arc.laplace, replace(arc.body, interior=interior), SETTINGS
+    )
     np.testing.assert_array_equal(found.interior, arc.boundaries.exterior)
     np.testing.assert_array_equal(found.exterior, arc.boundaries.interior)
 
@@ -157,7 +160,7 @@ def test_a_mirrored_phantom_gives_the_mirrored_boundaries():
 
 def test_the_eigenfunction_is_overruled_where_the_rules_disagree(arc):
     strict = SETTINGS.changed(max_distance=0.0)
-    found = find_boundaries(arc.surface, arc.mesh, arc.body, strict)
+    found = find_boundaries(arc.surface, arc.laplace, arc.body, strict)
     assert found.rule == "rims"
     for u, curve in ((0, found.medial_curve), (1, found.lateral_curve)):
         gap, _ = cKDTree(rim(arc, u)).query(curve)
@@ -167,7 +170,7 @@ def test_the_eigenfunction_is_overruled_where_the_rules_disagree(arc):
 def test_strips_that_swallow_the_sides_are_refused(arc):
     wide = SETTINGS.changed(first_strip=6.0, least_strip=6.0)
     with pytest.raises(GeometryError, match=r"do not separate the interior.*RAS") as caught:
-        find_boundaries(arc.surface, arc.mesh, arc.body, wide)
+        find_boundaries(arc.surface, arc.laplace, arc.body, wide)
     assert caught.value.reason == "boundaries"
 
 
@@ -178,5 +181,16 @@ def test_coordinates_are_fixed_on_the_boundaries(case):
     for axis, (low, high) in enumerate(pairs):
         assert (values[low, axis] == -1.0).all()
         assert (values[high, axis] == 1.0).all()
-    again = solve_coordinates(case.mesh, b)
+    again = solve_coordinates(volume_laplace(case.mesh), b)
     np.testing.assert_array_equal(again.values, values)
+
+
+def test_lapys_own_solver_finds_the_same(case):
+    """Same boundaries, and a sheet that agrees to 1e-6 mm."""
+    laplace = volume_laplace(case.mesh, "lapy")
+    found = find_boundaries(case.surface, laplace, case.body, SETTINGS.changed(solver="lapy"))
+    for name in ("medial", "lateral", "interior", "exterior"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(case.boundaries, name))
+    np.testing.assert_allclose(found.medial_curve, case.boundaries.medial_curve, atol=1e-6)
+    sheet = sample_sheet(case.mesh, solve_coordinates(laplace, found), SheetSettings())
+    np.testing.assert_allclose(sheet.points, case.sheet.points, atol=1e-6)

@@ -6,36 +6,45 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hipsta_bids.geometry.catalog import Measured
 from hipsta_bids.geometry.quality import Evidence, find_flags, quality_metrics
 from hipsta_bids.geometry.topology import Repair
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Sheet
 
-SETTINGS = Settings()
-
 
 @pytest.fixture
 def evidence(arc):
     """Nothing to warn about."""
-    return Evidence(
+    measured = Measured(
         body=arc.body,
+        surface=arc.surface,
+        mesh=arc.mesh,
+        sheet=arc.sheet,
+        subfield=np.zeros(arc.sheet.valid.shape, dtype=np.uint8),
+        whole=arc.sheet,
+        settings=Settings(),
+    )
+    return Evidence(
+        measured=measured,
         side=5.0,
         solid=arc.solid,
-        surface=arc.surface,
         voxels_across=5.0,
         smoothed=0,
-        mesh=arc.mesh,
         boundaries=arc.boundaries,
         label_order=0.95,
-        sheet=arc.sheet,
         bending=2.4,
         folded=0.0,
     )
 
 
+def with_measured(evidence, **changes):
+    return replace(evidence, measured=replace(evidence.measured, **changes))
+
+
 def reasons(evidence):
-    return [flag.reason for flag in find_flags(evidence, SETTINGS)]
+    return [flag.reason for flag in find_flags(evidence)]
 
 
 def test_a_sound_hemisphere_has_no_flags(evidence):
@@ -46,8 +55,9 @@ def test_a_sound_hemisphere_has_no_flags(evidence):
     "absent", [(Tissue.PRESUBICULUM, Tissue.SUBICULUM), (Tissue.CA1,), (Tissue.CA2_3,)]
 )
 def test_a_missing_end_of_the_ribbon_is_flagged(evidence, absent):
-    inside = evidence.body.inside & ~np.isin(evidence.body.tissue, absent)
-    found = reasons(replace(evidence, body=replace(evidence.body, inside=inside)))
+    body = evidence.measured.body
+    inside = body.inside & ~np.isin(body.tissue, absent)
+    found = reasons(with_measured(evidence, body=replace(body, inside=inside)))
     # Without CA1 the rest is two pieces, too.
     assert found == ["subfield-missing"] + ["loose-part"] * (absent == (Tissue.CA1,))
 
@@ -58,7 +68,7 @@ def repair(*, large):
 
 def test_large_repairs_are_flagged_one_by_one(evidence):
     repairs = (repair(large=True), repair(large=False), repair(large=True))
-    flags = find_flags(replace(evidence, solid=replace(evidence.solid, repairs=repairs)), SETTINGS)
+    flags = find_flags(replace(evidence, solid=replace(evidence.solid, repairs=repairs)))
     assert [flag.reason for flag in flags] == ["large-repair"] * 2
     assert "cut a bridge of 30 grid nodes at RAS 1.0 2.0 3.0 mm" in flags[0].message
 
@@ -96,23 +106,28 @@ def test_folded(evidence, folded, wanted):
 
 @pytest.mark.parametrize(("columns", "wanted"), [(25, ["columns-filled"]), (10, [])])
 def test_columns_filled(evidence, columns, wanted):
-    valid = np.ones(evidence.sheet.valid.shape, dtype=bool)
+    sheet = evidence.measured.sheet
+    valid = np.ones(sheet.valid.shape, dtype=bool)
     valid.reshape(-1)[:columns] = False  # of 861, 2 % are 17
-    sheet = Sheet(points=evidence.sheet.points, valid=valid)
-    assert reasons(replace(evidence, sheet=sheet)) == wanted
+    sheet = Sheet(points=sheet.points, valid=valid)
+    assert reasons(with_measured(evidence, sheet=sheet)) == wanted
 
 
 def test_metrics_are_json_and_complete(evidence):
-    metrics = quality_metrics(evidence)
+    measured = evidence.measured
+    repaired = np.arange(10).reshape(5, 2) < 1
+    metrics = quality_metrics(evidence, repaired)
     again = json.loads(json.dumps(metrics))
-    assert again["body_voxels"] == np.count_nonzero(evidence.body.inside)
+    assert again["body_voxels"] == np.count_nonzero(measured.body.inside)
     assert again["voxel_size_mm"] == [0.4, 0.4, 0.4]
     assert again["body_length_mm"] == pytest.approx(8.0, abs=0.2)  # half a voxel
     assert again["posterior_end_rule"] == again["anterior_end_rule"] == "labels"
     assert again["euler_before"] == again["euler_after"] == 1
-    assert again["surface_vertices"] == len(evidence.surface.vertices)
-    assert again["tetrahedra"] == len(evidence.mesh.tetrahedra)
+    assert again["surface_vertices"] == len(measured.surface.vertices)
+    assert again["tetrahedra"] == len(measured.mesh.tetrahedra)
     assert 0 < again["tetra_quality_p01"] < again["tetra_quality_median"] <= 1
     assert again["filled_columns"] == 0
+    assert again["repaired_fraction"] == 0.1
+    assert "mask_change" not in again  # no mask was edited
     assert again["thickness_expected_mm"] == pytest.approx(2.0, rel=0.05)  # rims
     assert np.linalg.norm(again["posterior_plane"]["normal_ras"]) == pytest.approx(1, abs=1e-3)

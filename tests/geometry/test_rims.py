@@ -17,7 +17,7 @@ def found(request):
     """A case, its wall, and its rim paths."""
     case = request.getfixturevalue(request.param)
     wall = Wall(case.surface, case.body, SETTINGS)
-    paths, depths = rim_paths(wall, case.mesh, case.body, SETTINGS)
+    paths, depths = rim_paths(wall, case.laplace, case.body, SETTINGS)
     return case, wall, paths, depths
 
 
