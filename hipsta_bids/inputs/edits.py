@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hipsta_bids.errors import HipstaError, InputError
-from hipsta_bids.inputs.generic import table_protocol
+from hipsta_bids.inputs.generic import is_edited, table_protocol
 from hipsta_bids.inputs.scan import (
     Edit,
     HemisphereInput,
@@ -29,8 +29,6 @@ _EDITED, _OUTPUT = "edited", "output"
 #: What an edited file replaces, by its suffix.
 _KINDS = {"dseg": "labels", "mask": "mask"}
 
-_IMAGES = (".nii.gz", ".nii", ".mgz", ".mgh")
-
 
 @dataclass(frozen=True, kw_only=True)
 class EditedFile:
@@ -46,18 +44,6 @@ class EditedFile:
     def names(self) -> dict[str, str]:
         """Entities of its name."""
         return entities(self.edit.path.name)
-
-
-def is_edited(name: str) -> bool:
-    """Check whether a file name is that of edited labels or an edited mask."""
-    if "desc-edited" not in name:
-        return False
-    pairs = entities(name)
-    return (
-        pairs.get("desc") == "edited"
-        and pairs["suffix"] in _KINDS
-        and pairs["extension"] in _IMAGES
-    )
 
 
 def edits_of_visit(visit: Visit, root: Path, source: str, *, beside: bool) -> Iterator[EditedFile]:

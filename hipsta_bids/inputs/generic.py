@@ -8,7 +8,6 @@ from functools import cache, lru_cache
 from pathlib import Path
 
 from hipsta_bids.errors import HipstaError, InputError, ProtocolError
-from hipsta_bids.inputs.edits import is_edited
 from hipsta_bids.inputs.hippunfold import is_hippunfold
 from hipsta_bids.inputs.scan import (
     HemisphereInput,
@@ -155,6 +154,18 @@ class _File:
         coarse = bool(self.space) and not self.space.startswith("crop")
         template = not _OWN_SPACE.fullmatch(self.space)
         return self.protocol is None, template, coarse, self.path.name.count("_"), self.path.name
+
+
+def is_edited(name: str) -> bool:
+    """Check whether a file name is that of edited labels or an edited mask."""
+    if "desc-edited" not in name:
+        return False
+    pairs = entities(name)
+    return (
+        pairs.get("desc") == "edited"
+        and pairs["suffix"] in {"dseg", "mask"}
+        and pairs["extension"] in _IMAGES
+    )
 
 
 def find_named(visit: Visit, source: Source, selection: Selection) -> Iterator[HemisphereInput]:

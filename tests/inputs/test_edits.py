@@ -4,7 +4,7 @@ import pytest
 from input_cases import by_key, describe, touch
 
 from hipsta_bids.errors import InputError
-from hipsta_bids.inputs.edits import is_edited
+from hipsta_bids.inputs.generic import is_edited
 from hipsta_bids.inputs.search import InputRequest, find_inputs, selection_table
 from hipsta_bids.protocols.protocol import Tissue
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from hipsta_bids.geometry.catalog import Measured
-from hipsta_bids.geometry.quality import Evidence, find_flags, quality_metrics
 from hipsta_bids.geometry.topology import Repair
+from hipsta_bids.participant.measure import Evidence, find_flags, quality_metrics
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Sheet
