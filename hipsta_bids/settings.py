@@ -53,26 +53,29 @@ class BodySettings(SettingsTable):
     head_piece: NonNegativeFloat = 1.5
     """Without end labels: the body ends where a slice shows two pieces above this area, mm2."""
     head_growth: NonNegativeFloat = 1.35
-    """Without end labels: ... or twice running an area above this multiple of the median."""
+    """Without end labels: the body ends before two slices in a row with more than this multiple of
+    the median area."""
     gap_directions: NonNegativeInt = 3
-    """A voxel without a label lies in a thin gap if it has the sheet on both sides in so many of
-    13 directions."""
+    """A voxel without a label lies in a thin gap if it has the sheet on both sides in this
+    many of 13 directions."""
     slit_area: NonNegativeFloat = 2.5
-    """Gaps larger than this are filled if they go through the sheet, mm2 ..."""
+    """Gaps larger than this are filled if they go through the sheet, mm2."""
     slit_openings: Fraction = 0.2
-    """... so that what is beside them falls into two parts, each of at least this share (in
-    six real bodies: none, and gaps with one opening are up to 4.0 mm2) ..."""
+    """A gap goes through the sheet if what is beside it falls into two parts, each of at least this
+    share (in six real bodies: none, and gaps with one opening are up to 4.0 mm2)."""
     slit_voxel: NonNegativeFloat = 0.8
-    """... and no edge of a voxel is longer than this, mm: between thick slices folds look alike."""
+    """Gaps are filled if no edge of a voxel is longer than this, mm: between thick slices folds
+    look like gaps."""
     end_fullness: Fraction = 0.9
     """Without end labels: cross-sections at an end are left out if they have less than this share
-    of the area ..."""
+    of the area of those behind them."""
     end_reach: NonNegativeFloat = 3.0
-    """... of those within this distance behind them, mm; at most so much is left out."""
+    """Distance behind an end within which cross-sections are compared, mm; at most this length is
+    left out."""
     max_mask_ratio: PositiveFloat = 1.5
-    """Flag an edited mask whose voxels are more than this many times those of the labels ..."""
+    """Flag an edited mask whose voxels are more than this many times those of the labels."""
     max_mask_change: NonNegativeFloat = 0.5
-    """... or that adds and removes more than this share of the body."""
+    """Flag an edited mask that adds and removes more than this share of the body."""
 
 
 class GridSettings(SettingsTable):
@@ -83,8 +86,8 @@ class GridSettings(SettingsTable):
     smoothing: Annotated[float, Field(ge=0, le=3)] = 0.9
     """Standard deviation of the Gaussian, in in-plane voxels of the segmentation."""
     min_smoothing: NonNegativeFloat = 0.36
-    """... but at least this, mm, so that finer voxels do not leave other maps: what smoothing
-    takes from thin rims and narrow bends changes the mean thickness."""
+    """Least standard deviation of that Gaussian, mm, so that finer voxels do not change maps:
+    what smoothing takes from thin edges and narrow bends changes the mean thickness."""
     margin: PositiveFloat = 1.5
     """Free space around the body, mm."""
 
@@ -105,7 +108,7 @@ class SliceSettings(SettingsTable):
     max_fragments: PositiveInt = 8
     """Most fragments that are joined in a slice."""
     max_rank_jump: NonNegativeInt = 2
-    """Fragments are joined preferably to subfields at most so many ranks away."""
+    """Fragments are joined preferably to subfields at most this many ranks away."""
     bridge: NonNegativeFloat = 0.45
     """Half width of a bridge between fragments, mm."""
     max_gap: NonNegativeFloat = 1.2
@@ -124,9 +127,9 @@ class SliceSettings(SettingsTable):
     flow_iterations: NonNegativeInt = 5
     """Iterations of the registration per level."""
     touch: NonNegativeFloat = 0.6
-    """The subiculum and CA2 or CA3 are kept apart where both are nearer than this, mm ..."""
+    """The subiculum and CA2 or CA3 are kept apart where both are nearer than this, mm."""
     slit: NonNegativeFloat = 0.3
-    """... by a slit of this half width, mm."""
+    """Half width of the slit that keeps them apart, mm."""
     hidden_depth: NonNegativeFloat = 0.1
     """What lies less deep than this inside an end plane is taken from inside, where the sheet's
     labels end at the plane, mm."""
@@ -142,30 +145,32 @@ class TopologySettings(SettingsTable):
     rounds: NonNegativeInt = 12
     """Most rounds of repair."""
     depth_rank: NonNegativeFloat = 0.05
-    """... and depth, in grid nodes, adds this much of the field to the order."""
+    """Share of the field that each grid node of depth adds to the order of that."""
     small_cost: NonNegativeFloat = 5.0
-    """Membranes cheaper than this are applied together; dearer ones one a round."""
+    """Membranes cheaper than this are applied together; costlier ones one per round."""
     plug_reach: NonNegativeInt = 8
-    """A filled hole becomes as thick as the wall within this distance of it, grid nodes ..."""
+    """A filled hole becomes as thick as the wall within this distance of it, grid nodes."""
     plug_neighbors: PositiveInt = 12
-    """... at each place as thick as at so many nodes of the wall's middle closest to it."""
+    """Number of nearest nodes of the wall's middle that a filled hole takes its thickness from."""
     oriented_nodes: NonNegativeInt = 4
     """Membranes of fewer nodes have no direction."""
     cut_across: NonNegativeFloat = 0.3
     """A cut severs the ribbon rather than a bridge if this share of it lies across the axis
-    (projected areas, squared) ..."""
+    (projected areas, squared)."""
     sever_reach: NonNegativeInt = 2
-    """... and the body goes on for so many grid nodes before and behind it ..."""
+    """A cut severs the ribbon only if the body goes on for this many grid nodes before and behind
+    it."""
     sever_share: NonNegativeFloat = 0.4
-    """... at more than this share of its nodes."""
+    """Share of the cut's nodes at which the body has to go on."""
     sever_factor: NonNegativeFloat = 1000.0
     """Such cuts cost this much more: where one is the only way, the hemisphere is flagged."""
     contact_reach: NonNegativeFloat = 1.2
-    """... unless both the subiculum and CA2 or CA3 lie within this distance of its middle, mm."""
+    """A cut with both the subiculum and CA2 or CA3 within this distance of its middle severs no
+    ribbon but turns that touch, mm."""
     fill_across: NonNegativeFloat = 0.5
     """A fill spans the inside of a bend rather than a hole if this share lies across the axis."""
     lid_nodes: NonNegativeFloat = 6.0
-    """... unless it lies within this distance of an end plane, grid nodes."""
+    """A fill within this distance of an end plane closes an end and no bend, grid nodes."""
     across_factor: NonNegativeFloat = 40.0
     """Such fills cost this much more."""
     flag_cut_cost: NonNegativeFloat = 2.0
@@ -174,9 +179,9 @@ class TopologySettings(SettingsTable):
     """Flag a filled hole whose membrane overrules more evidence than this (sum of the field; holes
     of 0.8 mm radius cost 2 to 6, of 1 mm 6 to 11)."""
     doubtful_fill_cost: NonNegativeFloat = 2.0
-    """... and a fill across the axis that overrules more than this."""
+    """Flag a fill across the axis that overrules more than this (sum of the field)."""
     flag_part: NonNegativeFloat = 0.01
-    """Flag the parting of turns that touch beyond this fraction of the body."""
+    """Flag the separation of turns that touch beyond this fraction of the body."""
     flag_fraction: NonNegativeFloat = 0.05
     """Flag a repair, or all together, beyond this fraction of the body."""
 
@@ -217,7 +222,7 @@ class BoundarySettings(SettingsTable):
     """Diffusion across sharper ones, of curvature k, is slowed by exp(-anisotropy (k -
     sharp_bend)), mm."""
     least_diffusion: PositiveFraction = 0.1
-    """... but, where curves are moved to the middle of the rims, never below this."""
+    """Least diffusion where curves are moved to the middle of the edges of the sheet."""
     curvature_smoothing: NonNegativeInt = 2
     """Smoothing steps of the curvature tensor."""
     lapy_curvature: PositiveFloat = 0.3
@@ -252,9 +257,9 @@ class BoundarySettings(SettingsTable):
     """The direction of the sheet is found after one, two and three steps of this length from the
     rim, in the same unit."""
     strip_neighbors: PositiveInt = 160
-    """... as the mean over so many tetrahedra,"""
+    """Number of tetrahedra over which that direction is averaged."""
     rim_neighbors: PositiveInt = 15
-    """... and then over so many points of the rim."""
+    """Number of points of the edge over which it is averaged then."""
     strip_reach: Numbers = (0.9, 0.75)
     """They hold nothing farther than this from the curves, in the same unit; one value per round.
     Later rounds start from the middle lines of the strips of the round before."""
@@ -305,11 +310,12 @@ class MeasureSettings(SettingsTable):
     """Beyond this x, and its negative, the lengths and areas of both walls follow those of the
     mid-surface: where a rounded rim ends a wall is arbitrary."""
     rim_window: PositiveFloat = 0.2
-    """... at the ratio of the two over this much of x before."""
+    """Extent in x, before that, over which the ratio of wall and mid-surface is taken."""
     repair_reach: PositiveFloat = 0.35
     """A column is marked as repaired this near to a grid node that a repair changed, mm."""
     stump_reach: NonNegativeFloat = 0.7
-    """... and up to this much farther from a cut than what is nearest to it, mm."""
+    """A column is marked as repaired up to this much farther from a cut than what is nearest to the
+    cut, mm."""
 
     @model_validator(mode="after")
     def _windows_hold_the_order(self) -> Self:
@@ -354,7 +360,8 @@ class CheckSettings(SettingsTable):
     """Flag a cross-section that has more than this many times of what its neighbors lack, or label
     interior, than the body's other cross-sections (2.7 at most in twelve real bodies)."""
     stub_nodes: NonNegativeFloat = 6.0
-    """... but for what lies within this distance of a bridge that was cut, grid nodes."""
+    """What lies within this distance of a bridge that was cut is left out of that comparison, grid
+    nodes."""
     section_noise: NonNegativeFloat = 0.02
     """Share of the area that is added to the usual before such comparisons, per mm of distance
     (interior: in all), since thickness may change along the body."""
@@ -364,16 +371,17 @@ class CheckSettings(SettingsTable):
     """Flag rows narrower than the widest on both sides by more than this (0.13 at most in twelve
     real bodies)."""
     row_dip_reach: NonNegativeFloat = 8.0
-    """... within this distance along the axis, mm."""
+    """Distance along the axis within which rows are compared, mm."""
     ridge_reach: Numbers = (1.0, 2.0, 3.0)
-    """Thickness is compared with that at these distances along the axis on both sides, mm ..."""
+    """Thickness is compared with that at these distances along the axis on both sides, mm."""
     ridge_columns: PositiveInt = 9
-    """... as the mean of so many neighboring columns of a row."""
+    """Number of neighboring columns of a row over which thickness is averaged for that."""
     flag_ridge: Numbers = (0.45, 0.75, 0.7)
     """Flag a band that is thicker than both by more than this, one per distance, mm (0.31, 0.56 and
-    0.54 at most in twelve real bodies) ..."""
+    0.54 at most in twelve real bodies)."""
     flag_groove: Numbers = (0.55, 0.75, 0.75)
-    """... or thinner (0.38, 0.59 and 0.53)."""
+    """Flag a band that is thinner than both by more than this, one per distance, mm (0.38, 0.59 and
+    0.53 at most)."""
     flag_pinholes: NonNegativeFloat = 0.01
     """Flag labels in which single voxels without a label are more than this share of the sheet's
     voxels (0.0015 at most in twelve real bodies)."""
