@@ -403,7 +403,7 @@ class FittedMaps:
     rows: Int
     """Rows of the design of the sheets used."""
     subfield: Int
-    """(x, y) most frequent subfield, place in ``maps.names``; -1 where there is none."""
+    """(x, y) most frequent subfield, position in ``maps.names``; -1 where there is none."""
     fits: Mapping[str, PointwiseFit]
     """By measure."""
 

@@ -76,7 +76,8 @@ def find_groups(
         first = reference or _reference(counts, settings.model)
         if first not in counts:
             raise ModelError(
-                f"model: nobody has {column!r} {first!r}; there are {', '.join(sorted(counts))}",
+                f"model: no participant has {column!r} {first!r}; there are"
+                f" {', '.join(sorted(counts))}",
                 reason="unknown-level",
             )
         return Groups(column, (first, *sorted(level for level in counts if level != first)))

@@ -118,7 +118,7 @@ class ScoredMaps:
     scores: Mapping[str, NormativeScores]
     """By measure; points in the order of the sheet."""
     subfield: Int
-    """(x, y) most frequent subfield, place in ``names``."""
+    """(x, y) most frequent subfield, position in ``names``."""
     names: tuple[str, ...]
 
 

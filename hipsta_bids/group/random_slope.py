@@ -234,7 +234,7 @@ def _derivatives(sums: SlopeSums, at: Float) -> tuple[Float, Float, Float]:
     shifts = _STEP * np.eye(3)
     ups = np.stack([_loss(sums, at + shift) for shift in shifts], axis=1)
     downs = np.stack([_loss(sums, at - shift) for shift in shifts], axis=1)
-    hessian = _second(lambda place: _loss(sums, place), at)
+    hessian = _second(lambda point: _loss(sums, point), at)
     return _loss(sums, at), (ups - downs) / (2 * _STEP), hessian
 
 
