@@ -59,7 +59,7 @@ def check_label_order(
 ) -> float:
     """Refuse coordinates that do not follow the medial-to-lateral order of the subfields.
 
-    Returns their rank correlation; NaN with one subfield.
+    The rank correlation is returned; NaN with one subfield.
     """
     index, points = body.inside_points()
     thin = slice(None, None, max(len(points) // 5000, 1))  # some thousand voxels are plenty

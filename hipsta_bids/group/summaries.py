@@ -31,7 +31,7 @@ class MeasureFit:
 def summary_values(cohort: Cohort, hemi: str, only: Sequence[str] | None = None) -> pd.DataFrame:
     """Summary measures by visit.
 
-    Returns One row per visit of the cohort's table, NaN where missing.
+    One row per visit of the cohort's table, NaN where missing.
     """
     if hemi == BOTH:
         left, right = (summary_values(cohort, side, only) for side in BOTH)

@@ -77,7 +77,23 @@ def protocol_names() -> tuple[str, ...]:
 
 
 def load_protocol(name_or_path: str | Path) -> Protocol:
-    """Load a bundled protocol by name, or a user's protocol file."""
+    """Load a bundled protocol by name, or a user's protocol file.
+
+    Parameters
+    ----------
+    name_or_path : str or Path
+        A name of :func:`protocol_names`, or the path of a TOML file (a ``Path``, or a string that
+        ends in ``.toml``).
+
+    Returns
+    -------
+    Protocol
+
+    Raises
+    ------
+    ProtocolError
+        ``unknown-scheme`` (with the nearest name), ``unreadable-scheme`` or ``invalid-scheme``.
+    """
     if isinstance(name_or_path, Path) or name_or_path.endswith(".toml"):
         return _load_file(Path(name_or_path))
     if name_or_path not in protocol_names():
