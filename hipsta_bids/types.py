@@ -61,6 +61,24 @@ class BodyMask:
         _set(self, "affine", np.float64, (4, 4))
 
 
+@dataclass(frozen=True, kw_only=True)
+class Visit:
+    """A participant, in one session where the dataset has sessions."""
+
+    subject: str
+    """Label without ``sub-``."""
+    session: str | None
+    """Label without ``ses-``; ``None`` where the dataset has no sessions."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hemisphere(Visit):
+    """One side of a visit."""
+
+    hemi: str
+    """``L`` or ``R``."""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LabelVolume:
     """A segmentation in the package's own vocabulary."""

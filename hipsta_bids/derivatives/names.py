@@ -10,18 +10,13 @@ from pathlib import PurePosixPath
 
 from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.io.files import LOGS
+from hipsta_bids.types import Hemisphere
 
 
 @dataclass(frozen=True, kw_only=True)
-class HemisphereName:
+class HemisphereName(Hemisphere):
     """The BIDS identity of one result."""
 
-    subject: str
-    """Label without ``sub-``."""
-    session: str | None
-    """Label without ``ses-``; ``None`` where the dataset has no sessions."""
-    hemi: str
-    """``L`` or ``R``."""
     seg: str
     """Name of the segmentation protocol."""
     region: str = "body"

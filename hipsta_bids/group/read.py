@@ -28,7 +28,7 @@ ARBITRARY = "arbitrary"
 #: Number of measures that a message lists.
 _SHOWN = 12
 
-Visit = tuple[str, str | None]
+VisitKey = tuple[str, str | None]
 """Subject and session, without prefixes."""
 
 
@@ -102,7 +102,7 @@ def read_sheets(
     records: Sequence[SheetRecord],
     settings: Mapping[str, Any],
     maps: Sequence[str],
-    visits: Sequence[Visit] | None = None,
+    visits: Sequence[VisitKey] | None = None,
 ) -> Measured:
     """Read all sheets and summaries."""
     grid = settings["sheet"]
@@ -137,7 +137,7 @@ def read_sheets(
     )
 
 
-def visits_of(records: Sequence[SheetRecord]) -> list[Visit]:
+def visits_of(records: Sequence[SheetRecord]) -> list[VisitKey]:
     """List subjects and sessions that have sheets, each once."""
     return list(dict.fromkeys((r.place.name.subject, r.place.name.session) for r in records))
 

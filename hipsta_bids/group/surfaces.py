@@ -11,7 +11,7 @@ import pandas as pd
 from hipsta_bids.errors import InputError, NothingToDoError, UsageError
 from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.group.data import Cohort, Int, SideMaps
-from hipsta_bids.group.read import CURVATURE, Measured, Visit
+from hipsta_bids.group.read import CURVATURE, Measured, VisitKey
 from hipsta_bids.inputs.maps import Found, check_pattern, fields_of, fill, find, scan
 from hipsta_bids.io.files import entities
 from hipsta_bids.io.gifti import PointMap, read_map, read_mesh
@@ -36,11 +36,11 @@ class ExternalFiles:
     request: MapPattern
     root: Path
     """Folder that patterns are relative to."""
-    files: Mapping[str, Mapping[Visit, Path]]
+    files: Mapping[str, Mapping[VisitKey, Path]]
     """By hemisphere and visit."""
 
     @property
-    def visits(self) -> set[Visit]:
+    def visits(self) -> set[VisitKey]:
         """Visits with a map of either hemisphere."""
         return {visit for side in self.files.values() for visit in side}
 
@@ -89,14 +89,14 @@ def taken_names(*, with_sheets: bool) -> tuple[str, ...]:
 def find_maps(
     request: MapPattern,
     root: Path,
-    known: Iterable[Visit],
+    known: Iterable[VisitKey],
     is_wanted: Callable[[str, str | None, str], bool],
 ) -> ExternalFiles:
     """Find the files of one map."""
     sessions: dict[str, list[str | None]] = {}
     for subject, session in known:
         sessions.setdefault(subject, []).append(session)
-    found: dict[str, dict[Visit, Path]] = {}
+    found: dict[str, dict[VisitKey, Path]] = {}
     for one in scan(request.pattern, root):
         if one.hemi is None:
             continue
@@ -131,7 +131,7 @@ def _sessions(one: Found, known: Mapping[str, Sequence[str | None]]) -> Sequence
 
 
 def read_maps(
-    found: ExternalFiles, visits: Sequence[Visit], grid: tuple[int, int], *, with_sheets: bool
+    found: ExternalFiles, visits: Sequence[VisitKey], grid: tuple[int, int], *, with_sheets: bool
 ) -> tuple[dict[str, SideMaps], str]:
     """Read one map of all hemispheres, by rows of visits, and its unit.
 
@@ -251,17 +251,17 @@ class ExternalCohorts:
 def find_all(
     requests: Sequence[MapPattern],
     root: Path,
-    known: Sequence[Visit],
+    known: Sequence[VisitKey],
     is_wanted: Callable[[str, str | None, str], bool],
-) -> tuple[list[ExternalFiles], list[Visit]]:
+) -> tuple[list[ExternalFiles], list[VisitKey]]:
     """Find the files of all maps, and who has them or a sheet."""
     found = [find_maps(request, root, known, is_wanted) for request in requests]
-    visits: set[Visit] = set(known).union(*(one.visits for one in found))
+    visits: set[VisitKey] = set(known).union(*(one.visits for one in found))
     return found, sorted(visits, key=lambda visit: (visit[0], visit[1] or ""))
 
 
 def add_external(
-    measured: Measured, found: Iterable[ExternalFiles], visits: Sequence[Visit]
+    measured: Measured, found: Iterable[ExternalFiles], visits: Sequence[VisitKey]
 ) -> ExternalCohorts:
     """Read other programs' maps, and add those on the grid of the sheets to the sheets.
 

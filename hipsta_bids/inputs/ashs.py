@@ -19,7 +19,7 @@ from hipsta_bids.inputs.scan import (
     InputRequest,
     Selection,
     Source,
-    Visit,
+    VisitFolders,
     list_visits,
     subject_folders,
     unknown_protocol,
@@ -188,7 +188,7 @@ def volume_table(path: Path) -> Path | None:
 
 
 def find_ashs(
-    visit: Visit, source: Source, atlases: AtlasFinder, selection: Selection
+    visit: VisitFolders, source: Source, atlases: AtlasFinder, selection: Selection
 ) -> Iterator[HemisphereInput]:
     """Find ASHS's segmentations of one visit."""
     everything = _files(visit)
@@ -247,7 +247,7 @@ def sample_files(source: Source) -> Callable[[], list[_Image]]:
     return sample
 
 
-def _files(visit: Visit) -> list[_File]:
+def _files(visit: VisitFolders) -> list[_File]:
     """List the segmentations of one visit, best first."""
     matches = (
         (folder.path / name, _NAME.fullmatch(name))

@@ -17,11 +17,12 @@ from hipsta_bids.inputs.scan import (
     HemisphereInput,
     InputRequest,
     Selection,
-    Visit,
+    VisitFolders,
     list_visits,
     subject_folders,
 )
 from hipsta_bids.io.files import entities
+from hipsta_bids.types import Visit
 
 #: Names under which ``--edited-dir`` and the output dataset appear in addresses.
 _EDITED, _OUTPUT = "edited", "output"
@@ -31,12 +32,10 @@ _KINDS = {"dseg": "labels", "mask": "mask"}
 
 
 @dataclass(frozen=True, kw_only=True)
-class EditedFile:
+class EditedFile(Visit):
     """An edited file, and whose it is."""
 
     edit: Edit
-    subject: str
-    session: str | None
     beside: bool
     """Found in a dataset of segmentations, not in the folder of edits."""
 
@@ -46,7 +45,9 @@ class EditedFile:
         return entities(self.edit.path.name)
 
 
-def edits_of_visit(visit: Visit, root: Path, source: str, *, beside: bool) -> Iterator[EditedFile]:
+def edits_of_visit(
+    visit: VisitFolders, root: Path, source: str, *, beside: bool
+) -> Iterator[EditedFile]:
     """List the edited files in the folders of one visit."""
     for folder in visit.folders:
         for name in filter(is_edited, folder.names):

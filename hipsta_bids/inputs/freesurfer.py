@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hipsta_bids.errors import HipstaError, InputError
-from hipsta_bids.inputs.scan import HemisphereInput, Selection, Source, Visit
+from hipsta_bids.inputs.scan import HemisphereInput, Selection, Source, VisitFolders
 from hipsta_bids.protocols.load import load_protocol
 
 _NAME = re.compile(
@@ -109,7 +109,7 @@ def volume_table(path: Path) -> Path | None:
 
 
 def find_freesurfer(
-    visit: Visit, source: Source, selection: Selection
+    visit: VisitFolders, source: Source, selection: Selection
 ) -> Iterator[HemisphereInput]:
     """Find FreeSurfer's segmentations of one visit.
 
@@ -148,7 +148,7 @@ def find_freesurfer(
         )
 
 
-def _runs(visit: Visit, hemi: str) -> list[_Run]:
+def _runs(visit: VisitFolders, hemi: str) -> list[_Run]:
     """Group a hemisphere's files by analysis and resolution, best first."""
     runs: dict[tuple[object, ...], _Run] = {}
     for folder in visit.folders:

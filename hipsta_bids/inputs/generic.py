@@ -13,7 +13,7 @@ from hipsta_bids.inputs.scan import (
     HemisphereInput,
     Selection,
     Source,
-    Visit,
+    VisitFolders,
     list_folder,
     unknown_protocol,
 )
@@ -168,7 +168,9 @@ def is_edited(name: str) -> bool:
     )
 
 
-def find_named(visit: Visit, source: Source, selection: Selection) -> Iterator[HemisphereInput]:
+def find_named(
+    visit: VisitFolders, source: Source, selection: Selection
+) -> Iterator[HemisphereInput]:
     """Find segmentations of one visit that a table or the user's protocol describes.
 
     Files whose table names no subiculum and CA1 are of something else, and are left out; so are
@@ -185,7 +187,7 @@ def find_named(visit: Visit, source: Source, selection: Selection) -> Iterator[H
                 yield _choose(group, visit, hemi, source)
 
 
-def _choose(files: list[_File], visit: Visit, hemi: str, source: Source) -> HemisphereInput:
+def _choose(files: list[_File], visit: VisitFolders, hemi: str, source: Source) -> HemisphereInput:
     chosen = files[0]
     problem = chosen.problem
     if problem is None and not _OWN_SPACE.fullmatch(chosen.space):
@@ -210,7 +212,7 @@ def _choose(files: list[_File], visit: Visit, hemi: str, source: Source) -> Hemi
     )
 
 
-def _files(visit: Visit, hemi: str, source: Source, selection: Selection) -> Iterator[_File]:
+def _files(visit: VisitFolders, hemi: str, source: Source, selection: Selection) -> Iterator[_File]:
     for folder in visit.folders:
         for name in folder.names:
             if f"_hemi-{hemi}_" not in name or "dseg." not in name or is_edited(name):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hipsta_bids.errors import HipstaError, InputError, ProtocolError
-from hipsta_bids.inputs.scan import HemisphereInput, Selection, Source, Visit
+from hipsta_bids.inputs.scan import HemisphereInput, Selection, Source, VisitFolders
 from hipsta_bids.io.files import entities
 from hipsta_bids.protocols.load import load_protocol
 
@@ -56,7 +56,7 @@ def is_hippunfold(name: str, source: Source) -> bool:
 
 
 def find_hippunfold(
-    visit: Visit, source: Source, selection: Selection
+    visit: VisitFolders, source: Source, selection: Selection
 ) -> Iterator[HemisphereInput]:
     """Find HippUnfold's segmentations of one visit.
 
@@ -86,7 +86,7 @@ def find_hippunfold(
         )
 
 
-def _files(visit: Visit, hemi: str, source: Source, selection: Selection) -> Iterator[_File]:
+def _files(visit: VisitFolders, hemi: str, source: Source, selection: Selection) -> Iterator[_File]:
     for folder in visit.folders:
         for name in folder.names:
             if not is_hippunfold(name, source):

@@ -20,6 +20,7 @@ from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.geometry.sampling import Regions
 from hipsta_bids.inputs.scan import HemisphereInput, MapSource
 from hipsta_bids.io import files
+from hipsta_bids.types import Visit
 
 #: Columns of a file of regions: node numbers as in the sheet table, and the region's name.
 COLUMNS = ("x", "y", "region")
@@ -92,12 +93,10 @@ def _nodes(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Found:
+class Found(Visit):
     """A file, and whose it is as far as its path says."""
 
     path: Path
-    subject: str
-    session: str | None
     hemi: str | None
 
 

@@ -17,6 +17,7 @@ from hipsta_bids.derivatives.dataset import NAME, generated_by, read_description
 from hipsta_bids.errors import HipstaError, InputError, UsageError
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Protocol
+from hipsta_bids.types import Hemisphere, Visit
 
 # What is asked for, and what was found: the values that the search for inputs works with.
 
@@ -91,15 +92,9 @@ class MapSource:
 
 
 @dataclass(frozen=True, kw_only=True)
-class HemisphereInput:
+class HemisphereInput(Hemisphere):
     """One hemisphere's segmentation: which files, which protocol, and why these."""
 
-    subject: str
-    """Without ``sub-``."""
-    session: str | None
-    """Without ``ses-``; None where the dataset has no sessions."""
-    hemi: str
-    """``L`` or ``R``."""
     protocol: Protocol
     files: tuple[Path, ...]
     """The file with subfields and, if parts come from another file, that one."""
@@ -168,11 +163,9 @@ _Wanted = Callable[[str | None], bool]
 
 
 @dataclass(frozen=True, kw_only=True)
-class SubjectFolder:
+class SubjectFolder(Visit):
     """A folder that belongs to a subject, by its name."""
 
-    subject: str
-    session: str | None
     longitudinal: bool
     path: Path
 
@@ -187,11 +180,9 @@ class Folder:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Visit:
+class VisitFolders(Visit):
     """All candidate folders of one subject, or of one of its sessions."""
 
-    subject: str
-    session: str | None
     folders: tuple[Folder, ...]
 
 
@@ -235,14 +226,14 @@ def subject_folders(root: Path) -> list[SubjectFolder]:
     ]
 
 
-def list_visits(folders: Iterable[SubjectFolder]) -> list[Visit]:
+def list_visits(folders: Iterable[SubjectFolder]) -> list[VisitFolders]:
     """List the candidate files of some subjects."""
     found: dict[tuple[str, str | None], list[Folder]] = {}
     for folder in folders:
         for session, inner in _inner_folders(folder):
             found.setdefault((folder.subject, session), []).append(inner)
     return [
-        Visit(subject=subject, session=session, folders=tuple(inner))
+        VisitFolders(subject=subject, session=session, folders=tuple(inner))
         for (subject, session), inner in found.items()
     ]
 
@@ -362,7 +353,7 @@ class Selection:
             and self._passes("subject", folder.subject)
         )
 
-    def wants_visit(self, visit: Visit) -> bool:
+    def wants_visit(self, visit: VisitFolders) -> bool:
         """Check whether a session of a subject is wanted."""
         asked = not self.sessions or visit.session in self.sessions
         return asked and self._passes("session", visit.session)

@@ -25,7 +25,7 @@ _RECORD = "_desc-qc_metrics.json"
 _RECORDS = tuple(f"{folder}/*{_RECORD}" for folder in ("sub-*/anat", "sub-*/ses-*/anat"))
 _LOGGER = logging.getLogger(__name__)
 
-Visit = tuple[str, str | None]
+VisitKey = tuple[str, str | None]
 """Labels of subject and session."""
 
 
@@ -45,7 +45,7 @@ class PageJob:
 
     root: Path
     """The output dataset."""
-    visit: Visit | None
+    visit: VisitKey | None
     """The visit that the page is about; ``None`` for that of the cohort."""
 
     @property
@@ -79,13 +79,13 @@ class Problem:
     """Whether the others would fail likewise."""
 
 
-def visits_of(root: Path) -> list[Visit]:
+def visits_of(root: Path) -> list[VisitKey]:
     """List the visits of which there is a record."""
     names = (place.name for place in list_results(root))
     return list(dict.fromkeys((name.subject, name.session) for name in names))
 
 
-def write_reports(plan: PagePlan, visits: Iterable[Visit]) -> Iterator[Problem]:
+def write_reports(plan: PagePlan, visits: Iterable[VisitKey]) -> Iterator[Problem]:
     """Make the pages of some visits, and that of the cohort."""
     jobs = [PageJob(root=plan.root, visit=None)] if plan.cohort else []
     jobs += [PageJob(root=plan.root, visit=visit) for visit in dict.fromkeys(visits)]
@@ -114,7 +114,7 @@ def write_reports(plan: PagePlan, visits: Iterable[Visit]) -> Iterator[Problem]:
 
 
 @contextlib.contextmanager
-def reports_after(plan: PagePlan, visits: Sequence[Visit]) -> Generator[Pages]:
+def reports_after(plan: PagePlan, visits: Sequence[VisitKey]) -> Generator[Pages]:
     """Make pages when the block ends, also by an error; not when the user stops the run."""
     pages = Pages()
     try:
@@ -126,7 +126,7 @@ def reports_after(plan: PagePlan, visits: Sequence[Visit]) -> Generator[Pages]:
         _try_all(plan, visits, pages.problems)
 
 
-def _try_all(plan: PagePlan, visits: Sequence[Visit], problems: list[str]) -> None:
+def _try_all(plan: PagePlan, visits: Sequence[VisitKey], problems: list[str]) -> None:
     """Make the pages that are older than the records they are about."""
     root = plan.root
     stale = []
