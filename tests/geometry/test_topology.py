@@ -22,7 +22,9 @@ SPACING = 0.5
 
 def repaired(mask, **changes):
     """Repair a mask's field; check what must hold whatever was wrong."""
-    solid = repair_topology(field_of(mask, spacing=SPACING), TopologySettings(**changes))
+    # Unchecked: shares below zero make every cut sever.
+    settings = TopologySettings().model_copy(update=changes)
+    solid = repair_topology(field_of(mask, spacing=SPACING), settings)
     positive = solid.field.values > 0
     assert euler_number(positive) == solid.euler_after == 1
     assert ndimage.label(positive)[1] == 1
@@ -148,7 +150,7 @@ def test_a_strip_beside_a_hole_is_not_severed():
 
 
 def test_a_cut_that_severs_the_ribbon_is_large_where_nothing_else_helps():
-    only_cuts = {"sever_share": 0.0, "cut_across": 0.0, "sever_factor": 1.001}
+    only_cuts = {"sever_share": -1.0, "cut_across": -1.0, "sever_factor": 1.001}
     mask, *_ = with_bridge()
     assert only_repair(repaired(mask, flag_cut_cost=1e9, **only_cuts), "cut").large
     assert not only_repair(repaired(mask, flag_cut_cost=1e9), "cut").large
