@@ -48,7 +48,7 @@ lint: $(STAMP)
 types: $(STAMP)
 	"$(BIN)/python" -m mypy --strict
 	"$(BIN)/python" -m mypy --strict tools/*.py
-	"$(BIN)/python" -m mypy --strict tools/make-descriptors
+	MYPYPATH=tools "$(BIN)/python" -m mypy --strict tools/make-descriptors
 	MYPYPATH=tools "$(BIN)/python" -m mypy --strict tools/make-docs
 	MYPYPATH=benchmarks "$(BIN)/python" -m mypy --strict benchmarks/*.py
 
