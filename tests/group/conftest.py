@@ -23,3 +23,11 @@ def r_data(oracle):
         name: {column: np.array(values) for column, values in table.items()}
         for name, table in oracle["data"].items()
     }
+
+
+@pytest.fixture(scope="session")
+def quick(tmp_path_factory):
+    """Settings with little cross-validation, which takes most of the time."""
+    path = tmp_path_factory.mktemp("settings") / "group.toml"
+    path.write_text("[classification]\nrepeats = 2\nfolds = 3\n[multiplicity]\nseed = 3\n")
+    return ["--settings", str(path)]

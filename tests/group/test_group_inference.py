@@ -27,13 +27,6 @@ def _no_figures(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def quick(tmp_path_factory):
-    path = tmp_path_factory.mktemp("settings") / "group.toml"
-    path.write_text("[classification]\nrepeats = 2\nfolds = 3\n[multiplicity]\nseed = 3\n")
-    return ["--settings", str(path)]
-
-
-@pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     return write_dataset(tmp_path_factory.mktemp("one-session"))
 

@@ -59,13 +59,6 @@ def _no_figures(request, monkeypatch):
         monkeypatch.setattr(write, "draw_figures", lambda *_: iter(()))
 
 
-@pytest.fixture(scope="module")
-def quick(tmp_path_factory):
-    path = tmp_path_factory.mktemp("settings") / "group.toml"
-    path.write_text("[classification]\nrepeats = 2\nfolds = 3\n")
-    return ["--settings", str(path)]
-
-
 def run(dataset, quick, *options):
     data, out = dataset
     return main([str(data), str(out), "group", *quick, *options]), out / "group"

@@ -26,14 +26,6 @@ def dataset(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def quick(tmp_path_factory):
-    """Settings with little cross-validation, which takes most of the time."""
-    path = tmp_path_factory.mktemp("settings") / "group.toml"
-    path.write_text("[classification]\nrepeats = 2\nfolds = 3\n")
-    return ["--settings", str(path)]
-
-
-@pytest.fixture(scope="module")
 def results(dataset, quick):
     data, out = dataset
     assert main([str(data), str(out), "group", *quick]) == 0
