@@ -219,7 +219,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     with tempfile.TemporaryDirectory(prefix="hipsta-cluster-") as folder:
         work = Path(folder)
-        running = subprocess.run(["sinfo"], capture_output=True, check=False).returncode == 0  # noqa: S607  (where it is differs)
+        sinfo = shutil.which("sinfo")  # starting SLURM may be what installs it
+        running = False
+        if sinfo:
+            running = not subprocess.run([sinfo], capture_output=True, check=False).returncode  # noqa: S603
         if not running:
             for line in run(str(options.start_slurm), str(work / "slurm")).splitlines():
                 name, _, value = line.removeprefix("export ").partition("=")
