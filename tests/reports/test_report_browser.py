@@ -165,7 +165,7 @@ def test_maps_are_drawn_and_lead_to_their_page(visit):
     assert (pixels(tile) != before).any()
     one(browser, "#tiles a").click()
     assert texts(browser, "h1") == ["sub-01"]
-    one(browser, ".fragments a").click()
+    one(browser, ".crumbs a").click()
     assert texts(browser, "h1") == ["All hemispheres"]
 
 
