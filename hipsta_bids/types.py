@@ -71,6 +71,10 @@ class Visit:
     """Label without ``ses-``; ``None`` where the dataset has no sessions."""
 
 
+VisitKey = tuple[str, str | None]
+"""Labels of subject and session, as a key of tables and sets."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Hemisphere(Visit):
     """One side of a visit."""

@@ -14,6 +14,7 @@ from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.group.collect import SheetRecord
 from hipsta_bids.group.data import PARTICIPANT, SESSION, Float, Measures, SideMaps
+from hipsta_bids.types import VisitKey
 
 #: Map that registration rests on.
 CURVATURE = "curvature"
@@ -27,9 +28,6 @@ VOLUME = "volume_"
 ARBITRARY = "arbitrary"
 #: Number of measures that a message lists.
 _SHOWN = 12
-
-VisitKey = tuple[str, str | None]
-"""Subject and session, without prefixes."""
 
 
 def choose_measures(

@@ -11,11 +11,11 @@ import pandas as pd
 from hipsta_bids.errors import InputError, NothingToDoError, UsageError
 from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.group.data import Cohort, Int, SideMaps
-from hipsta_bids.group.read import CURVATURE, Measured, VisitKey
+from hipsta_bids.group.read import CURVATURE, Measured
 from hipsta_bids.inputs.maps import Found, check_pattern, fields_of, fill, find, scan
 from hipsta_bids.io.files import entities
 from hipsta_bids.io.gifti import PointMap, read_map, read_mesh
-from hipsta_bids.types import Mesh
+from hipsta_bids.types import Mesh, VisitKey
 
 
 @dataclass(frozen=True, kw_only=True)

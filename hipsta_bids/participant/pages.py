@@ -18,15 +18,13 @@ from hipsta_bids.io import files
 from hipsta_bids.participant.cluster import Cluster, run_on_cluster
 from hipsta_bids.participant.pool import WorkerLost, WorkerPlan, run_jobs
 from hipsta_bids.reports.cohort import Cohort, read_cohort
+from hipsta_bids.types import VisitKey
 
 _TIMEOUT = 600.0  # s for one page
 _COHORT = DATASET_FILES["report"]
 _RECORD = "_desc-qc_metrics.json"
 _RECORDS = tuple(f"{folder}/*{_RECORD}" for folder in ("sub-*/anat", "sub-*/ses-*/anat"))
 _LOGGER = logging.getLogger(__name__)
-
-VisitKey = tuple[str, str | None]
-"""Labels of subject and session."""
 
 
 @dataclass
