@@ -230,7 +230,7 @@ class BoundarySettings(SettingsTable):
     label_neighbors: PositiveInt = 30
     """Voxels around a vertex whose labels tell how lateral it is."""
     label_stride: PositiveInt = 2
-    """Every so many-th vertex is asked."""
+    """One vertex in this many is asked."""
     lateral_share: PositiveFraction = 0.1
     """Share of the vertices that count as most lateral."""
     axial_stretch: PositiveFloat = 4.0

@@ -234,7 +234,7 @@ def is_group_level(arguments: Sequence[str]) -> bool:
             return True
         if arguments[2] == "participant":
             return False
-    # Options may precede the positions; "settings group" is another command.
+    # Options may precede the positions.
     return LEVEL in arguments[2:] and "participant" not in arguments
 
 

@@ -11,7 +11,7 @@ from importlib.resources import files
 from types import FrameType
 
 from hipsta_bids.cli.console import echo, warn
-from hipsta_bids.cli.group import is_group_level, run_group_level
+from hipsta_bids.cli.group import LEVEL, is_group_level, run_group_level
 from hipsta_bids.cli.participant import LEVELS, build_parser, run_participant_level
 from hipsta_bids.errors import EXIT_MEANINGS, ExitCode, HipstaError
 
@@ -96,17 +96,18 @@ def _terminable() -> Iterator[None]:
 
 
 def _dispatch(arguments: list[str]) -> ExitCode:
-    """Tell the other commands from the BIDS App, whose dataset may have any name."""
+    """Tell the other commands from the BIDS App, whose dataset may be called like one of them."""
     if _DESCRIPTOR in arguments:
         echo((files("hipsta_bids.cli") / "descriptor.json").read_text(encoding="utf-8").rstrip())
         return ExitCode.OK
-    if is_group_level(arguments):
-        return run_group_level(arguments)
-    is_app = any(level in arguments[1:] for level in LEVELS)
+    level = arguments[2:3] if not "".join(arguments[1:2]).startswith("-") else []
+    is_app = not {*LEVELS, LEVEL}.isdisjoint(level)
     if arguments and arguments[0] in COMMANDS and not is_app:
         function = COMMANDS[arguments[0]][0]
         code: ExitCode = getattr(import_module("hipsta_bids.cli.commands"), function)(arguments[1:])
         return code
+    if is_group_level(arguments):
+        return run_group_level(arguments)
     return run_participant_level(build_parser(EPILOG).parse_args(arguments), arguments)
 
 

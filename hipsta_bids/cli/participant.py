@@ -23,7 +23,7 @@ from hipsta_bids.cli.parser import (
 )
 from hipsta_bids.errors import ExitCode, NothingToDoError, UsageError
 from hipsta_bids.participant.cluster import Cluster, Shard, check_cluster, parse_shard
-from hipsta_bids.participant.pool import pin_threads
+from hipsta_bids.participant.pool import pin_threads, processors
 
 if TYPE_CHECKING:
     from argparse import Namespace
@@ -176,7 +176,7 @@ def _add_processing(parser: Parser) -> None:
         "N",
         "hemispheres at the same time, one processor each (default: all processors)",
         type=positive_int,
-        default=_processors(),
+        default=processors(),
     )
     add(
         "--mem --mem-mb",
@@ -255,13 +255,6 @@ def _gigabytes(text: str) -> float:
     if match is None:
         raise argparse.ArgumentTypeError(f"{text!r} is not a size; write 8000 (MB) or 8G")
     return positive_float(match[1]) * _GIGABYTES[match[2] or "M"]
-
-
-def _processors() -> int:
-    """Count the processors that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def run_participant_level(options: "Namespace", arguments: Sequence[str] = ()) -> ExitCode:

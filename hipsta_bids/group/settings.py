@@ -63,7 +63,8 @@ class RegistrationSettings(SettingsTable):
     max_gap: Fraction = 0.2
     """Profiles are filled along x if at most this fraction of them is missing."""
     extreme: NonNegativeFloat = 4.0
-    """Flag warps whose mean displacement is so many robust SDs above the median."""
+    """Flag warps whose mean displacement is above the median by more than this many robust
+    SDs."""
 
 
 class DesignSettings(SettingsTable):

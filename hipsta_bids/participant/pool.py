@@ -51,6 +51,13 @@ def pin_threads() -> None:
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
 
 
+def processors() -> int:
+    """Count the processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 @dataclass(frozen=True, kw_only=True)
 class WorkerPlan:
     """How workers run."""

@@ -1,7 +1,6 @@
 """What suites measure: phantoms in chosen poses beside their truth, and bodies, in workers."""
 
 import contextlib
-import os
 import tempfile
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import nullcontext
@@ -17,7 +16,7 @@ from hipsta_bids.errors import HipstaError
 from hipsta_bids.inputs.labels import read_label_volume
 from hipsta_bids.inputs.search import HemisphereInput, InputRequest, find_hemispheres
 from hipsta_bids.participant.measure import measure_hemisphere
-from hipsta_bids.participant.pool import WorkerLost, WorkerPlan, run_jobs
+from hipsta_bids.participant.pool import WorkerLost, WorkerPlan, processors, run_jobs
 from hipsta_bids.phantom import Phantom, PhantomSpec, PhantomTruth
 from hipsta_bids.phantom.shape import PITCH
 from hipsta_bids.protocols.load import load_protocol
@@ -260,13 +259,6 @@ def refusal_notes(groups: Mapping[str, Sequence[Any]]) -> str:
         if isinstance(result, Refusal)
     ]
     return "\n".join(["\nRefused:\n", *lines]) if lines else ""
-
-
-def processors() -> int:
-    """Count the processors that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _lost(lost: WorkerLost) -> Refusal:

@@ -2,7 +2,8 @@
 
 from validation_jobs import work
 
-from hipsta_bids.validation.cases import Refusal, processors, run_cases
+from hipsta_bids.participant.pool import processors
+from hipsta_bids.validation.cases import Refusal, run_cases
 
 
 def test_results_come_in_the_order_of_the_cases():
