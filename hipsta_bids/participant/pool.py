@@ -16,10 +16,10 @@ import multiprocessing
 import os
 import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, field
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -257,6 +257,7 @@ def _context() -> Any:  # noqa: ANN401  (the contexts have no common type that c
     with contextlib.suppress(OSError):
         if len(os.listdir("/proc/self/task")) == 1:  # noqa: PTH208  (a count, not paths)
             return multiprocessing.get_context("fork")
+    resource_tracker.ensure_running()  # its start would let Ctrl-C through
     return multiprocessing.get_context("spawn")
 
 
@@ -264,12 +265,12 @@ def _context() -> Any:  # noqa: ANN401  (the contexts have no common type that c
 def _inherited(plan: WorkerPlan) -> Iterator[None]:
     """Set what a new process inherits: one thread per library, and no reaction to Ctrl-C.
 
-    The terminal sends Ctrl-C to every process; it is this one that stops the workers.
+    The terminal sends Ctrl-C to every process; it is this one that stops the workers. Here it is
+    only put off until the process is started.
     """
     wanted = dict.fromkeys(THREAD_VARIABLES, "1") | dict(plan.environment)
     before = {name: os.environ.get(name) for name in wanted}
-    in_main = threading.current_thread() is threading.main_thread()
-    handler = signal.signal(signal.SIGINT, signal.SIG_IGN) if in_main else None
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     os.environ.update(wanted)
     try:
         yield
@@ -279,8 +280,7 @@ def _inherited(plan: WorkerPlan) -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
-        if handler is not None:  # none where it was not Python that set it
-            signal.signal(signal.SIGINT, handler)
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 def _stop(slots: list[_Slot]) -> None:
@@ -319,6 +319,7 @@ def _separate(parent: int) -> None:
     """Make a process group of its own, and die with the parent even if that is killed."""
     with contextlib.suppress(OSError):
         os.setsid()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     if sys.platform == "linux":
         with contextlib.suppress(OSError):

@@ -1,5 +1,7 @@
 import json
+import multiprocessing
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -8,6 +10,7 @@ from pathlib import Path
 import pytest
 from pool_jobs import broken_start, work
 
+from hipsta_bids.participant import pool
 from hipsta_bids.participant.pool import WorkerLost, WorkerPlan, run_jobs
 
 
@@ -56,6 +59,26 @@ def alive(number):
     return True
 
 
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_ctrl_c_while_a_worker_starts_is_not_lost(tmp_path, monkeypatch, method):
+    context = multiprocessing.get_context(method)
+    start = context.Process.start
+
+    def start_under_ctrl_c(process):
+        os.kill(os.getpid(), signal.SIGINT)
+        start(process)
+
+    monkeypatch.setattr(pool, "_context", lambda: context)
+    monkeypatch.setattr(context.Process, "start", start_under_ctrl_c)
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            list(run_jobs(plan(tmp_path), ["square 3"]))
+    finally:
+        signal.signal(signal.SIGINT, handler)
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+
+
 def test_workers_that_cannot_start_are_a_bug(tmp_path):
     with pytest.raises(RuntimeError, match="worker processes do not start"):
         list(run_jobs(plan(tmp_path, warm_up=broken_start), ["square 1"]))
@@ -91,7 +114,9 @@ import sys
 sys.path.insert(0, {tests!r})
 from pathlib import Path
 from pool_jobs import work
+from hipsta_bids.participant import pool
 from hipsta_bids.participant.pool import WorkerPlan, run_jobs
+from hipsta_bids.participant import pool
 from hipsta_bids.participant.pool import pin_threads
 def load():
     import colorsys
