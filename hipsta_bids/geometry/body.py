@@ -35,6 +35,8 @@ from hipsta_bids.types import Bool, EditedMask, Flag, Float, LabelVolume
 Index = NDArray[np.intp]
 Tissues = NDArray[np.uint8]
 
+_TIES = 8
+"""Nearest voxels that may be equally near: the corners of a cube."""
 _DIRECTIONS = [step for step in product((-1, 0, 1), repeat=3) if step > (0, 0, 0)]
 """One of each two opposite directions to the 26 neighbors."""
 
@@ -225,7 +227,11 @@ def _merge_layer(volume: LabelVolume, rule: str) -> tuple[Tissues, int]:
     # The nearest voxel always has a face neighbor outside.
     border = (candidates > 0) & ~ndimage.binary_erosion(candidates > 0, structure=FACES)
     tree = cKDTree(voxel_points(border, volume.affine))
-    nearest = candidates[border][tree.query(voxel_points(layer, volume.affine))[1]]
+    # Of labels that are equally near the most medial, whichever way the voxels are stored.
+    distance, index = tree.query(voxel_points(layer, volume.affine), k=_TIES)
+    tied = distance < distance[:, :1] + 1e-6
+    ranked = np.append(candidates[border], np.uint8(255))[index]  # fewer neighbors than asked
+    nearest = np.where(tied, ranked, np.uint8(255)).min(axis=1)
     tissue[layer] = np.where(nearest == Tissue.OTHER, 0, nearest)
     return tissue, int(np.count_nonzero(tissue[layer]))
 

@@ -87,13 +87,17 @@ def center_curves(wall: Wall, curves: Pair, thickness: float, settings: Boundary
 
 
 def middle_lines(wall: Wall, zones: Sequence[Bool]) -> Pair | None:
-    """Zero lines, within two zones, of the harmonic function between the two sides."""
+    """Zero lines of the harmonic function between the two sides, one in each of two zones."""
     sides = wall.sides(zones[0] | zones[1])
     if sides is None:
         return None
     fixed = np.flatnonzero(sides[0] | sides[1])
     values = np.where(sides[1][fixed], 1.0, -1.0)
-    return end_to_end(wall, wall.evenly_aware.solve(fixed, values))
+    lines = end_to_end(wall, wall.evenly_aware.solve(fixed, values))
+    if lines is None:
+        return None
+    first, second = (float(zones[0][wall.nearest(line)].mean()) for line in lines)
+    return lines if first >= second else (lines[1], lines[0])
 
 
 def _most_lateral(points: Float, body: Body, settings: BoundarySettings) -> NDArray[np.intp]:

@@ -31,7 +31,8 @@ class WedgeGrid:
     origin: Float
     """(3,) RAS mm of a = b = 0, anywhere along the axis."""
     across: Float
-    """(2, 3) unit vectors of a and b."""
+    """(2, 3) unit vectors of a and b; in a right hemisphere a, b and w are left-handed, so that
+    a mirrored body has the same nodes."""
     axis: Float
     """(3,) unit vector of w."""
     posterior: Float
@@ -69,6 +70,11 @@ class WedgeGrid:
         base = self.spacing * (a[..., None] * self.across[0] + b[..., None] * self.across[1])
         return np.asarray(self.origin + base[:, :, None, :] + along[..., None] * self.axis)
 
+    @property
+    def frame(self) -> Float:
+        """(3, 3) unit vectors of a, b and w."""
+        return np.vstack([self.across, self.axis])
+
     def _heights(self, a: Float, b: Float) -> tuple[Float, Float]:
         """Heights of both end planes at nodes across the axis, mm."""
         low, high = (
@@ -91,9 +97,9 @@ class Field:
     """(A, B, W) nodes in slits of the labels that were filled, if any."""
 
 
-def resample_body(body: Body, settings: GridSettings, slices: SliceSettings) -> Field:
+def resample_body(body: Body, hemi: str, settings: GridSettings, slices: SliceSettings) -> Field:
     """Sample the body's mask on a wedge grid and smooth it."""
-    grid = _fit_grid(body, settings)
+    grid = _fit_grid(body, hemi, settings)
     separated = None
     if has_thick_slices(body.affine, slices):
         points = grid.node_points(clamp=0.0).reshape(-1, 3)
@@ -176,7 +182,7 @@ def in_plane_voxel(affine: Float) -> float:
     return float(np.sqrt(edges[0] * edges[1]))
 
 
-def _fit_grid(body: Body, settings: GridSettings) -> WedgeGrid:
+def _fit_grid(body: Body, hemi: str, settings: GridSettings) -> WedgeGrid:
     """Fit the grid to the body.
 
     Its nodes across the axis form a lattice through the center of one voxel and along one edge of
@@ -187,7 +193,7 @@ def _fit_grid(body: Body, settings: GridSettings) -> WedgeGrid:
     nearest = np.rint(body.to_voxels(body.ends.posterior_point))
     anchor = body.affine[:3, :3] @ nearest + body.affine[:3, 3]
     flat = (points - anchor) - np.outer((points - anchor) @ axis, axis)
-    across = _directions_across(body, flat)
+    across = _directions_across(body, hemi, flat)
     reach = flat @ across.T
     margin = settings.margin + float(np.linalg.norm(body.affine[:3, :3], axis=0).min())
     first = np.floor((reach.min(axis=0) - margin) / settings.spacing)
@@ -222,7 +228,7 @@ def _fit_grid(body: Body, settings: GridSettings) -> WedgeGrid:
     )
 
 
-def _directions_across(body: Body, flat: Float) -> Float:
+def _directions_across(body: Body, hemi: str, flat: Float) -> Float:
     """Find two unit vectors (2, 3) across the axis, the first along the most lateral voxel edge.
 
     ``flat`` holds the body's points (N, 3) without their part along the axis, mm.
@@ -238,7 +244,8 @@ def _directions_across(body: Body, flat: Float) -> Float:
     best = int(np.argmax(np.where(usable, np.abs(along) / np.maximum(length, 0.5), -1.0)))
     side = -1.0 if along[best] < 0 else 1.0
     first = side * projected[best] / length[best]
-    return np.stack([first, np.cross(axis, first)])
+    second = np.cross(axis, first)
+    return np.stack([first, second if hemi == "L" else -second])
 
 
 def _plane_height(point: Float, normal: Float, origin: Float, steps: Float, axis: Float) -> Float:

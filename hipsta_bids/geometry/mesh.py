@@ -32,8 +32,7 @@ def extract_surface(field: Field, settings: SurfaceSettings) -> Surface:
     faces = faces.astype(np.int32)
     _check_sphere(len(nodes), faces)
     nodes = _taubin(nodes, faces, (posterior, anterior), settings)
-    # TetGen turns differences of 1e-14 mm, as between orders of the voxel axes, into other meshes.
-    vertices = field.grid.to_ras(nodes).round(6)
+    vertices = field.grid.to_ras(nodes)
     if signed_volume(vertices, faces) < 0:
         faces = faces[:, ::-1]
     return Surface(
@@ -130,12 +129,19 @@ def _outline_edges(cap_faces: Int, count: int) -> Int:
     return np.column_stack([once // count, once % count]).astype(np.int32)
 
 
-def tetrahedralize(surface: Surface, settings: TetraSettings) -> TetMesh:
+def tetrahedralize(
+    surface: Surface, settings: TetraSettings, frame: Float | None = None
+) -> TetMesh:
     """Fill a surface with tetrahedra; its vertices come first and stay in place.
 
     TetGen: Si 2015, ACM Trans Math Softw 41:11. ``nobisect`` keeps the surface as it is, so that
-    boundary sets found on the surface are valid in the volume.
+    boundary sets found on the surface are valid in the volume. TetGen makes other meshes of the
+    same surface elsewhere, or of its mirror image: it gets the surface in the body's own ``frame``
+    (3, 3), which may be left-handed.
     """
+    axes = np.eye(3) if frame is None else frame
+    turn = 1 if np.linalg.det(axes) > 0 else -1
+    origin = surface.vertices[0]
     options = {
         "plc": True,
         "quality": True,
@@ -144,14 +150,17 @@ def tetrahedralize(surface: Surface, settings: TetraSettings) -> TetMesh:
         "nobisect": True,
         "quiet": True,
     }
-    result = _CLIENT.mesh(surface.vertices, surface.triangles, options, settings.timeout)
+    # Differences of 1e-14 mm, as between orders of the voxel axes, make other meshes, too.
+    local = ((surface.vertices - origin) @ axes.T).round(6)
+    result = _CLIENT.mesh(local, surface.triangles[:, ::turn], options, settings.timeout)
     if isinstance(result, str):
         remedy = _where_to_look(surface) if "intersect" in result else "check the labels"
         raise GeometryError(f"{result}: {remedy}", reason="tetrahedralization")
     vertices, cells = result
     cells = cells.astype(np.int32)
-    if not np.array_equal(vertices[: len(surface.vertices)], surface.vertices):
+    if not np.array_equal(vertices[: len(local)], local):
         raise GeometryError("TetGen moved vertices of the surface", reason="tetrahedralization")
+    vertices = np.vstack([surface.vertices, vertices[len(local) :] @ axes + origin])
     volume = tetra_volumes(vertices, cells)
     enclosed = signed_volume(surface.vertices, surface.triangles)
     if not np.isclose(np.abs(volume).sum(), enclosed, rtol=1e-6):  # rounding of 1e5 elements

@@ -16,7 +16,11 @@ from hipsta_bids.types import Bool, Float, Int, Surface
 
 
 class _Mesh(TriaMesh):  # type: ignore[misc]  # LaPy is untyped
-    """LaPy's mesh, whose curvature spends half of its time on ``edges`` of LaPy 1.7."""
+    """LaPy's mesh, with two methods of LaPy 1.7 replaced.
+
+    Its curvature spends half of its time on ``edges``. ``curvature_tria`` averages directions whose
+    signs are arbitrary: they cancel each other or not by rounding.
+    """
 
     def edges(self, with_boundary: bool = False) -> tuple[Int, Int]:  # noqa: ARG002  (as in LaPy)
         """Inner edges (E, 2) and the triangles (E, 2) along and against which they run."""
@@ -25,6 +29,21 @@ class _Mesh(TriaMesh):  # type: ignore[misc]  # LaPy is untyped
         triangle = self.construct_adj_dir_tidx()
         beside = [inner.multiply(side).tocsr().data for side in (triangle, triangle.T)]
         return np.stack(inner.nonzero(), axis=1), np.stack(beside, axis=1).astype(np.int32) - 1
+
+    def curvature_tria(self, smoothit: int = 3) -> tuple[Float, Float, Float, Float]:
+        """Directions (T, 3) and values (T,) of least and largest curvature, as in LaPy."""
+        directions, _, least, most, *_ = self.curvature(smoothit)
+        normals = self.tria_normals()
+        first = self.v[self.t[:, 1]] - self.v[self.t[:, 0]]
+        first /= np.linalg.norm(first, axis=1)[:, None]
+        frame = first, np.cross(normals, first)
+        # Opposite directions are one: as complex numbers they have the same square.
+        a, b = (np.einsum("tik,tk->ti", directions[self.t], side) for side in frame)
+        mean = np.sqrt(((a + 1j * b) ** 2).mean(axis=1))
+        mean /= np.maximum(np.abs(mean), 1e-12)
+        along = mean.real[:, None] * frame[0] + mean.imag[:, None] * frame[1]
+        across = mean.real[:, None] * frame[1] - mean.imag[:, None] * frame[0]
+        return along, across, least[self.t].mean(axis=1), most[self.t].mean(axis=1)
 
 
 class Wall:
@@ -89,6 +108,10 @@ class Wall:
         seed = np.zeros(len(close), dtype=bool)
         seed[closest] = True
         return self.connected(close, seed)
+
+    def nearest(self, points: Float) -> NDArray[np.intp]:
+        """Vertex nearest to each of points (N, 3), RAS mm."""
+        return np.asarray(self._tree.query(points)[1])
 
     def connected(self, part: Bool, seed: Bool) -> Bool:
         """Vertices of a part of the wall that are connected within it to one of the seeds."""

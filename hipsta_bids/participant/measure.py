@@ -240,7 +240,7 @@ def measure_hemisphere(
         side = check_side(body, hemi)
     with clock("surface"):
         solid = repair_topology(
-            resample_body(body, settings.grid, settings.slices),
+            resample_body(body, hemi, settings.grid, settings.slices),
             settings.topology,
             name_subfields(body),
             find_contacts(body, settings.topology),
@@ -334,15 +334,17 @@ def _filled(
     solid: SolidField, surface: Surface, settings: Settings
 ) -> tuple[Surface, TetMesh, int]:
     """Fill the surface; smooth it more while TetGen cannot, and count how often."""
+    frame = solid.field.grid.frame
     for extra in range(settings.surface.untangle_tries):
         try:
-            return surface, tetrahedralize(surface, settings.tetra), extra
+            return surface, tetrahedralize(surface, settings.tetra, frame), extra
         except GeometryError:
             steps = settings.surface.taubin_iterations * (2 + extra)
             surface = extract_surface(
                 solid.field, settings.surface.changed(taubin_iterations=steps)
             )
-    return surface, tetrahedralize(surface, settings.tetra), settings.surface.untangle_tries
+    mesh = tetrahedralize(surface, settings.tetra, frame)
+    return surface, mesh, settings.surface.untangle_tries
 
 
 def _layers(sheet: Sheet, settings: Settings) -> tuple[Sheet, list[Flag]]:

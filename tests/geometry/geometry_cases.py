@@ -42,10 +42,10 @@ def solve_case(phantom, *, protocol="freesurfer", settings=None, **drawing):
     chosen = settings or Settings()
     volume = phantom.label_volume(load_protocol(protocol), **drawing)
     body = extract_body(volume, chosen.body)
-    field = resampled(body, chosen)
+    field = resampled(body, chosen, drawing.get("hemi", "L"))
     solid = repair_topology(field, chosen.topology)
     surface = extract_surface(solid.field, chosen.surface)
-    mesh = tetrahedralize(surface, chosen.tetra)
+    mesh = tetrahedralize(surface, chosen.tetra, field.grid.frame)
     laplace = volume_laplace(mesh)
     boundaries = find_boundaries(surface, laplace, body, chosen.boundaries)
     coordinates = solve_coordinates(laplace, boundaries)
@@ -64,10 +64,10 @@ def solve_case(phantom, *, protocol="freesurfer", settings=None, **drawing):
     )
 
 
-def resampled(body, settings=None):
+def resampled(body, settings=None, hemi="L"):
     """The body's field with the settings of this stage."""
     chosen = settings or Settings()
-    return resample_body(body, chosen.grid, chosen.slices)
+    return resample_body(body, hemi, chosen.grid, chosen.slices)
 
 
 def short_phantom(**changes):

@@ -4,16 +4,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from geometry_cases import short_phantom, solve_case
+from geometry_cases import resampled, short_phantom
 from scipy.spatial import cKDTree
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry.boundaries import find_boundaries
+from hipsta_bids.geometry.body import extract_body
+from hipsta_bids.geometry.boundaries import find_boundaries, middle_lines
 from hipsta_bids.geometry.fem import volume_laplace
 from hipsta_bids.geometry.measures import bending_angle
-from hipsta_bids.geometry.mesh import lateral_triangles
+from hipsta_bids.geometry.mesh import extract_surface, lateral_triangles, tetrahedralize
 from hipsta_bids.geometry.sheet import sample_sheet, solve_coordinates
-from hipsta_bids.settings import BoundarySettings, MeasureSettings, SheetSettings
+from hipsta_bids.geometry.topology import repair_topology
+from hipsta_bids.geometry.wall import Wall
+from hipsta_bids.protocols.load import load_protocol
+from hipsta_bids.settings import BoundarySettings, MeasureSettings, Settings, SheetSettings
 from hipsta_bids.types import Coordinates
 
 SETTINGS = BoundarySettings()
@@ -150,12 +154,37 @@ def test_labels_on_the_other_side_change_sides(arc):
     np.testing.assert_array_equal(found.exterior, arc.boundaries.interior)
 
 
-def test_a_mirrored_phantom_gives_the_mirrored_boundaries():
-    left, right = (solve_case(short_phantom(), hemi=hemi) for hemi in "LR")
+def test_the_mirror_image_has_the_same_boundaries():
+    volume = short_phantom().label_volume(load_protocol("freesurfer"))
+    image = replace(volume, affine=np.diag([-1.0, 1, 1, 1]) @ volume.affine)
+    left, right = solve_volume(volume, "L"), solve_volume(image, "R")
     for name in ("medial_curve", "lateral_curve"):
-        mirrored = getattr(right.boundaries, name) * [-1.0, 1.0, 1.0]
-        gap, _ = cKDTree(getattr(left.boundaries, name)).query(mirrored)
-        assert gap.mean() < 0.25  # grids of 0.4 mm lie differently in the two
+        mirrored = getattr(right, name) * [-1.0, 1.0, 1.0]
+        np.testing.assert_allclose(mirrored, getattr(left, name), atol=1e-6)
+    for name in ("medial", "lateral", "interior", "exterior"):
+        np.testing.assert_array_equal(getattr(right, name), getattr(left, name))
+
+
+def solve_volume(volume, hemi):
+    settings = Settings()
+    body = extract_body(volume, settings.body)
+    solid = repair_topology(resampled(body, settings, hemi), settings.topology)
+    surface = extract_surface(solid.field, settings.surface)
+    mesh = tetrahedralize(surface, settings.tetra, solid.field.grid.frame)
+    return find_boundaries(surface, volume_laplace(mesh), body, settings.boundaries)
+
+
+def test_middle_lines_come_in_the_order_of_their_zones(arc):
+    wall = Wall(arc.surface, arc.body, SETTINGS)
+    zones = [
+        wall.near(curve, 1.0)
+        for curve in (arc.boundaries.medial_curve, arc.boundaries.lateral_curve)
+    ]
+    medial, lateral = middle_lines(wall, zones)
+    assert zones[0][wall.nearest(medial)].all()
+    assert zones[1][wall.nearest(lateral)].all()
+    for swapped, line in zip(middle_lines(wall, zones[::-1]), (lateral, medial), strict=True):
+        np.testing.assert_array_equal(swapped, line)
 
 
 def test_the_eigenfunction_is_overruled_where_the_rules_disagree(arc):

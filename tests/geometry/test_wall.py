@@ -55,6 +55,22 @@ def test_orientation_decides_the_sign_of_lapys_curvature():
     assert abs(least) < 0.02 * most
 
 
+def test_directions_do_not_depend_on_arbitrary_signs():
+    """Along a cylinder curvature is largest (0) along its axis, whichever corner comes first."""
+    points, triangles = cylinder(2.0, 0.35, outward=True)
+    middle = points[triangles].mean(axis=1)[:, 2]
+    inner = (middle > 3) & (middle < 5)
+    first = _Mesh(points, triangles).curvature_tria(SETTINGS.curvature_smoothing)
+    again = _Mesh(points, np.roll(triangles, 1, axis=1)).curvature_tria(
+        SETTINGS.curvature_smoothing
+    )
+    assert (np.abs(first[1][inner, 2]) > 0.99).all()
+    np.testing.assert_allclose(np.abs((first[0] * again[0]).sum(axis=1)[inner]), 1.0, atol=1e-9)
+    lapy = TriaMesh(points, triangles).curvature_tria(SETTINGS.curvature_smoothing)
+    for ours, theirs in zip(first[2:], lapy[2:], strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-12)
+
+
 def test_caps_are_left_out(slab, wall):
     assert len(wall.triangles) == np.count_nonzero(lateral_triangles(slab.surface))
     original = slab.surface.triangles[lateral_triangles(slab.surface)]
