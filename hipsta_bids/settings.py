@@ -66,6 +66,11 @@ class BodySettings(SettingsTable):
     slit_voxel: NonNegativeFloat = 0.8
     """Gaps are filled if no edge of a voxel is longer than this, mm: between thick slices folds
     look like gaps."""
+    cavity_openness: Fraction = 0.25
+    """What is enclosed in a slice is filled if at most this share of what surrounds it is open to
+    the next slices; between thick slices, whatever lies there."""
+    cavity_radius: NonNegativeFloat = 0.9
+    """A cavity with room for a ball of this radius is too wide to be the molecular layer, mm."""
     end_fullness: Fraction = 0.9
     """Without end labels: cross-sections at an end are left out if they have less than this share
     of the area of those behind them."""

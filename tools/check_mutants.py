@@ -26,6 +26,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import CodeType
 from typing import Any
 
@@ -178,10 +179,18 @@ def start(mutant: Mutant, tests: Sequence[str]) -> int:
     os.chdir(ROOT)
     import pytest  # noqa: PLC0415  (loaded already)
 
-    with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
-        options = ["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist"]
-        code = int(pytest.main([*options, *tests])) if tests else 0
-    os._exit(code)
+    code = 1
+    try:
+        with (
+            TemporaryDirectory(dir=RECORD) as folder,  # other test runs tidy up the common one
+            redirect_stdout(io.StringIO()),
+            redirect_stderr(io.StringIO()),
+        ):
+            options = ["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist"]
+            options.append(f"--basetemp={Path(folder) / 'base'}")
+            code = int(pytest.main([*options, *tests])) if tests else 0
+    finally:
+        os._exit(code)
 
 
 def survivors(

@@ -20,6 +20,7 @@ from hipsta_bids.geometry.digital import (
     ALL,
     FACES,
     Box,
+    box,
     box_around,
     low_corner,
     piece_sizes,
@@ -37,6 +38,8 @@ Tissues = NDArray[np.uint8]
 
 _TIES = 8
 """Nearest voxels that may be equally near: the corners of a cube."""
+_NEAR = 8
+"""Voxels beyond others within which their nearest donors lie."""
 _DIRECTIONS = [step for step in product((-1, 0, 1), repeat=3) if step > (0, 0, 0)]
 """One of each two opposite directions to the 26 neighbors."""
 
@@ -56,6 +59,20 @@ class MaskChange:
     def share(self) -> float:
         """Changed voxels over those of the body as labeled."""
         return (self.added + self.removed) / max(self.before, 1)
+
+
+class Cavities(NamedTuple):
+    """Voxels (N, 3) without a label that the hippocampus encloses, between the end planes."""
+
+    narrow: tuple[Index, ...] = ()
+    """Cavities that may be a part of the molecular layer."""
+    wide: tuple[Index, ...] = ()
+    """Cavities that are too wide for that."""
+
+    @property
+    def all(self) -> Index:
+        """All voxels of all cavities."""
+        return np.concatenate([np.zeros((0, 3), np.intp), *self.narrow, *self.wide])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -80,6 +97,10 @@ class Body:
     """(I, J, K) sheet voxels between the end planes."""
     filled: Index = field(default_factory=lambda: np.zeros((0, 3), np.intp))
     """(N, 3) indices of voxels in slits through the sheet that were filled."""
+    cavities: Cavities = field(default_factory=Cavities)
+    """Cavities between the end planes that were filled."""
+    handed_over: int = 0
+    """Head or tail voxels without a subfield that got that of a neighbor between the planes."""
     gap: Index = field(default_factory=lambda: np.zeros((0, 3), np.intp))
     """(N, 3) indices of the largest thin gap in the labels that was not filled."""
     mask_change: MaskChange | None = None
@@ -129,8 +150,12 @@ def extract_body(volume: LabelVolume, settings: BodySettings) -> Body:
             reason="no-sheet-labels",
         )
     ends = find_end_planes(volume, tissue, settings)
-    change = None
-    if volume.edited_mask is not None:
+    change, handed_over, cavities = None, 0, Cavities()
+    if volume.edited_mask is None:
+        volume, tissue, handed_over = _hand_over(volume, tissue, ends)
+        cavities = find_cavities(volume, tissue, ends, settings)
+        volume, tissue = _fill_cavities(volume, tissue, cavities, settings)
+    else:
         volume, tissue, change = _apply_mask(volume, tissue, volume.edited_mask, ends)
         # What the mask removed may have changed the long axis.
         ends = find_end_planes(volume, tissue, settings)
@@ -160,6 +185,8 @@ def extract_body(volume: LabelVolume, settings: BodySettings) -> Body:
         layer_voxels=layer_voxels,
         inside=inside,
         filled=slits.filled,
+        cavities=cavities,
+        handed_over=handed_over,
         gap=slits.gap,
         mask_change=change,
     )
@@ -228,12 +255,114 @@ def _merge_layer(volume: LabelVolume, rule: str) -> tuple[Tissues, int]:
     border = (candidates > 0) & ~ndimage.binary_erosion(candidates > 0, structure=FACES)
     tree = cKDTree(voxel_points(border, volume.affine))
     # Of labels that are equally near the most medial, whichever way the voxels are stored.
-    distance, index = tree.query(voxel_points(layer, volume.affine), k=_TIES)
+    found = tree.query(voxel_points(layer, volume.affine), k=_TIES)
+    distance, index = (np.asarray(part) for part in found)
     tied = distance < distance[:, :1] + 1e-6
     ranked = np.append(candidates[border], np.uint8(255))[index]  # fewer neighbors than asked
     nearest = np.where(tied, ranked, np.uint8(255)).min(axis=1)
     tissue[layer] = np.where(nearest == Tissue.OTHER, 0, nearest)
     return tissue, int(np.count_nonzero(tissue[layer]))
+
+
+def _like_nearest(
+    volume: LabelVolume, tissue: Tissues, where: Index, donors: Bool
+) -> tuple[LabelVolume, Tissues]:
+    """Give voxels (N, 3) the label and the part of the sheet that the nearest donor has."""
+    around = box(np.maximum(where.min(axis=0) - _NEAR, 0), where.max(axis=0) + _NEAR + 1)
+    index = np.argwhere(donors[around]) + low_corner(around)
+    tree = cKDTree(to_ras(index, volume.affine))
+    source = tuple(index[tree.query(to_ras(where, volume.affine))[1]].T)
+    at = tuple(where.T)
+    labels, sheet = volume.tissue.copy(), tissue.copy()
+    labels[at], sheet[at] = volume.tissue[source], tissue[source]
+    return replace(volume, tissue=labels), sheet
+
+
+def _subfields(volume: LabelVolume) -> Bool:
+    """Voxels of the sheet, of its layer, and of what lies on its interior side."""
+    protocol = volume.protocol
+    return np.isin(volume.tissue, (*protocol.sheet, *protocol.layer, *protocol.interior))
+
+
+def _hand_over(
+    volume: LabelVolume, tissue: Tissues, ends: EndPlanes
+) -> tuple[LabelVolume, Tissues, int]:
+    """Give head and tail voxels without a subfield, between the planes, that of a neighbor.
+
+    No plane separates labels perfectly; left out, these voxels would be holes in the sheet.
+    """
+    index = np.argwhere(volume.tissue == Tissue.HIPPOCAMPUS)
+    where = index[ends.depth(to_ras(index, volume.affine)) > 0]
+    if not len(where):
+        return volume, tissue, 0
+    volume, tissue = _like_nearest(volume, tissue, where, _subfields(volume))
+    return volume, tissue, len(where)
+
+
+def find_cavities(
+    volume: LabelVolume, tissue: Tissues, ends: EndPlanes, settings: BodySettings
+) -> Cavities:
+    """Find what is unlabeled but enclosed by the sheet, its layer and its interior.
+
+    Vessels, cysts and strata that were left out make the inner wall jump across them. A cavity is
+    enclosed in three dimensions, or in a slice if little of it is open to the next slices.
+    """
+    solid = _subfields(volume) | np.isin(volume.tissue, (Tissue.HIPPOCAMPUS, Tissue.FISSURE))
+    around = box_around(np.argwhere(_between(solid, volume.affine, ends)[0]))
+    solid, sheet = solid[around], tissue[around] > 0
+    edges = np.linalg.norm(volume.affine[:3, :3], axis=0)
+    through = int(np.argmax(np.abs(ends.axis @ volume.affine[:3, :3]) / edges))
+    in_slice = FACES & (np.arange(3) == 1).reshape([3 if n == through else 1 for n in range(3)])
+    # What cannot leave in three dimensions cannot in its slices.
+    enclosed = _cannot_leave(solid, in_slice, through)
+    enclosed &= np.isin(volume.tissue[around], (Tissue.BACKGROUND, Tissue.CYST))
+    pieces, _ = ndimage.label(enclosed, structure=ALL)
+    most_open = 1.0 if edges[through] > settings.slit_voxel else settings.cavity_openness
+    narrow, wide = list[Index](), list[Index]()
+    for number, part in enumerate(ndimage.find_objects(pieces), 1):
+        room = box_around(np.argwhere(pieces[part] == number) + low_corner(part))
+        piece = pieces[room] == number
+        ring = ndimage.binary_dilation(piece, structure=ALL) & ~piece
+        is_open = (ring & ~solid[room] & ~enclosed[room]).sum() > most_open * ring.sum()
+        beside = ring & solid[room]
+        index = np.argwhere(piece) + low_corner(around) + low_corner(room)
+        index = index[ends.depth(to_ras(index, volume.affine)) > 0]
+        if not len(index) or is_open or not (beside & sheet[room]).any():
+            continue
+        if (beside & ~sheet[room]).any() or volume.protocol.layer:
+            radius = ndimage.distance_transform_edt(np.pad(piece, 1), sampling=edges).max()
+            is_wide = float(radius) > settings.cavity_radius
+            (wide if is_wide else narrow).append(index)
+    return Cavities(tuple(narrow), tuple(wide))
+
+
+def _cannot_leave(solid: Bool, structure: Bool, through: int) -> Bool:
+    """Free voxels (I, J, K) that no path of neighbors connects to the border across one axis."""
+    pieces, _ = ndimage.label(~solid, structure=structure)
+    borders = [np.moveaxis(pieces, n, 0)[[0, -1]] for n in range(3) if n != through]
+    outside = np.unique(np.concatenate([border.ravel() for border in borders]))
+    return np.asarray(~np.isin(pieces, outside) & ~solid)
+
+
+def _fill_cavities(
+    volume: LabelVolume, tissue: Tissues, cavities: Cavities, settings: BodySettings
+) -> tuple[LabelVolume, Tissues]:
+    """Make narrow cavities a part of the layer, if there is one, and divide others.
+
+    What lies between the sheet and its interior is the layer in the first place. What is too wide
+    for that, or has no layer beside it, goes to the nearest label on either side.
+    """
+    protocol, donors = volume.protocol, _subfields(volume)
+    as_layer = (
+        settings.layer_rule == "nearest-sheet" and np.isin(volume.tissue, protocol.layer).any()
+    )
+    for group, chosen in (
+        (cavities.wide, donors),
+        (cavities.narrow, donors & (tissue > 0) if as_layer else donors),
+    ):
+        if group:
+            volume, tissue = _like_nearest(volume, tissue, np.concatenate(group), chosen)
+    return volume, tissue
 
 
 def _between(mask: Bool, affine: Float, ends: EndPlanes) -> tuple[Bool, Float]:

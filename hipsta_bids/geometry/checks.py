@@ -213,6 +213,22 @@ def _check_beyond(volume: LabelVolume, body: Body, settings: CheckSettings) -> l
     return flags
 
 
+def check_cavities(body: Body) -> list[Flag]:
+    """Flag cavities that were too wide to say whose they are."""
+    edges = np.linalg.norm(body.affine[:3, :3], axis=0)
+    flags = []
+    for cavity in body.cavities.wide:
+        points = to_ras(cavity, body.affine)
+        across = float(np.min(np.ptp(to_ras(cavity, np.diag([*edges, 1.0])), axis=0) + edges))
+        message = (
+            f"a cavity of {len(cavity) * float(edges.prod()):.1f} mm3 without a label, near "
+            f"{name_place(points, body)}, was divided between the sheet and its interior: thickness "
+            f"there may be off by up to {across / 2:.1f} mm; label what it is"
+        )
+        flags.append(Flag(reason="wide-cavity", message=message))
+    return flags
+
+
 def check_labels(body: Body, settings: CheckSettings) -> list[Flag]:
     """Flag noise and thin gaps in the labels, which smoothing hides from the later steps."""
     around = box_around(body.inside_points()[0])
@@ -272,12 +288,14 @@ def check_cross_sections(
     Each cross-section is compared with those at a distance on both sides. What both lack, or where
     both have interior labels, is compared with the same body's other cross-sections: a bent ribbon
     moves sideways everywhere, a leak is in one position. ``cuts`` are nodes of bridges that were
-    cut, whose stumps do not count.
+    cut, whose stumps do not count, nor do cavities that were filled.
     """
     solid, interior = field.values > 0, _interior_nodes(field, body)
     counted = np.ones_like(solid)
     if cuts is not None and cuts.any():
         counted = ndimage.distance_transform_edt(~cuts) > settings.stub_nodes
+    if field.cavities is not None:
+        counted &= ~ndimage.binary_dilation(field.cavities, structure=ALL, iterations=2)
     length = body.ends.length(body.inside_points()[1])
     step = length / (field.grid.shape[2] - 1)
     area = float(np.median(solid.sum(axis=(0, 1))))

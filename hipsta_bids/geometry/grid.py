@@ -9,7 +9,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry.body import Body
+from hipsta_bids.geometry.body import Body, Index
 from hipsta_bids.geometry.slices import has_thick_slices, points_of_ends, sample_slices
 from hipsta_bids.settings import GridSettings, SliceSettings
 from hipsta_bids.types import Bool, Float
@@ -95,6 +95,8 @@ class Field:
     """(A, B, W) nodes of the body that were taken out between turns that touch, if any."""
     slits: Bool | None = None
     """(A, B, W) nodes in slits of the labels that were filled, if any."""
+    cavities: Bool | None = None
+    """(A, B, W) nodes in cavities of the labels that became a part of the sheet, if any."""
 
 
 def resample_body(body: Body, hemi: str, settings: GridSettings, slices: SliceSettings) -> Field:
@@ -110,21 +112,27 @@ def resample_body(body: Body, hemi: str, settings: GridSettings, slices: SliceSe
         between = _between_turns(body, points, slices)
         separated = (between & (values > 0.5)).reshape(grid.shape)  # noqa: PLR2004 -- in the mask
         values[between] = 0
+    cavities = body.cavities.all
+    cavities = cavities[body.tissue[tuple(cavities.T)] > 0]
     sigma = max(settings.smoothing * in_plane_voxel(body.affine), settings.min_smoothing)
     smooth = _smooth(values.reshape(grid.shape), sigma / settings.spacing)
     return Field(
         grid=grid,
         values=smooth - np.float32(0.5),
         separated=separated,
-        slits=_filled_nodes(body, points).reshape(grid.shape) if len(body.filled) else None,
+        slits=_nodes_in(body.filled, body, points, grid.shape),
+        cavities=_nodes_in(cavities, body, points, grid.shape),
     )
 
 
-def _filled_nodes(body: Body, points: Float) -> Bool:
-    """Which of (N, 3) points, RAS mm, lie in voxels that were filled."""
-    filled = np.zeros(body.inside.shape, dtype=np.uint8)
-    filled[tuple(body.filled.T)] = 1
-    return np.asarray(ndimage.map_coordinates(filled, body.to_voxels(points).T, order=0) > 0)
+def _nodes_in(voxels: Index, body: Body, points: Float, shape: tuple[int, int, int]) -> Bool | None:
+    """Which nodes, at points (N, 3), lie in some voxels (M, 3) of the body; None without any."""
+    if not len(voxels):
+        return None
+    chosen = np.zeros(body.inside.shape, dtype=np.uint8)
+    chosen[tuple(voxels.T)] = 1
+    hit = ndimage.map_coordinates(chosen, body.to_voxels(points).T, order=0) > 0
+    return np.asarray(hit.reshape(shape))
 
 
 def _sample_mask(body: Body, points: Float) -> NDArray[np.float32]:

@@ -5,7 +5,7 @@ rest on repaired voxels.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -144,10 +144,15 @@ def repair_topology(
     changed = after != before
     if field.slits is not None:
         changed |= field.slits
-    touched = changed if field.separated is None else changed | field.separated
+    touched = changed.copy()
+    for nodes in (field.separated, field.cavities):
+        if nodes is not None:
+            touched |= nodes
     repairs = tuple(_describe(edit, field, size, settings, locate) for edit in edits)
     return SolidField(
-        field=Field(grid=field.grid, values=_consistent_values(lifted[INNER], after)),
+        field=replace(
+            field, values=_consistent_values(lifted[INNER], after), separated=None, slits=None
+        ),
         repairs=repairs,
         touched=touched,
         euler_before=euler_before,
@@ -161,9 +166,14 @@ def _before_smoothing(field: Field) -> list[Edit]:
     edits = []
     if field.separated is not None and field.separated.any():
         edits.append(Edit("part", np.argwhere(field.separated) + FIRST))
-    if field.slits is not None:
-        pieces, count = ndimage.label(field.slits, structure=ALL)
-        edits += [Edit("slit", np.argwhere(pieces == n + 1) + FIRST) for n in range(count)]
+    kinds: tuple[tuple[Kind, Bool | None], ...] = (
+        ("slit", field.slits),
+        ("cavity", field.cavities),
+    )
+    for kind, nodes in kinds:
+        if nodes is not None:
+            pieces, count = ndimage.label(nodes, structure=ALL)
+            edits += [Edit(kind, np.argwhere(pieces == n + 1) + FIRST) for n in range(count)]
     return edits
 
 

@@ -22,6 +22,7 @@ from hipsta_bids.geometry.catalog import (
     summarize,
 )
 from hipsta_bids.geometry.checks import (
+    check_cavities,
     check_cross_sections,
     check_end_labels,
     check_image,
@@ -151,6 +152,7 @@ def find_flags(evidence: Evidence) -> list[Flag]:
     return [
         *found,
         *check_image(body, checks),
+        *check_cavities(body),
         *check_labels(body, checks),
         *check_cross_sections(solid.field, body, checks, solid.touched & (solid.field.values < 0)),
         *check_rows(sheet, checks),
@@ -171,6 +173,8 @@ def quality_metrics(evidence: Evidence, repaired: Bool) -> dict[str, Any]:
         "voxel_size_mm": np.linalg.norm(body.affine[:3, :3], axis=0).round(4).tolist(),
         "body_voxels": int(np.count_nonzero(body.inside)),
         "layer_voxels": body.layer_voxels,
+        "cavities_mm3": len(body.cavities.all) * abs(float(np.linalg.det(body.affine[:3, :3]))),
+        "end_voxels_inside": body.handed_over,
         "body_length_mm": ends.length(body.inside_points()[1]),
         "medial_offset_mm": evidence.side,
         "posterior_end_rule": ends.posterior_rule,

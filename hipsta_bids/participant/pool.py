@@ -16,6 +16,7 @@ import multiprocessing
 import os
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -23,7 +24,10 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from types import FrameType
 
 #: Read by the numerical libraries when they load, so they have to be set before. One thread per
 #: process: hemispheres are the unit of parallel work, not matrices.
@@ -270,6 +274,10 @@ def _inherited(plan: WorkerPlan) -> Iterator[None]:
     """
     wanted = dict.fromkeys(THREAD_VARIABLES, "1") | dict(plan.environment)
     before = {name: os.environ.get(name) for name in wanted}
+    caught: list[tuple[int, FrameType | None]] = []
+    in_main = threading.current_thread() is threading.main_thread()
+    # An exception would get lost within a fork; the mask is what the new process inherits.
+    handler = signal.signal(signal.SIGINT, lambda *event: caught.append(event)) if in_main else None
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     os.environ.update(wanted)
     try:
@@ -281,6 +289,10 @@ def _inherited(plan: WorkerPlan) -> Iterator[None]:
             else:
                 os.environ[name] = value
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        if handler is not None:  # none where it was not Python that set it
+            signal.signal(signal.SIGINT, handler)
+        if caught and callable(handler):
+            handler(*caught[0])
 
 
 def _stop(slots: list[_Slot]) -> None:

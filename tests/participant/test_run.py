@@ -358,6 +358,7 @@ def test_workers_have_one_thread_and_the_scratch_folder(tmp_path, monkeypatch):
 
 
 KILLED_RUN = """
+import signal
 import sys
 from pathlib import Path
 sys.path.insert(0, {tests!r})
@@ -366,6 +367,8 @@ if __name__ == "__main__":
     from hipsta_bids.cli import main as cli
     from hipsta_bids.participant import run as runner
     from hipsta_bids.settings import Settings
+    # Ignored where the tests run in the background of a shell.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     runner.run_job, runner.warm_up = stand_in_job, None
     where = Path({where!r})
     items = [make_input(where / "in", f"{{k:02d}}", act="slow") for k in range(9)]
