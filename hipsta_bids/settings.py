@@ -47,7 +47,8 @@ class BodySettings(SettingsTable):
     min_end_voxels: NonNegativeInt = 50
     """Fewer head or tail voxels than this count as no label."""
     plane_reach: PositiveFloat = 3.0
-    """End planes are fitted to labels within this distance of the interface, mm."""
+    """End planes are fitted to labels within this distance of the interface, mm; head and tail
+    labels that lie up to it on the wrong side get the subfield of a neighbor."""
     end_margin: NonNegativeFloat = 0.0
     """Taken off either end where head or tail labels are missing, mm."""
     head_piece: NonNegativeFloat = 1.5
@@ -387,6 +388,9 @@ class CheckSettings(SettingsTable):
     flag_groove: Numbers = (0.55, 0.75, 0.75)
     """Flag a band that is thinner than both by more than this, one per distance, mm (0.38, 0.59 and
     0.53 at most)."""
+    flag_cavity: NonNegativeFloat = 0.03
+    """Flag a wide cavity that was divided beyond this share of the body: half of it is what the
+    mean thickness may be off by."""
     flag_pinholes: NonNegativeFloat = 0.01
     """Flag labels in which single voxels without a label are more than this share of the sheet's
     voxels (0.0015 at most in twelve real bodies)."""

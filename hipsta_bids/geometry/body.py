@@ -100,7 +100,7 @@ class Body:
     cavities: Cavities = field(default_factory=Cavities)
     """Cavities between the end planes that were filled."""
     handed_over: int = 0
-    """Head or tail voxels without a subfield that got that of a neighbor between the planes."""
+    """Head or tail voxels between the planes that got the subfield of a neighbor."""
     gap: Index = field(default_factory=lambda: np.zeros((0, 3), np.intp))
     """(N, 3) indices of the largest thin gap in the labels that was not filled."""
     mask_change: MaskChange | None = None
@@ -152,7 +152,7 @@ def extract_body(volume: LabelVolume, settings: BodySettings) -> Body:
     ends = find_end_planes(volume, tissue, settings)
     change, handed_over, cavities = None, 0, Cavities()
     if volume.edited_mask is None:
-        volume, tissue, handed_over = _hand_over(volume, tissue, ends)
+        volume, tissue, handed_over = _hand_over(volume, tissue, ends, settings.plane_reach)
         cavities = find_cavities(volume, tissue, ends, settings)
         volume, tissue = _fill_cavities(volume, tissue, cavities, settings)
     else:
@@ -285,14 +285,15 @@ def _subfields(volume: LabelVolume) -> Bool:
 
 
 def _hand_over(
-    volume: LabelVolume, tissue: Tissues, ends: EndPlanes
+    volume: LabelVolume, tissue: Tissues, ends: EndPlanes, reach: float
 ) -> tuple[LabelVolume, Tissues, int]:
-    """Give head and tail voxels without a subfield, between the planes, that of a neighbor.
+    """Give head and tail voxels up to a distance inside the planes the label of a neighbor.
 
     No plane separates labels perfectly; left out, these voxels would be holes in the sheet.
     """
     index = np.argwhere(volume.tissue == Tissue.HIPPOCAMPUS)
-    where = index[ends.depth(to_ras(index, volume.affine)) > 0]
+    depth = ends.depth(to_ras(index, volume.affine))
+    where = index[(depth > 0) & (depth < reach)]
     if not len(where):
         return volume, tissue, 0
     volume, tissue = _like_nearest(volume, tissue, where, _subfields(volume))
@@ -310,6 +311,7 @@ def find_cavities(
     solid = _subfields(volume) | np.isin(volume.tissue, (Tissue.HIPPOCAMPUS, Tissue.FISSURE))
     around = box_around(np.argwhere(_between(solid, volume.affine, ends)[0]))
     solid, sheet = solid[around], tissue[around] > 0
+    inner = np.isin(volume.tissue[around], volume.protocol.interior)
     edges = np.linalg.norm(volume.affine[:3, :3], axis=0)
     through = int(np.argmax(np.abs(ends.axis @ volume.affine[:3, :3]) / edges))
     in_slice = FACES & (np.arange(3) == 1).reshape([3 if n == through else 1 for n in range(3)])
@@ -329,7 +331,7 @@ def find_cavities(
         index = index[ends.depth(to_ras(index, volume.affine)) > 0]
         if not len(index) or is_open or not (beside & sheet[room]).any():
             continue
-        if (beside & ~sheet[room]).any() or volume.protocol.layer:
+        if (beside & inner[room]).any():
             radius = ndimage.distance_transform_edt(np.pad(piece, 1), sampling=edges).max()
             is_wide = float(radius) > settings.cavity_radius
             (wide if is_wide else narrow).append(index)

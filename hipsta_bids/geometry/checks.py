@@ -213,19 +213,19 @@ def _check_beyond(volume: LabelVolume, body: Body, settings: CheckSettings) -> l
     return flags
 
 
-def check_cavities(body: Body) -> list[Flag]:
-    """Flag cavities that were too wide to say whose they are."""
-    edges = np.linalg.norm(body.affine[:3, :3], axis=0)
+def check_cavities(body: Body, settings: CheckSettings) -> list[Flag]:
+    """Flag large cavities that were too wide to say whose they are."""
+    volume = abs(float(np.linalg.det(body.affine[:3, :3])))
     flags = []
     for cavity in body.cavities.wide:
-        points = to_ras(cavity, body.affine)
-        across = float(np.min(np.ptp(to_ras(cavity, np.diag([*edges, 1.0])), axis=0) + edges))
-        message = (
-            f"a cavity of {len(cavity) * float(edges.prod()):.1f} mm3 without a label, near "
-            f"{name_place(points, body)}, was divided between the sheet and its interior: thickness "
-            f"there may be off by up to {across / 2:.1f} mm; label what it is"
-        )
-        flags.append(Flag(reason="wide-cavity", message=message))
+        share = len(cavity) / max(len(body.inside_points()[0]), 1)
+        if share > settings.flag_cavity:
+            message = (
+                f"a cavity of {len(cavity) * volume:.0f} mm3 without a label, near "
+                f"{name_place(to_ras(cavity, body.affine), body)}, was divided between the sheet "
+                f"and its interior: mean thickness may be off by {share / 2:.0%}; label what it is"
+            )
+            flags.append(Flag(reason="wide-cavity", message=message))
     return flags
 
 

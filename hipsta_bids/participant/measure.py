@@ -152,7 +152,7 @@ def find_flags(evidence: Evidence) -> list[Flag]:
     return [
         *found,
         *check_image(body, checks),
-        *check_cavities(body),
+        *check_cavities(body, checks),
         *check_labels(body, checks),
         *check_cross_sections(solid.field, body, checks, solid.touched & (solid.field.values < 0)),
         *check_rows(sheet, checks),

@@ -219,7 +219,8 @@ def test_a_hole_is_filled_and_reported(plain, damage):
     assert where.sum() > 10
     maps = measure(damage.erase(where))
     assert maps.status == Status.REPAIRED
-    (repair,) = maps.repairs
+    # Beside the dentate gyrus it is a cavity, where the sheet goes round it.
+    (repair,) = [text for text in maps.repairs if not text.startswith("filled a cavity")]
     assert repair.startswith("filled a hole")
     place = np.array(repair.split("RAS ")[1].split()[:3], dtype=float)
     true = plain.phantom.body.place(0.5, 0.5, 0.0)
