@@ -2,8 +2,8 @@
 
 File names consist of the analysis (which scans, and the version: ``-T1.v22``, ``-T1-T2.v21``), the
 hierarchy (``.CA``, ``.FS60``, ``.HBT``; nothing for the full one) and ``.FSvoxelSpace`` for a copy
-resampled to 1 mm. ``segment_subregions`` (FreeSurfer 7.3 and later) has ``--suffix`` in place of the
-analysis, ``.long`` in longitudinal folders, and otherwise nothing. It also runs in FastSurfer's
+resampled to 1 mm. ``segment_subregions`` (FreeSurfer 7.3 and later) has ``--suffix`` in place of
+the analysis, ``.long`` in longitudinal folders, and otherwise nothing. It also runs in FastSurfer's
 folders, which have the same layout.
 """
 

@@ -2,8 +2,8 @@
 
 The flow: which datasets to search, and which subjects and sessions they hold (``scan``), which
 files are segmentations (one module per layout: ``freesurfer``, ``ashs``, ``hippunfold``,
-``tools``, ``generic``), and which of several to take. No image is opened, except where ASHS's atlas can only
-be told from the labels.
+``tools``, ``generic``), and which of several to take. No image is opened, except where ASHS's atlas
+can only be told from the labels.
 """
 
 from collections.abc import Iterable, Iterator

@@ -86,7 +86,7 @@ def find_tools(
         for hemi in selection.wanted_hemis():
             files = [file for file in found if file.hemi in (hemi, None)]
             if files:
-                yield _choose(files, tool, hemi, visit, source, selection)
+                yield _choose(files, tool, hemi, visit, source=source, selection=selection)
 
 
 def _files(folder: Folder, tool: _Tool, source: Source, selection: Selection) -> Iterator[_File]:
@@ -109,6 +109,7 @@ def _choose(
     tool: _Tool,
     hemi: str,
     visit: VisitFolders,
+    *,
     source: Source,
     selection: Selection,
 ) -> HemisphereInput:
@@ -154,7 +155,5 @@ def _protocol(
     if len(known) == 1:
         return known[0], f"protocol {known[0].name}", None
     names = " or ".join(f"--scheme {each.name} ({each.title})" for each in known)
-    problem = ProtocolError(
-        f"{path}: {tool.choice}; say which: {names}", reason="ambiguous-scheme"
-    )
+    problem = ProtocolError(f"{path}: {tool.choice}; say which: {names}", reason="ambiguous-scheme")
     return unknown_protocol(tool.name, f"{tool.title}, mode not given"), "mode not given", problem

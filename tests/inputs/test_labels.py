@@ -194,7 +194,7 @@ def test_labels_that_lack_what_a_tool_always_writes_are_refused(tmp_path):
     volume = read_label_volume(make_item(path, protocol="hsfCA23"))
     assert (volume.tissue == Tissue.CA2_3).sum() == (volume.tissue == Tissue.SUBICULUM).sum() == 60
     data[20, 22, 15] = 5  # all fields apart
-    with pytest.raises(ProtocolError, match="labels 5 are not in the protocol hsfCA23.* and hsf$"):
+    with pytest.raises(ProtocolError, match=r"labels 5 are not in the protocol hsfCA23.* and hsf$"):
         read_label_volume(make_item(save(tmp_path / "b.nii", data), protocol="hsfCA23"))
 
 

@@ -217,9 +217,7 @@ def test_nothing_else_was_found(out):
     assert len(list(out.rglob("*desc-summary_morph.tsv"))) == len(EXPECTED)
 
 
-@pytest.mark.parametrize(
-    ("subject", "protocol"), [("both", "ashsABC3T"), ("maget", "cobralab")]
-)
+@pytest.mark.parametrize(("subject", "protocol"), [("both", "ashsABC3T"), ("maget", "cobralab")])
 def test_both_hemispheres_of_one_file_mirror_each_other(out, subject, protocol):
     left, right = (results(out, subject, hemi, protocol).sheet for hemi in "LR")
     # Mirrored voxels are cut into other triangles, mm.
@@ -233,14 +231,14 @@ def test_hsf_in_the_mode_that_is_named(tmp_path, mode):
     data = tmp_path / "hsf"
     put(data / "sub-h" / "anat" / "sub-h_T2w_right_hippocampus_seg.nii.gz", mode, "R")
     arguments = [str(tmp_path / "bids"), str(tmp_path / "out"), "participant", "-d", f"hsf={data}"]
-    assert main.main(arguments) == ExitCode.SOME_FAILED
+    assert main.main(arguments) == ExitCode.BAD_DATA
     refused = results(tmp_path / "out", "h", "R", "hsf").row
     assert (refused["status"], refused["reason"]) == ("failed", "ambiguous-scheme")
     assert main.main([*arguments, "--protocol", mode]) == ExitCode.OK
     found = results(tmp_path / "out", "h", "R", mode)
     assert float(found.summary["thickness_mean"]) == pytest.approx(1.8, abs=0.05)  # as above
     other = {"hsf": "hsfCA23", "hsfCA23": "hsf"}[mode]
-    assert main.main([*arguments, "--protocol", other]) == ExitCode.SOME_FAILED
+    assert main.main([*arguments, "--protocol", other]) == ExitCode.BAD_DATA
     wrong = results(tmp_path / "out", "h", "R", other).row
     assert wrong["reason"] in {"unknown-labels", "wrong-scheme"}
     assert f"the labels fit {mode}" in wrong["message"].replace("hippunfold and ", "")
