@@ -44,6 +44,13 @@ def test_the_named_mode_is_taken_and_nothing_is_opened(tmp_path, name):
     assert right.why == f"HSF, protocol {name} from --scheme"
 
 
+def test_hsf_writes_beside_the_images(tmp_path):
+    describe(tmp_path, kind="raw")
+    touch(tmp_path / "sub-01" / "ses-a" / "anat", *both(HSF), "sub-01_T2w.nii.gz")
+    found = find(tmp_path, derivatives={"hsf": tmp_path}, protocol="hsf")
+    assert [(item.session, item.hemi) for item in found] == [("a", "L"), ("a", "R")]
+
+
 def test_other_files_of_hsf_are_not_segmentations(tmp_path):
     crops = ["hsf_outputs/sub-01_T2w_left_hippocampus_seg_crop.nii.gz"]
     put(tmp_path, *crops, "sub-01_T2w_left_hippocampus.nii.gz", HSF.format("left"))
