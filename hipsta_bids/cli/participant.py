@@ -119,7 +119,12 @@ def add_segmentations(parser: Parser) -> None:
         "FreeSurfer analysis to use where there are several, such as T1 or T1-T2",
     )
     add("--ashs-atlas", "SCHEME", "atlas of the ASHS runs, a name from `hipsta-bids schemes`")
-    add("--scheme --protocol", "FILE.toml", "a protocol of your own for the BIDS dseg files")
+    add(
+        "--scheme --protocol",
+        "FILE.toml",
+        "a protocol of your own for the BIDS dseg files; or the name of one from `hipsta-bids"
+        " schemes` where labels do not tell (hsf, hsfCA23, cobralab)",
+    )
     add(
         "--edited-dir",
         "DIR",

@@ -21,11 +21,12 @@ from hipsta_bids.inputs.scan import (
     Source,
     VisitFolders,
     list_visits,
+    measurable,
     subject_folders,
     unknown_protocol,
 )
 from hipsta_bids.protocols.load import agrees, load_protocol, protocol_names
-from hipsta_bids.protocols.protocol import Protocol
+from hipsta_bids.protocols.protocol import Protocol, Tissue
 
 _TOOL = "ashs"
 
@@ -35,6 +36,9 @@ _SIDES = {"left": "L", "right": "R"}
 #: ASHS's last step comes first.
 _KINDS = ("corr_usegray", "corr_nogray", "heur")
 
+#: Tissues that an atlas without subfields labels in everyone.
+_ALWAYS = {Tissue.HIPPOCAMPUS, Tissue.ENTORHINAL, Tissue.BA35, Tissue.BA36, Tissue.PARAHIPPOCAMPAL}
+
 #: Subjects whose files are opened to find out a dataset's atlas, spread over the dataset.
 _SAMPLE = 8
 
@@ -42,10 +46,12 @@ _Image = tuple[Path, str, bool]
 """File, hemisphere, and whether the file carries both."""
 
 
-def _protocols() -> tuple[Protocol, ...]:
-    """List the bundled protocols of ASHS's atlases."""
+def _protocols(*, refused: bool = False) -> tuple[Protocol, ...]:
+    """List the bundled protocols of ASHS's atlases: those with subfields, or those without."""
     return tuple(
-        protocol for name in protocol_names() if (protocol := load_protocol(name)).tool == _TOOL
+        protocol
+        for name in protocol_names()
+        if (protocol := load_protocol(name)).tool == _TOOL and bool(protocol.refused) == refused
     )
 
 
@@ -54,9 +60,9 @@ def choose_atlas(request: InputRequest) -> Protocol | None:
     if request.ashs_atlas is None:
         return None
     key = _plain(request.ashs_atlas)
-    for protocol in _protocols():
+    for protocol in (*_protocols(), *_protocols(refused=True)):
         if key in {_plain(protocol.name), _plain(protocol.name).removeprefix(_TOOL)}:
-            return protocol
+            return measurable(protocol)
     return load_protocol(request.ashs_atlas)
 
 
@@ -64,8 +70,9 @@ class AtlasFinder:
     """Identifies the atlas of each segmentation of one dataset.
 
     In this order: the option; a label table beside or above the file; the values, if only one
-    atlas has such values; and, as one dataset is made with one atlas, the values of a sample of the
-    dataset's files, if all of them that fit one atlas only fit the same one.
+    atlas has such values; as one dataset is made with one atlas, the values of a sample of the
+    dataset's files, if all of them that fit one atlas only fit the same one; and the first of
+    several atlases by name, if the body is the same with all of them.
     """
 
     def __init__(
@@ -86,7 +93,8 @@ class AtlasFinder:
             if table is not None:
                 return self._from_table(table), f"atlas from {table.name}", None
             return *self._from_values(image), None
-        except (ProtocolError, InputError) as problem:
+        except (ProtocolError, InputError) as found:
+            problem = self._without_subfields(image) or found
             unknown = unknown_protocol(_TOOL, "ASHS, atlas not identified")
             return unknown, "atlas not identified", problem
 
@@ -95,21 +103,25 @@ class AtlasFinder:
             rows = read_table(path)
             fitting = [protocol for protocol in _protocols() if agrees(protocol, rows)]
             self._tables[path] = (
-                fitting[0] if len(fitting) == 1 else table_protocol(path, "ashsCustom")
+                fitting[0] if _one_body(fitting) else table_protocol(path, "ashsCustom")
             )
         return self._tables[path]
 
     def _from_values(self, image: _Image) -> tuple[Protocol, str]:
-        shared = self._shared
-        if shared is not None and image not in self._values:
+        shared, count = self._shared
+        if shared and image not in self._values:
             # Not opened here; reading it later will fail if its values do not fit.
-            return shared[0], f"atlas from the labels of {_others(shared[1])}"
+            return shared[0], f"atlas from the labels of {_others(count)}{_or_another(shared)}"
         fitting = self._fitting(image)
         if len(fitting) == 1:
             return fitting[0], "only this atlas has such labels"
-        if shared is not None and shared[0] in fitting:
-            others = f"those of {_others(shared[1])} only this one"
-            return shared[0], f"its labels fit {_names(fitting)}, {others}"
+        left = [protocol for protocol in shared if protocol in fitting]
+        if left and len(left) < len(fitting):
+            only = "this one" if len(left) == 1 else _names(left)
+            others = f"those of {_others(count)} only {only}"
+            return left[0], f"its labels fit {_names(fitting)}, {others}{_or_another(left)}"
+        if _one_body(fitting):
+            return fitting[0], f"its labels fit {_names(fitting)}{_or_another(fitting)}"
         values = ", ".join(map(str, sorted(self._read(image))))
         if fitting:
             raise ProtocolError(
@@ -125,20 +137,37 @@ class AtlasFinder:
         )
 
     @cached_property
-    def _shared(self) -> tuple[Protocol, int] | None:
-        """The atlas of the dataset and how many files of a sample prove it."""
-        proofs: list[Protocol] = []
+    def _shared(self) -> tuple[list[Protocol], int]:
+        """The atlases that the dataset can be of, and how many files of a sample prove it.
+
+        Several only if the body is the same with all of them; none if the files disagree.
+        """
+        proofs: list[list[Protocol]] = []
         for image in self._sample():
             try:
                 fitting = self._fitting(image)
             except InputError:  # its own hemisphere will report it
                 continue
-            if len(fitting) == 1:
-                proofs += fitting
-        return (proofs[0], len(proofs)) if len(set(proofs)) == 1 else None
+            if _one_body(fitting):
+                proofs.append(fitting)
+        common = [p for p in proofs[0] if all(p in proof for proof in proofs)] if proofs else []
+        return common, len(proofs)
 
     def _fitting(self, image: _Image) -> list[Protocol]:
         return [protocol for protocol in _protocols() if protocol.fits(self._read(image))]
+
+    def _without_subfields(self, image: _Image) -> ProtocolError | None:
+        """Recognize the labels of an atlas that has no subfields; it says what to do instead."""
+        try:
+            values = self._read(image)
+        except InputError:
+            return None
+        path = image[0]
+        for protocol in _protocols(refused=True):
+            named = {label.code for label in protocol.labels if label.tissue in _ALWAYS}
+            if named <= values and not self._fitting(image):
+                return ProtocolError(f"{path}: {protocol.refused}", reason="no-subfields")
+        return None
 
     def _read(self, image: _Image) -> frozenset[int]:
         """Read the codes of one hemisphere, in the range of the left one."""
@@ -162,7 +191,18 @@ def _others(count: int) -> str:
 
 
 def _names(protocols: list[Protocol]) -> str:
-    return " and ".join(protocol.name for protocol in protocols)
+    *most, last = (protocol.name for protocol in protocols)
+    return f"{', '.join(most)} and {last}" if most else last
+
+
+def _or_another(protocols: list[Protocol]) -> str:
+    """Say what to do if several protocols with the same body are possible."""
+    return "; the body is the same, --ashs-atlas names the other" if len(protocols) > 1 else ""
+
+
+def _one_body(protocols: list[Protocol]) -> bool:
+    """Check that there are protocols, and that all give the same body."""
+    return bool(protocols) and all(protocols[0].same_body(other) for other in protocols[1:])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,7 +246,7 @@ def find_ashs(
                 "keep one of them in the subject's folder",
                 reason="several-files",
             )
-        elif problem is None and bilateral and not protocol.right_offset:
+        elif problem is None and bilateral and not protocol.offset:
             problem = InputError(
                 f"{chosen.path}: neither left nor right is in its name, and the protocol "
                 f"{protocol.name} does not say how the hemispheres differ; set right_offset in its "
@@ -220,7 +260,7 @@ def find_ashs(
             protocol=protocol,
             files=(chosen.path,),
             bilateral=bilateral,
-            code_offset=protocol.right_offset if bilateral and hemi == "R" else 0,
+            code_offset=protocol.shift(hemi) if bilateral else 0,
             source=source.name,
             source_path=source.path,
             why=f"{chosen.kind}{', both hemispheres in one file' if bilateral else ''}; {why}",

@@ -1,8 +1,10 @@
 """FreeSurfer's hippocampal subfields: ``mri/{lh,rh}.hippoAmygLabels*`` and ``hippoSfLabels*``.
 
-File names consist of the analysis (which scans, and the version: ``-T1.v22``, ``-T1-T2.v21``,
-``.long``, or nothing), the hierarchy (``.CA``, ``.FS60``, ``.HBT``; nothing for the full one) and
-``.FSvoxelSpace`` for a copy resampled to 1 mm.
+File names consist of the analysis (which scans, and the version: ``-T1.v22``, ``-T1-T2.v21``), the
+hierarchy (``.CA``, ``.FS60``, ``.HBT``; nothing for the full one) and ``.FSvoxelSpace`` for a copy
+resampled to 1 mm. ``segment_subregions`` (FreeSurfer 7.3 and later) has ``--suffix`` in place of
+the analysis, ``.long`` in longitudinal folders, and otherwise nothing. It also runs in FastSurfer's
+folders, which have the same layout.
 """
 
 import re
@@ -11,11 +13,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hipsta_bids.errors import HipstaError, InputError
-from hipsta_bids.inputs.scan import HemisphereInput, Selection, Source, VisitFolders
+from hipsta_bids.inputs.scan import (
+    Folder,
+    HemisphereInput,
+    Selection,
+    Source,
+    VisitFolders,
+)
 from hipsta_bids.protocols.load import load_protocol
 
 _NAME = re.compile(
-    r"(?P<hemi>[lr])h\.(?P<base>hippoAmygLabels|hippoSfLabels)(?P<analysis>(?:[-.].+?)??)"
+    r"(?P<hemi>[lr])h\.(?P<base>hippoAmygLabels|hippoSfLabels)(?P<analysis>.*?)"
     r"(?:\.(?P<hierarchy>CA|FS60|HBT))?(?P<coarse>\.FSvoxelSpace)?\.(?:mgz|mgh|nii|nii\.gz)"
 )
 
@@ -70,7 +78,7 @@ class Analysis:
 
 def parse_analysis(text: str, *, longitudinal: bool = False) -> Analysis:
     """Understand a suffix such as ``-T1-T2.v21`` or ``.long``, or a user's spelling of it."""
-    words = [word for word in re.split(r"[-.]", text) if word and word != _UNNAMED]
+    words = [word for word in re.split(r"[-._]", text) if word and word != _UNNAMED]
     versions = [int(word[1:]) for word in words if re.fullmatch(r"v\d+", word)]
     return Analysis(
         scans=tuple(word for word in words if not re.fullmatch(r"long|v\d+", word)),
@@ -151,7 +159,7 @@ def find_freesurfer(
 def _runs(visit: VisitFolders, hemi: str) -> list[_Run]:
     """Group a hemisphere's files by analysis and resolution, best first."""
     runs: dict[tuple[object, ...], _Run] = {}
-    for folder in visit.folders:
+    for folder in _each_once(visit.folders):
         for name in folder.names:
             match = _NAME.fullmatch(name) if ".hippo" in name else None
             if match is None or match["hemi"] != hemi.lower():
@@ -163,6 +171,14 @@ def _runs(visit: VisitFolders, hemi: str) -> list[_Run]:
             # Of several formats, the first by name: .mgz before .nii.
             run.files.setdefault(match["hierarchy"] or "full", folder.path / name)
     return sorted(runs.values(), key=lambda run: run.rank)
+
+
+def _each_once(folders: tuple[Folder, ...]) -> tuple[Folder, ...]:
+    """Leave out longitudinal folders that are links to others here, as FastSurfer's tools make."""
+    if not any(folder.longitudinal for folder in folders):
+        return folders
+    own = {folder.path.resolve() for folder in folders if not folder.longitudinal}
+    return tuple(f for f in folders if not f.longitudinal or f.path.resolve() not in own)
 
 
 def _why(run: _Run, subfields: str, parts: str | None, asked: str | None) -> str:

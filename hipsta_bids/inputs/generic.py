@@ -235,9 +235,11 @@ def _describe(
 ) -> _File | None:
     """Find out what a file's labels mean; None if they are not the hippocampus's."""
     space = pairs.get("space", "")
-    if selection.protocol is not None:
-        return _File(path=path, space=space, protocol=selection.protocol, origin="--scheme")
-    table = find_table(path, source.path)
+    users = selection.protocol
+    # A tool's protocol, which the user chose for the files of that tool, replaces no table.
+    table = find_table(path, source.path) if users is None or users.tool else None
+    if users is not None and table is None:
+        return _File(path=path, space=space, protocol=users, origin="--scheme")
     problem: HipstaError
     if table is None:
         problem = ProtocolError(

@@ -12,6 +12,8 @@ from hipsta_bids.inputs.scan import HemisphereInput, Selection, Source, VisitFol
 from hipsta_bids.io.files import entities
 from hipsta_bids.protocols.load import load_protocol
 
+_TOOL = "hippunfold"
+
 #: Atlases with the bundled protocol's codes, best first; None is version 0, which had one atlas.
 _ATLASES = ("multihist7", "bigbrain", None)
 
@@ -69,7 +71,7 @@ def find_hippunfold(
             continue
         chosen = files[0]
         known = chosen.atlas in _ATLASES
-        users = None if known else selection.protocol
+        users = selection.protocol if not known and selection.describes(_TOOL) else None
         note = "labels on the image's own grid, which may be coarse; no space-crop* file exists"
         yield HemisphereInput(
             subject=visit.subject,

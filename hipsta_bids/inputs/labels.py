@@ -202,7 +202,7 @@ def _one_hemisphere(
     """Keep one hemisphere's labels of a file that carries both, without the offset."""
     if not item.bilateral:
         return codes
-    offset = item.protocol.right_offset
+    offset = item.protocol.offset
     own = codes > offset if item.code_offset else (codes > 0) & (codes < offset)
     if not own.any():
         raise InputError(

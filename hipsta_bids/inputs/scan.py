@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from hipsta_bids.derivatives.dataset import NAME, generated_by, read_description
-from hipsta_bids.errors import HipstaError, InputError, UsageError
+from hipsta_bids.errors import HipstaError, InputError, ProtocolError, UsageError
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Protocol
 from hipsta_bids.types import Hemisphere, Visit
@@ -45,9 +45,9 @@ class InputRequest:
     """The FreeSurfer analysis to take, such as ``T1`` or ``T1-T2.v21``."""
     ashs_atlas: str | None = None
     """Name of a bundled ASHS protocol (with or without ``ashs``), or a protocol file."""
-    protocol: Path | None = None
-    """The user's protocol file, for labels that no bundled protocol describes (for ASHS's, see
-    ``ashs_atlas``)."""
+    protocol: str | Path | None = None
+    """The user's protocol file, for labels that no bundled protocol describes, or the name of a
+    bundled one, for labels that do not say which it is (for ASHS's, see ``ashs_atlas``)."""
     edited_dir: Path | None = None
     """Labels and masks that a person corrected."""
     output_dir: Path | None = None
@@ -101,8 +101,7 @@ class HemisphereInput(Hemisphere):
     parts_protocol: Protocol | None = None
     """The protocol of the second file."""
     bilateral: bool = False
-    """The file carries both hemispheres, the right-hand codes shifted by
-    ``protocol.right_offset``."""
+    """The file carries both hemispheres, the codes of one shifted by ``protocol.offset``."""
     code_offset: int = 0
     """To be subtracted from the codes of this hemisphere."""
     source: str
@@ -147,8 +146,9 @@ _SESSION = re.compile(r"ses-(?P<session>[A-Za-z0-9+]+)")
 #: Folders below a subject or a session that can hold segmentations.
 _INNER = re.compile(r"anat|mri|final|seg\w*")
 
-LAYOUTS = ("freesurfer", "ashs", "hippunfold", "named")
-"""Kinds of folders that can be searched; ``named`` is any ``_hemi-?_..._dseg`` file with names."""
+LAYOUTS = ("freesurfer", "ashs", "hippunfold", "tools", "named")
+"""Kinds of folders that can be searched; ``tools`` are those without an option of their own, and
+``named`` is any ``_hemi-?_..._dseg`` file with names."""
 
 #: The entry of the filter file that applies to segmentations.
 _QUERY = "dseg"
@@ -345,6 +345,10 @@ class Selection:
     protocol: Protocol | None = None
     """The user's protocol."""
 
+    def describes(self, tool: str) -> bool:
+        """Check whether the user's protocol is one for the files of a tool."""
+        return self.protocol is not None and self.protocol.tool in ("", tool)
+
     def wants_folder(self, folder: SubjectFolder) -> bool:
         """Check whether a subject's folder has to be looked into."""
         return (
@@ -388,8 +392,20 @@ def make_selection(request: InputRequest) -> Selection:
         hemis=request.hemis,
         rules=_rules(request.bids_filter_file) if request.bids_filter_file else {},
         fs_analysis=request.fs_analysis,
-        protocol=load_protocol(request.protocol) if request.protocol else None,
+        protocol=_chosen_protocol(request.protocol) if request.protocol else None,
     )
+
+
+def _chosen_protocol(choice: str | Path) -> Protocol:
+    """Load a protocol by the name of a file or of a bundled one."""
+    return measurable(load_protocol(Path(choice) if Path(choice).is_file() else str(choice)))
+
+
+def measurable(protocol: Protocol) -> Protocol:
+    """Return a protocol, unless it is known to have no subfields."""
+    if protocol.refused:
+        raise ProtocolError(protocol.refused, reason="no-subfields")
+    return protocol
 
 
 def _labels(labels: Iterable[str], prefix: str, option: str) -> frozenset[str]:

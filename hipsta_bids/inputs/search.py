@@ -2,8 +2,8 @@
 
 The flow: which datasets to search, and which subjects and sessions they hold (``scan``), which
 files are segmentations (one module per layout: ``freesurfer``, ``ashs``, ``hippunfold``,
-``generic``), and which of several to take. No image is opened, except where ASHS's atlas can only
-be told from the labels.
+``tools``, ``generic``), and which of several to take. No image is opened, except where ASHS's atlas
+can only be told from the labels.
 """
 
 from collections.abc import Iterable, Iterator
@@ -29,6 +29,7 @@ from hipsta_bids.inputs.scan import (
     make_selection,
     subject_folders,
 )
+from hipsta_bids.inputs.tools import find_tools
 from hipsta_bids.protocols.protocol import Protocol
 
 __all__ = [
@@ -45,7 +46,8 @@ __all__ = [
 
 _LOOKED_FOR = (
     "FreeSurfer's mri/[lr]h.hippoAmygLabels*, ASHS's *_lfseg_*, HippUnfold's "
-    "*_desc-subfields*_dseg, and *_hemi-*_dseg with a table"
+    "*_desc-subfields*_dseg, HSF's *_hippocampus_seg, NextBrain's seg*, and *_hemi-*_dseg with a "
+    "table"
 )
 
 #: How many names an error message lists.
@@ -167,6 +169,8 @@ def _search(
             yield from find_ashs(visit, source, atlases, selection)
         if "hippunfold" in source.layouts:
             yield from find_hippunfold(visit, source, selection)
+        if "tools" in source.layouts:
+            yield from find_tools(visit, source, selection)
         if "named" in source.layouts:
             yield from find_named(visit, source, selection)
 

@@ -167,6 +167,7 @@ def _check_agreement(protocol: Protocol, *, origin: str) -> None:
     twice = sorted({code for code in codes if codes.count(code) > 1})
     used = {label.tissue for label in protocol.labels}
     named = (*protocol.sheet, *protocol.layer, *protocol.interior, *protocol.neighbors)
+    named += protocol.recognized_by
     absent = [tissue.name for tissue in dict.fromkeys(named) if tissue not in used]
     order = tuple(tissue for tissue in MEDIAL_TO_LATERAL if tissue in protocol.sheet)
     beside = tuple(tissue for tissue in FAR_TO_NEAR if tissue in protocol.neighbors)
@@ -178,6 +179,9 @@ def _check_agreement(protocol: Protocol, *, origin: str) -> None:
         "there are no labels": not codes,
         f"code {', '.join(map(str, twice))} is listed twice": twice,
         "right_offset has to exceed every code": protocol.right_offset in range(1, top + 1),
+        "left_offset has to exceed every code": protocol.left_offset in range(1, top + 1),
+        "only one of left_offset and right_offset can be given": protocol.left_offset
+        and protocol.right_offset,
         f"no label has tissue {', '.join(absent)}": absent,
         "sheet has to list each tissue once, medial to lateral, out of "
         + ", ".join(t.name for t in MEDIAL_TO_LATERAL): protocol.sheet != order,
@@ -185,7 +189,7 @@ def _check_agreement(protocol: Protocol, *, origin: str) -> None:
         + ", ".join(t.name for t in FAR_TO_NEAR): protocol.neighbors != beside,
         "a tissue is in both sheet and layer": not sheet.isdisjoint(protocol.layer),
         "a tissue is in both sheet and interior": not sheet.isdisjoint(protocol.interior),
-        "layer, interior or neighbors is given without a sheet": named and not sheet,
+        "layer, interior, neighbors or recognized_by is given without a sheet": named and not sheet,
         "there is neither a sheet nor a label with a part": not sheet
         and all(label.part is Part.UNKNOWN for label in protocol.labels),
     }

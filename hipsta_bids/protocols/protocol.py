@@ -137,22 +137,52 @@ class Protocol(TomlTable):
     """Cortex beyond the medial end of the sheet, from far to near, for the regions with cortex."""
     right_offset: NonNegativeInt = 0
     """Added to right-hand codes in files that carry both hemispheres; 0 if there are none."""
+    left_offset: NonNegativeInt = 0
+    """The same for left-hand codes; one of the two is 0."""
+    complete: bool = False
+    """Refuse labels without some tissue of the sheet: where codes shift, that means others."""
+    recognized_by: Tissues = ()
+    """Tissues that have to occur, besides those of the sheet, in values that fit the protocol."""
+    refused: str = ""
+    """Why labels of this protocol cannot be measured, and what to use; empty if they can."""
 
     @property
     def codes(self) -> frozenset[int]:
         """All codes of the protocol, without the background."""
         return frozenset(label.code for label in self.labels)
 
+    @property
+    def offset(self) -> int:
+        """What tells the hemispheres apart in files that carry both; 0 if nothing does."""
+        return max(self.left_offset, self.right_offset)
+
+    def shift(self, hemi: str) -> int:
+        """Return what is added to the codes of a hemisphere in files that carry both."""
+        return self.left_offset if hemi == "L" else self.right_offset
+
+    def same_body(self, other: "Protocol") -> bool:
+        """Say whether codes that both protocols list give the same body."""
+        own, others = ({label.code: label for label in p.labels} for p in (self, other))
+        return (self.sheet, self.layer, self.interior) == (
+            other.sheet,
+            other.layer,
+            other.interior,
+        ) and all(
+            (own[code].tissue, own[code].part) == (others[code].tissue, others[code].part)
+            for code in own.keys() & others.keys()
+        )
+
     def fits(self, values: frozenset[int]) -> bool:
         """Say whether the values found in one hemisphere can come from this protocol.
 
-        Every value has to be listed, and each tissue of the sheet and at least one of its interior
-        has to occur.
+        Every value has to be listed, and each tissue of the sheet, at least one of its interior
+        and those that the protocol is recognized by have to occur.
         """
         if not self.sheet or not values <= self.codes:
             return False
         found = {label.tissue for label in self.labels if label.code in values}
-        return found.issuperset(self.sheet) and not found.isdisjoint(self.interior)
+        needed = {*self.sheet, *self.recognized_by}
+        return needed <= found and not found.isdisjoint(self.interior)
 
 
 def translate(
@@ -177,6 +207,14 @@ def translate(
             f"labels {_some(unknown)} are not in the protocol {protocol.name}; if the protocol is "
             "right, copy its TOML file, add the labels, and pass it with --scheme",
             reason="unknown-labels",
+        )
+    absent = [t.name for t in protocol.sheet if not (occurs & (tissues == t)).any()]
+    if protocol.complete and absent:
+        found = np.unique(codes[codes != 0])
+        raise ProtocolError(
+            f"no label of {', '.join(absent)} occurs (found {_some(found)}), which {protocol.name} "
+            "always has: another protocol was used",
+            reason="wrong-scheme",
         )
     wanted = np.isin(tissues, protocol.sheet) if protocol.sheet else parts != Part.UNKNOWN
     if not (occurs & wanted).any():

@@ -305,8 +305,8 @@ def _names(hemisphere: Hemisphere, data: NDArray[np.generic] | None) -> dict[int
         colors = {code: _COLORS[n % len(_COLORS)] for n, code in enumerate(codes)}
         return {code: LabelName(name=f"label {code}", color=colors[code]) for code in codes}
     known = {label.code: label for label in protocol.labels}
-    offset = protocol.right_offset if hemisphere.place.name.hemi == "R" else 0
-    # Files of one hemisphere may have the left codes on both sides.
+    offset = protocol.shift(hemisphere.place.name.hemi)
+    # Files of one hemisphere may have the same codes on both sides.
     shift = offset if any(code - offset in known for code in codes) else 0
     return {
         code: LabelName(name=label.abbreviation or label.name, color=label.color)

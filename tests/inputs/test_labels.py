@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import nibabel as nib
 import numpy as np
 import pytest
@@ -166,6 +168,34 @@ def test_one_hemisphere_is_taken_from_a_file_of_both(tmp_path):
     with pytest.raises(InputError, match="no labels of hemisphere R") as caught:
         read_label_volume(item)
     assert caught.value.reason == "empty-labels"
+
+
+def test_the_left_hemisphere_may_have_the_higher_codes(tmp_path):
+    data = np.zeros(SHAPE, np.uint8)
+    data[5:8, 5:8, 5:8] = [[[1, 2, 5]]]
+    data[40:44, 5:8, 5:8] = [[[101, 102, 105]]]
+    data[40, 5, :2] = 222, 33  # white matter: left alveus, left fornix
+    item = make_item(save(tmp_path / "a.nii", data), protocol="cobralab", bilateral=True, hemi="R")
+    right = read_label_volume(item)
+    left = read_label_volume(replace(item, hemi="L", code_offset=100))
+    assert [(side.tissue == Tissue.CA1).sum() for side in (left, right)] == [12, 9]
+    assert (left.tissue == Tissue.OTHER).sum() == 1
+    assert (right.tissue == Tissue.OTHER).sum() <= 1
+
+
+def test_labels_that_lack_what_a_tool_always_writes_are_refused(tmp_path):
+    data = np.zeros(SHAPE, np.uint8)
+    data[20:30, 22:28, 15:19] = [1, 2, 3, 4]  # DG, CA1, CA2 and CA3, subiculum
+    path = save(tmp_path / "a.nii", data)
+    message = r"no label of SUBICULUM occurs \(found 1, 2, 3, 4\), which hsf always.*fit.*hsfCA23"
+    with pytest.raises(ProtocolError, match=message) as caught:
+        read_label_volume(make_item(path, protocol="hsf"))
+    assert caught.value.reason == "wrong-scheme"
+    volume = read_label_volume(make_item(path, protocol="hsfCA23"))
+    assert (volume.tissue == Tissue.CA2_3).sum() == (volume.tissue == Tissue.SUBICULUM).sum() == 60
+    data[20, 22, 15] = 5  # all fields apart
+    with pytest.raises(ProtocolError, match=r"labels 5 are not in the protocol hsfCA23.* and hsf$"):
+        read_label_volume(make_item(save(tmp_path / "b.nii", data), protocol="hsfCA23"))
 
 
 def test_a_problem_found_earlier_is_raised(tmp_path):

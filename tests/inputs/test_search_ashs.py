@@ -6,6 +6,9 @@ from hipsta_bids.inputs import ashs
 
 GRAY = "lfseg_corr_usegray.nii.gz"
 ABC = [1, 2, 3, 4, 5, 8]
+CORTEX = [*ABC, 9, 10, 11, 12]  # ABC-3T or Magdeburg: the body is the same
+MAGDEBURG = [*CORTEX, 13]
+T1 = [1, 2, 4, 7, 10, 11, 12, 13, 14, 17]
 BOTH = [1, 2, 3, 4, 8]  # ABC-3T without tail, or PMC without cortex
 PMC = [1, 2, 3, 4, 8, 10, 11, 12, 13]
 UTRECHT = [1, 2, 3, 4, 5, 6, 7, 8]
@@ -103,7 +106,14 @@ def test_an_unknown_atlas_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("values", "protocol"), [(ABC, "ashsABC3T"), (PMC, "ashsPMC"), (UTRECHT, "ashsUtrecht7T")]
+    ("values", "protocol"),
+    [
+        (ABC, "ashsABC3T"),
+        ([*CORTEX, 20], "ashsABC3T"),
+        (PMC, "ashsPMC"),
+        (UTRECHT, "ashsUtrecht7T"),
+        (MAGDEBURG, "ashsMagdeburg7T"),
+    ],
 )
 def test_values_decide_if_one_atlas_only_fits(tmp_path, values, protocol):
     left(tmp_path, values=values)
@@ -123,6 +133,50 @@ def test_ambiguous_values_are_never_guessed(tmp_path):
         "say which atlas was used with --ashs-atlas"
     )
     assert item.protocol.name == "ashs"
+
+
+def test_two_atlases_with_the_same_body_share_a_name(tmp_path):
+    left(tmp_path, values=CORTEX)
+    item = only(tmp_path)
+    assert item.problem is None
+    assert item.protocol.name == "ashsABC3T"
+    assert "fit ashsABC3T and ashsMagdeburg7T; the body is the same" in item.why
+    assert only(tmp_path, ashs_atlas="magdeburg7t").protocol.name == "ashsMagdeburg7T"
+
+
+def test_one_file_with_a_code_of_its_own_names_the_whole_dataset(tmp_path):
+    left(tmp_path, "sub-01", CORTEX)
+    left(tmp_path, "sub-02", MAGDEBURG)
+    first, second = find(tmp_path)
+    assert first.protocol.name == second.protocol.name == "ashsMagdeburg7T"
+    assert "fit ashsABC3T and ashsMagdeburg7T, those of 2 other files" in first.why
+    # Without it, whichever the others are named by.
+    left(tmp_path, "sub-02", [*CORTEX, 20])
+    assert {item.protocol.name for item in find(tmp_path)} == {"ashsABC3T"}
+    left(tmp_path, "sub-02", BOTH)
+    first, second = find(tmp_path)
+    assert first.protocol.name == second.protocol.name == "ashsABC3T"
+    assert "; the body is the same" in first.why
+
+
+@pytest.mark.parametrize("name", ["T1", "ashsT1", "ASHS-T1"])
+def test_an_atlas_without_subfields_is_refused_by_name(tmp_path, name):
+    left(tmp_path)
+    with pytest.raises(ProtocolError, match=r"no subfields; run ASHS on a T2-.* or") as caught:
+        find(tmp_path, ashs_atlas=name)
+    assert caught.value.reason == "no-subfields"
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("table", [None, '1 255 0 0 1 1 1 "Left Anterior hippocampus"\n'])
+def test_an_atlas_without_subfields_is_refused_by_its_labels(tmp_path, table):
+    path = left(tmp_path, values=T1)
+    if table:
+        (folder(tmp_path) / "snaplabels.txt").write_text(table, encoding="utf-8")
+    problem = only(tmp_path).problem
+    assert problem is not None
+    assert problem.reason == "no-subfields"
+    assert str(problem).startswith(f"{path}: ASHS-T1 (ashsT1) divides the hippocampus")
 
 
 def test_values_that_fit_no_atlas(tmp_path):

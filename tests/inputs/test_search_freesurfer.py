@@ -2,7 +2,7 @@ import pytest
 from input_cases import by_key, find, touch
 
 from hipsta_bids.errors import UsageError
-from hipsta_bids.inputs.freesurfer import parse_analysis
+from hipsta_bids.inputs.freesurfer import parse_analysis, volume_table
 
 FULL = "hippoAmygLabels-T1.v22"
 
@@ -34,6 +34,8 @@ def one(tmp_path, *stems, **options):
         "hippoAmygLabels-T1-T2.v21.mgz",
         "hippoAmygLabels-T2.v22.mgz",
         "hippoAmygLabels.long.mgz",
+        "hippoAmygLabels_rerun.mgz",
+        "hippoAmygLabelsT2.mgz",
         "hippoAmygLabels-T1.long.v21.mgz",
         "hippoAmygLabels-T1-HR.acq.v21.mgz",
         "hippoAmygLabels-T1.v22.nii.gz",
@@ -170,6 +172,30 @@ def test_sessions_in_any_spelling_and_longitudinal_folders(tmp_path):
     assert ".long." not in str(items[2].files[0])
     (long,) = find(tmp_path, fs_analysis="T1.long", participant_labels=("03",))
     assert ".long.sub-03" in str(long.files[0])
+
+
+def test_what_segment_subregions_writes(tmp_path):
+    kinds = ("", ".HBT", ".FS60", ".CA")
+    stems = [f"hippoAmygLabels{kind}{copy}.mgz" for kind in kinds for copy in ("", ".FSvoxelSpace")]
+    put(tmp_path, "sub-01", *both("hippoSfVolumes.txt"), *(name for s in stems for name in both(s)))
+    left, right = find(tmp_path)
+    assert (names(left), names(right)) == (["lh.hippoAmygLabels.mgz"], ["rh.hippoAmygLabels.mgz"])
+    assert len(left.passed_over) == len(stems) - 1
+    table = volume_table(left.files[0])
+    assert table is not None
+    assert table.exists()
+
+
+def test_folders_that_fastsurfer_links_to_as_longitudinal_count_once(tmp_path):
+    put(tmp_path, "sub-01_ses-a", "lh.hippoAmygLabels.long.mgz", "lh.hippoAmygLabels.mgz")
+    dataset = tmp_path / "derivatives" / "freesurfer"
+    (dataset / "sub-01_ses-a.long.sub-01").symlink_to("sub-01_ses-a")
+    (item,) = find(tmp_path)
+    assert (item.session, names(item)) == ("a", ["lh.hippoAmygLabels.mgz"])
+    assert [name for name, _ in item.passed_over] == ["lh.hippoAmygLabels.long.mgz"]
+    (item,) = find(tmp_path, fs_analysis="long")
+    assert names(item) == ["lh.hippoAmygLabels.long.mgz"]
+    assert item.problem is None
 
 
 def test_other_files_of_a_freesurfer_folder_do_not_matter(tmp_path):

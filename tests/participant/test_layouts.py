@@ -22,11 +22,15 @@ EXPECTED = [
     ("abc", "L", "ashsABC3T", "labels", "labels"),
     ("pmc", "L", "ashsPMC", "automatic", "automatic"),
     ("utrecht", "L", "ashsUtrecht7T", "labels", "automatic"),
+    ("magdeburg", "R", "ashsMagdeburg7T", "labels", "automatic"),
     ("both", "L", "ashsABC3T", "labels", "labels"),
     ("both", "R", "ashsABC3T", "labels", "labels"),
     ("v1", "R", "hippunfold", "automatic", "automatic"),
     ("v2", "L", "hippunfold", "automatic", "automatic"),
     ("lab", "L", "ourlab", "labels", "labels"),
+    ("maget", "L", "cobralab", "automatic", "automatic"),
+    ("maget", "R", "cobralab", "automatic", "automatic"),
+    ("brain", "L", "nextbrain", "automatic", "automatic"),
 ]
 
 #: The second automatic rule guards the first and may take off the last slice, which is tilted
@@ -125,20 +129,24 @@ def write_ashs(root):
     rows = [f"{label.code}\t{label.name}" for label in load_protocol("ashsUtrecht7T").labels]
     table = "\n".join(["index\tname", *rows])
     (root / "ashs-utrecht" / "dseg.tsv").write_text(table, encoding="utf-8")
-    save(root / "ashs-both" / "sub-both" / "final" / f"id_{GRAY}", *both_hemispheres())
+    save(root / "ashs-both" / "sub-both" / "final" / f"id_{GRAY}", *both_hemispheres("ashsABC3T"))
+    put(root / "ashs-magdeburg" / "sub-magdeburg" / f"id_right_{GRAY}", "ashsMagdeburg7T", "R")
+    rows = [f"{label.code}\t{label.name}" for label in load_protocol("ashsMagdeburg7T").labels]
+    table = "\n".join(["index\tname", *rows])
+    (root / "ashs-magdeburg" / "dseg.tsv").write_text(table, encoding="utf-8")
 
 
-def both_hemispheres():
-    """Both on one grid, the right one's codes shifted by 100."""
-    left, right = draw("ashsABC3T"), draw("ashsABC3T", "R")
+def both_hemispheres(protocol):
+    """Both on one grid, the codes of one shifted by 100."""
+    left, right = draw(protocol), draw(protocol, "R")
     step = left.affine[0, 0]
     # The lattice of phantoms is fixed in space, so one grid holds both.
     start = np.rint((right.affine - left.affine)[:3, 3] / step).astype(int)
     low = np.minimum(start, 0)
     high = np.maximum(np.array(left.tissue.shape), start + right.tissue.shape)
     codes = np.zeros(high - low, dtype=np.int16)
-    for volume, corner, offset in ((left, -low, 0), (right, start - low, 100)):
-        own = encode(volume)
+    for volume, corner, hemi in ((left, -low, "L"), (right, start - low, "R")):
+        own, offset = encode(volume), volume.protocol.shift(hemi)
         box = tuple(slice(a, a + n) for a, n in zip(corner, own.shape, strict=True))
         codes[box] += np.where(own > 0, own + offset, 0).astype(np.int16)
     affine = left.affine.copy()
@@ -151,6 +159,14 @@ def write_hippunfold(root):
     newer = "sub-v2_hemi-L_space-cropT2w_label-hipp_atlas-multihist7_desc-subfields_dseg.nii.gz"
     put(root / "sub-v1" / "anat" / first, "hippunfold", "R")
     put(root / "sub-v2" / "anat" / newer, "hippunfold", axes="PIR")
+
+
+def write_tools(root):
+    describe(root / "maget", "MAGeTbrain")
+    name = "sub-maget_T1w_labels.nii.gz"
+    save(root / "maget" / "sub-maget" / "anat" / name, *both_hemispheres("cobralab"))
+    put(root / "nextbrain" / "sub-brain" / "seg.left.nii.gz", "nextbrain")
+    (root / "nextbrain" / "sub-brain" / "lut.txt").touch()
 
 
 def write_lab(root, name, table=None):
@@ -172,6 +188,7 @@ def out(tmp_path_factory):
     write_freesurfer(derivatives / "freesurfer")
     write_ashs(derivatives)
     write_hippunfold(derivatives / "hippunfold")
+    write_tools(derivatives)
     write_lab(derivatives / "our-lab", "desc-hipp_", TABLE)
     code = main.main([str(bids), str(bids / "out"), "participant", "--n-procs", "2"])
     assert code == ExitCode.OK
@@ -200,11 +217,31 @@ def test_nothing_else_was_found(out):
     assert len(list(out.rglob("*desc-summary_morph.tsv"))) == len(EXPECTED)
 
 
-def test_both_hemispheres_of_one_file_mirror_each_other(out):
-    left, right = (results(out, "both", hemi, "ashsABC3T").sheet for hemi in "LR")
+@pytest.mark.parametrize(("subject", "protocol"), [("both", "ashsABC3T"), ("maget", "cobralab")])
+def test_both_hemispheres_of_one_file_mirror_each_other(out, subject, protocol):
+    left, right = (results(out, subject, hemi, protocol).sheet for hemi in "LR")
     # Mirrored voxels are cut into other triangles, mm.
     assert (left.thickness - right.thickness).std() < 0.04
     assert (left.r + right.r).abs().max() < 0.5
+
+
+@pytest.mark.parametrize("mode", ["hsf", "hsfCA23"])
+def test_hsf_in_the_mode_that_is_named(tmp_path, mode):
+    describe(tmp_path / "bids", kind="raw")
+    data = tmp_path / "hsf"
+    put(data / "sub-h" / "anat" / "sub-h_T2w_right_hippocampus_seg.nii.gz", mode, "R")
+    arguments = [str(tmp_path / "bids"), str(tmp_path / "out"), "participant", "-d", f"hsf={data}"]
+    assert main.main(arguments) == ExitCode.BAD_DATA
+    refused = results(tmp_path / "out", "h", "R", "hsf").row
+    assert (refused["status"], refused["reason"]) == ("failed", "ambiguous-scheme")
+    assert main.main([*arguments, "--protocol", mode]) == ExitCode.OK
+    found = results(tmp_path / "out", "h", "R", mode)
+    assert float(found.summary["thickness_mean"]) == pytest.approx(1.8, abs=0.05)  # as above
+    other = {"hsf": "hsfCA23", "hsfCA23": "hsf"}[mode]
+    assert main.main([*arguments, "--protocol", other]) == ExitCode.BAD_DATA
+    wrong = results(tmp_path / "out", "h", "R", other).row
+    assert wrong["reason"] in {"unknown-labels", "wrong-scheme"}
+    assert f"the labels fit {mode}" in wrong["message"].replace("hippunfold and ", "")
 
 
 def test_a_users_protocol(tmp_path):

@@ -86,6 +86,63 @@ PUBLISHED = {
         (7, Tissue.CYST, Part.UNKNOWN),
         (8, Tissue.HIPPOCAMPUS, Part.TAIL),
     },
+    "ashsMagdeburg7T": {
+        (1, Tissue.CA1, Part.UNKNOWN),
+        (2, Tissue.CA2, Part.UNKNOWN),
+        (3, Tissue.DENTATE_GYRUS, Part.UNKNOWN),
+        (4, Tissue.CA3, Part.UNKNOWN),
+        (5, Tissue.HIPPOCAMPUS, Part.TAIL),
+        (8, Tissue.SUBICULUM, Part.UNKNOWN),
+        (9, Tissue.ENTORHINAL, Part.UNKNOWN),
+        (13, Tissue.CYST, Part.UNKNOWN),
+    },
+    "ashsT1": {
+        (1, Tissue.HIPPOCAMPUS, Part.HEAD),
+        (2, Tissue.HIPPOCAMPUS, Part.UNKNOWN),
+        (10, Tissue.ENTORHINAL, Part.UNKNOWN),
+        (11, Tissue.BA35, Part.UNKNOWN),
+        (12, Tissue.BA36, Part.UNKNOWN),
+        (13, Tissue.PARAHIPPOCAMPAL, Part.UNKNOWN),
+    },
+    "cobralab": {
+        (1, Tissue.CA1, Part.UNKNOWN),
+        (2, Tissue.SUBICULUM, Part.UNKNOWN),
+        (4, Tissue.DENTATE_GYRUS, Part.UNKNOWN),
+        (5, Tissue.CA2_3, Part.UNKNOWN),
+        (6, Tissue.MOLECULAR_LAYER, Part.UNKNOWN),
+    },
+    "hsf": {
+        (1, Tissue.DENTATE_GYRUS, Part.UNKNOWN),
+        (2, Tissue.CA1, Part.UNKNOWN),
+        (3, Tissue.CA2, Part.UNKNOWN),
+        (4, Tissue.CA3, Part.UNKNOWN),
+        (5, Tissue.SUBICULUM, Part.UNKNOWN),
+    },
+    "hsfCA23": {
+        (1, Tissue.DENTATE_GYRUS, Part.UNKNOWN),
+        (2, Tissue.CA1, Part.UNKNOWN),
+        (3, Tissue.CA2_3, Part.UNKNOWN),
+        (4, Tissue.SUBICULUM, Part.UNKNOWN),
+    },
+    # Subiculum; per field: lacunosum-moleculare, radiatum, pyramidale, oriens; CA4; dentate gyrus.
+    "nextbrain": {
+        (code, tissue, Part.UNKNOWN)
+        for tissue, codes in {
+            Tissue.SUBICULUM: (326, 347, 576),
+            Tissue.CA1: (341, 342, 345, 346, 564, 565),
+            Tissue.CA2: (370, 371, 410, 411, 568, 569),
+            Tissue.CA3: (374, 375, 420, 421, 573, 574),
+            Tissue.CA4: (422, 432, 575),
+            Tissue.DENTATE_GYRUS: (364, 365, 367, 404, 405, 407, 558, 559, 561),
+            Tissue.MOLECULAR_LAYER: (
+                *(339, 340, 343, 344, 562, 563),
+                *(368, 369, 408, 409, 566, 567),
+                *(372, 373, 418, 419, 571, 572),
+            ),
+            Tissue.FIMBRIA: (461,),
+        }.items()
+        for code in codes
+    },
     "hippunfold": {
         (1, Tissue.SUBICULUM, Part.UNKNOWN),
         (2, Tissue.CA1, Part.UNKNOWN),
@@ -176,6 +233,8 @@ def test_a_users_file_loads_and_fills_in_defaults(tmp_path):
         ('interior = ["dentate_gyrus"]', 'interior = ["CA1"]', "in both sheet and interior"),
         ("layer = []", 'layer = []\nunlisted = "ignore"', "'error' or 'other'"),
         ("layer = []", "layer = []\nright_offset = 2", "exceed every code"),
+        ("layer = []", "layer = []\nleft_offset = 3", "left_offset has to exceed every code"),
+        ("layer = []", "layer = []\nleft_offset = 9\nright_offset = 9", "only one of left_offset"),
         ("labels = [", "labels = [ 7,", "entry 1 of labels is 7, but has to be a table"),
     ],
 )
@@ -248,6 +307,27 @@ def test_translate_refuses_labels_of_another_protocol():
         translate(np.array([0, 236]), load_protocol("freesurferHBT"))
 
 
+@pytest.mark.parametrize(
+    ("name", "other", "same"),
+    [
+        ("ashsABC3T", "ashsMagdeburg7T", True),
+        ("ashsABC3T", "ashsPMC", False),  # code 10
+        ("hsf", "hsfCA23", False),
+        ("hippunfold", "hsf", False),
+    ],
+)
+def test_protocols_with_the_same_body(name, other, same):
+    first, second = load_protocol(name), load_protocol(other)
+    assert first.same_body(second) is second.same_body(first) is same
+    assert first.same_body(first)
+
+
+def test_hemispheres_of_one_file_are_told_apart_by_an_offset():
+    protocols = {name: load_protocol(name) for name in ("ashsPMC", "cobralab", "hsf")}
+    shifts = {name: (p.shift("L"), p.shift("R"), p.offset) for name, p in protocols.items()}
+    assert shifts == {"ashsPMC": (0, 100, 100), "cobralab": (100, 0, 100), "hsf": (0, 0, 0)}
+
+
 def test_a_long_list_of_unknown_labels_is_cut():
     with pytest.raises(ProtocolError, match=r"109, 110, 111 and 38 more are not") as caught:
         translate(np.arange(100, 150), load_protocol("hippunfold"))
@@ -259,9 +339,16 @@ def test_a_long_list_of_unknown_labels_is_cut():
     [
         ({1, 2, 3, 4, 5, 8, 20}, {"ashsABC3T"}),
         ({1, 2, 3, 4, 5, 8}, {"ashsABC3T", "hippunfold"}),
+        ({1, 2, 3, 4, 5, 8, 9, 10, 11, 12}, {"ashsABC3T", "ashsMagdeburg7T"}),
+        ({1, 2, 3, 4, 5, 8, 9, 10, 11, 12, 13}, {"ashsMagdeburg7T"}),
         ({1, 2, 3, 4, 8}, {"ashsABC3T", "ashsPMC"}),
         ({1, 2, 3, 4, 8, 10, 11, 12}, {"ashsABC3T", "ashsPMC"}),
         ({1, 2, 3, 4, 8, 10, 11, 12, 13}, {"ashsPMC"}),
+        ({1, 2, 4, 10, 11, 12, 13}, set()),
+        ({1, 2, 4, 5, 6}, {"cobralab"}),
+        ({1, 2, 3, 4, 5}, {"hippunfold", "hsf"}),
+        ({1, 2, 3, 4}, {"hsfCA23"}),
+        ({341, 347, 370, 374, 365}, {"nextbrain"}),
         ({1, 2, 3, 4, 5, 6, 7, 8}, {"ashsUtrecht7T", "hippunfold"}),
         ({205, 206, 208, 204, 209}, {"freesurferCA", "freesurferFS60"}),
         ({1, 2}, set()),
