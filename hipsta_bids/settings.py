@@ -96,6 +96,9 @@ class GridSettings(SettingsTable):
     what smoothing takes from thin edges and narrow bends changes the mean thickness."""
     margin: PositiveFloat = 1.5
     """Free space around the body, mm."""
+    beyond: NonNegativeFloat = 1.75
+    """The body goes on for this much beyond each end plane, mm, as it is there: columns would be
+    oblique, and too long, next to a plane that cuts the sheet obliquely."""
 
 
 class SliceSettings(SettingsTable):
@@ -372,7 +375,8 @@ class CheckSettings(SettingsTable):
     """Share of the area that is added to the usual before such comparisons, per mm of distance
     (interior: in all), since thickness may change along the body."""
     flag_row_jump: NonNegativeFloat = 0.15
-    """Flag if the sheet's width changes by more than this from one row to the next."""
+    """Flag if the sheet's width changes by more than this from one row to the next, or by twice as
+    much at an end."""
     flag_row_dip: NonNegativeFloat = 0.15
     """Flag rows narrower than the widest on both sides by more than this (0.13 at most in twelve
     real bodies)."""

@@ -28,7 +28,6 @@ from hipsta_bids.geometry.measures import (
     subfield_volumes,
     wall_area,
 )
-from hipsta_bids.geometry.mesh import signed_volume
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Bool, Float, Sheet, Surface, TetMesh
@@ -61,13 +60,13 @@ class Measured:
 
     @cached_property
     def volumes(self) -> dict[Tissue, float]:
-        """Volume of the mesh in each subfield, mm3."""
+        """Volume of each subfield between the end planes, mm3."""
         return subfield_volumes(self.mesh, self.body)
 
     @cached_property
     def volume(self) -> float:
-        """Volume of the mesh, mm3."""
-        return signed_volume(self.surface.vertices, self.surface.triangles)
+        """Volume between the end planes, mm3."""
+        return sum(self.volumes.values())
 
     @cached_property
     def thickness(self) -> Float:

@@ -23,7 +23,7 @@ from hipsta_bids.geometry.digital import (
     to_ras,
     voxel_points,
 )
-from hipsta_bids.geometry.grid import Field, in_plane_voxel
+from hipsta_bids.geometry.grid import Field, continued_nodes, in_plane_voxel
 from hipsta_bids.geometry.mesh import mean_wall_thickness
 from hipsta_bids.geometry.slices import points_of_ends
 from hipsta_bids.protocols.protocol import Part, Tissue, lateral_rank
@@ -296,8 +296,9 @@ def check_cross_sections(
         counted = ndimage.distance_transform_edt(~cuts) > settings.stub_nodes
     if field.cavities is not None:
         counted &= ~ndimage.binary_dilation(field.cavities, structure=ALL, iterations=2)
-    length = body.ends.length(body.inside_points()[1])
-    step = length / (field.grid.shape[2] - 1)
+    levels = slice(field.beyond, solid.shape[2] - field.beyond)
+    solid, interior, counted = (part[:, :, levels] for part in (solid, interior, counted))
+    step = field.grid.step
     area = float(np.median(solid.sum(axis=(0, 1))))
     notch, bump, intrusion = _Outlier(), _Outlier(), _Outlier()
     for reach, limit in zip(settings.notch_reach, settings.notch_share, strict=True):
@@ -306,7 +307,8 @@ def check_cross_sections(
             continue
         before, here, after = solid[:, :, : -2 * k], solid[:, :, k:-k], solid[:, :, 2 * k :]
         missing = before & after & ~here
-        notch.update(missing, missing.sum(axis=(0, 1)) / here.sum(axis=(0, 1)), limit, k)
+        lacking = missing.sum(axis=(0, 1)) / here.sum(axis=(0, 1))
+        notch.update(missing, lacking, limit, k + field.beyond)
         unexplained = here & counted[:, :, k:-k]
         enclosed = unexplained & interior[:, :, : -2 * k] & interior[:, :, 2 * k :]
         added = unexplained & ~before & ~after
@@ -314,7 +316,7 @@ def check_cross_sections(
         for outlier, part, least in ((bump, added, noise * reach), (intrusion, enclosed, noise)):
             share = part.sum(axis=(0, 1)) / area
             usual = settings.bump_contrast * (float(np.median(share)) + least)
-            outlier.update(part, share, usual, k)
+            outlier.update(part, share, usual, k + field.beyond)
     rows = (
         ("section-notch", notch, "lacks what its neighbors have", "complete the labels there"),
         ("section-bump", bump, "has what its neighbors lack", "look for leaks and bridges there"),
@@ -337,8 +339,11 @@ def check_cross_sections(
 
 
 def _interior_nodes(field: Field, body: Body) -> Bool:
-    """Nodes whose nearest voxel has an interior label and is not of the sheet."""
-    points = field.grid.node_points(clamp=0.0)
+    """Nodes whose nearest voxel has an interior label and is not of the sheet.
+
+    Beyond the end planes they go on as the sheet does.
+    """
+    points = continued_nodes(field.grid, body, body.ends.half_slice)
     voxels = np.rint(body.to_voxels(points)).astype(np.intp)
     voxels = np.clip(voxels, 0, np.array(body.interior.shape) - 1)
     return np.asarray((body.interior & (body.tissue == 0))[tuple(np.moveaxis(voxels, -1, 0))])
@@ -369,6 +374,7 @@ def check_rows(sheet: Sheet, settings: CheckSettings) -> list[Flag]:
     middle = sheet.points[:, :, sheet.middle]
     lengths = np.linalg.norm(np.diff(middle, axis=0), axis=-1).sum(axis=0)
     jumps = np.abs(np.diff(lengths)) / np.minimum(lengths[1:], lengths[:-1])
+    jumps[[0, -1]] /= 2  # a plane may cut the sheet where it flares
     dips = 1 - lengths / _wider(lengths, middle, settings.row_dip_reach)
     found = []
     for reason, change, limit, what in (

@@ -31,7 +31,7 @@ from hipsta_bids.types import Bool, Float
 Bits = NDArray[np.uint32]
 Index = NDArray[np.intp]
 Box = tuple[slice, slice, slice]
-Kind = Literal["part", "slit", "cut", "fill", "island", "cavity"]
+Kind = Literal["part", "slit", "cut", "fill", "island", "cavity", "uncus"]
 
 FACES = ndimage.generate_binary_structure(3, 1)
 """Structuring element: voxels that share a face."""

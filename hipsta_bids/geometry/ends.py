@@ -5,7 +5,7 @@ the rule of Diers et al. 2023 (NeuroImage 276:120182, section 2.1), cut short wh
 cross-sections no longer look like the body.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -63,6 +63,15 @@ class EndPlanes:
         if end == "posterior":
             return np.asarray((points - self.posterior_point) @ self.posterior_normal)
         return np.asarray((points - self.anterior_point) @ self.anterior_normal)
+
+    def beyond(self, distance: float) -> "EndPlanes":
+        """Planes that lie farther apart, each moved outward along the axis by a distance, mm."""
+        step = distance * self.axis
+        return replace(
+            self,
+            posterior_point=self.posterior_point - step,
+            anterior_point=self.anterior_point + step,
+        )
 
     def depth(self, points: Float) -> Float:
         """Distance of (N, 3) points from the nearer plane, mm, (N,); positive between them."""

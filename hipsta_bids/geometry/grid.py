@@ -10,9 +10,13 @@ from scipy.spatial import cKDTree
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body, Index
+from hipsta_bids.geometry.digital import ALL, box_around, low_corner, piece_sizes
+from hipsta_bids.geometry.ends import End
 from hipsta_bids.geometry.slices import has_thick_slices, points_of_ends, sample_slices
 from hipsta_bids.settings import GridSettings, SliceSettings
 from hipsta_bids.types import Bool, Float
+
+_END_REACH = 4.0  # mm behind an end plane over which the body's direction is taken
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -59,16 +63,22 @@ class WedgeGrid:
         w = (local @ self.axis - low) / (high - low) * (self.shape[2] - 1)
         return np.column_stack([a, b, w])
 
-    def node_points(self, clamp: float) -> Float:
-        """RAS mm of all nodes, (A, B, W, 3), kept ``clamp`` mm away from the end planes."""
+    def node_points(self) -> Float:
+        """RAS mm of all nodes, (A, B, W, 3)."""
         counts = (np.arange(n, dtype=np.float64) for n in self.shape[:2])
         a, b = np.meshgrid(*counts, indexing="ij")
         low, high = self._heights(a, b)
         share = np.linspace(0, 1, self.shape[2])
         along = low[..., None] + (high - low)[..., None] * share
-        along = np.clip(along, (low + clamp)[..., None], (high - clamp)[..., None])
         base = self.spacing * (a[..., None] * self.across[0] + b[..., None] * self.across[1])
         return np.asarray(self.origin + base[:, :, None, :] + along[..., None] * self.axis)
+
+    @property
+    def step(self) -> float:
+        """Mean distance of nodes along the axis in the middle of the grid, mm."""
+        a, b = (np.array([0.5 * (n - 1)]) for n in self.shape[:2])
+        low, high = self._heights(a, b)
+        return float((high - low)[0]) / (self.shape[2] - 1)
 
     @property
     def frame(self) -> Float:
@@ -89,6 +99,8 @@ class Field:
 
     grid: WedgeGrid
     """Grid with the nodes."""
+    beyond: int = 0
+    """Number of levels along w that lie beyond each end plane."""
     values: NDArray[np.float32]
     """(A, B, W), -0.5 far outside and 0.5 deep inside; a little beyond near the wall."""
     separated: Bool | None = None
@@ -100,14 +112,17 @@ class Field:
 
 
 def resample_body(body: Body, hemi: str, settings: GridSettings, slices: SliceSettings) -> Field:
-    """Sample the body's mask on a wedge grid and smooth it."""
+    """Sample the body's mask on a wedge grid and smooth it.
+
+    Beyond its end planes the body goes on as it is there.
+    """
     grid = _fit_grid(body, hemi, settings)
     separated = None
     if has_thick_slices(body.affine, slices):
-        points = grid.node_points(clamp=0.0).reshape(-1, 3)
+        points = continued_nodes(grid, body, 0.0).reshape(-1, 3)
         values = sample_slices(body, points, slices)
     else:
-        points = grid.node_points(clamp=body.ends.half_slice).reshape(-1, 3)
+        points = continued_nodes(grid, body, body.ends.half_slice).reshape(-1, 3)
         values = _sample_mask(body, points)
         between = _between_turns(body, points, slices)
         separated = (between & (values > 0.5)).reshape(grid.shape)  # noqa: PLR2004 -- in the mask
@@ -118,11 +133,46 @@ def resample_body(body: Body, hemi: str, settings: GridSettings, slices: SliceSe
     smooth = _smooth(values.reshape(grid.shape), sigma / settings.spacing)
     return Field(
         grid=grid,
+        beyond=round(settings.beyond / grid.step),
         values=smooth - np.float32(0.5),
         separated=separated,
         slits=_nodes_in(body.filled, body, points, grid.shape),
         cavities=_nodes_in(cavities, body, points, grid.shape),
     )
+
+
+def continued_nodes(grid: WedgeGrid, body: Body, depth: float) -> Float:
+    """Where to read the labels of all nodes, (A, B, W, 3), RAS mm.
+
+    Nodes less than ``depth``, mm, inside an end plane, and those beyond it, are moved to that depth
+    along the body: there it goes on as it is at the plane.
+    """
+    points = grid.node_points()
+    for end, outward in directions_at_ends(body).items():
+        inside = body.ends.height(points, end)
+        slope = body.ends.height(outward, end) - body.ends.height(np.zeros(3), end)
+        missing = np.maximum(depth - inside * np.sign(-slope), 0.0)
+        points -= (missing / abs(slope))[..., None] * outward
+    return points
+
+
+def directions_at_ends(body: Body) -> dict[End, Float]:
+    """Find the unit vectors (3,) along which the body leaves its two end planes."""
+    index, points = body.inside_points()
+    pieces, _ = ndimage.label(body.inside[box_around(index)], structure=ALL)
+    number = pieces[tuple((index - low_corner(box_around(index))).T)]
+    points = points[number == piece_sizes(pieces).argmax()]  # without an uncus beside it
+    found: dict[End, Float] = {}
+    signs: tuple[tuple[End, float], ...] = (("posterior", 1.0), ("anterior", -1.0))
+    for end, sign in signs:
+        depth = sign * body.ends.height(points, end)
+        last = min(_END_REACH, 0.5 * float(depth.max()))
+        near, far = (
+            points[(depth >= a * last) & (depth <= b * last)].mean(axis=0)
+            for a, b in ((0.0, 0.5), (0.5, 1.0))
+        )
+        found[end] = (near - far) / np.linalg.norm(near - far)
+    return found
 
 
 def _nodes_in(voxels: Index, body: Body, points: Float, shape: tuple[int, int, int]) -> Bool | None:
@@ -203,16 +253,25 @@ def _fit_grid(body: Body, hemi: str, settings: GridSettings) -> WedgeGrid:
     flat = (points - anchor) - np.outer((points - anchor) @ axis, axis)
     across = _directions_across(body, hemi, flat)
     reach = flat @ across.T
+    aside = [
+        settings.beyond * (way @ across.T) / abs(way @ axis)
+        for way in directions_at_ends(body).values()
+    ]
     margin = settings.margin + float(np.linalg.norm(body.affine[:3, :3], axis=0).min())
-    first = np.floor((reach.min(axis=0) - margin) / settings.spacing)
-    last = np.ceil((reach.max(axis=0) + margin) / settings.spacing)
+    first = np.floor(
+        (reach.min(axis=0) + np.min(aside, axis=0).clip(max=0) - margin) / settings.spacing
+    )
+    last = np.ceil(
+        (reach.max(axis=0) + np.max(aside, axis=0).clip(min=0) + margin) / settings.spacing
+    )
     size = (last - first).astype(int) + 1
     origin = anchor + settings.spacing * first @ across
+    ends = body.ends.beyond(settings.beyond)
     planes = [
         _plane_height(point, normal, origin, across * settings.spacing, axis)
         for point, normal in (
-            (body.ends.posterior_point, body.ends.posterior_normal),
-            (body.ends.anterior_point, body.ends.anterior_normal),
+            (ends.posterior_point, ends.posterior_normal),
+            (ends.anterior_point, ends.anterior_normal),
         )
     ]
     corners = np.array([[1, a, b] for a in (0, size[0]) for b in (0, size[1])])
@@ -224,7 +283,7 @@ def _fit_grid(body: Body, hemi: str, settings: GridSettings) -> WedgeGrid:
             "check the head and tail labels",
             reason="ends-crossed",
         )
-    length = body.ends.length(points)
+    length = ends.length(points)
     return WedgeGrid(
         shape=(int(size[0]), int(size[1]), max(round(length / settings.spacing) + 1, 8)),
         spacing=settings.spacing,

@@ -10,6 +10,7 @@ from scipy import ndimage
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.boundaries import Boundaries
+from hipsta_bids.geometry.ends import EndPlanes
 from hipsta_bids.geometry.fem import Laplace
 from hipsta_bids.geometry.measures import labels_at
 from hipsta_bids.geometry.mesh import cross, tetra_volumes
@@ -208,6 +209,24 @@ def solve_coordinates(laplace: Laplace, boundaries: Boundaries) -> Coordinates:
         laplace.between(boundaries.interior, boundaries.exterior),
     )
     return Coordinates(values=np.column_stack(values))
+
+
+def between_planes(mesh: TetMesh, coordinates: Coordinates, ends: EndPlanes) -> Coordinates:
+    """Scale y so that the mid-surface goes from plane to plane between y = -1 and 1.
+
+    The mesh goes on beyond the planes. Lines of equal y are those of the harmonic function there,
+    at right angles to the walls, however obliquely a plane cuts them.
+    """
+    x, y = np.linspace(-0.98, 0.98, 41), np.linspace(-0.998, 0.998, 121)
+    middle = _filled(_invert(mesh, coordinates.values, (x, y, np.array([-0.5, 0.0, 0.5]))))[:, :, 1]
+    limits = []
+    for height in (ends.height(middle, "posterior"), ends.height(middle, "anterior")):
+        rising = np.maximum.accumulate(np.nan_to_num(height, nan=-np.inf), axis=1)
+        limits.append([np.interp(0.0, row, y) for row in rising])
+    values = coordinates.values.copy()
+    low, high = (np.interp(values[:, 0], x, limit) for limit in limits)
+    values[:, 1] = 2 * (values[:, 1] - low) / (high - low) - 1
+    return Coordinates(values=values)
 
 
 def equal_volume_layers(sheet: Sheet) -> tuple[Sheet, Bool]:

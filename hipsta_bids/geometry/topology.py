@@ -4,7 +4,7 @@ Also a field that marching cubes reads as digital topology does, and the columns
 rest on repaired voxels.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -46,7 +46,7 @@ class Repair:
 
     kind: Kind
     """``part`` turns that touch, fill a ``slit`` of the labels, ``cut`` a bridge, ``fill`` a hole,
-    remove an ``island``, fill a ``cavity``."""
+    remove an ``island``, fill a ``cavity``, leave out the ``uncus``."""
     voxels: int
     """Changed nodes of the working grid."""
     cost: float
@@ -68,6 +68,7 @@ class Repair:
             "fill": "filled a hole",
             "island": "removed a separate piece",
             "cavity": "filled a cavity",
+            "uncus": "left out the uncus, a piece",
         }[self.kind]
         return (
             f"{what} of {self.voxels} grid nodes at {position_text(self.position, self.subfield)}"
@@ -141,14 +142,12 @@ def repair_topology(
         raise _unrepaired(edits, state, field, locate)
     after = state[INNER]
     size = int(np.count_nonzero(before))
-    changed = after != before
-    if field.slits is not None:
-        changed |= field.slits
-    touched = changed.copy()
-    for nodes in (field.separated, field.cavities):
-        if nodes is not None:
-            touched |= nodes
-    repairs = tuple(_describe(edit, field, size, settings, locate) for edit in edits)
+    changed, touched = _changes(field, after, edits)
+    repairs = tuple(
+        _describe(edit, field, size, settings, locate)
+        for edit in edits
+        if _between_planes(edit, field).mean() > 0.5  # noqa: PLR2004 -- most of it
+    )
     return SolidField(
         field=replace(
             field, values=_consistent_values(lifted[INNER], after), separated=None, slits=None
@@ -159,6 +158,27 @@ def repair_topology(
         euler_after=euler(state),
         changed_fraction=float(np.count_nonzero(changed) / size),
     )
+
+
+def _between_planes(edit: Edit, field: Field) -> Bool:
+    """Which nodes (N,) of a change lie between the end planes."""
+    level = (edit.where - FIRST)[:, 2]
+    return (level >= field.beyond) & (level < field.grid.shape[2] - field.beyond)
+
+
+def _changes(field: Field, after: Bool, edits: Sequence[Edit]) -> tuple[Bool, Bool]:
+    """Nodes that repairs of the sheet changed, and all for which columns of the map are marked."""
+    changed = after != (field.values > 0)
+    for edit in edits:
+        if edit.kind == "uncus":  # no part of the sheet
+            changed[tuple((edit.where - FIRST).T)] = False
+    if field.slits is not None:
+        changed |= field.slits
+    touched = changed.copy()
+    for nodes in (field.separated, field.cavities):
+        if nodes is not None:
+            touched |= nodes
+    return changed, touched
 
 
 def _before_smoothing(field: Field) -> list[Edit]:
@@ -254,12 +274,22 @@ def _remove_islands(state: Bool, field: Field, locate: Locate | None) -> list[Ed
         raise _interrupted(pieces, field, locate)
     if count == 1:
         return []
-    state[INNER] &= pieces == through[0]
+    main = pieces == through[0]
+    state[INNER] &= main
     return [
-        Edit("island", np.argwhere(pieces == n) + FIRST)
-        for n in range(1, count + 1)
-        if n != through[0]
+        Edit("uncus" if _is_uncus(piece, main) else "island", np.argwhere(piece) + FIRST)
+        for piece in (pieces == n for n in range(1, count + 1) if n != through[0])
     ]
+
+
+def _is_uncus(piece: Bool, main: Bool) -> bool:
+    """Whether a separate piece reaches the anterior end, and lies medially of the sheet there."""
+    levels = np.flatnonzero(piece.any(axis=(0, 1)))
+    if levels[-1] < piece.shape[2] - 1:
+        return False
+    # The first direction across the axis points laterally.
+    medial = np.argwhere(piece)[:, 0].mean()
+    return bool(medial < np.argwhere(main[:, :, levels[0] :])[:, 0].mean())
 
 
 def _fill_cavities(state: Bool, *, plates: bool = False) -> list[Edit]:
@@ -292,7 +322,7 @@ def _describe(
         large=bool(
             edit.doubtful
             or cost > limit
-            or len(where) > share * size
+            or (len(where) > share * size and kind != "uncus")
             or (kind == "fill" and _beside_slit(inside, field))
         ),
     )

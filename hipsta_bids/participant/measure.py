@@ -40,6 +40,7 @@ from hipsta_bids.geometry.grid import in_plane_voxel, resample_body
 from hipsta_bids.geometry.measures import bending_angle
 from hipsta_bids.geometry.mesh import extract_surface, tetra_quality, tetrahedralize
 from hipsta_bids.geometry.sheet import (
+    between_planes,
     check_flipped,
     check_layers,
     equal_volume_layers,
@@ -255,9 +256,12 @@ def measure_hemisphere(
         surface, mesh, smoothed = _filled(solid, surface, settings)
     with clock("boundaries"):
         laplace = volume_laplace(mesh, settings.boundaries.solver)
-        boundaries = find_boundaries(surface, laplace, body, settings.boundaries)
+        longer = replace(body, ends=body.ends.beyond(settings.grid.beyond))
+        boundaries = find_boundaries(surface, laplace, longer, settings.boundaries)
     with clock("coordinates"):
         coordinates = solve_coordinates(laplace, boundaries)
+        if settings.grid.beyond:
+            coordinates = between_planes(mesh, coordinates, body.ends)
         order = check_label_order(mesh, coordinates, body, settings.checks)
     with clock("sheet"):
         sheet = sample_sheet(mesh, coordinates, settings.sheet)
