@@ -42,6 +42,9 @@ class BodySettings(SettingsTable):
     layer_rule: Literal["nearest-sheet", "nearest-label"] = "nearest-sheet"
     """Who gets the molecular layer: ``nearest-sheet`` (the nearest sheet subfield; Diers et al.
     2023) or ``nearest-label`` (the nearest label; voxels nearest to DG or CA4 are left out)."""
+    join_every_layer: bool = False
+    """Join the molecular layer to the sheet also where the protocol leaves it out (HippUnfold's,
+    whose own inner wall is the outer one of that layer)."""
     min_length: NonNegativeFloat = 5.0
     """Shortest body that is measured, mm."""
     min_end_voxels: NonNegativeInt = 50
