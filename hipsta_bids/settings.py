@@ -53,6 +53,12 @@ class BodySettings(SettingsTable):
     """End planes are fitted to labels within this distance of the interface, mm."""
     end_margin: NonNegativeFloat = 0.0
     """Taken off either end where head or tail labels are missing, mm."""
+    core_share: PositiveFraction = 0.5
+    """Without tail labels: the body ends where slices have less than this share of the usual area
+    of dentate gyrus and CA4, since the sheet closes over them in the tail."""
+    core_margin: NonNegativeFloat = 1.0
+    """Left out beside that, mm, if the sheet goes on as far behind: the closing wall is cut
+    obliquely there (chosen from 0 to 1.5 on HippUnfold's labels of a person and two templates)."""
     head_piece: NonNegativeFloat = 1.5
     """Without end labels: the body ends where a slice shows two pieces above this area, mm2."""
     head_growth: NonNegativeFloat = 1.35
