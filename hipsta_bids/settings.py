@@ -336,6 +336,9 @@ class MeasureSettings(SettingsTable):
 class CheckSettings(SettingsTable):
     """What makes a map doubtful (flag) or wrong (refusal)."""
 
+    max_voxel: PositiveFloat = 0.9
+    """Refuse labels whose voxels in plane are larger, mm: no sheet is as thick as
+    ``min_voxels_across`` of these (1.9 mm at most in sixteen real bodies)."""
     min_voxels_across: NonNegativeFloat = 2.5
     """Refuse sheets thinner than this many in-plane voxels."""
     min_label_order: Annotated[float, Field(ge=-1, le=1)] = 0.45

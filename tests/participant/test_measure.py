@@ -13,7 +13,8 @@ from measured_phantoms import (
 )
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.phantom import PhantomSpec
+from hipsta_bids.phantom import Phantom, PhantomSpec
+from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import BodySettings, CheckSettings, Settings, SheetSettings
 from hipsta_bids.types import Status
@@ -217,6 +218,13 @@ def test_the_molecular_layer_of_hippunfold_is_joined_on_request(lined):
     assert joined.qc["layer_voxels"] > 1000
     # Columns with 0.6 mm of lining; at the lateral tip it is a fold of its own.
     assert joined.thickness[23:30].mean() == pytest.approx(2.6, abs=0.1)
+
+
+def test_voxels_of_a_millimeter_are_refused_whatever_the_sheet():
+    thick = Phantom(spiral(kind="arc", thickness=3.0)).label_volume(
+        load_protocol("hippunfold"), voxel_size=(1.0, 1.0, 1.0)
+    )
+    refused(thick, "sheet-too-thin", "too coarse for a sheet of one to two millimeters")
 
 
 def test_the_grid_of_hipsta_measures_nine_tenths_of_the_wall(plain):
