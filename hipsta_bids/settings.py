@@ -42,6 +42,9 @@ class BodySettings(SettingsTable):
     layer_rule: Literal["nearest-sheet", "nearest-label"] = "nearest-sheet"
     """Who gets the molecular layer: ``nearest-sheet`` (the nearest sheet subfield; Diers et al.
     2023) or ``nearest-label`` (the nearest label; voxels nearest to DG or CA4 are left out)."""
+    join_every_layer: bool = False
+    """Join the molecular layer to the sheet also where the protocol leaves it out (HippUnfold's,
+    whose own inner wall is the outer one of that layer)."""
     min_length: NonNegativeFloat = 5.0
     """Shortest body that is measured, mm."""
     min_end_voxels: NonNegativeInt = 50
@@ -51,6 +54,12 @@ class BodySettings(SettingsTable):
     labels that lie up to it on the wrong side get the subfield of a neighbor."""
     end_margin: NonNegativeFloat = 0.0
     """Taken off either end where head or tail labels are missing, mm."""
+    core_share: PositiveFraction = 0.5
+    """Without tail labels: the body ends where slices have less than this share of the usual area
+    of dentate gyrus and CA4, since the sheet closes over them in the tail."""
+    core_margin: NonNegativeFloat = 1.0
+    """Left out beside that, mm, if the sheet goes on as far behind: the closing wall is cut
+    obliquely there (chosen from 0 to 1.5 on HippUnfold's labels of a person and two templates)."""
     head_piece: NonNegativeFloat = 1.5
     """Without end labels: the body ends where a slice shows two pieces above this area, mm2."""
     head_growth: NonNegativeFloat = 1.35
@@ -336,6 +345,9 @@ class MeasureSettings(SettingsTable):
 class CheckSettings(SettingsTable):
     """What makes a map doubtful (flag) or wrong (refusal)."""
 
+    max_voxel: PositiveFloat = 0.9
+    """Refuse labels whose voxels in plane are larger, mm: no sheet is as thick as
+    ``min_voxels_across`` of these (1.9 mm at most in sixteen real bodies)."""
     min_voxels_across: NonNegativeFloat = 2.5
     """Refuse sheets thinner than this many in-plane voxels."""
     min_label_order: Annotated[float, Field(ge=-1, le=1)] = 0.45

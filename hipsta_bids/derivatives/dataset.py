@@ -15,7 +15,7 @@ from hipsta_bids.derivatives.names import (
 from hipsta_bids.errors import InputError, SettingsError, UsageError
 from hipsta_bids.io import files
 from hipsta_bids.io.files import DATASET, locked
-from hipsta_bids.protocols.protocol import Protocol
+from hipsta_bids.protocols.protocol import Protocol, Tissue
 from hipsta_bids.protocols.toml import flatten, resolve, settings_hash
 from hipsta_bids.settings import BodySettings, Settings
 
@@ -201,6 +201,19 @@ REFERENCES: dict[str, str] = {
 }
 
 
+def _layer_rule(settings: BodySettings, protocols: Sequence[Protocol]) -> str:
+    """Say what became of the molecular layer, and in which protocols it was left out."""
+    rule = _LAYER_RULES[settings.layer_rule]
+    apart = [
+        protocol.name
+        for protocol in protocols
+        if Tissue.MOLECULAR_LAYER in protocol.interior and not protocol.layer
+    ]
+    if settings.join_every_layer or not apart:
+        return rule
+    return f"{rule}, or left out ({', '.join(apart)})"
+
+
 def citation_text(settings: Settings, protocols: Sequence[Protocol]) -> str:
     """Compose the methods paragraph, with all settings and the references."""
     entries = list(REFERENCES.values())
@@ -219,7 +232,7 @@ def citation_text(settings: Settings, protocols: Sequence[Protocol]) -> str:
             f" Segmentations were found with PyBIDS {cite['pybids']} and follow: {titles}."
             " The subfields of the hippocampal body from presubiculum to CA3 were merged into one"
             " sheet; the molecular layer, where labeled,"
-            f" {_LAYER_RULES.get(settings.body.layer_rule, settings.body.layer_rule)}."
+            f" {_layer_rule(settings.body, protocols)}."
             f"{_REGIONS[settings.body.region]}"
             " The sheet was meshed as a closed surface of checked topology and filled with"
             f" tetrahedra by TetGen {cite['tetgen']}. Its medial and lateral ends were located with"

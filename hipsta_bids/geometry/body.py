@@ -1,8 +1,8 @@
 """From subfield labels to the hippocampal body: one ribbon between two end planes.
 
-The sheet's subfields and the molecular layer are merged, a mask that a person corrected replaces
-them where there is one, the cortex beside the body is added on request, and slits of about one
-voxel through the sheet are filled.
+The sheet's subfields are merged, with the molecular layer where the protocol says so. A mask that a
+person corrected replaces them where there is one, the cortex beside the body is added on request,
+and slits of about one voxel through the sheet are filled.
 """
 
 from dataclasses import dataclass, field, replace
@@ -142,7 +142,7 @@ def extract_body(volume: LabelVolume, settings: BodySettings) -> Body:
 
     Merging and the molecular-layer rule: Diers et al. 2023, section 2.1.
     """
-    tissue, layer_voxels = _merge_layer(volume, settings.layer_rule)
+    tissue, layer_voxels = _merge_layer(volume, settings)
     if not tissue.any():
         raise GeometryError(
             "no voxel of the sheet's subfields "
@@ -237,19 +237,21 @@ def _has_handedness(body: Body, subiculum: Float, ca1: Float, hemi: str) -> bool
     return (turn if hemi == "L" else -turn) > 0.05  # noqa: PLR2004
 
 
-def _merge_layer(volume: LabelVolume, rule: str) -> tuple[Tissues, int]:
+def _merge_layer(volume: LabelVolume, settings: BodySettings) -> tuple[Tissues, int]:
     """Assign each molecular-layer voxel to the nearest subfield (distances in mm), and count them.
 
-    By the rule ``nearest-label`` voxels nearer to another interior label are left out.
+    By the rule ``nearest-label`` voxels nearer to another interior label are left out. A layer that
+    the protocol does not list is left out as a whole, unless the settings ask for it.
     """
     protocol = volume.protocol
+    kinds = {*protocol.layer, *((Tissue.MOLECULAR_LAYER,) if settings.join_every_layer else ())}
     tissue = np.where(np.isin(volume.tissue, protocol.sheet), volume.tissue, 0).astype(np.uint8)
-    layer = np.isin(volume.tissue, protocol.layer)
+    layer = np.isin(volume.tissue, list(kinds))
     if not layer.any() or not tissue.any():
         return tissue, 0
     candidates = tissue.copy()
-    if rule == "nearest-label":
-        rivals = [t for t in protocol.interior if t not in protocol.layer]
+    if settings.layer_rule == "nearest-label":
+        rivals = [t for t in protocol.interior if t not in kinds]
         candidates[np.isin(volume.tissue, rivals)] = Tissue.OTHER
     # The nearest voxel always has a face neighbor outside.
     border = (candidates > 0) & ~ndimage.binary_erosion(candidates > 0, structure=FACES)

@@ -43,8 +43,8 @@ class _Slices(NamedTuple):
 class EndPlanes:
     """Two planes, each by a point (3,), RAS mm, and a unit normal (3,) that points anterior.
 
-    A plane's rule is ``labels``, ``subfields`` (the paper's automatic rule), or ``cross-section``
-    (that rule ran beyond the body and was cut short).
+    A plane's rule is ``labels``, ``subfields`` (the paper's automatic rule), or what cut short that
+    rule where it ran beyond the body: ``core`` (there is no dentate gyrus) or ``cross-section``.
     """
 
     posterior_point: Float
@@ -255,6 +255,10 @@ def _automatic_range(
     slices = _Slices(axis, float(along.min()), step)
     number = np.floor((along - slices.first) / step + 0.5).astype(int)
     low, high = _subfield_range(sheet[sheet > 0], number, slices, known)
+    rule = "subfields"
+    if "posterior" not in known:
+        core = _core_start(volume, slices, (low, high), settings)
+        low, rule = (core, "core") if core > low else (low, rule)
     section, pixel = _sections(sheet > 0, volume.affine, slices, (low, high))
     first, last = (low + number for number in _body_like(section, pixel, settings))
     area = section.sum(axis=(1, 2))[first - low : last - low + 1]
@@ -264,7 +268,7 @@ def _automatic_range(
     start = float(slices.first + step * (first + before - 0.5)) + settings.end_margin
     stop = float(slices.first + step * (last - after + 0.5)) - settings.end_margin
     return {
-        "posterior": (start, "cross-section" if first > low else "subfields"),
+        "posterior": (start, "cross-section" if first > low else rule),
         "anterior": (stop, "cross-section" if last < high else "subfields"),
     }
 
@@ -293,6 +297,30 @@ def _subfield_range(
             reason="no-body",
         )
     return int(both[0]), int(np.flatnonzero(ca23)[-1])
+
+
+def _core_start(
+    volume: LabelVolume, slices: _Slices, bounds: tuple[int, int], settings: BodySettings
+) -> int:
+    """First slice between bounds at which the sheet curls round its core, dentate gyrus and CA4.
+
+    In the tail the sheet goes on behind the core and closes over it: there, a cross-section cuts
+    the wall obliquely, and it reads too thick. Where all labels begin with the core, they have been
+    cut there, and nothing is taken off.
+    """
+    low, high = bounds
+    core = np.isin(volume.tissue, (Tissue.DENTATE_GYRUS, Tissue.CA4))
+    along = voxel_points(core, volume.affine) @ slices.axis
+    number = np.floor((along - slices.first) / slices.step + 0.5).astype(int)
+    count = np.bincount(number[number >= 0], minlength=high + 1)
+    present = count[low : high + 1]
+    if not present.any():
+        return low
+    usual = np.median(present[present > 0])
+    first = int(np.flatnonzero(count >= settings.core_share * usual)[0])
+    margin = round(settings.core_margin / slices.step)
+    start = first + margin if first > margin else first
+    return start if low < start < high else low
 
 
 def _body_like(section: Bool, pixel: float, settings: BodySettings) -> tuple[int, int]:

@@ -31,6 +31,7 @@ from hipsta_bids.geometry.checks import (
     check_ridges,
     check_rows,
     check_thickness,
+    check_voxel,
     check_voxels_across,
     find_contacts,
     name_subfields,
@@ -241,6 +242,7 @@ def measure_hemisphere(
         With the reason why this hemisphere cannot be measured.
     """
     with clock("body"):
+        check_voxel(volume, settings.checks)
         body = extract_body(volume, settings.body)
         side = check_side(body, hemi)
     with clock("surface"):

@@ -227,7 +227,9 @@ def _label_table(protocol: Protocol) -> NDArray[np.intp]:
     position = {id(label): i + 1 for i, label in enumerate(protocol.labels)}
     for part in _PARTS:
         sheet = [label_for(protocol, tissue, part) for tissue, _ in SUBFIELD_STARTS]
-        layer = label_for(protocol, Tissue.MOLECULAR_LAYER, part)
+        # A phantom's layer is part of its wall, as it is of the sheet in these protocols only.
+        layered = Tissue.MOLECULAR_LAYER in protocol.layer
+        layer = label_for(protocol, Tissue.MOLECULAR_LAYER, part) if layered else None
         inner = [label_for(protocol, tissue, part) for tissue in (Tissue.DENTATE_GYRUS, Tissue.CA4)]
         if part is Part.BODY and None in sheet:
             raise ProtocolError(

@@ -125,7 +125,8 @@ class Protocol(TomlTable):
     sheet: Tissues
     """Tissues merged into the sheet, medial to lateral; empty where only parts are labeled."""
     layer: Tissues
-    """Tissues whose voxels go to the nearest sheet tissue."""
+    """Tissues whose voxels go to the nearest sheet tissue; what is left out here is no part of the
+    sheet."""
     interior: Tissues
     """Tissues on the concave (interior) side of the sheet."""
     labels: Annotated[tuple[Label, ...], Strict(strict=False)]

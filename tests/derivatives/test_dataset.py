@@ -9,6 +9,7 @@ from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.dataset import COLUMNS, read_status, update_status, write_sidecar
 from hipsta_bids.derivatives.names import DATASET_FILES
 from hipsta_bids.errors import InputError, SettingsError, UsageError
+from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.settings import BodySettings, Settings
 
 
@@ -101,6 +102,15 @@ def test_citation_states_settings_and_protocols(tmp_path):
     for reference in ("120182", "BrainPrint", "TetGen", "10.21105/joss.01294", "Nobody N"):
         assert reference in text
     assert "{" not in text
+
+
+def test_citation_says_whose_molecular_layer_was_left_out():
+    protocols = [load_protocol("freesurfer"), load_protocol("hippunfold")]
+    text = dataset.citation_text(Settings(), protocols)
+    assert "given to the nearest subfield of the sheet, or left out (hippunfold)." in text
+    joined = Settings(body=BodySettings(join_every_layer=True))
+    for settings, chosen in ((joined, protocols), (Settings(), protocols[:1])):
+        assert "left out" not in dataset.citation_text(settings, chosen)
 
 
 def row(subject, hemi="L", **more):

@@ -1,5 +1,7 @@
 """Merging of the sheet's labels, the molecular layer, and the refusals."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from geometry_cases import rigid, short_phantom
@@ -35,7 +37,7 @@ def row(*tissues):
 def test_layer_goes_to_the_nearest_sheet_subfield():
     layer = Tissue.MOLECULAR_LAYER
     line = row(Tissue.SUBICULUM, layer, layer, layer, layer, Tissue.DENTATE_GYRUS)
-    tissue, given_away = _merge_layer(line, "nearest-sheet")
+    tissue, given_away = _merge_layer(line, BodySettings())
     assert tissue.ravel().tolist() == [Tissue.SUBICULUM] * 5 + [0]
     assert given_away == 4
 
@@ -43,9 +45,25 @@ def test_layer_goes_to_the_nearest_sheet_subfield():
 def test_layer_nearest_to_the_dentate_gyrus_is_left_out_by_the_other_rule():
     layer = Tissue.MOLECULAR_LAYER
     line = row(Tissue.SUBICULUM, layer, layer, layer, layer, Tissue.DENTATE_GYRUS)
-    tissue, given_away = _merge_layer(line, "nearest-label")
+    tissue, given_away = _merge_layer(line, BodySettings(layer_rule="nearest-label"))
     assert tissue.ravel().tolist() == [Tissue.SUBICULUM] * 3 + [0] * 3
     assert given_away == 2
+
+
+def test_a_layer_that_the_protocol_does_not_list_stays_inside_unless_asked_for():
+    """HippUnfold's SRLM lies within the inner wall of its sheet."""
+    layer = Tissue.MOLECULAR_LAYER
+    tissues = (Tissue.SUBICULUM, layer, layer, Tissue.DENTATE_GYRUS)
+    line = replace(row(*tissues), protocol=load_protocol("hippunfold"))
+    assert layer in line.protocol.interior
+    tissue, given_away = _merge_layer(line, BodySettings())
+    assert tissue.ravel().tolist() == [Tissue.SUBICULUM, 0, 0, 0]
+    assert given_away == 0
+    for rule, count in (("nearest-sheet", 2), ("nearest-label", 1)):
+        asked = BodySettings(join_every_layer=True, layer_rule=rule)
+        tissue, given_away = _merge_layer(line, asked)
+        assert tissue.ravel().tolist() == [Tissue.SUBICULUM] * (1 + count) + [0] * (3 - count)
+        assert given_away == count
 
 
 def test_layer_distances_are_millimetres_not_voxels():
@@ -53,7 +71,7 @@ def test_layer_distances_are_millimetres_not_voxels():
     tissue[0, 0] = Tissue.MOLECULAR_LAYER
     tissue[1, 0] = Tissue.CA1  # one voxel of 2 mm
     tissue[0, 2] = Tissue.SUBICULUM  # two voxels of 0.5 mm
-    given_to, _ = _merge_layer(volume_of(tissue, (2.0, 0.5, 1.0)), "nearest-sheet")
+    given_to, _ = _merge_layer(volume_of(tissue, (2.0, 0.5, 1.0)), BodySettings())
     assert given_to[0, 0, 0] == Tissue.SUBICULUM
 
 
@@ -71,7 +89,7 @@ def test_layer_takers_are_as_near_as_any(tissue):
     """Against Euclidean distance transforms, one per subfield."""
     voxel = (0.5, 0.7, 1.3)
     volume = volume_of(tissue, voxel)
-    given_to, _ = _merge_layer(volume, "nearest-sheet")
+    given_to, _ = _merge_layer(volume, BodySettings())
     if not np.isin(tissue, FREESURFER.sheet).any():
         assert not given_to.any()
         return

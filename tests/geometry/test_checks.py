@@ -16,6 +16,7 @@ from hipsta_bids.geometry.checks import (
     check_end_labels,
     check_label_order,
     check_thickness,
+    check_voxel,
     check_voxels_across,
 )
 from hipsta_bids.geometry.measures import measure_thickness
@@ -42,6 +43,26 @@ def test_a_sheet_of_hardly_more_than_a_voxel_is_refused():
     surface, body = surface_of("spiral", 1.0, 1.2)
     with pytest.raises(GeometryError, match=r"voxels of 1\.00 mm; 2\.5 are needed") as caught:
         check_voxels_across(surface, body, CHECKS)
+    assert caught.value.reason == "sheet-too-thin"
+
+
+@pytest.mark.parametrize(
+    ("voxel", "fine"),
+    [
+        ((1.0, 1.0, 1.0), False),
+        ((0.95, 2.0, 0.95), False),
+        ((0.8, 0.8, 0.8), True),
+        ((0.4, 2.0, 0.4), True),
+        ((2.0, 0.4, 0.4), True),
+    ],
+)
+def test_coarse_voxels_in_plane_are_refused_and_thick_slices_are_not(voxel, fine):
+    volume = short_phantom().label_volume(load_protocol("freesurfer"), voxel_size=voxel)
+    if fine:
+        check_voxel(volume, CHECKS)
+        return
+    with pytest.raises(GeometryError, match=r"voxels of \S+ mm in plane are too coarse") as caught:
+        check_voxel(volume, CHECKS)
     assert caught.value.reason == "sheet-too-thin"
 
 

@@ -217,6 +217,61 @@ def test_a_plain_rod_has_no_head_to_stop_at():
     assert abs(ends.height(far, "anterior")[0]) < 0.5 + 1e-6  # half a slice beyond the last center
 
 
+def ends_round_core(core, *, tail=0, settings=BODY):
+    """Ends of a slab along +y, 32 mm, CA1 beside CA2, with dentate gyrus above it.
+
+    ``core`` has the number of its voxels in each slice; the first ``tail`` slices are of the tail.
+    """
+    volume = sheet_with_head(twofold=True)
+    tissue, part = volume.tissue.copy(), volume.part.copy()
+    tissue[:, :, :12] = 0
+    sheet = tissue.copy()
+    for y, count in core.items():
+        tissue[5 : 5 + count, y, 17] = Tissue.DENTATE_GYRUS
+    part[:, :tail] = Part.TAIL
+    drawn = LabelVolume(tissue=tissue, part=part, affine=volume.affine, protocol=HIPPUNFOLD)
+    return find_end_planes(drawn, sheet, settings)
+
+
+def slices(first, end=64, count=20):
+    return dict.fromkeys(range(first, end), count)
+
+
+def posterior_end(ends):
+    """Where the posterior plane crosses the middle of the slab, mm from the first voxels."""
+    return -ends.height(np.array([[9.5, -0.25, 6.75]]), "posterior")[0]
+
+
+def test_the_body_ends_where_its_core_vanishes_in_the_tail():
+    ends = ends_round_core(slices(12))
+    assert (ends.posterior_rule, ends.anterior_rule) == ("core", "subfields")
+    # A margin of 1 mm from where voxels 12 begin; the axis leans by a degree towards the core.
+    assert posterior_end(ends) == pytest.approx(12 * 0.5 + 1.0, abs=0.1)
+    bare = ends_round_core(slices(12), settings=BodySettings(core_margin=0.0))
+    assert posterior_end(bare) == pytest.approx(12 * 0.5, abs=0.1)
+
+
+def test_remnants_of_the_core_do_not_count():
+    core = slices(4, 12, count=9) | slices(12)
+    assert posterior_end(ends_round_core(core)) == pytest.approx(12 * 0.5 + 1.0, abs=0.1)
+    more = ends_round_core(core, settings=BodySettings(core_share=0.4))
+    assert posterior_end(more) == pytest.approx(4 * 0.5 + 1.0, abs=0.1)
+
+
+@pytest.mark.parametrize("core", [{}, slices(0), slices(0, 50)], ids=["none", "all", "no head"])
+def test_nothing_is_taken_off_where_the_labels_begin_with_the_core_or_have_none(core):
+    ends = ends_round_core(core)
+    assert (ends.posterior_rule, ends.anterior_rule) == ("subfields", "subfields")
+    # No margin of 1 mm; a slice that the leaning axis fills in part may go.
+    assert -0.1 < posterior_end(ends) < 0.6
+
+
+def test_labels_of_the_tail_go_before_the_core():
+    ends = ends_round_core(slices(16), tail=8)
+    assert ends.posterior_rule == "labels"
+    assert posterior_end(ends) == pytest.approx(8 * 0.5, abs=0.1)
+
+
 def test_no_slice_with_ca1_and_ca2_is_refused():
     volume = sheet_with_head(twofold=True)
     tissue = np.where(volume.tissue == Tissue.CA2, Tissue.CA1, volume.tissue)

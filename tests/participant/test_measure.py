@@ -13,7 +13,8 @@ from measured_phantoms import (
 )
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.phantom import PhantomSpec
+from hipsta_bids.phantom import Phantom, PhantomSpec
+from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import BodySettings, CheckSettings, Settings, SheetSettings
 from hipsta_bids.types import Status
@@ -191,6 +192,39 @@ def test_the_molecular_layer_goes_where_the_setting_says():
     lateral = sheet_coordinates(nearest_sheet)[..., 0] > 0.5
     assert middle(loss)[middle(lateral)].mean() == pytest.approx(0.3, abs=0.1)
     assert abs(middle(loss)[:8].mean()) < 0.05  # no dentate gyrus at the medial end
+
+
+@pytest.fixture(scope="module")
+def lined():
+    """HippUnfold's labels, with 0.6 mm of SRLM between the wall and the dentate gyrus."""
+    case = measured(spiral(), protocol="hippunfold")
+    drawn = Damage(case)
+    lining = (drawn.n < -1.0) & (drawn.n > -1.6) & (case.volume.tissue == Tissue.DENTATE_GYRUS)
+    return case, drawn.relabel(lining, Tissue.MOLECULAR_LAYER, Part.UNKNOWN)
+
+
+def test_the_molecular_layer_of_hippunfold_is_no_part_of_the_sheet(lined):
+    case, volume = lined
+    maps = measure(volume)
+    assert np.count_nonzero(volume.tissue == Tissue.MOLECULAR_LAYER) > 1000
+    assert (maps.qc["layer_voxels"], maps.qc["side_rule"]) == (0, "labels")
+    # The wall of 2 mm is the phantom's; the end planes differ by what the core tilts the axis.
+    assert middle(maps.thickness).mean() == pytest.approx(2.0, abs=0.05)
+    np.testing.assert_allclose(maps.thickness, case.maps.thickness, atol=0.1)
+
+
+def test_the_molecular_layer_of_hippunfold_is_joined_on_request(lined):
+    joined = measure(lined[1], settings=Settings(body=BodySettings(join_every_layer=True)))
+    assert joined.qc["layer_voxels"] > 1000
+    # Columns with 0.6 mm of lining; at the lateral tip it is a fold of its own.
+    assert joined.thickness[23:30].mean() == pytest.approx(2.6, abs=0.1)
+
+
+def test_voxels_of_a_millimeter_are_refused_whatever_the_sheet():
+    thick = Phantom(spiral(kind="arc", thickness=3.0)).label_volume(
+        load_protocol("hippunfold"), voxel_size=(1.0, 1.0, 1.0)
+    )
+    refused(thick, "sheet-too-thin", "too coarse for a sheet of one to two millimeters")
 
 
 def test_the_grid_of_hipsta_measures_nine_tenths_of_the_wall(plain):

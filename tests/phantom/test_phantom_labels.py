@@ -189,8 +189,9 @@ def test_molecular_layer_is_the_inner_part_of_the_same_wall():
     assert layered.truth(0.5, 0.5).summary == bare.truth(0.5, 0.5).summary
 
 
-def test_protocol_without_molecular_layer_keeps_the_subfields():
-    protocol = load_protocol("ashsPMC")
+@pytest.mark.parametrize("name", ["ashsPMC", "hippunfold"])
+def test_protocol_without_molecular_layer_in_its_sheet_keeps_the_subfields(name):
+    protocol = load_protocol(name)
     bare, layered = Phantom(SMALL), Phantom(replace(SMALL, layer_thickness=0.5))
     assert_same_voxels(
         layered.label_volume(protocol, voxel_size=COARSE),
