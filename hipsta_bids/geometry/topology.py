@@ -163,7 +163,7 @@ def repair_topology(
 def _between_planes(edit: Edit, field: Field) -> Bool:
     """Which nodes (N,) of a change lie between the end planes."""
     level = (edit.where - FIRST)[:, 2]
-    return (level >= field.beyond) & (level < field.grid.shape[2] - field.beyond)
+    return np.asarray((level >= field.beyond) & (level < field.grid.shape[2] - field.beyond))
 
 
 def _changes(field: Field, after: Bool, edits: Sequence[Edit]) -> tuple[Bool, Bool]:

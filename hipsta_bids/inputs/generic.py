@@ -8,7 +8,6 @@ from functools import cache, lru_cache
 from pathlib import Path
 
 from hipsta_bids.errors import HipstaError, InputError, ProtocolError
-from hipsta_bids.inputs.hippunfold import is_hippunfold
 from hipsta_bids.inputs.scan import (
     HemisphereInput,
     Selection,
@@ -17,6 +16,7 @@ from hipsta_bids.inputs.scan import (
     list_folder,
     unknown_protocol,
 )
+from hipsta_bids.inputs.tools import is_hippunfold
 from hipsta_bids.io.files import entities
 from hipsta_bids.protocols.load import NamedCode, protocol_from_names
 from hipsta_bids.protocols.protocol import Protocol

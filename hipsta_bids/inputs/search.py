@@ -16,7 +16,6 @@ from hipsta_bids.inputs.ashs import AtlasFinder, choose_atlas, find_ashs, sample
 from hipsta_bids.inputs.edits import EditedFile, attach_edits, each_once, edits_of_visit, list_edits
 from hipsta_bids.inputs.freesurfer import find_freesurfer
 from hipsta_bids.inputs.generic import find_named, forget_tables
-from hipsta_bids.inputs.hippunfold import find_hippunfold
 from hipsta_bids.inputs.scan import (
     HEMIS,
     HemisphereInput,
@@ -29,7 +28,7 @@ from hipsta_bids.inputs.scan import (
     make_selection,
     subject_folders,
 )
-from hipsta_bids.inputs.tools import find_tools
+from hipsta_bids.inputs.tools import find_hippunfold, find_tools
 from hipsta_bids.protocols.protocol import Protocol
 
 __all__ = [
