@@ -76,6 +76,9 @@ class BodySettings(SettingsTable):
     slit_voxel: NonNegativeFloat = 0.8
     """Gaps are filled if no edge of a voxel is longer than this, mm: between thick slices folds
     look like gaps."""
+    uncus_offset: PositiveFloat = 5.0
+    """CA2 or CA3 at the anterior plane is the uncus if it lies farther than this medially of the
+    body's own, mm (10 to 12 in three real brains)."""
     cavity_openness: Fraction = 0.25
     """What is enclosed in a slice is filled if at most this share of what surrounds it is open to
     the next slices; between thick slices, whatever lies there."""
@@ -404,6 +407,8 @@ class CheckSettings(SettingsTable):
     flag_groove: Numbers = (0.55, 0.75, 0.75)
     """Flag a band that is thinner than both by more than this, one per distance, mm (0.38, 0.59 and
     0.53 at most)."""
+    uncus_reach: NonNegativeFloat = 2.0
+    """Warn of an uncus that begins farther than this behind the anterior plane, mm."""
     flag_cavity: NonNegativeFloat = 0.03
     """Flag a wide cavity that was divided beyond this share of the body: half of it is what the
     mean thickness may be off by."""

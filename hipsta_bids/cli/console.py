@@ -67,7 +67,7 @@ def summary_line(outcome: "Outcome") -> str:
     name = outcome.job.place.name
     parts = [f"{name.stem}_{name.protocol}", str(outcome.status)]
     if outcome.thickness is not None:
-        parts.append(f"mean thickness {outcome.thickness:.3f} mm")
+        parts.append(f"mean thickness {outcome.thickness:.3f} mm (by area)")
     if outcome.seconds is not None:
         parts.append(f"{outcome.seconds:.1f} s")
     if outcome.job.item.edited:

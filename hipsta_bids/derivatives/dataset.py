@@ -234,14 +234,17 @@ def citation_text(settings: Settings, protocols: Sequence[Protocol]) -> str:
             " sheet; the molecular layer, where labeled,"
             f" {_layer_rule(settings.body, protocols)}."
             f"{_REGIONS[settings.body.region]}"
-            " The sheet was meshed as a closed surface of checked topology and filled with"
+            " The sheet was continued a little beyond both ends, meshed as a closed surface of"
+            " checked topology and filled with"
             f" tetrahedra by TetGen {cite['tetgen']}. Its medial and lateral ends were located with"
             " an eigenfunction of the anisotropic Laplace-Beltrami operator, computed with LaPy"
             f" {cite['shapedna']}{cite['brainprint']} and checked against the lines farthest from"
             " each other inside the body; three harmonic functions between opposite"
             " faces gave each point a medial-to-lateral, posterior-to-anterior and"
             " interior-to-exterior coordinate. Thickness is the length of a line from the interior"
-            " to the exterior wall; curvature is the mean curvature of the mid-surface."
+            " to the exterior wall; its mean counts every square millimeter of the mid-surface the"
+            " same (`thickness_mean`), or every node of the grid, as in the original method"
+            " (`thickness_nodes`). Curvature is the mean curvature of the mid-surface."
         ),
         "",
         "All settings:",

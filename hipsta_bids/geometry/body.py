@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
+from skimage.segmentation import watershed
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.digital import (
@@ -99,6 +100,8 @@ class Body:
     """(N, 3) indices of voxels in slits through the sheet that were filled."""
     cavities: Cavities = field(default_factory=Cavities)
     """Cavities between the end planes that were filled."""
+    uncus: Index = field(default_factory=lambda: np.zeros((0, 3), np.intp))
+    """(N, 3) indices of voxels of the uncus, which are no part of the sheet."""
     handed_over: int = 0
     """Head or tail voxels between the planes that got the subfield of a neighbor."""
     gap: Index = field(default_factory=lambda: np.zeros((0, 3), np.intp))
@@ -159,6 +162,9 @@ def extract_body(volume: LabelVolume, settings: BodySettings) -> Body:
         volume, tissue, change = _apply_mask(volume, tissue, volume.edited_mask, ends)
         # What the mask removed may have changed the long axis.
         ends = find_end_planes(volume, tissue, settings)
+    uncus = find_uncus(tissue, volume.affine, ends, settings)
+    tissue = tissue.copy()
+    tissue[tuple(uncus.T)] = 0
     hippocampal, region = tissue, settings.region
     if region != "body":
         tissue = join_cortex(volume, hippocampal, region)
@@ -186,6 +192,7 @@ def extract_body(volume: LabelVolume, settings: BodySettings) -> Body:
         inside=inside,
         filled=slits.filled,
         cavities=cavities,
+        uncus=uncus,
         handed_over=handed_over,
         gap=slits.gap,
         mask_change=change,
@@ -264,6 +271,46 @@ def _merge_layer(volume: LabelVolume, settings: BodySettings) -> tuple[Tissues, 
     nearest = np.where(tied, ranked, np.uint8(255)).min(axis=1)
     tissue[layer] = np.where(nearest == Tissue.OTHER, 0, nearest)
     return tissue, int(np.count_nonzero(tissue[layer]))
+
+
+def find_uncus(tissue: Tissues, affine: Float, ends: EndPlanes, settings: BodySettings) -> Index:
+    """Find voxels (N, 3) of the uncus, which the head bends back to beside the body.
+
+    It shows as a second piece of CA2 or CA3 that reaches the anterior plane far medially of the
+    first. The part of CA1 that is nearer to it than to the rest, on the way through the sheet, goes
+    with it.
+    """
+    lateral = np.isin(tissue, (Tissue.CA2, Tissue.CA2_3, Tissue.CA3))
+    medial = np.isin(tissue, (Tissue.PRESUBICULUM, Tissue.SUBICULUM))
+    none = np.zeros((0, 3), np.intp)
+    pieces, count = ndimage.label(_between(lateral, affine, ends)[0], structure=ALL)
+    if count < 2 or not medial.any():  # noqa: PLR2004 -- the body's own is the first
+        return none
+    main = to_ras(np.argwhere(pieces == piece_sizes(pieces).argmax()), affine)
+    towards = voxel_points(medial, affine).mean(axis=0) - voxel_points(lateral, affine).mean(axis=0)
+    towards -= (towards @ ends.axis) * ends.axis
+    towards /= np.linalg.norm(towards)
+    found = np.zeros(tissue.shape, dtype=bool)
+    depth = 0.0
+    for number in np.flatnonzero(piece_sizes(pieces) * abs(np.linalg.det(affine[:3, :3])) > 1.0):
+        points = to_ras(np.argwhere(pieces == number), affine)
+        inside = -ends.height(points, "anterior")
+        beside = main[-ends.height(main, "anterior") < inside.max() + ends.half_slice]
+        aside = points.mean(axis=0) - (beside if len(beside) else main).mean(axis=0)
+        if inside.min() < 3 * ends.half_slice and aside @ towards > settings.uncus_offset:
+            found |= pieces == number
+            depth = max(depth, float(inside.max()))
+    if not found.any():
+        return none
+    near, _ = _between(tissue > 0, affine, ends.beyond(1.0))
+    index = np.argwhere(near)
+    height = -ends.height(to_ras(index, affine), "anterior")
+    near[tuple(index[height > depth + 1.0].T)] = False
+    markers = np.where(found, 1, np.where((lateral | medial) & near, 2, 0))
+    around = box_around(np.argwhere(near))
+    flat = np.zeros(markers[around].shape, np.uint8)
+    basins = watershed(flat, markers[around], ALL, mask=near[around])  # type: ignore[no-untyped-call]
+    return np.argwhere(basins == 1) + low_corner(around)
 
 
 def _like_nearest(

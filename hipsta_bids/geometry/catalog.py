@@ -315,6 +315,13 @@ SUMMARY: tuple[SummaryMeasure, ...] = (
         lambda m: m.mean(m.thickness, m.sheet.valid),
     ),
     SummaryMeasure(
+        "thickness_nodes",
+        "mm",
+        "mean thickness over the nodes of the sheet",
+        lambda m: float(m.thickness[m.sheet.valid].mean()),
+        source=DIERS,
+    ),
+    SummaryMeasure(
         "extent_x",
         "mm",
         "mean length of the mid-surface's lines from medial to lateral rim",
@@ -334,7 +341,7 @@ SUMMARY: tuple[SummaryMeasure, ...] = (
         lambda m: float(np.average(m.thickness, weights=m.area)),
     ),
     SummaryMeasure(
-        "volume", "mm^3", "volume of the sheet, enclosed by its triangle mesh", lambda m: m.volume
+        "volume", "mm^3", "volume of the sheet between the end planes", lambda m: m.volume
     ),
     SummaryMeasure(
         "area_interior",

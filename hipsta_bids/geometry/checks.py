@@ -225,6 +225,18 @@ def _check_beyond(volume: LabelVolume, body: Body, settings: CheckSettings) -> l
     return flags
 
 
+def describe_uncus(body: Body, settings: CheckSettings) -> list[str]:
+    """Say that the uncus was left out of the sheet, and warn if it begins far behind the head."""
+    if not len(body.uncus):
+        return []
+    points = to_ras(body.uncus, body.affine)
+    volume = len(points) * abs(float(np.linalg.det(body.affine[:3, :3])))
+    reach = float(-body.ends.height(points, "anterior").min())
+    far = f"; it begins {reach:.1f} mm behind the anterior end: does the head begin there?"
+    warning = far if reach > settings.uncus_reach else ""
+    return [f"left out the uncus, {volume:.0f} mm3 at {name_place(points, body)}{warning}"]
+
+
 def check_cavities(body: Body, settings: CheckSettings) -> list[Flag]:
     """Flag large cavities that were too wide to say whose they are."""
     volume = abs(float(np.linalg.det(body.affine[:3, :3])))

@@ -275,7 +275,7 @@ def test_run_says_what_happened(stand_in_run, tmp_path, capsys):
     start, *lines = said.out.splitlines()
     assert start == opening(stand_in_run[0])
     assert lines[0] == "note: no description"
-    assert lines[1].startswith("sub-01_hemi-L_seg-demo  ok  mean thickness 1.500 mm  ")
+    assert lines[1].startswith("sub-01_hemi-L_seg-demo  ok  mean thickness 1.500 mm (by area)  ")
     assert lines[2].startswith("sub-03_hemi-L_seg-demo  flagged  mean thickness 1.500 mm")
     assert lines[2].endswith("[odd-shape] look at it")
     assert lines[3] == "4 hemispheres: 2 failed, 1 flagged, 1 ok"
