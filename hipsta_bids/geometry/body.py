@@ -398,19 +398,18 @@ def _cannot_leave(solid: Bool, structure: Bool, through: int) -> Bool:
 def _fill_cavities(
     volume: LabelVolume, tissue: Tissues, cavities: Cavities, settings: BodySettings
 ) -> tuple[LabelVolume, Tissues]:
-    """Make narrow cavities a part of the layer, if there is one, and divide others.
+    """Make narrow cavities a part of the layer, where it is labeled, and divide others.
 
     What lies between the sheet and its interior is the layer in the first place. What is too wide
     for that, or has no layer beside it, goes to the nearest label on either side.
     """
-    protocol, donors = volume.protocol, _subfields(volume)
-    as_layer = (
-        settings.layer_rule == "nearest-sheet" and np.isin(volume.tissue, protocol.layer).any()
-    )
-    for group, chosen in (
-        (cavities.wide, donors),
-        (cavities.narrow, donors & (tissue > 0) if as_layer else donors),
-    ):
+    donors = _subfields(volume)
+    narrow = donors
+    layer = volume.tissue == Tissue.MOLECULAR_LAYER
+    if settings.layer_rule == "nearest-sheet" and layer.any():
+        merged = tissue[layer].any()
+        narrow = donors & ((tissue > 0) if merged else (tissue == 0))
+    for group, chosen in ((cavities.wide, donors), (cavities.narrow, narrow)):
         if group:
             volume, tissue = _like_nearest(volume, tissue, np.concatenate(group), chosen)
     return volume, tissue
