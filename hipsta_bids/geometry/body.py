@@ -153,12 +153,11 @@ def extract_body(volume: LabelVolume, settings: BodySettings) -> Body:
             reason="no-sheet-labels",
         )
     ends = find_end_planes(volume, tissue, settings)
-    change, handed_over, cavities = None, 0, Cavities()
-    if volume.edited_mask is None:
-        volume, tissue, handed_over = _hand_over(volume, tissue, ends, settings.plane_reach)
-        cavities = find_cavities(volume, tissue, ends, settings)
-        volume, tissue = _fill_cavities(volume, tissue, cavities, settings)
-    else:
+    volume, tissue, handed_over = _hand_over(volume, tissue, ends, settings.plane_reach)
+    cavities = find_cavities(volume, tissue, ends, settings)
+    volume, tissue = _fill_cavities(volume, tissue, cavities, settings)
+    change = None
+    if volume.edited_mask is not None:
         volume, tissue, change = _apply_mask(volume, tissue, volume.edited_mask, ends)
         # What the mask removed may have changed the long axis.
         ends = find_end_planes(volume, tissue, settings)

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body, Index
-from hipsta_bids.geometry.digital import ALL, box_around, low_corner, piece_sizes
+from hipsta_bids.geometry.digital import ALL, box_around, low_corner
 from hipsta_bids.geometry.ends import End
 from hipsta_bids.geometry.slices import has_thick_slices, points_of_ends, sample_slices
 from hipsta_bids.settings import GridSettings, SliceSettings
@@ -161,17 +161,15 @@ def directions_at_ends(body: Body) -> dict[End, Float]:
     index, points = body.inside_points()
     pieces, _ = ndimage.label(body.inside[box_around(index)], structure=ALL)
     number = pieces[tuple((index - low_corner(box_around(index))).T)]
-    points = points[number == piece_sizes(pieces).argmax()]  # without an uncus beside it
     found: dict[End, Float] = {}
     signs: tuple[tuple[End, float], ...] = (("posterior", 1.0), ("anterior", -1.0))
     for end, sign in signs:
         depth = sign * body.ends.height(points, end)
-        last = min(_END_REACH, 0.5 * float(depth.max()))
-        near, far = (
-            points[(depth >= a * last) & (depth <= b * last)].mean(axis=0)
-            for a, b in ((0.0, 0.5), (0.5, 1.0))
-        )
-        found[end] = (near - far) / np.linalg.norm(near - far)
+        last = depth < min(_END_REACH, float(depth.max()))
+        last &= number == np.bincount(number[last]).argmax()  # without an uncus beside it
+        middle = np.median(depth[last])
+        step = points[last & (depth <= middle)].mean(0) - points[last & (depth >= middle)].mean(0)
+        found[end] = step / max(float(np.linalg.norm(step)), 1e-9)
     return found
 
 

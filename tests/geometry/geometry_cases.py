@@ -37,9 +37,13 @@ class Case:
     sheet: Sheet
 
 
+#: Stages are tested on meshes whose caps lie in the end planes.
+UP_TO_THE_PLANES = Settings().changed(grid={"beyond": 0.0})
+
+
 def solve_case(phantom, *, protocol="freesurfer", settings=None, **drawing):
     """Run the stages of the participant level one after the other."""
-    chosen = settings or Settings()
+    chosen = settings or UP_TO_THE_PLANES
     volume = phantom.label_volume(load_protocol(protocol), **drawing)
     body = extract_body(volume, chosen.body)
     field = resampled(body, chosen, drawing.get("hemi", "L"))
@@ -66,7 +70,7 @@ def solve_case(phantom, *, protocol="freesurfer", settings=None, **drawing):
 
 def resampled(body, settings=None, hemi="L"):
     """The body's field with the settings of this stage."""
-    chosen = settings or Settings()
+    chosen = settings or UP_TO_THE_PLANES
     return resample_body(body, hemi, chosen.grid, chosen.slices)
 
 

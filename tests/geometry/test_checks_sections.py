@@ -41,7 +41,7 @@ def place_of(flag):
 
 def ball(field, middle, radius):
     """Nodes within a radius (mm) of a point."""
-    points = field.grid.node_points(clamp=0.0)
+    points = field.grid.node_points()
     return np.linalg.norm(points - middle, axis=-1) < radius
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.ends import EndPlanes
-from hipsta_bids.geometry.grid import in_plane_voxel
+from hipsta_bids.geometry.grid import continued_nodes, in_plane_voxel
 from hipsta_bids.protocols.protocol import Tissue
 
 EXACT = 1e-9  # rounding of coordinates of some ten mm
@@ -41,17 +41,17 @@ def test_end_planes_are_grid_planes(case):
 def test_node_points_are_the_nodes_places(arc):
     grid = arc.field.grid
     index = np.argwhere(np.ones(grid.shape, dtype=bool)).astype(float)
-    places = grid.node_points(clamp=0.0).reshape(-1, 3)
+    places = grid.node_points().reshape(-1, 3)
     np.testing.assert_allclose(places, grid.to_ras(index), atol=EXACT)
 
 
-def test_clamped_nodes_keep_away_from_the_end_planes():
-    ends = straight_ends(8.0)
-    grid = resampled(box_body()).grid
-    places = grid.node_points(clamp=0.6)
+def test_labels_are_read_inside_of_the_end_planes():
+    ends, body = straight_ends(8.0), box_body()
+    grid = resampled(body).grid
+    places = continued_nodes(grid, body, 0.6)
     assert places[..., 2].min() == pytest.approx(0.6)
     assert places[..., 2].max() == pytest.approx(ends.anterior_point[2] - 0.6)
-    free = grid.node_points(clamp=0.0)
+    free = grid.node_points()
     inner = (free[..., 2] > 0.6) & (free[..., 2] < 7.4)
     np.testing.assert_allclose(places[inner], free[inner], atol=EXACT)
 
@@ -107,7 +107,7 @@ def test_damage_moves_no_node_elsewhere():
 
 def test_field_is_positive_inside_and_negative_outside(case):
     field = case.field
-    places = field.grid.node_points(clamp=0.0).reshape(-1, 3)
+    places = field.grid.node_points().reshape(-1, 3)
     hemi = "R" if case.phantom.spec.kind == "spiral" else "L"
     u, _, n = case.phantom.body.locate(places, hemi=hemi, reach=3.0).T
     values = field.values.ravel()

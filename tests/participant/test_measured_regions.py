@@ -176,7 +176,7 @@ def test_regions_need_labels(tmp_path, capsys):
     assert code == ExitCode.BAD_DATA  # every hemisphere's input is unusable
     row = found(tmp_path / "out", "L", "extended", seg="freesurfer").row
     assert row["reason"] == "no-cortex-labels"
-    assert "ashsABC3T, ashsPMC, ashsUtrecht7T" in row["message"]
+    assert "ashsABC3T, ashsMagdeburg7T, ashsPMC, ashsUtrecht7T" in row["message"]
     assert "Traceback" not in capsys.readouterr().err
     write_dataset(tmp_path / "none", [plain], layouts=("ashs",))
     assert run(tmp_path / "none", tmp_path / "out", "--region", "entorhinal") == (

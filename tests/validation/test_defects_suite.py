@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 
 from hipsta_bids.errors import GeometryError
+from hipsta_bids.types import Status
 from hipsta_bids.validation import defects
 from hipsta_bids.validation.cases import Refusal, measure_reference
 from hipsta_bids.validation.defects import Damage, Trial, compare, measure_trial
@@ -62,13 +63,19 @@ def test_refusals_name_the_defect(kind, size, reason):
         ("bridge-ca1-ca1", 0.8, "section-bump"),
         ("leak", 3.0, "section-bump"),
         ("salt", 0.03, "noisy-labels"),
-        ("gap", 0.4, "thin-gap"),
         ("cut-short", 8.0, "labels-end"),
         ("ends-flush", 1.0, "labels-end"),
     ],
 )
 def test_what_cannot_be_repaired_is_flagged(kind, size, reason):
     assert reason in measure_trial(trial(kind, size)).reasons
+
+
+def test_a_gap_that_the_hippocampus_encloses_is_filled():
+    found = measure_trial(trial("gap", 0.4))
+    assert found.status == Status.REPAIRED
+    assert (found.near_wrong, found.far_wrong) == (0, 0)
+    assert abs(found.mean) < 0.01
 
 
 def test_columns_are_counted_near_and_far():
