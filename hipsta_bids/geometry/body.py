@@ -261,15 +261,26 @@ def _merge_layer(volume: LabelVolume, settings: BodySettings) -> tuple[Tissues, 
         candidates[np.isin(volume.tissue, rivals)] = Tissue.OTHER
     # The nearest voxel always has a face neighbor outside.
     border = (candidates > 0) & ~ndimage.binary_erosion(candidates > 0, structure=FACES)
-    tree = cKDTree(voxel_points(border, volume.affine))
-    # Of labels that are equally near the most medial, whichever way the voxels are stored.
-    found = tree.query(voxel_points(layer, volume.affine), k=_TIES)
-    distance, index = (np.asarray(part) for part in found)
-    tied = distance < distance[:, :1] + 1e-6
-    ranked = np.append(candidates[border], np.uint8(255))[index]  # fewer neighbors than asked
-    nearest = np.where(tied, ranked, np.uint8(255)).min(axis=1)
+    nearest = _value_of_nearest(
+        candidates[border],
+        voxel_points(border, volume.affine),
+        voxel_points(layer, volume.affine),
+    )
     tissue[layer] = np.where(nearest == Tissue.OTHER, 0, nearest)
     return tissue, int(np.count_nonzero(tissue[layer]))
+
+
+def _value_of_nearest(values: NDArray[np.integer], points: Float, at: Float) -> Index:
+    """Value of the nearest of points (N, 3) at others (M, 3); the smallest if some are tied.
+
+    So the way in which voxels are stored decides nothing.
+    """
+    found = cKDTree(points).query(at, k=_TIES)
+    distance, index = (np.asarray(part) for part in found)
+    tied = distance < distance[:, :1] + 1e-6
+    most = np.iinfo(np.intp).max  # also for fewer points than asked
+    ranked = np.append(values.astype(np.intp), most)[index]
+    return np.asarray(np.where(tied, ranked, most).min(axis=1))
 
 
 def find_uncus(tissue: Tissues, affine: Float, ends: EndPlanes, settings: BodySettings) -> Index:
@@ -318,11 +329,13 @@ def _like_nearest(
     """Give voxels (N, 3) the label and the part of the sheet that the nearest donor has."""
     around = box(np.maximum(where.min(axis=0) - _NEAR, 0), where.max(axis=0) + _NEAR + 1)
     index = np.argwhere(donors[around]) + low_corner(around)
-    tree = cKDTree(to_ras(index, volume.affine))
-    source = tuple(index[tree.query(to_ras(where, volume.affine))[1]].T)
+    pairs = volume.tissue.astype(np.intp) * 256 + tissue
+    nearest = _value_of_nearest(
+        pairs[tuple(index.T)], to_ras(index, volume.affine), to_ras(where, volume.affine)
+    )
     at = tuple(where.T)
     labels, sheet = volume.tissue.copy(), tissue.copy()
-    labels[at], sheet[at] = volume.tissue[source], tissue[source]
+    labels[at], sheet[at] = np.divmod(nearest, 256)
     return replace(volume, tissue=labels), sheet
 
 
