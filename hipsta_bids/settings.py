@@ -48,6 +48,16 @@ class BodySettings(SettingsTable):
     """Fewer head or tail voxels than this count as no label."""
     plane_reach: PositiveFloat = 3.0
     """End planes are fitted to labels within this distance of the interface, mm."""
+    plane_ratio: NonNegativeFloat = 1.8
+    """Where slices are thicker than this many pixels, they have a say in the tilt of the planes."""
+    plane_slices: PositiveFloat = 1.5
+    """There planes are fitted to labels within this many slices of the interface."""
+    plane_width: PositiveFloat = 0.1
+    """Width of the logistic function, slices."""
+    plane_tilt: Annotated[float, Field(gt=0, lt=90)] = 10.0
+    """Tilts against the slices are expected to be of this size, degrees (standard deviation)."""
+    plane_prior: NonNegativeFloat = 0.03
+    """Weight of that expectation; all labels together weigh 1."""
     end_margin: NonNegativeFloat = 0.0
     """Taken off either end where head or tail labels are missing, mm."""
     head_piece: NonNegativeFloat = 1.5
