@@ -127,6 +127,20 @@ class SliceSettings(SettingsTable):
     """Fragments farther away are dropped if they are smaller than this, mm2."""
     hole_area: NonNegativeFloat = 3.0
     """Smaller holes in a slice are filled, mm2."""
+    ring_length: NonNegativeFloat = 0.02
+    """Rings are cut along the cheapest path: cost of its length, to which depth in the ribbon (mm)
+    is added."""
+    ring_beside: NonNegativeFloat = 2.0
+    """What lies in the ribbon of the slices beside costs their depth times this as well."""
+    end_ratio: Annotated[float, Field(gt=1)] = 9.0
+    """Outer slices are left out if the area of their ribbon is this many times that of the next, or
+    less than its inverse."""
+    ribbon_nodes: Annotated[int, Field(ge=3)] = 81
+    """Nodes along the ribbon of a slice."""
+    rim_half: PositiveFloat = 0.5
+    """Half length of the edges of the ribbon along its outline, multiples of 2 area / length."""
+    match_stretch: NonNegativeFloat = 0.5
+    """Mid-lines of slices are matched by squared distance, mm2, and this times squared stretch."""
     flow_window: PositiveFloat = 1.0
     """Standard deviation of the window of the registration of slices, mm."""
     flow_ridge: NonNegativeFloat = 0.02

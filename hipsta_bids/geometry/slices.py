@@ -11,11 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import ndimage, sparse
+from scipy.sparse import csgraph
+from scipy.spatial import cKDTree
 from scipy.special import ndtri
 
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.digital import Box, box, low_corner, piece_sizes, to_ras, voxel_points
+from hipsta_bids.geometry.ribbon import align_nodes, ribbon_nodes
 from hipsta_bids.protocols.protocol import Tissue, lateral_rank
 from hipsta_bids.settings import SliceSettings
 from hipsta_bids.types import Bool, Float
@@ -116,6 +119,61 @@ def _segment_distance(
     share = ((grid - start) @ along) / max(float(along @ along), 1e-9)
     foot = start + np.clip(share, 0, 1)[..., None] * along
     return np.asarray(np.linalg.norm(grid - foot, axis=-1))
+
+
+def cut_rings(outlines: Stack, pixel: float, settings: SliceSettings) -> Stack:
+    """Open each outline (N, I, J), mm, that closes round a hole; fine pixels of ``pixel`` mm.
+
+    The sheet is a ribbon: where it closes to a ring, turns touch. The cut follows the cheapest path
+    from the hole to the outside, through what is thin here and lies outside in the slices beside.
+    """
+    cut = outlines.copy()
+    for number in range(len(outlines)):
+        beside = [outlines[k] for k in (number - 1, number + 1) if 0 <= k < len(outlines)]
+        near = np.mean(beside, axis=0) if beside else np.zeros_like(outlines[0])
+        for _ in range(settings.max_fragments):
+            path = _way_out(cut[number], near, settings)
+            if path is None:
+                break
+            gap = pixel * ndimage.distance_transform_edt(~path)
+            cut[number] = np.minimum(cut[number], gap - settings.slit)
+    return cut
+
+
+def _way_out(outline: Stack, beside: Stack, settings: SliceSettings) -> Bool | None:
+    """Pixels of the cheapest path through the ribbon from its largest hole; None without holes."""
+    empty, count = ndimage.label(np.pad(outline <= 0, 1, constant_values=True))
+    if count == 1:
+        return None
+    sizes = piece_sizes(empty)
+    sizes[empty[0, 0]] = 0
+    outside, hole = empty == empty[0, 0], empty == sizes.argmax()
+    depth, height = np.pad(outline, 1), np.pad(beside, 1, mode="edge")
+    cost = settings.ring_length + np.maximum(depth, 0)
+    cost += settings.ring_beside * np.clip(height + settings.slit, 0, 1.5)
+    cost[outside | (empty > 0)] = settings.ring_length
+    nodes = np.arange(cost.size).reshape(cost.shape)
+    steps = []
+    for di, dj in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        first = nodes[: cost.shape[0] - di, max(-dj, 0) : cost.shape[1] - max(dj, 0)]
+        second = nodes[di:, max(dj, 0) : cost.shape[1] + min(dj, 0)]
+        length = np.hypot(di, dj) * 0.5 * (cost.ravel()[first] + cost.ravel()[second])
+        steps.append((first.ravel(), second.ravel(), length.ravel()))
+    first, second, length = (np.concatenate(part) for part in zip(*steps, strict=True))
+    graph = sparse.csr_array((length, (first, second)), shape=(cost.size,) * 2)
+    away, before, _ = csgraph.dijkstra(
+        graph,
+        directed=False,
+        indices=nodes[hole],
+        return_predecessors=True,
+        min_only=True,
+    )
+    at = int(nodes[outside][np.argmin(away[nodes[outside]])])
+    path = np.zeros(cost.size, dtype=bool)
+    while at >= 0:
+        path[at] = True
+        at = int(before[at])
+    return np.asarray(path.reshape(cost.shape)[1:-1, 1:-1])
 
 
 def register_slices(outlines: Stack, pixel: float, settings: SliceSettings) -> Stack:
@@ -256,8 +314,10 @@ def sample_slices(body: Body, points: Float, settings: SliceSettings) -> Stack:
     for step, depth, known in zip((1, -1), _depths(body, through, part), labeled, strict=True):
         if not known:
             _extrapolate(tissue[::step], (depth < settings.hidden_depth)[::step], pixel, settings)
-    stack = _stacked(tissue, pixel, settings)
+    alike = _alike(tissue > 0, settings)
+    stack = _stacked(tissue[alike], pixel, settings)
     voxels = body.to_voxels(points)[:, _order(through)] - low_corner(part)
+    voxels[:, 0] -= alike.start
     where = ((voxels[:, 1:] + 0.5) * settings.upsampling - 0.5).astype(np.float32).T
     distance = stack.blend(voxels[:, 0].astype(np.float32), where)
     return np.asarray(np.clip(distance / (2 * settings.edge) + 0.5, 0, 1), dtype=np.float32)
@@ -268,15 +328,61 @@ def _stacked(tissue: NDArray[np.uint8], pixel: float, settings: SliceSettings) -
     if len(tissue) == 1:
         tissue = np.concatenate([tissue, tissue])
     outlines = np.stack([outline_slice(image, pixel, settings) for image in tissue])
+    if settings.ring_length: outlines = cut_rings(outlines, pixel / settings.upsampling, settings)
     ends = np.array(
         [[_part_distance(image, end, pixel, settings) for image in tissue] for end in _ENDS]
     )
     return _SliceStack(
         outlines=outlines,
         ends=ends,
-        flows=register_slices(outlines, pixel, settings),
+        flows=_flows(outlines, tissue, pixel, settings),
         settings=settings,
     )
+
+
+def _flows(
+    outlines: Stack, tissue: NDArray[np.uint8], pixel: float, settings: SliceSettings
+) -> Stack:
+    """Displacements from each slice to the next, by aligned ribbons, elsewhere by registration."""
+    up = settings.upsampling
+    block = np.ones((up, up), dtype=np.uint8)
+    ribbons = []
+    for outline, image in zip(outlines, tissue, strict=True):
+        labels = np.kron(image, block)
+        rank = np.where(labels > 0, lateral_rank(labels), np.nan)
+        ribbons.append(ribbon_nodes(outline, rank, pixel / up, settings))
+    flows = register_slices(outlines, pixel, settings)
+    where = (np.indices(flows.shape[2:]).reshape(2, -1).T + 0.5) * up - 0.5
+    start = 0
+    while start < len(ribbons):
+        stop = start
+        while stop < len(ribbons) and ribbons[stop] is not None:
+            stop += 1
+        if stop - start > 1:
+            aligned = align_nodes(ribbons[start:stop], pixel / up, settings)
+            for k in range(start, stop - 1):
+                first, second = (nodes.reshape(-1, 2) for nodes in aligned[k - start : k - start + 2])
+                gap, nearest = cKDTree(0.5 * (first + second)).query(where, k=6)
+                weight = 1 / (gap**2 + 0.25)
+                weight /= weight.sum(axis=1, keepdims=True)
+                move = ((second - first)[nearest] * weight[..., None]).sum(axis=1)
+                flows[:, k] = move.T.reshape(flows[:, k].shape)
+        start = stop + 1
+    return flows
+
+
+def _alike(mask: Bool, settings: SliceSettings) -> slice:
+    """Leave out outer slices whose ribbon is much larger or smaller than that of the one inside.
+
+    There the uncus joins the body, or its labels end obliquely.
+    """
+    area = np.array([piece_sizes(ndimage.label(image)[0]).max(initial=1) for image in mask])
+    middle = len(area) // 2
+    odd = np.abs(np.log(area[1:] / area[:-1])) > np.log(settings.end_ratio)
+    before, after = np.flatnonzero(odd[:middle]), np.flatnonzero(odd[middle:])
+    first = int(before[-1]) + 1 if len(before) else 0
+    last = middle + int(after[0]) if len(after) else len(area) - 1
+    return slice(first, last + 1)
 
 
 def _labeled_ends(body: Body, through: int) -> tuple[bool, bool]:
