@@ -132,7 +132,7 @@ class SliceSettings(SettingsTable):
     is added."""
     ring_beside: NonNegativeFloat = 2.0
     """What lies in the ribbon of the slices beside costs their depth times this as well."""
-    end_ratio: Annotated[float, Field(gt=1)] = 9.0
+    end_ratio: Annotated[float, Field(gt=1)] = 1.25
     """Outer slices are left out if the area of their ribbon is this many times that of the next, or
     less than its inverse."""
     ribbon_nodes: Annotated[int, Field(ge=3)] = 81

@@ -280,13 +280,15 @@ class _SliceStack:
             + share * _interpolated(images, below + 1, *(middle + 0.5 * step))
             for images in (self.outlines, *self.ends)
         )
-        return np.asarray(np.minimum(distance, self._slit(medial, lateral)), dtype=np.float32)
+        slit = _slit(medial, lateral, self.settings)
+        return np.asarray(np.minimum(distance, slit), dtype=np.float32)
 
-    def _slit(self, medial: Stack, lateral: Stack) -> Stack:
-        """Distance from a slit midway between the two ends of the ribbon, where both are near."""
-        apart = 0.5 * np.abs(medial - lateral) - self.settings.slit
-        far = -np.minimum(medial, lateral) - self.settings.touch
-        return np.asarray(np.maximum(apart, far))
+
+def _slit(medial: Stack, lateral: Stack, settings: SliceSettings) -> Stack:
+    """Distance from a slit midway between the two ends of the ribbon, where both are near, mm."""
+    apart = 0.5 * np.abs(medial - lateral) - settings.slit
+    far = -np.minimum(medial, lateral) - settings.touch
+    return np.asarray(np.maximum(apart, far))
 
 
 def points_of_ends(body: Body) -> tuple[Float, Float]:
@@ -314,44 +316,77 @@ def sample_slices(body: Body, points: Float, settings: SliceSettings) -> Stack:
     for step, depth, known in zip((1, -1), _depths(body, through, part), labeled, strict=True):
         if not known:
             _extrapolate(tissue[::step], (depth < settings.hidden_depth)[::step], pixel, settings)
-    alike = _alike(tissue > 0, settings)
-    stack = _stacked(tissue[alike], pixel, settings)
+    stack, first = _stacked(tissue, pixel, settings, labeled)
     voxels = body.to_voxels(points)[:, _order(through)] - low_corner(part)
-    voxels[:, 0] -= alike.start
+    voxels[:, 0] -= first
     where = ((voxels[:, 1:] + 0.5) * settings.upsampling - 0.5).astype(np.float32).T
     distance = stack.blend(voxels[:, 0].astype(np.float32), where)
     return np.asarray(np.clip(distance / (2 * settings.edge) + 0.5, 0, 1), dtype=np.float32)
 
 
-def _stacked(tissue: NDArray[np.uint8], pixel: float, settings: SliceSettings) -> _SliceStack:
-    """Outline and register slices; a single one is taken twice."""
+def _stacked(
+    tissue: NDArray[np.uint8],
+    pixel: float,
+    settings: SliceSettings,
+    beyond: tuple[bool, bool] = (False, False),
+) -> tuple[_SliceStack, int]:
+    """Outline and align slices, and the number of the first; a single one is taken twice.
+
+    ``beyond`` says whether the first and the last slice lie beyond the end planes.
+    """
     if len(tissue) == 1:
         tissue = np.concatenate([tissue, tissue])
     outlines = np.stack([outline_slice(image, pixel, settings) for image in tissue])
-    if settings.ring_length: outlines = cut_rings(outlines, pixel / settings.upsampling, settings)
     ends = np.array(
         [[_part_distance(image, end, pixel, settings) for image in tissue] for end in _ENDS]
     )
-    return _SliceStack(
-        outlines=outlines,
-        ends=ends,
-        flows=_flows(outlines, tissue, pixel, settings),
-        settings=settings,
+    fine = pixel / settings.upsampling
+    outlines = np.minimum(outlines, _slit(*ends, settings))
+    outlines = cut_rings(outlines, fine, settings)
+    ribbons = [
+        ribbon_nodes(outline, _ranks(image, settings.upsampling), fine, settings)
+        for outline, image in zip(outlines, tissue, strict=True)
+    ]
+    kept = _alike(ribbons, beyond, settings)
+    flows = register_slices(outlines[kept], pixel, settings)
+    _align(flows, ribbons[kept], fine, settings)
+    stack = _SliceStack(
+        outlines=outlines[kept], ends=ends[:, kept], flows=flows, settings=settings
     )
+    return stack, kept.start
 
 
-def _flows(
-    outlines: Stack, tissue: NDArray[np.uint8], pixel: float, settings: SliceSettings
-) -> Stack:
-    """Displacements from each slice to the next, by aligned ribbons, elsewhere by registration."""
+def _ranks(tissue: NDArray[np.uint8], upsampling: int) -> Float:
+    """How lateral each fine pixel's label is; NaN without a label."""
+    labels = np.kron(tissue, np.ones((upsampling,) * 2, dtype=np.uint8))
+    return np.where(labels > 0, lateral_rank(labels), np.nan)
+
+
+def _alike(
+    ribbons: list[Float | None], beyond: tuple[bool, bool], settings: SliceSettings
+) -> slice:
+    """Leave out slices beyond the end planes whose ribbon is not like that of the slice inside.
+
+    Beyond the anterior plane the uncus may join the body.
+    """
+    first, last = 0, len(ribbons) - 1
+    if beyond[0] and last > 1 and not _similar(ribbons[0], ribbons[1], settings):
+        first = 1
+    if beyond[1] and last - first > 1 and not _similar(ribbons[-1], ribbons[-2], settings):
+        last -= 1
+    return slice(first, last + 1)
+
+
+def _similar(first: Float | None, second: Float | None, settings: SliceSettings) -> bool:
+    if first is None or second is None:
+        return True
+    lengths = [np.linalg.norm(np.diff(n[:, n.shape[1] // 2], axis=0), axis=1).sum() for n in (first, second)]
+    return max(lengths) < settings.end_ratio * min(lengths)
+
+
+def _align(flows: Stack, ribbons: list[Float | None], pixel: float, settings: SliceSettings) -> None:
+    """Displace, in place, from slice to slice as aligned ribbons do, where both have one."""
     up = settings.upsampling
-    block = np.ones((up, up), dtype=np.uint8)
-    ribbons = []
-    for outline, image in zip(outlines, tissue, strict=True):
-        labels = np.kron(image, block)
-        rank = np.where(labels > 0, lateral_rank(labels), np.nan)
-        ribbons.append(ribbon_nodes(outline, rank, pixel / up, settings))
-    flows = register_slices(outlines, pixel, settings)
     where = (np.indices(flows.shape[2:]).reshape(2, -1).T + 0.5) * up - 0.5
     start = 0
     while start < len(ribbons):
@@ -359,7 +394,7 @@ def _flows(
         while stop < len(ribbons) and ribbons[stop] is not None:
             stop += 1
         if stop - start > 1:
-            aligned = align_nodes(ribbons[start:stop], pixel / up, settings)
+            aligned = align_nodes(ribbons[start:stop], pixel, settings)
             for k in range(start, stop - 1):
                 first, second = (nodes.reshape(-1, 2) for nodes in aligned[k - start : k - start + 2])
                 gap, nearest = cKDTree(0.5 * (first + second)).query(where, k=6)
@@ -368,21 +403,6 @@ def _flows(
                 move = ((second - first)[nearest] * weight[..., None]).sum(axis=1)
                 flows[:, k] = move.T.reshape(flows[:, k].shape)
         start = stop + 1
-    return flows
-
-
-def _alike(mask: Bool, settings: SliceSettings) -> slice:
-    """Leave out outer slices whose ribbon is much larger or smaller than that of the one inside.
-
-    There the uncus joins the body, or its labels end obliquely.
-    """
-    area = np.array([piece_sizes(ndimage.label(image)[0]).max(initial=1) for image in mask])
-    middle = len(area) // 2
-    odd = np.abs(np.log(area[1:] / area[:-1])) > np.log(settings.end_ratio)
-    before, after = np.flatnonzero(odd[:middle]), np.flatnonzero(odd[middle:])
-    first = int(before[-1]) + 1 if len(before) else 0
-    last = middle + int(after[0]) if len(after) else len(area) - 1
-    return slice(first, last + 1)
 
 
 def _labeled_ends(body: Body, through: int) -> tuple[bool, bool]:
@@ -439,7 +459,7 @@ def _extrapolate(
     where = np.indices(tissue.shape[1:], dtype=np.float32).reshape(2, -1) * up + 0.5 * (up - 1)
     level = np.full(where.shape[1], -1.0, dtype=np.float32)
     for number in range(int(cut.max(initial=-1)), -1, -1):
-        stack = _stacked(tissue[number + 1 : number + 3], pixel, settings)
+        stack, _ = _stacked(tissue[number + 1 : number + 3], pixel, settings)
         expected = stack.blend(level, where).reshape(tissue.shape[1:]) > 0
         inner = tissue[number + 1]
         nearest = ndimage.distance_transform_edt(
