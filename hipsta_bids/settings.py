@@ -132,9 +132,6 @@ class SliceSettings(SettingsTable):
     is added."""
     ring_beside: NonNegativeFloat = 2.0
     """What lies in the ribbon of the slices beside costs their depth times this as well."""
-    end_ratio: Annotated[float, Field(gt=1)] = 1.25
-    """Outer slices are left out if the area of their ribbon is this many times that of the next, or
-    less than its inverse."""
     ribbon_nodes: Annotated[int, Field(ge=3)] = 81
     """Nodes along the ribbon of a slice."""
     rim_half: PositiveFloat = 0.5

@@ -316,24 +316,15 @@ def sample_slices(body: Body, points: Float, settings: SliceSettings) -> Stack:
     for step, depth, known in zip((1, -1), _depths(body, through, part), labeled, strict=True):
         if not known:
             _extrapolate(tissue[::step], (depth < settings.hidden_depth)[::step], pixel, settings)
-    stack, first = _stacked(tissue, pixel, settings, labeled)
+    stack = _stacked(tissue, pixel, settings)
     voxels = body.to_voxels(points)[:, _order(through)] - low_corner(part)
-    voxels[:, 0] -= first
     where = ((voxels[:, 1:] + 0.5) * settings.upsampling - 0.5).astype(np.float32).T
     distance = stack.blend(voxels[:, 0].astype(np.float32), where)
     return np.asarray(np.clip(distance / (2 * settings.edge) + 0.5, 0, 1), dtype=np.float32)
 
 
-def _stacked(
-    tissue: NDArray[np.uint8],
-    pixel: float,
-    settings: SliceSettings,
-    beyond: tuple[bool, bool] = (False, False),
-) -> tuple[_SliceStack, int]:
-    """Outline and align slices, and the number of the first; a single one is taken twice.
-
-    ``beyond`` says whether the first and the last slice lie beyond the end planes.
-    """
+def _stacked(tissue: NDArray[np.uint8], pixel: float, settings: SliceSettings) -> _SliceStack:
+    """Outline and align slices; a single one is taken twice."""
     if len(tissue) == 1:
         tissue = np.concatenate([tissue, tissue])
     outlines = np.stack([outline_slice(image, pixel, settings) for image in tissue])
@@ -343,45 +334,38 @@ def _stacked(
     fine = pixel / settings.upsampling
     outlines = np.minimum(outlines, _slit(*ends, settings))
     outlines = cut_rings(outlines, fine, settings)
+    ranks = [_ranks(image, settings.upsampling) for image in tissue]
+    for outline, rank in zip(outlines, ranks, strict=True):
+        _drop_doubles(outline, rank, settings)
     ribbons = [
-        ribbon_nodes(outline, _ranks(image, settings.upsampling), fine, settings)
-        for outline, image in zip(outlines, tissue, strict=True)
+        ribbon_nodes(outline, rank, fine, settings)
+        for outline, rank in zip(outlines, ranks, strict=True)
     ]
-    kept = _alike(ribbons, beyond, settings)
-    flows = register_slices(outlines[kept], pixel, settings)
-    _align(flows, ribbons[kept], fine, settings)
-    stack = _SliceStack(
-        outlines=outlines[kept], ends=ends[:, kept], flows=flows, settings=settings
-    )
-    return stack, kept.start
+    flows = register_slices(outlines, pixel, settings)
+    _align(flows, ribbons, fine, settings)
+    return _SliceStack(outlines=outlines, ends=ends, flows=flows, settings=settings)
+
+
+def _drop_doubles(outline: Stack, rank: Float, settings: SliceSettings) -> None:
+    """Drop, in place, pieces of a slice (I, J) that have no subfield that the largest one lacks.
+
+    The ribbon has each subfield once: such a piece is the uncus, which passes beside the body.
+    """
+    pieces, count = ndimage.label(outline > 0)
+    if count < 2:  # noqa: PLR2004 -- one piece is the ribbon
+        return
+    main = int(piece_sizes(pieces).argmax())
+    known = np.unique(rank[(pieces == main) & np.isfinite(rank)])
+    for number in range(1, count + 1):
+        piece = pieces == number
+        if number != main and np.isin(rank[piece & np.isfinite(rank)], known).all():
+            outline[piece] = -settings.reach
 
 
 def _ranks(tissue: NDArray[np.uint8], upsampling: int) -> Float:
     """How lateral each fine pixel's label is; NaN without a label."""
     labels = np.kron(tissue, np.ones((upsampling,) * 2, dtype=np.uint8))
     return np.where(labels > 0, lateral_rank(labels), np.nan)
-
-
-def _alike(
-    ribbons: list[Float | None], beyond: tuple[bool, bool], settings: SliceSettings
-) -> slice:
-    """Leave out slices beyond the end planes whose ribbon is not like that of the slice inside.
-
-    Beyond the anterior plane the uncus may join the body.
-    """
-    first, last = 0, len(ribbons) - 1
-    if beyond[0] and last > 1 and not _similar(ribbons[0], ribbons[1], settings):
-        first = 1
-    if beyond[1] and last - first > 1 and not _similar(ribbons[-1], ribbons[-2], settings):
-        last -= 1
-    return slice(first, last + 1)
-
-
-def _similar(first: Float | None, second: Float | None, settings: SliceSettings) -> bool:
-    if first is None or second is None:
-        return True
-    lengths = [np.linalg.norm(np.diff(n[:, n.shape[1] // 2], axis=0), axis=1).sum() for n in (first, second)]
-    return max(lengths) < settings.end_ratio * min(lengths)
 
 
 def _align(flows: Stack, ribbons: list[Float | None], pixel: float, settings: SliceSettings) -> None:
@@ -459,7 +443,7 @@ def _extrapolate(
     where = np.indices(tissue.shape[1:], dtype=np.float32).reshape(2, -1) * up + 0.5 * (up - 1)
     level = np.full(where.shape[1], -1.0, dtype=np.float32)
     for number in range(int(cut.max(initial=-1)), -1, -1):
-        stack, _ = _stacked(tissue[number + 1 : number + 3], pixel, settings)
+        stack = _stacked(tissue[number + 1 : number + 3], pixel, settings)
         expected = stack.blend(level, where).reshape(tissue.shape[1:]) > 0
         inner = tissue[number + 1]
         nearest = ndimage.distance_transform_edt(
