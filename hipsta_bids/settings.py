@@ -52,11 +52,11 @@ class BodySettings(SettingsTable):
     """Where slices are thicker than this many pixels, they have a say in the tilt of the planes."""
     plane_slices: PositiveFloat = 1.5
     """There planes are fitted to labels within this many slices of the interface."""
-    plane_width: PositiveFloat = 0.1
+    plane_width: PositiveFloat = 0.05
     """Width of the logistic function, slices."""
     plane_tilt: Annotated[float, Field(gt=0, lt=90)] = 10.0
     """Tilts against the slices are expected to be of this size, degrees (standard deviation)."""
-    plane_prior: NonNegativeFloat = 0.03
+    plane_prior: NonNegativeFloat = 0.05
     """Weight of that expectation; all labels together weigh 1."""
     end_margin: NonNegativeFloat = 0.0
     """Taken off either end where head or tail labels are missing, mm."""
