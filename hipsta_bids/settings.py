@@ -132,6 +132,8 @@ class SliceSettings(SettingsTable):
     is added."""
     ring_beside: NonNegativeFloat = 2.0
     """What lies in the ribbon of the slices beside costs their depth times this as well."""
+    turn_length: PositiveFloat = 3.0
+    """Turns are parts of the ribbon farther apart along it than this, mm."""
     ribbon_nodes: Annotated[int, Field(ge=3)] = 81
     """Nodes along the ribbon of a slice."""
     rim_half: PositiveFloat = 0.5

@@ -1,35 +1,42 @@
-"""The ribbon in single slices: its coordinates in two dimensions, aligned from slice to slice.
+"""The ribbon in single slices: its nodes along and across, aligned from slice to slice.
 
-In each slice two harmonic functions run along and across the ribbon. Where the mid-lines of two
-slices belong together is found by monotone matching, so that walls between slices can be moved
-from one to the other even where the ribbon moves sideways by more than its own thickness.
+In each slice, harmonic functions run along and across the ribbon and give it nodes. Where nodes of
+two slices belong together is found by monotone matching of their mid-lines, so that the walls of
+one can be moved to those of the other even where the ribbon moves by more than its own thickness.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 from lapy import TriaMesh
-from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.interpolate import LinearNDInterpolator
-from scipy.spatial import Delaunay, QhullError
+from scipy.spatial import Delaunay, QhullError, cKDTree
 from skimage.measure import find_contours
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.digital import piece_sizes
 from hipsta_bids.geometry.fem import Laplace
 from hipsta_bids.settings import SliceSettings
-from hipsta_bids.types import Bool, Float, Int
+from hipsta_bids.types import Float, Int
 
 _ACROSS = np.linspace(-1, 1, 5)
 """Coordinates across the ribbon at which it has nodes."""
+_WITHIN = 1 - 1e-6
+"""Nodes of the wall are looked up this near to it, so that rounding does not put them outside."""
+_PER_NODE = 4
+"""Places on a mid-line per node of the other, in matching."""
+_MAX_STRETCH = 4
+"""Of a mid-line against another."""
+_NEIGHBORS = 6
+"""Nearest nodes that a pixel moves with."""
 
 
 class _Mesh(NamedTuple):
     """Triangles inside an outline."""
 
     points: Float
-    """(V, 2) fine pixels; the first ones go round the outline."""
+    """(V, 2) pixels; the first ones go round the outline."""
     cells: Int
     """(T, 3)."""
     border: int
@@ -39,10 +46,10 @@ class _Mesh(NamedTuple):
 def ribbon_nodes(
     outline: Float, lateral: Float, pixel: float, settings: SliceSettings
 ) -> Float | None:
-    """Nodes (X, Z, 2) of a slice's largest piece, from medial to lateral; fine pixels.
+    """Nodes (X, Z, 2), in pixels, of the largest piece in a slice, the first ones medial.
 
-    ``outline`` (I, J) is a signed distance, mm, ``lateral`` (I, J) grows from medial to lateral
-    within the ribbon, and NaN elsewhere. None where the piece is no ribbon.
+    ``outline`` (I, J) is the signed distance, mm; ``lateral`` (I, J) grows from medial to lateral
+    and is NaN outside. None where the piece has no two ends, or its coordinates fold.
     """
     pieces, count = ndimage.label(outline > 0)
     if not count:
@@ -50,26 +57,30 @@ def ribbon_nodes(
     main = pieces == piece_sizes(pieces).argmax()
     try:
         mesh = _triangles(np.where(main | (pieces == 0), outline, -pixel), pixel)
-        return _nodes(mesh, np.where(main, lateral, np.nan), settings)
-    except (GeometryError, QhullError, ValueError, IndexError, RuntimeError):
+        nodes = _nodes(mesh, np.where(main, lateral, np.nan), settings)
+    except (GeometryError, QhullError):
         return None
+    return nodes if np.isfinite(nodes).all() else None
 
 
 def _triangles(field: Float, pixel: float) -> _Mesh:
-    """Triangulate where a field (I, J), mm, is positive, by its pixels and its contour."""
-    lines = find_contours(np.pad(field, 1, constant_values=-pixel), 0.0)  # type: ignore[no-untyped-call]
+    """Triangulate where a field (I, J), mm, is positive; vertices are on its contour and pixels."""
+    framed = np.pad(field, 1, constant_values=-pixel)
+    lines = find_contours(framed, 0.0)  # type: ignore[no-untyped-call]
     line = max(lines, key=len) - 1
-    steps = np.append(0.0, np.linalg.norm(np.diff(line, axis=0), axis=1).cumsum())
-    count = max(round(steps[-1]), 8)
-    at = np.linspace(0, steps[-1], count, endpoint=False)
-    border = np.stack([np.interp(at, steps, line[:, k]) for k in (0, 1)], axis=1)
-    inner = np.argwhere(field > 0.5 * pixel)
-    points = np.concatenate([border, inner])
+    along = _along(line)
+    count = round(along[-1])
+    if count < 2 * len(_ACROSS):
+        raise GeometryError("a slice has a few pixels only", reason="slice-ribbon")
+    at = np.linspace(0, along[-1], count, endpoint=False)
+    border = np.stack([np.interp(at, along, line[:, k]) for k in (0, 1)], axis=1)
+    points = np.concatenate([border, np.argwhere(field > 0.5 * pixel)])
     cells = Delaunay(points).simplices
-    inside = ndimage.map_coordinates(field, points[cells].mean(axis=1).T, order=1) > 0
     a, b, c = (points[cells[:, k]] for k in range(3))
     area = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
-    cells = np.where((area > 0)[:, None], cells, cells[:, ::-1])[inside & (np.abs(area) > 1e-6)]
+    inside = ndimage.map_coordinates(field, points[cells].mean(axis=1).T, order=1) > 0
+    cells = np.where((area > 0)[:, None], cells, cells[:, ::-1])
+    cells = cells[inside & (np.abs(area) > 1e-6)]  # noqa: PLR2004 -- slivers on straight borders
     used = np.zeros(len(points), dtype=bool)
     used[cells] = True
     number = np.cumsum(used) - 1
@@ -77,112 +88,148 @@ def _triangles(field: Float, pixel: float) -> _Mesh:
 
 
 def _nodes(mesh: _Mesh, lateral: Float, settings: SliceSettings) -> Float:
+    """Invert the coordinates along and across the ribbon on a regular grid; NaN where they fold."""
     flat = np.column_stack([mesh.points, np.zeros(len(mesh.points))])
     laplace = Laplace(TriaMesh(flat, mesh.cells))
     slow = laplace.eigenfunctions(1)[1][:, 0]
+    if _rises(slow, mesh.points, lateral) < 0:
+        slow = -slow
     border = mesh.points[: mesh.border]
-    steps = np.linalg.norm(np.roll(border, -1, axis=0) - border, axis=1)
-    along, length = np.append(0.0, steps.cumsum()[:-1]), float(steps.sum())
-    area = _area(border)
-    thickness = 2 * abs(area) / length
-    tips = [int(np.argmin(slow[: mesh.border])), int(np.argmax(slow[: mesh.border]))]
-    index = np.rint(mesh.points).astype(int)
-    known = lateral[tuple(np.clip(index, 0, np.array(lateral.shape) - 1).T)]
-    good = np.isfinite(known)
-    if np.corrcoef(slow[good], known[good])[0, 1] < 0:
-        tips = tips[::-1]
-    strips, ends = [], []
-    for tip in tips:
-        gap = (along - along[tip] + 0.5 * length) % length - 0.5 * length
-        near = np.abs(gap) <= settings.rim_half * thickness
-        strips.append(np.flatnonzero(near))
-        ends.append((int(np.argmin(np.where(near, gap, np.inf))), int(np.argmax(np.where(near, gap, -np.inf)))))
-    first = _between(ends[0][1], ends[1][0], mesh.border)
-    second = _between(ends[1][1], ends[0][0], mesh.border)
-    if area < 0:
-        first, second = second, first
-    x = laplace.between(strips[0], strips[1])
-    z = laplace.between(first, second)
-    scale = np.array([0.5 * abs(area) / thickness, 0.5 * thickness])
-    back = LinearNDInterpolator(np.column_stack([x, z]) * scale, mesh.points)
-    rows, columns = np.meshgrid(
-        np.linspace(-1, 1, settings.ribbon_nodes), _ACROSS, indexing="ij"
-    )
-    found = back(np.stack([rows, columns], axis=-1) * (1 - 1e-6) * scale)
-    if not np.isfinite(found).all():
-        raise GeometryError("the ribbon of a slice folds", reason="slice-ribbon")
-    return np.asarray(found)
+    around = _along(np.concatenate([border, border[:1]]))
+    after = np.roll(border, -1, axis=0)
+    area = 0.5 * float((border[:, 0] * after[:, 1] - border[:, 1] * after[:, 0]).sum())
+    thickness = 2 * abs(area) / around[-1]
+    strips = []
+    for tip in (int(slow[: mesh.border].argmin()), int(slow[: mesh.border].argmax())):
+        gap = (around[:-1] - around[tip] + 0.5 * around[-1]) % around[-1] - 0.5 * around[-1]
+        order = np.argsort(gap)
+        strips.append(order[np.abs(gap[order]) <= settings.rim_half * thickness])
+    medial, lateral_end = strips
+    walls = [
+        _numbers(medial[-1], lateral_end[0], mesh.border),
+        _numbers(lateral_end[-1], medial[0], mesh.border),
+    ]
+    first, second = walls if area > 0 else walls[::-1]
+    # Lengths in pixels, so that triangles between the coordinates keep their shape.
+    scale = 0.5 * np.array([abs(area) / thickness, thickness])
+    places = np.column_stack([laplace.between(medial, lateral_end), laplace.between(first, second)])
+    rows, columns = np.meshgrid(np.linspace(-1, 1, settings.ribbon_nodes), _ACROSS, indexing="ij")
+    wanted = _WITHIN * np.stack([rows, columns], axis=-1)
+    return np.asarray(LinearNDInterpolator(places * scale, mesh.points)(wanted * scale))
 
 
-def _area(line: Float) -> float:
-    after = np.roll(line, -1, axis=0)
-    return 0.5 * float((line[:, 0] * after[:, 1] - line[:, 1] * after[:, 0]).sum())
+def _rises(values: Float, points: Float, lateral: Float) -> float:
+    """Covariance of values (V,) at points (V, 2), pixels, with how lateral these are."""
+    index = np.clip(np.rint(points).astype(int), 0, np.array(lateral.shape) - 1)
+    ranks = lateral[tuple(index.T)]
+    known = np.isfinite(ranks)
+    if not known.any():
+        return 0.0
+    return float(((ranks[known] - ranks[known].mean()) * values[known]).sum())
 
 
-def _between(start: int, stop: int, count: int) -> Int:
+def _numbers(start: int, stop: int, count: int) -> Int:
     """Numbers from start to stop, both included, round a circle of ``count``."""
-    return (start + np.arange((stop - start) % count + 1)) % count
+    return np.asarray((start + np.arange((stop - start) % count + 1)) % count)
 
 
-def match_lines(first: Float, second: Float, bending: float) -> Float:
-    """Where on the second mid-line (N, 2), mm, points of the first (M, 2) belong: (M,) in 0 to 1.
+def _along(line: Float) -> Float:
+    """Length of a line (N, 2) up to each of its points, (N,)."""
+    return np.append(0.0, np.linalg.norm(np.diff(line, axis=0), axis=1).cumsum())
 
-    Monotone, from end to end: the sum of squared distances and of ``bending`` (mm2) times the
-    squared stretch, by dynamic programming.
+
+def _middle(nodes: Float) -> Float:
+    return np.asarray(nodes[:, nodes.shape[1] // 2])
+
+
+def align_nodes(
+    ribbons: list[Float | None], pixel: float, settings: SliceSettings
+) -> list[Float | None]:
+    """Move nodes (X, Z, 2) along each slice to where those of the slice inside belong.
+
+    From the middle slice, on which they are at equal distances, outwards.
     """
-    count = 4 * len(first)
-    line, length = _even(second, count)
-    steps = np.linalg.norm(np.diff(first, axis=0), axis=1)
-    cost = ((first[:, None] - line[None]) ** 2).sum(axis=2)
-    reach = 16  # a stretch by four
-    stretch = length / (count - 1) * np.arange(reach + 1) / np.maximum(steps[:, None], 1e-3)
-    total = np.full(count, np.inf)
-    total[0] = cost[0, 0]
-    chosen = np.zeros((len(first), count), dtype=np.int16)
-    for i in range(1, len(first)):
-        before = np.full((reach + 1, count), np.inf)
-        for step in range(reach + 1):
-            before[step, step:] = total[: count - step] + bending * stretch[i - 1, step] ** 2
-        chosen[i] = before.argmin(axis=0)
-        total = before.min(axis=0) + cost[i]
-    at = np.zeros(len(first))
-    j = count - 1
-    for i in range(len(first) - 1, -1, -1):
-        at[i] = j
-        j -= int(chosen[i, j])
-    return at / (count - 1)
-
-
-def _even(line: Float, count: int) -> tuple[Float, float]:
-    """Points (count, 2) at equal steps along a line (N, 2), and its length."""
-    along = np.append(0.0, np.linalg.norm(np.diff(line, axis=0), axis=1).cumsum())
-    at = np.linspace(0, along[-1], count)
-    return np.stack([np.interp(at, along, line[:, k]) for k in (0, 1)], axis=1), float(along[-1])
-
-
-def align_nodes(nodes: list[Float], pixel: float, settings: SliceSettings) -> list[Float]:
-    """Move nodes (X, Z, 2) along each slice so that equal numbers belong together."""
-    middle = len(nodes) // 2
-    aligned: dict[int, Float] = {middle: _at(nodes[middle], np.linspace(0, 1, len(nodes[middle])))}
-    for order in (range(middle + 1, len(nodes)), range(middle - 1, -1, -1)):
-        last = middle
+    aligned = list(ribbons)
+    middle = len(ribbons) // 2
+    for order in (range(middle, len(ribbons)), range(middle, -1, -1)):
+        inside = None
         for number in order:
-            center = nodes[number].shape[1] // 2
-            where = match_lines(
-                pixel * aligned[last][:, center],
-                pixel * nodes[number][:, center],
-                settings.match_stretch,
-            )
-            aligned[number] = _at(nodes[number], where)
-            last = number
-    return [aligned[number] for number in range(len(nodes))]
+            nodes = ribbons[number]
+            if nodes is None:
+                inside = None
+                continue
+            where = np.linspace(0, 1, len(nodes))
+            if inside is not None:
+                lines = pixel * _middle(inside), pixel * _middle(nodes)
+                where = match_lines(*lines, settings.match_stretch)
+            aligned[number] = inside = _nodes_at(nodes, where)
+    return aligned
 
 
-def _at(nodes: Float, where: Float) -> Float:
-    """Nodes at fractions (M,) of the length of the mid-line."""
-    middle = nodes[:, nodes.shape[1] // 2]
-    along = np.append(0.0, np.linalg.norm(np.diff(middle, axis=0), axis=1).cumsum())
+def match_lines(first: Float, second: Float, stretching: float) -> Float:
+    """Where points of a line (M, 2), mm, belong on a second one (N, 2): (M,) shares of its length.
+
+    Monotone and from end to end. The sum over the points of squared distance and of ``stretching``
+    (mm2) times the squared stretch is least, by dynamic programming.
+    """
+    count = _PER_NODE * (len(first) - 1) + 1
+    along = _along(second)
+    at = np.linspace(0, along[-1], count)
+    places = np.stack([np.interp(at, along, second[:, k]) for k in (0, 1)], axis=1)
+    cost = ((first[:, None] - places) ** 2).sum(axis=2)
+    moves = np.arange(_PER_NODE * _MAX_STRETCH + 1)
+    steps = np.maximum(np.diff(_along(first)), 1e-3 * along[-1] / count)
+    stretch = stretching * (at[1] * moves / steps[:, None]) ** 2
+    total = np.where(np.arange(count) == 0, cost[0], np.inf)
+    chosen = np.zeros((len(first), count), dtype=np.intp)
+    for number in range(1, len(first)):
+        ways = np.full((len(moves), count), np.inf)
+        for move in moves:
+            ways[move, move:] = total[: count - move] + stretch[number - 1, move]
+        chosen[number] = ways.argmin(axis=0)
+        total = ways.min(axis=0) + cost[number]
+    place = count - 1
+    where = np.zeros(len(first))
+    for number in range(len(first) - 1, -1, -1):
+        where[number] = place / (count - 1)
+        place -= chosen[number, place]
+    return where
+
+
+def _nodes_at(nodes: Float, where: Float) -> Float:
+    """Nodes (M, Z, 2) at shares (M,) of the length of the mid-line."""
+    along = _along(_middle(nodes))
     row = np.interp(where * along[-1], along, np.arange(len(nodes)))
     below = np.clip(row.astype(int), 0, len(nodes) - 2)
     share = (row - below)[:, None, None]
     return np.asarray((1 - share) * nodes[below] + share * nodes[below + 1])
+
+
+def moves_between(first: Float, second: Float, where: Float) -> Float:
+    """Displacement (N, 2) from one slice to the next at pixels (N, 2) halfway between both.
+
+    Pixels move with the nodes (X, Z, 2) near to them.
+    """
+    first, second = first.reshape(-1, 2), second.reshape(-1, 2)
+    gap, nearest = cKDTree(0.5 * (first + second)).query(where, k=_NEIGHBORS)
+    weight = 1 / (gap**2 + 0.25)  # within half a pixel all nodes count about the same
+    weight /= weight.sum(axis=1, keepdims=True)
+    return np.asarray(((second - first)[nearest] * weight[..., None]).sum(axis=1))
+
+
+def part_turns(outline: Float, nodes: Float, pixel: float, settings: SliceSettings) -> None:
+    """Widen, in place, gaps between turns of a slice's ribbon that later smoothing would close.
+
+    ``outline`` (I, J) is the signed distance, mm, ``nodes`` (X, Z, 2) are in pixels.
+    """
+    near = np.argwhere(np.abs(outline) < settings.touch)
+    row = cKDTree(nodes.reshape(-1, 2)).query(near)[1] // nodes.shape[1]
+    place = np.full(outline.shape, np.nan)
+    place[tuple(near.T)] = pixel * _along(_middle(nodes))[row]
+    between = np.zeros(outline.shape, dtype=bool)
+    between[:-1] |= np.abs(np.diff(place, axis=0)) > settings.turn_length
+    between[:, :-1] |= np.abs(np.diff(place, axis=1)) > settings.turn_length
+    between &= outline < pixel
+    if between.any():
+        gap = pixel * ndimage.distance_transform_edt(~between)
+        np.minimum(outline, gap - settings.slit, out=outline)

@@ -2,23 +2,24 @@
 
 Where slices are much thicker than their pixels, the ribbon moves sideways by its own thickness from
 one slice to the next, and blending slices in place would break it. Each slice becomes a signed
-distance from its outline; neighboring slices are registered, and the shapes between them are blends
-of both, moved along the registration. Where head or tail labels hide how the sheet continues, its
-shapes are extrapolated from inside. Where the two ends of the ribbon touch, they are kept apart.
+distance from its outline; the ribbons of neighboring slices are aligned (``ribbon``), or registered
+where one is none, and the shapes between them are blends of both, moved along. Where head or tail
+labels hide how the sheet continues, its shapes are extrapolated from inside. Turns of the ribbon
+that touch are kept apart.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, sparse
 from scipy.sparse import csgraph
-from scipy.spatial import cKDTree
 from scipy.special import ndtri
 
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.digital import Box, box, low_corner, piece_sizes, to_ras, voxel_points
-from hipsta_bids.geometry.ribbon import align_nodes, ribbon_nodes
+from hipsta_bids.geometry.ribbon import align_nodes, moves_between, part_turns, ribbon_nodes
 from hipsta_bids.protocols.protocol import Tissue, lateral_rank
 from hipsta_bids.settings import SliceSettings
 from hipsta_bids.types import Bool, Float
@@ -341,8 +342,11 @@ def _stacked(tissue: NDArray[np.uint8], pixel: float, settings: SliceSettings) -
         ribbon_nodes(outline, rank, fine, settings)
         for outline, rank in zip(outlines, ranks, strict=True)
     ]
+    for outline, nodes in zip(outlines, ribbons, strict=True):
+        if nodes is not None:
+            part_turns(outline, nodes, fine, settings)
     flows = register_slices(outlines, pixel, settings)
-    _align(flows, ribbons, fine, settings)
+    _align(flows, align_nodes(ribbons, fine, settings), settings)
     return _SliceStack(outlines=outlines, ends=ends, flows=flows, settings=settings)
 
 
@@ -368,25 +372,14 @@ def _ranks(tissue: NDArray[np.uint8], upsampling: int) -> Float:
     return np.where(labels > 0, lateral_rank(labels), np.nan)
 
 
-def _align(flows: Stack, ribbons: list[Float | None], pixel: float, settings: SliceSettings) -> None:
-    """Displace, in place, from slice to slice as aligned ribbons do, where both have one."""
+def _align(flows: Stack, ribbons: list[Float | None], settings: SliceSettings) -> None:
+    """Replace, in place, displacements between slices with nodes by those of the nodes."""
     up = settings.upsampling
     where = (np.indices(flows.shape[2:]).reshape(2, -1).T + 0.5) * up - 0.5
-    start = 0
-    while start < len(ribbons):
-        stop = start
-        while stop < len(ribbons) and ribbons[stop] is not None:
-            stop += 1
-        if stop - start > 1:
-            aligned = align_nodes(ribbons[start:stop], pixel, settings)
-            for k in range(start, stop - 1):
-                first, second = (nodes.reshape(-1, 2) for nodes in aligned[k - start : k - start + 2])
-                gap, nearest = cKDTree(0.5 * (first + second)).query(where, k=6)
-                weight = 1 / (gap**2 + 0.25)
-                weight /= weight.sum(axis=1, keepdims=True)
-                move = ((second - first)[nearest] * weight[..., None]).sum(axis=1)
-                flows[:, k] = move.T.reshape(flows[:, k].shape)
-        start = stop + 1
+    for number, (first, second) in enumerate(pairwise(ribbons)):
+        if first is not None and second is not None:
+            moves = moves_between(first, second, where)
+            flows[:, number] = moves.T.reshape(flows[:, number].shape)
 
 
 def _labeled_ends(body: Body, through: int) -> tuple[bool, bool]:
