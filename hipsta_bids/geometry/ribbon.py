@@ -57,21 +57,26 @@ def ribbon_nodes(
     main = pieces == piece_sizes(pieces).argmax()
     try:
         mesh = _triangles(np.where(main | (pieces == 0), outline, -pixel), pixel)
+        if mesh is None:
+            return None
         nodes = _nodes(mesh, np.where(main, lateral, np.nan), settings)
     except (GeometryError, QhullError):
         return None
     return nodes if np.isfinite(nodes).all() else None
 
 
-def _triangles(field: Float, pixel: float) -> _Mesh:
-    """Triangulate where a field (I, J), mm, is positive; vertices are on its contour and pixels."""
+def _triangles(field: Float, pixel: float) -> _Mesh | None:
+    """Triangulate where a field (I, J), mm, is positive; vertices are on its contour and pixels.
+
+    None for a few pixels only.
+    """
     framed = np.pad(field, 1, constant_values=-pixel)
     lines = find_contours(framed, 0.0)  # type: ignore[no-untyped-call]
     line = max(lines, key=len) - 1
     along = _along(line)
     count = round(along[-1])
     if count < 2 * len(_ACROSS):
-        raise GeometryError("a slice has a few pixels only", reason="slice-ribbon")
+        return None
     at = np.linspace(0, along[-1], count, endpoint=False)
     border = np.stack([np.interp(at, along, line[:, k]) for k in (0, 1)], axis=1)
     points = np.concatenate([border, np.argwhere(field > 0.5 * pixel)])
@@ -212,9 +217,9 @@ def moves_between(first: Float, second: Float, where: Float) -> Float:
     """
     first, second = first.reshape(-1, 2), second.reshape(-1, 2)
     gap, nearest = cKDTree(0.5 * (first + second)).query(where, k=_NEIGHBORS)
-    weight = 1 / (gap**2 + 0.25)  # within half a pixel all nodes count about the same
-    weight /= weight.sum(axis=1, keepdims=True)
-    return np.asarray(((second - first)[nearest] * weight[..., None]).sum(axis=1))
+    weight = 1 / (np.asarray(gap) ** 2 + 0.25)  # within half a pixel all nodes count about the same
+    weight /= np.sum(weight, axis=1, keepdims=True)
+    return np.asarray(np.einsum("nk,nkd->nd", weight, (second - first)[nearest]))
 
 
 def part_turns(outline: Float, nodes: Float, pixel: float, settings: SliceSettings) -> None:

@@ -333,7 +333,7 @@ def _stacked(tissue: NDArray[np.uint8], pixel: float, settings: SliceSettings) -
         [[_part_distance(image, end, pixel, settings) for image in tissue] for end in _ENDS]
     )
     fine = pixel / settings.upsampling
-    outlines = np.minimum(outlines, _slit(*ends, settings))
+    outlines = np.minimum(outlines, _slit(ends[0], ends[1], settings))
     outlines = cut_rings(outlines, fine, settings)
     ranks = [_ranks(image, settings.upsampling) for image in tissue]
     for outline, rank in zip(outlines, ranks, strict=True):
@@ -375,7 +375,8 @@ def _ranks(tissue: NDArray[np.uint8], upsampling: int) -> Float:
 def _align(flows: Stack, ribbons: list[Float | None], settings: SliceSettings) -> None:
     """Replace, in place, displacements between slices with nodes by those of the nodes."""
     up = settings.upsampling
-    where = (np.indices(flows.shape[2:]).reshape(2, -1).T + 0.5) * up - 0.5
+    pixels = np.indices(flows.shape[2:]).reshape(2, -1).T.astype(np.float64)
+    where = (pixels + 0.5) * up - 0.5
     for number, (first, second) in enumerate(pairwise(ribbons)):
         if first is not None and second is not None:
             moves = moves_between(first, second, where)
