@@ -52,6 +52,16 @@ class BodySettings(SettingsTable):
     plane_reach: PositiveFloat = 3.0
     """End planes are fitted to labels within this distance of the interface, mm; head and tail
     labels that lie up to it on the wrong side get the subfield of a neighbor."""
+    plane_ratio: NonNegativeFloat = 1.8
+    """Where slices are thicker than this many pixels, they have a say in the tilt of the planes."""
+    plane_slices: PositiveFloat = 1.5
+    """There planes are fitted to labels within this many slices of the interface."""
+    plane_width: PositiveFloat = 0.05
+    """Width of the logistic function, slices."""
+    plane_tilt: Annotated[float, Field(gt=0, lt=90)] = 10.0
+    """Tilts against the slices are expected to be of this size, degrees (standard deviation)."""
+    plane_prior: NonNegativeFloat = 0.05
+    """Weight of that expectation; all labels together weigh 1."""
     end_margin: NonNegativeFloat = 0.0
     """Taken off either end where head or tail labels are missing, mm."""
     core_share: PositiveFraction = 0.5
@@ -138,6 +148,19 @@ class SliceSettings(SettingsTable):
     """Fragments farther away are dropped if they are smaller than this, mm2."""
     hole_area: NonNegativeFloat = 3.0
     """Smaller holes in a slice are filled, mm2."""
+    ring_length: NonNegativeFloat = 0.02
+    """Rings are cut along the cheapest path: cost of its length, to which depth in the ribbon (mm)
+    is added."""
+    ring_beside: NonNegativeFloat = 2.0
+    """What lies in the ribbon of the slices beside costs their depth times this as well."""
+    turn_length: PositiveFloat = 3.0
+    """Turns are parts of the ribbon farther apart along it than this, mm."""
+    ribbon_nodes: Annotated[int, Field(ge=3)] = 81
+    """Nodes along the ribbon of a slice."""
+    rim_half: PositiveFloat = 0.5
+    """Half length of the edges of the ribbon along its outline, multiples of 2 area / length."""
+    match_stretch: NonNegativeFloat = 0.5
+    """Mid-lines of slices are matched by squared distance, mm2, and this times squared stretch."""
     flow_window: PositiveFloat = 1.0
     """Standard deviation of the window of the registration of slices, mm."""
     flow_ridge: NonNegativeFloat = 0.02

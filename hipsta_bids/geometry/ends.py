@@ -11,6 +11,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.special import expit
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.digital import ALL, piece_sizes, voxel_points
@@ -107,8 +108,11 @@ def find_end_planes(
     )
     for end, below, above in sides:
         if min(below.sum(), above.sum()) >= settings.min_end_voxels:
-            point, normal = _separating_plane(
-                points[below], points[above], axis, settings.plane_reach
+            across = _across_slices(volume.affine, axis, settings)
+            point, normal = (
+                _separating_plane(points[below], points[above], axis, settings.plane_reach)
+                if across is None
+                else _plane_along_slices(points[below], points[above], across, settings)
             )
             planes[end] = _Plane(point, normal, "labels")
     if len(planes) < 2:  # noqa: PLR2004 -- two ends
@@ -211,6 +215,70 @@ def _separating_plane(below: Float, above: Float, axis: Float, reach: float) -> 
             break
         point, normal = _logistic_plane(near[0], near[1], axis)
     return point, normal
+
+
+def _across_slices(affine: Float, axis: Float, settings: BodySettings) -> Float | None:
+    """Vector from one slice to the next, mm, (3,), where slices are thick and lie across the axis.
+
+    It points as the axis does.
+    """
+    edges = np.linalg.norm(affine[:3, :3], axis=0)
+    through = int(np.argmax(edges))
+    step = np.asarray(affine[:3, through])
+    along = float(step @ axis)
+    if (
+        edges[through] <= settings.plane_ratio * np.delete(edges, through).max()
+        or abs(along) < edges[through] * np.cos(np.radians(60))  # cut lengthwise
+    ):
+        return None
+    return step if along > 0 else -step
+
+
+def _plane_along_slices(
+    below: Float, above: Float, across: Float, settings: BodySettings
+) -> tuple[Float, Float]:
+    """Fit the point and normal of a plane between labels in thick slices, RAS mm.
+
+    The labels of one slice or two that lie on both sides leave the tilt open over a wide range. Of
+    that range the plane takes what is near to the slices: its slopes against them have a normal
+    prior distribution. The logistic function's width is a fraction of a slice, whatever the tilt.
+    """
+    step = float(np.linalg.norm(across))
+    normal = across / step
+    flat = np.linalg.svd(normal[None])[2][1:]
+    low, high = below @ normal, above @ normal
+    level = 0.5 * (np.quantile(low, 0.995) + np.quantile(high, 0.005))
+    point, slopes = level * normal, np.zeros(2)
+    prior = np.full(3, settings.plane_prior / np.tan(np.radians(settings.plane_tilt)) ** 2)
+    prior[0] = 0.0
+    # From a wide function to the narrow one: Newton's method needs a start near its end.
+    for width in (1.0, 0.3, settings.plane_width):
+        near = [
+            part[np.abs((part - point) @ (normal - slopes @ flat)) < settings.plane_slices * step]
+            for part in (below, above)
+        ]
+        count = [len(part) for part in near]
+        if min(count) < 10:  # noqa: PLR2004 -- three parameters need some voxels
+            break
+        points = np.vstack(near)
+        offset = points - points.mean(axis=0)
+        design = np.column_stack([np.ones(len(points)), offset @ flat.T])
+        target, weight = np.repeat([0.0, 1.0], count), np.repeat([0.5 / n for n in count], count)
+        moved = point - points.mean(axis=0)
+        fit = np.array([moved @ normal - moved @ flat.T @ slopes, *slopes])
+        scale = width * step
+        for _ in range(50):
+            p = expit((offset @ normal - design @ fit) / scale)
+            gradient = design.T @ (weight * (target - p)) / scale + prior * fit
+            curvature = weight * np.maximum(p * (1 - p), 1e-9) / scale**2
+            change = np.linalg.solve((design.T * curvature) @ design + np.diag(prior), gradient)
+            change *= min(1.0, 0.5 * scale / max(float(np.abs(design @ change).max()), 1e-12))
+            fit = fit - change
+            if np.abs(change).max() < 1e-6:  # noqa: PLR2004 -- converged
+                break
+        point, slopes = points.mean(axis=0) + fit[0] * normal, fit[1:]
+    tilted = normal - slopes @ flat
+    return point, tilted / np.linalg.norm(tilted)
 
 
 def _logistic_plane(below: Float, above: Float, axis: Float) -> tuple[Float, Float]:

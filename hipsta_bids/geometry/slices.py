@@ -2,20 +2,24 @@
 
 Where slices are much thicker than their pixels, the ribbon moves sideways by its own thickness from
 one slice to the next, and blending slices in place would break it. Each slice becomes a signed
-distance from its outline; neighboring slices are registered, and the shapes between them are blends
-of both, moved along the registration. Where head or tail labels hide how the sheet continues, its
-shapes are extrapolated from inside. Where the two ends of the ribbon touch, they are kept apart.
+distance from its outline; the ribbons of neighboring slices are aligned (``ribbon``), or registered
+where one is none, and the shapes between them are blends of both, moved along. Where head or tail
+labels hide how the sheet continues, its shapes are extrapolated from inside. Turns of the ribbon
+that touch are kept apart.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import ndimage, sparse
+from scipy.sparse import csgraph
 from scipy.special import ndtri
 
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.digital import Box, box, low_corner, piece_sizes, to_ras, voxel_points
+from hipsta_bids.geometry.ribbon import align_nodes, moves_between, part_turns, ribbon_nodes
 from hipsta_bids.protocols.protocol import Tissue, lateral_rank
 from hipsta_bids.settings import SliceSettings
 from hipsta_bids.types import Bool, Float
@@ -116,6 +120,61 @@ def _segment_distance(
     share = ((grid - start) @ along) / max(float(along @ along), 1e-9)
     foot = start + np.clip(share, 0, 1)[..., None] * along
     return np.asarray(np.linalg.norm(grid - foot, axis=-1))
+
+
+def cut_rings(outlines: Stack, pixel: float, settings: SliceSettings) -> Stack:
+    """Open each outline (N, I, J), mm, that closes round a hole; fine pixels of ``pixel`` mm.
+
+    The sheet is a ribbon: where it closes to a ring, turns touch. The cut follows the cheapest path
+    from the hole to the outside, through what is thin here and lies outside in the slices beside.
+    """
+    cut = outlines.copy()
+    for number in range(len(outlines)):
+        beside = [outlines[k] for k in (number - 1, number + 1) if 0 <= k < len(outlines)]
+        near = np.mean(beside, axis=0) if beside else np.zeros_like(outlines[0])
+        for _ in range(settings.max_fragments):
+            path = _way_out(cut[number], near, settings)
+            if path is None:
+                break
+            gap = pixel * ndimage.distance_transform_edt(~path)
+            cut[number] = np.minimum(cut[number], gap - settings.slit)
+    return cut
+
+
+def _way_out(outline: Stack, beside: Stack, settings: SliceSettings) -> Bool | None:
+    """Pixels of the cheapest path through the ribbon from its largest hole; None without holes."""
+    empty, count = ndimage.label(np.pad(outline <= 0, 1, constant_values=True))
+    if count == 1:
+        return None
+    sizes = piece_sizes(empty)
+    sizes[empty[0, 0]] = 0
+    outside, hole = empty == empty[0, 0], empty == sizes.argmax()
+    depth, height = np.pad(outline, 1), np.pad(beside, 1, mode="edge")
+    cost = settings.ring_length + np.maximum(depth, 0)
+    cost += settings.ring_beside * np.clip(height + settings.slit, 0, 1.5)
+    cost[outside | (empty > 0)] = settings.ring_length
+    nodes = np.arange(cost.size).reshape(cost.shape)
+    steps = []
+    for di, dj in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        first = nodes[: cost.shape[0] - di, max(-dj, 0) : cost.shape[1] - max(dj, 0)]
+        second = nodes[di:, max(dj, 0) : cost.shape[1] + min(dj, 0)]
+        length = np.hypot(di, dj) * 0.5 * (cost.ravel()[first] + cost.ravel()[second])
+        steps.append((first.ravel(), second.ravel(), length.ravel()))
+    first, second, length = (np.concatenate(part) for part in zip(*steps, strict=True))
+    graph = sparse.csr_array((length, (first, second)), shape=(cost.size,) * 2)
+    away, before, _ = csgraph.dijkstra(
+        graph,
+        directed=False,
+        indices=nodes[hole],
+        return_predecessors=True,
+        min_only=True,
+    )
+    at = int(nodes[outside][np.argmin(away[nodes[outside]])])
+    path = np.zeros(cost.size, dtype=bool)
+    while at >= 0:
+        path[at] = True
+        at = int(before[at])
+    return np.asarray(path.reshape(cost.shape)[1:-1, 1:-1])
 
 
 def register_slices(outlines: Stack, pixel: float, settings: SliceSettings) -> Stack:
@@ -222,13 +281,15 @@ class _SliceStack:
             + share * _interpolated(images, below + 1, *(middle + 0.5 * step))
             for images in (self.outlines, *self.ends)
         )
-        return np.asarray(np.minimum(distance, self._slit(medial, lateral)), dtype=np.float32)
+        slit = _slit(medial, lateral, self.settings)
+        return np.asarray(np.minimum(distance, slit), dtype=np.float32)
 
-    def _slit(self, medial: Stack, lateral: Stack) -> Stack:
-        """Distance from a slit midway between the two ends of the ribbon, where both are near."""
-        apart = 0.5 * np.abs(medial - lateral) - self.settings.slit
-        far = -np.minimum(medial, lateral) - self.settings.touch
-        return np.asarray(np.maximum(apart, far))
+
+def _slit(medial: Stack, lateral: Stack, settings: SliceSettings) -> Stack:
+    """Distance from a slit midway between the two ends of the ribbon, where both are near, mm."""
+    apart = 0.5 * np.abs(medial - lateral) - settings.slit
+    far = -np.minimum(medial, lateral) - settings.touch
+    return np.asarray(np.maximum(apart, far))
 
 
 def points_of_ends(body: Body) -> tuple[Float, Float]:
@@ -264,19 +325,62 @@ def sample_slices(body: Body, points: Float, settings: SliceSettings) -> Stack:
 
 
 def _stacked(tissue: NDArray[np.uint8], pixel: float, settings: SliceSettings) -> _SliceStack:
-    """Outline and register slices; a single one is taken twice."""
+    """Outline and align slices; a single one is taken twice."""
     if len(tissue) == 1:
         tissue = np.concatenate([tissue, tissue])
     outlines = np.stack([outline_slice(image, pixel, settings) for image in tissue])
     ends = np.array(
         [[_part_distance(image, end, pixel, settings) for image in tissue] for end in _ENDS]
     )
-    return _SliceStack(
-        outlines=outlines,
-        ends=ends,
-        flows=register_slices(outlines, pixel, settings),
-        settings=settings,
-    )
+    fine = pixel / settings.upsampling
+    outlines = np.minimum(outlines, _slit(ends[0], ends[1], settings))
+    outlines = cut_rings(outlines, fine, settings)
+    ranks = [_ranks(image, settings.upsampling) for image in tissue]
+    for outline, rank in zip(outlines, ranks, strict=True):
+        _drop_doubles(outline, rank, settings)
+    ribbons = [
+        ribbon_nodes(outline, rank, fine, settings)
+        for outline, rank in zip(outlines, ranks, strict=True)
+    ]
+    for outline, nodes in zip(outlines, ribbons, strict=True):
+        if nodes is not None:
+            part_turns(outline, nodes, fine, settings)
+    flows = register_slices(outlines, pixel, settings)
+    _align(flows, align_nodes(ribbons, fine, settings), settings)
+    return _SliceStack(outlines=outlines, ends=ends, flows=flows, settings=settings)
+
+
+def _drop_doubles(outline: Stack, rank: Float, settings: SliceSettings) -> None:
+    """Drop, in place, pieces of a slice (I, J) that have no subfield that the largest one lacks.
+
+    The ribbon has each subfield once: such a piece is the uncus, which passes beside the body.
+    """
+    pieces, count = ndimage.label(outline > 0)
+    if count < 2:  # noqa: PLR2004 -- one piece is the ribbon
+        return
+    main = int(piece_sizes(pieces).argmax())
+    known = np.unique(rank[(pieces == main) & np.isfinite(rank)])
+    for number in range(1, count + 1):
+        piece = pieces == number
+        if number != main and np.isin(rank[piece & np.isfinite(rank)], known).all():
+            outline[piece] = -settings.reach
+
+
+def _ranks(tissue: NDArray[np.uint8], upsampling: int) -> Float:
+    """How lateral each fine pixel's label is; NaN without a label."""
+    labels = np.kron(tissue, np.ones((upsampling,) * 2, dtype=np.uint8))
+    return np.where(labels > 0, lateral_rank(labels), np.nan)
+
+
+def _align(flows: Stack, ribbons: list[Float | None], settings: SliceSettings) -> None:
+    """Replace, in place, displacements between slices with nodes by those of the nodes."""
+    up = settings.upsampling
+    pixels = np.indices(flows.shape[2:]).reshape(2, -1).T.astype(np.float64)
+    where = (pixels + 0.5) * up - 0.5
+    for number, (first, second) in enumerate(pairwise(ribbons)):
+        if first is not None and second is not None:
+            moves = moves_between(first, second, where)
+            flows[:, number] = moves.T.reshape(flows[:, number].shape)
 
 
 def _labeled_ends(body: Body, through: int) -> tuple[bool, bool]:

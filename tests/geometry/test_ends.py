@@ -65,6 +65,27 @@ def test_a_tilt_of_one_step_between_thick_slices_is_found_roughly():
     assert degrees_between(ends.anterior_normal, normal) < 3.0
 
 
+@pytest.mark.parametrize("share", [0.15, 0.5, 0.85])
+def test_one_slice_with_labels_of_both_sides_tilts_the_plane_little(share):
+    """It allows for any tilt up to that from its edge to the far edge of the next slice."""
+    volume = rod([0, 1, 0], [0, 1, 0], voxel=(0.4, 2.0, 0.4))
+    part = volume.part.copy()
+    first = int(np.flatnonzero((part == Part.BODY).any(axis=(0, 2)))[0])
+    part[: int(share * part.shape[0]), first] = Part.TAIL
+    mixed = LabelVolume(
+        tissue=volume.tissue, part=part, affine=volume.affine, protocol=volume.protocol
+    )
+    along = np.array([0.0, 1.0, 0.0])
+    assert degrees_between(ends_of(mixed).posterior_normal, along) < BODY.plane_tilt
+    # The plane goes through that slice, within half of its thickness.
+    level = volume.affine[1, 1] * first + volume.affine[1, 3]
+    assert abs(ends_of(mixed).posterior_point @ along - level) < 1.0
+    if share == 0.5:  # where it allows for most, the plane keeps to the slices
+        free = ends_of(mixed, BODY.changed(plane_prior=1e-4)).posterior_normal
+        tilt = degrees_between(ends_of(mixed).posterior_normal, along)
+        assert degrees_between(free, along) > 1.2 * tilt
+
+
 def test_planes_move_with_the_volume():
     pose = rigid(degrees=(10.0, 20.0, -30.0))
     normals = [rotation(0, 15) @ [0.0, 1.0, 0.0], rotation(2, -10) @ [0.0, 1.0, 0.0]]

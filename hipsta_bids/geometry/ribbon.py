@@ -1,0 +1,240 @@
+"""The ribbon in single slices: its nodes along and across, aligned from slice to slice.
+
+In each slice, harmonic functions run along and across the ribbon and give it nodes. Where nodes of
+two slices belong together is found by monotone matching of their mid-lines, so that the walls of
+one can be moved to those of the other even where the ribbon moves by more than its own thickness.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from lapy import TriaMesh
+from scipy import ndimage
+from scipy.interpolate import LinearNDInterpolator
+from scipy.spatial import Delaunay, QhullError, cKDTree
+from skimage.measure import find_contours
+
+from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry.digital import piece_sizes
+from hipsta_bids.geometry.fem import Laplace
+from hipsta_bids.settings import SliceSettings
+from hipsta_bids.types import Float, Int
+
+_ACROSS = np.linspace(-1, 1, 5)
+"""Coordinates across the ribbon at which it has nodes."""
+_WITHIN = 1 - 1e-6
+"""Nodes of the wall are looked up this near to it, so that rounding does not put them outside."""
+_PER_NODE = 4
+"""Places on a mid-line per node of the other, in matching."""
+_MAX_STRETCH = 4
+"""Of a mid-line against another."""
+_NEIGHBORS = 6
+"""Nearest nodes that a pixel moves with."""
+
+
+class _Mesh(NamedTuple):
+    """Triangles inside an outline."""
+
+    points: Float
+    """(V, 2) pixels; the first ones go round the outline."""
+    cells: Int
+    """(T, 3)."""
+    border: int
+    """Number of vertices on the outline."""
+
+
+def ribbon_nodes(
+    outline: Float, lateral: Float, pixel: float, settings: SliceSettings
+) -> Float | None:
+    """Nodes (X, Z, 2), in pixels, of the largest piece in a slice, the first ones medial.
+
+    ``outline`` (I, J) is the signed distance, mm; ``lateral`` (I, J) grows from medial to lateral
+    and is NaN outside. None where the piece has no two ends, or its coordinates fold.
+    """
+    pieces, count = ndimage.label(outline > 0)
+    if not count:
+        return None
+    main = pieces == piece_sizes(pieces).argmax()
+    try:
+        mesh = _triangles(np.where(main | (pieces == 0), outline, -pixel), pixel)
+        if mesh is None:
+            return None
+        nodes = _nodes(mesh, np.where(main, lateral, np.nan), settings)
+    except (GeometryError, QhullError):
+        return None
+    return nodes if np.isfinite(nodes).all() else None
+
+
+def _triangles(field: Float, pixel: float) -> _Mesh | None:
+    """Triangulate where a field (I, J), mm, is positive; vertices are on its contour and pixels.
+
+    None for a few pixels only.
+    """
+    framed = np.pad(field, 1, constant_values=-pixel)
+    lines = find_contours(framed, 0.0)  # type: ignore[no-untyped-call]
+    line = max(lines, key=len) - 1
+    along = _along(line)
+    count = round(along[-1])
+    if count < 2 * len(_ACROSS):
+        return None
+    at = np.linspace(0, along[-1], count, endpoint=False)
+    border = np.stack([np.interp(at, along, line[:, k]) for k in (0, 1)], axis=1)
+    points = np.concatenate([border, np.argwhere(field > 0.5 * pixel)])
+    cells = Delaunay(points).simplices
+    a, b, c = (points[cells[:, k]] for k in range(3))
+    area = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
+    inside = ndimage.map_coordinates(field, points[cells].mean(axis=1).T, order=1) > 0
+    cells = np.where((area > 0)[:, None], cells, cells[:, ::-1])
+    cells = cells[inside & (np.abs(area) > 1e-6)]  # noqa: PLR2004 -- slivers on straight borders
+    used = np.zeros(len(points), dtype=bool)
+    used[cells] = True
+    number = np.cumsum(used) - 1
+    return _Mesh(points[used], number[cells], int(used[:count].sum()))
+
+
+def _nodes(mesh: _Mesh, lateral: Float, settings: SliceSettings) -> Float:
+    """Invert the coordinates along and across the ribbon on a regular grid; NaN where they fold."""
+    flat = np.column_stack([mesh.points, np.zeros(len(mesh.points))])
+    laplace = Laplace(TriaMesh(flat, mesh.cells))
+    slow = laplace.eigenfunctions(1)[1][:, 0]
+    if _rises(slow, mesh.points, lateral) < 0:
+        slow = -slow
+    border = mesh.points[: mesh.border]
+    around = _along(np.concatenate([border, border[:1]]))
+    after = np.roll(border, -1, axis=0)
+    area = 0.5 * float((border[:, 0] * after[:, 1] - border[:, 1] * after[:, 0]).sum())
+    thickness = 2 * abs(area) / around[-1]
+    strips = []
+    for tip in (int(slow[: mesh.border].argmin()), int(slow[: mesh.border].argmax())):
+        gap = (around[:-1] - around[tip] + 0.5 * around[-1]) % around[-1] - 0.5 * around[-1]
+        order = np.argsort(gap)
+        strips.append(order[np.abs(gap[order]) <= settings.rim_half * thickness])
+    medial, lateral_end = strips
+    walls = [
+        _numbers(medial[-1], lateral_end[0], mesh.border),
+        _numbers(lateral_end[-1], medial[0], mesh.border),
+    ]
+    first, second = walls if area > 0 else walls[::-1]
+    # Lengths in pixels, so that triangles between the coordinates keep their shape.
+    scale = 0.5 * np.array([abs(area) / thickness, thickness])
+    places = np.column_stack([laplace.between(medial, lateral_end), laplace.between(first, second)])
+    rows, columns = np.meshgrid(np.linspace(-1, 1, settings.ribbon_nodes), _ACROSS, indexing="ij")
+    wanted = _WITHIN * np.stack([rows, columns], axis=-1)
+    return np.asarray(LinearNDInterpolator(places * scale, mesh.points)(wanted * scale))
+
+
+def _rises(values: Float, points: Float, lateral: Float) -> float:
+    """Covariance of values (V,) at points (V, 2), pixels, with how lateral these are."""
+    index = np.clip(np.rint(points).astype(int), 0, np.array(lateral.shape) - 1)
+    ranks = lateral[tuple(index.T)]
+    known = np.isfinite(ranks)
+    if not known.any():
+        return 0.0
+    return float(((ranks[known] - ranks[known].mean()) * values[known]).sum())
+
+
+def _numbers(start: int, stop: int, count: int) -> Int:
+    """Numbers from start to stop, both included, round a circle of ``count``."""
+    return np.asarray((start + np.arange((stop - start) % count + 1)) % count)
+
+
+def _along(line: Float) -> Float:
+    """Length of a line (N, 2) up to each of its points, (N,)."""
+    return np.append(0.0, np.linalg.norm(np.diff(line, axis=0), axis=1).cumsum())
+
+
+def _middle(nodes: Float) -> Float:
+    return np.asarray(nodes[:, nodes.shape[1] // 2])
+
+
+def align_nodes(
+    ribbons: list[Float | None], pixel: float, settings: SliceSettings
+) -> list[Float | None]:
+    """Move nodes (X, Z, 2) along each slice to where those of the slice inside belong.
+
+    From the middle slice, on which they are at equal distances, outwards.
+    """
+    aligned = list(ribbons)
+    middle = len(ribbons) // 2
+    for order in (range(middle, len(ribbons)), range(middle, -1, -1)):
+        inside = None
+        for number in order:
+            nodes = ribbons[number]
+            if nodes is None:
+                inside = None
+                continue
+            where = np.linspace(0, 1, len(nodes))
+            if inside is not None:
+                lines = pixel * _middle(inside), pixel * _middle(nodes)
+                where = match_lines(*lines, settings.match_stretch)
+            aligned[number] = inside = _nodes_at(nodes, where)
+    return aligned
+
+
+def match_lines(first: Float, second: Float, stretching: float) -> Float:
+    """Where points of a line (M, 2), mm, belong on a second one (N, 2): (M,) shares of its length.
+
+    Monotone and from end to end. The sum over the points of squared distance and of ``stretching``
+    (mm2) times the squared stretch is least, by dynamic programming.
+    """
+    count = _PER_NODE * (len(first) - 1) + 1
+    along = _along(second)
+    at = np.linspace(0, along[-1], count)
+    places = np.stack([np.interp(at, along, second[:, k]) for k in (0, 1)], axis=1)
+    cost = ((first[:, None] - places) ** 2).sum(axis=2)
+    moves = np.arange(_PER_NODE * _MAX_STRETCH + 1)
+    steps = np.maximum(np.diff(_along(first)), 1e-3 * along[-1] / count)
+    stretch = stretching * (at[1] * moves / steps[:, None]) ** 2
+    total = np.where(np.arange(count) == 0, cost[0], np.inf)
+    chosen = np.zeros((len(first), count), dtype=np.intp)
+    for number in range(1, len(first)):
+        ways = np.full((len(moves), count), np.inf)
+        for move in moves:
+            ways[move, move:] = total[: count - move] + stretch[number - 1, move]
+        chosen[number] = ways.argmin(axis=0)
+        total = ways.min(axis=0) + cost[number]
+    place = count - 1
+    where = np.zeros(len(first))
+    for number in range(len(first) - 1, -1, -1):
+        where[number] = place / (count - 1)
+        place -= chosen[number, place]
+    return where
+
+
+def _nodes_at(nodes: Float, where: Float) -> Float:
+    """Nodes (M, Z, 2) at shares (M,) of the length of the mid-line."""
+    along = _along(_middle(nodes))
+    row = np.interp(where * along[-1], along, np.arange(len(nodes)))
+    below = np.clip(row.astype(int), 0, len(nodes) - 2)
+    share = (row - below)[:, None, None]
+    return np.asarray((1 - share) * nodes[below] + share * nodes[below + 1])
+
+
+def moves_between(first: Float, second: Float, where: Float) -> Float:
+    """Displacement (N, 2) from one slice to the next at pixels (N, 2) halfway between both.
+
+    Pixels move with the nodes (X, Z, 2) near to them.
+    """
+    first, second = first.reshape(-1, 2), second.reshape(-1, 2)
+    gap, nearest = cKDTree(0.5 * (first + second)).query(where, k=_NEIGHBORS)
+    weight = 1 / (np.asarray(gap) ** 2 + 0.25)  # within half a pixel all nodes count about the same
+    weight /= np.sum(weight, axis=1, keepdims=True)
+    return np.asarray(np.einsum("nk,nkd->nd", weight, (second - first)[nearest]))
+
+
+def part_turns(outline: Float, nodes: Float, pixel: float, settings: SliceSettings) -> None:
+    """Widen, in place, gaps between turns of a slice's ribbon that later smoothing would close.
+
+    ``outline`` (I, J) is the signed distance, mm, ``nodes`` (X, Z, 2) are in pixels.
+    """
+    near = np.argwhere(np.abs(outline) < settings.touch)
+    row = cKDTree(nodes.reshape(-1, 2)).query(near)[1] // nodes.shape[1]
+    place = np.full(outline.shape, np.nan)
+    place[tuple(near.T)] = pixel * _along(_middle(nodes))[row]
+    between = np.zeros(outline.shape, dtype=bool)
+    between[:-1] |= np.abs(np.diff(place, axis=0)) > settings.turn_length
+    between[:, :-1] |= np.abs(np.diff(place, axis=1)) > settings.turn_length
+    between &= outline < pixel
+    if between.any():
+        gap = pixel * ndimage.distance_transform_edt(~between)
+        np.minimum(outline, gap - settings.slit, out=outline)
