@@ -9,7 +9,8 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry.body import Body, Index
+from hipsta_bids.geometry.body import Body
+from hipsta_bids.geometry.completion import Index
 from hipsta_bids.geometry.digital import ALL, box_around, low_corner
 from hipsta_bids.geometry.ends import End
 from hipsta_bids.geometry.slices import has_thick_slices, points_of_ends, sample_slices

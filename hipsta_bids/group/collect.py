@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from hipsta_bids.derivatives.dataset import NOT_FINISHED, name_of, read_status
-from hipsta_bids.derivatives.hemisphere import ResultPlace
-from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName
-from hipsta_bids.derivatives.read import (
+from hipsta_bids.derivatives.hemisphere import (
+    ResultPlace,
     list_results,
     read_record,
 )
+from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName
 from hipsta_bids.errors import InputError, NothingToDoError, UsageError
 from hipsta_bids.group.covariates import relocate
 from hipsta_bids.io import files

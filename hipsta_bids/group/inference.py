@@ -1,24 +1,246 @@
-"""What survives when many points are tested: false discovery rate, or permutations."""
+"""What survives when many points are tested: false discovery rate, or permutations of residuals."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
+from scipy.linalg import null_space
 from statsmodels.stats.multitest import multipletests
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.clusters import edges_of
+from hipsta_bids.group.clusters import edges_of, enhance
 from hipsta_bids.group.data import Bool, Float, Int
-from hipsta_bids.group.formula import check_names, listed
-from hipsta_bids.group.glm import FittedMaps, RowModel
-from hipsta_bids.group.permutation import PermutationPart, PermutationTest, permute
-from hipsta_bids.group.settings import GroupSettings, MultiplicitySettings
+from hipsta_bids.group.formula import Contrast, check_names, listed
+from hipsta_bids.group.glm import FittedMaps, RowModel, fit_points
+from hipsta_bids.group.settings import GlmSettings, GroupSettings, MultiplicitySettings
 
 #: Share of the smallest p that serves as cut-off when nothing is rejected.
 BELOW_ALL = 0.1
 #: Methods that hold the family-wise error rate.
 PERMUTATIONS = ("permutation-tfce", "permutation-max")
+#: Permutations whose maps are in memory at once; does not change a result.
+_BATCH = 50
+#: Sums in another order differ by less, relatively.
+_ROUNDING = 1e-9
+#: The method that does without cluster enhancement.
+_MAXIMUM = "permutation-max"
+#: Length left of the constant vector, of length 1, if it is not among the columns.
+_CONSTANT = 1e-6
+
+
+@dataclass(frozen=True)
+class PermutationTest:
+    """Corrected p-values; the family is all points of all parts."""
+
+    p_uncorrected: Float
+    """(points,) of each point alone."""
+    p_max: Float
+    """(points,) of the statistic itself (maximum over the sheet)."""
+    p_enhanced: Float
+    """(points,) of the cluster-enhanced statistic; NaN with ``permutation-max``."""
+    statistic: Float
+    """(points,) t, or F."""
+
+
+@dataclass(frozen=True, eq=False)
+class PermutationPart:
+    """Maps of one sheet, as of one hemisphere."""
+
+    maps: Float
+    """(subjects, points) NaN is missing."""
+    matrix: Float
+    """(subjects, columns) design of full column rank."""
+    subjects: Int
+    """(subjects,) which ones of the whole sample they are: the same subject is shuffled in the
+    same way in all parts."""
+    edges: Int
+    """(edges, 2) neighbors among the points."""
+
+
+def permute(
+    parts: Sequence[PermutationPart],
+    contrast: Contrast,
+    *,
+    settings: MultiplicitySettings,
+    blocks: Int | None = None,
+) -> list[PermutationTest]:
+    """Permutation test of one contrast at all points (Freedman and Lane 1983).
+
+    What the covariates explain is subtracted, the residuals are shuffled between subjects, and
+    the whole model is fitted to them again (Winkler et al. 2014). If the contrast tests what
+    all subjects have in common (an intercept), signs are flipped instead of subjects shuffled.
+
+    Missing values count as what the covariates predict, which shrinks an effect; degrees of
+    freedom are those of the subjects present.
+    """
+    runs = [_Run.build(part, contrast, settings, blocks) for part in parts]
+    random = np.random.default_rng(settings.seed)
+    n_subjects = 1 + max(int(part.subjects.max()) for part in parts)
+    for start in range(1, settings.permutations, _BATCH):
+        count = min(_BATCH, settings.permutations - start)
+        keys = random.random((count, n_subjects))
+        maps = [run.shuffled(keys) for run in runs]
+        highest = np.max([_maximum(t) for t, _ in maps], axis=0)
+        highest_enhanced = np.max([_maximum(enhanced) for _, enhanced in maps], axis=0)
+        for run, (t, _) in zip(runs, maps, strict=True):
+            run.count(t, highest, highest_enhanced)
+    return [run.result() for run in runs]
+
+
+@dataclass(frozen=True, eq=False)
+class _Run:
+    """One part, with its counts of what reached the observed statistics."""
+
+    part: PermutationPart
+    contrast: Contrast
+    settings: MultiplicitySettings
+    model: "_Model"
+    blocks: Int | None
+    observed: Float
+    enhanced: Float
+    counts: Float
+    """(3, points) of each point alone, of the maximum, and of the enhanced maximum."""
+
+    @classmethod
+    def build(
+        cls,
+        part: PermutationPart,
+        contrast: Contrast,
+        settings: MultiplicitySettings,
+        blocks: Int | None,
+    ) -> "_Run":
+        maps, matrix = part.maps, part.matrix
+        if part.edges.max(initial=-1) >= maps.shape[1] or maps.shape[0] != matrix.shape[0]:
+            raise ModelError(
+                f"permutation: maps of shape {maps.shape} do not fit edges between"
+                f" {part.edges.max(initial=-1) + 1} points and {matrix.shape[0]} subjects",
+                reason="design-shape",
+            )
+        model = _Model.build(maps, matrix, contrast)
+        own = None if blocks is None else blocks[part.subjects]
+        if own is not None and not model.tests_common_part():
+            _check_blocks(matrix @ np.linalg.pinv(contrast.weights), own, contrast)
+        observed = model.statistics(model.basis[None])
+        enhanced = _enhanced(observed, part.edges, settings)
+        counts = np.ones((3, maps.shape[1]))
+        return cls(part, contrast, settings, model, own, observed, enhanced, counts)
+
+    def shuffled(self, keys: Float) -> tuple[Float, Float]:
+        """Statistics, and enhanced ones, of the permutations that are given by keys of subjects."""
+        flip = self.model.tests_common_part()
+        bases = [
+            _shuffle(self.model.basis, self.blocks, key[self.part.subjects], flip=flip)
+            for key in keys
+        ]
+        t = self.model.statistics(np.stack(bases))
+        return t, _enhanced(t, self.part.edges, self.settings)
+
+    def count(self, t: Float, highest: Float, highest_enhanced: Float) -> None:
+        """Count permutations that reach what was observed."""
+        self.counts[0] += _at_least(t, self.observed).sum(axis=0)
+        self.counts[1] += _at_least(highest, self.observed).sum(axis=0)
+        self.counts[2] += _at_least(highest_enhanced, self.enhanced).sum(axis=0)
+
+    def result(self) -> PermutationTest:
+        """Turn counts into p-values."""
+        t = self.observed[0]
+        p = np.where(np.isnan(t), np.nan, self.counts / self.settings.permutations)
+        if self.settings.method == _MAXIMUM:
+            p[2] = np.nan
+        return PermutationTest(p[0], p[1], p[2], t if self.contrast.n_rows == 1 else t**2)
+
+
+def _check_blocks(tested: Float, blocks: Int, contrast: Contrast) -> None:
+    """Refuse blocks inside which what is tested does not vary: shuffling cannot break it up."""
+    numbers = np.unique(blocks, return_inverse=True)[1]
+    sizes = np.bincount(numbers)
+    means = np.stack([np.bincount(numbers, column) for column in tested.T], axis=1) / sizes[:, None]
+    if np.abs(tested - means[numbers]).max() < _CONSTANT * np.abs(tested).max():
+        raise ModelError(
+            f"permutation: {contrast.name} does not vary inside the blocks, so that shuffling there"
+            " says nothing about it; leave --blocks out, or choose larger blocks",
+            reason="permutation-blocks",
+        )
+
+
+def _enhanced(t: Float, edges: Int, settings: MultiplicitySettings) -> Float:
+    """Cluster enhancement, zero where the method does without."""
+    return np.zeros_like(t) if settings.method == _MAXIMUM else enhance(t, edges, settings)
+
+
+@dataclass(frozen=True)
+class _Model:
+    """The design, split into what is tested and what is not; both orthonormal."""
+
+    basis: Float
+    """(subjects, columns), tested ones first."""
+    rows: int
+    residuals: Float
+    """(subjects, points) what the columns not tested leave; zero where missing."""
+    squares: Float
+    df: Float
+    """(points,) NaN where there is nothing to test."""
+
+    @classmethod
+    def build(cls, maps: Float, matrix: Float, contrast: Contrast) -> "_Model":
+        rows = contrast.n_rows
+        # Orthogonal to the rest; its product with the data is the estimated contrast.
+        tested = matrix @ np.linalg.solve(matrix.T @ matrix, contrast.weights.T)
+        tested = tested / np.linalg.norm(tested) if rows == 1 else np.linalg.qr(tested)[0]
+        rest = np.linalg.qr(matrix @ null_space(contrast.weights))[0]
+        present = np.isfinite(maps)
+        residuals = np.where(present, maps, 0.0)
+        if rest.shape[1]:
+            fitted = rest @ fit_points(maps, rest, (), GlmSettings()).coefficients
+            residuals = np.nan_to_num(np.where(present, maps - fitted, 0.0))
+        squares = np.einsum("sp,sp->p", residuals, residuals)
+        df = present.sum(axis=0) - matrix.shape[1]
+        usable = (df > 0) & (squares > 0)
+        basis = np.column_stack([tested, rest])
+        return cls(basis, rows, residuals, squares, np.where(usable, df, np.nan))
+
+    def tests_common_part(self) -> bool:
+        """Whether the columns not tested cannot make a constant: then it is tested."""
+        ones = np.full(len(self.basis), 1 / np.sqrt(len(self.basis)))
+        rest = self.basis[:, self.rows :]
+        return bool(np.linalg.norm(ones - rest @ (rest.T @ ones)) > _CONSTANT)
+
+    def statistics(self, bases: Float) -> Float:
+        """Signed t, or square root of F, of (batch, points)."""
+        scores = np.swapaxes(bases, 1, 2) @ self.residuals
+        noise = self.squares - np.einsum("bcp,bcp->bp", scores, scores)
+        tested = scores[:, : self.rows]
+        gained = np.einsum("bcp,bcp->bp", tested, tested) / self.rows
+        # Rounding only may take the noise below zero, where the model fits perfectly.
+        t = np.sqrt(gained * self.df / np.maximum(noise, np.finfo(np.float64).eps * self.squares))
+        return np.asarray(np.copysign(t, tested[:, 0]) if self.rows == 1 else t, dtype=np.float64)
+
+
+def _shuffle(basis: Float, blocks: Int | None, key: Float, *, flip: bool) -> Float:
+    """Shuffle subjects, within blocks; the same as shuffling residuals the other way round.
+
+    Keys are uniform between 0 and 1: their order is the permutation, their halves are signs.
+    """
+    if flip:
+        signs: Float = np.where(key < 0.5, -1.0, 1.0)[:, None]  # noqa: PLR2004 -- half of them
+        return basis * signs
+    if blocks is None:
+        return basis[np.argsort(key)]
+    result = basis.copy()
+    result[np.argsort(blocks, kind="stable")] = basis[np.lexsort((key, blocks))]
+    return result
+
+
+def _maximum(values: Float) -> Float:
+    """Largest size on each map."""
+    return np.asarray(np.nanmax(np.abs(values), axis=1, keepdims=True, initial=0.0))
+
+
+def _at_least(values: Float, observed: Float) -> NDArray[np.bool_]:
+    """Whether values reach those observed, but for rounding."""
+    return np.abs(values) >= np.abs(observed) * (1 - _ROUNDING)
 
 
 @dataclass(frozen=True)

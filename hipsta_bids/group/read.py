@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from hipsta_bids.derivatives.read import read_sheet, read_summary, read_units
+from hipsta_bids.derivatives.hemisphere import read_sheet, read_summary, read_units
 from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.group.collect import SheetRecord

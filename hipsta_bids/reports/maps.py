@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hipsta_bids.derivatives.read import read_sheet
+from hipsta_bids.derivatives.hemisphere import read_sheet
 from hipsta_bids.errors import InputError
 from hipsta_bids.reports.results import Hemisphere
 from hipsta_bids.types import Float, Status

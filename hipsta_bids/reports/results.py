@@ -12,9 +12,14 @@ import numpy as np
 from nibabel.orientations import apply_orientation, inv_ornt_aff, io_orientation
 from numpy.typing import NDArray
 
-from hipsta_bids.derivatives.hemisphere import ResultPlace
+from hipsta_bids.derivatives.hemisphere import (
+    ResultPlace,
+    list_results,
+    read_record,
+    read_sheet,
+    read_summary,
+)
 from hipsta_bids.derivatives.names import DATASET_FILES
-from hipsta_bids.derivatives.read import list_results, read_record, read_sheet, read_summary
 from hipsta_bids.errors import HipstaError, InputError
 from hipsta_bids.io import files, gifti
 from hipsta_bids.io.volumes import read_voxels

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hipsta_bids.derivatives import dataset, hemisphere
-from hipsta_bids.derivatives.hemisphere import ResultPlace
+from hipsta_bids.derivatives.hemisphere import ResultPlace, read_sheet
 from hipsta_bids.derivatives.names import HemisphereName
-from hipsta_bids.derivatives.read import read_sheet
 from hipsta_bids.errors import (
     ExitCode,
     GeometryError,

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from geometry_cases import resampled
 
-from hipsta_bids.geometry.body import extract_body, fill_slits
+from hipsta_bids.geometry.body import extract_body
+from hipsta_bids.geometry.completion import fill_slits
 from hipsta_bids.geometry.topology import repair_topology
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import BodySettings, TopologySettings

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hipsta_bids.geometry.body import fill_slits
 from hipsta_bids.geometry.checks import check_labels
+from hipsta_bids.geometry.completion import fill_slits
 from hipsta_bids.settings import BodySettings, CheckSettings
 
 CHECKS = CheckSettings()

@@ -10,8 +10,8 @@ from hipsta_bids.errors import ModelError
 from hipsta_bids.group.clusters import sheet_edges
 from hipsta_bids.group.formula import Contrast
 from hipsta_bids.group.glm import fit_points
-from hipsta_bids.group.permutation import PermutationPart
-from hipsta_bids.group.permutation import permute as permute_parts
+from hipsta_bids.group.inference import PermutationPart
+from hipsta_bids.group.inference import permute as permute_parts
 from hipsta_bids.group.settings import GlmSettings, MultiplicitySettings
 
 SETTINGS = MultiplicitySettings(method="permutation-tfce", permutations=400)

@@ -1,0 +1,295 @@
+"""What labels lack, or have too much, before they make one ribbon.
+
+Cavities between the sheet and the dentate gyrus, slits through the sheet, end labels on the wrong
+side of an end plane, and the uncus beside the front of the body.
+"""
+
+from dataclasses import replace
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import cKDTree
+from skimage.segmentation import watershed
+
+from hipsta_bids.geometry.digital import (
+    ALL,
+    FACES,
+    Box,
+    box,
+    box_around,
+    low_corner,
+    piece_sizes,
+    to_ras,
+    voxel_points,
+)
+from hipsta_bids.geometry.ends import EndPlanes
+from hipsta_bids.protocols.protocol import Tissue
+from hipsta_bids.settings import BodySettings
+from hipsta_bids.types import Bool, Float, LabelVolume
+
+Index = NDArray[np.intp]
+Tissues = NDArray[np.uint8]
+
+_TIES = 8
+"""Nearest voxels that may be equally near: the corners of a cube."""
+_NEAR = 8
+"""Voxels beyond others within which their nearest donors lie."""
+_DIRECTIONS = [step for step in product((-1, 0, 1), repeat=3) if step > (0, 0, 0)]
+"""One of each two opposite directions to the 26 neighbors."""
+
+
+def between(mask: Bool, affine: Float, ends: EndPlanes) -> tuple[Bool, Float]:
+    """Part of a mask between the end planes, (I, J, K), and its voxels in RAS mm, (N, 3)."""
+    index = np.argwhere(mask)
+    points = to_ras(index, affine)
+    between = ends.depth(points) > 0
+    inside = np.zeros(mask.shape, dtype=bool)
+    inside[tuple(index[between].T)] = True
+    return inside, points[between]
+
+
+def value_of_nearest(values: NDArray[np.integer], points: Float, at: Float) -> Index:
+    """Value of the nearest of points (N, 3) at others (M, 3); the smallest if some are tied.
+
+    So the way in which voxels are stored decides nothing.
+    """
+    found = cKDTree(points).query(at, k=_TIES)
+    distance, index = (np.asarray(part) for part in found)
+    tied = distance < distance[:, :1] + 1e-6
+    most = np.iinfo(np.intp).max  # also for fewer points than asked
+    ranked = np.append(values.astype(np.intp), most)[index]
+    return np.asarray(np.where(tied, ranked, most).min(axis=1))
+
+
+class Cavities(NamedTuple):
+    """Voxels (N, 3) without a label that the hippocampus encloses, between the end planes."""
+
+    narrow: tuple[Index, ...] = ()
+    """Cavities that may be a part of the molecular layer."""
+    wide: tuple[Index, ...] = ()
+    """Cavities that are too wide for that."""
+
+    @property
+    def all(self) -> Index:
+        """All voxels of all cavities."""
+        return np.concatenate([np.zeros((0, 3), np.intp), *self.narrow, *self.wide])
+
+
+def find_uncus(tissue: Tissues, affine: Float, ends: EndPlanes, settings: BodySettings) -> Index:
+    """Find voxels (N, 3) of the uncus, which the head bends back to beside the body.
+
+    It shows as a second piece of CA2 or CA3 that reaches the anterior plane far medially of the
+    first. The part of CA1 that is nearer to it than to the rest, on the way through the sheet, goes
+    with it.
+    """
+    lateral = np.isin(tissue, (Tissue.CA2, Tissue.CA2_3, Tissue.CA3))
+    medial = np.isin(tissue, (Tissue.PRESUBICULUM, Tissue.SUBICULUM))
+    none = np.zeros((0, 3), np.intp)
+    pieces, count = ndimage.label(between(lateral, affine, ends)[0], structure=ALL)
+    if count < 2 or not medial.any():  # noqa: PLR2004 -- the body's own is the first
+        return none
+    main = to_ras(np.argwhere(pieces == piece_sizes(pieces).argmax()), affine)
+    towards = voxel_points(medial, affine).mean(axis=0) - voxel_points(lateral, affine).mean(axis=0)
+    towards -= (towards @ ends.axis) * ends.axis
+    towards /= np.linalg.norm(towards)
+    found = np.zeros(tissue.shape, dtype=bool)
+    depth = 0.0
+    for number in np.flatnonzero(piece_sizes(pieces) * abs(np.linalg.det(affine[:3, :3])) > 1.0):
+        points = to_ras(np.argwhere(pieces == number), affine)
+        inside = -ends.height(points, "anterior")
+        beside = main[-ends.height(main, "anterior") < inside.max() + ends.half_slice]
+        aside = points.mean(axis=0) - (beside if len(beside) else main).mean(axis=0)
+        if inside.min() < 3 * ends.half_slice and aside @ towards > settings.uncus_offset:
+            found |= pieces == number
+            depth = max(depth, float(inside.max()))
+    if not found.any():
+        return none
+    near, _ = between(tissue > 0, affine, ends.beyond(1.0))
+    index = np.argwhere(near)
+    height = -ends.height(to_ras(index, affine), "anterior")
+    near[tuple(index[height > depth + 1.0].T)] = False
+    markers = np.where(found, 1, np.where((lateral | medial) & near, 2, 0))
+    around = box_around(np.argwhere(near))
+    flat = np.zeros(markers[around].shape, np.uint8)
+    basins = watershed(flat, markers[around], ALL, mask=near[around])  # type: ignore[no-untyped-call]
+    return np.argwhere(basins == 1) + low_corner(around)
+
+
+def _like_nearest(
+    volume: LabelVolume, tissue: Tissues, where: Index, donors: Bool
+) -> tuple[LabelVolume, Tissues]:
+    """Give voxels (N, 3) the label and the part of the sheet that the nearest donor has."""
+    around = box(np.maximum(where.min(axis=0) - _NEAR, 0), where.max(axis=0) + _NEAR + 1)
+    index = np.argwhere(donors[around]) + low_corner(around)
+    pairs = volume.tissue.astype(np.intp) * 256 + tissue
+    nearest = value_of_nearest(
+        pairs[tuple(index.T)], to_ras(index, volume.affine), to_ras(where, volume.affine)
+    )
+    at = tuple(where.T)
+    labels, sheet = volume.tissue.copy(), tissue.copy()
+    labels[at], sheet[at] = np.divmod(nearest, 256)
+    return replace(volume, tissue=labels), sheet
+
+
+def _subfields(volume: LabelVolume) -> Bool:
+    """Voxels of the sheet, of its layer, and of what lies on its interior side."""
+    protocol = volume.protocol
+    return np.isin(volume.tissue, (*protocol.sheet, *protocol.layer, *protocol.interior))
+
+
+def hand_over(
+    volume: LabelVolume, tissue: Tissues, ends: EndPlanes, reach: float
+) -> tuple[LabelVolume, Tissues, int]:
+    """Give head and tail voxels up to a distance inside the planes the label of a neighbor.
+
+    No plane separates labels perfectly; left out, these voxels would be holes in the sheet.
+    """
+    index = np.argwhere(volume.tissue == Tissue.HIPPOCAMPUS)
+    depth = ends.depth(to_ras(index, volume.affine))
+    where = index[(depth > 0) & (depth < reach)]
+    if not len(where):
+        return volume, tissue, 0
+    volume, tissue = _like_nearest(volume, tissue, where, _subfields(volume))
+    return volume, tissue, len(where)
+
+
+def find_cavities(
+    volume: LabelVolume, tissue: Tissues, ends: EndPlanes, settings: BodySettings
+) -> Cavities:
+    """Find what is unlabeled but enclosed by the sheet, its layer and its interior.
+
+    Vessels, cysts and strata that were left out make the inner wall jump across them. A cavity is
+    enclosed in three dimensions, or in a slice if little of it is open to the next slices.
+    """
+    solid = _subfields(volume) | np.isin(volume.tissue, (Tissue.HIPPOCAMPUS, Tissue.FISSURE))
+    around = box_around(np.argwhere(between(solid, volume.affine, ends)[0]))
+    solid, sheet = solid[around], tissue[around] > 0
+    inner = np.isin(volume.tissue[around], volume.protocol.interior)
+    edges = np.linalg.norm(volume.affine[:3, :3], axis=0)
+    through = int(np.argmax(np.abs(ends.axis @ volume.affine[:3, :3]) / edges))
+    in_slice = FACES & (np.arange(3) == 1).reshape([3 if n == through else 1 for n in range(3)])
+    # What cannot leave in three dimensions cannot in its slices.
+    enclosed = _cannot_leave(solid, in_slice, through)
+    enclosed &= np.isin(volume.tissue[around], (Tissue.BACKGROUND, Tissue.CYST))
+    pieces, _ = ndimage.label(enclosed, structure=ALL)
+    most_open = 1.0 if edges[through] > settings.slit_voxel else settings.cavity_openness
+    narrow, wide = list[Index](), list[Index]()
+    for number, part in enumerate(ndimage.find_objects(pieces), 1):
+        room = box_around(np.argwhere(pieces[part] == number) + low_corner(part))
+        piece = pieces[room] == number
+        ring = ndimage.binary_dilation(piece, structure=ALL) & ~piece
+        is_open = (ring & ~solid[room] & ~enclosed[room]).sum() > most_open * ring.sum()
+        beside = ring & solid[room]
+        index = np.argwhere(piece) + low_corner(around) + low_corner(room)
+        index = index[ends.depth(to_ras(index, volume.affine)) > 0]
+        if not len(index) or is_open or not (beside & sheet[room]).any():
+            continue
+        if (beside & inner[room]).any():
+            radius = ndimage.distance_transform_edt(np.pad(piece, 1), sampling=edges).max()
+            is_wide = float(radius) > settings.cavity_radius
+            (wide if is_wide else narrow).append(index)
+    return Cavities(tuple(narrow), tuple(wide))
+
+
+def _cannot_leave(solid: Bool, structure: Bool, through: int) -> Bool:
+    """Free voxels (I, J, K) that no path of neighbors connects to the border across one axis."""
+    pieces, _ = ndimage.label(~solid, structure=structure)
+    borders = [np.moveaxis(pieces, n, 0)[[0, -1]] for n in range(3) if n != through]
+    outside = np.unique(np.concatenate([border.ravel() for border in borders]))
+    return np.asarray(~np.isin(pieces, outside) & ~solid)
+
+
+def fill_cavities(
+    volume: LabelVolume, tissue: Tissues, cavities: Cavities, settings: BodySettings
+) -> tuple[LabelVolume, Tissues]:
+    """Make narrow cavities a part of the layer, where it is labeled, and divide others.
+
+    What lies between the sheet and its interior is the layer in the first place. What is too wide
+    for that, or has no layer beside it, goes to the nearest label on either side.
+    """
+    donors = _subfields(volume)
+    narrow = donors
+    layer = volume.tissue == Tissue.MOLECULAR_LAYER
+    if settings.layer_rule == "nearest-sheet" and layer.any():
+        merged = tissue[layer].any()
+        narrow = donors & ((tissue > 0) if merged else (tissue == 0))
+    for group, chosen in ((cavities.wide, donors), (cavities.narrow, narrow)):
+        if group:
+            volume, tissue = _like_nearest(volume, tissue, np.concatenate(group), chosen)
+    return volume, tissue
+
+
+class Slits(NamedTuple):
+    """Narrow gaps in the sheet."""
+
+    tissue: Tissues
+    """(I, J, K) tissue with the slits filled."""
+    filled: Index
+    """(N, 3) indices of voxels that were filled."""
+    gap: Index
+    """(N, 3) indices of the largest thin gap that was not filled."""
+
+
+def fill_slits(
+    tissue: Tissues, inside: Bool, unlabeled: Bool, affine: Float, settings: BodySettings
+) -> Slits:
+    """Fill slits through the sheet with the nearest labels.
+
+    A voxel without any label lies in a gap if the sheet is on both sides of it in several
+    directions. A slit opens on both sides of the sheet; a crevice between two folds, which opens
+    on one side, is left as it is.
+    """
+    around = box_around(np.argwhere(inside))
+    sheet = np.pad(tissue[around] > 0, 1)
+    # Between the end planes: next to voxels that lie there.
+    beside = ndimage.binary_dilation(np.pad(inside[around], 1), structure=ALL)
+    empty = np.pad(unlabeled[around], 1)
+    enclosed = _enclosed(sheet, settings.gap_directions)
+    pieces, _ = ndimage.label(empty & beside & enclosed, structure=ALL)
+    sizes = piece_sizes(pieces)
+    edges = np.sort(np.linalg.norm(affine[:3, :3], axis=0))
+    least = settings.slit_area / float(edges[0] * edges[1])
+    through = [
+        number
+        for number in np.flatnonzero(sizes > least)
+        if edges[2] <= settings.slit_voxel
+        and _opens_on_both_sides(pieces == number, sheet, settings.slit_openings)
+    ]
+    filled = np.argwhere(np.isin(pieces, through)) + low_corner(around) - 1
+    sizes[through] = 0
+    gap = np.argwhere((pieces == sizes.argmax()) & (pieces > 0)) + low_corner(around) - 1
+    return Slits(_with_nearest(tissue, filled, around), filled, gap)
+
+
+def _enclosed(sheet: Bool, directions: int) -> Bool:
+    """Voxels that have the sheet on both sides in at least ``directions`` of 13."""
+    opposite = np.zeros(sheet.shape, dtype=np.int8)
+    for step in _DIRECTIONS:
+        back = tuple(-s for s in step)
+        opposite += np.roll(sheet, step, (0, 1, 2)) & np.roll(sheet, back, (0, 1, 2))
+    return np.asarray(~sheet & (opposite >= directions))
+
+
+def _opens_on_both_sides(piece: Bool, sheet: Bool, least: float) -> bool:
+    """Whether what surrounds a gap, outside of the sheet, has two pieces of at least this share."""
+    border = ndimage.binary_dilation(piece, structure=ALL) & ~sheet & ~piece
+    openings, count = ndimage.label(border, structure=ALL)
+    sizes = np.sort(piece_sizes(openings))
+    return count > 1 and bool(sizes[-2] >= least * sizes.sum())
+
+
+def _with_nearest(tissue: Tissues, index: Index, around: Box) -> Tissues:
+    """Label voxels (N, 3) with the nearest label within a box."""
+    if not len(index):
+        return tissue
+    nearest = ndimage.distance_transform_edt(
+        tissue[around] == 0, return_distances=False, return_indices=True
+    )
+    low = low_corner(around)
+    found = nearest[:, *(index - low).T].T + low
+    filled = tissue.copy()
+    filled[tuple(index.T)] = tissue[tuple(found.T)]
+    return filled
