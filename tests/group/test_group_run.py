@@ -195,7 +195,9 @@ def test_flagged_hemispheres_are_told(dataset, quick, capsys):
     before = path.read_bytes()
     files.write_json(path, json.loads(before) | {"status": "flagged"})
     assert main([str(data), str(out), "group", *quick, "--name", "flagged"]) == 0
-    assert "note: 1 flagged hemispheres are in it" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "note: 1 flagged hemispheres are in it" in said
+    assert f"what was done and found: {out / 'group' / 'flagged.html'}\n" in said
     path.write_bytes(before)
 
 
