@@ -90,6 +90,8 @@ def test_permutations_are_in_the_tables_of_the_map(dataset, quick):
         text = (folder / "methods.md").read_text()
         assert "100 permutations" in text
         assert "seed 3" in text
+        enhanced = "the largest threshold-free cluster enhancement [" in text
+        assert enhanced == (method == "permutation-tfce")
         corrected[method] = found
     maximum = corrected["permutation-max"]
     # The largest t has the smallest p: the correction is monotone.
