@@ -191,6 +191,7 @@ def test_formula_contrast_reference_and_options(dataset, quick):
     text = (folder / "methods.md").read_text()
     assert "Maps were not registered to each other." in text
     assert "the procedure of Benjamini and Hochberg [2], for both hemispheres together." in text
+    assert "Wrobel" not in text  # who is not referred to
     maps = table(folder / "maps.tsv")
     assert set(maps.n_tests) == {2 * NODES[0] * NODES[1]}
     again = [*(str(data), str(out), "group", *quick), "--model", str(folder / "model.json")]
