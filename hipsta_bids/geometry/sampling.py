@@ -111,8 +111,7 @@ def _nearest(values: Float, index: Float, _: float) -> Float:
 def _depth_weights(count: int) -> Float:
     """Weights of evenly spaced points of a column, (1, 1, count, 1), with sum 1."""
     weights = np.ones(count)
-    if count > 1:
-        weights[[0, -1]] = 0.5
+    weights[[0, -1]] = 0.5
     return np.asarray(weights / weights.sum())[None, None, :, None]
 
 

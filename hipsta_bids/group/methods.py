@@ -127,7 +127,7 @@ def _words(names: Sequence[str]) -> str:
 def _alignment(
     analysis: Analysis, settings: GroupSettings, cite: Callable[[str], str], others: Sequence[str]
 ) -> str:
-    parts = [_registration(analysis, settings, cite("registr"))] if analysis.sides else []
+    parts = [_registration(analysis, settings, cite)] if analysis.sides else []
     if others:
         parts.append(
             f"Maps of other programs ({', '.join(others)}) were taken as they are, point by point,"
@@ -136,11 +136,11 @@ def _alignment(
     return " ".join(parts)
 
 
-def _registration(analysis: Analysis, settings: GroupSettings, registr: str) -> str:
+def _registration(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], str]) -> str:
     how = settings.registration
     if how.align == "none":
         return "Maps were not registered to each other."
-    method = f"alternating fits of a template and of monotone B-spline warps {registr}"
+    method = f"alternating fits of a template and of monotone B-spline warps {cite('registr')}"
     if how.align == "penalized":
         method += ", with a penalty on local stretch that was estimated from the data"
     shares = "; ".join(

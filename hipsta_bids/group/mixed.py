@@ -156,8 +156,8 @@ def best_ratio(sums: Sums, settings: LongitudinalSettings) -> Float:
         middle = (low + high) / 2
         beyond = rising(middle) > 0
         low, high = np.where(beyond, low, middle), np.where(beyond, middle, high)
-    at_bound = (best == 0) & (rising(np.zeros(len(sums.n))) >= 0)
-    return np.where(at_bound, 0.0, low / (1 - low))
+    # Where the loss rises from zero on, the lower limit never leaves it.
+    return np.asarray(low / (1 - low))
 
 
 def fit_mixed(

@@ -119,6 +119,7 @@ def fit_template(
     mean = np.linalg.solve(moments.squares.sum(axis=0), moments.products.sum(axis=0))
     parts = _start(moments, mean, components)
     noise = 1.0
+    scores = _expect(moments, mean, parts, noise)  # the answer if there are no steps
     for _ in range(settings.em_iterations - 1):
         scores = _expect(moments, mean, parts, noise)
         new_mean, new_parts = _maximize(moments, scores)

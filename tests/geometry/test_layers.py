@@ -75,6 +75,13 @@ def test_where_layers_fold_they_keep_equal_distances():
     assert "\n" not in flag.message
 
 
+def test_a_fold_is_placed_by_its_first_column():
+    folded = np.zeros((41, 21), dtype=bool)
+    folded[[6, 7], [3, 1]] = True
+    (flag,) = check_layers(folded)
+    assert "in 2 of 861 columns, the first at x 7, y 4:" in flag.message  # counted from 1
+
+
 def test_no_fold_no_flag():
     assert check_layers(np.zeros((41, 21), dtype=bool)) == []
 

@@ -176,12 +176,27 @@ def test_points_outside_are_missing_and_counted():
     np.testing.assert_array_equal(np.isnan(found.values[..., 0]), beyond)
 
 
-def test_the_outer_half_of_the_outermost_voxels_is_inside():
-    field = np.full(SHAPE, 2.0)
-    points = np.stack([centers()[0, 0, 0] - AFFINE[:3, :3] @ ([0.49] * 3)] * 3)[None, None]
-    one = Sheet(points=points, valid=np.ones((1, 1), bool))
-    found = sample(field, sheet=one)
-    assert (found.outside, found.values.item()) == (0, 2.0)
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("last", [False, True])
+def test_the_field_of_view_ends_at_the_outer_faces(axis, last):
+    corner = np.array(SHAPE) - 1 if last else np.zeros(3)
+    for beyond, outside in ((0.49, 0), (0.5, 0), (0.51, 1)):  # voxels; on a face is inside
+        index = corner.astype(float)
+        index[axis] += beyond if last else -beyond
+        points = np.tile(AFFINE[:3, :3] @ index + AFFINE[:3, 3], (1, 1, 3, 1))
+        found = sample(np.full(SHAPE, 2.0), sheet=Sheet(points=points, valid=np.ones((1, 1), bool)))
+        assert found.outside == outside
+        assert np.isnan(found.values).all() == outside
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "nearest"])
+def test_the_mean_over_a_single_depth_is_its_value(interpolation):
+    sheet = arc()
+    single = Sheet(points=sheet.points[:, :, sheet.middle][:, :, None], valid=sheet.valid)
+    field = linear(centers())
+    found = sample(field, sheet=single, sampling="depth", interpolation=interpolation)
+    wanted = sample(field, sheet=sheet, interpolation=interpolation)
+    np.testing.assert_allclose(found.values, wanted.values, rtol=1e-12)  # rounding
 
 
 def test_columns_without_a_position_are_missing_but_not_outside():

@@ -104,15 +104,20 @@ def test_firth_maximizes_the_penalized_likelihood():
     assert fit.log_likelihood == pytest.approx(-best.fun, abs=1e-8)
 
 
-def test_firth_of_a_two_by_two_table_adds_half_to_each_cell():
-    """The penalized estimates of a saturated model are the log odds with 1/2 added."""
-    counts = {(0, 0): 7, (0, 1): 3, (1, 0): 4, (1, 1): 0}
+@pytest.mark.parametrize("many", [1, 24000])
+def test_firth_of_a_two_by_two_table_adds_half_to_each_cell(many):
+    """The penalized estimates of a saturated model are the log odds with 1/2 added.
+
+    Of many rows, the last steps promise less than the rounding of the likelihood; there are no
+    more steps for that (14 at either size).
+    """
+    counts = {(0, 0): 7 * many, (0, 1): 3 * many, (1, 0): 4, (1, 1): 0}
     rows = [(x, y) for (x, y), count in counts.items() for _ in range(count)]
     x, y = np.array(rows).T
     matrix = np.column_stack([np.ones(len(x)), x])
     assert is_separated(matrix, y == 1)
-    fit = fit_logistic(matrix, y == 1, SETTINGS, firth=True)
-    first, second = np.log(3.5 / 7.5), np.log(0.5 / 4.5)
+    fit = fit_logistic(matrix, y == 1, SETTINGS.changed(firth_iterations=16), firth=True)
+    first, second = np.log((3 * many + 0.5) / (7 * many + 0.5)), np.log(0.5 / 4.5)
     np.testing.assert_allclose(fit.coefficients, [first, second - first], rtol=1e-6)
 
 
@@ -294,6 +299,7 @@ def test_each_pair_is_the_comparison_of_its_subjects():
     alone = compare_models(base, thickness[used], groups[used] == "DAT", PAIRS)
     assert found[1].comparison.likelihood_ratio == alone.likelihood_ratio
     assert found[1].comparison.n == used.sum()
+    np.testing.assert_array_equal(found[1].is_case, groups[used] == "DAT")
     # Groups two steps apart are easier to tell than neighbors.
     areas = [pair.comparison.full.auc.area for pair in found]
     assert areas[1] > max(areas[0], areas[2])

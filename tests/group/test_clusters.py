@@ -101,6 +101,15 @@ def test_enhancement_of_a_plateau_is_the_sum_of_its_heights():
     assert np.count_nonzero(raised) == 7
 
 
+@pytest.mark.parametrize("count", range(1, 31))
+def test_enhancement_reaches_the_height_that_a_point_has(count):
+    """Sums of steps are rounded: a tenth, ten times, is less than 1 and counts as ten heights."""
+    heights = np.cumsum(np.full(count, 0.1))
+    settings = MultiplicitySettings(tfce_step=0.1)
+    (found,) = enhance(heights[None, -1:], np.zeros((0, 2), dtype=int), settings)
+    assert found.item() == pytest.approx((heights**2).sum() * 0.1, rel=1e-12)  # order of sums
+
+
 def test_clusters_are_split_by_sign_and_by_neighbors():
     significant = np.zeros((5, 5), dtype=bool)
     significant[[0, 1, 2, 2], [0, 1, 1, 2]] = True

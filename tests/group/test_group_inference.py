@@ -90,6 +90,8 @@ def test_permutations_are_in_the_tables_of_the_map(dataset, quick):
         text = (folder / "methods.md").read_text()
         assert "100 permutations" in text
         assert "seed 3" in text
+        enhanced = "the largest threshold-free cluster enhancement [" in text
+        assert enhanced == (method == "permutation-tfce")
         corrected[method] = found
     maximum = corrected["permutation-max"]
     # The largest t has the smallest p: the correction is monotone.
@@ -183,7 +185,8 @@ def test_longitudinal_model_finds_the_slopes(sessions, quick, random):
         # Sessions of a participant do not count as participants.
         assert (found.df < 90).all()
     text = (folder / "methods.md").read_text()
-    assert "mixed model" in text
+    own = "intercepts and slopes" if random == "slope" else "intercepts"
+    assert f"a linear mixed model with {own} of participants `" in text
     assert "30 participants (90 visits)" in text
     # Classification wants independent rows.
     assert set(table(folder / "classification.tsv").n) == {30}
@@ -273,7 +276,9 @@ def test_w_scores_are_those_of_a_model_without_the_participant(dataset, quick):
     # What counts as low is one in forty of a healthy participant's points.
     assert members.low.mean() == pytest.approx(0.025, abs=0.025)
     assert found[~found.reference].low.mean() > members.low.mean() + 0.02
-    assert "against 16 with group CN" in (folder / "methods.md").read_text()
+    text = (folder / "methods.md").read_text()
+    assert "against 16 with group CN" in text
+    assert "with the uncertainty of the model, is below 0.05." in text
 
 
 def test_w_scores_say_what_is_wrong_with_their_reference(dataset, capsys):

@@ -10,9 +10,11 @@ from pyarrow import parquet
 from small_cohorts import NODES, PLAN, place_of, write_dataset
 
 from hipsta_bids.cli.main import main
+from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.sampling import SampledMap
 from hipsta_bids.group import write
 from hipsta_bids.group.formula import left_side
+from hipsta_bids.group.read import choose_measures
 from hipsta_bids.group.tables import COLUMNS
 from hipsta_bids.inputs.scan import MapSource
 from hipsta_bids.io import files
@@ -130,6 +132,13 @@ def test_unknown_measures_are_refused_in_one_line(dataset, capsys, options, code
     assert error.count("\n") == 1
     assert words in error
     assert sorted(dataset[1].glob("group/*")) == before
+
+
+def test_messages_list_a_dozen_measures():
+    for count, more in ((12, ""), (13, r" \.\.\.")):
+        others = [f"m{i}" for i in range(count)]
+        with pytest.raises(InputError, match=rf"there are m0, .*, m11{more}$"):
+            choose_measures(["xyz"], (), others)
 
 
 def test_left_side_of_formulas():

@@ -199,11 +199,13 @@ def test_a_page_that_fails_costs_a_line_and_no_results(copy):
     assert (copy / "group" / MODEL / "peaks.tsv").exists()
 
 
-def test_no_page_is_made_or_left_if_none_is_wanted(dataset, copy, monkeypatch):
+def test_no_page_is_made_or_left_if_none_is_wanted(dataset, copy, monkeypatch, capsys):
     data, _, given = dataset
     monkeypatch.setattr(write, "draw_figures", lambda *_: iter(()))
     assert main([str(data), str(copy), "group", *given, "--no-reports"]) == 0
     assert not (copy / "group" / f"{MODEL}.html").exists()
+    methods = copy / "group" / MODEL / "methods.md"
+    assert f"what was done and found: {methods}\n" in capsys.readouterr().out
 
 
 @pytest.fixture(scope="module")

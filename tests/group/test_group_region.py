@@ -7,6 +7,8 @@ from small_cohorts import PLAN, place_of, write_dataset
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.derivatives.dataset import identity, update_status
+from hipsta_bids.group.collect import GroupRequest, collect_sheets
+from hipsta_bids.io import files
 
 QUICK = ["group", "--align", "none", "--measures", "thickness", "--formula", "group", "--contrast"]
 QUICK += ["group[CN]-group[AD]"]
@@ -48,6 +50,15 @@ def test_body_is_the_default_and_others_are_counted(study, capsys):
     assert "60 hemispheres of region body" in capsys.readouterr().out
     names = {path.name for path in (out / "group").iterdir()}
     assert names == {"thickness_group", "thickness_group_extended"}
+
+
+@pytest.mark.parametrize(("seg", "count"), [(None, 2), ("demo", 1)])
+def test_others_are_counted_in_the_protocol_that_is_asked_for(tmp_path, seg, count):
+    for one in ("demo", "ashs"):
+        files.write_json(place_of(tmp_path, "01", "L", seg=one, region="extended").path("qc"), {})
+    found = collect_sheets(GroupRequest(roots=(tmp_path,), seg=seg), may_lack=True)
+    (note,) = found.notes
+    assert note.startswith(f"{count} hemispheres of region extended are not in this analysis;")
 
 
 def test_missing_region_is_refused_with_what_there_is(study, capsys):

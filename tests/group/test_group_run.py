@@ -10,9 +10,11 @@ from pyarrow import parquet
 from small_cohorts import GROUPS, NODES, PLAN, place_of, write_dataset
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.group import write
+from hipsta_bids.group import run, write
+from hipsta_bids.group.collect import GroupRequest
 from hipsta_bids.group.formula import Contrast
 from hipsta_bids.group.glm import fit_points
+from hipsta_bids.group.model import ModelRequest
 from hipsta_bids.group.settings import GlmSettings
 from hipsta_bids.group.tables import COLUMNS
 from hipsta_bids.io import files
@@ -134,6 +136,10 @@ def test_record_and_methods_have_the_numbers(results, dataset, quick):
     assert f"{PLAN.sizes[0]} CN, {PLAN.sizes[1]} AD" in text
     significant = int(statmap(results, "L").significant.sum())
     assert f"thickness, CN-AD, L: {significant} of" in text
+    assert "fitted (reference levels: group CN, sex F); contrasts: CN-AD." in text
+    assert "the two-stage procedure of Benjamini, Krieger and Yekutieli [3], for each map." in text
+    assert "were registered by alternating fits" in text
+    assert "with a penalty" not in text
     model = json.loads((results / "model.json").read_text())
     assert model["BIDSModelVersion"] == "1.0.0"
 
@@ -172,6 +178,7 @@ def test_formula_contrast_reference_and_options(dataset, quick):
             *("--formula", "thickness ~ group + age", "--contrast", "slope = age"),
             *("group[AD]-group[CN]", "--reference", "group=AD", "--align", "none"),
             *("--fdr-scope", "hemispheres", "--base", "thickness_mean", "age"),
+            *("--correction", "bh"),
         ]
     )
     assert code == 0
@@ -181,6 +188,10 @@ def test_formula_contrast_reference_and_options(dataset, quick):
     assert record["references"] == {"group": "AD"}
     assert set(record["contrasts"]) == {"slope", "group[AD]-group[CN]"}
     assert not (folder / "template.json").exists()
+    text = (folder / "methods.md").read_text()
+    assert "Maps were not registered to each other." in text
+    assert "the procedure of Benjamini and Hochberg [2], for both hemispheres together." in text
+    assert "Wrobel" not in text  # who is not referred to
     maps = table(folder / "maps.tsv")
     assert set(maps.n_tests) == {2 * NODES[0] * NODES[1]}
     again = [*(str(data), str(out), "group", *quick), "--model", str(folder / "model.json")]
@@ -189,13 +200,26 @@ def test_formula_contrast_reference_and_options(dataset, quick):
     assert set(first.contrast) == set(second.contrast)
 
 
+@pytest.mark.parametrize("problem", [None, "kept.html: not made (no space)"])
+def test_the_page_is_named_unless_it_could_not_be_made(tmp_path, monkeypatch, problem):
+    monkeypatch.setattr(run, "write_group_report", lambda *_: problem)
+    sheets = GroupRequest(roots=(tmp_path,))
+    given = run.GroupOptions(
+        bids_dir=tmp_path, out_dir=tmp_path, sheets=sheets, model=ModelRequest()
+    )
+    page = tmp_path / "group" / "kept.html"
+    assert run._report(given, "kept") == (None if problem else page, problem)
+
+
 def test_flagged_hemispheres_are_told(dataset, quick, capsys):
     data, out = dataset
     path = place_of(out, "02", "R").path("qc")
     before = path.read_bytes()
     files.write_json(path, json.loads(before) | {"status": "flagged"})
     assert main([str(data), str(out), "group", *quick, "--name", "flagged"]) == 0
-    assert "note: 1 flagged hemispheres are in it" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "note: 1 flagged hemispheres are in it" in said
+    assert f"what was done and found: {out / 'group' / 'flagged.html'}\n" in said
     path.write_bytes(before)
 
 

@@ -134,6 +134,23 @@ def test_no_variance_between_participants_gives_the_linear_model():
         np.testing.assert_array_equal(mixed.df[zero], 69)
 
 
+def test_variances_of_a_balanced_design_are_those_of_mean_squares():
+    """Restricted likelihood gives the analysis of variance's, zero where that is negative."""
+    who, matrix, maps = case(5, between=0.02, points=60)
+    fit = fit_mixed(maps, matrix, who, single(3), SETTINGS)
+    means = maps.reshape(24, 3, -1).mean(axis=1)
+    left = means - np.stack([means[::2].mean(axis=0), means[1::2].mean(axis=0)])[np.arange(24) % 2]
+    fixed = np.column_stack([np.arange(72)[:, None] // 3 == np.arange(24), matrix[:, 2]])
+    within = np.linalg.lstsq(fixed.astype(float), maps, rcond=None)[1] / (72 - 25)
+    between = np.sum(left**2, axis=0) / (24 - 2) - within / 3
+    expected = np.maximum(between, 0)
+    # Some estimates lie between zero and half the first step of the grid that is searched.
+    share = expected / (expected + within)
+    step = SETTINGS.max_correlation / (SETTINGS.grid - 1)
+    assert ((share > 0) & (share < step / 2)).any()
+    np.testing.assert_allclose(fit.variances["participant"], expected, atol=1e-9)  # of .01
+
+
 def test_missing_values_give_the_fit_of_those_present():
     who, matrix, maps = case(6, points=12)
     random = np.random.default_rng(6)

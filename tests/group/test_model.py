@@ -8,9 +8,16 @@ import pytest
 from scipy import stats
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.formula import model_from_shortcut, parse_expression, parse_model
+from hipsta_bids.group.formula import listed, model_from_shortcut, parse_expression, parse_model
 from hipsta_bids.group.glm import fit_points
-from hipsta_bids.group.model import build_design, default_formula, find_groups, folder_name
+from hipsta_bids.group.model import (
+    ModelRequest,
+    build_design,
+    default_formula,
+    find_groups,
+    folder_name,
+    model_document,
+)
 from hipsta_bids.group.settings import DesignSettings, GlmSettings, GroupSettings
 
 SETTINGS = DesignSettings()
@@ -281,3 +288,27 @@ def test_different_models_have_different_folders():
     )
     assert len({folder_name(formula) for formula in formulas}) == len(formulas)
     assert folder_name("thickness ~ group + age") == "group-age"
+
+
+@pytest.mark.parametrize("formula", [None, "thickness ~ group + age + sex"])
+def test_models_have_the_name_that_they_are_given_or_that_of_their_formula(formula):
+    table = participants()
+    groups = find_groups(table, DEFAULTS)
+    for name, wanted in ((None, "group-age-sex"), ("mine", "mine")):
+        request = ModelRequest(formula=formula, name=name)
+        assert model_document(request, table, groups, DEFAULTS)["Name"] == wanted
+
+
+def test_contrasts_of_a_request_come_before_those_of_the_groups():
+    table = participants()
+    groups = find_groups(table, DEFAULTS)
+    for formula in (None, "group + age"):
+        for contrasts, names in (((), ["CU-DAT", "CU-MCI"]), (("slope = age",), ["slope"])):
+            request = ModelRequest(formula=formula, contrasts=contrasts)
+            spec = parse_model(model_document(request, table, groups, DEFAULTS))
+            assert [contrast.name for contrast in spec.contrasts] == names
+
+
+def test_long_lists_are_cut_in_messages():
+    assert listed(range(8)) == "0, 1, 2, 3, 4, 5, 6, 7"
+    assert listed(range(11)) == "0, 1, 2, 3, 4, 5, 6, 7 and 3 more"

@@ -11,6 +11,7 @@ from hipsta_bids.group.registration import mean_profiles, register, register_to,
 from hipsta_bids.group.settings import RegistrationSettings
 from hipsta_bids.group.warps import (
     WarpBasis,
+    fit_template,
     fit_warps,
     inner_knots,
     make_basis,
@@ -80,6 +81,20 @@ def test_known_warps_are_recovered(settings):
     np.testing.assert_array_equal(found.warps[:, 0], 0.0)
     np.testing.assert_allclose(found.warps[:, -1], 1.0, rtol=1e-12)
     np.testing.assert_allclose(found.warps.mean(axis=0), GRID, atol=2e-3)  # a tenth of a node
+
+
+def test_a_single_step_gives_principal_components():
+    """The variance that they explain is that of the profiles, whose shapes are splines here."""
+    random = np.random.default_rng(4)
+    warps = np.tile(GRID, (40, 1))
+    curve = make_basis(inner_knots(warps, 12))(GRID)
+    scores = random.standard_normal((40, 2)) * [0.5, 0.2]
+    profiles = (scores @ random.standard_normal((2, 12)) + random.standard_normal(12)) @ curve.T
+    template, _ = fit_template(profiles, warps, 12, 2, SETTINGS.changed(em_iterations=1))
+    parts = curve @ template.components
+    expected = np.cov(profiles.T, ddof=0)
+    np.testing.assert_allclose(parts @ parts.T, expected, atol=1e-9)  # rounding
+    np.testing.assert_allclose(curve @ template.mean, profiles.mean(axis=0), rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("penalty", [0.0, 1.0])
