@@ -1,8 +1,8 @@
 """From subfield labels to the hippocampal body: one ribbon between two end planes.
 
 The sheet's subfields are merged, with the molecular layer where the protocol says so. A mask that a
-person corrected replaces them where there is one, the cortex beside the body is added on request, and what
-the labels lack or have too much is mended (see :mod:`hipsta_bids.geometry.completion`).
+person corrected replaces them where there is one, the cortex beside the body is added on request,
+and what the labels lack or have too much is mended (``completion``).
 """
 
 from dataclasses import dataclass, field, replace
