@@ -74,7 +74,8 @@ def compare_summary(phantom: Phantom, maps: HemisphereMaps, *, hemi: str = "L") 
     Curvatures are averaged over part of the sheet; the truth is averaged over the same.
     """
     means = {f"{one.name}_mean": one.means[1] for one in compare_maps(phantom, maps, hemi=hemi)}
-    truth = means | dict(phantom.region_summary("extended"))
+    nodes = float(_truth_at_nodes(phantom, maps, hemi).thickness.mean())
+    truth = means | dict(phantom.region_summary("extended")) | {"thickness_nodes": nodes}
     return [_comparison(row, maps.summary[row.name], truth[row.name]) for row in SUMMARY]
 
 

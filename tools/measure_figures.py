@@ -39,7 +39,7 @@ def draw_thickness(figure: Figure, example: Example) -> None:
     for x, color in ((10, ACCENT), (30, VIOLET)):
         axis.plot(*points[x].T, color=color, lw=3, marker=".", ms=5, zorder=4)
         lines += [(f"column {x + 1}", color), (f"  {example.at('thickness', x)}", color)]
-    for name in ("thickness_mean", "extent_z"):
+    for name in ("thickness_mean", "thickness_nodes", "extent_z"):
         lines += [(name, MID), (f"  {example.of_summary(name)}", MID)]
     lines += [("thickness of this section, mean", MID)]
     lines += [(f"  {example.of_section('thickness')}", MID)]

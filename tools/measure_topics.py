@@ -29,11 +29,12 @@ TOPICS = (
         title="Thickness",
         text="Gray lines are columns of the sheet: they follow z from the interior to the exterior"
         " wall. Two of them are drawn in color with the lengths of their points' steps. Means count"
-        " every square millimeter of the mid-surface the same.",
+        " every square millimeter of the mid-surface the same, but for `thickness_nodes`: there"
+        " every node counts the same, as in Diers et al. (2023).",
         measures={
             "sheet": ("thickness",),
             "sections": ("thickness",),
-            "summary": ("thickness_mean", "extent_z"),
+            "summary": ("thickness_mean", "thickness_nodes", "extent_z"),
         },
     ),
     Topic(
