@@ -86,6 +86,8 @@ class BodySettings(SettingsTable):
     slit_voxel: NonNegativeFloat = 0.8
     """Gaps are filled if no edge of a voxel is longer than this, mm: between thick slices folds
     look like gaps."""
+    uncus_size: NonNegativeFloat = 1.0
+    """Smaller pieces of CA2 or CA3 are no uncus, mm3."""
     uncus_offset: PositiveFloat = 5.0
     """CA2 or CA3 at the anterior plane is the uncus if it lies farther than this medially of the
     body's own, mm (10 to 12 in three real brains)."""

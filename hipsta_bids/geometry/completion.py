@@ -23,7 +23,6 @@ from hipsta_bids.geometry.digital import (
     low_corner,
     piece_sizes,
     to_ras,
-    voxel_points,
 )
 from hipsta_bids.geometry.ends import EndPlanes
 from hipsta_bids.protocols.protocol import Tissue
@@ -85,37 +84,41 @@ def find_uncus(tissue: Tissues, affine: Float, ends: EndPlanes, settings: BodySe
     first. The part of CA1 that is nearer to it than to the rest, on the way through the sheet, goes
     with it.
     """
-    lateral = np.isin(tissue, (Tissue.CA2, Tissue.CA2_3, Tissue.CA3))
-    medial = np.isin(tissue, (Tissue.PRESUBICULUM, Tissue.SUBICULUM))
-    none = np.zeros((0, 3), np.intp)
-    pieces, count = ndimage.label(between(lateral, affine, ends)[0], structure=ALL)
-    if count < 2 or not medial.any():  # noqa: PLR2004 -- the body's own is the first
-        return none
-    main = to_ras(np.argwhere(pieces == piece_sizes(pieces).argmax()), affine)
-    towards = voxel_points(medial, affine).mean(axis=0) - voxel_points(lateral, affine).mean(axis=0)
+    index = np.argwhere(tissue)
+    points = to_ras(index, affine)
+    near = ends.beyond(1.0).depth(points) > 0
+    index, points = index[near], points[near]
+    low = index.min(axis=0) if len(index) else np.zeros(3, np.intp)
+    kinds, at = tissue[tuple(index.T)], tuple((index - low).T)
+    lateral = np.isin(kinds, (Tissue.CA2, Tissue.CA2_3, Tissue.CA3))
+    medial = np.isin(kinds, (Tissue.PRESUBICULUM, Tissue.SUBICULUM))
+    grid = np.zeros(index.max(axis=0, initial=-1) - low + 1, dtype=np.int32)
+    grid[at] = lateral & (ends.depth(points) > 0)
+    pieces = ndimage.label(grid, structure=ALL)[0][at]
+    sizes = np.bincount(pieces)[1:] * abs(np.linalg.det(affine[:3, :3]))
+    if len(sizes) < 2 or not medial.any():  # noqa: PLR2004 -- the body's own is the first
+        return np.zeros((0, 3), np.intp)
+    towards = points[medial].mean(axis=0) - points[lateral].mean(axis=0)
     towards -= (towards @ ends.axis) * ends.axis
     towards /= np.linalg.norm(towards)
-    found = np.zeros(tissue.shape, dtype=bool)
-    depth = 0.0
-    for number in np.flatnonzero(piece_sizes(pieces) * abs(np.linalg.det(affine[:3, :3])) > 1.0):
-        points = to_ras(np.argwhere(pieces == number), affine)
-        inside = -ends.height(points, "anterior")
-        beside = main[-ends.height(main, "anterior") < inside.max() + ends.half_slice]
-        aside = points.mean(axis=0) - (beside if len(beside) else main).mean(axis=0)
-        if inside.min() < 3 * ends.half_slice and aside @ towards > settings.uncus_offset:
-            found |= pieces == number
-            depth = max(depth, float(inside.max()))
+    depth = -ends.height(points, "anterior")
+    main = pieces == sizes.argmax() + 1
+    found = np.zeros(len(points), dtype=bool)
+    for number in np.flatnonzero(sizes > settings.uncus_size) + 1:
+        piece = pieces == number
+        beside = main & (depth < depth[piece].max() + ends.half_slice)
+        body = points[beside if beside.any() else main]
+        aside = (points[piece].mean(axis=0) - body.mean(axis=0)) @ towards
+        if depth[piece].min() < 3 * ends.half_slice and aside > settings.uncus_offset:
+            found |= piece
     if not found.any():
-        return none
-    near, _ = between(tissue > 0, affine, ends.beyond(1.0))
-    index = np.argwhere(near)
-    height = -ends.height(to_ras(index, affine), "anterior")
-    near[tuple(index[height > depth + 1.0].T)] = False
-    markers = np.where(found, 1, np.where((lateral | medial) & near, 2, 0))
-    around = box_around(np.argwhere(near))
-    flat = np.zeros(markers[around].shape, np.uint8)
-    basins = watershed(flat, markers[around], ALL, mask=near[around])  # type: ignore[no-untyped-call]
-    return np.argwhere(basins == 1) + low_corner(around)
+        return np.zeros((0, 3), np.intp)
+    beside = depth < depth[found].max() + 1.0
+    grid[at] = np.where(found, 1, np.where((lateral | medial) & beside, 2, 0))
+    mask = np.zeros(grid.shape, dtype=bool)
+    mask[at] = beside
+    basins = watershed(np.zeros_like(grid), grid, ALL, mask=mask)  # type: ignore[no-untyped-call]
+    return np.asarray(index[basins[at] == 1])
 
 
 def _like_nearest(
