@@ -17,6 +17,7 @@ from hipsta_bids.geometry.slices import has_thick_slices, points_of_ends, sample
 from hipsta_bids.settings import GridSettings, SliceSettings
 from hipsta_bids.types import Bool, Float
 
+_LEAST_SLOPE = 0.34  # cosine of 70 degrees
 _END_REACH = 4.0  # mm behind an end plane over which the body's direction is taken
 
 
@@ -162,15 +163,18 @@ def directions_at_ends(body: Body) -> dict[End, Float]:
     index, points = body.inside_points()
     pieces, _ = ndimage.label(body.inside[box_around(index)], structure=ALL)
     number = pieces[tuple((index - low_corner(box_around(index))).T)]
-    found: dict[End, Float] = {}
+    ends, found = body.ends, dict[End, Float]()
     signs: tuple[tuple[End, float], ...] = (("posterior", 1.0), ("anterior", -1.0))
     for end, sign in signs:
-        depth = sign * body.ends.height(points, end)
+        depth = sign * ends.height(points, end)
         last = depth < min(_END_REACH, float(depth.max()))
         last &= number == np.bincount(number[last]).argmax()  # without an uncus beside it
         middle = np.median(depth[last])
         step = points[last & (depth <= middle)].mean(0) - points[last & (depth >= middle)].mean(0)
-        found[end] = step / max(float(np.linalg.norm(step)), 1e-9)
+        step /= max(float(np.linalg.norm(step)), 1e-9)
+        normal = ends.posterior_normal if end == "posterior" else ends.anterior_normal
+        # Nearly along the plane, or of a single slice, it says nothing.
+        found[end] = step if -sign * (step @ normal) > _LEAST_SLOPE else -sign * ends.axis
     return found
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.ends import EndPlanes
-from hipsta_bids.geometry.grid import continued_nodes, in_plane_voxel
+from hipsta_bids.geometry.grid import continued_nodes, directions_at_ends, in_plane_voxel
 from hipsta_bids.protocols.protocol import Tissue
 
 EXACT = 1e-9  # rounding of coordinates of some ten mm
@@ -193,3 +193,17 @@ def test_turns_that_touch_are_separated():
     # The slit's half width of 0.3 mm and what smoothing adds.
     assert (values[block & (offset[:, 1] > 0.7) & (offset[:, 1] < 0.8)] > 0).all()
     assert (block & (offset[:, 1] > 0.7) & (offset[:, 1] < 0.8)).any()
+
+
+def test_a_body_of_one_slice_at_an_end_goes_on_along_the_axis():
+    """Voxel centers all as deep as each other tell no direction."""
+    body = box_body()
+    index, points = body.inside_points()
+    depth = body.ends.height(points, "posterior")
+    level = depth[np.argmin(np.abs(depth - 2.0))]
+    kept = np.isclose(depth, level) | (depth > 4.5)
+    inside = np.zeros_like(body.inside)
+    inside[tuple(index[kept].T)] = True
+    found = directions_at_ends(replace(body, inside=inside))
+    np.testing.assert_allclose(found["posterior"], -body.ends.axis, atol=EXACT)
+    np.testing.assert_allclose(found["anterior"], body.ends.axis, atol=0.02)
