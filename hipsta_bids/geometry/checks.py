@@ -23,7 +23,7 @@ from hipsta_bids.geometry.digital import (
     to_ras,
     voxel_points,
 )
-from hipsta_bids.geometry.grid import Field, continued_nodes, in_plane_voxel
+from hipsta_bids.geometry.grid import Field, continued_nodes, cut_across, in_plane_voxel
 from hipsta_bids.geometry.mesh import mean_wall_thickness
 from hipsta_bids.geometry.slices import points_of_ends
 from hipsta_bids.protocols.protocol import Part, Tissue, lateral_rank
@@ -175,9 +175,7 @@ def check_image(body: Body, settings: CheckSettings) -> list[Flag]:
 def _sliced_lengthwise(body: Body, settings: CheckSettings) -> bool:
     """Whether the longest edge of the voxels is long, and lies across the long axis."""
     edges = np.linalg.norm(body.affine[:3, :3], axis=0)
-    longest = int(np.argmax(edges))
-    along = abs(float(body.ends.axis @ body.affine[:3, longest])) / float(edges[longest])
-    return bool(edges.max() > settings.slice_ratio * edges.min() and along < 0.5)  # noqa: PLR2004 -- 60 degrees
+    return bool(edges.max() > settings.slice_ratio * edges.min() and not cut_across(body))
 
 
 def _voxel_across(body: Body, settings: CheckSettings) -> float:

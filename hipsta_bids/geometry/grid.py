@@ -120,7 +120,7 @@ def resample_body(body: Body, hemi: str, settings: GridSettings, slices: SliceSe
     """
     grid = _fit_grid(body, hemi, settings)
     separated = None
-    if has_thick_slices(body.affine, slices):
+    if has_thick_slices(body.affine, slices) and cut_across(body):
         points = continued_nodes(grid, body, 0.0).reshape(-1, 3)
         values = sample_slices(body, points, slices)
     else:
@@ -141,6 +141,13 @@ def resample_body(body: Body, hemi: str, settings: GridSettings, slices: SliceSe
         slits=_nodes_in(body.filled, body, points, grid.shape),
         cavities=_nodes_in(cavities, body, points, grid.shape),
     )
+
+
+def cut_across(body: Body) -> bool:
+    """Whether slices, along the longest edges of the voxels, lie rather across the body."""
+    edges = np.linalg.norm(body.affine[:3, :3], axis=0)
+    along = abs(body.ends.axis @ body.affine[:3, int(np.argmax(edges))]) / edges.max()
+    return bool(along > 0.5)  # noqa: PLR2004 -- 60 degrees
 
 
 def continued_nodes(grid: WedgeGrid, body: Body, depth: float) -> Float:
