@@ -26,15 +26,21 @@ from hipsta_bids.geometry.completion import (
     value_of_nearest,
 )
 from hipsta_bids.geometry.digital import (
+    ALL,
     FACES,
+    box_around,
+    low_corner,
     to_ras,
     voxel_points,
 )
-from hipsta_bids.geometry.ends import EndPlanes, find_end_planes
+from hipsta_bids.geometry.ends import End, EndPlanes, find_end_planes
 from hipsta_bids.protocols.load import for_region
 from hipsta_bids.protocols.protocol import Tissue, lateral_rank
 from hipsta_bids.settings import BodySettings
 from hipsta_bids.types import Bool, EditedMask, Flag, Float, LabelVolume
+
+_END_REACH = 4.0  # mm behind an end plane over which the body's direction is taken
+_LEAST_SLOPE = 0.34  # cosine of 70 degrees
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,6 +105,33 @@ class Body:
         medial = np.isin(self.hippocampal, (Tissue.PRESUBICULUM, Tissue.SUBICULUM))
         near = cKDTree(voxel_points(medial, self.affine))
         return np.asarray(-near.query(self.inside_points()[1])[0])
+
+    @cached_property
+    def voxel_volume(self) -> float:
+        """Volume of a voxel, mm3."""
+        return abs(float(np.linalg.det(self.affine[:3, :3])))
+
+    @cached_property
+    def outward(self) -> dict[End, Float]:
+        """Unit vectors (3,) along which the body leaves its two end planes."""
+        index, points = self.inside_points()
+        around = box_around(index)
+        pieces, _ = ndimage.label(self.inside[around], structure=ALL)
+        number = pieces[tuple((index - low_corner(around)).T)]
+        ends, found = self.ends, dict[End, Float]()
+        signs: tuple[tuple[End, float], ...] = (("posterior", 1.0), ("anterior", -1.0))
+        for end, sign in signs:
+            depth = sign * ends.height(points, end)
+            last = depth < min(_END_REACH, float(depth.max()))
+            last &= number == np.bincount(number[last]).argmax()  # without an uncus beside it
+            middle = np.median(depth[last])
+            near, far = points[last & (depth <= middle)], points[last & (depth >= middle)]
+            step = near.mean(axis=0) - far.mean(axis=0)
+            step /= max(float(np.linalg.norm(step)), 1e-9)
+            normal = ends.posterior_normal if end == "posterior" else ends.anterior_normal
+            # Nearly along the plane, or of a single slice, it says nothing.
+            found[end] = step if -sign * (step @ normal) > _LEAST_SLOPE else -sign * ends.axis
+        return found
 
     def to_voxels(self, points: Float) -> Float:
         """Voxel indices (..., 3), fractions included, of points (..., 3), RAS mm."""

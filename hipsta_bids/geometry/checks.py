@@ -228,7 +228,7 @@ def describe_uncus(body: Body, settings: CheckSettings) -> list[str]:
     if not len(body.uncus):
         return []
     points = to_ras(body.uncus, body.affine)
-    volume = len(points) * abs(float(np.linalg.det(body.affine[:3, :3])))
+    volume = len(points) * body.voxel_volume
     reach = float(-body.ends.height(points, "anterior").min())
     far = f"; it begins {reach:.1f} mm behind the anterior end: does the head begin there?"
     warning = far if reach > settings.uncus_reach else ""
@@ -237,13 +237,12 @@ def describe_uncus(body: Body, settings: CheckSettings) -> list[str]:
 
 def check_cavities(body: Body, settings: CheckSettings) -> list[Flag]:
     """Flag large cavities that were too wide to say whose they are."""
-    volume = abs(float(np.linalg.det(body.affine[:3, :3])))
     flags = []
     for cavity in body.cavities.wide:
         share = len(cavity) / max(len(body.inside_points()[0]), 1)
         if share > settings.flag_cavity:
             message = (
-                f"a cavity of {len(cavity) * volume:.0f} mm3 without a label, near "
+                f"a cavity of {len(cavity) * body.voxel_volume:.0f} mm3 without a label, near "
                 f"{name_place(to_ras(cavity, body.affine), body)}, was divided between the sheet "
                 f"and its interior: mean thickness may be off by {share / 2:.0%}; label what it is"
             )

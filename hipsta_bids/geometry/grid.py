@@ -11,14 +11,9 @@ from scipy.spatial import cKDTree
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.completion import Index
-from hipsta_bids.geometry.digital import ALL, box_around, low_corner
-from hipsta_bids.geometry.ends import End
 from hipsta_bids.geometry.slices import has_thick_slices, points_of_ends, sample_slices
 from hipsta_bids.settings import GridSettings, SliceSettings
 from hipsta_bids.types import Bool, Float
-
-_LEAST_SLOPE = 0.34  # cosine of 70 degrees
-_END_REACH = 4.0  # mm behind an end plane over which the body's direction is taken
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -157,32 +152,12 @@ def continued_nodes(grid: WedgeGrid, body: Body, depth: float) -> Float:
     along the body: there it goes on as it is at the plane.
     """
     points = grid.node_points()
-    for end, outward in directions_at_ends(body).items():
+    for end, outward in body.outward.items():
         inside = body.ends.height(points, end)
         slope = body.ends.height(outward, end) - body.ends.height(np.zeros(3), end)
         missing = np.maximum(depth - inside * np.sign(-slope), 0.0)
         points -= (missing / abs(slope))[..., None] * outward
     return points
-
-
-def directions_at_ends(body: Body) -> dict[End, Float]:
-    """Find the unit vectors (3,) along which the body leaves its two end planes."""
-    index, points = body.inside_points()
-    pieces, _ = ndimage.label(body.inside[box_around(index)], structure=ALL)
-    number = pieces[tuple((index - low_corner(box_around(index))).T)]
-    ends, found = body.ends, dict[End, Float]()
-    signs: tuple[tuple[End, float], ...] = (("posterior", 1.0), ("anterior", -1.0))
-    for end, sign in signs:
-        depth = sign * ends.height(points, end)
-        last = depth < min(_END_REACH, float(depth.max()))
-        last &= number == np.bincount(number[last]).argmax()  # without an uncus beside it
-        middle = np.median(depth[last])
-        step = points[last & (depth <= middle)].mean(0) - points[last & (depth >= middle)].mean(0)
-        step /= max(float(np.linalg.norm(step)), 1e-9)
-        normal = ends.posterior_normal if end == "posterior" else ends.anterior_normal
-        # Nearly along the plane, or of a single slice, it says nothing.
-        found[end] = step if -sign * (step @ normal) > _LEAST_SLOPE else -sign * ends.axis
-    return found
 
 
 def _nodes_in(voxels: Index, body: Body, points: Float, shape: tuple[int, int, int]) -> Bool | None:
@@ -263,10 +238,7 @@ def _fit_grid(body: Body, hemi: str, settings: GridSettings) -> WedgeGrid:
     flat = (points - anchor) - np.outer((points - anchor) @ axis, axis)
     across = _directions_across(body, hemi, flat)
     reach = flat @ across.T
-    aside = [
-        settings.beyond * (way @ across.T) / abs(way @ axis)
-        for way in directions_at_ends(body).values()
-    ]
+    aside = [settings.beyond * (way @ across.T) / abs(way @ axis) for way in body.outward.values()]
     margin = settings.margin + float(np.linalg.norm(body.affine[:3, :3], axis=0).min())
     first = np.floor(
         (reach.min(axis=0) + np.min(aside, axis=0).clip(max=0) - margin) / settings.spacing

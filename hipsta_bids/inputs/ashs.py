@@ -22,6 +22,7 @@ from hipsta_bids.inputs.scan import (
     VisitFolders,
     list_visits,
     measurable,
+    several_files,
     subject_folders,
     unknown_protocol,
 )
@@ -241,11 +242,7 @@ def find_ashs(
         protocol, why, problem = atlases.identify((chosen.path, hemi, bilateral))
         rivals = [file.path.name for file in files if file.rank == chosen.rank]
         if len(rivals) > 1:
-            problem = InputError(
-                f"{chosen.path.parent}: {' and '.join(rivals)} are equally good; "
-                "keep one of them in the subject's folder",
-                reason="several-files",
-            )
+            problem = several_files(chosen.path.parent, rivals)
         elif problem is None and bilateral and not protocol.offset:
             problem = InputError(
                 f"{chosen.path}: neither left nor right is in its name, and the protocol "

@@ -19,6 +19,7 @@ from hipsta_bids.inputs.scan import (
     Selection,
     Source,
     VisitFolders,
+    several_files,
     unknown_protocol,
 )
 from hipsta_bids.io.files import entities
@@ -121,11 +122,7 @@ def _choose(
     protocol, why, problem = _protocol(chosen.path, tool, selection)
     rivals = [file.path.name for file in files if file.rank == chosen.rank]
     if len(rivals) > 1:
-        problem = InputError(
-            f"{chosen.path.parent}: {' and '.join(rivals)} are equally good; "
-            "keep one of them in the subject's folder",
-            reason="several-files",
-        )
+        problem = several_files(chosen.path.parent, rivals)
     return HemisphereInput(
         subject=visit.subject,
         session=visit.session,

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.ends import EndPlanes
-from hipsta_bids.geometry.grid import continued_nodes, directions_at_ends, in_plane_voxel
+from hipsta_bids.geometry.grid import continued_nodes, in_plane_voxel
 from hipsta_bids.protocols.protocol import Tissue
 
 EXACT = 1e-9  # rounding of coordinates of some ten mm
@@ -204,6 +204,6 @@ def test_a_body_of_one_slice_at_an_end_goes_on_along_the_axis():
     kept = np.isclose(depth, level) | (depth > 4.5)
     inside = np.zeros_like(body.inside)
     inside[tuple(index[kept].T)] = True
-    found = directions_at_ends(replace(body, inside=inside))
+    found = replace(body, inside=inside).outward
     np.testing.assert_allclose(found["posterior"], -body.ends.axis, atol=EXACT)
     np.testing.assert_allclose(found["anterior"], body.ends.axis, atol=0.02)
