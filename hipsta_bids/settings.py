@@ -275,7 +275,7 @@ class BoundarySettings(SettingsTable):
     """LaPy's curvature over curvature x mean edge length (measured on cylinders)."""
     label_neighbors: PositiveInt = 30
     """Voxels around a vertex whose labels tell how lateral it is."""
-    label_stride: PositiveInt = 2
+    label_stride: PositiveInt = 4
     """One vertex in this many is asked."""
     lateral_share: PositiveFraction = 0.1
     """Share of the vertices that count as most lateral."""
@@ -302,8 +302,10 @@ class BoundarySettings(SettingsTable):
     strip_step: PositiveFloat = 0.5
     """The direction of the sheet is found after one, two and three steps of this length from the
     rim, in the same unit."""
-    strip_neighbors: PositiveInt = 160
+    strip_neighbors: PositiveInt = 40
     """Number of tetrahedra over which that direction is averaged."""
+    strip_stride: PositiveInt = 4
+    """One tetrahedron in this many is asked."""
     rim_neighbors: PositiveInt = 15
     """Number of points of the edge over which it is averaged then."""
     strip_reach: Numbers = (0.9, 0.75)

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.checks import name_place
-from hipsta_bids.geometry.fem import Laplace
+from hipsta_bids.geometry.fem import DIRECTION_RESIDUAL, Laplace
 from hipsta_bids.geometry.mesh import mean_wall_thickness, signed_volume
 from hipsta_bids.geometry.wall import Wall, edge_graph, end_to_end
 from hipsta_bids.settings import BoundarySettings
@@ -161,7 +161,8 @@ def facing_strips(
     for reach in settings.strip_reach:
         lines = _near(wall, curves, settings.least_strip * thickness)
         limits = _near(wall, curves, reach * thickness)
-        flow = laplace.gradient(laplace.between(wall.index[strips[0]], wall.index[strips[1]]))
+        medial, lateral = (wall.index[strip] for strip in strips)
+        flow = laplace.gradient(laplace.between(medial, lateral, DIRECTION_RESIDUAL))
         strips = (
             finder.strip(starts[0], flow, lines[0], limits[0]),
             finder.strip(starts[1], -flow, lines[1], limits[1]),
@@ -185,7 +186,8 @@ class _Finder:
         self._step = settings.strip_step * thickness
         links = edge_graph(wall.edges, np.ones(len(wall.edges)), len(wall.vertices))
         self._normals = _unit((links + sparse.eye_array(len(wall.vertices))) @ wall.normals)
-        self._centers = cKDTree(laplace.points[laplace.cells.T].mean(axis=0))
+        asked = laplace.cells[:: settings.strip_stride]
+        self._centers = cKDTree(laplace.points[asked.T].mean(axis=0))
 
     def strip(self, starts: Float, inward: Float, line: Bool, limit: Bool) -> Bool:
         """Vertices (V,) within a limit that face away from the sheet, with a line among them."""
@@ -216,7 +218,7 @@ class _Finder:
 
     def _mean(self, points: Float, flow: Float) -> Float:
         _, nearest = self._centers.query(points, k=self._settings.strip_neighbors)
-        return _unit(flow[nearest].mean(axis=1))
+        return _unit(flow[:: self._settings.strip_stride][nearest].mean(axis=1))
 
 
 def _unit(vectors: Float) -> Float:
@@ -272,10 +274,7 @@ def find_boundaries(
     distance = float("nan")
     if curves is not None and guided is not None:
         distance = _curve_distance(curves, guided)
-    attempts = [
-        (rule, pair and center_curves(wall, pair, thickness, settings))
-        for rule, pair in (("eigenfunction", curves), ("rims", guided))
-    ]
+    attempts = [("eigenfunction", curves), ("rims", guided)]
     if not distance <= settings.max_distance:
         attempts.reverse()
     found = _separating(wall, laplace, attempts, thickness, settings)
@@ -316,9 +315,10 @@ def _separating(
     settings: BoundarySettings,
 ) -> tuple[str, Pair, tuple[Bool, Bool], tuple[Bool, Bool]] | None:
     """Take the first pair of curves whose strips separate the wall into two sides, if any."""
-    for rule, pair in attempts:
-        if pair is None:
+    for rule, found in attempts:
+        if found is None:
             continue
+        pair = center_curves(wall, found, thickness, settings)
         plain = _near(wall, pair, settings.first_strip * thickness)
         for strips, middle in (
             facing_strips(wall, laplace, pair, thickness, settings),

@@ -17,7 +17,8 @@ from hipsta_bids.errors import GeometryError
 from hipsta_bids.types import Bool, Float, Int
 
 _MANY = 4000  # vertices of a volume from which on iterating is faster than factorizing
-_RESIDUAL = 1e-11  # of the right-hand side; it leaves errors of 1e-9 mm in the sheet
+_RESIDUAL = 1e-9  # of the right-hand side; it leaves errors of 1e-7 mm in the sheet
+DIRECTION_RESIDUAL = 1e-6  # for directions, which are averaged over many tetrahedra
 _MAX_STEPS = 1000  # bodies take 100 to 150
 _GROUPS = 2.0  # times the root of the number of unknowns: a step's two levels cost about the same
 
@@ -67,8 +68,13 @@ class Laplace:
         once = neighbors.indices > first
         return np.column_stack([first[once], neighbors.indices[once]])
 
-    def solve(self, fixed: NDArray[np.integer], values: Float) -> Float:
-        """Harmonic function (V,) with given values at some vertices and no flux elsewhere."""
+    def solve(
+        self, fixed: NDArray[np.integer], values: Float, residual: float = _RESIDUAL
+    ) -> Float:
+        """Harmonic function (V,) with given values at some vertices and no flux elsewhere.
+
+        Where it is iterated, what is left over is at most ``residual`` of the right-hand side.
+        """
         result, free = np.zeros(len(self.points)), np.ones(len(self.points), dtype=bool)
         result[fixed], free[fixed] = values, False
         with _solvable():
@@ -76,15 +82,15 @@ class Laplace:
                 known = np.flatnonzero(~free)
                 result = self._fem.poisson(0.0, (known, result[known]))
             else:
-                result += self._rest(-(self.stiffness @ result), free)
+                result += self._rest(-(self.stiffness @ result), free, residual)
         if not np.isfinite(result).all():
             raise _unsolvable()
         return result
 
-    def between(self, first: Int, second: Int) -> Float:
-        """Harmonic function (V,) from -1 to 1 between two sets of vertices."""
+    def between(self, first: Int, second: Int, residual: float = _RESIDUAL) -> Float:
+        """Harmonic function (V,) from -1 to 1 between two sets of vertices, as in ``solve``."""
         values = np.repeat([-1.0, 1.0], [len(first), len(second)])
-        return self.solve(np.concatenate([first, second]), values)
+        return self.solve(np.concatenate([first, second]), values, residual)
 
     def gradient(self, values: Float) -> Float:
         """Gradient (T, 3) of a piecewise linear function (V,), per mm."""
@@ -119,11 +125,11 @@ class Laplace:
         order = np.argsort(values)[1:]
         return values[order], functions[:, order]
 
-    def _rest(self, right: Float, free: Bool) -> Float:
+    def _rest(self, right: Float, free: Bool, residual: float) -> Float:
         """Solve for the free vertices; zero at the others."""
         volume = self.cells.shape[1] == 4  # noqa: PLR2004 -- corners of a tetrahedron
         if volume and len(free) > _MANY and free.mean() > 0.5:  # noqa: PLR2004 -- most
-            return solve_two_level(self.stiffness, right, free, self._groups)
+            return solve_two_level(self.stiffness, right, free, self._groups, residual)
         result = np.zeros(len(free))
         result[free] = _factor(self.stiffness[free][:, free].tocsc()).solve(right[free])
         return result
@@ -184,7 +190,11 @@ def compact_groups(points: Float) -> NDArray[np.intp]:
 
 
 def solve_two_level(
-    matrix: sparse.csr_array, right: Float, free: Bool, groups: NDArray[np.intp]
+    matrix: sparse.csr_array,
+    right: Float,
+    free: Bool,
+    groups: NDArray[np.intp],
+    residual: float = _RESIDUAL,
 ) -> Float:
     """Solve a symmetric positive definite system on some of the unknowns.
 
@@ -210,16 +220,19 @@ def solve_two_level(
         sums = coarse @ np.bincount(groups, root * rest, len(coarse))
         return np.asarray(rest + root * sums[groups])
 
-    return inverse * _conjugate_gradients(scaled, inverse * right, both_levels)
+    return inverse * _conjugate_gradients(scaled, inverse * right, both_levels, residual)
 
 
 def _conjugate_gradients(
-    matrix: sparse.csr_array, right: Float, precondition: Callable[[Float], Float]
+    matrix: sparse.csr_array,
+    right: Float,
+    precondition: Callable[[Float], Float],
+    residual: float,
 ) -> Float:
     result, rest = np.zeros(len(right)), right.copy()
     step = precondition(rest)
     size = float(rest @ step)
-    limit = _RESIDUAL * float(np.linalg.norm(right))
+    limit = residual * float(np.linalg.norm(right))
     for _ in range(_MAX_STEPS):
         if np.linalg.norm(rest) <= limit:
             return result

@@ -381,7 +381,9 @@ def repaired_columns(sheet: Sheet, solid: SolidField, settings: MeasureSettings)
     nodes, radii = _changed_nodes(solid, sheet.points[known].reshape(-1, 3), settings)
     gaps = np.stack([_gaps(sheet.points, axis) for axis in (0, 1)], axis=-1)
     # Most columns are far from all repairs: only the others are interpolated.
-    near = np.asarray(cKDTree(nodes).query(sheet.points[known])[0])
+    reach = float(radii.max() + gaps[known].max())
+    tree = cKDTree(nodes)
+    near = np.asarray(tree.query(sheet.points[known], distance_upper_bound=reach)[0])
     candidates = np.argwhere(known)[near.min(axis=1) <= radii.max() + gaps[known].mean(axis=-1)]
     if not len(candidates):
         return marked
