@@ -19,6 +19,7 @@ from hipsta_bids.group.comparison import (
 from hipsta_bids.group.data import PARTICIPANT, Cohort, Float, Measures, SideMaps
 from hipsta_bids.group.formula import ModelSpec
 from hipsta_bids.group.glm import FittedMaps, PointTest, RowModel, fit_maps, with_mean
+from hipsta_bids.group.grammar import closed_formula
 from hipsta_bids.group.inference import Discoveries, MapKey, check_permutations, correct
 from hipsta_bids.group.mixed import longitudinal_model
 from hipsta_bids.group.model import Design, Groups, build_design
@@ -243,8 +244,7 @@ def _references(
 ) -> dict[str, str]:
     """Take reference levels of the user, and that of the groups if they are in the model."""
     chosen = dict(references)
-    words = model.formula.replace("*", " ").replace(":", " ").replace("+", " ").split()
-    if groups is not None and groups.column in words:
+    if groups is not None and groups.column in closed_formula(model.formula).names:
         chosen.setdefault(groups.column, groups.reference)
     return chosen
 

@@ -27,6 +27,7 @@ from hipsta_bids.types import Status
 #: Number of names that a note lists.
 _SHOWN = 4
 _ALLOWED = "may hold comparisons, and, or, not, + - * / only"
+_LONGEST = 500  # characters of a condition
 _OPERATORS: Mapping[type[ast.AST], Callable[[Any, Any], Any]] = {
     ast.Lt: operator.lt,
     ast.LtE: operator.le,
@@ -85,10 +86,12 @@ class QualityCondition:
     """A condition on quality metrics, such as ``filled_fraction > 0.01 or voxels_across < 3``."""
 
     def __init__(self, text: str) -> None:
-        self.text = text
+        self.text = text[:_LONGEST]
+        if len(text) > _LONGEST:
+            raise self._refusal(f"... is too long; {_LONGEST} characters are the limit")
         try:
             self._tree = ast.parse(text.strip(), mode="eval").body
-        except SyntaxError as error:
+        except (SyntaxError, ValueError) as error:  # ValueError: a null byte
             raise self._refusal("cannot be read; write it as filled_fraction > 0.01") from error
 
     def holds(self, metrics: Mapping[str, Any]) -> bool:
@@ -126,6 +129,8 @@ class QualityCondition:
             raise self._refusal(_ALLOWED)
         if a is None or b is None:
             return None
+        if isinstance(sign, ast.operator) and (isinstance(a, str) or isinstance(b, str)):
+            raise self._refusal(f"cannot combine {a!r} and {b!r}")
         try:
             return _OPERATORS[type(sign)](a, b)
         except (TypeError, ZeroDivisionError) as error:

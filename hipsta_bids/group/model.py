@@ -30,6 +30,7 @@ from hipsta_bids.group.formula import (
     set_levels,
     typed,
 )
+from hipsta_bids.group.grammar import CONTEXT, closed_formula
 from hipsta_bids.group.settings import DefaultModelSettings, DesignSettings, GroupSettings
 from hipsta_bids.io import files
 
@@ -240,8 +241,9 @@ def build_design(
     table: pd.DataFrame, model: ModelSpec, settings: DesignSettings, references: Mapping[str, str]
 ) -> Design:
     """Make the design matrix of a model, or say what keeps it from being fitted."""
-    formula = _read_formula(model.formula)
-    names = sorted(str(name) for name in formula.required_variables)
+    closed = closed_formula(model.formula)
+    formula = _read_formula(closed.text)
+    names = sorted(closed.names)
     check_names(names, table.columns)
     used = table[names].copy()
     for name in names:
@@ -252,8 +254,8 @@ def build_design(
     check_left(used, dropped)
     chosen = set_levels(used, references, settings)
     try:
-        made = formula.get_model_matrix(used, na_action="raise", context={})
-    except (FormulaicError, ValueError, TypeError, KeyError) as error:
+        made = formula.get_model_matrix(used, na_action="raise", context=dict(CONTEXT))
+    except (FormulaicError, ArithmeticError, ValueError, TypeError, LookupError) as error:
         raise ModelError(
             f"formula {model.formula!r}: {str(error).partition(chr(10))[0]}", reason="formula"
         ) from error
@@ -305,8 +307,10 @@ class _Terms:
         # The mean of the model over all rows if every one had this level.
         moved = self.table.copy()
         moved[factor] = pd.Categorical([level] * len(moved), categories=self.levels[factor])
-        matrix = np.asarray(self.spec.get_model_matrix(moved), dtype=np.float64)
-        return np.asarray(matrix.mean(axis=0), dtype=np.float64)
+        matrix = np.asarray(
+            self.spec.get_model_matrix(moved, context=dict(CONTEXT)), dtype=np.float64
+        )
+        return np.asarray(np.asarray(matrix, dtype=np.float64).mean(axis=0), dtype=np.float64)
 
     def _split(self, name: str) -> tuple[str | None, str]:
         """Factor and level of ``factor[level]`` or ``factor.level``."""
@@ -329,19 +333,13 @@ def _dummies(columns: tuple[str, ...], test: str | None) -> list[ContrastSpec]:
 
 def _read_formula(text: str) -> Formula:
     try:
-        formula = Formula(text)
-        formula.required_variables  # noqa: B018 -- finds names that are none
+        return Formula(text)
     except (FormulaicError, ValueError, AttributeError) as error:
         raise ModelError(
             f"formula {text!r} cannot be read; write it as group + age, and names with blanks in"
             " backticks",
             reason="formula",
         ) from error
-    if hasattr(formula, "rhs"):
-        raise ModelError(
-            f"formula {text!r}: give the right-hand side only, as group + age", reason="formula"
-        )
-    return formula
 
 
 def _check_matrix(

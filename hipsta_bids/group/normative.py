@@ -13,6 +13,7 @@ from hipsta_bids.errors import ModelError
 from hipsta_bids.group.data import PARTICIPANT, SESSION, Bool, Cohort, Float, Int, Measures
 from hipsta_bids.group.formula import ModelSpec, check_names, listed
 from hipsta_bids.group.glm import chunks, fit_block, most_frequent
+from hipsta_bids.group.grammar import closed_formula
 from hipsta_bids.group.model import build_design
 from hipsta_bids.group.settings import GlmSettings, GroupSettings
 from hipsta_bids.group.summaries import hemispheres, summary_values
@@ -149,7 +150,7 @@ def score_cohort(
     """Score all participants who have the covariates of a model, whatever their group."""
     factor, level = normative
     formula = _without(model.formula, factor)
-    known = {str(name) for name in Formula(formula).required_variables}
+    known = closed_formula(formula).names
     check_names([factor], cohort.table.columns)
     chosen = {name: text for name, text in references.items() if name in known}
     spec = replace(model, formula=formula, contrasts=(), dummy=None)
@@ -198,8 +199,8 @@ def _without(formula: str, factor: str) -> str:
     """Leave out all terms in which a variable has a part."""
     terms = [
         str(term)
-        for term in Formula(formula)
-        if factor not in {str(name) for name in Formula(str(term)).required_variables}
+        for term in Formula(closed_formula(formula).text)
+        if factor not in closed_formula(str(term)).names
     ]
     return " + ".join(terms) or "1"
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
-from formulaic import Formula
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.classify import PairComparison, compare_pairs
@@ -13,6 +12,7 @@ from hipsta_bids.group.comparison import BOTH
 from hipsta_bids.group.data import Cohort, Float
 from hipsta_bids.group.formula import Contrast, ModelSpec, check_names, typed
 from hipsta_bids.group.glm import MEAN, PointwiseFit, RowModel, with_mean
+from hipsta_bids.group.grammar import closed_formula
 from hipsta_bids.group.model import Design, Groups, build_design
 from hipsta_bids.group.settings import GroupSettings
 
@@ -70,7 +70,7 @@ def fit_summaries(
     if icv is None:
         notes.append("volumes are not adjusted: no intracranial volume is known")
         return fits, notes
-    if icv in {str(name) for name in Formula(model.formula).required_variables}:
+    if icv in closed_formula(model.formula).names:
         return fits, notes
     try:
         adjusted = replace(model, formula=f"{model.formula} + {icv}")
