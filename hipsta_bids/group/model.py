@@ -34,6 +34,16 @@ from hipsta_bids.group.grammar import CONTEXT, closed_formula
 from hipsta_bids.group.settings import DefaultModelSettings, DesignSettings, GroupSettings
 from hipsta_bids.io import files
 
+#: What formulaic raises on formulas that make no sense, such as ``0 / age``.
+_FORMULA_ERRORS = (
+    FormulaicError,
+    ArithmeticError,
+    AttributeError,
+    LookupError,
+    TypeError,
+    ValueError,
+)
+
 
 @dataclass(frozen=True)
 class Groups:
@@ -255,7 +265,7 @@ def build_design(
     chosen = set_levels(used, references, settings)
     try:
         made = formula.get_model_matrix(used, na_action="raise", context=dict(CONTEXT))
-    except (FormulaicError, ArithmeticError, ValueError, TypeError, LookupError) as error:
+    except _FORMULA_ERRORS as error:
         raise ModelError(
             f"formula {model.formula!r}: {str(error).partition(chr(10))[0]}", reason="formula"
         ) from error
@@ -334,7 +344,7 @@ def _dummies(columns: tuple[str, ...], test: str | None) -> list[ContrastSpec]:
 def _read_formula(text: str) -> Formula:
     try:
         return Formula(text)
-    except (FormulaicError, ValueError, AttributeError) as error:
+    except _FORMULA_ERRORS as error:
         raise ModelError(
             f"formula {text!r} cannot be read; write it as group + age, and names with blanks in"
             " backticks",

@@ -10,7 +10,7 @@ from scipy import ndimage
 from hipsta_bids.errors import InputError, ProtocolError
 from hipsta_bids.geometry.grid import in_plane_voxel
 from hipsta_bids.inputs.scan import HemisphereInput
-from hipsta_bids.io.volumes import read_voxels
+from hipsta_bids.io.volumes import LabelImage, box_with_margin, label_codes, moved, read_labels
 from hipsta_bids.protocols.load import for_region, load_protocol, protocol_names
 from hipsta_bids.protocols.protocol import OUTSIDE, Part, Protocol, Tissue, translate
 from hipsta_bids.types import Bool, EditedMask, Float, LabelVolume
@@ -71,25 +71,20 @@ def read_label_volume(item: HemisphereInput, region: str = "body") -> LabelVolum
     sheet = for_region(item.protocol, region).sheet
     labels, mask = item.edit("labels"), item.edit("mask")
     path = labels.path if labels else item.files[0]
-    data, affine = read_voxels(path)
-    # A first crop in the type on disk saves memory; it is wide enough for the final one.
-    box = _bounding_box(data != 0, affine, path)
-    codes = _one_hemisphere(_integers(data[box], path), item, path)
-    shape = data.shape
-    del data
+    image = read_labels(path, MARGIN)
+    if not image.data.size:
+        raise _empty(path)
+    codes = _one_hemisphere(_integers(image.data, path), item, path)
     tissue, part = _translate(codes, item.protocol, path)
     for other in item.files[1:]:
-        more = _beside(other, path, shape, affine, edited=labels is not None)
-        _, parts = _translate(
-            _integers(more[box], other), item.parts_protocol or item.protocol, other
-        )
+        more = _beside(other, path, image, edited=labels is not None)
+        _, parts = _translate(_integers(more, other), item.parts_protocol or item.protocol, other)
         part = np.where(parts == Part.UNKNOWN, part, parts)
     part = np.where(tissue == Tissue.BACKGROUND, np.uint8(Part.UNKNOWN), part)
     hippocampal = ~np.isin(tissue, tuple(OUTSIDE.difference(sheet)))
-    inner = _bounding_box(hippocampal, affine, path)
-    start = np.array([a.start + b.start for a, b in zip(box, inner, strict=True)])
-    cropped = affine.copy()
-    cropped[:3, 3] += affine[:3, :3] @ start
+    inner = _bounding_box(hippocampal, image.affine, path)
+    first, second, third = (a + b.start for a, b in zip(image.start, inner, strict=True))
+    cropped = moved(image.affine, (first, second, third))
     if labels:
         _check_same_place(hippocampal[inner], cropped, item, path)
     return LabelVolume(
@@ -98,26 +93,30 @@ def read_label_volume(item: HemisphereInput, region: str = "body") -> LabelVolum
         affine=cropped,
         protocol=item.protocol,
         edited_mask=(
-            _sample_mask(*read_voxels(mask.path), cropped, tissue[inner].shape, mask.path)
+            _sample_mask(read_labels(mask.path, 1.0), cropped, tissue[inner].shape, mask.path)
             if mask
             else None
         ),
-        start=(int(start[0]), int(start[1]), int(start[2])),
-        file_shape=(int(shape[0]), int(shape[1]), int(shape[2])),
+        start=(first, second, third),
+        file_shape=image.shape,
     )
 
 
-def _beside(
-    other: Path, path: Path, shape: tuple[int, ...], affine: Float, *, edited: bool
-) -> NDArray[Any]:
-    """Read a second file on the grid of the first, at nearest voxels if that one was edited."""
-    data, own = read_voxels(other)
-    if data.shape == shape and np.allclose(own, affine, rtol=0, atol=_SAME_GRID):
-        return data
+def _beside(other: Path, path: Path, image: LabelImage, *, edited: bool) -> NDArray[Any]:
+    """Read a second file where the first has labels, at nearest voxels if that one was edited."""
+    more = read_labels(other, MARGIN)
+    if more.shape == image.shape and np.allclose(
+        more.affine, image.affine, rtol=0, atol=_SAME_GRID
+    ):
+        return read_labels(other, box=image.box).data
     if edited:
-        to_own = np.linalg.inv(own) @ affine
+        to_own = np.linalg.inv(more.own_affine) @ image.own_affine
         sampled: NDArray[Any] = ndimage.affine_transform(
-            _integers(data, other), to_own[:3, :3], to_own[:3, 3], output_shape=shape, order=0
+            _integers(more.data, other),
+            to_own[:3, :3],
+            to_own[:3, 3],
+            output_shape=image.data.shape,
+            order=0,
         )
         return sampled
     raise InputError(
@@ -131,15 +130,13 @@ def _check_same_place(hippocampal: Bool, affine: Float, item: HemisphereInput, p
     """Refuse edited labels that lie elsewhere than those which they correct."""
     original = item.files[0]
     try:
-        data, own = read_voxels(original)
-        box = _bounding_box(data != 0, own, original)
+        image = read_labels(original, MARGIN)
     except InputError:  # that may be why a person made others
         return
-    to_own = np.linalg.inv(own) @ affine
+    to_own = np.linalg.inv(image.own_affine) @ affine
     index = np.argwhere(hippocampal) @ to_own[:3, :3].T + to_own[:3, 3]
-    low, high = ([getattr(side, name) for side in box] for name in ("start", "stop"))
-    share = float(((index >= low) & (index < high)).all(axis=1).mean())
-    if share < _SAME_PLACE:
+    share = float(((index >= 0) & (index < image.data.shape)).all(axis=1).mean())
+    if image.data.size and share < _SAME_PLACE:
         raise InputError(
             f"{path}: {1 - share:.0%} of the edited labels lie elsewhere than those of "
             f"{original.name}; keep the orientation and position of the image that was edited",
@@ -149,8 +146,7 @@ def _check_same_place(hippocampal: Bool, affine: Float, item: HemisphereInput, p
 
 def label_values(path: Path) -> frozenset[int]:
     """List the distinct codes of a segmentation, without the background."""
-    data, _ = read_voxels(path)
-    values = np.unique(_integers(data[data != 0], path))
+    values = _integers(np.array(label_codes(path)), path)
     if not values.size:
         raise _empty(path)
     return frozenset(values.tolist())
@@ -167,15 +163,8 @@ def _bounding_box(inside: Bool, affine: Float, path: Path) -> _Box:
     """Bounding box of all true voxels, with the margin as far as the image goes."""
     if not inside.any():
         raise _empty(path)
-    # Each axis is projected on its own; ranges of indices are all that is kept.
-    hits = [np.flatnonzero(inside.any(axis=axes)) for axes in ((1, 2), (0, 2), (0, 1))]
-    # Headers keep single precision: 0.4999999 mm voxels are 0.5 mm voxels.
-    extra = np.ceil(MARGIN / np.linalg.norm(affine[:3, :3], axis=0) - 1e-4).astype(int)
-    first, second, third = (
-        slice(max(int(hit[0] - pad), 0), min(int(hit[-1] + pad) + 1, size))
-        for hit, pad, size in zip(hits, extra, inside.shape, strict=True)
-    )
-    return first, second, third
+    hits = [np.asarray(inside.any(axis=axes)) for axes in ((1, 2), (0, 2), (0, 1))]
+    return box_with_margin(hits, MARGIN, affine)
 
 
 def _integers(data: NDArray[Any], path: Path) -> NDArray[np.integer[Any]]:
@@ -225,11 +214,11 @@ def _translate(
         raise ProtocolError(f"{path}: {error}{hint}", reason=error.reason) from error
 
 
-def _sample_mask(
-    data: NDArray[Any], own: Float, affine: Float, shape: tuple[int, ...], path: Path
-) -> EditedMask:
+def _sample_mask(mask: LabelImage, affine: Float, shape: tuple[int, ...], path: Path) -> EditedMask:
     """Bring an edited mask from its own affine to the grid of the labels."""
-    values = np.unique(data)
+    values = np.unique(mask.data)
+    if mask.data.shape != mask.shape:  # around it everything is zero
+        values = np.unique(np.append(values, 0))
     shown = ", ".join(f"{value:g}" for value in values[:_SHOWN].tolist())
     shown += ", ..." if len(values) > _SHOWN else ""
     if len(values) > 2 or not np.isfinite(values).all() or (len(values) == 2 and 0 not in values):  # noqa: PLR2004 (two)
@@ -243,15 +232,10 @@ def _sample_mask(
             f"{path}: the edited mask is empty; delete it, or save it again",
             reason="edited-mask-empty",
         )
-    inside = data != 0
-    index = np.argwhere(inside)
     # A border of zeros, so that interpolation ends beside the mask.
-    low = index.min(axis=0) - 1
-    size = index.max(axis=0) + 2 - low
-    crop = np.zeros(size, dtype=np.float32)
-    crop[tuple((index - low).T)] = 1
-    to_mask = np.linalg.inv(own) @ affine
+    inside = np.pad((mask.data != 0).astype(np.float32), 1)
+    to_mask = np.linalg.inv(mask.own_affine) @ affine
     sampled = ndimage.affine_transform(
-        crop, to_mask[:3, :3], to_mask[:3, 3] - low, output_shape=shape, order=1, mode="constant"
+        inside, to_mask[:3, :3], to_mask[:3, 3] + 1, output_shape=shape, order=1, mode="constant"
     )
-    return EditedMask(inside=sampled >= _HALF, voxel=in_plane_voxel(own))
+    return EditedMask(inside=sampled >= _HALF, voxel=in_plane_voxel(mask.affine))

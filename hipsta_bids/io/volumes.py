@@ -2,8 +2,10 @@
 
 import contextlib
 import gzip
+import math
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +34,7 @@ _READ_ERRORS = (
     ValueError,
     KeyError,
     OverflowError,
+    MemoryError,
     zlib.error,
     ImageFileError,
     HeaderDataError,
@@ -40,22 +43,168 @@ _READ_ERRORS = (
 
 _SPACE = 3
 
+#: Most voxels of a label image, of one of its slices, and of the part of it that is not zero: a
+#: header may declare anything. 1200 x 1200 x 900 voxels are read; what is read at once fits into
+#: some 100 MB, the part with labels into 400 MB.
+MOST_VOXELS, _MOST_IN_SLICE, MOST_LABELED = 4_000_000_000, 50_000_000, 100_000_000
 
-def read_voxels(path: Path) -> tuple[NDArray[Any], Float]:
-    """Read a 3-D image of labels or a mask, and its affine from voxel index to RAS mm."""
+#: Voxels that are read at once.
+_SLAB = 8_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class LabelImage:
+    """The part of a 3-D image of labels, or of a mask, in which not all voxels are zero."""
+
+    data: NDArray[Any]
+    """(I, J, K); empty if all voxels are zero."""
+    start: tuple[int, int, int]
+    """Where it begins in the whole image."""
+    shape: tuple[int, int, int]
+    """Of the whole image."""
+    affine: Float
+    """(4, 4), voxel index in the whole image to RAS mm."""
+
+    @property
+    def box(self) -> tuple[slice, slice, slice]:
+        """Where the part lies in the whole image."""
+        first, second, third = (
+            slice(start, start + count)
+            for start, count in zip(self.start, self.data.shape, strict=True)
+        )
+        return first, second, third
+
+    @property
+    def own_affine(self) -> Float:
+        """(4, 4), voxel index in the part to RAS mm."""
+        return moved(self.affine, self.start)
+
+
+def moved(affine: Float, start: tuple[int, int, int]) -> Float:
+    """Affine of a part of an image that begins at a voxel."""
+    own = affine.copy()
+    own[:3, 3] += affine[:3, :3] @ start
+    return own
+
+
+def read_labels(
+    path: Path, margin: float = 0.0, box: tuple[slice, slice, slice] | None = None
+) -> LabelImage:
+    """Read what is not zero in an image of labels or a mask, or a given part of it.
+
+    Shape and type are checked before any voxel is read, and no more than a slab is read at once:
+    what a header declares does not decide how much memory is needed.
+
+    Parameters
+    ----------
+    path : Path
+    margin : float
+        Voxels up to this distance (mm, along the image's axes) are kept around what is not zero.
+    box : tuple of slice, optional
+        The part to read instead.
+    """
     with _opened(path) as image:
-        data = np.asanyarray(image.dataobj)
+        shape = _label_shape(image, path)
         affine = np.asarray(image.affine, dtype=np.float64)
-    while data.ndim > _SPACE and data.shape[-1] == 1:
-        data = data[..., 0]
-    if data.ndim != _SPACE:
+        _check_affine(image, affine, path, VOXEL_SIZES)
+        first = None
+        if box is None:
+            box, first = _labeled_part(image, shape, margin, affine)
+        size = math.prod(side.stop - side.start for side in box)
+        if size > MOST_LABELED:
+            raise InputError(
+                f"{path}: voxels other than zero fill a part of {size / 1e6:.0f} million voxels, "
+                f"{MOST_LABELED / 1e6:.0f} are the limit; are these labels?",
+                reason="image-too-large",
+            )
+        data = first[box] if first is not None else _voxels(image, shape, box)
+    start = (box[0].start, box[1].start, box[2].start)
+    return LabelImage(data=data, start=start, shape=shape, affine=affine)
+
+
+def label_codes(path: Path) -> list[float]:
+    """List the distinct values of an image of labels other than zero, in order."""
+    with _opened(path) as image:
+        shape = _label_shape(image, path)
+        found = [np.unique(slab[slab != 0]) for _, slab in _slabs(image, shape)]
+    return np.unique(np.concatenate(found)).tolist() if found else []
+
+
+def _label_shape(image: Any, path: Path) -> tuple[int, int, int]:  # noqa: ANN401 (untyped)
+    """Shape of an image of labels, by its header; refuse what is none, or too large."""
+    shape = [int(n) for n in image.shape]
+    text = " x ".join(map(str, shape))
+    while len(shape) > _SPACE and shape[-1] == 1:
+        shape.pop()
+    if len(shape) != _SPACE:
         raise InputError(
-            f"{path}: has shape {' x '.join(map(str, data.shape))}, but labels are one 3-D volume; "
-            "extract the volume",
+            f"{path}: has shape {text}, but labels are one 3-D volume; extract the volume",
             reason="not-3d",
         )
-    _check_affine(image, affine, path, VOXEL_SIZES)
-    return data, affine
+    if image.get_data_dtype().kind not in "iufb":
+        raise InputError(
+            f"{path}: labels are not whole numbers but colors or complex numbers; save them as "
+            "integers",
+            reason="non-integer-labels",
+        )
+    if math.prod(shape) > MOST_VOXELS or shape[0] * shape[1] > _MOST_IN_SLICE:
+        raise InputError(
+            f"{path}: its header declares {text} voxels, {MOST_VOXELS / 1e9:.0f} billion are the "
+            "limit; make the file again, or crop it to the hippocampus",
+            reason="image-too-large",
+        )
+    return shape[0], shape[1], shape[2]
+
+
+def _voxels(image: Any, shape: tuple[int, int, int], box: tuple[slice, ...]) -> NDArray[Any]:  # noqa: ANN401 (untyped)
+    """Read a part of an image; further axes have length one."""
+    data = image.dataobj[(*box, *(0,) * (len(image.shape) - len(shape)))]
+    return np.asarray(data).reshape([side.stop - side.start for side in box])
+
+
+def _slabs(image: Any, shape: tuple[int, int, int]) -> Iterator[tuple[int, NDArray[Any]]]:  # noqa: ANN401 (untyped)
+    """Read slab by slab along the last axis; yields where each begins."""
+    step = max(_SLAB // max(shape[0] * shape[1], 1), 1)
+    for start in range(0, shape[2], step):
+        stop = min(start + step, shape[2])
+        yield (
+            start,
+            _voxels(image, shape, (slice(0, shape[0]), slice(0, shape[1]), slice(start, stop))),
+        )
+
+
+def _labeled_part(
+    image: Any,  # noqa: ANN401 (untyped)
+    shape: tuple[int, int, int],
+    margin: float,
+    affine: Float,
+) -> tuple[tuple[slice, slice, slice], NDArray[Any] | None]:
+    """Bounding box of what is not zero; also the voxels, if they were read at once."""
+    hits = [np.zeros(count, dtype=bool) for count in shape]
+    slab = None
+    for start, slab in _slabs(image, shape):
+        inside = slab != 0
+        hits[0] |= inside.any(axis=(1, 2))
+        hits[1] |= inside.any(axis=(0, 2))
+        hits[2][start : start + slab.shape[2]] = inside.any(axis=(0, 1))
+    whole = slab if slab is not None and slab.shape == shape else None
+    if not hits[0].any():
+        return (slice(0, 0), slice(0, 0), slice(0, 0)), whole
+    return box_with_margin(hits, margin, affine), whole
+
+
+def box_with_margin(
+    hits: Sequence[NDArray[np.bool_]], margin: float, affine: Float
+) -> tuple[slice, slice, slice]:
+    """Range of true positions along each axis, with a margin (mm) as far as the image goes."""
+    # Headers keep single precision: 0.4999999 mm voxels are 0.5 mm voxels.
+    extra = np.ceil(margin / np.linalg.norm(affine[:3, :3], axis=0) - 1e-4).astype(int)
+    first, second, third = (
+        slice(max(int(found[0] - pad), 0), min(int(found[-1] + pad) + 1, len(hit)))
+        for hit, pad in zip(hits, extra.tolist(), strict=True)
+        for found in [np.flatnonzero(hit)]
+    )
+    return first, second, third
 
 
 def read_scalars(path: Path, points: Float) -> ScalarVolume:

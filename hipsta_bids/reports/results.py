@@ -22,7 +22,7 @@ from hipsta_bids.derivatives.hemisphere import (
 from hipsta_bids.derivatives.names import DATASET_FILES
 from hipsta_bids.errors import HipstaError, InputError
 from hipsta_bids.io import files, gifti
-from hipsta_bids.io.volumes import read_voxels
+from hipsta_bids.io.volumes import read_labels
 from hipsta_bids.protocols.load import load_protocol, protocol_names
 from hipsta_bids.protocols.protocol import Protocol
 from hipsta_bids.types import Bool, Float, Status
@@ -277,7 +277,10 @@ def input_path(hemisphere: Hemisphere) -> Path | None:
 
 def _read_mask(hemisphere: Hemisphere) -> tuple[NDArray[np.generic], Float] | None:
     path = hemisphere.place.path("body_mask")
-    return _reoriented(*read_voxels(path)) if path.exists() else None
+    if not path.exists():
+        return None
+    image = read_labels(path)
+    return _reoriented(image.data, image.own_affine)
 
 
 def _read_labels(
@@ -287,7 +290,8 @@ def _read_labels(
     if path is None:
         return None, "the record names no file"
     try:
-        return _reoriented(*read_voxels(path)), None
+        image = read_labels(path)
+        return _reoriented(image.data, image.own_affine), None
     except InputError as error:
         reason = "is not there any more" if not path.exists() else f"is unusable: {error.reason}"
         return None, f"{path.name} {reason}"

@@ -86,6 +86,13 @@ def truncate(path):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
+def declare(path, *shape):
+    """Let the MGH header declare another shape than the file has voxels."""
+    content = bytearray(gzip.decompress(path.read_bytes()))
+    content[4:16] = np.array(shape, ">i4").tobytes()
+    path.write_bytes(gzip.compress(bytes(content)))
+
+
 def swap_sides(path):
     shutil.copy(path.with_name(path.name.replace("lh.", "rh.")), path)
 
@@ -102,6 +109,9 @@ FAULTS = {
     "nanaffine": (lambda path: spoil_header(path, 3, np.nan), "bad-affine"),
     "singular": (lambda path: [spoil_header(path, k, 0) for k in (3, 4, 5)], "bad-affine"),
     "fourd": (lambda path: save_labels(path, lambda data: np.stack([data, data], -1)), "not-3d"),
+    "huge": (lambda path: declare(path, 3000, 3000, 1000), "image-too-large"),
+    "longslices": (lambda path: declare(path, 32767, 32767, 1), "image-too-large"),
+    "large": (lambda path: declare(path, 1500, 1500, 1500), "unreadable-image"),
     "fractions": (
         lambda path: save_labels(path, lambda data: data * 0.999, np.float32),
         "non-integer-labels",

@@ -138,6 +138,13 @@ def test_part_that_is_not_allowed_is_named(formula, part, tmp_path, monkeypatch)
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("formula", ["(0) / age", "age **", "age + + age +", "exp(exp(age))"])
+def test_formula_without_sense_is_refused_in_one_line(formula):
+    with pytest.raises(ModelError) as caught:
+        design(formula)
+    assert "\n" not in str(caught.value)
+
+
 def test_column_named_as_a_function():
     table = TABLE.assign(log=1.0 + np.arange(N) ** 2)
     spec = parse_model(model_from_shortcut("log + age", [], "test"))

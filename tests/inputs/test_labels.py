@@ -1,3 +1,6 @@
+import gzip
+import subprocess
+import sys
 from dataclasses import replace
 
 import nibabel as nib
@@ -8,6 +11,8 @@ from input_cases import AFFINE, save
 from hipsta_bids.errors import InputError, ProtocolError
 from hipsta_bids.inputs.labels import MARGIN, label_values, read_label_volume
 from hipsta_bids.inputs.scan import HemisphereInput
+from hipsta_bids.io import volumes
+from hipsta_bids.io.volumes import read_labels
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Part, Tissue
 
@@ -350,3 +355,78 @@ def test_label_values_lists_what_occurs(tmp_path):
     assert label_values(save(tmp_path / "a.mgz", make_labels(np.int32))) == {1, 2}
     with pytest.raises(InputError, match="all labels are zero"):
         label_values(save(tmp_path / "b.nii", np.zeros(SHAPE, np.uint8)))
+
+
+def peak_memory(path):
+    """Peak memory, MB, of a process of its own that lists and reads labels."""
+    code = (
+        "import sys; from pathlib import Path\n"
+        "from hipsta_bids.inputs.labels import label_values\n"
+        "from hipsta_bids.io.volumes import read_labels\n"
+        "from hipsta_bids.participant.job import peak_memory\n"
+        "path = Path(sys.argv[1]); assert label_values(path) == {1, 2}\n"
+        "image = read_labels(path, 1.0); assert (image.data > 0).sum() == 2000\n"
+        "print(*image.shape, int(peak_memory() / 2**20))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True
+    )
+    *shape, peak = map(int, done.stdout.split())
+    assert shape == [600, 600, 900]
+    return peak
+
+
+def write_large(path):
+    """Labels in 600 x 600 x 900 voxels (324 MB), written without holding them."""
+    header = nib.Nifti1Header()
+    header.set_data_shape((600, 600, 900))
+    header.set_data_dtype(np.uint8)
+    header.set_sform(np.diag([0.3, 0.3, 0.3, 1.0]), code=1)
+    header["vox_offset"] = 352
+    header["magic"] = b"n+1"
+    plane = np.zeros((600, 600), np.uint8, order="F")
+    labeled = plane.copy()
+    labeled[300:310, 200:210], labeled[310:320, 200:210] = 1, 2
+    with gzip.open(path, "wb", compresslevel=1) as stream:
+        stream.write(header.binaryblock + bytes(4))
+        for number in range(900):
+            stream.write((labeled if 500 <= number < 510 else plane).tobytes(order="F"))
+
+
+def test_large_images_are_read_by_their_labels(tmp_path):
+    path = tmp_path / "large.nii.gz"
+    write_large(path)
+    small = save(tmp_path / "small.nii.gz", make_labels(np.uint8))
+    assert read_labels(path).data.shape == (20, 10, 10)
+    assert read_labels(path, 0.9).start == (297, 197, 497)
+    np.testing.assert_array_equal(
+        read_labels(path).own_affine[:3, 3], np.array([300, 200, 500]) * np.float32(0.3)
+    )
+    assert label_values(small) == {1, 2}
+    assert peak_memory(path) < 250  # the whole image has 309
+
+
+def test_slabs_give_what_the_whole_gives(tmp_path, monkeypatch):
+    path = save(tmp_path / "a.nii.gz", make_labels(np.int32))
+    whole = read_labels(path, 1.0)
+    monkeypatch.setattr(volumes, "_SLAB", 5000)
+    parts = read_labels(path, 1.0)
+    np.testing.assert_array_equal(parts.data, whole.data)
+    assert parts.start == whole.start
+    assert label_values(path) == {1, 2}
+
+
+def test_labels_that_fill_a_huge_part_are_refused(tmp_path, monkeypatch):
+    path = save(tmp_path / "a.nii.gz", make_labels(np.int32))
+    monkeypatch.setattr(volumes, "MOST_LABELED", 100)
+    with pytest.raises(InputError, match="are these labels") as caught:
+        read_labels(path)
+    assert caught.value.reason == "image-too-large"
+
+
+@pytest.mark.parametrize("kind", [np.complex64, [("R", "u1"), ("G", "u1"), ("B", "u1")]])
+def test_labels_that_are_no_numbers(tmp_path, kind):
+    path = save(tmp_path / "a.nii", np.zeros(SHAPE, np.dtype(kind)))
+    with pytest.raises(InputError, match="colors or complex numbers") as caught:
+        label_values(path)
+    assert caught.value.reason == "non-integer-labels"

@@ -1,3 +1,6 @@
+import gzip
+
+import numpy as np
 import pytest
 from input_cases import by_key, describe, find, save_values, touch
 
@@ -238,6 +241,16 @@ def test_an_unreadable_file_is_its_own_problem(tmp_path):
     first, second = find(tmp_path)
     assert first.problem is None
     assert second.protocol.name == "ashsABC3T"
+
+
+def test_a_huge_header_is_the_problem_of_one_hemisphere(tmp_path):
+    path = save_values(folder(tmp_path, "sub-02") / f"x_left_{GRAY}", ABC)
+    content = bytearray(gzip.decompress(path.read_bytes()))
+    content[42:48] = np.array([32767] * 3, "<i2").tobytes()
+    path.write_bytes(gzip.compress(bytes(content)))
+    assert only(tmp_path).problem.reason == "image-too-large"
+    left(tmp_path, "sub-01", ABC)
+    assert find(tmp_path)[0].problem is None
 
 
 @pytest.mark.parametrize("place", ["sub-01/final", "sub-01", ".", "snap"])
