@@ -6,6 +6,7 @@ They lie beside the labels that they correct, in the output dataset, or in a fol
 """
 
 import contextlib
+import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -79,7 +80,9 @@ def _edits_of_dataset(root: Path, name: str, selection: Selection) -> list[Edite
 
 def each_once(edited: Iterable[EditedFile]) -> list[EditedFile]:
     """Keep the first of entries for the same file: folders may be given twice."""
-    return list({file.edit.path.resolve(): file for file in reversed(list(edited))}.values())[::-1]
+    return list(
+        {os.path.realpath(file.edit.path): file for file in reversed(list(edited))}.values()
+    )[::-1]
 
 
 def attach_edits(

@@ -7,6 +7,7 @@ the analysis, ``.long`` in longitudinal folders, and otherwise nothing. It also 
 folders, which have the same layout.
 """
 
+import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -177,8 +178,8 @@ def _each_once(folders: tuple[Folder, ...]) -> tuple[Folder, ...]:
     """Leave out longitudinal folders that are links to others here, as FastSurfer's tools make."""
     if not any(folder.longitudinal for folder in folders):
         return folders
-    own = {folder.path.resolve() for folder in folders if not folder.longitudinal}
-    return tuple(f for f in folders if not f.longitudinal or f.path.resolve() not in own)
+    own = {os.path.realpath(folder.path) for folder in folders if not folder.longitudinal}
+    return tuple(f for f in folders if not f.longitudinal or os.path.realpath(f.path) not in own)
 
 
 def _why(run: _Run, subfields: str, parts: str | None, asked: str | None) -> str:

@@ -203,7 +203,7 @@ def list_folder(path: Path) -> tuple[list[str], list[str]]:
         with os.scandir(path) as entries:
             for entry in entries:
                 if not entry.name.startswith("."):
-                    (folders if entry.is_dir() else files).append(entry.name)
+                    (folders if _is_folder(entry) else files).append(entry.name)
     except FileNotFoundError as error:
         raise InputError(
             f"{path}: no such folder; check the path", reason="missing-folder"
@@ -218,6 +218,14 @@ def list_folder(path: Path) -> tuple[list[str], list[str]]:
             reason="unreadable-folder",
         ) from error
     return sorted(folders), sorted(files)
+
+
+def _is_folder(entry: os.DirEntry[str]) -> bool:
+    """Whether it can be listed as a folder; a link that leads back to itself cannot."""
+    try:
+        return entry.is_dir()
+    except OSError:
+        return False
 
 
 def subject_folders(root: Path) -> list[SubjectFolder]:
@@ -293,7 +301,7 @@ def list_sources(request: InputRequest) -> tuple[Source, ...]:
     for source in _candidates(request):
         description = read_description(source.path)
         made_by = frozenset(name.lower() for name in generated_by(description))
-        key = source.path.resolve()
+        key = Path(os.path.realpath(source.path))  # also where links go round in circles
         if NAME not in {name.replace("-", "_") for name in made_by} and key not in sources:
             sources[key] = replace(source, generators=made_by)
     return tuple(sources.values())

@@ -10,6 +10,7 @@ from input_cases import by_key, describe, find, save_values, touch
 
 from hipsta_bids.errors import InputError, NothingToDoError, ProtocolError, UsageError
 from hipsta_bids.inputs import scan
+from hipsta_bids.inputs.labels import read_label_volume
 from hipsta_bids.inputs.search import (
     HemisphereInput,
     InputRequest,
@@ -150,6 +151,26 @@ def test_a_folder_that_cannot_be_listed(tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"cannot list the folder.*Permission denied") as caught:
         find(tmp_path, derivatives={"x": closed})
     assert caught.value.reason == "unreadable-folder"
+
+
+@pytest.mark.parametrize(
+    "place", ["loop", "derivatives/loop", "derivatives/fs/sub-09", "derivatives/fs/sub-01/loop"]
+)
+def test_links_in_circles_hide_nothing_else(tmp_path, place):
+    freesurfer(tmp_path / "derivatives" / "fs", "sub-01", "sub-02")
+    (tmp_path / place).symlink_to(tmp_path / place)
+    assert len(find(tmp_path)) == 4
+
+
+def test_a_file_that_is_a_link_in_circles_is_its_own_problem(tmp_path):
+    freesurfer(tmp_path / "derivatives" / "fs", "sub-01")
+    labels = tmp_path / "derivatives" / "fs" / "sub-02" / "mri" / "lh.hippoAmygLabels-T1.v22.mgz"
+    labels.parent.mkdir(parents=True)
+    labels.symlink_to(labels)
+    found = find(tmp_path)
+    assert [item.subject for item in found] == ["01", "01", "02"]
+    with pytest.raises(InputError, match="cannot be read as an image"):
+        read_label_volume(found[-1])
 
 
 # Which subjects, sessions, hemispheres and files
