@@ -138,7 +138,9 @@ def test_part_that_is_not_allowed_is_named(formula, part, tmp_path, monkeypatch)
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("formula", ["(0) / age", "age **", "age + + age +", "exp(exp(age))"])
+@pytest.mark.parametrize(
+    "formula", ["(0) / age", "age ** (0)", "age **", "age + + age +", "exp(exp(age))"]
+)
 def test_formula_without_sense_is_refused_in_one_line(formula):
     with pytest.raises(ModelError) as caught:
         design(formula)
