@@ -462,6 +462,25 @@ class MapSettings(SettingsTable):
     """Flag if a larger share of the points lies outside the volume's field of view."""
 
 
+class UncertaintySettings(SettingsTable):
+    """Perturbed copies of the labels, whose spread tells how certain a map is (``--uncertainty``).
+
+    The numbers follow from what a voxel's label says, and are fitted to no data.
+    """
+
+    jitter: NonNegativeFloat = 0.5
+    """Boundaries may be drawn this far away, voxels along each axis of the voxels, evenly
+    distributed: SD is this over the root of 3. 0: perfect labels, but for their voxels."""
+    correlation: PositiveFloat = 1.0
+    """Points this far apart move alike with a correlation of 1/e, voxels: 1 if voxels are labeled
+    one by one. Errors that reach farther make maps less certain."""
+    rotation: Annotated[float, Field(ge=0, le=45)] = 5.0
+    """Voxels are turned by up to this about each axis, degrees, and shifted by up to half of one:
+    as if the body had lain elsewhere in the scanner."""
+    spacing: Annotated[float, Field(ge=0.1, le=1)] = 0.42
+    """Least ``grid.spacing`` of copies, mm: what all copies share cancels out, and time matters."""
+
+
 class SurrogateSettings(SettingsTable):
     """Thickness from the medial axis of single slices (``hipsta-bids surrogate``)."""
 
@@ -500,6 +519,7 @@ class Settings(SettingsTable):
     measures: MeasureSettings = Field(default_factory=MeasureSettings)
     checks: CheckSettings = Field(default_factory=CheckSettings)
     maps: MapSettings = Field(default_factory=MapSettings)
+    uncertainty: UncertaintySettings = Field(default_factory=UncertaintySettings)
     surrogate: SurrogateSettings = Field(default_factory=SurrogateSettings)
 
 

@@ -30,6 +30,7 @@ _CONVERTERS: Mapping[str, Entry] = {
     "named_path": {"type": "File"},
     "positive_int": {"type": "Number", "integer": True, "minimum": 1},
     "int": {"type": "Number", "integer": True},
+    "_copies": {"type": "Number", "integer": True, "minimum": 0},
     "positive_float": {"type": "Number", "minimum": 0, "exclusive-minimum": True},
     "float": {"type": "Number"},
     "_hemi": {"type": "String", "value-choices": ["L", "R"]},

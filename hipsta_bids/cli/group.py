@@ -176,6 +176,13 @@ def _add_methods(parser: Parser) -> None:
     )
     add("--template", "FILE", "register to the template.json of another analysis")
     add(
+        "--weights",
+        "",
+        "how much each map counts at a point: the same (none, the default), or by its SD as"
+        " estimated by --uncertainty of the participant level",
+        choices=["none", "uncertainty"],
+    )
+    add(
         "--correction",
         "",
         "for the number of points: false discovery rate (fdr2, the default; bh), or"
@@ -302,6 +309,7 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
             "blocks": parsed.blocks,
         },
         "longitudinal": {"random": parsed.longitudinal},
+        "glm": {"weights": parsed.weights},
         "classification": {"base": tuple(parsed.base) or None},
     }
     settings = load_group_settings(parsed.settings)

@@ -170,6 +170,14 @@ def _add_processing(parser: Parser) -> None:
         choices=REGIONS,
     )
     add("--write-meshes", "", "also write the tetrahedral meshes (VTU)")
+    add(
+        "--uncertainty",
+        "K",
+        "also measure K perturbed copies of the labels, and write the SD of maps and summary"
+        " measures (default: 0, none; 8 take about 7 times as long)",
+        type=_copies,
+        default=0,
+    )
     add("--force", "", "redo what is up to date")
     add_pages = adder(group.add_mutually_exclusive_group())
     add_pages("--no-reports", "", "make no pages to look at (OUT_DIR/*.html)")
@@ -248,6 +256,13 @@ def _choice(*values: str) -> Callable[[str], tuple[str | None, str]]:
         return name or None, value
 
     return convert
+
+
+def _copies(text: str) -> int:
+    """Read a number of copies: an SD takes two."""
+    if not text.isascii() or not text.isdigit() or int(text) == 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of copies; use 0, or 2 or more")
+    return int(text)
 
 
 def _shard(text: str) -> Shard:

@@ -296,6 +296,44 @@ def write_results(
     )
 
 
+def spread_name(measure: str) -> str:
+    """Name of the column with the SD of a measure over perturbed copies."""
+    return f"{measure}_sd"
+
+
+def write_spread(
+    place: ResultPlace, maps: Mapping[str, Float], summary: Mapping[str, float], copies: int
+) -> None:
+    """Write SDs over perturbed copies: of maps (Nx, Ny), as table and GIFTI, and of the summary.
+
+    Arguments are by name of the measure, ``copies`` is the number that SDs rest on.
+    """
+    wording = f"SD over {copies} perturbed copies of the labels: {{}}"
+    nodes = {spread_name(name): column for name, column in _formatted(MAPS, maps).items()}
+    definitions = {spread_name(row.name): _measure(row, wording) for row in MAPS}
+    _write_table(
+        place,
+        "uncertainty",
+        {**_numbers(NODES, maps["thickness"].shape), **nodes},
+        {**_definitions(NODES), **definitions},
+    )
+    rows = {row.name: row for row in SUMMARY}
+    definitions = {}
+    columns = {}
+    for name, value in summary.items():
+        about = _measure(rows[name]) if name in rows else _subfield_definition(name)
+        about["Description"] = wording.format(about["Description"])
+        digits = rows[name].digits if name in rows else _MILLIMETER_DIGITS
+        definitions[spread_name(name)] = about
+        columns[spread_name(name)] = format_column(np.array([value]), digits)
+    _write_table(place, "summaryuncertainty", columns, definitions)
+    name, unit = spread_name("thickness"), "mm"
+    content = gifti.shape_bytes(
+        maps["thickness"].ravel(), hemi=place.name.hemi, name=name, unit=unit
+    )
+    files.write_bytes(place.path("thickness_sd"), content)
+
+
 def write_failure(
     place: ResultPlace,
     error: HipstaError,

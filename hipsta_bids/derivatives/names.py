@@ -155,6 +155,24 @@ EXTRA_OUTPUTS: tuple[Output, ...] = (
         called="the region table",
     ),
     *_table(
+        "uncertainty",
+        "one row per sheet point: SD of each map over perturbed copies of the labels"
+        " (`--uncertainty`)",
+        called="that table",
+    ),
+    *_table(
+        "summaryuncertainty",
+        "one row: SD of each summary measure over the same copies (`--uncertainty`)",
+        called="that table",
+    ),
+    Output(
+        "thickness_sd",
+        "morph",
+        ".shape.gii",
+        "SD of thickness over the same copies; per surface vertex, mm (`--uncertainty`)",
+        desc="thicknessSd",
+    ),
+    *_table(
         "surrogate",
         "thickness from the medial axis of single slices (`hipsta-bids surrogate`)",
         called="that table",

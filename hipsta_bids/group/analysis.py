@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from hipsta_bids.errors import ModelError
 from hipsta_bids.group.classify import PairComparison
 from hipsta_bids.group.comparison import (
     BOTH,
@@ -20,7 +21,13 @@ from hipsta_bids.group.data import PARTICIPANT, Cohort, Float, Measures, SideMap
 from hipsta_bids.group.formula import ModelSpec
 from hipsta_bids.group.glm import FittedMaps, PointTest, RowModel, fit_maps, with_mean
 from hipsta_bids.group.grammar import closed_formula
-from hipsta_bids.group.inference import Discoveries, MapKey, check_permutations, correct
+from hipsta_bids.group.inference import (
+    PERMUTATIONS,
+    Discoveries,
+    MapKey,
+    check_permutations,
+    correct,
+)
 from hipsta_bids.group.mixed import longitudinal_model
 from hipsta_bids.group.model import Design, Groups, build_design
 from hipsta_bids.group.normative import Scores, score_cohort
@@ -141,6 +148,7 @@ def analyze_cohort(
         rows_of = partial(longitudinal_model, table=table, time=time, settings=settings)
     rows = rows_of(design)
     check_permutations(rows, settings)
+    _check_weights(comparison, settings)
     sides = {
         hemi: _register_side(cohort, hemi, groups=groups, settings=settings, templates=templates)
         for hemi in (cohort.sides if measures.maps else ())
@@ -219,6 +227,25 @@ def analyze_points(cohort: Cohort, analysis: Analysis, settings: GroupSettings) 
     )
 
 
+def _check_weights(comparison: Comparison, settings: GroupSettings) -> None:
+    """Refuse weights where there is no rule for them."""
+    others = {
+        "--longitudinal": comparison.longitudinal,
+        "--paired": comparison.pair,
+        "--asymmetry": comparison.asymmetry,
+        "--normative": comparison.normative,
+        "permutations": settings.multiplicity.method in PERMUTATIONS,
+        "hc3": settings.glm.covariance != "ordinary",
+    }
+    wrong = [name for name, given in others.items() if given]
+    if settings.glm.weights != "none" and wrong:
+        raise ModelError(
+            f"--weights {settings.glm.weights}: not together with {', '.join(wrong)}; leave one"
+            " out",
+            reason="weights-alone",
+        )
+
+
 def _fit_sides(
     compared: Cohort,
     maps: tuple[str, ...],
@@ -284,6 +311,7 @@ def _register_maps(side: SideMaps, warps: Float) -> SideMaps:
     return SideMaps(
         rows=side.rows,
         maps={name: warp_values(maps, warps) for name, maps in side.maps.items()},
+        errors={name: warp_values(maps, warps) for name, maps in side.errors.items()},
         subfield=labels.astype(np.int8),
         names=side.names,
         summary=side.summary,

@@ -1,7 +1,7 @@
 """Values passed between reading, analyzing and writing at the group level."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pandas as pd
@@ -41,6 +41,8 @@ class SideMaps:
     """Abbreviations of subfields."""
     summary: pd.DataFrame
     """One row per sheet: the columns of the participant level's summaries, as numbers."""
+    errors: Mapping[str, Float] = field(default_factory=dict)
+    """(sheets, x, y) SD of the measurement per measure, where it was asked for."""
     mesh: Mesh | None = None
     """Surface of the points if they are not on the grid: x are its vertices then, and y is 1."""
 
@@ -65,6 +67,7 @@ class SideMaps:
             self,
             rows=(np.cumsum(keep) - 1)[self.rows[own]],
             maps={name: values[own] for name, values in self.maps.items()},
+            errors={name: values[own] for name, values in self.errors.items()},
             subfield=self.subfield[own],
             summary=self.summary[own].reset_index(drop=True),
         )

@@ -140,14 +140,27 @@ class PointBlock:
 
 
 def fit_points(
-    maps: Float, matrix: Float, contrasts: Sequence[Contrast], settings: GlmSettings
+    maps: Float,
+    matrix: Float,
+    contrasts: Sequence[Contrast],
+    settings: GlmSettings,
+    errors: Float | None = None,
 ) -> PointwiseFit:
-    """Fit the same linear model to each column of a table, with values missing anywhere."""
+    """Fit the same linear model to each column of a table, with values missing anywhere.
+
+    ``errors`` are the SDs of the measurements, (subjects, points); values weigh by
+    :func:`uncertainty_weights` then, and those without an SD are left out.
+    """
     _check(maps, matrix, contrasts)
     basis, triangle = np.linalg.qr(matrix)
     back = np.linalg.inv(triangle)
     blocks = [
-        fit_block(np.asarray(maps[:, part], dtype=np.float64), basis, settings)
+        fit_block(
+            np.asarray(maps[:, part], dtype=np.float64),
+            basis,
+            settings,
+            errors if errors is None else errors[:, part],
+        )
         for part in chunks(maps.shape, matrix.shape[1])
     ]
     names = ("scores", "covariance", "sigma", "n")
@@ -193,30 +206,68 @@ def chunks(shape: tuple[int, ...], columns: int) -> Iterator[slice]:
     return (slice(start, start + step) for start in range(0, max(shape[1], 1), step))
 
 
-def fit_block(maps: Float, basis: Float, settings: GlmSettings) -> PointBlock:
+def uncertainty_weights(maps: Float, errors: Float, basis: Float, settings: GlmSettings) -> Float:
+    """Weights 1 / (t2 + s2), mean 1, of values (subjects, points) with error variances s2.
+
+    t2 is the variance between subjects at a point: the residual variance of the unweighted fit,
+    less what the errors explain of it,
+
+        t2 = (sum of squared residuals - sum s2 (1 - leverage)) / (n - columns),
+
+    by the method of moments (Hedges and Olkin 1985, Statistical Methods for Meta-Analysis, chapter
+    9; with covariates Raudenbush 2009). The scale of the variance is estimated anew from the
+    weighted residuals, so that tests keep their level if all SDs are too large or too small by the
+    same factor (Knapp and Hartung 2003, doi:10.1002/sim.1482). 0 where a value or SD is missing.
+    """
+    present = np.isfinite(maps) & np.isfinite(errors)
+    plain = fit_block(np.where(present, maps, np.nan), basis, settings)
+    squared = np.where(present, errors, 0.0) ** 2
+    products = (basis[:, :, None] * basis[:, None, :]).reshape(len(basis), -1)
+    spread = (squared.T @ products).reshape(plain.covariance.shape)
+    variance = plain.sigma**2
+    inverse = plain.covariance / variance[:, None, None]
+    explained = squared.sum(axis=0) - np.einsum("pij,pij->p", inverse, spread)
+    freedom = np.maximum(plain.n - basis.shape[1], 1)
+    between = np.maximum(variance - explained / freedom, settings.least_between * variance)
+    weights = np.where(present & np.isfinite(between), 1 / (between + squared), 0.0)
+    total = weights.sum(axis=0)
+    return np.asarray(weights * np.where(total > 0, plain.n / np.where(total > 0, total, 1), 0))
+
+
+def fit_block(
+    maps: Float, basis: Float, settings: GlmSettings, errors: Float | None = None
+) -> PointBlock:
     """Solve least squares at some points, by normal equations in orthonormal coordinates.
 
     There the equations of a complete point are the identity, and those of others stay well
     conditioned unless the missing subjects really carried a column.
     """
     present = np.isfinite(maps)
+    weights = None
+    if errors is not None:
+        weights = uncertainty_weights(maps, errors, basis, settings)
+        present = weights > 0
     values = np.where(present, maps, 0.0)
     n = present.sum(axis=0)
     columns = basis.shape[1]
-    if present.all():
+    if weights is None and present.all():
         inverse = np.repeat(np.eye(columns)[None], maps.shape[1], axis=0)
         usable = n - columns >= settings.min_residual_df
     else:
         products = (basis[:, :, None] * basis[:, None, :]).reshape(len(basis), -1)
-        information = (present.T.astype(np.float64) @ products).reshape(-1, columns, columns)
+        shares = present.astype(np.float64) if weights is None else weights
+        information = (shares.T @ products).reshape(-1, columns, columns)
         usable = np.linalg.eigvalsh(information)[:, 0] > settings.min_information
         usable &= n - columns >= settings.min_residual_df
         information[~usable] = np.eye(columns)
         inverse = np.asarray(np.linalg.inv(information), dtype=np.float64)
-    scores = np.einsum("pij,jp->pi", inverse, basis.T @ values)
+    weighted = values if weights is None else weights * values
+    scores = np.einsum("pij,jp->pi", inverse, basis.T @ weighted)
     residuals = np.where(present, values - basis @ scores.T, 0.0)
-    squares = np.einsum("sp,sp->p", residuals, residuals)
-    total = np.einsum("sp,sp->p", values, values)
+    squares = np.einsum(
+        "sp,sp->p", residuals, residuals if weights is None else weights * residuals
+    )
+    total = np.einsum("sp,sp->p", values, weighted)
     usable &= squares > total * np.finfo(np.float64).eps  # else the model leaves rounding only
     sigma = np.sqrt(squares / np.where(usable, n - columns, 1))
     sigma[~usable] = np.nan
@@ -428,6 +479,14 @@ def fit_maps(
     try:
         fits = {
             name: model.fit(_values(maps, used), rows, tested, settings)
+            if settings.glm.weights == "none"
+            else fit_points(
+                _values(maps, used),
+                model.design.matrix[rows],
+                tested,
+                settings.glm,
+                _values(side.errors[name], used),
+            )
             for name, maps in side.maps.items()
         }
     except ModelError as error:

@@ -2,14 +2,19 @@
 
 import difflib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from hipsta_bids.derivatives.hemisphere import read_sheet, read_summary, read_units
+from hipsta_bids.derivatives.hemisphere import (
+    read_sheet,
+    read_summary,
+    read_units,
+    spread_name,
+)
 from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.group.collect import SheetRecord
@@ -101,8 +106,12 @@ def read_sheets(
     settings: Mapping[str, Any],
     maps: Sequence[str],
     visits: Sequence[VisitKey] | None = None,
+    *,
+    with_errors: bool = False,
 ) -> Measured:
-    """Read all sheets and summaries."""
+    """Read all sheets and summaries, and perhaps the SDs of the maps."""
+    if with_errors:
+        _check_errors(records, maps)
     grid = settings["sheet"]
     shape = (int(grid["x_nodes"]), int(grid["y_nodes"]))
     visits = visits_of(records) if visits is None else visits
@@ -114,6 +123,9 @@ def read_sheets(
         rows = [row_of[r.place.name.subject, r.place.name.session] for r in own]
         if own:
             sides[hemi] = _read_side(own, np.array(rows, dtype=np.int64), shape, names)
+        if own and with_errors:
+            errors = _read_errors(own, shape, maps)
+            sides[hemi] = replace(sides[hemi], errors=errors)
     table = pd.DataFrame(
         {
             PARTICIPANT: [f"sub-{subject}" for subject, _ in visits],
@@ -133,6 +145,34 @@ def read_sheets(
             for r in reversed(records)
         },
     )
+
+
+def _check_errors(records: Sequence[SheetRecord], maps: Sequence[str]) -> None:
+    """Refuse weights by uncertainty where an SD is missing."""
+    if others := [name for name in maps if name not in SHEET_MAPS]:
+        raise InputError(
+            f"--weights uncertainty: there are no SDs of {', '.join(others)}; leave these maps"
+            " out by --measures, or the weights",
+            reason="no-uncertainty",
+        )
+    lacking = [r.place.name.stem for r in records if not r.place.path("uncertainty").is_file()]
+    if lacking:
+        shown = ", ".join(lacking[:_SHOWN]) + (" ..." if len(lacking) > _SHOWN else "")
+        raise InputError(
+            f"--weights uncertainty: {len(lacking)} of {len(records)} hemispheres have no SD maps"
+            f" ({shown}); run the participant level again with --uncertainty 8, or leave them"
+            " out by --exclude",
+            reason="no-uncertainty",
+        )
+
+
+def _read_errors(
+    records: Sequence[SheetRecord], shape: tuple[int, int], maps: Sequence[str]
+) -> dict[str, Float]:
+    """(sheets, x, y) SD of each map."""
+    columns = [spread_name(name) for name in maps]
+    tables = [read_sheet(r.place.path("uncertainty"), columns, shape=shape) for r in records]
+    return {name: np.stack([t[spread_name(name)] for t in tables]) for name in maps}
 
 
 def visits_of(records: Sequence[SheetRecord]) -> list[VisitKey]:

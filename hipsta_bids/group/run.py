@@ -11,7 +11,7 @@ import pandas as pd
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.names import group_report
-from hipsta_bids.errors import ModelError
+from hipsta_bids.errors import InputError, ModelError
 from hipsta_bids.group import write
 from hipsta_bids.group.analysis import Analysis, analyze_cohort, analyze_points
 from hipsta_bids.group.collect import (
@@ -215,7 +215,8 @@ def _read(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
     requests = map_patterns(options.maps, options.surfaces, taken)
     wanted = wanted_measures(options.model, options.measures)
     measures = choose_measures(wanted, found.records, [one.name for one in requests])
-    external = _read_maps(options, found, requests, measures)
+    weighted = settings.glm.weights != "none"
+    external = _read_maps(options, found, requests, measures, with_errors=weighted)
     measured, volume_notes = add_volumes(
         external.measured, found.records, options.volumes, options.bids_dir
     )
@@ -255,6 +256,8 @@ def _read_maps(
     found: Collection,
     requests: Sequence[MapPattern],
     measures: Measures,
+    *,
+    with_errors: bool,
 ) -> ExternalCohorts:
     """Read the maps that are asked for, of the sheets and of other programs."""
     asked = [one for one in requests if one.name in measures.maps]
@@ -263,7 +266,14 @@ def _read_maps(
     )
     names = {one.name for one in requests}
     own = [name for name in measures.maps if name not in names]
-    measured = read_sheets(found.records, found.settings, own, visits)
+    if with_errors and asked:
+        names_of = ", ".join(one.name for one in asked)
+        raise InputError(
+            f"--weights uncertainty: there are no SDs of {names_of}; leave --maps or the"
+            " weights out",
+            reason="no-uncertainty",
+        )
+    measured = read_sheets(found.records, found.settings, own, visits, with_errors=with_errors)
     return add_external(measured, files_of, visits)
 
 

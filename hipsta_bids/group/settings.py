@@ -101,6 +101,12 @@ class GlmSettings(SettingsTable):
     covariance: Literal["ordinary", "hc3"] = "ordinary"
     """Of the coefficients: ``ordinary`` (equal variances) or ``hc3`` (any variances; MacKinnon and
     White 1985)."""
+    weights: Literal["none", "uncertainty"] = "none"
+    """``uncertainty``: maps count by 1 / (variance between participants + squared SD of the
+    measurement), from ``--uncertainty`` of the participant level; summary measures all the same."""
+    least_between: OpenFraction = 0.1
+    """Least variance between participants for these weights, share of the residual variance, so
+    that a few maps do not decide alone."""
     confidence: OpenFraction = 0.95
     """Coverage of two-sided confidence limits, fraction."""
     min_residual_df: PositiveInt = 3

@@ -8,9 +8,9 @@ import sys
 import time
 import traceback
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import hemisphere
@@ -29,7 +29,10 @@ from hipsta_bids.participant.maps import (
 )
 from hipsta_bids.protocols.load import for_region
 from hipsta_bids.settings import Settings
-from hipsta_bids.types import BodyMask, Status
+from hipsta_bids.types import BodyMask, HemisphereMaps, Status
+
+if TYPE_CHECKING:
+    from hipsta_bids.participant.uncertainty import Uncertainty
 
 INTERNAL = "internal-error"
 """Reason of a failure that is a bug."""
@@ -48,6 +51,8 @@ class Job:
     sources: tuple[tuple[str, Path], ...]
     """Input datasets by name."""
     write_meshes: bool
+    copies: int = 0
+    """Perturbed copies from which uncertainty is estimated; 0 for none."""
     force: bool = False
     """Redo it even if an earlier run has done the same."""
 
@@ -92,6 +97,7 @@ def recorded(job: Job) -> Outcome | None:
     whole = status == Status.FAILED or (
         all(path.exists() for path in job.place.paths(optional=job.write_meshes))
         and is_complete(job.place, record)
+        and has_spread(job.place, record, job.copies)
     )
     if not (same and whole):
         return None
@@ -261,6 +267,7 @@ def run_job(job: Job) -> Outcome:
 def _measure(job: Job) -> Outcome:
     from hipsta_bids.inputs.labels import read_label_volume  # noqa: PLC0415  (workers only)
     from hipsta_bids.participant.measure import find_body, measure_hemisphere  # noqa: PLC0415
+    from hipsta_bids.participant.uncertainty import estimate_uncertainty  # noqa: PLC0415
 
     clock = CostClock()
     record = base_record(job)
@@ -276,6 +283,12 @@ def _measure(job: Job) -> Outcome:
             with clock("maps"):
                 maps, mapped = add_signals(job.item, maps, job.settings.maps, dict(job.sources))
                 record |= mapped.record
+        spread = None
+        if job.copies:
+            with clock("uncertainty"):
+                spread = estimate_uncertainty(volume, job.item.hemi, job.settings, job.copies)
+                maps = replace(maps, qc={**maps.qc, **spread.metrics})
+                record["notes"] = [*record["notes"], *spread.notes]
         with clock("write"):
             hemisphere.write_results(
                 job.place,
@@ -283,7 +296,7 @@ def _measure(job: Job) -> Outcome:
                 for_region(job.item.protocol, job.settings.body.region),
                 record,
                 write_meshes=job.write_meshes,
-                write_more=lambda: write_signals(job.place, maps, mapped),
+                write_more=lambda: _write_more(job.place, maps, mapped, spread),
             )
     except Exception as error:  # noqa: BLE001  (one hemisphere's bug must not end the others)
         explained = _explain(error, job.place.root)
@@ -302,6 +315,26 @@ def _measure(job: Job) -> Outcome:
         thickness=maps.summary.get("thickness_mean"),
         **clock.spent(),
     )
+
+
+def _write_more(
+    place: ResultPlace, maps: HemisphereMaps, mapped: Mapped, spread: "Uncertainty | None"
+) -> None:
+    """Write what options asked for."""
+    write_signals(place, maps, mapped)
+    if spread is not None and spread.known:
+        measured = spread.copies - spread.failed
+        hemisphere.write_spread(place, spread.maps, spread.summary, measured)
+
+
+def has_spread(place: ResultPlace, record: Mapping[str, Any], copies: int) -> bool:
+    """Return whether the files of a record's uncertainty exist, and are of as many copies."""
+    metrics = record.get("metrics") or {}
+    made = metrics.get("uncertainty_copies", 0)
+    if not made or metrics.get("uncertainty_thickness_mm") is None:
+        return made == copies or not copies
+    keys = ("uncertainty", "summaryuncertainty", "thickness_sd")
+    return copies in {0, made} and all(place.path(key).exists() for key in keys)
 
 
 def fail(

@@ -221,28 +221,10 @@ def _plane(point: Float, normal: Float) -> dict[str, list[float]]:
 Clock = Callable[[str], AbstractContextManager[None]]
 
 
-def measure_hemisphere(
+def unfold(
     volume: LabelVolume, hemi: str, settings: Settings, clock: Clock
-) -> HemisphereMaps:
-    """Measure thickness, curvature and shape of one hippocampal body.
-
-    Parameters
-    ----------
-    volume : LabelVolume
-    hemi : {"L", "R"}
-    settings : Settings
-    clock : callable
-        ``clock(stage)`` is a context manager that times a stage.
-
-    Returns
-    -------
-    HemisphereMaps
-
-    Raises
-    ------
-    GeometryError
-        With the reason why this hemisphere cannot be measured.
-    """
+) -> tuple[Evidence, Coordinates]:
+    """Lay out the sheet of one hippocampal body; arguments are those of `measure_hemisphere`."""
     with clock("body"):
         check_voxel(volume, settings.checks)
         body = extract_body(volume, settings.body)
@@ -278,8 +260,8 @@ def measure_hemisphere(
         whole = sample_sheet(mesh, coordinates, whole_body(settings.sheet))
         subfield = label_sheet(sheet, body)
         folded = folded_fraction(mesh, coordinates)
-    with clock("measures"):
-        measured = Measured(
+    evidence = Evidence(
+        measured=Measured(
             body=body,
             surface=surface,
             mesh=mesh,
@@ -287,18 +269,45 @@ def measure_hemisphere(
             subfield=subfield,
             whole=whole,
             settings=settings,
-        )
-        evidence = Evidence(
-            measured=measured,
-            side=side,
-            solid=solid,
-            voxels_across=across,
-            smoothed=smoothed,
-            boundaries=boundaries,
-            label_order=order,
-            bending=bending,
-            folded=folded,
-        )
+        ),
+        side=side,
+        solid=solid,
+        voxels_across=across,
+        smoothed=smoothed,
+        boundaries=boundaries,
+        label_order=order,
+        bending=bending,
+        folded=folded,
+    )
+    return evidence, coordinates
+
+
+def measure_hemisphere(
+    volume: LabelVolume, hemi: str, settings: Settings, clock: Clock
+) -> HemisphereMaps:
+    """Measure thickness, curvature and shape of one hippocampal body.
+
+    Parameters
+    ----------
+    volume : LabelVolume
+    hemi : {"L", "R"}
+    settings : Settings
+    clock : callable
+        ``clock(stage)`` is a context manager that times a stage.
+
+    Returns
+    -------
+    HemisphereMaps
+
+    Raises
+    ------
+    GeometryError
+        With the reason why this hemisphere cannot be measured.
+    """
+    evidence, coordinates = unfold(volume, hemi, settings, clock)
+    measured, solid, boundaries = evidence.measured, evidence.solid, evidence.boundaries
+    body, sheet = measured.body, measured.sheet
+    with clock("measures"):
         flags = check_end_labels(volume, body, settings.checks)
         flags += check_thickness(measured.thickness, boundaries.sheet_thickness, settings.checks)
         flags += check_ridges(sheet, measured.thickness, settings.checks)
@@ -314,14 +323,14 @@ def measure_hemisphere(
             maps=maps,
             profiles=average_profiles(maps, sheet),
             sections=measure_sections(measured),
-            subfield=subfield,
+            subfield=measured.subfield,
             repaired=repaired,
             body_mask=volume.in_file(body.inside),
             summary=summarize(measured, for_region(volume.protocol, body.region).sheet),
             qc=quality_metrics(evidence, repaired),
             repairs=(*map(str, solid.repairs), *describe_uncus(body, settings.checks)),
             flags=(*flags, *folds),
-            mesh=mesh,
+            mesh=measured.mesh,
             coordinates=coordinates,
         )
 

@@ -202,6 +202,8 @@ class RunOptions:
     force: bool = False
     """Redo hemispheres that are up to date."""
     write_meshes: bool = False
+    uncertainty: int = 0
+    """Perturbed copies per hemisphere from which uncertainty is estimated; 0 for none."""
     timeout: float = 600.0
     """Seconds per hemisphere."""
     shard: Shard | None = None
@@ -382,6 +384,7 @@ def _prepare(
             settings_hash=digest,
             sources=tuple(sources.items()),
             write_meshes=options.write_meshes,
+            copies=options.uncertainty,
             force=options.force,
         )
         for item in items

@@ -113,6 +113,16 @@ CURVATURE = MapKind(
     percentiles=(4, 96),
 )
 MAP_KINDS = (THICKNESS, CURVATURE)
+#: Drawn where it was estimated (``--uncertainty``).
+UNCERTAINTY = MapKind(
+    column="thickness_sd",
+    title="SD of thickness",
+    unit="mm",
+    colors="magma",
+    centered=False,
+    digits=2,
+    percentiles=(1, 99),
+)
 
 
 @dataclass(frozen=True, kw_only=True)

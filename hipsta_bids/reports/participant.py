@@ -16,6 +16,7 @@ from hipsta_bids.reports.cohort import MEASURES, SMALLEST_COHORT, Cohort, Measur
 from hipsta_bids.reports.maps import (
     MAP_KINDS,
     THICKNESS,
+    UNCERTAINTY,
     color_table,
     draw_map,
     draw_profiles,
@@ -385,11 +386,26 @@ def _sheets(series: Series) -> Mapping[str, Any] | None:
     measured = series.measured
     if not measured:
         return None
+    uncertain = [h for h in measured if UNCERTAINTY.column in h.sheet.columns]
+    pictures = [draw_map(kind, measured) for kind in MAP_KINDS]
+    pictures += [draw_map(UNCERTAINTY, uncertain)] if uncertain else []
     return {
-        "pictures": [draw_map(kind, measured) for kind in MAP_KINDS],
+        "pictures": pictures,
+        "uncertainty": [_uncertainty(h) for h in uncertain],
         "repaired": any(h.sheet.repaired.any() for h in measured),
         "invalid": any(not h.sheet.valid.all() for h in measured),
     }
+
+
+def _uncertainty(hemisphere: Hemisphere) -> str:
+    """Say how certain the maps of a hemisphere are."""
+    metrics = hemisphere.metrics
+    used = metrics["uncertainty_copies"] - metrics["uncertainty_failed"]
+    return (
+        f"{hemisphere.side}: SD of thickness over {used} perturbed copies of the labels"
+        f" {metrics['uncertainty_thickness_mm']:.2f} mm at a point (median), and"
+        f" {metrics['uncertainty_mean_mm']:.3f} mm of the mean thickness"
+    )
 
 
 def _view(series: Series) -> Mapping[str, Any] | None:

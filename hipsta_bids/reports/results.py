@@ -143,6 +143,8 @@ class Hemisphere:
         words = ("subfield", "valid", "repaired")
         columns = read_sheet(self.place.path("sheet"), words=words)
         subfield, valid, repaired = (columns.pop(name) for name in words)
+        if "uncertainty_copies" in self.metrics and self.place.path("uncertainty").exists():
+            columns |= read_sheet(self.place.path("uncertainty"))
         return SheetTable(
             columns=columns,
             subfield=subfield.astype(np.str_),

@@ -1,0 +1,271 @@
+"""How certain a map is: the spread of measurements of perturbed copies of the same labels.
+
+Labels tell on which side of a boundary a voxel's center lies, no more: the boundary may be anywhere
+up to half a voxel away. A copy is what the same body might look like if it had been scanned and
+labeled again: its boundaries are moved at random within that range, and its voxels lie elsewhere.
+This is a parametric bootstrap (Efron and Tibshirani 1993, An Introduction to the Bootstrap, chapter
+6). It knows nothing of errors that do not look like this, such as a whole subfield drawn wrongly.
+"""
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d, maximum_filter, minimum_filter
+from scipy.spatial.transform import Rotation
+
+from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry.catalog import measure_maps, summarize
+from hipsta_bids.geometry.checks import check_thickness
+from hipsta_bids.participant.measure import unfold
+from hipsta_bids.protocols.load import for_region
+from hipsta_bids.settings import Settings, UncertaintySettings
+from hipsta_bids.types import EditedMask, Float, LabelVolume
+
+_Codes = NDArray[np.int64]
+
+#: Copies without which no SD is told.
+LEAST = 2
+#: Labels of a voxel as one number: tissue, part, and whether it is in the edited mask.
+_PART, _MASK = 1 << 8, 1 << 16
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Uncertainty:
+    """Standard deviations over perturbed copies of one hemisphere's labels."""
+
+    copies: int
+    """Number of copies that were made."""
+    failed: int
+    """Number of copies that could not be measured."""
+    maps: Mapping[str, Float]
+    """(Nx, Ny) by name of the map, in its unit; empty if fewer than half could be measured."""
+    summary: Mapping[str, float]
+    """By name of the summary measure, in its unit; empty likewise."""
+
+    @property
+    def known(self) -> bool:
+        """Whether enough copies could be measured."""
+        return bool(self.maps)
+
+    @property
+    def metrics(self) -> dict[str, Any]:
+        """Numbers for the quality record."""
+        sd = float(np.nanmedian(self.maps["thickness"])) if self.known else None
+        return {
+            "uncertainty_copies": self.copies,
+            "uncertainty_failed": self.failed,
+            "uncertainty_thickness_mm": sd,
+            "uncertainty_mean_mm": self.summary["thickness_mean"] if self.known else None,
+        }
+
+    @property
+    def notes(self) -> list[str]:
+        """What a person should know, one line each."""
+        if self.known:
+            return []
+        failed = f"{self.failed} of {self.copies} perturbed copies could not be measured"
+        return [f"no uncertainty: {failed}; look at the labels"]
+
+
+def estimate_uncertainty(
+    volume: LabelVolume, hemi: str, settings: Settings, copies: int
+) -> Uncertainty:
+    """Measure perturbed copies of a label volume, and take the SD at each node of the sheet.
+
+    Parameters
+    ----------
+    volume : LabelVolume
+    hemi : {"L", "R"}
+    settings : Settings
+    copies : int
+        Number of copies, 2 or more. The same labels always give the same copies, and the first ones
+        do not depend on how many there are.
+
+    Returns
+    -------
+    Uncertainty
+        SDs with ``n - 1`` in the denominator.
+    """
+    found: list[tuple[Mapping[str, Float], Mapping[str, float]]] = []
+    for number in range(copies):
+        try:
+            copy = perturb(volume, settings.uncertainty, number)
+            found.append(_measure(copy, hemi, settings))
+        except GeometryError:
+            continue
+    enough = len(found) >= max(LEAST, copies / 2)
+    return Uncertainty(
+        copies=copies,
+        failed=copies - len(found),
+        maps=_spread([maps for maps, _ in found]) if enough else {},
+        summary={k: float(v) for k, v in _spread([one for _, one in found]).items()}
+        if enough
+        else {},
+    )
+
+
+def _measure(
+    volume: LabelVolume, hemi: str, settings: Settings
+) -> tuple[Mapping[str, Float], Mapping[str, float]]:
+    """Measure maps and summary alone: no flags, cross-sections or layers."""
+    grid = {"spacing": max(settings.grid.spacing, settings.uncertainty.spacing)}
+    evidence, _ = unfold(volume, hemi, settings.changed(grid=grid), _no_clock)
+    measured = evidence.measured
+    check_thickness(measured.thickness, evidence.boundaries.sheet_thickness, settings.checks)
+    tissues = for_region(volume.protocol, settings.body.region).sheet
+    return measure_maps(measured), summarize(measured, tissues)
+
+
+def _no_clock(stage: str) -> AbstractContextManager[None]:
+    del stage
+    return nullcontext()
+
+
+def _spread(rows: Sequence[Mapping[str, Any]]) -> dict[str, Float]:
+    """SD over copies by name, of what at least two of them know; NaN elsewhere."""
+    spread = {}
+    for name in rows[0]:
+        values = np.array([row[name] for row in rows], dtype=np.float64)
+        known = np.isfinite(values)
+        count = known.sum(axis=0)
+        mean = np.where(known, values, 0.0).sum(axis=0) / np.maximum(count, 1)
+        squares = np.where(known, (values - mean) ** 2, 0.0).sum(axis=0)
+        sd = np.sqrt(squares / np.maximum(count - 1, 1))
+        spread[name] = np.where(count >= LEAST, sd, np.nan)
+    return spread
+
+
+def perturb(volume: LabelVolume, settings: UncertaintySettings, number: int) -> LabelVolume:
+    """Make one copy: boundaries moved at random, on a voxel grid that lies elsewhere.
+
+    ``number`` tells copies of the same labels apart.
+    """
+    volume = _cropped(volume)
+    generator = np.random.default_rng((_fingerprint(volume), number))
+    codes = _encode(volume)
+    shape, affine = _other_grid(volume, settings, generator)
+    to_volume = np.linalg.inv(volume.affine) @ affine
+    places = to_volume[:3, :3] @ np.indices(shape).reshape(3, -1) + to_volume[:3, 3:]
+    near = _near_labels(codes, places)
+    places = places[:, near]
+    spread = settings.jitter / np.sqrt(3.0)  # SD of a uniform distribution
+    for axis in range(3):
+        noise = _smooth_noise(shape, settings.correlation, generator)
+        places[axis] += spread * noise[near]
+    found = np.zeros(np.prod(shape), dtype=np.int64)
+    found[near] = _likeliest(codes, places)
+    found = found.reshape(shape)
+    mask = volume.edited_mask
+    return LabelVolume(
+        tissue=(found % _PART).astype(np.uint8),
+        part=(found % _MASK // _PART).astype(np.uint8),
+        affine=affine,
+        protocol=volume.protocol,
+        edited_mask=None if mask is None else EditedMask(inside=found >= _MASK, voxel=mask.voxel),
+    )
+
+
+def _cropped(volume: LabelVolume) -> LabelVolume:
+    """Leave out what lies round the labels, but for two voxels."""
+    labeled = _encode(volume) > 0
+    if not labeled.any():
+        return volume
+    where = np.argwhere(labeled)
+    low = np.maximum(where.min(axis=0) - 2, 0)
+    box = tuple(slice(a, b) for a, b in zip(low, where.max(axis=0) + 3, strict=True))
+    affine = volume.affine.copy()
+    affine[:3, 3] += affine[:3, :3] @ low
+    mask = volume.edited_mask
+    return LabelVolume(
+        tissue=volume.tissue[box],
+        part=volume.part[box],
+        affine=affine,
+        protocol=volume.protocol,
+        edited_mask=None if mask is None else replace(mask, inside=mask.inside[box]),
+    )
+
+
+def _fingerprint(volume: LabelVolume) -> int:
+    """Turn the labels' content into a number."""
+    content = hashlib.sha256(repr(volume.tissue.shape).encode())
+    for array in (volume.tissue, volume.part, volume.affine.round(6) + 0.0):
+        content.update(np.ascontiguousarray(array).tobytes())
+    return int.from_bytes(content.digest()[:16], "big")
+
+
+def _encode(volume: LabelVolume) -> _Codes:
+    codes: _Codes = volume.tissue + np.int64(_PART) * volume.part
+    if volume.edited_mask is not None:
+        codes += _MASK * volume.edited_mask.inside
+    return codes
+
+
+def _other_grid(
+    volume: LabelVolume, settings: UncertaintySettings, generator: np.random.Generator
+) -> tuple[tuple[int, int, int], Float]:
+    """Shape and affine of the same grid, turned about its middle and shifted by part of a voxel."""
+    matrix = volume.affine[:3, :3]
+    angles = generator.uniform(-settings.rotation, settings.rotation, 3)
+    turned = Rotation.from_euler("xyz", angles, degrees=True).as_matrix() @ matrix
+    size = np.array(volume.tissue.shape) - 1
+    corners = np.array(np.meshgrid(*([0, n] for n in size))).reshape(3, -1)
+    middle = size[:, None] / 2
+    reach = np.linalg.solve(turned, matrix @ (corners - middle))
+    low = np.floor(reach.min(axis=1))
+    count = np.ceil(reach.max(axis=1)) - low + 1
+    affine = np.eye(4)
+    affine[:3, :3] = turned
+    affine[:3, 3:] = volume.affine[:3, 3:] + matrix @ middle
+    affine[:3, 3] += turned @ (low + generator.uniform(-0.5, 0.5, 3))
+    return (int(count[0]), int(count[1]), int(count[2])), affine
+
+
+def _near_labels(codes: _Codes, places: Float) -> NDArray[np.intp]:
+    """Places (3, N), in voxels, that may get a label: within three voxels of one."""
+    labeled = maximum_filter(np.pad(codes > 0, 4), 7)
+    last = np.array(labeled.shape)[:, None] - 1
+    nearest = np.clip(np.rint(places).astype(np.intp) + 4, 0, last)
+    return np.flatnonzero(labeled[tuple(nearest)])
+
+
+def _smooth_noise(shape: tuple[int, ...], length: float, generator: np.random.Generator) -> Float:
+    """Gaussian noise of SD 1 at the voxels (N,), correlated over ``length`` voxels.
+
+    White noise smoothed with a Gaussian of SD s has the autocorrelation exp(-d^2 / 4 s^2), which is
+    1/e at the distance d = 2 s.
+    """
+    noise: NDArray[np.float32] = generator.standard_normal(shape, dtype=np.float32)
+    for axis in range(3):
+        impulse = np.zeros(shape[axis])
+        impulse[0] = 1.0
+        kernel = gaussian_filter1d(impulse, length / 2, mode="wrap")
+        noise = gaussian_filter1d(noise, length / 2, axis=axis, mode="wrap")
+        noise /= np.float32(np.linalg.norm(kernel))
+    return noise.ravel().astype(np.float64)
+
+
+def _likeliest(codes: _Codes, places: Float) -> _Codes:
+    """Code with most weight in linear interpolation at places (3, N), in voxels; outside 0."""
+    padded = np.pad(codes, 2)
+    last = np.array(padded.shape)[:, None] - 2
+    places = np.clip(places + 2, 0, last - 1e-6)
+    nearest = tuple(np.rint(places).astype(np.int64))
+    found: _Codes = padded[nearest]
+    # Most voxels lie among voxels of one label only.
+    low, high = (f(padded, 3, mode="nearest") for f in (minimum_filter, maximum_filter))
+    mixed = np.flatnonzero((low != high)[nearest])
+    corner = np.floor(places[:, mixed]).astype(np.int64)
+    share = places[:, mixed] - corner
+    offsets = np.indices((2, 2, 2)).reshape(3, -1).T
+    kinds = np.array([padded[tuple(corner + offset[:, None])] for offset in offsets])
+    weights = np.array(
+        [np.where(offset[:, None] == 1, share, 1 - share).prod(axis=0) for offset in offsets]
+    )
+    votes = np.array([(weights * (kinds == kind)).sum(axis=0) for kind in kinds])
+    found[mixed] = kinds[votes.argmax(axis=0), np.arange(len(mixed))]
+    return found
