@@ -235,7 +235,6 @@ def _check_weights(comparison: Comparison, settings: GroupSettings) -> None:
         "--asymmetry": comparison.asymmetry,
         "--normative": comparison.normative,
         "permutations": settings.multiplicity.method in PERMUTATIONS,
-        "hc3": settings.glm.covariance != "ordinary",
     }
     wrong = [name for name, given in others.items() if given]
     if settings.glm.weights != "none" and wrong:

@@ -149,7 +149,7 @@ def fit_points(
     """Fit the same linear model to each column of a table, with values missing anywhere.
 
     ``errors`` are the SDs of the measurements, (subjects, points); values weigh by
-    :func:`uncertainty_weights` then, and those without an SD are left out.
+    :func:`uncertainty_weights` then, those without an SD are left out, and standard errors are HC3.
     """
     _check(maps, matrix, contrasts)
     basis, triangle = np.linalg.qr(matrix)
@@ -215,12 +215,13 @@ def uncertainty_weights(maps: Float, errors: Float, basis: Float, settings: GlmS
         t2 = (sum of squared residuals - sum s2 (1 - leverage)) / (n - columns),
 
     by the method of moments (Hedges and Olkin 1985, Statistical Methods for Meta-Analysis, chapter
-    9; with covariates Raudenbush 2009). The scale of the variance is estimated anew from the
-    weighted residuals, so that tests keep their level if all SDs are too large or too small by the
-    same factor (Knapp and Hartung 2003, doi:10.1002/sim.1482). 0 where a value or SD is missing.
+    9; with covariates Raudenbush 2009). SDs from a few copies are rough and may all be too large or
+    too small; tests have HC3 standard errors, which do not take them at their word. 0 where a value
+    or SD is missing.
     """
     present = np.isfinite(maps) & np.isfinite(errors)
-    plain = fit_block(np.where(present, maps, np.nan), basis, settings)
+    ordinary = settings.changed(covariance="ordinary")
+    plain = fit_block(np.where(present, maps, np.nan), basis, ordinary)
     squared = np.where(present, errors, 0.0) ** 2
     products = (basis[:, :, None] * basis[:, None, :]).reshape(len(basis), -1)
     spread = (squared.T @ products).reshape(plain.covariance.shape)
@@ -271,8 +272,8 @@ def fit_block(
     usable &= squares > total * np.finfo(np.float64).eps  # else the model leaves rounding only
     sigma = np.sqrt(squares / np.where(usable, n - columns, 1))
     sigma[~usable] = np.nan
-    if settings.covariance == "hc3":
-        covariance = _hc3(residuals, basis, inverse)
+    if settings.covariance == "hc3" or weights is not None:
+        covariance = _hc3(residuals, basis, inverse, weights)
     else:
         covariance = inverse * (sigma**2)[:, None, None]
     return PointBlock(
@@ -283,12 +284,14 @@ def fit_block(
     )
 
 
-def _hc3(residuals: Float, basis: Float, inverse: Float) -> Float:
+def _hc3(residuals: Float, basis: Float, inverse: Float, weights: Float | None) -> Float:
     """Sandwich covariance with residuals over (1 - leverage) (MacKinnon and White 1985).
 
     NaN where one subject alone determines a coefficient.
     """
     leverage = np.einsum("psi,si->sp", basis @ inverse, basis)
+    if weights is not None:
+        leverage, residuals = weights * leverage, weights * residuals
     alone = (1 - leverage < np.sqrt(np.finfo(np.float64).eps)) & (residuals != 0)
     weights = np.where(alone, np.nan, residuals / np.where(alone, 1.0, 1 - leverage)) ** 2
     products = (basis[:, :, None] * basis[:, None, :]).reshape(len(basis), -1)

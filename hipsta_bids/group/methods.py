@@ -40,8 +40,6 @@ REFERENCES: Mapping[str, str] = {
     "moments": "Raudenbush SW. Analyzing effect sizes: random-effects models. In: Cooper H, Hedges"
     " LV, Valentine JC, eds. The Handbook of Research Synthesis and Meta-Analysis. 2nd ed. Russell"
     " Sage Foundation; 2009:295-315.",
-    "knapp": "Knapp G, Hartung J. Improved tests for a random effects meta-regression with a single"
-    " covariate. Statistics in Medicine 2003;22(17):2693-2710. doi:10.1002/sim.1482",
     "asymmetry": "Kong XZ, Mathias SR, Guadalupe T, et al. Mapping cortical brain asymmetry in"
     " 17,141 healthy individuals worldwide via the ENIGMA Consortium. Proceedings of the National"
     " Academy of Sciences 2018;115(22):E5154-E5163. doi:10.1073/pnas.1718418115",
@@ -170,8 +168,8 @@ def _models(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], s
     if settings.glm.weights != "none":
         errors = (
             " by weighted least squares, with weights 1 / (variance between participants + squared"
-            " standard deviation of the measurement); the former was estimated by moments"
-            f" {cite('moments')} and the scale from the weighted residuals {cite('knapp')}"
+            f" standard deviation of the measurement), the former estimated by moments"
+            f" {cite('moments')}, and HC3 standard errors"
         )
     if analysis.comparison.pair:
         first, second = analysis.comparison.pair

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.ndimage import uniform_filter
 
 from hipsta_bids.derivatives.hemisphere import (
     read_sheet,
@@ -107,10 +108,10 @@ def read_sheets(
     maps: Sequence[str],
     visits: Sequence[VisitKey] | None = None,
     *,
-    with_errors: bool = False,
+    error_window: int = 0,
 ) -> Measured:
-    """Read all sheets and summaries, and perhaps the SDs of the maps."""
-    if with_errors:
+    """Read all sheets and summaries, and the SDs of the maps if they have a window."""
+    if error_window:
         _check_errors(records, maps)
     grid = settings["sheet"]
     shape = (int(grid["x_nodes"]), int(grid["y_nodes"]))
@@ -123,8 +124,8 @@ def read_sheets(
         rows = [row_of[r.place.name.subject, r.place.name.session] for r in own]
         if own:
             sides[hemi] = _read_side(own, np.array(rows, dtype=np.int64), shape, names)
-        if own and with_errors:
-            errors = _read_errors(own, shape, maps)
+        if own and error_window:
+            errors = _read_errors(own, shape, maps, error_window)
             sides[hemi] = replace(sides[hemi], errors=errors)
     table = pd.DataFrame(
         {
@@ -167,12 +168,22 @@ def _check_errors(records: Sequence[SheetRecord], maps: Sequence[str]) -> None:
 
 
 def _read_errors(
-    records: Sequence[SheetRecord], shape: tuple[int, int], maps: Sequence[str]
+    records: Sequence[SheetRecord], shape: tuple[int, int], maps: Sequence[str], window: int
 ) -> dict[str, Float]:
-    """(sheets, x, y) SD of each map."""
+    """(sheets, x, y) SD of each map, from squares averaged over ``window`` nodes on both axes."""
     columns = [spread_name(name) for name in maps]
     tables = [read_sheet(r.place.path("uncertainty"), columns, shape=shape) for r in records]
-    return {name: np.stack([t[spread_name(name)] for t in tables]) for name in maps}
+    errors = {}
+    for name in maps:
+        squares = np.stack([t[spread_name(name)] for t in tables]) ** 2
+        known = np.isfinite(squares)
+        total, count = (
+            uniform_filter(values, (1, window, window), mode="nearest")
+            for values in (np.where(known, squares, 0.0), known.astype(np.float64))
+        )
+        mean = total / np.where(known, count, 1.0)
+        errors[name] = np.where(known, np.sqrt(np.maximum(mean, 0.0)), np.nan)
+    return errors
 
 
 def visits_of(records: Sequence[SheetRecord]) -> list[VisitKey]:

@@ -215,8 +215,8 @@ def _read(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
     requests = map_patterns(options.maps, options.surfaces, taken)
     wanted = wanted_measures(options.model, options.measures)
     measures = choose_measures(wanted, found.records, [one.name for one in requests])
-    weighted = settings.glm.weights != "none"
-    external = _read_maps(options, found, requests, measures, with_errors=weighted)
+    window = 0 if settings.glm.weights == "none" else settings.glm.error_window
+    external = _read_maps(options, found, requests, measures, window)
     measured, volume_notes = add_volumes(
         external.measured, found.records, options.volumes, options.bids_dir
     )
@@ -256,8 +256,7 @@ def _read_maps(
     found: Collection,
     requests: Sequence[MapPattern],
     measures: Measures,
-    *,
-    with_errors: bool,
+    error_window: int,
 ) -> ExternalCohorts:
     """Read the maps that are asked for, of the sheets and of other programs."""
     asked = [one for one in requests if one.name in measures.maps]
@@ -266,14 +265,14 @@ def _read_maps(
     )
     names = {one.name for one in requests}
     own = [name for name in measures.maps if name not in names]
-    if with_errors and asked:
+    if error_window and asked:
         names_of = ", ".join(one.name for one in asked)
         raise InputError(
             f"--weights uncertainty: there are no SDs of {names_of}; leave --maps or the"
             " weights out",
             reason="no-uncertainty",
         )
-    measured = read_sheets(found.records, found.settings, own, visits, with_errors=with_errors)
+    measured = read_sheets(found.records, found.settings, own, visits, error_window=error_window)
     return add_external(measured, files_of, visits)
 
 

@@ -5,7 +5,14 @@ from typing import Annotated, Literal, get_args
 
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
-from hipsta_bids.protocols.toml import Fraction, OpenFraction, SettingsTable, Texts, read_settings
+from hipsta_bids.protocols.toml import (
+    Fraction,
+    Odd,
+    OpenFraction,
+    SettingsTable,
+    Texts,
+    read_settings,
+)
 
 Splines = Annotated[int, Field(ge=4)]
 AtLeastTwo = Annotated[int, Field(ge=2)]
@@ -103,10 +110,14 @@ class GlmSettings(SettingsTable):
     White 1985)."""
     weights: Literal["none", "uncertainty"] = "none"
     """``uncertainty``: maps count by 1 / (variance between participants + squared SD of the
-    measurement), from ``--uncertainty`` of the participant level; summary measures all the same."""
-    least_between: OpenFraction = 0.1
+    measurement), from ``--uncertainty`` of the participant level, with HC3 standard errors; summary
+    measures are not weighted."""
+    least_between: OpenFraction = 0.5
     """Least variance between participants for these weights, share of the residual variance, so
-    that a few maps do not decide alone."""
+    that a few maps do not decide alone where SDs are too large."""
+    error_window: Odd = 5
+    """Squared SDs are averaged over this many nodes along both axes, odd: from 8 copies, each is
+    known to a third only."""
     confidence: OpenFraction = 0.95
     """Coverage of two-sided confidence limits, fraction."""
     min_residual_df: PositiveInt = 3

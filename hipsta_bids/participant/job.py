@@ -267,7 +267,6 @@ def run_job(job: Job) -> Outcome:
 def _measure(job: Job) -> Outcome:
     from hipsta_bids.inputs.labels import read_label_volume  # noqa: PLC0415  (workers only)
     from hipsta_bids.participant.measure import find_body, measure_hemisphere  # noqa: PLC0415
-    from hipsta_bids.participant.uncertainty import estimate_uncertainty  # noqa: PLC0415
 
     clock = CostClock()
     record = base_record(job)
@@ -285,6 +284,10 @@ def _measure(job: Job) -> Outcome:
                 record |= mapped.record
         spread = None
         if job.copies:
+            from hipsta_bids.participant.uncertainty import (  # noqa: PLC0415  (as above)
+                estimate_uncertainty,
+            )
+
             with clock("uncertainty"):
                 spread = estimate_uncertainty(volume, job.item.hemi, job.settings, job.copies)
                 maps = replace(maps, qc={**maps.qc, **spread.metrics})

@@ -28,6 +28,7 @@ SUITES: Mapping[str, str] = MappingProxyType(
         "slices": "invariance:run_slices",
         "convergence": "accuracy:run_convergence",
         "invariance": "invariance:run",
+        "uncertainty": "invariance:run_uncertainty",
         "defects": "defects:run",
         "group": "group:run",
         "surrogate": "slice_thickness:run",
