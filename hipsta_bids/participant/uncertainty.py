@@ -15,7 +15,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d, maximum_filter, minimum_filter
+from scipy.ndimage import (
+    affine_transform,
+    gaussian_filter1d,
+    maximum_filter,
+    maximum_filter1d,
+    minimum_filter,
+)
 from scipy.spatial.transform import Rotation
 
 from hipsta_bids.errors import GeometryError
@@ -150,9 +156,7 @@ def perturb(volume: LabelVolume, settings: UncertaintySettings, number: int) -> 
     codes = _encode(volume)
     shape, affine = _other_grid(volume, settings, generator)
     to_volume = np.linalg.inv(volume.affine) @ affine
-    places = to_volume[:3, :3] @ np.indices(shape).reshape(3, -1) + to_volume[:3, 3:]
-    near = _near_labels(codes, places)
-    places = places[:, near]
+    near, places = _near_labels(codes, shape, to_volume)
     spread = settings.jitter / np.sqrt(3.0)  # SD of a uniform distribution
     for axis in range(3):
         noise = _smooth_noise(shape, settings.correlation, generator)
@@ -225,12 +229,23 @@ def _other_grid(
     return (int(count[0]), int(count[1]), int(count[2])), affine
 
 
-def _near_labels(codes: _Codes, places: Float) -> NDArray[np.intp]:
-    """Places (3, N), in voxels, that may get a label: within three voxels of one."""
-    labeled = maximum_filter(np.pad(codes > 0, 4), 7)
-    last = np.array(labeled.shape)[:, None] - 1
-    nearest = np.clip(np.rint(places).astype(np.intp) + 4, 0, last)
-    return np.flatnonzero(labeled[tuple(nearest)])
+def _near_labels(
+    codes: _Codes, shape: tuple[int, int, int], to_volume: Float
+) -> tuple[NDArray[np.intp], Float]:
+    """Voxels of a copy that may get a label (N,), and their places (3, N) in the volume's voxels.
+
+    They lie within three voxels of one that has a label.
+    """
+    labeled = np.pad(codes > 0, 4)
+    for axis in range(3):
+        labeled = maximum_filter1d(labeled.view(np.uint8), 7, axis=axis) > 0
+    near = np.flatnonzero(
+        affine_transform(
+            labeled.view(np.uint8), to_volume[:3, :3], to_volume[:3, 3] + 4, shape, order=0
+        )
+    )
+    index = np.array(np.unravel_index(near, shape))
+    return near, to_volume[:3, :3] @ index + to_volume[:3, 3:]
 
 
 def _smooth_noise(shape: tuple[int, ...], length: float, generator: np.random.Generator) -> Float:
