@@ -477,7 +477,7 @@ class UncertaintySettings(SettingsTable):
     rotation: Annotated[float, Field(ge=0, le=45)] = 5.0
     """Voxels are turned by up to this about each axis, degrees, and shifted by up to half of one:
     as if the body had lain elsewhere in the scanner."""
-    spacing: Annotated[float, Field(ge=0.1, le=1)] = 0.42
+    spacing: Annotated[float, Field(ge=0.1, le=1)] = 0.46
     """Least ``grid.spacing`` of copies, mm: what all copies share cancels out, and time matters."""
 
 
