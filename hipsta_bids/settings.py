@@ -64,17 +64,31 @@ class BodySettings(SettingsTable):
     """Weight of that expectation; all labels together weigh 1."""
     end_margin: NonNegativeFloat = 0.0
     """Taken off either end where head or tail labels are missing, mm."""
+    end_smoothing: PositiveFloat = 1.0
+    """Without head or tail labels, ends are found from profiles of cross-sections along the axis,
+    smoothed by a Gaussian of this standard deviation, mm."""
+    end_usual: OpenFraction = 0.3
+    """What is usual in the body is this quantile over the cross-sections with CA1 and CA2 or CA3; a
+    part of these belongs to the head and the tail, where most of it is larger."""
+    end_weight: PositiveFloat = 3.0
+    """How much a millimeter of certain evidence multiplies odds, natural logarithm (times 0.5)."""
+    lost_share: PositiveFraction = 0.5
+    """Even odds of the end of the body where the sheet, CA1, or CA2 and CA3 have less than this
+    share of their usual area."""
     core_share: PositiveFraction = 0.5
-    """Without tail labels: the body ends where slices have less than this share of the usual area
-    of dentate gyrus and CA4, since the sheet closes over them in the tail."""
-    core_margin: NonNegativeFloat = 1.0
-    """Left out beside that, mm, if the sheet goes on as far behind: the closing wall is cut
-    obliquely there (chosen from 0 to 1.5 on HippUnfold's labels of a person and two templates)."""
-    head_piece: NonNegativeFloat = 1.5
-    """Without end labels: the body ends where a slice shows two pieces above this area, mm2."""
-    head_growth: NonNegativeFloat = 1.35
-    """Without end labels: the body ends before two slices in a row with more than this multiple of
-    the median area."""
+    """The same of dentate gyrus and CA4, since the sheet closes over them in the tail."""
+    lost_width: PositiveFloat = 0.5
+    """The evidence rises from none to certain over this range of such shares."""
+    uncus_spread: Annotated[float, Field(gt=1)] = 2.5
+    """Even odds where CA2 and CA3 spread over a cross-section this many times as far as usual (root
+    mean square distance): the uncus is a second part of them."""
+    core_spread: Annotated[float, Field(gt=1)] = 1.6
+    """The same of dentate gyrus and CA4."""
+    core_growth: Annotated[float, Field(gt=1)] = 1.6
+    """Even odds where these have more than this multiple of their usual area."""
+    head_growth: Annotated[float, Field(gt=1)] = 1.5
+    """Even odds where the sheet has more than this multiple of its usual area. The four cues are
+    averaged."""
     gap_directions: NonNegativeInt = 3
     """A voxel without a label lies in a thin gap if it has the sheet on both sides in this
     many of 13 directions."""
@@ -96,9 +110,9 @@ class BodySettings(SettingsTable):
     the next slices; between thick slices, whatever lies there."""
     cavity_radius: NonNegativeFloat = 0.9
     """A cavity with room for a ball of this radius is too wide to be the molecular layer, mm."""
-    end_fullness: Fraction = 0.9
-    """Without end labels: cross-sections at an end are left out if they have less than this share
-    of the area of those behind them."""
+    end_fullness: OpenFraction = 0.9
+    """Without end labels, where labels end obliquely: cross-sections at an end are left out if they
+    have less than this share of the area of those behind them."""
     end_reach: NonNegativeFloat = 3.0
     """Distance behind an end within which cross-sections are compared, mm; at most this length is
     left out."""
@@ -394,6 +408,9 @@ class CheckSettings(SettingsTable):
     """Flag if the sheet turns round its exterior side by more than this, rad."""
     slice_ratio: NonNegativeFloat = 1.5
     """Voxels are long if their longest edge is more than this many times the shortest."""
+    flag_end: NonNegativeFloat = 2.5
+    """Flag an end that was found without a label if its standard error is more than this, mm (2.1
+    at most in twelve real hemispheres, as they are and resliced)."""
     end_label_depth: NonNegativeFloat = 2.0
     """Head or tail labels farther inside the body than this are out of place, mm."""
     end_label_share: NonNegativeFloat = 0.005

@@ -8,7 +8,7 @@ x runs medial to lateral, y posterior to anterior, z interior to exterior, in bo
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,9 @@ from hipsta_bids.protocols.protocol import Protocol
 Float = NDArray[np.float64]
 Int = NDArray[np.int32]
 Bool = NDArray[np.bool_]
+
+End = Literal["posterior", "anterior"]
+"""An end of the body."""
 
 
 def _set(
@@ -83,6 +86,17 @@ class Hemisphere(Visit):
     """``L`` or ``R``."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class GivenEnd:
+    """An end of the body that a person has placed."""
+
+    end: End
+    point: tuple[float, float, float]
+    """A point of the plane, scanner RAS, mm."""
+    normal: tuple[float, float, float] | None = None
+    """Its normal, RAS, of any length and sign; None for the direction found without it."""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LabelVolume:
     """A segmentation in the package's own vocabulary."""
@@ -96,6 +110,8 @@ class LabelVolume:
     protocol: Protocol
     edited_mask: EditedMask | None = None
     """Body that replaces that of the labels between the end planes, if a person corrected it."""
+    given_ends: tuple[GivenEnd, ...] = ()
+    """Ends that a person has placed; they go before labels and the automatic rule."""
     start: tuple[int, int, int] = (0, 0, 0)
     """Index, in the file, of the first voxel of this part of it."""
     file_shape: tuple[int, int, int] | None = None

@@ -33,11 +33,11 @@ from hipsta_bids.geometry.digital import (
     to_ras,
     voxel_points,
 )
-from hipsta_bids.geometry.ends import End, EndPlanes, find_end_planes
+from hipsta_bids.geometry.ends import EndPlanes, find_end_planes
 from hipsta_bids.protocols.load import for_region
 from hipsta_bids.protocols.protocol import Tissue, lateral_rank
 from hipsta_bids.settings import BodySettings
-from hipsta_bids.types import Bool, EditedMask, Flag, Float, LabelVolume
+from hipsta_bids.types import Bool, EditedMask, End, Flag, Float, LabelVolume
 
 _END_REACH = 4.0  # mm behind an end plane over which the body's direction is taken
 _LEAST_SLOPE = 0.34  # cosine of 70 degrees

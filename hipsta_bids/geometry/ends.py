@@ -1,12 +1,11 @@
 """Where the hippocampal body begins and ends along its long axis.
 
-Planes are fitted to head and tail labels where the segmentation has them. Other ends are found by
-the rule of Diers et al. 2023 (NeuroImage 276:120182, section 2.1), cut short where the
-cross-sections no longer look like the body.
+A user's planes come first, then planes fitted to head and tail labels. Other ends are found from
+the cross-sections of the labels (``automatic_ends``).
 """
 
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +13,11 @@ from scipy import ndimage
 from scipy.special import expit
 
 from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry.automatic_ends import find_ends
 from hipsta_bids.geometry.digital import ALL, piece_sizes, voxel_points
 from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import BodySettings
-from hipsta_bids.types import Bool, Float, Int, LabelVolume, position_text
-
-End = Literal["posterior", "anterior"]
+from hipsta_bids.types import Bool, End, Float, GivenEnd, LabelVolume, position_text
 
 
 class _Plane(NamedTuple):
@@ -28,24 +26,16 @@ class _Plane(NamedTuple):
     point: Float
     normal: Float
     rule: str
-
-
-class _Slices(NamedTuple):
-    """Cross-sections at equal steps along an axis."""
-
-    axis: Float
-    first: float
-    """Level of the first slice along the axis, mm."""
-    step: float
-    """Distance between slices, mm."""
+    uncertainty: float = 0.0
+    """Standard error of its place, mm, if the automatic rule found it."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class EndPlanes:
     """Two planes, each by a point (3,), RAS mm, and a unit normal (3,) that points anterior.
 
-    A plane's rule is ``labels``, ``subfields`` (the paper's automatic rule), or what cut short that
-    rule where it ran beyond the body: ``core`` (there is no dentate gyrus) or ``cross-section``.
+    A plane's rule is ``user``, ``labels``, or what the automatic rule found most different beyond
+    it: ``subfields`` (no CA1, CA2 or CA3), ``core`` (no dentate gyrus) or ``cross-section``.
     """
 
     posterior_point: Float
@@ -58,6 +48,10 @@ class EndPlanes:
     """(3,) unit vector, posterior to anterior, between the two normals."""
     half_slice: float
     """Half of a voxel's extent along the axis, mm."""
+    posterior_uncertainty: float = 0.0
+    """Standard error over the cues of the automatic rule, mm."""
+    anterior_uncertainty: float = 0.0
+    """The same of the anterior end."""
 
     def height(self, points: Float, end: End) -> Float:
         """Distance of (N, 3) points from one end plane, mm, (N,); positive anterior of it."""
@@ -115,13 +109,26 @@ def find_end_planes(
                 else _plane_along_slices(points[below], points[above], across, settings)
             )
             planes[end] = _Plane(point, normal, "labels")
+    # Where one end is known, the other is cut parallel to it.
+    across = next((plane.normal for plane in planes.values()), axis)
+    for given in volume.given_ends:
+        without = planes[given.end].normal if given.end in planes else across
+        planes[given.end] = _given_plane(given, without, axis)
     if len(planes) < 2:  # noqa: PLR2004 -- two ends
-        # Where one end is labeled, the other is cut parallel to it.
         across = next((plane.normal for plane in planes.values()), axis)
-        found = _automatic_range(volume, sheet, across, planes, settings)
-        for end, (level, rule) in found.items():
-            planes.setdefault(end, _Plane(level * across, across, rule))
+        known = {end: float(plane.point @ across) for end, plane in planes.items()}
+        for end, found in find_ends(volume, sheet, across, known, settings).items():
+            plane = _Plane(found.level * across, across, found.rule, found.uncertainty)
+            planes.setdefault(end, plane)
     return _checked(planes, axis, half_slice)
+
+
+def _given_plane(given: GivenEnd, without: Float, axis: Float) -> _Plane:
+    """Place a user's plane; its normal is that of the plane without it, if none is given."""
+    if given.normal is None:
+        return _Plane(np.array(given.point), without, "user")
+    normal = np.array(given.normal) / np.linalg.norm(given.normal)
+    return _Plane(np.array(given.point), normal if normal @ axis > 0 else -normal, "user")
 
 
 def _largest_ends(part: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -135,7 +142,7 @@ def _largest_ends(part: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 def _checked(planes: dict[End, _Plane], axis: Float, half_slice: float) -> EndPlanes:
     """Combine two planes that lie across the long axis; refuse others."""
-    for end, (point, normal, _) in planes.items():
+    for end, (point, normal, rule, _) in planes.items():
         at = position_text(point)
         tilt = np.degrees(np.arccos(np.clip(normal @ axis, -1, 1)))
         if tilt > 90:  # noqa: PLR2004 -- reversed
@@ -146,7 +153,15 @@ def _checked(planes: dict[End, _Plane], axis: Float, half_slice: float) -> EndPl
                 reason="end-labels-inside",
             )
         if tilt > 50:  # noqa: PLR2004 -- beyond this the labels do not end across the long axis
-            lacking = [name for name, (_, _, rule) in planes.items() if rule != "labels"]
+            if rule == "user":
+                raise GeometryError(
+                    f"the given {end} end plane at {at} is tilted by {tilt:.0f} degrees against "
+                    "the long axis: correct its normal in the table of ends",
+                    reason="end-plane-tilted",
+                )
+            lacking = [
+                name for name, plane in planes.items() if plane.rule not in ("labels", "user")
+            ]
             if lacking:
                 raise GeometryError(
                     f"what is labeled does not run from the {end} end near {at} to the "
@@ -170,6 +185,8 @@ def _checked(planes: dict[End, _Plane], axis: Float, half_slice: float) -> EndPl
         anterior_rule=anterior.rule,
         axis=middle / np.linalg.norm(middle),
         half_slice=half_slice,
+        posterior_uncertainty=posterior.uncertainty,
+        anterior_uncertainty=anterior.uncertainty,
     )
 
 
@@ -304,153 +321,3 @@ def _logistic_plane(below: Float, above: Float, axis: Float) -> tuple[Float, Flo
     length = np.linalg.norm(beta[:3])
     normal = beta[:3] / length
     return center - beta[3] / length * scale * normal, normal
-
-
-def _automatic_range(
-    volume: LabelVolume,
-    sheet: NDArray[np.uint8],
-    axis: Float,
-    known: dict[End, _Plane],
-    settings: BodySettings,
-) -> dict[End, tuple[float, str]]:
-    """Level along the axis, mm, and rule of each end, by Diers et al. 2023, section 2.1.
-
-    The body reaches from the most posterior slice with CA1 and CA2 or CA3 to the most anterior
-    one with CA2 or CA3, counted along the hippocampus's own long axis.
-    """
-    along = voxel_points(sheet > 0, volume.affine) @ axis
-    step = float(np.abs(axis @ volume.affine[:3, :3]).max())
-    slices = _Slices(axis, float(along.min()), step)
-    number = np.floor((along - slices.first) / step + 0.5).astype(int)
-    low, high = _subfield_range(sheet[sheet > 0], number, slices, known)
-    rule = "subfields"
-    if "posterior" not in known:
-        core = _core_start(volume, slices, (low, high), settings)
-        low, rule = (core, "core") if core > low else (low, rule)
-    section, pixel = _sections(sheet > 0, volume.affine, slices, (low, high))
-    first, last = (low + number for number in _body_like(section, pixel, settings))
-    area = section.sum(axis=(1, 2))[first - low : last - low + 1]
-    reach = max(round(settings.end_reach / step), 1)
-    before, after = (_grazed(a, reach, settings.end_fullness) for a in (area, area[::-1]))
-    # Each kept slice reaches half a step to both sides.
-    start = float(slices.first + step * (first + before - 0.5)) + settings.end_margin
-    stop = float(slices.first + step * (last - after + 0.5)) - settings.end_margin
-    return {
-        "posterior": (start, "cross-section" if first > low else rule),
-        "anterior": (stop, "cross-section" if last < high else "subfields"),
-    }
-
-
-def _subfield_range(
-    values: NDArray[np.uint8],
-    number: Int,
-    slices: _Slices,
-    known: dict[End, _Plane],
-) -> tuple[int, int]:
-    """First slice that has CA1 and CA2 or CA3, and last that has CA2 or CA3, between known ends."""
-    count = int(number.max()) + 1
-    ca1 = np.bincount(number[values == Tissue.CA1], minlength=count) > 0
-    lateral = np.isin(values, (Tissue.CA2, Tissue.CA2_3, Tissue.CA3))
-    ca23 = np.bincount(number[lateral], minlength=count) > 0
-    levels = slices.first + slices.step * np.arange(count)
-    if "posterior" in known:
-        ca23 &= levels > known["posterior"].point @ slices.axis
-    if "anterior" in known:
-        ca23 &= levels < known["anterior"].point @ slices.axis
-    both = np.flatnonzero(ca1 & ca23)
-    if not len(both):
-        raise GeometryError(
-            "no slice across the long axis has both CA1 and CA2/CA3, and there are no head and "
-            "tail labels: label the head and the tail, or check that the protocol fits the labels",
-            reason="no-body",
-        )
-    return int(both[0]), int(np.flatnonzero(ca23)[-1])
-
-
-def _core_start(
-    volume: LabelVolume, slices: _Slices, bounds: tuple[int, int], settings: BodySettings
-) -> int:
-    """First slice between bounds at which the sheet curls round its core, dentate gyrus and CA4.
-
-    In the tail the sheet goes on behind the core and closes over it: there, a cross-section cuts
-    the wall obliquely, and it reads too thick. Where all labels begin with the core, they have been
-    cut there, and nothing is taken off.
-    """
-    low, high = bounds
-    core = np.isin(volume.tissue, (Tissue.DENTATE_GYRUS, Tissue.CA4))
-    along = voxel_points(core, volume.affine) @ slices.axis
-    number = np.floor((along - slices.first) / slices.step + 0.5).astype(int)
-    count = np.bincount(number[number >= 0], minlength=high + 1)
-    present = count[low : high + 1]
-    if not present.any():
-        return low
-    usual = np.median(present[present > 0])
-    first = int(np.flatnonzero(count >= settings.core_share * usual)[0])
-    margin = round(settings.core_margin / slices.step)
-    start = first + margin if first > margin else first
-    return start if low < start < high else low
-
-
-def _body_like(section: Bool, pixel: float, settings: BodySettings) -> tuple[int, int]:
-    """First and last cross-section, counted from the middle, that look like the body.
-
-    Where CA2/CA3 is labeled in the head or in the tail's bend, the rule of the paper runs deep
-    into them. The body ends where the cross-section falls into two large pieces, or where two
-    successive ones exceed the usual area.
-    """
-    area = section.sum(axis=(1, 2)) * pixel**2
-    count = len(area)
-    usual = float(np.median(area[count // 4 : count - count // 4]))
-    in_slice = np.zeros((3, 3, 3), dtype=bool)
-    in_slice[1] = True  # pieces are sought within each slice
-    pieces, total = ndimage.label(section, structure=in_slice)
-    sizes = np.bincount(pieces.ravel(), minlength=total + 1)[1:] * pixel**2
-    owner = np.zeros(total, dtype=int)
-    number = np.broadcast_to(np.arange(count)[:, None, None], section.shape)
-    owner[pieces[section] - 1] = number[section]
-    split = np.bincount(owner[sizes > settings.head_piece], minlength=count) > 1
-    wide = area > settings.head_growth * usual
-    twice = np.zeros(count, dtype=bool)
-    twice[:-1] |= wide[:-1] & wide[1:]
-    twice[1:] |= wide[1:] & wide[:-1]
-    odd = np.flatnonzero(split | twice)
-    before, after = odd[odd < count // 2], odd[odd > count // 2]
-    first = int(before[-1]) + 1 if len(before) else 0
-    last = int(after[0]) - 1 if len(after) else count - 1
-    return first, last
-
-
-def _grazed(area: Int, reach: int, fullness: float) -> int:
-    """Count the first cross-sections that are smaller than those that follow them.
-
-    Labels that end obliquely fill a part of these only.
-    """
-    outer = area[: min(reach, len(area) // 4)]
-    usual = [np.median(area[i + 1 : i + 1 + reach]) for i in range(len(outer))]
-    whole = np.flatnonzero(outer >= fullness * np.array(usual))
-    return int(whole[0]) if len(whole) else len(outer)
-
-
-def _sections(
-    mask: Bool, affine: Float, slices: _Slices, bounds: tuple[int, int]
-) -> tuple[Bool, float]:
-    """Sample the mask in the slices between bounds, (N, A, B); also the pixel edge, mm."""
-    axis = slices.axis
-    side = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    side = side / np.linalg.norm(side)
-    up = np.cross(axis, side)
-    pixel = float(np.linalg.norm(affine[:3, :3], axis=0).min())
-    points = voxel_points(mask, affine)
-    a, b = (
-        np.arange(reach.min() - 1, reach.max() + 1, pixel) for reach in (points @ side, points @ up)
-    )
-    levels = slices.first + slices.step * np.arange(bounds[0], bounds[1] + 1)
-    where = (
-        a[None, :, None, None] * side
-        + b[None, None, :, None] * up
-        + levels[:, None, None, None] * axis
-    )
-    inverse = np.linalg.inv(affine)
-    voxels = np.moveaxis(where @ inverse[:3, :3].T + inverse[:3, 3], -1, 0)
-    field = ndimage.map_coordinates(mask.astype(np.float32), voxels, order=1, output=np.float32)
-    return field > 0.5, pixel  # noqa: PLR2004 -- halfway between outside and inside

@@ -183,6 +183,8 @@ def quality_metrics(evidence: Evidence, repaired: Bool) -> dict[str, Any]:
         "medial_offset_mm": evidence.side,
         "posterior_end_rule": ends.posterior_rule,
         "anterior_end_rule": ends.anterior_rule,
+        "posterior_end_uncertainty_mm": ends.posterior_uncertainty,
+        "anterior_end_uncertainty_mm": ends.anterior_uncertainty,
         "posterior_plane": _plane(ends.posterior_point, ends.posterior_normal),
         "anterior_plane": _plane(ends.anterior_point, ends.anterior_normal),
         "voxels_across": evidence.voxels_across,

@@ -1,0 +1,265 @@
+"""Where the hippocampal body ends along an axis where no label says so.
+
+Cross-sections of the labels are measured at small steps along the axis. Evidence that a level lies
+outside of the body is graded, from several cues, and an end is a mean over all levels at which the
+body may end: so it moves little if voxels do.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.special import ndtr
+
+from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry.digital import voxel_points
+from hipsta_bids.protocols.protocol import Tissue
+from hipsta_bids.settings import BodySettings
+from hipsta_bids.types import Bool, End, Float, LabelVolume
+
+Cues = dict[str, Float]
+"""Evidence (T,) from 0 to 1 that a level is outside of the body, by name."""
+
+
+class FoundEnd(NamedTuple):
+    """An end that was found by the automatic rule."""
+
+    level: float
+    """Along the axis, mm."""
+    rule: str
+    uncertainty: float
+    """Standard error over the cues, mm."""
+
+
+class _Profile(NamedTuple):
+    """Cross-sections at equal steps along an axis, smoothed along it."""
+
+    levels: Float
+    """(T,) mm along the axis."""
+    area: dict[str, Float]
+    """(T,) area per kind of tissue, mm2."""
+    spread: dict[str, Float]
+    """(T,) root mean square distance of a tissue from its center, mm."""
+
+
+_LATERAL = (Tissue.CA2, Tissue.CA2_3, Tissue.CA3)
+_CORE = (Tissue.DENTATE_GYRUS, Tissue.CA4)
+_STEP = 0.25  # mm between the levels of a profile
+_BESIDE = 2.0  # mm beyond an end, where it is asked why it is there
+
+
+def find_ends(
+    volume: LabelVolume,
+    sheet: NDArray[np.uint8],
+    axis: Float,
+    known: dict[End, float],
+    settings: BodySettings,
+) -> dict[End, FoundEnd]:
+    """Find where each end lies along the axis, between the levels of ends that are known, mm.
+
+    As in Diers et al. 2023, section 2.1, the body has CA1 and CA2 or CA3 everywhere. It also has a
+    dentate gyrus, and cross-sections like those in its middle. All this is evidence for or against
+    each level; an end is the mean over all places where the body may end, weighted by evidence.
+    """
+    profile = _profile(volume, sheet, axis, settings)
+    levels = profile.levels
+    low, high = known.get("posterior", -np.inf), known.get("anterior", np.inf)
+    typical = _has_subfields(profile) & (levels > low) & (levels < high)
+    if not typical.any():
+        raise GeometryError(
+            "no slice across the long axis has both CA1 and CA2/CA3, and there are no head and "
+            "tail labels: label the head and the tail, or check that the protocol fits the labels",
+            reason="no-body",
+        )
+    lost, odd = _evidence(profile, typical, settings)
+    ends = _mean_ends(levels, _doubt(lost, odd), known, settings)
+    # The standard error over the cues, by leaving each out once (jackknife).
+    less = [
+        _mean_ends(levels, _doubt(lost, {k: odd[k] for k in odd if k != left}), known, settings)
+        for left in odd
+    ]
+    found: dict[End, FoundEnd] = {}
+    sides: tuple[tuple[End, float], ...] = (("posterior", 1.0), ("anterior", -1.0))
+    for n, (end, sign) in enumerate(sides):
+        others = np.array([pair[n] for pair in less])
+        error = float(np.sqrt((len(others) - 1) * others.var())) if len(others) > 1 else 0.0
+        trim = _grazed(profile, lost["sheet"], ends[n], sign, settings) + settings.end_margin
+        rule = _main_evidence(levels, ends[n], sign, lost, odd)
+        found[end] = FoundEnd(ends[n] + sign * trim, rule, error)
+    return found
+
+
+def _profile(
+    volume: LabelVolume, sheet: NDArray[np.uint8], axis: Float, settings: BodySettings
+) -> _Profile:
+    """Measure cross-sections of the sheet and of what lies inside it."""
+    edges = volume.affine[:3, :3]
+    along = axis @ edges
+    through = int(np.argmax(np.abs(along)))
+    parts = int(np.ceil(abs(along[through]) / _STEP))
+    offsets = ((np.arange(parts) + 0.5) / parts - 0.5) * along[through]
+    tissues = {
+        "sheet": sheet > 0,
+        "CA1": sheet == Tissue.CA1,
+        "CA2-3": np.isin(sheet, _LATERAL),
+        "core": np.isin(volume.tissue, _CORE),
+    }
+    points = {name: voxel_points(mask, volume.affine) for name, mask in tissues.items()}
+    middle = points["sheet"].mean(axis=0)
+    reach = (points["sheet"] - middle) @ axis
+    margin = 5 * settings.end_smoothing + abs(along[through])
+    first = int(np.floor((reach.min() - margin) / _STEP))
+    last = int(np.ceil((reach.max() + margin) / _STEP))
+    volume_of_part = abs(float(np.linalg.det(edges))) / parts / _STEP
+    area, spread = dict[str, Float](), dict[str, Float]()
+    for name, place in points.items():
+        local = place - middle
+        height = local @ axis
+        flat = local - height[:, None] * axis
+        at = (height[:, None] + offsets) / _STEP - first  # parts of voxels
+        moments = np.column_stack([np.ones(len(flat)), flat, (flat**2).sum(axis=1)])
+        sums = _binned(at, moments, last - first + 1)
+        sums = ndimage.gaussian_filter1d(
+            sums, settings.end_smoothing / _STEP, axis=0, mode="constant"
+        )
+        area[name] = sums[:, 0] * volume_of_part
+        mean = sums[:, 1:] / np.maximum(sums[:, :1], 1e-9)
+        spread[name] = np.sqrt(np.maximum(mean[:, 3] - (mean[:, :3] ** 2).sum(axis=1), 0))
+    levels = middle @ axis + _STEP * np.arange(first, last + 1)
+    return _Profile(levels, area, spread)
+
+
+def _binned(at: Float, values: Float, count: int) -> Float:
+    """Sum values (N, K) at places (N, M), in bins; each is shared by the two nearest, (count, K).
+
+    So nothing jumps as voxels move.
+    """
+    low = np.floor(at).astype(int)
+    kept = (low >= 0) & (low < count - 1)
+    upper = np.where(kept, at - low, 0.0)
+    lower = np.where(kept, 1.0 - upper, 0.0)
+    low = np.where(kept, low, 0)
+    sums = [
+        np.bincount(low.ravel(), (lower * column[:, None]).ravel(), count)
+        + np.bincount(low.ravel() + 1, (upper * column[:, None]).ravel(), count)
+        for column in values.T
+    ]
+    return np.column_stack(sums)
+
+
+def _has_subfields(profile: _Profile) -> Bool:
+    """Say which levels have CA1 and CA2 or CA3."""
+    both = np.ones(len(profile.levels), dtype=bool)
+    for name in ("CA1", "CA2-3"):
+        area = profile.area[name]
+        present = area > 0.01 * area.max(initial=0)  # without tails of the Gaussian
+        both &= area > 0.2 * np.median(area[present]) if present.any() else False
+    return both
+
+
+def _evidence(profile: _Profile, typical: Bool, settings: BodySettings) -> tuple[Cues, Cues]:
+    """Weigh what speaks against each level: tissues that are lost, and shapes unlike the body's.
+
+    Either is 0.5 at the share, or ratio, that the settings name. Usual is a low quantile over the
+    levels with CA1 and CA2 or CA3, since part of these may belong to the head or the tail.
+    """
+
+    def usual(values: Float) -> float:
+        return max(float(np.quantile(values[typical], settings.end_usual)), 1e-6)
+
+    area, spread = profile.area, profile.spread
+    shares = dict.fromkeys(("sheet", "CA1", "CA2-3"), settings.lost_share)
+    has_core = usual(area["core"]) > 0.02 * usual(area["sheet"])  # is it labeled
+    if has_core:
+        shares["core"] = settings.core_share
+    lost = {
+        name: np.clip(0.5 + (share - area[name] / usual(area[name])) / settings.lost_width, 0, 1)
+        for name, share in shares.items()
+    }
+    ratios = {
+        "spread of CA2-3": (spread["CA2-3"], settings.uncus_spread),
+        "area of the sheet": (area["sheet"], settings.head_growth),
+    }
+    if has_core:
+        ratios["spread of the core"] = (spread["core"], settings.core_spread)
+        ratios["area of the core"] = (area["core"], settings.core_growth)
+    odd = {
+        name: np.clip(0.5 * np.log(np.maximum(x / usual(x), 1.0)) / np.log(ratio), 0, 1)
+        for name, (x, ratio) in ratios.items()
+    }
+    return lost, odd
+
+
+def _doubt(lost: Cues, odd: Cues) -> Float:
+    """Combine evidence (T,): any lost tissue is enough, cues of the shape are averaged."""
+    inside = 1.0 - np.mean(list(odd.values()), axis=0)
+    for share in lost.values():
+        inside = inside * (1.0 - share)
+    return np.asarray(1.0 - inside)
+
+
+def _mean_ends(
+    levels: Float, doubt: Float, known: dict[End, float], settings: BodySettings
+) -> tuple[float, float]:
+    """Mean level of both ends, weighted by the evidence for a body between each two levels.
+
+    The logarithm of a weight is the integral of 0.5 - doubt over the body, times a setting. So an
+    end is near to where doubt passes one half, or a mean if it does so at several places.
+    """
+    gain = settings.end_weight * np.cumsum(0.5 - doubt) * _STEP
+    weight = gain - gain[:, None]
+    allowed = levels - levels[:, None] >= settings.min_length
+    low, high = known.get("posterior"), known.get("anterior")
+    if low is not None:
+        allowed &= (levels == levels[np.abs(levels - low).argmin()])[:, None]
+    if high is not None:
+        allowed &= levels == levels[np.abs(levels - high).argmin()]
+    if not allowed.any():
+        raise GeometryError(
+            f"the labels go on for less than {settings.min_length:g} mm beside the one end that "
+            "has a label or a plane: check it, or label the whole hippocampus",
+            reason="body-too-short",
+        )
+    weight = np.where(allowed, weight, -np.inf)
+    weight = np.exp(weight - weight.max())
+    weight /= weight.sum()
+    edges = levels + 0.5 * _STEP  # the sums reach to here
+    return float(weight.sum(axis=1) @ edges), float(weight.sum(axis=0) @ edges)
+
+
+def _grazed(
+    profile: _Profile, lost: Float, end: float, sign: float, settings: BodySettings
+) -> float:
+    """Length behind an end, mm, at which cross-sections are smaller than those that follow them.
+
+    Labels that end obliquely fill a part of these only. Smoothing alone takes as much within a
+    known distance of where labels end. Where the sheet goes on, nothing is left out.
+    """
+    depth = sign * (profile.levels - end)
+    area = profile.area["sheet"]
+    inner = (depth > settings.end_reach) & (depth < 2 * settings.end_reach)
+    if not inner.any():
+        return 0.0
+    fine = np.arange(0.5, settings.end_reach / _STEP) * _STEP
+    share = np.interp(fine, np.sort(depth), area[np.argsort(depth)]) / area[inner].mean()
+    length = _below(share, settings.end_fullness)
+    blurred = _below(ndtr(fine / settings.end_smoothing), settings.end_fullness)
+    labels_end = np.interp(-_BESIDE, np.sort(depth), lost[np.argsort(depth)])
+    return float(labels_end * max(length - blurred, 0.0))
+
+
+def _below(share: Float, fullness: float) -> float:
+    """Length over which shares (N,), at steps of a profile, are less than they should be, mm."""
+    return float(np.clip((fullness - share) / (1 - fullness), 0, 1).sum() * _STEP)
+
+
+def _main_evidence(levels: Float, end: float, sign: float, lost: Cues, odd: Cues) -> str:
+    """Name the strongest evidence just beyond an end."""
+    depth = sign * (levels - end)
+    beyond = (depth < 0) & (depth > -_BESIDE)
+    strength = {name: float(share[beyond].mean()) for name, share in lost.items()}
+    fields = max(strength["sheet"], strength["CA1"], strength["CA2-3"])
+    shape = float(np.mean([share[beyond].mean() for share in odd.values()]))
+    names = {"subfields": fields, "core": strength.get("core", 0.0), "cross-section": shape}
+    return max(names, key=lambda name: names[name])
