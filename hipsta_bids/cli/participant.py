@@ -169,6 +169,12 @@ def _add_processing(parser: Parser) -> None:
         "body (default), extended (with neighboring cortex), entorhinal (that alone)",
         choices=REGIONS,
     )
+    add(
+        "--ends",
+        "FILE.tsv",
+        "ends of the body placed by hand: columns participant_id, hemi, end, r, a, s (and session,"
+        " nr, na, ns)",
+    )
     add("--write-meshes", "", "also write the tetrahedral meshes (VTU)")
     add(
         "--uncertainty",
@@ -293,6 +299,7 @@ def run_participant_level(options: "Namespace", arguments: Sequence[str] = ()) -
         settings = settings.changed(body={"region": options.region})
     request = input_request(options)
     echo_start(options.analysis_level, options.bids_dir)
+    from hipsta_bids.inputs.ends import attach_ends  # noqa: PLC0415  (heavy)
     from hipsta_bids.inputs.maps import attach, map_requests  # noqa: PLC0415  (heavy)
     from hipsta_bids.inputs.search import dataset_notes, selection_table  # noqa: PLC0415  (heavy)
 
@@ -301,8 +308,9 @@ def run_participant_level(options: "Namespace", arguments: Sequence[str] = ()) -
     if found is None:
         echo(f"part {options.shard.name} of the dataset has nothing to process")
         return ExitCode.OK
-    items, map_notes = attach(found.items, requests, options.roi, options.bids_dir)
-    for note in (*dataset_notes(request, items), *found.notes, *map_notes):
+    items, end_notes = attach_ends(found.items, options.ends)
+    items, map_notes = attach(items, requests, options.roi, options.bids_dir)
+    for note in (*dataset_notes(request, items), *found.notes, *end_notes, *map_notes):
         echo(f"note: {note}")
     if options.dry_run:
         echo_table(selection_table(items))

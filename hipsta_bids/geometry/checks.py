@@ -210,7 +210,7 @@ def _check_beyond(volume: LabelVolume, body: Body, settings: CheckSettings) -> l
         ("posterior", ends.posterior_rule, ends.height(points, "posterior")),
         ("anterior", ends.anterior_rule, -ends.height(points, "anterior")),
     ):
-        if rule == "labels":
+        if rule in ("labels", "user"):
             continue
         near = points[(height > 0) & (height < settings.beyond_reach)]
         beyond = np.count_nonzero((height < 0) & (height > -settings.beyond_reach))

@@ -19,6 +19,9 @@ from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import BodySettings
 from hipsta_bids.types import Bool, End, Float, GivenEnd, LabelVolume, position_text
 
+_FAR = 10.0
+"""A point of a plane may lie beside the hippocampus, but not farther than this, mm."""
+
 
 class _Plane(NamedTuple):
     """One end plane, and the rule by which it was found."""
@@ -112,6 +115,7 @@ def find_end_planes(
     # Where one end is known, the other is cut parallel to it.
     across = next((plane.normal for plane in planes.values()), axis)
     for given in volume.given_ends:
+        _check_inside(given, points)
         without = planes[given.end].normal if given.end in planes else across
         planes[given.end] = _given_plane(given, without, axis)
     if len(planes) < 2:  # noqa: PLR2004 -- two ends
@@ -121,6 +125,18 @@ def find_end_planes(
             plane = _Plane(found.level * across, across, found.rule, found.uncertainty)
             planes.setdefault(end, plane)
     return _checked(planes, axis, half_slice)
+
+
+def _check_inside(given: GivenEnd, points: Float) -> None:
+    """Refuse a plane that a person has placed far from the hippocampus, at points (N, 3)."""
+    distance = float(np.linalg.norm(points - given.point, axis=1).min())
+    if distance > _FAR:
+        raise GeometryError(
+            f"the given {given.end} end at {position_text(np.array(given.point))} lies "
+            f"{distance:.0f} mm from the labels: give a point in the hippocampus, in scanner "
+            "coordinates (RAS, mm)",
+            reason="given-end-outside",
+        )
 
 
 def _given_plane(given: GivenEnd, without: Float, axis: Float) -> _Plane:

@@ -97,6 +97,7 @@ def read_label_volume(item: HemisphereInput, region: str = "body") -> LabelVolum
             if mask
             else None
         ),
+        given_ends=item.ends,
         start=(first, second, third),
         file_shape=image.shape,
     )

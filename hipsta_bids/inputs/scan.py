@@ -17,7 +17,7 @@ from hipsta_bids.derivatives.dataset import NAME, generated_by, read_description
 from hipsta_bids.errors import HipstaError, InputError, ProtocolError, UsageError
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Protocol
-from hipsta_bids.types import Hemisphere, Visit
+from hipsta_bids.types import GivenEnd, Hemisphere, Visit
 
 # What is asked for, and what was found: the values that the search for inputs works with.
 
@@ -126,6 +126,8 @@ class HemisphereInput(Hemisphere):
     """What a reader should know about this choice."""
     edits: tuple[Edit, ...] = ()
     """Corrections by a person that take the place of what the files say."""
+    ends: tuple[GivenEnd, ...] = ()
+    """Ends of the body that a person has placed."""
     maps: tuple[MapSource, ...] = ()
     """Other volumes to be sampled on the sheet."""
     regions: Path | None = None

@@ -8,7 +8,7 @@ import sys
 import time
 import traceback
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,7 +29,7 @@ from hipsta_bids.participant.maps import (
 )
 from hipsta_bids.protocols.load import for_region
 from hipsta_bids.settings import Settings
-from hipsta_bids.types import BodyMask, HemisphereMaps, Status
+from hipsta_bids.types import BodyMask, GivenEnd, HemisphereMaps, Status
 
 if TYPE_CHECKING:
     from hipsta_bids.participant.uncertainty import Uncertainty
@@ -144,7 +144,14 @@ def base_record(job: Job) -> dict[str, Any]:
             for path, why in item.passed_over
         ],
         "notes": item.notes,
+        **({"given_ends": [_given_end(end) for end in item.ends]} if item.ends else {}),
     }
+
+
+def _given_end(end: GivenEnd) -> dict[str, Any]:
+    """Describe an end that a person has placed."""
+    normal = {"normal_ras": end.normal} if end.normal else {}
+    return {"end": end.end, "point_ras_mm": end.point, **normal}
 
 
 def hash_inputs(job: Job, record: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
@@ -174,6 +181,7 @@ def hash_inputs(job: Job, record: Mapping[str, Any]) -> tuple[str, dict[str, Any
         ],
         [item.protocol.unlisted, item.bilateral, item.code_offset, item.hemi],
         sorted([entry["what"], entry["sha256"]] for entry in edited),
+        *([[asdict(end) for end in item.ends]] if item.ends else []),
         *signal_hash(item),
     ]
     digest = hashlib.sha256(json.dumps(reading).encode()).hexdigest()

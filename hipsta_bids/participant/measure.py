@@ -112,6 +112,19 @@ def find_flags(evidence: Evidence) -> list[Flag]:
         (repair.large, "large-repair", f"{repair}: a large repair, look at the labels there")
         for repair in solid.repairs
     ]
+    ends = body.ends
+    rows += [
+        (
+            uncertainty > checks.flag_end,
+            "ends-uncertain",
+            f"without labels of head and tail, the {end} end is certain to {uncertainty:.1f} mm "
+            "only: look at the plane, and place it with --ends if it is wrong",
+        )
+        for end, uncertainty in (
+            ("posterior", ends.posterior_uncertainty),
+            ("anterior", ends.anterior_uncertainty),
+        )
+    ]
     rows += [
         (
             not present & set(tissues),

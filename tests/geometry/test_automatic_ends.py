@@ -1,0 +1,186 @@
+"""Ends without labels: where they are drawn, however voxels lie; how sure; and a user's planes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from geometry_cases import rigid, rotation, short_phantom
+
+from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry.body import extract_body
+from hipsta_bids.geometry.ends import find_end_planes
+from hipsta_bids.protocols.load import load_protocol
+from hipsta_bids.protocols.protocol import Tissue
+from hipsta_bids.settings import BodySettings
+from hipsta_bids.types import GivenEnd, LabelVolume
+
+HIPPUNFOLD = load_protocol("hippunfold")
+BODY = BodySettings()
+TAIL, UNCUS = -12.0, 8.0
+"""Where the body below begins and ends along y, mm."""
+
+
+def tissue_at(points):
+    """A flat hippocampus along y, from -18 to 18 mm: subiculum, CA1 and CA2 below a dentate gyrus.
+
+    Towards the tail the dentate gyrus gets lower over 4 mm, round where the body begins. In the
+    head an uncus of CA2 and dentate gyrus lies medially, and gets higher over 4 mm.
+    """
+    x, y, z = points.T
+    tissue = np.zeros(len(points), dtype=np.uint8)
+    sheet = (abs(x) < 8) & (abs(z) < 1) & (abs(y) < 18)
+    edges = [-8, -3, 4, 8]
+    for kind, low, high in zip((2, 3, 4), edges, edges[1:], strict=False):
+        tissue[sheet & (x >= low) & (x < high)] = kind
+    height = 3 * np.clip((y - TAIL) / 4 + 0.5, 0, 1)
+    core = (x > -1) & (x < 5) & (z >= 1) & (z < 1 + height) & (abs(y) < 18)
+    tissue[core] = Tissue.DENTATE_GYRUS
+    uncus = 6 * np.clip((y - UNCUS) / 4 + 0.5, 0, 1) * (y < 18)
+    tissue[(x > -8) & (x < -3) & (z >= 4) & (z < 4 + uncus)] = Tissue.CA2
+    tissue[(x > -8) & (x < -1) & (z >= 4 - 0.5 * uncus) & (z < 4)] = Tissue.DENTATE_GYRUS
+    return tissue
+
+
+def drawn(voxel=(0.4, 0.4, 0.4), shift=0.0, tilt=(0.0, 0.0), mirror=False):
+    """Its labels on a grid that is shifted by a share of a voxel along y, and tilted, degrees."""
+    edges = rotation(0, tilt[0]) @ rotation(2, tilt[1]) * voxel
+    half = np.ceil([13.0, 22.0, 14.0] / np.array(voxel)).astype(int)
+    index = np.indices(2 * half).reshape(3, -1).T
+    affine = np.eye(4)
+    affine[:3, :3] = edges
+    affine[:3, 3] = edges @ (np.array([0.03, shift, 0.04]) - half)
+    points = index @ edges.T + affine[:3, 3]
+    if mirror:
+        affine = np.diag([-1.0, 1, 1, 1]) @ affine
+    tissue = tissue_at(points).reshape(2 * half)
+    return LabelVolume(
+        tissue=tissue, part=np.zeros_like(tissue), affine=affine, protocol=HIPPUNFOLD
+    )
+
+
+def ends_of(volume, settings=BODY):
+    sheet = np.where(np.isin(volume.tissue, (2, 3, 4)), volume.tissue, 0).astype(np.uint8)
+    return find_end_planes(volume, sheet, settings)
+
+
+def places(volume):
+    """Where the end planes cross the middle of the body, mm along y."""
+    ends = ends_of(volume)
+    middle = np.array([[0.0, 0.0, 0.5]])
+    return [
+        float(-ends.height(middle, end)[0] / getattr(ends, f"{end}_normal")[1])
+        for end in ("posterior", "anterior")
+    ]
+
+
+def test_ends_lie_where_the_dentate_gyrus_and_the_uncus_begin():
+    ends = ends_of(drawn())
+    assert (ends.posterior_rule, ends.anterior_rule) == ("core", "cross-section")
+    # The long axis leans towards the uncus.
+    np.testing.assert_allclose(places(drawn()), [TAIL, UNCUS], atol=0.6)
+
+
+@pytest.mark.parametrize("slice_mm", [1.0, 2.0])
+def test_half_a_slice_moves_no_end_by_half_a_slice(slice_mm):
+    found = [places(drawn((0.4, slice_mm, 0.4), shift)) for shift in (0.0, 0.25, 0.5, 0.75)]
+    assert np.ptp(found, axis=0).max() < 0.3 * slice_mm
+    np.testing.assert_allclose(np.mean(found, axis=0), places(drawn()), atol=0.2 * slice_mm)
+
+
+@pytest.mark.parametrize("tilt", [(8.0, 0.0), (-8.0, 0.0), (0.0, 8.0), (0.0, -8.0)])
+def test_a_tilt_of_the_slices_moves_no_end(tilt):
+    moved = np.subtract(places(drawn((0.4, 2.0, 0.4), tilt=tilt)), places(drawn()))
+    assert np.abs(moved).max() < 0.6
+
+
+def test_ends_move_with_the_volume_and_with_its_mirror_image():
+    volume, pose = drawn((0.4, 2.0, 0.4)), rigid()
+    here, there = ends_of(volume), ends_of(replace(volume, affine=pose @ volume.affine))
+    image = ends_of(drawn((0.4, 2.0, 0.4), mirror=True))
+    flip = np.diag([-1.0, 1.0, 1.0])
+    for end in ("posterior", "anterior"):
+        point, normal = getattr(here, f"{end}_point"), getattr(here, f"{end}_normal")
+        moved = (pose[:3, :3] @ point + pose[:3, 3])[None]
+        assert abs(there.height(moved, end)[0]) < 1e-8
+        np.testing.assert_allclose(getattr(there, f"{end}_normal"), pose[:3, :3] @ normal)
+        assert abs(image.height((flip @ point)[None], end)[0]) < 1e-8
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.5])
+def test_phantom_ends_are_found_in_thick_slices(shift):
+    """CA2 and CA3 are drawn in the body alone, 14 mm long."""
+    phantom = short_phantom(length=14.0)
+    pose = np.eye(4)
+    pose[1, 3] = 2.0 * shift
+    volume = phantom.label_volume(HIPPUNFOLD, voxel_size=(0.4, 2.0, 0.4), pose=pose)
+    ends = extract_body(volume, BODY).ends
+    assert ends.posterior_uncertainty < 0.5
+    assert ends.anterior_uncertainty < 0.5
+    u = np.linspace(0.1, 0.9, 9)
+    for end, v in (("posterior", 0.0), ("anterior", 1.0)):
+        plane = phantom.body.place(u, v, 0.0) + pose[:3, 3]
+        assert abs(ends.height(plane, end).mean()) < 0.5
+
+
+def test_an_end_is_less_certain_where_the_cues_differ():
+    """The dentate gyrus spreads from 3 mm behind the uncus on."""
+    volume = drawn()
+    x, y, z = np.moveaxis(np.indices(volume.tissue.shape), 0, -1).reshape(-1, 3).T
+    points = np.stack([x, y, z], axis=-1) @ volume.affine[:3, :3].T + volume.affine[:3, 3]
+    early = (
+        (points[:, 0] > -8)
+        & (points[:, 0] <= -1)
+        & (points[:, 2] >= 1)
+        & (points[:, 2] < 3)
+        & (points[:, 1] > UNCUS - 6)
+        & (points[:, 1] < 18)
+    ).reshape(volume.tissue.shape)
+    tissue = np.where(early, np.uint8(Tissue.DENTATE_GYRUS), volume.tissue)
+    sure, unsure = ends_of(volume), ends_of(replace(volume, tissue=tissue))
+    assert sure.anterior_uncertainty < 1.0
+    assert unsure.anterior_uncertainty > sure.anterior_uncertainty + 0.5
+    assert unsure.posterior_uncertainty < 0.5
+    # It moves towards that, and not all the way.
+    moved = places(replace(volume, tissue=tissue))[1] - places(volume)[1]
+    assert -5.5 < moved < -0.5
+
+
+def test_a_users_plane_goes_before_what_is_found():
+    volume = drawn()
+    point, normal = (0.0, 4.0, 0.5), (0.1, -1.0, 0.0)
+    plain = ends_of(volume)
+    given = replace(volume, given_ends=(GivenEnd(end="anterior", point=point, normal=normal),))
+    ends = ends_of(given)
+    assert (ends.posterior_rule, ends.anterior_rule) == (plain.posterior_rule, "user")
+    assert ends.anterior_uncertainty == 0.0
+    assert abs(ends.height(np.array([point]), "anterior")[0]) < 1e-9
+    np.testing.assert_allclose(ends.anterior_normal, -np.array(normal) / np.linalg.norm(normal))
+    moved = replace(given, given_ends=(GivenEnd(end="anterior", point=point),))
+    np.testing.assert_allclose(ends_of(moved).anterior_normal, plain.anterior_normal)
+
+
+def test_a_users_plane_goes_before_labels(arc):
+    plain = arc.body.ends
+    point = plain.anterior_point - 1.5 * plain.axis
+    given = (GivenEnd(end="anterior", point=tuple(point)),)
+    ends = extract_body(replace(arc.volume, given_ends=given), BODY).ends
+    assert (ends.posterior_rule, ends.anterior_rule) == ("labels", "user")
+    np.testing.assert_allclose(ends.anterior_point, point)
+    np.testing.assert_allclose(ends.anterior_normal, plain.anterior_normal)
+    np.testing.assert_allclose(ends.posterior_point, plain.posterior_point)
+
+
+@pytest.mark.parametrize(
+    ("given", "reason"),
+    [
+        (GivenEnd(end="anterior", point=(60.0, 8.0, 0.0)), "given-end-outside"),
+        (
+            GivenEnd(end="anterior", point=(0.0, 8.0, 0.0), normal=(1.0, 0.2, 0.0)),
+            "end-plane-tilted",
+        ),
+    ],
+)
+def test_impossible_planes_are_refused(given, reason):
+    with pytest.raises(GeometryError, match="the given anterior end") as caught:
+        ends_of(replace(drawn((0.8, 0.8, 0.8)), given_ends=(given,)))
+    assert caught.value.reason == reason
