@@ -45,6 +45,7 @@ class _Profile(NamedTuple):
 
 _LATERAL = (Tissue.CA2, Tissue.CA2_3, Tissue.CA3)
 _CORE = (Tissue.DENTATE_GYRUS, Tissue.CA4)
+_NEEDED = ("sheet", "CA1", "CA2-3")
 _STEP = 0.25  # mm between the levels of a profile
 _BESIDE = 2.0  # mm beyond an end, where it is asked why it is there
 
@@ -84,7 +85,13 @@ def find_ends(
     for n, (end, sign) in enumerate(sides):
         others = np.array([pair[n] for pair in less])
         error = float(np.sqrt((len(others) - 1) * others.var())) if len(others) > 1 else 0.0
-        trim = _grazed(profile, lost["sheet"], ends[n], sign, settings) + settings.end_margin
+        order = np.argsort(sign * levels)
+        depth = sign * (levels[order] - ends[n])
+        trim = max(
+            _grazed(depth, profile.area[name][order], lost[name][order], settings)
+            for name in _NEEDED
+        )
+        trim += settings.end_margin
         rule = _main_evidence(levels, ends[n], sign, lost, odd)
         found[end] = FoundEnd(ends[n] + sign * trim, rule, error)
     return found
@@ -169,7 +176,7 @@ def _evidence(profile: _Profile, typical: Bool, settings: BodySettings) -> tuple
         return max(float(np.quantile(values[typical], settings.end_usual)), 1e-6)
 
     area, spread = profile.area, profile.spread
-    shares = dict.fromkeys(("sheet", "CA1", "CA2-3"), settings.lost_share)
+    shares = dict.fromkeys(_NEEDED, settings.lost_share)
     has_core = usual(area["core"]) > 0.02 * usual(area["sheet"])  # is it labeled
     if has_core:
         shares["core"] = settings.core_share
@@ -228,24 +235,20 @@ def _mean_ends(
     return float(weight.sum(axis=1) @ edges), float(weight.sum(axis=0) @ edges)
 
 
-def _grazed(
-    profile: _Profile, lost: Float, end: float, sign: float, settings: BodySettings
-) -> float:
-    """Length behind an end, mm, at which cross-sections are smaller than those that follow them.
+def _grazed(depth: Float, area: Float, lost: Float, settings: BodySettings) -> float:
+    """Length behind an end, mm, at which a tissue's areas are smaller than behind it.
 
-    Labels that end obliquely fill a part of these only. Smoothing alone takes as much within a
-    known distance of where labels end. Where the sheet goes on, nothing is left out.
+    Labels that end obliquely fill a part of these cross-sections only. Smoothing alone takes as
+    much within a known distance of where labels end. Where they go on, nothing is left out.
     """
-    depth = sign * (profile.levels - end)
-    area = profile.area["sheet"]
     inner = (depth > settings.end_reach) & (depth < 2 * settings.end_reach)
     if not inner.any():
         return 0.0
     fine = np.arange(0.5, settings.end_reach / _STEP) * _STEP
-    share = np.interp(fine, np.sort(depth), area[np.argsort(depth)]) / area[inner].mean()
+    share = np.interp(fine, depth, area) / max(float(area[inner].mean()), 1e-6)
     length = _below(share, settings.end_fullness)
     blurred = _below(ndtr(fine / settings.end_smoothing), settings.end_fullness)
-    labels_end = np.interp(-_BESIDE, np.sort(depth), lost[np.argsort(depth)])
+    labels_end = np.interp(-_BESIDE, depth, lost)
     return float(labels_end * max(length - blurred, 0.0))
 
 
@@ -259,7 +262,7 @@ def _main_evidence(levels: Float, end: float, sign: float, lost: Cues, odd: Cues
     depth = sign * (levels - end)
     beyond = (depth < 0) & (depth > -_BESIDE)
     strength = {name: float(share[beyond].mean()) for name, share in lost.items()}
-    fields = max(strength["sheet"], strength["CA1"], strength["CA2-3"])
+    fields = max(strength[name] for name in _NEEDED)
     shape = float(np.mean([share[beyond].mean() for share in odd.values()]))
     names = {"subfields": fields, "core": strength.get("core", 0.0), "cross-section": shape}
     return max(names, key=lambda name: names[name])

@@ -22,6 +22,9 @@ from hipsta_bids.types import Bool, End, Float, GivenEnd, LabelVolume, position_
 _FAR = 10.0
 """A point of a plane may lie beside the hippocampus, but not farther than this, mm."""
 
+_BESIDE = 2.0
+"""What lies within this distance of a plane is its cross-section, mm."""
+
 
 class _Plane(NamedTuple):
     """One end plane, and the rule by which it was found."""
@@ -112,19 +115,23 @@ def find_end_planes(
                 else _plane_along_slices(points[below], points[above], across, settings)
             )
             planes[end] = _Plane(point, normal, "labels")
-    # Where one end is known, the other is cut parallel to it.
-    across = next((plane.normal for plane in planes.values()), axis)
     for given in volume.given_ends:
         _check_inside(given, points)
-        without = planes[given.end].normal if given.end in planes else across
+        without = planes[given.end].normal if given.end in planes else axis
         planes[given.end] = _given_plane(given, without, axis)
     if len(planes) < 2:  # noqa: PLR2004 -- two ends
-        across = next((plane.normal for plane in planes.values()), axis)
-        known = {end: float(plane.point @ across) for end, plane in planes.items()}
+        across = _body_axis(points[~is_head & ~is_tail], axis)
+        known = {end: _level(plane, points, across) for end, plane in planes.items()}
         for end, found in find_ends(volume, sheet, across, known, settings).items():
             plane = _Plane(found.level * across, across, found.rule, found.uncertainty)
             planes.setdefault(end, plane)
     return _checked(planes, axis, half_slice)
+
+
+def _level(plane: _Plane, points: Float, axis: Float) -> float:
+    """Where a plane lies along the axis in the middle of the hippocampus, at points (N, 3), mm."""
+    near = points[np.abs((points - plane.point) @ plane.normal) < _BESIDE]
+    return float((near.mean(axis=0) if len(near) else plane.point) @ axis)
 
 
 def _check_inside(given: GivenEnd, points: Float) -> None:
@@ -231,6 +238,17 @@ def _long_axis(points: Float, parts: NDArray[np.uint8]) -> Float:
     if abs(along) < 0.8:  # noqa: PLR2004 -- 37 degrees
         return np.asarray(direction)
     return np.asarray(vectors[:, -1] if along > 0 else -vectors[:, -1])
+
+
+def _body_axis(points: Float, axis: Float) -> Float:
+    """First principal axis (3,) of the body, at points (N, 3), directed as the long axis.
+
+    The long axis instead, if they lie in quite different directions: a body cut short is wide.
+    """
+    centered = points - points.mean(axis=0)
+    own: Float = np.linalg.eigh(centered.T @ centered)[1][:, -1]
+    along = float(own @ axis)
+    return axis if abs(along) < 0.8 else own * np.sign(along)  # noqa: PLR2004 -- 37 degrees
 
 
 def _separating_plane(below: Float, above: Float, axis: Float, reach: float) -> tuple[Float, Float]:

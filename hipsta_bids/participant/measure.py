@@ -117,8 +117,7 @@ def find_flags(evidence: Evidence) -> list[Flag]:
         (
             uncertainty > checks.flag_end,
             "ends-uncertain",
-            f"without labels of head and tail, the {end} end is certain to {uncertainty:.1f} mm "
-            "only: look at the plane, and place it with --ends if it is wrong",
+            f"the {end} end, which has no label, is certain to {uncertainty:.1f} mm only: check it",
         )
         for end, uncertainty in (
             ("posterior", ends.posterior_uncertainty),
