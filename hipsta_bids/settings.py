@@ -411,6 +411,9 @@ class CheckSettings(SettingsTable):
     flag_end: NonNegativeFloat = 2.5
     """Flag an end that was found without a label if its standard error is more than this, mm (2.1
     at most in twelve real hemispheres, as they are and resliced)."""
+    usual_length_difference: NonNegativeFloat = 4.0
+    """The report marks bodies of both sides whose lengths differ by more than this, mm (2.8 at most
+    in the labels of three real brains)."""
     end_label_depth: NonNegativeFloat = 2.0
     """Head or tail labels farther inside the body than this are out of place, mm."""
     end_label_share: NonNegativeFloat = 0.005

@@ -201,6 +201,24 @@ def usual_ranges(thickness: float, settings: Mapping[str, Any]) -> tuple[Usual, 
             unit="mm",
         ),
         Usual(
+            name="length_difference_mm",
+            title="Difference of lengths",
+            meaning="length of the body minus that of the other side; look at ends without labels",
+            low=-checks["usual_length_difference"],
+            high=checks["usual_length_difference"],
+            unit="mm",
+        ),
+        *(
+            Usual(
+                name=f"{end}_end_uncertainty_mm",
+                title=f"Uncertainty of the {end} end",
+                meaning="standard error over the cues by which it was found, 0 with labels",
+                high=checks["flag_end"],
+                unit="mm",
+            )
+            for end in ("posterior", "anterior")
+        ),
+        Usual(
             name="changed_fraction",
             title="Changed by repairs",
             meaning="share of the body that repairs of its topology added or removed",

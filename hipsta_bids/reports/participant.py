@@ -249,8 +249,12 @@ def _quality_numbers(series: Series) -> Mapping[str, Any] | None:
         return None
     thickness = float(np.nanmean([h.summary.get("thickness_mean", np.nan) for h in measured]))
     rows = []
+    lengths = np.array([number(h.metrics, "body_length_mm") for h in measured])
+    others = lengths[::-1] if len(lengths) > 1 else np.full(1, np.nan)
     for usual in usual_ranges(thickness, series.cohort.settings):
         values = [number(h.metrics, usual.name) for h in measured]
+        if usual.name == "length_difference_mm":
+            values = (lengths - others).tolist()
         if np.isnan(values).all():
             continue
         rows.append(

@@ -2,10 +2,13 @@
 
 import base64
 import io
+from types import SimpleNamespace
 
 import numpy as np
+import pytest
 from PIL import Image
 
+from hipsta_bids.reports.participant import _quality_numbers
 from hipsta_bids.reports.slices import cut, outline, path_data, png_address
 
 
@@ -48,3 +51,26 @@ def test_pictures_come_back_as_they_were():
     encoded = png_address(pixels).removeprefix("data:image/png;base64,")
     read = np.asarray(Image.open(io.BytesIO(base64.b64decode(encoded))))
     np.testing.assert_array_equal(read, pixels)
+
+
+@pytest.mark.parametrize(("lengths", "marked"), [((16.0, 18.0), False), ((12.0, 18.0), True)])
+def test_bodies_of_both_sides_of_quite_different_length_are_marked(lengths, marked):
+    measured = [
+        SimpleNamespace(
+            side=side,
+            summary={"thickness_mean": 2.0},
+            metrics={"body_length_mm": length, "anterior_end_uncertainty_mm": 1.0},
+        )
+        for side, length in zip(("left", "right"), lengths, strict=True)
+    ]
+
+    def row(*sides):
+        series = SimpleNamespace(measured=list(sides), cohort=SimpleNamespace(settings={}))
+        rows = _quality_numbers(series)["rows"]
+        return {row["title"]: row for row in rows}.get("Difference of lengths")
+
+    both = row(*measured)
+    difference = lengths[0] - lengths[1]
+    assert [cell["text"] for cell in both["cells"]] == [f"{difference:g} mm", f"{-difference:g} mm"]
+    assert [cell["unusual"] for cell in both["cells"]] == [marked, marked]
+    assert row(measured[0]) is None  # there is nothing to compare
