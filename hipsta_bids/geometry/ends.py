@@ -22,6 +22,8 @@ from hipsta_bids.types import Bool, End, Float, GivenEnd, LabelVolume, position_
 _FAR = 10.0
 """A point of a plane may lie beside the hippocampus, but not farther than this, mm."""
 
+_ELONGATED = 1.75
+"""A body whose extents (standard deviations) differ by this ratio has an axis of its own."""
 _BESIDE = 2.0
 """What lies within this distance of a plane is its cross-section, mm."""
 
@@ -120,7 +122,7 @@ def find_end_planes(
         without = planes[given.end].normal if given.end in planes else axis
         planes[given.end] = _given_plane(given, without, axis)
     if len(planes) < 2:  # noqa: PLR2004 -- two ends
-        across = _body_axis(points[~is_head & ~is_tail], axis)
+        across = _body_axis(points[~is_head & ~is_tail], axis, planes)
         known = {end: _level(plane, points, across) for end, plane in planes.items()}
         for end, found in find_ends(volume, sheet, across, known, settings).items():
             plane = _Plane(found.level * across, across, found.rule, found.uncertainty)
@@ -240,15 +242,17 @@ def _long_axis(points: Float, parts: NDArray[np.uint8]) -> Float:
     return np.asarray(vectors[:, -1] if along > 0 else -vectors[:, -1])
 
 
-def _body_axis(points: Float, axis: Float) -> Float:
+def _body_axis(points: Float, axis: Float, planes: dict[End, _Plane]) -> Float:
     """First principal axis (3,) of the body, at points (N, 3), directed as the long axis.
 
-    The long axis instead, if they lie in quite different directions: a body cut short is wide.
+    Where it is short and wide, that says little: then the other end's normal, or the long axis.
     """
     centered = points - points.mean(axis=0)
-    own: Float = np.linalg.eigh(centered.T @ centered)[1][:, -1]
-    along = float(own @ axis)
-    return axis if abs(along) < 0.8 else own * np.sign(along)  # noqa: PLR2004 -- 37 degrees
+    spread, vectors = np.linalg.eigh(centered.T @ centered)
+    own: Float = vectors[:, -1] * np.sign(vectors[:, -1] @ axis)
+    if spread[-1] > _ELONGATED**2 * spread[-2] and own @ axis > 0.8:  # noqa: PLR2004 -- 37 degrees
+        return own
+    return next((plane.normal for plane in planes.values()), axis)
 
 
 def _separating_plane(below: Float, above: Float, axis: Float, reach: float) -> tuple[Float, Float]:

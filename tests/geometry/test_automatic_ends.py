@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from geometry_cases import rigid, rotation, short_phantom
+from geometry_cases import degrees_between, rigid, rotation, short_phantom
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import extract_body
 from hipsta_bids.geometry.ends import find_end_planes
 from hipsta_bids.protocols.load import load_protocol
-from hipsta_bids.protocols.protocol import Tissue
+from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import BodySettings
 from hipsta_bids.types import GivenEnd, LabelVolume
 
@@ -120,6 +120,20 @@ def test_phantom_ends_are_found_in_thick_slices(shift):
     for end, v in (("posterior", 0.0), ("anterior", 1.0)):
         plane = phantom.body.place(u, v, 0.0) + pose[:3, 3]
         assert abs(ends.height(plane, end).mean()) < 0.5
+
+
+def test_an_oblique_plane_of_the_tail_leaves_the_head_alone():
+    """Tail labels that end at 31 degrees."""
+    volume = drawn()
+    index = np.moveaxis(np.indices(volume.tissue.shape), 0, -1)
+    x, y, _ = np.moveaxis(index @ volume.affine[:3, :3].T + volume.affine[:3, 3], -1, 0)
+    part = np.where((volume.tissue > 0) & (y < TAIL + 0.6 * x), Part.TAIL, Part.UNKNOWN)
+    ends = ends_of(replace(volume, part=part))
+    assert (ends.posterior_rule, ends.anterior_rule) == ("labels", "cross-section")
+    assert degrees_between(ends.posterior_normal, [-0.6, 1.0, 0.0]) < 3.0
+    # The body's own axis leans a little towards the uncus.
+    assert degrees_between(ends.anterior_normal, [0.0, 1.0, 0.0]) < 12.0
+    assert abs(ends.height(np.array([[0.0, UNCUS, 0.5]]), "anterior")[0]) < 0.8
 
 
 def test_an_end_is_less_certain_where_the_cues_differ():
