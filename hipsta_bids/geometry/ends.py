@@ -22,7 +22,7 @@ from hipsta_bids.types import Bool, End, Float, GivenEnd, LabelVolume, position_
 _FAR = 10.0
 """A point of a plane may lie beside the hippocampus, but not farther than this, mm."""
 
-_ELONGATED = 1.75
+_ELONGATED = 1.6
 """A body whose extents (standard deviations) differ by this ratio has an axis of its own."""
 _BESIDE = 2.0
 """What lies within this distance of a plane is its cross-section, mm."""
