@@ -65,30 +65,25 @@ class BodySettings(SettingsTable):
     end_margin: NonNegativeFloat = 0.0
     """Taken off either end where head or tail labels are missing, mm."""
     end_smoothing: PositiveFloat = 1.0
-    """Without head or tail labels, ends are found from profiles of cross-sections along the axis,
-    smoothed by a Gaussian of this standard deviation, mm."""
+    """Without end labels: profiles of cross-sections are smoothed by this standard deviation, mm."""
     end_usual: OpenFraction = 0.3
-    """What is usual in the body is this quantile over the cross-sections with CA1 and CA2 or CA3; a
-    part of these belongs to the head and the tail, where most of it is larger."""
+    """What is usual in the body: this quantile over cross-sections with CA1 and CA2 or CA3."""
     end_weight: PositiveFloat = 3.0
     """How much a millimeter of certain evidence multiplies odds, natural logarithm (times 0.5)."""
     lost_share: PositiveFraction = 0.5
-    """Even odds of the end of the body where the sheet, CA1, or CA2 and CA3 have less than this
-    share of their usual area."""
+    """Even odds of an end: the sheet, CA1, or CA2 and CA3 have this share of their usual area."""
     core_share: PositiveFraction = 0.5
     """The same of dentate gyrus and CA4, since the sheet closes over them in the tail."""
     lost_width: PositiveFloat = 0.5
     """The evidence rises from none to certain over this range of such shares."""
     uncus_spread: Annotated[float, Field(gt=1)] = 2.5
-    """Even odds where CA2 and CA3 spread over a cross-section this many times as far as usual (root
-    mean square distance): the uncus is a second part of them."""
+    """Even odds: CA2 and CA3 spread this many times as far as usual, since the uncus has some."""
     core_spread: Annotated[float, Field(gt=1)] = 1.6
     """The same of dentate gyrus and CA4."""
     core_growth: Annotated[float, Field(gt=1)] = 1.6
-    """Even odds where these have more than this multiple of their usual area."""
+    """Even odds: these have this multiple of their usual area."""
     head_growth: Annotated[float, Field(gt=1)] = 1.5
-    """Even odds where the sheet has more than this multiple of its usual area. The four cues are
-    averaged."""
+    """Even odds: the sheet has this multiple of its usual area."""
     gap_directions: NonNegativeInt = 3
     """A voxel without a label lies in a thin gap if it has the sheet on both sides in this
     many of 13 directions."""
