@@ -37,8 +37,7 @@ class BodySettings(SettingsTable):
     (with the neighboring cortex) or ``entorhinal`` (that cortex alone); the command line's
     ``--region`` goes first."""
     min_cortex_reach: PositiveFraction = 0.9
-    """Refuse regions with cortex if its labels fill less than this share of the distance between
-    the end planes: the sheet would not go from end to end."""
+    """Refuse cortex with labels along less than this share of the body."""
     layer_rule: Literal["nearest-sheet", "nearest-label"] = "nearest-sheet"
     """Who gets the molecular layer: ``nearest-sheet`` (the nearest sheet subfield; Diers et al.
     2023) or ``nearest-label`` (the nearest label; voxels nearest to DG or CA4 are left out)."""
@@ -65,7 +64,7 @@ class BodySettings(SettingsTable):
     end_margin: NonNegativeFloat = 0.0
     """Taken off either end where head or tail labels are missing, mm."""
     end_smoothing: PositiveFloat = 1.0
-    """Without end labels: profiles of cross-sections are smoothed by this standard deviation, mm."""
+    """Without end labels: standard deviation by which profiles along the axis are smoothed, mm."""
     end_usual: OpenFraction = 0.3
     """What is usual in the body: this quantile over cross-sections with CA1 and CA2 or CA3."""
     end_weight: PositiveFloat = 3.0
@@ -78,23 +77,19 @@ class BodySettings(SettingsTable):
     """The evidence rises from none to certain over this range of such shares."""
     uncus_spread: Annotated[float, Field(gt=1)] = 2.5
     """Even odds: CA2 and CA3 spread this many times as far as usual, since the uncus has some."""
-    core_spread: Annotated[float, Field(gt=1)] = 1.6
-    """The same of dentate gyrus and CA4."""
     core_growth: Annotated[float, Field(gt=1)] = 1.6
-    """Even odds: these have this multiple of their usual area."""
+    """The same of dentate gyrus and CA4; and even odds at this multiple of their usual area."""
     head_growth: Annotated[float, Field(gt=1)] = 1.5
     """Even odds: the sheet has this multiple of its usual area."""
     gap_directions: NonNegativeInt = 3
-    """A voxel without a label lies in a thin gap if it has the sheet on both sides in this
-    many of 13 directions."""
+    """Unlabeled voxels with sheet on both sides in this many of 13 directions are a gap."""
     slit_area: NonNegativeFloat = 2.5
     """Gaps larger than this are filled if they go through the sheet, mm2."""
     slit_openings: Fraction = 0.2
     """A gap goes through the sheet if what is beside it falls into two parts, each of at least this
     share (in six real bodies: none, and gaps with one opening are up to 4.0 mm2)."""
     slit_voxel: NonNegativeFloat = 0.8
-    """Gaps are filled if no edge of a voxel is longer than this, mm: between thick slices folds
-    look like gaps."""
+    """Gaps are filled if no voxel edge is longer, mm: folds between thick slices look alike."""
     uncus_size: NonNegativeFloat = 1.0
     """Smaller pieces of CA2 or CA3 are no uncus, mm3."""
     uncus_offset: PositiveFloat = 5.0
@@ -106,11 +101,9 @@ class BodySettings(SettingsTable):
     cavity_radius: NonNegativeFloat = 0.9
     """A cavity with room for a ball of this radius is too wide to be the molecular layer, mm."""
     end_fullness: OpenFraction = 0.9
-    """Without end labels, where labels end obliquely: cross-sections at an end are left out if they
-    have less than this share of the area of those behind them."""
+    """Cross-sections where labels end obliquely go below this share of those behind them."""
     end_reach: NonNegativeFloat = 3.0
-    """Distance behind an end within which cross-sections are compared, mm; at most this length is
-    left out."""
+    """Length behind an end that is compared, and of which all may be left out, mm."""
     max_mask_ratio: PositiveFloat = 1.5
     """Flag an edited mask whose voxels are more than this many times those of the labels."""
     max_mask_change: NonNegativeFloat = 0.5
@@ -404,11 +397,10 @@ class CheckSettings(SettingsTable):
     slice_ratio: NonNegativeFloat = 1.5
     """Voxels are long if their longest edge is more than this many times the shortest."""
     flag_end: NonNegativeFloat = 2.5
-    """Flag an end that was found without a label if its standard error is more than this, mm (2.1
-    at most in twelve real hemispheres, as they are and resliced)."""
+    """Flag an end without a label if its standard error is larger, mm (2.1 at most in twelve real
+    hemispheres, as they are and resliced)."""
     usual_length_difference: NonNegativeFloat = 4.0
-    """The report marks bodies of both sides whose lengths differ by more than this, mm (2.8 at most
-    in the labels of three real brains)."""
+    """The report marks sides whose lengths differ by more, mm (2.8 at most in real labels)."""
     end_label_depth: NonNegativeFloat = 2.0
     """Head or tail labels farther inside the body than this are out of place, mm."""
     end_label_share: NonNegativeFloat = 0.005

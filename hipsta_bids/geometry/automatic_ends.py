@@ -189,7 +189,7 @@ def _evidence(profile: _Profile, typical: Bool, settings: BodySettings) -> tuple
         "area of the sheet": (area["sheet"], settings.head_growth),
     }
     if has_core:
-        ratios["spread of the core"] = (spread["core"], settings.core_spread)
+        ratios["spread of the core"] = (spread["core"], settings.core_growth)
         ratios["area of the core"] = (area["core"], settings.core_growth)
     odd = {
         name: np.clip(0.5 * np.log(np.maximum(x / usual(x), 1.0)) / np.log(ratio), 0, 1)
