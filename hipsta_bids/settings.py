@@ -397,8 +397,7 @@ class CheckSettings(SettingsTable):
     slice_ratio: NonNegativeFloat = 1.5
     """Voxels are long if their longest edge is more than this many times the shortest."""
     flag_end: NonNegativeFloat = 2.5
-    """Flag an end without a label if its standard error is larger, mm (2.1 at most in twelve real
-    hemispheres, as they are and resliced)."""
+    """Flag an end without a label if its standard error is larger, mm (2.1 at most in 12 real)."""
     usual_length_difference: NonNegativeFloat = 4.0
     """The report marks sides whose lengths differ by more, mm (2.8 at most in real labels)."""
     end_label_depth: NonNegativeFloat = 2.0
