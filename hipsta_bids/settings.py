@@ -82,7 +82,9 @@ class BodySettings(SettingsTable):
     head_growth: Annotated[float, Field(gt=1)] = 1.5
     """Even odds: the sheet has this multiple of its usual area."""
     gap_directions: NonNegativeInt = 3
-    """Unlabeled voxels with sheet on both sides in this many of 13 directions are a gap."""
+    """A voxel without a label lies in a thin gap if it has the sheet on both sides in this
+    many of 13 directions; where an edge of the voxels is longer than ``slit_voxel``, in the same
+    share of those across that edge."""
     slit_area: NonNegativeFloat = 2.5
     """Gaps larger than this are filled if they go through the sheet, mm2."""
     slit_openings: Fraction = 0.2
@@ -163,8 +165,14 @@ class SliceSettings(SettingsTable):
     """Nodes along the ribbon of a slice."""
     rim_half: PositiveFloat = 0.5
     """Half length of the edges of the ribbon along its outline, multiples of 2 area / length."""
+    least_half: NonNegativeFloat = 0.3
+    """Half the least thickness of the ribbon in a slice, mm: the working grid's smoothing leaves
+    three fourths of the height of a strip of 0.6 mm, but only half of one of 0.4 mm."""
     match_stretch: NonNegativeFloat = 0.5
     """Mid-lines of slices are matched by squared distance, mm2, and this times squared stretch."""
+    path_smoothing: Fraction = 1.0
+    """Paths of the ribbon's nodes through the slices: from 0 (through their places in the slices)
+    to 1 (cubic B-splines with these as control points: half the variance of noise is left)."""
     flow_window: PositiveFloat = 1.0
     """Standard deviation of the window of the registration of slices, mm."""
     flow_ridge: NonNegativeFloat = 0.02

@@ -250,15 +250,17 @@ def fill_slits(
     # Between the end planes: next to voxels that lie there.
     beside = ndimage.binary_dilation(np.pad(inside[around], 1), structure=ALL)
     empty = np.pad(unlabeled[around], 1)
-    enclosed = _enclosed(sheet, settings.gap_directions)
+    edges = np.linalg.norm(affine[:3, :3], axis=0)
+    coarse = edges > settings.slit_voxel
+    enclosed = _enclosed(sheet, settings.gap_directions, coarse)
     pieces, _ = ndimage.label(empty & beside & enclosed, structure=ALL)
     sizes = piece_sizes(pieces)
-    edges = np.sort(np.linalg.norm(affine[:3, :3], axis=0))
-    least = settings.slit_area / float(edges[0] * edges[1])
+    small = np.sort(edges)[:2]
+    least = settings.slit_area / float(small[0] * small[1])
     through = [
         number
         for number in np.flatnonzero(sizes > least)
-        if edges[2] <= settings.slit_voxel
+        if not coarse.any()
         and _opens_on_both_sides(pieces == number, sheet, settings.slit_openings)
     ]
     filled = np.argwhere(np.isin(pieces, through)) + low_corner(around) - 1
@@ -267,13 +269,20 @@ def fill_slits(
     return Slits(_with_nearest(tissue, filled, around), filled, gap)
 
 
-def _enclosed(sheet: Bool, directions: int) -> Bool:
-    """Voxels that have the sheet on both sides in at least ``directions`` of 13."""
+def _enclosed(sheet: Bool, directions: int, coarse: Bool) -> Bool:
+    """Voxels that have the sheet on both sides in at least ``directions`` of 13.
+
+    Steps along a ``coarse`` axis (3,) do not count, and the same share of the others is asked for:
+    from one thick slice to the next, a sheet that moves sideways lies on both sides of what is
+    beside it.
+    """
+    steps = [step for step in _DIRECTIONS if not np.any(coarse & (np.array(step) != 0))]
+    least = max(round(directions * len(steps) / len(_DIRECTIONS)), 1)
     opposite = np.zeros(sheet.shape, dtype=np.int8)
-    for step in _DIRECTIONS:
+    for step in steps:
         back = tuple(-s for s in step)
         opposite += np.roll(sheet, step, (0, 1, 2)) & np.roll(sheet, back, (0, 1, 2))
-    return np.asarray(~sheet & (opposite >= directions))
+    return np.asarray(~sheet & (opposite >= least))
 
 
 def _opens_on_both_sides(piece: Bool, sheet: Bool, least: float) -> bool:

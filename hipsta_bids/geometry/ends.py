@@ -306,10 +306,12 @@ def _plane_along_slices(
     point, slopes = level * normal, np.zeros(2)
     prior = np.full(3, settings.plane_prior / np.tan(np.radians(settings.plane_tilt)) ** 2)
     prior[0] = 0.0
+    reach = settings.plane_slices * step
     # From a wide function to the narrow one: Newton's method needs a start near its end.
     for width in (1.0, 0.3, settings.plane_width):
         near = [
-            part[np.abs((part - point) @ (normal - slopes @ flat)) < settings.plane_slices * step]
+            # Whole slices often lie at just this distance: rounding must not decide about them.
+            part[np.abs((part - point) @ (normal - slopes @ flat)) < reach + 1e-3]
             for part in (below, above)
         ]
         count = [len(part) for part in near]

@@ -28,6 +28,8 @@ _PER_NODE = 4
 """Places on a mid-line per node of the other, in matching."""
 _MAX_STRETCH = 4
 """Of a mid-line against another."""
+_TIP = 2
+"""Outer nodes along the ribbon that may lie in its rounded ends."""
 _NEIGHBORS = 6
 """Nearest nodes that a pixel moves with."""
 
@@ -220,6 +222,26 @@ def moves_between(first: Float, second: Float, where: Float) -> Float:
     weight = 1 / (np.asarray(gap) ** 2 + 0.25)  # within half a pixel all nodes count about the same
     weight /= np.sum(weight, axis=1, keepdims=True)
     return np.asarray(np.einsum("nk,nkd->nd", weight, (second - first)[nearest]))
+
+
+def keep_whole(outline: Float, nodes: Float, pixel: float, settings: SliceSettings) -> None:
+    """Thicken, in place, where a slice's ribbon is so thin that later smoothing would break it.
+
+    ``outline`` (I, J) is the signed distance, mm, ``nodes`` (X, Z, 2) are in pixels.
+    """
+    middle = _middle(nodes)[_TIP:-_TIP]
+    reach = settings.least_half / pixel
+    low = np.maximum(np.floor(middle.min(axis=0) - reach).astype(int), 0)
+    high = np.ceil(middle.max(axis=0) + reach).astype(int) + 1
+    part = outline[low[0] : high[0], low[1] : high[1]]
+    index = np.argwhere(part < settings.least_half)
+    along = _along(middle)
+    at = np.linspace(0, along[-1], max(round(2 * along[-1]), 2))
+    line = np.stack([np.interp(at, along, middle[:, k]) for k in (0, 1)], axis=1)
+    gap = np.asarray(cKDTree(line).query(index + low, distance_upper_bound=reach)[0])
+    near = np.isfinite(gap)
+    chosen = tuple(index[near].T)
+    part[chosen] = np.maximum(part[chosen], settings.least_half - pixel * gap[near])
 
 
 def part_turns(outline: Float, nodes: Float, pixel: float, settings: SliceSettings) -> None:

@@ -8,7 +8,7 @@ labels hide how the sheet continues, its shapes are extrapolated from inside. Tu
 that touch are kept apart.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -19,7 +19,13 @@ from scipy.special import ndtri
 
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.digital import Box, box, low_corner, piece_sizes, to_ras, voxel_points
-from hipsta_bids.geometry.ribbon import align_nodes, moves_between, part_turns, ribbon_nodes
+from hipsta_bids.geometry.ribbon import (
+    align_nodes,
+    keep_whole,
+    moves_between,
+    part_turns,
+    ribbon_nodes,
+)
 from hipsta_bids.protocols.protocol import Tissue, lateral_rank
 from hipsta_bids.settings import SliceSettings
 from hipsta_bids.types import Bool, Float
@@ -257,6 +263,9 @@ class _SliceStack:
     flows: Stack
     """(2, N - 1, I', J') fine pixels from each slice to the next, halfway between them, at the
     pixels of the segmentation."""
+    bends: Stack
+    """(2, N, I', J') second differences of the places at which what moves through the slices meets
+    the slice before, this one and the next, fine pixels; at the pixels of the segmentation."""
     settings: SliceSettings
     """Settings of the interpolation."""
 
@@ -270,6 +279,7 @@ class _SliceStack:
         below = np.clip(np.floor(level), 0, last - 1)
         share = level - below
         coarse = self.flows.shape[2] / self.outlines.shape[1]
+        where = where - self._departure(below, share, (where + 0.5) * coarse - 0.5)
         step = np.zeros_like(where)
         # The flow is known halfway between the slices: find the point there that moves to here.
         for _ in range(3):
@@ -283,6 +293,22 @@ class _SliceStack:
         )
         slit = _slit(medial, lateral, self.settings)
         return np.asarray(np.minimum(distance, slit), dtype=np.float32)
+
+    def _departure(self, below: Stack, share: Stack, middle: Stack) -> Stack:
+        """Departure of the paths through the slices from straight ones, fine pixels, (2, N).
+
+        In the setting's proportion of cubic B-splines, whose control points are the places in the
+        slices, and of cubic Hermite splines through these with central differences as slopes
+        (Catmull & Rom 1974, Computer Aided Geometric Design:317-326), both written in second
+        differences.
+        """
+        s = self.settings.path_smoothing
+        departure = np.zeros_like(middle)
+        share = np.clip(share, 0, 1)  # beyond the last slice
+        for level, near in ((below, 1 - share), (below + 1, share)):
+            weight = s * near**3 / 6 - (1 - s) * 0.5 * near**2 * (1 - near)
+            departure += weight * np.stack([_interpolated(b, level, *middle) for b in self.bends])
+        return departure
 
 
 def _slit(medial: Stack, lateral: Stack, settings: SliceSettings) -> Stack:
@@ -308,12 +334,15 @@ def has_thick_slices(affine: Float, settings: SliceSettings) -> bool:
 
 def sample_slices(body: Body, points: Float, settings: SliceSettings) -> Stack:
     """Sample the body's mask between and beyond its thick slices, at points (N, 3), RAS mm."""
+    body = _in_own_order(body)
     edges = np.linalg.norm(body.affine[:3, :3], axis=0)
     through = int(np.argmax(edges))
     pixel = float(np.delete(edges, through).mean())
     labeled = _labeled_ends(body, through)
-    part = _bounds(np.moveaxis(body.inside, through, 0), settings.reach / pixel, labeled)
-    tissue = np.moveaxis(body.tissue, through, 0)[part].copy()
+    sheet = np.moveaxis(body.tissue, through, 0)
+    inside = np.moveaxis(body.inside, through, 0)
+    part = _bounds(inside, sheet, settings.reach / pixel, labeled)
+    tissue = sheet[part].copy()
     for step, depth, known in zip((1, -1), _depths(body, through, part), labeled, strict=True):
         if not known:
             _extrapolate(tissue[::step], (depth < settings.hidden_depth)[::step], pixel, settings)
@@ -322,6 +351,35 @@ def sample_slices(body: Body, points: Float, settings: SliceSettings) -> Stack:
     where = ((voxels[:, 1:] + 0.5) * settings.upsampling - 0.5).astype(np.float32).T
     distance = stack.blend(voxels[:, 0].astype(np.float32), where)
     return np.asarray(np.clip(distance / (2 * settings.edge) + 0.5, 0, 1), dtype=np.float32)
+
+
+def _in_own_order(body: Body) -> Body:
+    """Count the body's voxels from posterior to anterior and from medial to lateral.
+
+    So the order in which an image stores its voxels decides nothing. What refers to voxels by their
+    indices is left as it was.
+    """
+    index, _ = body.inside_points()
+    edges = np.linalg.norm(body.affine[:3, :3], axis=0)
+    through = int(np.argmax(edges))
+    towards = (body.lateral - body.lateral.mean()) @ (index - index.mean(axis=0)) * edges
+    towards[through] = body.ends.axis @ body.affine[:3, through]
+    first, second = sorted((n for n in range(3) if n != through), key=lambda n: -abs(towards[n]))
+    order, steps = (through, first, second), np.where(towards < 0, -1, 1)
+    flips = tuple(slice(None, None, steps[n]) for n in order)
+    affine = body.affine.copy()
+    affine[:3, 3] += affine[:3, :3] @ np.where(steps < 0, np.array(body.tissue.shape) - 1, 0)
+    affine[:3, :3] = (affine[:3, :3] * steps)[:, order]
+    tissue, hippocampal = (v.transpose(order)[flips] for v in (body.tissue, body.hippocampal))
+    interior, inside = (v.transpose(order)[flips] for v in (body.interior, body.inside))
+    return replace(
+        body,
+        tissue=tissue,
+        hippocampal=hippocampal,
+        interior=interior,
+        inside=inside,
+        affine=affine,
+    )
 
 
 def _stacked(tissue: NDArray[np.uint8], pixel: float, settings: SliceSettings) -> _SliceStack:
@@ -344,10 +402,12 @@ def _stacked(tissue: NDArray[np.uint8], pixel: float, settings: SliceSettings) -
     ]
     for outline, nodes in zip(outlines, ribbons, strict=True):
         if nodes is not None:
+            keep_whole(outline, nodes, fine, settings)
             part_turns(outline, nodes, fine, settings)
     flows = register_slices(outlines, pixel, settings)
-    _align(flows, align_nodes(ribbons, fine, settings), settings)
-    return _SliceStack(outlines=outlines, ends=ends, flows=flows, settings=settings)
+    bends = np.zeros((2, len(outlines), *flows.shape[2:]), dtype=np.float32)
+    _align(flows, bends, align_nodes(ribbons, fine, settings), settings)
+    return _SliceStack(outlines=outlines, ends=ends, flows=flows, bends=bends, settings=settings)
 
 
 def _drop_doubles(outline: Stack, rank: Float, settings: SliceSettings) -> None:
@@ -372,7 +432,9 @@ def _ranks(tissue: NDArray[np.uint8], upsampling: int) -> Float:
     return np.where(labels > 0, lateral_rank(labels), np.nan)
 
 
-def _align(flows: Stack, ribbons: list[Float | None], settings: SliceSettings) -> None:
+def _align(
+    flows: Stack, bends: Stack, ribbons: list[Float | None], settings: SliceSettings
+) -> None:
     """Replace, in place, displacements between slices with nodes by those of the nodes."""
     up = settings.upsampling
     pixels = np.indices(flows.shape[2:]).reshape(2, -1).T.astype(np.float64)
@@ -381,6 +443,12 @@ def _align(flows: Stack, ribbons: list[Float | None], settings: SliceSettings) -
         if first is not None and second is not None:
             moves = moves_between(first, second, where)
             flows[:, number] = moves.T.reshape(flows[:, number].shape)
+    for number in range(1, len(ribbons) - 1):
+        before, here, after = ribbons[number - 1 : number + 2]
+        if before is not None and here is not None and after is not None:
+            half = 0.5 * (before - 2 * here + after)
+            bend = moves_between(here - half, here + half, where)
+            bends[:, number] = bend.T.reshape(bends[:, number].shape)
 
 
 def _labeled_ends(body: Body, through: int) -> tuple[bool, bool]:
@@ -405,13 +473,16 @@ def _order(through: int) -> list[int]:
     return [through, *(axis for axis in range(3) if axis != through)]
 
 
-def _bounds(inside: Bool, margin: float, labeled: tuple[bool, bool]) -> Box:
-    """Box round the body: a margin within the slices, and one slice more where labels go on."""
-    index = np.argwhere(inside)
+def _bounds(
+    inside: Bool, sheet: NDArray[np.uint8], margin: float, labeled: tuple[bool, bool]
+) -> Box:
+    """Box round the sheet in the body's slices, and in one slice more where labels go on."""
+    levels = np.flatnonzero(inside.any(axis=(1, 2)))
+    first = max(int(levels[0]) - labeled[0], 0)
+    last = min(int(levels[-1]) + labeled[1], len(inside) - 1)
+    index = np.argwhere(sheet[first : last + 1]) + np.array([first, 0, 0])
     room = np.ceil([0, margin, margin]).astype(int)
     low, high = index.min(axis=0) - room, index.max(axis=0) + 1 + room
-    low[0] -= labeled[0]
-    high[0] += labeled[1]
     return box(np.maximum(low, 0), np.minimum(high, inside.shape))
 
 

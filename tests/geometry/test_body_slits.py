@@ -85,6 +85,20 @@ def test_between_thick_slices_nothing_is_filled():
     assert len(found.gap) == 12 * 5
 
 
+def test_a_sheet_that_moves_from_thick_slice_to_thick_slice_has_no_gap():
+    """What lies beside it has the sheet on both sides in the slices before and behind only."""
+    tissue = np.zeros(SHAPE, dtype=np.uint8)
+    for number in range(2, 38):
+        first = 4 if number % 2 else 8
+        tissue[2:28, first : first + 4, number] = Tissue.CA1
+    fine, thick = (
+        fill_slits(tissue, tissue > 0, tissue == 0, np.diag([VOXEL, VOXEL, step, 1.0]), BODY)
+        for step in (VOXEL, 2.0)
+    )
+    assert len(fine.gap) + len(fine.filled) > 1000
+    assert len(thick.gap) == len(thick.filled) == 0
+
+
 def test_slits_with_another_label_are_none():
     """Such as the fissure: it says that nothing of the sheet is missing there."""
     tissue = with_slit()

@@ -399,3 +399,22 @@ def test_cross_sections_that_have_a_part_of_the_labels_only_are_left_out(slope):
     corners[:, 1] += 0.5 * 44
     assert ends.height(corners, "anterior").min() > -most
     assert ends.length(corners) > 22.0 - 15.0 * steep - 1.5
+
+
+def test_rounding_does_not_decide_which_thick_slices_tell_the_plane():
+    """Whole slices lie at 1.5 of their distance, where the window of the fit ends."""
+    i, j = np.meshgrid(np.arange(20) * 0.4, np.arange(30) * 0.4, indexing="ij")
+    flat = np.column_stack([i.ravel(), j.ravel()])
+    parts = []
+    for z in (-3.0, -1.0, 1.0, 3.0):
+        held = flat[:, 0] < 4.0 + (z == 3.0) * (flat[:, 1] - 6.0)  # the farther slice is lopsided
+        parts.append(np.column_stack([flat[held], np.full(held.sum(), z)]))
+    below, above = np.vstack(parts[:2]), np.vstack(parts[2:])
+    step = np.array([0.0, 0.0, 2.0])
+    planes = [
+        ends_mod._plane_along_slices(below * (1 + shift), above * (1 + shift), step, BodySettings())
+        for shift in (-1e-9, 0.0, 1e-9)
+    ]
+    for point, normal in planes[1:]:
+        np.testing.assert_allclose(normal, planes[0][1], atol=1e-7)
+        assert abs((point - planes[0][0]) @ normal) < 1e-7

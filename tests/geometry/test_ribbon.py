@@ -9,6 +9,7 @@ from scipy import ndimage
 
 from hipsta_bids.geometry.ribbon import (
     align_nodes,
+    keep_whole,
     match_lines,
     moves_between,
     part_turns,
@@ -136,6 +137,63 @@ def test_a_ring_alone_is_cut_where_it_is_thin():
     assert np.cos(angle[lost] - 2.0).min() > 0.85
 
 
+def test_a_thin_part_of_a_ribbon_is_thickened_and_the_rest_stays():
+    outline, angle = arc()
+    thin = np.cos(angle - np.pi) > 0.9
+    x, y = (np.indices(outline.shape) + 0.5) * FINE - CENTER
+    line = 0.17 - np.abs(np.hypot(x, y) - RADIUS)
+    narrow = np.where(thin, np.minimum(outline, line), outline)
+    nodes = ribbon_nodes(narrow, np.where(narrow > 0, angle, np.nan), FINE, SETTINGS)
+    found = narrow.copy()
+    keep_whole(found, nodes, FINE, SETTINGS)
+    core = np.cos(angle - np.pi) > 0.95
+    expected = SETTINGS.least_half - np.abs(np.hypot(x, y) - RADIUS)
+    near = core & (expected > 0.05)
+    assert near.sum() > 20
+    # The mid-line of the nodes lies within a fourth of a pixel of the circle.
+    np.testing.assert_allclose(found[near], expected[near], atol=0.05)
+    assert (found >= narrow).all()
+    assert (
+        found[~thin & (narrow > SETTINGS.least_half)]
+        == narrow[~thin & (narrow > SETTINGS.least_half)]
+    ).all()
+    whole = outline.copy()
+    keep_whole(whole, arc_nodes(), FINE, SETTINGS)
+    np.testing.assert_array_equal(whole, outline)
+
+
+def radius_at(settings, z, radii):
+    """Mean radius, mm, of the outer wall of an arc, between slices 2 mm apart with such radii."""
+    pixel, step = 0.4, 2.0
+    size = round(SIZE * FINE / pixel)
+    tissue = np.zeros((size, size, len(radii)), dtype=np.uint8)
+    for number, radius in enumerate(radii):
+        outline, angle = arc(fine=pixel, radius=radius)
+        labels = np.select([angle < 2.4, angle < 4], [Tissue.SUBICULUM, Tissue.CA1], Tissue.CA3)
+        tissue[..., number] = np.where(outline > 0, labels, 0)
+    affine = np.diag([pixel, pixel, step, 1.0])
+    affine[:2, 3] = 0.5 * pixel
+    body = plain_body(tissue, affine, straight_ends((len(radii) - 1) * step))
+    angles = np.linspace(1.6, 2 * np.pi - 1.6, 60)
+    out = np.arange(2.0, 8.0, 0.02)
+    x, y = (CENTER + way(angles)[:, None] * out for way in (np.cos, np.sin))
+    points = np.stack([x, y, np.full(x.shape, z)], axis=-1).reshape(-1, 3)
+    inside = (sample_slices(body, points, settings) > 0.5).reshape(x.shape)
+    return float((out[0] + 0.02 * inside.shape[1] - 0.02 * inside[:, ::-1].argmax(axis=1)).mean())
+
+
+@pytest.mark.parametrize("smoothing", [0.0, 1.0])
+def test_the_ribbon_follows_a_smooth_path_through_the_slices(smoothing):
+    """Cubic paths through, or B-splines over, radii that are 0.8 mm more in one slice."""
+    radii = [4.6, 4.6, 5.4, 4.6, 4.6]
+    settings = SETTINGS.changed(path_smoothing=smoothing)
+    found = np.array([radius_at(settings, z, radii) for z in (4.0, 3.0, 2.0)]) - 0.5 * WALL
+    # Catmull-Rom halfway: (-1, 9, 9, -1) / 16; B-spline: (1, 4, 1) / 6 and (1, 23, 23, 1) / 48.
+    shares = np.array([1, 9 / 16, 0]) if smoothing == 0 else np.array([4 / 6, 23 / 48, 1 / 6])
+    # Voxels of 0.4 mm, smoothed in the slice, and moves that are averaged over near nodes.
+    np.testing.assert_allclose(found, 4.6 + 0.8 * shares, atol=0.05)
+
+
 def test_turns_are_parted_and_a_single_ribbon_stays():
     """Ends of the arc 0.2 mm apart: later smoothing would close the gap."""
     opening = (WALL + 0.2) / RADIUS
@@ -223,6 +281,31 @@ def test_strands_are_not_taken_for_their_neighbors():
     both = np.count_nonzero(found & truth)
     # Corners are rounded off; registration of the outlines alone finds half.
     assert 2 * both / (found.sum() + truth.sum()) > 0.93
+
+
+@pytest.mark.parametrize("way", [(0,), (1,), (2,), (0, 1, 2)])
+def test_the_order_of_voxels_in_the_image_decides_nothing(way):
+    """An even number of slices, so that the middle of the stack is a matter of its direction."""
+    size, pixel, step = 60, 0.4, 2.0
+    tissue = np.zeros((size, size, 6), dtype=np.uint8)
+    for number in range(6):
+        outline, angle = arc(fine=pixel, turn=0.3 + 0.2 * number, radius=4.6 + 0.2 * number)
+        labels = np.select([angle < 2.4, angle < 4], [Tissue.SUBICULUM, Tissue.CA1], Tissue.CA3)
+        first = slice(3 + number, 3 + number + len(outline))
+        tissue[first, 5 : 5 + len(outline), number] = np.where(outline > 0, labels, 0)
+    affine = np.diag([pixel, pixel, step, 1.0])
+    points = np.argwhere(tissue)[::3] @ affine[:3, :3] + [0.1, 0.15, 0.7]
+    found = sample_slices(plain_body(tissue, affine, straight_ends(10.0)), points, SETTINGS)
+    turned = affine.copy()
+    for n in way:
+        turned[:3, 3] += turned[:3, n] * (tissue.shape[n] - 1)
+        turned[:3, n] *= -1
+    body = plain_body(np.flip(tissue, way).copy(), turned, straight_ends(10.0))
+    np.testing.assert_allclose(sample_slices(body, points, SETTINGS), found, atol=1e-5)
+    order = plain_body(
+        tissue.transpose(2, 0, 1).copy(), affine[:, [2, 0, 1, 3]], straight_ends(10.0)
+    )
+    np.testing.assert_allclose(sample_slices(order, points, SETTINGS), found, atol=1e-5)
 
 
 def test_outlines_of_labels_give_nodes_too():

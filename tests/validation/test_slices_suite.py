@@ -85,7 +85,14 @@ def test_sampling_a_spike_between_slices_loses_all_of_it():
 
 def outcome(change, correlation=0.9, status="ok"):
     sampled = ((0.01, 0.95), (-0.03, 0.93), (0.02, 0.97))
-    return Outcome(status=status, change=change, correlation=correlation, sampled=sampled)
+    return Outcome(
+        status=status,
+        change=change,
+        correlation=correlation,
+        sampled=sampled,
+        thickness=np.full((3, 2), 1.0 + change),
+        half_sampled=0.1,
+    )
 
 
 def row_of(results, step=2.0):
@@ -102,9 +109,12 @@ def row_of(results, step=2.0):
     ("results", "met"),
     [
         ([outcome(0.02), outcome(-0.03)], True),
-        ([outcome(0.02), outcome(-0.09)], False),  # worst
+        ([*3 * [outcome(0.01)], outcome(-0.11)], False),  # worst
         ([outcome(0.04), outcome(-0.04)], False),  # mean
-        ([outcome(0.02, 0.61), outcome(0.02)], False),  # one correlation
+        ([outcome(0.02, 0.54), outcome(0.02)], False),  # one correlation
+        ([outcome(0.02, 0.82), outcome(0.02, 0.85)], False),  # their median
+        ([*6 * [outcome(0.02)], outcome(0.02, status="flagged")], True),
+        ([*5 * [outcome(0.02)], outcome(0.02, status="flagged")], False),  # accepted
     ],
 )
 def test_targets_are_judged(results, met):
@@ -117,11 +127,50 @@ def test_no_accepted_map_may_be_far_off_whatever_the_distance():
 
 
 def test_refusals_are_counted_and_explained():
-    row, met, table = row_of([outcome(0.01), Refusal(reason="topology", message="a knot")])
-    assert (row["number"], row["refused"], row["flagged"]) == (2, 1, 0)
+    refused = Refusal(reason="topology", message="a knot")
+    row, met, table = row_of([*6 * [outcome(0.01)], refused])
+    assert (row["number"], row["refused"], row["flagged"]) == (7, 1, 0)
     assert met is True
+    assert row_of([*5 * [outcome(0.01)], refused])[1] is False
     assert "phantoms, 2 mm, straight: topology: a knot" in table.notes
     assert row_of([Refusal(reason="topology", message="a knot")])[1] is False
+
+
+def half_row(*offsets_and_results):
+    trials = [
+        Trial(body=invariance.PHANTOMS[0], step=2.0, offset=offset, tilt=0.0)
+        for offset, _ in offsets_and_results
+    ]
+    table = invariance._half_table(trials, [result for _, result in offsets_and_results])
+    return table.rows
+
+
+def test_maps_half_a_slice_apart_are_compared():
+    (row,) = half_row(
+        (0.0, outcome(0.0)), (0.25, outcome(0.0)), (0.5, outcome(0.2)), (0.75, outcome(-0.1))
+    )
+    assert (row["pairs"], row["one accepted only"]) == (2, 0)
+    assert row["RMS change, mean"] == pytest.approx(0.15)
+    assert row["RMS change, worst"] == pytest.approx(0.2)
+    assert row["met"] is True
+
+
+@pytest.mark.parametrize(
+    ("second", "flips"),
+    [
+        (outcome(0.25), 0),
+        (outcome(0.0, status="flagged"), 1),
+        (Refusal(reason="topology", message="a knot"), 1),
+    ],
+)
+def test_changes_of_half_a_slice_are_judged(second, flips):
+    (row,) = half_row((0.0, outcome(0.0)), (0.5, second))
+    assert row["one accepted only"] == flips
+    assert row["met"] is False
+
+
+def test_no_pair_makes_no_row():
+    assert not half_row((0.0, outcome(0.0)), (0.25, outcome(0.0)))
 
 
 def test_a_phantom_in_thick_slices_meets_the_targets():
