@@ -477,10 +477,7 @@ class MapSettings(SettingsTable):
 
 
 class UncertaintySettings(SettingsTable):
-    """Perturbed copies of the labels, whose spread tells how certain a map is (``--uncertainty``).
-
-    The numbers follow from what a voxel's label says, and are fitted to no data.
-    """
+    """Perturbed copies of the labels, whose spread says how certain a map is (``--uncertainty``)."""
 
     jitter: NonNegativeFloat = 0.5
     """Boundaries may be drawn this far away, voxels along each axis of the voxels, evenly

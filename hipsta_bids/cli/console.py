@@ -35,7 +35,7 @@ class Progress:
     def __init__(self, total: int, verbosity: int) -> None:
         self._verbosity = verbosity
         self._bar: Any = None
-        if sys.stderr.isatty():
+        if verbosity >= 0 and sys.stderr.isatty():
             from tqdm import tqdm  # noqa: PLC0415  (not needed elsewhere)
 
             tqdm.monitor_interval = 0  # its thread would keep workers from being forked
@@ -54,9 +54,9 @@ class Progress:
             self._bar.clear()
         if outcome.status == "failed":
             warn(summary_line(outcome))
-            if outcome.trace and self._verbosity:
+            if outcome.trace and self._verbosity > 0:
                 sys.stderr.write(outcome.trace)
-        elif not outcome.skipped or self._verbosity:
+        elif not outcome.skipped or self._verbosity > 0:
             echo(summary_line(outcome))
         if self._bar is not None:
             self._bar.update()

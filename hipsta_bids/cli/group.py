@@ -98,6 +98,12 @@ def _add_sheets(parser: Parser) -> None:
             "only these, with or without prefix",
             type=bids_label(prefix),
         )
+    add(
+        "--exclude-participant-label",
+        "LABEL...",
+        "leave out these, with or without prefix",
+        type=bids_label("sub-"),
+    )
     add("--exclude-flagged", "", "leave out hemispheres that the participant level flagged")
     add(
         "--exclude-qc",
@@ -236,6 +242,8 @@ def _name(text: str) -> str:
 
 def is_group_level(arguments: Sequence[str]) -> bool:
     """Tell a call of the group level from others, whatever folders are called."""
+    if arguments[:1] == [LEVEL] and {"-h", "--help"} & set(arguments):
+        return True
     if arguments[2:3]:
         if arguments[2] == LEVEL:
             return True
@@ -331,6 +339,7 @@ def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOpti
         parsed,
         roots=tuple(dict.fromkeys(parsed.derivatives)) or (parsed.output_dir,),
         subjects=tuple(parsed.participant_label),
+        excluded=tuple(parsed.exclude_participant_label),
         sessions=tuple(parsed.session_label),
         exclude_quality=condition,
         exclude_table=parsed.exclude,

@@ -1,7 +1,8 @@
 """The parser of every command, and the way from its options to a dataclass."""
 
 import argparse
-from collections.abc import Callable, Sequence
+import difflib
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
@@ -43,8 +44,51 @@ class Parser(argparse.ArgumentParser):
         return super().parse_known_args(spelled, namespace)
 
     def error(self, message: str) -> NoReturn:
-        """Turn argparse's message into the package's own error."""
-        raise UsageError(f"{message} (see {self.prog} --help)", reason="usage")
+        """Turn argparse's message into the package's own error; name options like unknown ones."""
+        unknown = message.removeprefix("unrecognized arguments: ")
+        near = [
+            match
+            for text in (unknown.split() if unknown != message else ())
+            for match in difflib.get_close_matches(
+                text.partition("=")[0], self._option_string_actions, n=1
+            )
+            if text.startswith("-")
+        ]
+        hint = f"; did you mean {' '.join(near)}?" if near else ""
+        raise UsageError(f"{message}{hint} (see {self.prog} --help)", reason="usage")
+
+
+class _Ignored(argparse.Action):
+    """Remembers an option of other BIDS Apps that has no meaning here, and why."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: object,
+        option_string: str | None = None,
+    ) -> None:
+        del parser, values
+        given = dict(getattr(namespace, self.dest) or {})
+        namespace.ignored = {**given, str(option_string): str(self.const)}
+
+
+def accept(parser: argparse.ArgumentParser, options: Mapping[str, str]) -> None:
+    """Accept options that have no meaning here; ``--name VALUE`` takes a value. Not in the help.
+
+    What was given is in ``ignored`` of the namespace, with the reason.
+    """
+    for name, why in options.items():
+        flag, _, value = name.partition(" ")
+        parser.add_argument(
+            flag,
+            action=_Ignored,
+            nargs=1 if value else 0,
+            dest="ignored",
+            const=why,
+            default={},
+            help=argparse.SUPPRESS,
+        )
 
 
 def adder(group: argparse._ActionsContainer) -> Callable[..., None]:

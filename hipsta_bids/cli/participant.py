@@ -5,6 +5,7 @@ import os
 import re
 import shlex
 from collections.abc import Callable, Sequence
+from contextlib import redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,6 +14,7 @@ from hipsta_bids import __version__
 from hipsta_bids.cli.console import Progress, echo, echo_result, echo_start, echo_table, warn
 from hipsta_bids.cli.parser import (
     Parser,
+    accept,
     adder,
     bids_label,
     from_namespace,
@@ -36,6 +38,15 @@ COLLECT = "collect"
 LEVELS = ("participant", COLLECT)
 REGIONS = ("body", "extended", "entorhinal")
 
+#: Options of other BIDS Apps, and why they change nothing here.
+_NO_MEANING = {
+    "--omp-nthreads N": "each hemisphere uses one processor; --n-procs says how many at a time",
+    "--low-mem": "a hemisphere takes a few hundred megabytes; --mem limits how many at a time",
+    "--clean-workdir": "nothing is left in the scratch folder",
+    "--notrack": "nothing is tracked",
+    "--fs-license-file FILE": "FreeSurfer's programs are not run",
+}
+
 _GIGABYTES = {"K": 1e-6, "M": 1e-3, "G": 1.0, "T": 1e3}
 
 
@@ -56,6 +67,7 @@ def build_parser(epilog: str | None = None) -> Parser:
         " (which has a --help of its own)",
     )
     parser.add_argument("--version", action="version", version=f"hipsta_bids {__version__}")
+    accept(parser, _NO_MEANING)
     add_selection(parser)
     add_segmentations(parser)
     _add_signals(parser)
@@ -71,6 +83,12 @@ def add_selection(parser: Parser) -> None:
         "--participant-label",
         "LABEL...",
         "subjects, with or without sub- (default: all)",
+        type=bids_label("sub-"),
+    )
+    add(
+        "--exclude-participant-label",
+        "LABEL...",
+        "subjects to leave out",
         type=bids_label("sub-"),
     )
     add(
@@ -162,7 +180,11 @@ def _add_signals(parser: Parser) -> None:
 def _add_processing(parser: Parser) -> None:
     group = parser.add_argument_group("how to process")
     add = adder(group)
-    add("--settings", "FILE.toml", "settings that change results (see `hipsta-bids settings`)")
+    add(
+        "--settings --config-file",
+        "FILE.toml",
+        "settings that change results (see `hipsta-bids settings`)",
+    )
     add(
         "--region",
         "NAME",
@@ -191,7 +213,7 @@ def _add_processing(parser: Parser) -> None:
         "--reports-only", "", "make these pages again from the results that are there, and end"
     )
     add(
-        "--n-procs --nprocs --n-cpus",
+        "--n-procs --nprocs --n-cpus --nthreads",
         "N",
         "hemispheres at the same time, one processor each (default: all processors)",
         type=positive_int,
@@ -213,6 +235,7 @@ def _add_processing(parser: Parser) -> None:
     add("-w --work-dir", "DIR", "scratch folder")
     add("--stop-on-first-crash", "", "stop at the first hemisphere that fails")
     add("-v --verbose", "", "say more; twice for still more", action="count", default=0)
+    add("-q --quiet", "", "say only what went wrong")
 
 
 def _add_machines(parser: Parser) -> None:
@@ -285,9 +308,18 @@ def _gigabytes(text: str) -> float:
 
 def run_participant_level(options: "Namespace", arguments: Sequence[str] = ()) -> ExitCode:
     """Measure, collect or list hemispheres, as a parsed command line says."""
+    if options.quiet:
+        with Path(os.devnull).open("w", encoding="utf-8") as nowhere, redirect_stdout(nowhere):
+            return _run(options, arguments)
+    return _run(options, arguments)
+
+
+def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
     pin_threads()
     from hipsta_bids.settings import load_settings  # noqa: PLC0415  (start-up time)
 
+    for name, why in options.ignored.items():
+        echo(f"note: {name} has no effect: {why}")
     check_folders(options)
     collects = options.analysis_level == COLLECT
     if collects and options.shard is not None:
@@ -322,7 +354,8 @@ def run_participant_level(options: "Namespace", arguments: Sequence[str] = ()) -
     if collects:
         result = collect(items, out, settings, run_options)
     else:
-        with Progress(len(items), options.verbose) as progress:
+        verbosity = -1 if options.quiet else options.verbose
+        with Progress(len(items), verbosity) as progress:
             result = run_participants(items, out, settings, run_options, progress.report)
     echo_result(result, out)
     return result.exit_code
@@ -355,6 +388,7 @@ def _rebuild_reports(options: "Namespace") -> ExitCode:
         (subject, session)
         for subject, session in visits_of(root)
         if subject in (options.participant_label or [subject])
+        and subject not in options.exclude_participant_label
         and session in (options.session_label or [session])
     ]
     if not visits:
@@ -406,6 +440,7 @@ def input_request(options: "Namespace") -> "InputRequest":
         options,
         derivatives=derivatives,
         participant_labels=tuple(options.participant_label),
+        excluded_labels=tuple(options.exclude_participant_label),
         session_labels=tuple(options.session_label),
         hemis=tuple(dict.fromkeys(options.hemi)),
         protocol=options.scheme,

@@ -11,6 +11,7 @@ import atexit
 import contextlib
 import os
 import pickle
+import platform
 import select
 import struct
 import subprocess
@@ -133,9 +134,11 @@ def _serve() -> None:
 def _mesh(vertices: Float, triangles: Int, options: dict[str, Any]) -> tuple[Float, NDArray[Any]]:
     from tetgen import TetGen  # noqa: PLC0415 -- only the worker process needs it
 
-    # TetGen writes the triangles that it could not use into the working folder.
+    # TetGen writes the triangles that it could not use into the working folder. The folder is named
+    # as those of `io.files.scratch_folder`, so that it goes if this process is killed.
+    name = f"hipsta-bids-{platform.node()}-{os.getpid()}-tetgen-"
     with (
-        tempfile.TemporaryDirectory(prefix="tetgen-", ignore_cleanup_errors=True) as aside,
+        tempfile.TemporaryDirectory(prefix=name, ignore_cleanup_errors=True) as aside,
         contextlib.chdir(aside),
     ):
         points, cells, *_ = TetGen(vertices, triangles).tetrahedralize(**options)

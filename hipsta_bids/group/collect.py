@@ -159,6 +159,8 @@ class GroupRequest:
     """What was measured: ``body``, ``extended`` or ``entorhinal``."""
     subjects: tuple[str, ...] = ()
     """Labels without ``sub-``; empty is all."""
+    excluded: tuple[str, ...] = ()
+    """Labels to leave out."""
     sessions: tuple[str, ...] = ()
     """Labels without ``ses-``; empty is all."""
     exclude_flagged: bool = False
@@ -167,6 +169,14 @@ class GroupRequest:
     """Participants, or single sessions and hemispheres, to leave out."""
     segmentations: tuple[Path, ...] = ()
     """Where segmentations are now, if they have moved since they were measured."""
+
+    def wants(self, subject: str, session: str | None) -> bool:
+        """Tell whether a visit is asked for, by its labels."""
+        return (
+            (not self.subjects or subject in self.subjects)
+            and subject not in self.excluded
+            and (not self.sessions or session in self.sessions)
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -260,11 +270,7 @@ def wanted_by(request: GroupRequest) -> Callable[[str, str | None, str], bool]:
 
     def is_wanted(subject: str, session: str | None, hemi: str) -> bool:
         name = HemisphereName(subject=subject, session=session, hemi=hemi, seg="")
-        return (
-            (not request.subjects or subject in request.subjects)
-            and (not request.sessions or session in request.sessions)
-            and not any(is_listed(name, row) for row in unwanted)
-        )
+        return request.wants(subject, session) and not any(is_listed(name, row) for row in unwanted)
 
     return is_wanted
 
@@ -277,8 +283,7 @@ def _wanted_results(root: Path, request: GroupRequest) -> list[ResultPlace]:
     return [
         place
         for place in list_results(root)
-        if (not request.subjects or place.name.subject in request.subjects)
-        and (not request.sessions or place.name.session in request.sessions)
+        if request.wants(place.name.subject, place.name.session)
     ]
 
 
@@ -382,9 +387,7 @@ def _refuse_unfinished(
     for root in request.roots:
         for row in read_status(root):
             name = name_of(row)
-            asked = (not request.subjects or name.subject in request.subjects) and (
-                not request.sessions or name.session in request.sessions
-            )
+            asked = request.wants(name.subject, name.session)
             listed = any(is_listed(name, one) for one in unwanted)
             same = (name.seg, name.region) == (seg, request.region)
             if row.get("reason") == NOT_FINISHED and same and asked and not listed:

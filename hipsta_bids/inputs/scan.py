@@ -38,6 +38,8 @@ class InputRequest:
     hippunfold_dir: Path | None = None
     participant_labels: tuple[str, ...] = ()
     """Empty for all; with or without ``sub-``."""
+    excluded_labels: tuple[str, ...] = ()
+    """Subjects to leave out."""
     session_labels: tuple[str, ...] = ()
     """Empty for all; with or without ``ses-``."""
     hemis: tuple[str, ...] = HEMIS
@@ -354,7 +356,8 @@ class Selection:
     """What the user asked for, ready to be applied."""
 
     subjects: frozenset[str] = frozenset()
-    """Empty for all, as in the next one."""
+    """Empty for all, as in ``sessions``."""
+    excluded: frozenset[str] = frozenset()
     sessions: frozenset[str] = frozenset()
     hemis: tuple[str, ...] = HEMIS
     rules: Mapping[str, _Wanted] = field(default_factory=dict)
@@ -372,6 +375,7 @@ class Selection:
         """Check whether a subject's folder has to be looked into."""
         return (
             (not self.subjects or folder.subject in self.subjects)
+            and folder.subject not in self.excluded
             and (not self.sessions or folder.session is None or folder.session in self.sessions)
             and self._passes("subject", folder.subject)
         )
@@ -407,6 +411,7 @@ def make_selection(request: InputRequest) -> Selection:
         )
     return Selection(
         subjects=_labels(request.participant_labels, "sub-", "--participant-label"),
+        excluded=_labels(request.excluded_labels, "sub-", "--exclude-participant-label"),
         sessions=_labels(request.session_labels, "ses-", "--session-label"),
         hemis=request.hemis,
         rules=_rules(request.bids_filter_file) if request.bids_filter_file else {},
@@ -452,10 +457,10 @@ def _rules(path: Path) -> dict[str, _Wanted]:
         raise InputError(
             f"{path}: the filter file is not JSON ({error})", reason="unreadable-filter"
         ) from error
-    query = contents.get(_QUERY) if isinstance(contents, dict) else None
+    query = contents.get(_QUERY, {}) if isinstance(contents, dict) else None
     if not isinstance(query, dict):
         raise UsageError(
-            f"{path}: the filter file has no entry {_QUERY!r}, which is the one for segmentations",
+            f'{path}: the filter file is not of the form {{"{_QUERY}": {{ENTITY: VALUE}}}}',
             reason="bad-filter",
         )
     known = _entities()

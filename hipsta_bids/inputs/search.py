@@ -148,7 +148,8 @@ def dataset_notes(request: InputRequest, items: Iterable[HemisphereInput]) -> tu
         )
     asked = make_selection(request).subjects
     known = asked or list_participants(request)
-    without = sorted(known - {item.subject for item in items})
+    left_out = make_selection(request).excluded
+    without = sorted(known - left_out - {item.subject for item in items})
     if without:
         notes.append(f"no segmentation found for {_count(without, 'participant')}")
     return tuple(notes)
@@ -209,6 +210,7 @@ def _nothing(request: InputRequest, sources: tuple[Source, ...]) -> NothingToDoE
     searched = ", ".join(str(source.path) for source in sources)
     restricted = (
         *(f"--participant-label {label}" for label in request.participant_labels[:_SHOWN]),
+        *(f"--exclude-participant-label {label}" for label in request.excluded_labels[:_SHOWN]),
         *(f"--session-label {label}" for label in request.session_labels[:_SHOWN]),
         *(f"--hemi {hemi}" for hemi in request.hemis if request.hemis != HEMIS),
         *([f"--bids-filter-file {request.bids_filter_file}"] if request.bids_filter_file else []),

@@ -8,12 +8,15 @@ import contextlib
 import csv
 import errno
 import fcntl
+import glob
 import hashlib
 import io
 import json
 import math
 import os
+import platform
 import secrets
+import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -82,10 +85,44 @@ def check_writable(folder: Path) -> None:
         raise output_error(folder, error) from error
 
 
+def scratch_folder(kind: str) -> Path:
+    """Make a temporary folder of this process; its name says whose it is."""
+    return Path(tempfile.mkdtemp(prefix=f"{_scratch_prefix()}{os.getpid()}-{kind}-"))
+
+
+def _scratch_prefix() -> str:
+    """Process numbers mean something on one machine only, and folders may be shared by several."""
+    return f"hipsta-bids-{platform.node()}-"
+
+
+def remove_left_scratch(folder: Path) -> None:
+    """Remove temporary folders that processes of this machine left when they were killed."""
+    prefix = _scratch_prefix()
+    for left in folder.glob(f"{glob.escape(prefix)}*"):
+        number = left.name.removeprefix(prefix).partition("-")[0]
+        with contextlib.suppress(OSError):
+            if number.isdigit() and left.stat().st_uid == os.getuid() and not _runs(int(number)):
+                shutil.rmtree(left, ignore_errors=True)
+
+
+def _runs(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:  # it is another user's
+        pass
+    return True
+
+
 def check_scratch(folder: Path | None = None) -> None:
-    """Prove that temporary files can be written, in a folder or where the system has them."""
+    """Prove that temporary files can be written, in a folder or where the system has them.
+
+    What killed processes left there is removed.
+    """
     if folder is not None:
         check_writable(folder)
+        remove_left_scratch(folder)
         return
     try:
         tempfile.gettempdir()
@@ -95,6 +132,7 @@ def check_scratch(folder: Path | None = None) -> None:
             " mount one at /tmp)",
             reason="no-scratch",
         ) from error
+    remove_left_scratch(Path(tempfile.gettempdir()))
 
 
 def write_bytes(path: Path, content: bytes) -> None:

@@ -8,7 +8,6 @@ import os
 import re
 import shutil
 import sys
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 
 from hipsta_bids.derivatives.hemisphere import read_sheet
 from hipsta_bids.errors import InputError
+from hipsta_bids.io.files import scratch_folder
 from hipsta_bids.reports.results import Hemisphere
 from hipsta_bids.types import Float, Status
 
@@ -66,7 +66,7 @@ def _own_settings() -> Iterator[None]:
     It keeps a list of fonts in the user's home, which may be missing or read-only in containers
     and on clusters, and would read that user's preferences there.
     """
-    folder = tempfile.mkdtemp(prefix="hipsta-bids-fonts-")
+    folder = str(scratch_folder("fonts"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     before = {name: os.environ.pop(name, None) for name in (*_PREFERENCES, "MPLCONFIGDIR")}
     os.environ["MPLCONFIGDIR"] = folder

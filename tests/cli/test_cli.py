@@ -93,6 +93,35 @@ def test_every_command_has_help_and_is_loaded_by_its_name(command, capsys):
     assert f"hipsta-bids {command}" in EPILOG or f"also: {command}" in EPILOG
 
 
+def test_help_of_the_group_level(capsys):
+    for arguments in (["group", "--help"], ["in", "out", "group", "--help"]):
+        with pytest.raises(SystemExit) as end:
+            main.main(arguments)
+        assert end.value.code == 0
+        assert "--formula" in capsys.readouterr().out
+
+
+def test_options_without_meaning_are_noted(seen, tmp_path, capsys):
+    options = "--omp-nthreads 4 --low-mem --notrack --clean-workdir --fs-license-file l.txt"
+    assert main.main(["in", str(tmp_path), "participant", *options.split()]) == 0
+    said = capsys.readouterr().out
+    for name in (
+        "--omp-nthreads",
+        "--low-mem",
+        "--notrack",
+        "--clean-workdir",
+        "--fs-license-file",
+    ):
+        assert f"note: {name} has no effect: " in said
+    assert main.main(["in", str(tmp_path), "participant"]) == 0
+    assert "has no effect" not in capsys.readouterr().out
+
+
+def test_quiet(seen, tmp_path, capsys):
+    assert main.main(["in", str(tmp_path), "participant", "--quiet", "--notrack"]) == 0
+    assert capsys.readouterr() == ("", "")
+
+
 def test_defaults(seen, tmp_path):
     assert main.main(["in", str(tmp_path), "participant"]) == 0
     assert seen["request"] == InputRequest(bids_dir=Path("in"), output_dir=tmp_path)
@@ -164,6 +193,10 @@ def test_everything_reaches_its_place(seen, tmp_path):
         ("--fs-subjects-dir f", "freesurfer_dir", Path("f")),
         ("--stop_on_first_crash", "stop_on_first_crash", True),
         ("--skip_bids_validation", "skip_bids_validation", True),
+        ("--nthreads 3", "n_procs", 3),
+        ("--config-file c.toml", "settings", Path("c.toml")),
+        ("-q", "quiet", True),
+        ("--exclude_participant_label 01", "exclude_participant_label", ["01"]),
         ("--edited_dir e", "edited_dir", Path("e")),
         ("--bids_filter_file j", "bids_filter_file", Path("j")),
         ("--protocol p_1.toml", "scheme", Path("p_1.toml")),
@@ -191,7 +224,9 @@ def test_spellings_of_other_bids_apps(alias, field, value):
         ("in out participant --participant-label a_b", "'a_b' is not a BIDS label"),
         ("in out participant -d a= ", "'a=' is not of the form NAME=PATH"),
         ("in out participant -d a=x a=y", "a name occurs twice"),
-        ("in out participant --forc", "unrecognized arguments: --forc"),
+        ("in out participant --forc", "unrecognized arguments: --forc; did you mean --force?"),
+        ("in out participant --particpant-label 1", "did you mean --participant-label?"),
+        ("in out group --formla x", "did you mean --formula?"),
         ("in in participant", "the output folder is the BIDS dataset itself"),
         ("in out participant --settings none.toml", "settings cannot be read"),
         ("protocols x", "unrecognized arguments: x (see hipsta-bids protocols --help)"),

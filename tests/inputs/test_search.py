@@ -267,6 +267,23 @@ def test_a_filter_file_selects_as_in_fmriprep(tmp_path, query, expected):
     assert names == [f"{name}_desc-subfields_dseg.nii.gz" for name in expected]
 
 
+def test_a_filter_file_about_other_images_filters_nothing(tmp_path):
+    freesurfer(tmp_path / "derivatives" / "fs", "sub-01")
+    assert len(filtered(tmp_path, {"t1w": {"run": 1}})) == 2
+
+
+def test_subjects_to_leave_out(tmp_path):
+    freesurfer(tmp_path / "derivatives" / "fs", "sub-01", "sub-02", "sub-03")
+    touch(tmp_path, "sub-02/anat/sub-02_T1w.nii.gz")
+    describe(tmp_path, kind="raw")
+    request = InputRequest(bids_dir=tmp_path, excluded_labels=("sub-02", "09"))
+    items = find_hemispheres(request)
+    assert {item.subject for item in items} == {"01", "03"}
+    assert dataset_notes(request, items) == ()
+    with pytest.raises(NothingToDoError, match="--exclude-participant-label 01"):
+        find(tmp_path, excluded_labels=("01", "02", "03"))
+
+
 def test_for_folders_without_entities_subject_and_session_are_filtered(tmp_path):
     freesurfer(tmp_path / "derivatives" / "fs", "sub-01_ses-a", "sub-01_ses-b", "sub-02_ses-a")
     items = filtered(tmp_path, {"dseg": {"session": "a", "subject": "02", "space": "T1w"}})
@@ -276,9 +293,9 @@ def test_for_folders_without_entities_subject_and_session_are_filtered(tmp_path)
 @pytest.mark.parametrize(
     ("text", "error", "message"),
     [
-        ('{"bold": {}}', UsageError, "no entry 'dseg'"),
+        ('{"dseg": []}', UsageError, "is not of the form"),
         ('{"dseg": {"sesion": "a"}}', UsageError, "did you mean 'session'"),
-        ("[]", UsageError, "no entry 'dseg'"),
+        ("[]", UsageError, "is not of the form"),
         ("{", InputError, "not JSON"),
         (None, InputError, "cannot read the filter file"),
     ],

@@ -1,8 +1,10 @@
 import errno
 import json
 import os
+import platform
 import resource
 import signal
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -179,3 +181,20 @@ def test_names_are_split_as_by_pybids(name):
     keys["segmentation"] = "seg"
     theirs = pybids.parse_file_entities(f"/{name}", entities=known)
     assert files.entities(name) == {keys.get(key, key): str(v) for key, v in theirs.items()}
+
+
+def test_scratch_of_dead_processes_is_removed(tmp_path, monkeypatch):
+    monkeypatch.setattr(files.tempfile, "tempdir", str(tmp_path))
+    own = files.scratch_folder("fonts")
+    done = subprocess.Popen(["true"])
+    done.wait()
+    node = platform.node()
+    dead = tmp_path / f"hipsta-bids-{node}-{done.pid}-tetgen-abc"
+    elsewhere = tmp_path / f"hipsta-bids-other{node}-{done.pid}-tetgen-abc"
+    foreign = tmp_path / f"hipsta-{done.pid}"
+    for folder in (dead, elsewhere, foreign):
+        folder.mkdir()
+        (folder / "file").touch()
+    files.check_scratch()
+    assert not dead.exists()
+    assert own.exists() and elsewhere.exists() and foreign.exists()
