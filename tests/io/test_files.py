@@ -197,4 +197,4 @@ def test_scratch_of_dead_processes_is_removed(tmp_path, monkeypatch):
         (folder / "file").touch()
     files.check_scratch()
     assert not dead.exists()
-    assert own.exists() and elsewhere.exists() and foreign.exists()
+    assert all(folder.exists() for folder in (own, elsewhere, foreign))
