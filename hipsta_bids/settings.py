@@ -477,7 +477,7 @@ class MapSettings(SettingsTable):
 
 
 class UncertaintySettings(SettingsTable):
-    """Perturbed copies of the labels: their spread says how certain a map is (``--uncertainty``)."""
+    """Perturbed copies of the labels; their spread says how certain a map is (`--uncertainty`)."""
 
     jitter: NonNegativeFloat = 0.5
     """Boundaries may be drawn this far away, voxels along each axis of the voxels, evenly
