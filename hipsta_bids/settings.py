@@ -453,6 +453,8 @@ class CheckSettings(SettingsTable):
     flag_cavity: NonNegativeFloat = 0.03
     """Flag a wide cavity that was divided beyond this share of the body: half of it is what the
     mean thickness may be off by."""
+    flag_reach: PositiveFloat = 1.0
+    """A flag concerns the columns within this distance of what was found, mm."""
     flag_pinholes: NonNegativeFloat = 0.01
     """Flag labels in which single voxels without a label are more than this share of the sheet's
     voxels (0.0015 at most in twelve real bodies)."""

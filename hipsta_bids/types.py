@@ -6,7 +6,7 @@ x runs medial to lateral, y posterior to anterior, z interior to exterior, in bo
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, Literal
 
@@ -210,14 +210,64 @@ class Status(StrEnum):
     FAILED = "failed"
 
 
-@dataclass(frozen=True, kw_only=True)
+def _nowhere() -> Float:
+    return np.zeros((0, 3))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Finding:
+    """What a check measured, whether or not that is beyond its limit."""
+
+    reason: str
+    """Name of the reason in kebab case."""
+    value: float
+    """Statistic of the check."""
+    limit: float
+    """A larger value is flagged."""
+    what: str
+    """What was found, for people."""
+    remedy: str
+    """What to try, for people."""
+    points: Float = field(default_factory=_nowhere)
+    """(N, 3) where it was found, RAS mm; none if it concerns the sheet as a whole."""
+    placed: bool = False
+    """Whether :attr:`what` says where."""
+    share: float = float("nan")
+    """Share of the columns that are concerned, where the points do not tell."""
+    change: float = float("nan")
+    """What the mean thickness may be off by, mm, where the points do not tell."""
+
+    @property
+    def margin(self) -> float:
+        """Value over limit; infinite where none is allowed."""
+        if self.limit > 0:
+            return self.value / self.limit
+        return float("inf") if self.value > self.limit else 0.0
+
+    @property
+    def raised(self) -> bool:
+        """Whether a person should look at it."""
+        return self.value > self.limit
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Flag:
     """Something a person should look at before trusting a map."""
 
     reason: str
     """Name of the reason in kebab case, for programs."""
     message: str
-    """One line for people: what, where, what to try."""
+    """One line for people: what, where, what to try, and what it means for the map."""
+    value: float = float("nan")
+    """Statistic of the check; NaN where nothing was measured."""
+    limit: float = float("nan")
+    """Its limit."""
+    points: Float = field(default_factory=_nowhere)
+    """(N, 3) where it was found, RAS mm."""
+    share: float = float("nan")
+    """Share of the columns that are concerned."""
+    change: float = float("nan")
+    """By how much the mean thickness is larger than if these were as those around them, mm."""
 
 
 def position_text(point: Float | tuple[float, float, float], subfields: str = "") -> str:

@@ -26,7 +26,7 @@ from hipsta_bids.geometry.sheet import is_left_handed, layer_depth
 from hipsta_bids.io import files, gifti
 from hipsta_bids.io.volumes import mask_bytes
 from hipsta_bids.protocols.protocol import Label, Part, Protocol, Tissue
-from hipsta_bids.types import BodyMask, Bool, Float, HemisphereMaps, Sheet, Status
+from hipsta_bids.types import BodyMask, Bool, Flag, Float, HemisphereMaps, Sheet, Status
 
 _REDO = "run the participant level again with --force"
 
@@ -289,7 +289,7 @@ def write_results(
             "message": message,
             **record,
             "repairs": maps.repairs,
-            "flags": [{"reason": f.reason, "message": f.message} for f in maps.flags],
+            "flags": [_flag_entry(flag) for flag in maps.flags],
             "undefined_columns": undefined,
             "metrics": maps.qc,
         },
@@ -332,6 +332,18 @@ def write_spread(
         maps["thickness"].ravel(), hemi=place.name.hemi, name=name, unit=unit
     )
     files.write_bytes(place.path("thickness_sd"), content)
+
+
+def _flag_entry(flag: Flag) -> dict[str, Any]:
+    return {
+        "reason": flag.reason,
+        "message": flag.message,
+        "value": flag.value,
+        "limit": flag.limit,
+        "position_ras_mm": flag.points.mean(axis=0).round(2) if len(flag.points) else None,
+        "columns_share": flag.share,
+        "mean_change_mm": flag.change,
+    }
 
 
 def write_failure(

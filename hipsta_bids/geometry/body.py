@@ -37,7 +37,7 @@ from hipsta_bids.geometry.ends import EndPlanes, find_end_planes
 from hipsta_bids.protocols.load import for_region
 from hipsta_bids.protocols.protocol import Tissue, lateral_rank
 from hipsta_bids.settings import BodySettings
-from hipsta_bids.types import Bool, EditedMask, End, Flag, Float, LabelVolume
+from hipsta_bids.types import Bool, EditedMask, End, Finding, Float, LabelVolume
 
 _END_REACH = 4.0  # mm behind an end plane over which the body's direction is taken
 _LEAST_SLOPE = 0.34  # cosine of 70 degrees
@@ -355,19 +355,24 @@ def _apply_mask(
 
 def check_mask(
     mask: EditedMask, change: MaskChange, voxel: float, settings: BodySettings
-) -> list[Flag]:
+) -> list[Finding]:
     """Flag an edited mask that is coarser than the labels' voxels (mm), or differs much."""
-    flags = []
-    if mask.voxel > settings.max_mask_ratio * voxel:
-        coarse = (
-            f"the edited mask has voxels of {mask.voxel:.2f} mm, the labels of {voxel:.2f} mm: "
-            "draw it on the grid of the labels"
-        )
-        flags.append(Flag(reason="edited-mask-coarse", message=coarse))
-    if change.share > settings.max_mask_change:
-        different = (
-            f"the edited mask adds {change.added} voxels to the body and removes {change.removed} "
-            f"of {change.before}: check that it is in the space of the labels"
-        )
-        flags.append(Flag(reason="edited-mask-different", message=different))
-    return flags
+    return [
+        Finding(
+            reason="edited-mask-coarse",
+            value=mask.voxel / voxel,
+            limit=settings.max_mask_ratio,
+            what=f"the edited mask has voxels of {mask.voxel:.2f} mm, the labels of {voxel:.2f} mm",
+            remedy="draw it on the grid of the labels",
+            share=1.0,
+        ),
+        Finding(
+            reason="edited-mask-different",
+            value=change.share,
+            limit=settings.max_mask_change,
+            what=f"the edited mask adds {change.added} voxels to the body and removes "
+            f"{change.removed} of {change.before}",
+            remedy="check that it is in the space of the labels",
+            share=1.0,
+        ),
+    ]

@@ -31,7 +31,7 @@ from hipsta_bids.settings import CheckSettings, TopologySettings
 from hipsta_bids.types import (
     Bool,
     Coordinates,
-    Flag,
+    Finding,
     Float,
     LabelVolume,
     Sheet,
@@ -104,7 +104,7 @@ def _rank_correlation(x: Float, y: NDArray[np.int8]) -> float:
     return float(np.corrcoef(ranks[0], ranks[1])[0, 1])
 
 
-def check_thickness(thickness: Float, expected: float, settings: CheckSettings) -> list[Flag]:
+def check_thickness(thickness: Float, expected: float, settings: CheckSettings) -> list[Finding]:
     """Compare the mean thickness with 2 volume / area of the two sides, ``expected`` mm."""
     mean = float(np.nanmean(thickness))
     ratio = abs(mean / expected - 1)
@@ -114,9 +114,17 @@ def check_thickness(thickness: Float, expected: float, settings: CheckSettings) 
             f"{text}: the map would be wrong; check the labels for bridges and missing parts",
             reason="thickness-implausible",
         )
-    if ratio > settings.flag_thickness_ratio:
-        return [Flag(reason="thickness-doubtful", message=f"{text}: look at the map")]
-    return []
+    return [
+        Finding(
+            reason="thickness-doubtful",
+            value=ratio,
+            limit=settings.flag_thickness_ratio,
+            what=text,
+            remedy="look at the map",
+            share=1.0,
+            change=mean - expected,
+        )
+    ]
 
 
 def name_subfields(body: Body) -> Callable[[Float], str]:
@@ -151,25 +159,29 @@ def name_place(points: Float, body: Body) -> str:
     return position_text(points.mean(axis=0), name_subfields(body)(points))
 
 
-def check_image(body: Body, settings: CheckSettings) -> list[Flag]:
+def check_image(body: Body, settings: CheckSettings) -> list[Finding]:
     """Flag images whose voxels or borders do not suit the body."""
-    flags = []
-    if _sliced_lengthwise(body, settings):
-        longest = np.linalg.norm(body.affine[:3, :3], axis=0).max()
-        message = (
-            f"the longest voxel edge ({longest:.2f} mm) lies across the long axis: check the "
-            "header of the image; slices should lie across the hippocampus"
-        )
-        flags.append(Flag(reason="slices-along-axis", message=message))
+    edges = np.linalg.norm(body.affine[:3, :3], axis=0)
     index, points = body.inside_points()
     outer = ((index == 0) | (index == np.array(body.inside.shape) - 1)).any(axis=1)
-    if outer.any():
-        message = (
-            f"{np.count_nonzero(outer)} voxels of the body lie at the border of the image, near "
-            f"{position_text(points[outer].mean(axis=0))}: check that the image holds all of it"
-        )
-        flags.append(Flag(reason="image-border", message=message))
-    return flags
+    return [
+        Finding(
+            reason="slices-along-axis",
+            value=0.0 if cut_across(body) else float(edges.max() / edges.min()),
+            limit=settings.slice_ratio,
+            what=f"the longest voxel edge ({edges.max():.2f} mm) lies across the long axis",
+            remedy="check the header of the image; slices should lie across the hippocampus",
+            share=1.0,
+        ),
+        Finding(
+            reason="image-border",
+            value=float(np.count_nonzero(outer)),
+            limit=0,
+            what=f"{np.count_nonzero(outer)} voxels of the body lie at the border of the image",
+            remedy="check that the image holds all of it",
+            points=points[outer],
+        ),
+    ]
 
 
 def _sliced_lengthwise(body: Body, settings: CheckSettings) -> bool:
@@ -185,26 +197,27 @@ def _voxel_across(body: Body, settings: CheckSettings) -> float:
     return in_plane_voxel(body.affine)
 
 
-def check_end_labels(volume: LabelVolume, body: Body, settings: CheckSettings) -> list[Flag]:
+def check_end_labels(volume: LabelVolume, body: Body, settings: CheckSettings) -> list[Finding]:
     """Flag head or tail labels amid the body, and ends beyond which nothing is labeled."""
     labeled = np.isin(volume.part, (Part.HEAD, Part.TAIL)) & (volume.tissue > 0)
     points = voxel_points(labeled, volume.affine)
     inside = points[body.ends.depth(points) > settings.end_label_depth]
-    flags = []
-    if len(inside) > settings.end_label_share * max(len(body.inside_points()[0]), 1):
-        message = (
-            f"{len(inside)} head or tail voxels lie inside the body, near "
-            f"{name_place(inside, body)}: correct these labels"
-        )
-        flags.append(Flag(reason="end-labels-inside", message=message))
-    return flags + _check_beyond(volume, body, settings)
+    amid = Finding(
+        reason="end-labels-inside",
+        value=len(inside) / max(len(body.inside_points()[0]), 1),
+        limit=settings.end_label_share,
+        what=f"{len(inside)} head or tail voxels lie inside the body",
+        remedy="correct these labels",
+        points=inside,
+    )
+    return [amid, *_check_beyond(volume, body, settings)]
 
 
-def _check_beyond(volume: LabelVolume, body: Body, settings: CheckSettings) -> list[Flag]:
+def _check_beyond(volume: LabelVolume, body: Body, settings: CheckSettings) -> list[Finding]:
     """Flag ends without head or tail labels at which all labels end."""
     labeled = (volume.tissue > 0) & (volume.tissue <= Tissue.HIPPOCAMPUS)
     points = voxel_points(labeled, volume.affine)
-    flags = []
+    found = []
     ends = body.ends
     for end, rule, height in (
         ("posterior", ends.posterior_rule, ends.height(points, "posterior")),
@@ -214,13 +227,17 @@ def _check_beyond(volume: LabelVolume, body: Body, settings: CheckSettings) -> l
             continue
         near = points[(height > 0) & (height < settings.beyond_reach)]
         beyond = np.count_nonzero((height < 0) & (height > -settings.beyond_reach))
-        if beyond < settings.beyond_share * len(near):
-            message = (
-                f"the labels end where the body does, at its {end} end near "
-                f"{name_place(near, body)}: it may be cut short there; label the whole hippocampus"
+        found.append(
+            Finding(
+                reason="labels-end",
+                value=1 - float(beyond) / max(len(near), 1),
+                limit=1 - settings.beyond_share,
+                what=f"the labels end where the body does, at its {end} end",
+                remedy="it may be cut short there; label the whole hippocampus",
+                points=near,
             )
-            flags.append(Flag(reason="labels-end", message=message))
-    return flags
+        )
+    return found
 
 
 def describe_uncus(body: Body, settings: CheckSettings) -> list[str]:
@@ -235,22 +252,25 @@ def describe_uncus(body: Body, settings: CheckSettings) -> list[str]:
     return [f"left out the uncus, {volume:.0f} mm3 at {name_place(points, body)}{warning}"]
 
 
-def check_cavities(body: Body, settings: CheckSettings) -> list[Flag]:
+def check_cavities(body: Body, settings: CheckSettings) -> list[Finding]:
     """Flag large cavities that were too wide to say whose they are."""
-    flags = []
-    for cavity in body.cavities.wide:
-        share = len(cavity) / max(len(body.inside_points()[0]), 1)
-        if share > settings.flag_cavity:
-            message = (
-                f"a cavity of {len(cavity) * body.voxel_volume:.0f} mm3 without a label, near "
-                f"{name_place(to_ras(cavity, body.affine), body)}, was divided between the sheet "
-                f"and its interior: mean thickness may be off by {share / 2:.0%}; label what it is"
-            )
-            flags.append(Flag(reason="wide-cavity", message=message))
-    return flags
+    size = max(len(body.inside_points()[0]), 1)
+    return [
+        Finding(
+            reason="wide-cavity",
+            value=len(cavity) / size,
+            limit=settings.flag_cavity,
+            what=f"a cavity of {len(cavity) * body.voxel_volume:.0f} mm3 without a label was "
+            "divided between the sheet and its interior, mean thickness may be off by "
+            f"{len(cavity) / size / 2:.0%}",
+            remedy="label what it is",
+            points=to_ras(cavity, body.affine),
+        )
+        for cavity in body.cavities.wide
+    ]
 
 
-def check_labels(body: Body, settings: CheckSettings) -> list[Flag]:
+def check_labels(body: Body, settings: CheckSettings) -> list[Finding]:
     """Flag noise and thin gaps in the labels, which smoothing hides from the later steps."""
     around = box_around(body.inside_points()[0])
     low = low_corner(around) - 1
@@ -271,39 +291,42 @@ def check_labels(body: Body, settings: CheckSettings) -> list[Flag]:
     rows = (
         (
             "noisy-labels",
-            noise > settings.flag_pinholes,
+            (noise, settings.flag_pinholes),
             f"the labels are noisy: {noise:.1%} of the sheet are single voxels without a label",
             pinholes + low,
             "smooth or correct the labels",
         ),
         (
             "thin-gap",
-            len(body.gap) > settings.flag_gap,
+            (float(len(body.gap)), float(settings.flag_gap)),
             f"a thin gap of {len(body.gap)} voxels without a label divides the sheet",
             body.gap,
             "fill it in the labels",
         ),
         (
             "loose-part",
-            loose > settings.flag_loose_part,
+            (loose, settings.flag_loose_part),
             f"{loose:.0%} of the sheet do not touch the rest by any face of a voxel",
-            np.argwhere(pieces == second) + low,
+            np.argwhere(pieces == second) + low if loose else np.zeros((0, 3)),
             "fill the gap in the labels",
         ),
     )
     return [
-        Flag(
+        Finding(
             reason=reason,
-            message=f"{what}, near {name_place(to_ras(voxels, body.affine), body)}: {remedy}",
+            value=value,
+            limit=limit,
+            what=what,
+            remedy=remedy,
+            points=to_ras(voxels, body.affine),
         )
-        for reason, found, what, voxels, remedy in rows
-        if found
+        for reason, (value, limit), what, voxels, remedy in rows
     ]
 
 
 def check_cross_sections(
     field: Field, body: Body, settings: CheckSettings, cuts: Bool | None = None
-) -> list[Flag]:
+) -> list[Finding]:
     """Flag a body of which a part is missing between cross-sections that have it, or added.
 
     Each cross-section is compared with those at a distance on both sides. What both lack, or where
@@ -349,13 +372,15 @@ def check_cross_sections(
         ),
     )
     return [
-        Flag(
+        Finding(
             reason=reason,
-            message=f"a cross-section {what}, {outlier.share:.0%} of its area, at "
-            f"{name_place(field.grid.to_ras(outlier.nodes), body)}: {remedy}",
+            value=outlier.share,
+            limit=outlier.limit,
+            what=f"a cross-section {what}, {outlier.share:.0%} of its area",
+            remedy=remedy,
+            points=field.grid.to_ras(outlier.nodes),
         )
         for reason, outlier, what, remedy in rows
-        if outlier.excess > 1
     ]
 
 
@@ -373,24 +398,23 @@ def _interior_nodes(field: Field, body: Body) -> Bool:
 class _Outlier:
     """The cross-section that departs most from its neighbors."""
 
-    excess = 1.0
-    """How many times the limit the departing share is."""
     share = 0.0
     """Share of its area that departs."""
+    limit = 1.0
+    """Limit of that share."""
     nodes: Float = np.zeros((0, 3))
     """Grid nodes (N, 3) that depart."""
 
     def update(self, part: Bool, share: Float, limit: float, first: int) -> None:
         """Take over the cross-section that departs most, if more than those before."""
         at = int(share.argmax())
-        if share[at] > limit * self.excess:
-            self.excess = float(share[at] / limit)
-            self.share = float(share[at])
+        if share[at] / limit > self.share / self.limit:
+            self.share, self.limit = float(share[at]), limit
             nodes = np.argwhere(part[:, :, at]).astype(float)
             self.nodes = np.column_stack([nodes, np.full(len(nodes), at + first)])
 
 
-def check_rows(sheet: Sheet, settings: CheckSettings) -> list[Flag]:
+def check_rows(sheet: Sheet, settings: CheckSettings) -> list[Finding]:
     """Flag a sheet whose medial-to-lateral length jumps from row to row, or dips."""
     middle = sheet.points[:, :, sheet.middle]
     lengths = np.linalg.norm(np.diff(middle, axis=0), axis=-1).sum(axis=0)
@@ -403,37 +427,51 @@ def check_rows(sheet: Sheet, settings: CheckSettings) -> list[Flag]:
         ("extent-dip", dips, settings.flag_row_dip, "dips by {}"),
     ):
         row = int(np.nanargmax(change))
-        if change[row] > limit:
-            at = position_text(np.nanmean(middle[:, row], axis=0))
-            message = (
-                f"the sheet's width {what.format(f'{change[row]:.0%}')}, near {at}: look for "
-                "missing or added parts in the labels"
+        found.append(
+            Finding(
+                reason=reason,
+                value=float(change[row]),
+                limit=limit,
+                what=f"the sheet's width {what.format(f'{change[row]:.0%}')}",
+                remedy="look for missing or added parts in the labels",
+                points=_known(middle[:, row]),
             )
-            found.append(Flag(reason=reason, message=message))
+        )
     return found
 
 
-def check_ridges(sheet: Sheet, thickness: Float, settings: CheckSettings) -> list[Flag]:
+def _known(points: Float) -> Float:
+    """Rows of (N, 3) points without NaN."""
+    return points[np.isfinite(points).all(axis=1)]
+
+
+def check_ridges(sheet: Sheet, thickness: Float, settings: CheckSettings) -> list[Finding]:
     """Flag a band across the axis where thickness (Nx, Ny), mm, differs from that on both sides.
 
     Labels that leaked, or that a bar or a dent has changed, show in few cross-sections; thickness
     of a whole sheet changes more slowly along the axis.
     """
     middle = sheet.points[:, :, sheet.middle]
-    flags = []
+    found = []
     for reason, sign, limits, what in (
         ("thickness-ridge", 1, settings.flag_ridge, "thicker"),
         ("thickness-groove", -1, settings.flag_groove, "thinner"),
     ):
         bands = _bands(sign * thickness, limits, _row_step(middle), settings)
-        excess, size, at = max(bands, default=(0.0, 0.0, (0, 0)))
-        if excess > 1:
-            message = (
-                f"a band of the sheet is {size:.1f} mm {what} than the sheet before and behind "
-                f"it, near {position_text(middle[at])}: look at the labels there"
+        excess, size, (column, row) = max(bands, default=(0.0, 0.0, (0, 0)))
+        half = settings.ridge_columns // 2
+        found.append(
+            Finding(
+                reason=reason,
+                value=size,
+                limit=size / excess if excess else limits[0],
+                what=f"a band of the sheet is {size:.1f} mm {what} than the sheet before and "
+                "behind it",
+                remedy="look at the labels there",
+                points=_known(middle[max(column - half, 0) : column + half + 1, row]),
             )
-            flags.append(Flag(reason=reason, message=message))
-    return flags
+        )
+    return found
 
 
 def _bands(
@@ -448,7 +486,7 @@ def _bands(
         above = np.nan_to_num(thickness[:, k:-k] - sides)
         band = ndimage.uniform_filter1d(above, settings.ridge_columns, axis=0)
         at = np.unravel_index(band.argmax(), band.shape)
-        size = float(band[at])
+        size = max(float(band[at]), 0.0)
         yield size / limit, size, (int(at[0]), int(at[1]) + k)
 
 

@@ -15,7 +15,7 @@ from hipsta_bids.geometry.fem import Laplace
 from hipsta_bids.geometry.measures import labels_at
 from hipsta_bids.geometry.mesh import cross, tetra_volumes
 from hipsta_bids.settings import SheetSettings
-from hipsta_bids.types import Bool, Coordinates, Flag, Float, Sheet, TetMesh
+from hipsta_bids.types import Bool, Coordinates, Finding, Float, Sheet, TetMesh
 
 
 def sample_sheet(mesh: TetMesh, coordinates: Coordinates, settings: SheetSettings) -> Sheet:
@@ -90,12 +90,17 @@ def is_flipped(sheet: Sheet, hemi: str) -> bool:
     return is_left_handed(sheet.points) == (hemi == "L")
 
 
-def check_flipped(sheet: Sheet, hemi: str) -> list[Flag]:
+def check_flipped(sheet: Sheet, hemi: str) -> Finding:
     """Flag a sheet whose interior side, found by labels, is not that of its hemisphere."""
-    if not is_flipped(sheet, hemi):
-        return []
-    text = "the labels of the dentate gyrus lie on the exterior side of the sheet: look at the map"
-    return [Flag(reason="side-doubtful", message=text)]
+    return Finding(
+        reason="side-doubtful",
+        value=float(is_flipped(sheet, hemi)),
+        limit=0,
+        what="the labels of the dentate gyrus lie on the exterior side of the sheet",
+        remedy="look at the map",
+        share=1.0,
+        change=0.0,
+    )
 
 
 def label_sheet(sheet: Sheet, body: Body) -> NDArray[np.uint8]:
@@ -255,19 +260,20 @@ def equal_volume_layers(sheet: Sheet) -> tuple[Sheet, Bool]:
     return Sheet(points=points, valid=sheet.valid), folded
 
 
-def check_layers(folded: Bool) -> list[Flag]:
+def check_layers(folded: Bool, sheet: Sheet) -> Finding:
     """Flag a sheet whose layers fold, so that some columns have no equal-volume depths."""
-    if not folded.any():
-        return []
-    x, y = np.argwhere(folded)[0] + 1
-    return [
-        Flag(
-            reason="layers-fold",
-            message=f"layers fold in {folded.sum()} of {folded.size} columns, the first at x {x}, "
-            f"y {y}: their layers are at equal distances instead; set sheet.depths to distance, "
-            "or leave these points out",
-        )
-    ]
+    first = np.argwhere(folded)[:1] + 1
+    return Finding(
+        reason="layers-fold",
+        value=float(np.count_nonzero(folded)),
+        limit=0,
+        what=f"layers fold in {folded.sum()} of {folded.size} columns"
+        + "".join(f", the first at x {x}, y {y}" for x, y in first)
+        + ", their layers are at equal distances instead",
+        remedy="set sheet.depths to distance, or leave these points out",
+        points=sheet.points[folded][:, sheet.middle],
+        placed=True,
+    )
 
 
 def layer_depth(layers: Sheet) -> Float:

@@ -40,7 +40,7 @@ Contact = Callable[[Float], bool]
 """Function that says whether, by the labels, two turns touch at (N, 3) points, RAS mm."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Repair:
     """One change of the body's shape."""
 
@@ -56,9 +56,16 @@ class Repair:
     """Center, RAS mm."""
     subfield: str = ""
     """Subfields at the center, if known."""
-    large: bool
-    """Whether it is beyond the limits of :class:`TopologySettings`, or contradicts the run of the
-    ribbon, and a person should look at it."""
+    excess: float
+    """How many times the limits of :class:`TopologySettings` it is: beyond 1, a person should look
+    at it; infinite if it contradicts the run of the ribbon."""
+    points: Float
+    """(N, 3) changed nodes, RAS mm."""
+
+    @property
+    def large(self) -> bool:
+        """Whether it is beyond the limits."""
+        return self.excess > 1
 
     def __str__(self) -> str:
         what = {
@@ -308,7 +315,8 @@ def _describe(
 ) -> Repair:
     """Locate one change, and find out whether it is large."""
     kind, where = edit.kind, edit.where
-    center = field.grid.to_ras((where - FIRST).mean(axis=0, keepdims=True))[0]
+    points = field.grid.to_ras((where - FIRST).astype(np.float64))
+    center = points.mean(axis=0)
     inside = np.clip(where - FIRST, 0, np.array(field.grid.shape) - 1)
     cost = edit.cost or float(np.abs(field.values[tuple(inside.T)]).sum())
     share = settings.flag_part if kind == "part" else settings.flag_fraction
@@ -319,12 +327,10 @@ def _describe(
         cost=cost,
         position=(float(center[0]), float(center[1]), float(center[2])),
         subfield=locate(center[None]) if locate else "",
-        large=bool(
-            edit.doubtful
-            or cost > limit
-            or (len(where) > share * size and kind != "uncus")
-            or (kind == "fill" and _beside_slit(inside, field))
-        ),
+        excess=float("inf")
+        if edit.doubtful or (kind == "fill" and _beside_slit(inside, field))
+        else max(cost / max(limit, 1e-9), 0.0 if kind == "uncus" else len(where) / (share * size)),
+        points=points,
     )
 
 

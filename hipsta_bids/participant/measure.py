@@ -35,9 +35,16 @@ from hipsta_bids.geometry.checks import (
     check_voxels_across,
     describe_uncus,
     find_contacts,
+    name_place,
     name_subfields,
 )
 from hipsta_bids.geometry.fem import volume_laplace
+from hipsta_bids.geometry.findings import (
+    add_consequence,
+    consequence_text,
+    flag_margins,
+    raise_flags,
+)
 from hipsta_bids.geometry.grid import in_plane_voxel, resample_body
 from hipsta_bids.geometry.measures import bending_angle
 from hipsta_bids.geometry.mesh import extract_surface, tetra_quality, tetrahedralize
@@ -53,7 +60,7 @@ from hipsta_bids.geometry.sheet import (
     solve_coordinates,
     whole_body,
 )
-from hipsta_bids.geometry.topology import SolidField, repair_topology, repaired_columns
+from hipsta_bids.geometry.topology import Repair, SolidField, repair_topology, repaired_columns
 from hipsta_bids.protocols.load import for_region
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import Settings
@@ -61,7 +68,7 @@ from hipsta_bids.types import (
     BodyMask,
     Bool,
     Coordinates,
-    Flag,
+    Finding,
     Float,
     HemisphereMaps,
     LabelVolume,
@@ -101,77 +108,125 @@ class Evidence:
     """Fraction of the volume in which the coordinates have the opposite orientation."""
 
 
-def find_flags(evidence: Evidence) -> list[Flag]:
-    """List what a person should look at before using the map."""
+def find_all(evidence: Evidence) -> list[Finding]:
+    """List what the checks of one hemisphere found, within their limits or not."""
     measured, solid, boundaries = evidence.measured, evidence.solid, evidence.boundaries
     body, sheet, settings = measured.body, measured.sheet, measured.settings
     checks = settings.checks
-    filled = 1 - float(sheet.valid.mean())
+    middle = sheet.points[:, :, sheet.middle]
     present = set(np.unique(body.tissue[body.inside]).tolist())
-    rows: list[tuple[bool, str, str]] = [
-        (repair.large, "large-repair", f"{repair}: a large repair, look at the labels there")
-        for repair in solid.repairs
-    ]
+    edges = np.minimum(*(np.linalg.norm(middle - middle[[end]], axis=2) for end in (0, -1)))
     ends = body.ends
-    rows += [
+    rows: list[tuple[str, float, float, str, str, Float | float]] = [
         (
-            uncertainty > checks.flag_end,
             "ends-uncertain",
-            f"the {end} end, which has no label, is certain to {uncertainty:.1f} mm only: check it",
+            uncertainty,
+            checks.flag_end,
+            f"the {end} end, which has no label, is certain to {uncertainty:.1f} mm only",
+            "check it",
+            middle[:, row],
         )
-        for end, uncertainty in (
-            ("posterior", ends.posterior_uncertainty),
-            ("anterior", ends.anterior_uncertainty),
+        for end, uncertainty, row in (
+            ("posterior", ends.posterior_uncertainty, 0),
+            ("anterior", ends.anterior_uncertainty, -1),
         )
     ]
     rows += [
         (
-            not present & set(tissues),
             "subfield-missing",
-            f"the body has no {name}: the sheet ends there; look at the labels",
+            float(not present & set(tissues)),
+            0,
+            f"the body has no {name}: the sheet ends there",
+            "look at the labels",
+            1.0,
         )
         for name, tissues in _PARTS.items()
         if body.region != "entorhinal"
     ]
     rows += [
         (
-            solid.changed_fraction > settings.topology.flag_fraction,
             "much-repaired",
-            f"{solid.changed_fraction:.1%} of the body was changed by repairs: look at the labels",
+            solid.changed_fraction,
+            settings.topology.flag_fraction,
+            f"{solid.changed_fraction:.1%} of the body was changed by repairs",
+            "look at the labels",
+            middle[repaired_columns(sheet, solid, settings.measures)],
         ),
         (
-            boundaries.rim_distance > checks.flag_rim_distance * boundaries.sheet_thickness,
             "boundary-doubtful",
+            boundaries.rim_distance / boundaries.sheet_thickness,
+            checks.flag_rim_distance,
             f"the medial or lateral boundary is uncertain by {boundaries.rim_distance:.1f} mm",
+            "look at the edges of the sheet",
+            middle[edges < boundaries.rim_distance],
         ),
         (
             # The cortex beside the body bends the other way.
-            body.region == "body"
-            and boundaries.side_rule == "labels"
-            and evidence.bending < -checks.flag_bending,
             "side-doubtful",
+            -evidence.bending
+            if body.region == "body" and boundaries.side_rule == "labels"
+            else 0.0,
+            checks.flag_bending,
             f"dentate gyrus labels lie on the outer side of the bend ({evidence.bending:.1f} rad)",
+            "look at which wall is called interior; thickness does not depend on it",
+            1.0,
         ),
         (
-            evidence.folded > checks.flag_folded,
             "folded",
-            f"the coordinates fold in {evidence.folded:.1%} of the volume: look at the map",
+            evidence.folded,
+            checks.flag_folded,
+            f"the coordinates fold in {evidence.folded:.1%} of the volume",
+            "look at the map",
+            evidence.folded,
         ),
         (
-            filled > checks.flag_filled,
             "columns-filled",
-            f"{filled:.1%} of the columns were filled from their neighbors: look at the map",
+            1 - float(sheet.valid.mean()),
+            checks.flag_filled,
+            f"{1 - sheet.valid.mean():.1%} of the columns were filled from their neighbors",
+            "look at the map",
+            middle[~sheet.valid],
         ),
     ]
-    found = [Flag(reason=reason, message=message) for wrong, reason, message in rows if wrong]
     return [
-        *found,
+        *map(_of_repair, solid.repairs),
+        *map(_whole, rows),
         *check_image(body, checks),
         *check_cavities(body, checks),
         *check_labels(body, checks),
         *check_cross_sections(solid.field, body, checks, solid.touched & (solid.field.values < 0)),
         *check_rows(sheet, checks),
+        *check_ridges(sheet, measured.thickness, checks),
     ]
+
+
+def _of_repair(repair: Repair) -> Finding:
+    return Finding(
+        reason="large-repair",
+        value=repair.excess,
+        limit=1.0,
+        what=str(repair),
+        remedy="a large repair, look at the labels there",
+        points=repair.points,
+        placed=True,
+    )
+
+
+def _whole(row: tuple[str, float, float, str, str, Float | float]) -> Finding:
+    """Make a finding about the sheet as a whole, from the columns concerned or their share."""
+    reason, value, limit, what, remedy, where = row
+    finding = Finding(
+        reason=reason, value=value, limit=limit, what=what, remedy=remedy, placed=True
+    )
+    if isinstance(where, float):
+        return replace(finding, share=where)
+    return replace(finding, points=where[np.isfinite(where).all(axis=-1)])
+
+
+def _told(repair: Repair, sheet: Sheet, settings: Settings) -> str:
+    """Write what a repair changed, and what it means for the map."""
+    known = add_consequence(_of_repair(repair), sheet, settings.checks)
+    return f"{repair}{consequence_text(known)}"
 
 
 def quality_metrics(evidence: Evidence, repaired: Bool) -> dict[str, Any]:
@@ -322,13 +377,15 @@ def measure_hemisphere(
     measured, solid, boundaries = evidence.measured, evidence.solid, evidence.boundaries
     body, sheet = measured.body, measured.sheet
     with clock("measures"):
-        flags = check_end_labels(volume, body, settings.checks)
-        flags += check_thickness(measured.thickness, boundaries.sheet_thickness, settings.checks)
-        flags += check_ridges(sheet, measured.thickness, settings.checks)
-        flags += check_flipped(sheet, hemi) if body.region == "extended" else []
-        flags += _check_edited_mask(volume, body, settings)
-        flags += find_flags(evidence)
-        layers, folds = _layers(sheet, settings)
+        layers, folded_layers = _layers(sheet, settings)
+        findings = [
+            *check_end_labels(volume, body, settings.checks),
+            *check_thickness(measured.thickness, boundaries.sheet_thickness, settings.checks),
+            *([check_flipped(sheet, hemi)] if body.region == "extended" else []),
+            *_check_edited_mask(volume, body, settings),
+            *find_all(evidence),
+            *folded_layers,
+        ]
         repaired = repaired_columns(sheet, solid, settings.measures)
         maps = measure_maps(measured)
         return HemisphereMaps(
@@ -341,9 +398,16 @@ def measure_hemisphere(
             repaired=repaired,
             body_mask=volume.in_file(body.inside),
             summary=summarize(measured, for_region(volume.protocol, body.region).sheet),
-            qc=quality_metrics(evidence, repaired),
-            repairs=(*map(str, solid.repairs), *describe_uncus(body, settings.checks)),
-            flags=(*flags, *folds),
+            qc={**quality_metrics(evidence, repaired), "flag_margins": flag_margins(findings)},
+            repairs=(
+                *(_told(repair, sheet, settings) for repair in solid.repairs),
+                *describe_uncus(body, settings.checks),
+            ),
+            flags=tuple(
+                raise_flags(
+                    findings, sheet, lambda points: name_place(points, body), settings.checks
+                )
+            ),
             mesh=measured.mesh,
             coordinates=coordinates,
         )
@@ -358,7 +422,7 @@ def find_body(volume: LabelVolume, settings: Settings) -> BodyMask | None:
     return volume.in_file(body.inside)
 
 
-def _check_edited_mask(volume: LabelVolume, body: Body, settings: Settings) -> list[Flag]:
+def _check_edited_mask(volume: LabelVolume, body: Body, settings: Settings) -> list[Finding]:
     if volume.edited_mask is None or body.mask_change is None:
         return []
     voxel = in_plane_voxel(body.affine)
@@ -382,12 +446,12 @@ def _filled(
     return surface, mesh, settings.surface.untangle_tries
 
 
-def _layers(sheet: Sheet, settings: Settings) -> tuple[Sheet, list[Flag]]:
-    """Space layers as the settings say, and flag where that is not possible."""
+def _layers(sheet: Sheet, settings: Settings) -> tuple[Sheet, list[Finding]]:
+    """Space layers as the settings say, and find out where that is not possible."""
     if settings.sheet.depths == "distance":
         return sheet, []
     layers, folded = equal_volume_layers(sheet)
-    return layers, check_layers(folded)
+    return layers, [check_layers(folded, sheet)]
 
 
 def _sides_exchanged(sheet: Sheet, rule: str, bending: float, hemi: str) -> bool:

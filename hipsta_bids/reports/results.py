@@ -116,8 +116,9 @@ class Hemisphere:
         flags = [_finding("flag", str(f["message"])) for f in self.record.get("flags") or []]
         repairs = [_finding("repair", str(r)) for r in self.record.get("repairs") or []]
         # A large repair is also a flag.
-        said = {finding.message for finding in flags}
-        return (*flags, *(r for r in repairs if not any(m.startswith(r.message) for m in said)))
+        said = tuple(finding.message for finding in flags)
+        new = (r for r in repairs if not any(m.startswith(r.message.split(";")[0]) for m in said))
+        return (*flags, *new)
 
     @cached_property
     def summary(self) -> Mapping[str, float]:

@@ -107,7 +107,7 @@ def test_a_mask_elsewhere_is_refused(volume, body):
 def test_a_coarse_mask_is_flagged(body, voxel, wanted):
     mask = EditedMask(inside=body.inside, voxel=voxel)
     flags = check_mask(mask, MaskChange(before=9, added=0, removed=0), 0.4, SETTINGS)
-    assert [flag.reason.removeprefix("edited-mask-") for flag in flags] == wanted
+    assert [flag.reason.removeprefix("edited-mask-") for flag in flags if flag.raised] == wanted
 
 
 @pytest.mark.parametrize(("removed", "wanted"), [(40, []), (41, ["different"])])
@@ -115,7 +115,7 @@ def test_a_mask_that_changes_half_of_the_body_is_flagged(body, removed, wanted):
     mask = EditedMask(inside=body.inside, voxel=0.4)
     change = MaskChange(before=100, added=10, removed=removed)
     flags = check_mask(mask, change, 0.4, SETTINGS)
-    assert [flag.reason.removeprefix("edited-mask-") for flag in flags] == wanted
+    assert [flag.reason.removeprefix("edited-mask-") for flag in flags if flag.raised] == wanted
 
 
 def test_changes_are_counted(volume, body):

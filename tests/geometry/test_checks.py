@@ -157,7 +157,8 @@ def test_rank_correlation_is_spearmans(seed):
 
 def test_thickness_of_phantoms_is_as_expected(case):
     thickness = measure_thickness(case.sheet)
-    assert check_thickness(thickness, case.boundaries.sheet_thickness, CHECKS) == []
+    (found,) = check_thickness(thickness, case.boundaries.sheet_thickness, CHECKS)
+    assert not found.raised
 
 
 def map_of(mean):
@@ -170,8 +171,10 @@ def map_of(mean):
     ("mean", "flagged"), [(2.0, False), (2.25, False), (2.4, True), (1.6, True)]
 )
 def test_a_doubtful_mean_is_flagged(mean, flagged):
-    flags = check_thickness(map_of(mean), 2.0, CHECKS)
-    assert [flag.reason for flag in flags] == ["thickness-doubtful"] * flagged
+    (found,) = check_thickness(map_of(mean), 2.0, CHECKS)
+    assert found.reason == "thickness-doubtful"
+    assert found.raised is flagged
+    assert found.change == pytest.approx(mean - 2.0)
 
 
 @pytest.mark.parametrize("mean", [5.0, 1.0, 2.8, np.nan])
@@ -195,10 +198,11 @@ def test_an_end_at_which_all_labels_end_is_flagged(arc, part):
         tissue=np.where(lost, 0, arc.volume.tissue),
         part=np.where(lost, Part.UNKNOWN, arc.volume.part),
     )
-    flags = check_end_labels(volume, extract_body(volume, ALL.body), CHECKS)
+    found = check_end_labels(volume, extract_body(volume, ALL.body), CHECKS)
+    flags = [finding for finding in found if finding.raised]
     assert [flag.reason for flag in flags] == ["labels-end"]
-    assert ("anterior" if part is Part.HEAD else "posterior") in flags[0].message
+    assert ("anterior" if part is Part.HEAD else "posterior") in flags[0].what
 
 
 def test_short_head_and_tail_labels_are_enough(arc):
-    assert check_end_labels(arc.volume, arc.body, CHECKS) == []
+    assert not any(found.raised for found in check_end_labels(arc.volume, arc.body, CHECKS))

@@ -69,21 +69,21 @@ def test_where_layers_fold_they_keep_equal_distances():
     assert not folded[:10].any()
     np.testing.assert_array_equal(layers.points[folded], sheet.points[folded])
     assert np.isfinite(layers.points).all()
-    (flag,) = check_layers(folded)
-    assert flag.reason == "layers-fold"
-    assert f"{folded.sum()} of 861 columns" in flag.message
-    assert "\n" not in flag.message
+    found = check_layers(folded, sheet)
+    assert (found.reason, found.raised) == ("layers-fold", True)
+    assert f"{folded.sum()} of 861 columns" in found.what
+    assert len(found.points) == folded.sum()
 
 
 def test_a_fold_is_placed_by_its_first_column():
     folded = np.zeros((41, 21), dtype=bool)
     folded[[6, 7], [3, 1]] = True
-    (flag,) = check_layers(folded)
-    assert "in 2 of 861 columns, the first at x 7, y 4:" in flag.message  # counted from 1
+    what = check_layers(folded, tube()).what
+    assert "in 2 of 861 columns, the first at x 7, y 4," in what  # counted from 1
 
 
 def test_no_fold_no_flag():
-    assert check_layers(np.zeros((41, 21), dtype=bool)) == []
+    assert not check_layers(np.zeros((41, 21), dtype=bool), tube()).raised
 
 
 def test_depth_runs_from_wall_to_wall():

@@ -8,7 +8,7 @@ import pytest
 
 from hipsta_bids.geometry.catalog import Measured
 from hipsta_bids.geometry.topology import Repair
-from hipsta_bids.participant.measure import Evidence, find_flags, quality_metrics
+from hipsta_bids.participant.measure import Evidence, find_all, quality_metrics
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Sheet
@@ -44,7 +44,7 @@ def with_measured(evidence, **changes):
 
 
 def reasons(evidence):
-    return [flag.reason for flag in find_flags(evidence)]
+    return [found.reason for found in find_all(evidence) if found.raised]
 
 
 def test_a_sound_hemisphere_has_no_flags(evidence):
@@ -62,15 +62,24 @@ def test_a_missing_end_of_the_ribbon_is_flagged(evidence, absent):
     assert found == ["subfield-missing"] + ["loose-part"] * (absent == (Tissue.CA1,))
 
 
-def repair(*, large):
-    return Repair(kind="cut", voxels=30, cost=12.0, position=(1.0, 2.0, 3.0), large=large)
+def repair(excess):
+    return Repair(
+        kind="cut",
+        voxels=30,
+        cost=12.0,
+        position=(1.0, 2.0, 3.0),
+        excess=excess,
+        points=np.array([[1.0, 2.0, 3.0]]),
+    )
 
 
 def test_large_repairs_are_flagged_one_by_one(evidence):
-    repairs = (repair(large=True), repair(large=False), repair(large=True))
-    flags = find_flags(replace(evidence, solid=replace(evidence.solid, repairs=repairs)))
-    assert [flag.reason for flag in flags] == ["large-repair"] * 2
-    assert "cut a bridge of 30 grid nodes at RAS 1.0 2.0 3.0 mm" in flags[0].message
+    repairs = (repair(1.5), repair(0.7), repair(np.inf))
+    found = find_all(replace(evidence, solid=replace(evidence.solid, repairs=repairs)))
+    large = [finding for finding in found if finding.reason == "large-repair"]
+    assert [finding.margin for finding in large] == [1.5, 0.7, np.inf]
+    assert [finding.raised for finding in large] == [True, False, True]
+    assert "cut a bridge of 30 grid nodes at RAS 1.0 2.0 3.0 mm" in large[0].what
 
 
 @pytest.mark.parametrize(("fraction", "wanted"), [(0.06, ["much-repaired"]), (0.04, [])])

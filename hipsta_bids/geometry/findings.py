@@ -1,0 +1,115 @@
+"""From what checks found to flags: where it is, and what it means for the map."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import spsolve
+from scipy.spatial import cKDTree
+
+from hipsta_bids.geometry.measures import column_area, measure_thickness
+from hipsta_bids.settings import CheckSettings
+from hipsta_bids.types import Bool, Finding, Flag, Float, Sheet
+
+_SAME = 0.005
+"""mm; means that differ by less read the same."""
+
+
+def flag_margins(findings: Sequence[Finding]) -> dict[str, float]:
+    """Largest value over limit by reason; above 1 is flagged."""
+    margins: dict[str, float] = {}
+    for finding in findings:
+        margins[finding.reason] = max(finding.margin, margins.get(finding.reason, 0.0))
+    return margins
+
+
+def raise_flags(
+    findings: Sequence[Finding],
+    sheet: Sheet,
+    place: Callable[[Float], str],
+    settings: CheckSettings,
+) -> list[Flag]:
+    """Turn what is beyond its limit into flags that say where, and what it means for the map.
+
+    ``place`` writes the place of (N, 3) points, RAS mm.
+    """
+    flags = []
+    for found in findings:
+        if found.raised:
+            known = add_consequence(found, sheet, settings)
+            where = (
+                f", near {place(found.points)}" if len(found.points) and not found.placed else ""
+            )
+            flags.append(
+                Flag(
+                    reason=found.reason,
+                    message=f"{found.what}{where}: {found.remedy}{consequence_text(known)}",
+                    value=float(found.value),
+                    limit=float(found.limit),
+                    points=found.points,
+                    share=known.share,
+                    change=known.change,
+                )
+            )
+    return flags
+
+
+def add_consequence(finding: Finding, sheet: Sheet, settings: CheckSettings) -> Finding:
+    """Add which share of the columns the points of a finding concern, and what that does.
+
+    The mean thickness, weighted by area, is compared with that of a map in which the columns near
+    these points are as those around them.
+    """
+    if not len(finding.points):
+        return finding
+    near = columns_near(sheet, finding.points, settings.flag_reach)
+    thickness, area = measure_thickness(sheet), column_area(sheet)
+    known = np.isfinite(thickness) & np.isfinite(area)
+    change = float("nan")
+    if (known & ~near).any():
+        step = np.where(near, thickness - spread_over(thickness, near | ~known), 0.0)[known]
+        change = float((step * area[known]).sum() / area[known].sum())
+    return replace(finding, share=float(near.mean()), change=change)
+
+
+def columns_near(sheet: Sheet, points: Float, reach: float) -> Bool:
+    """Columns (Nx, Ny) of which any point lies within ``reach`` mm of points (N, 3)."""
+    known = np.isfinite(sheet.points).all(axis=-1)
+    near = np.zeros(known.shape, dtype=bool)
+    near[known] = cKDTree(points).query(sheet.points[known])[0] <= reach
+    return np.asarray(near.any(axis=2))
+
+
+def spread_over(values: Float, where: Bool) -> Float:
+    """Replace values (Nx, Ny) by the smoothest continuation of the others, a harmonic function."""
+    number = np.arange(values.size).reshape(values.shape)
+    first = np.concatenate([number[1:].ravel(), number[:, 1:].ravel()])
+    second = np.concatenate([number[:-1].ravel(), number[:, :-1].ravel()])
+    edges = sparse.coo_array((np.ones(first.size), (first, second)), shape=(values.size,) * 2)
+    weights = (edges + edges.T).tocsr()
+    laplace = (sparse.diags_array(weights.sum(axis=1)) - weights).tocsr()
+    inner, outer = np.flatnonzero(where), np.flatnonzero(~where)
+    result = values.ravel().copy()
+    if len(inner) and len(outer):
+        result[inner] = spsolve(
+            laplace[inner][:, inner].tocsc(), -laplace[inner][:, outer] @ result[outer]
+        )
+    return np.asarray(result.reshape(values.shape))
+
+
+def consequence_text(found: Finding) -> str:
+    """Write what a finding means for the map, to follow its message; empty if that is unknown."""
+    if np.isnan(found.share):
+        return ""
+    if found.share == 0:
+        return "; no measured column lies near"
+    which = "all columns" if found.share == 1 else f"{found.share:.1%} of the columns"
+    if np.isnan(found.change):
+        return f"; it concerns {which}"
+    less = "the same" if abs(found.change) < _SAME else f"{abs(found.change):.2f} mm "
+    if abs(found.change) >= _SAME:
+        less += "less" if found.change > 0 else "more"
+    if found.share == 1:
+        return f"; it concerns all columns, the mean thickness may be {less}"
+    return f"; it concerns {which}: were they as those around them, the mean would be {less}"
