@@ -269,6 +269,11 @@ def _lost(lost: WorkerLost) -> Refusal:
 
 def _work(job: tuple[int, Callable[[Any], Any], Any]) -> Any:  # noqa: ANN401  (any result)
     _, work, case = job
+    return attempt(work, case)
+
+
+def attempt(work: Callable[[Any], Any], case: Any) -> Any:  # noqa: ANN401  (any result)
+    """Do the work of a case; an error becomes a refusal."""
     try:
         return work(case)
     except HipstaError as error:

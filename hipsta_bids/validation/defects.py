@@ -1,6 +1,7 @@
 """How damaged labels end: repaired, flagged or refused, and how far the maps move."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 
@@ -118,6 +119,10 @@ class Damage:
     """All columns of the sheet."""
     changed: float = 0.0
     """Share of the body that repairs changed."""
+    far: int = 0
+    """Columns that are not near the defect."""
+    margins: Mapping[str, float] = field(default_factory=dict)
+    """Statistic over limit by reason of a flag."""
 
     @property
     def missed(self) -> tuple[str, ...]:
@@ -143,7 +148,7 @@ def run(full: bool, labels: Path | None = None) -> Suite:
     plan = PLAN if full else PLAN[::3]
     trials = [Trial(body=body, kind=k, size=s, position=p) for body in bodies for k, s, p in plan]
     results = [
-        _refused(result) if isinstance(result, Refusal) else result
+        refused(result) if isinstance(result, Refusal) else result
         for result in run_cases(measure_trial, trials, timeout=TIMEOUT)
     ]
     return Suite(
@@ -188,10 +193,13 @@ def compare(maps: HemisphereMaps, reference: HemisphereMaps, changed: Float) -> 
         mean=float(np.nanmean(change)),
         columns=change.size,
         changed=float(maps.qc["changed_fraction"]),
+        far=int(np.count_nonzero(~near)),
+        margins=maps.qc["flag_margins"],
     )
 
 
-def _refused(refusal: Refusal) -> Damage:
+def refused(refusal: Refusal) -> Damage:
+    """Enter a refusal among the results."""
     status = CRASH if refusal.is_bug else Status.FAILED
     return Damage(status=status, reasons=(refusal.reason,), message=refusal.message)
 

@@ -30,13 +30,14 @@ SUITES: Mapping[str, str] = MappingProxyType(
         "invariance": "invariance:run",
         "uncertainty": "invariance:run_uncertainty",
         "defects": "defects:run",
+        "population": "population:run",
         "group": "group:run",
         "surrogate": "slice_thickness:run",
     }
 )
 
 #: Suites that measure real segmentations too, where there are any.
-WITH_LABELS = frozenset({"defects", "slices", "surrogate"})
+WITH_LABELS = frozenset({"defects", "population", "slices", "surrogate"})
 
 #: What is written, below the output folder.
 PAGE = "validation.md"

@@ -1,0 +1,502 @@
+"""A population of undamaged and damaged hippocampi, and what flags do on it.
+
+Segmentations are warped smoothly at random, turned, mirrored and drawn in the voxels of usual
+protocols. The limit of each flag is compared with quantiles of its statistic, and judged on brains
+that did not set it.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
+
+from hipsta_bids.errors import SettingsError
+from hipsta_bids.geometry.body import extract_body
+from hipsta_bids.inputs.search import InputRequest, find_hemispheres
+from hipsta_bids.phantom import PhantomSpec
+from hipsta_bids.settings import Settings
+from hipsta_bids.types import Float, HemisphereMaps, LabelVolume, Status
+from hipsta_bids.validation.cases import (
+    Refusal,
+    ValidationBody,
+    attempt,
+    load_body,
+    measure_body,
+    refusal_notes,
+    run_cases,
+)
+from hipsta_bids.validation.damage import Position, Site, make_defect
+from hipsta_bids.validation.defects import PLAN, WRONG, Damage, compare, refused
+from hipsta_bids.validation.report import Cell, Cells, Suite, Table
+
+SEED = 3
+#: Voxels that usual protocols give: FreeSurfer; HSF and others on isotropic scans; ASHS at 7 T and
+#: at 3 T, across the long axis. Labels with thick slices keep their own.
+SIZES: tuple[tuple[float, float, float], ...] = (
+    (1 / 3, 1 / 3, 1 / 3),
+    (0.5, 0.5, 0.5),
+    (0.4, 0.4, 1.0),
+    (0.4, 0.4, 2.0),
+)
+WARP_SD = (0.5, 1.5)
+"""mm, SD of the displacement along each axis, from the narrowest to the widest warp."""
+WARP_SCALE = (8.0, 20.0)
+"""mm, full width at half maximum of the Gaussian that makes it smooth: strains are 10 to 12 %."""
+TURN = 15.0
+"""Degrees, about each axis, by which isotropic grids are turned at most."""
+TILT = 8.0
+"""Degrees, standard deviation of the tilt of slices against the long axis."""
+CRISP = 0.6
+"""Voxels, SD of the Gaussian on the labels before they are drawn anew."""
+FINE = 0.6
+"""mm; voxels without a longer edge are fine."""
+PHANTOM_VOXEL = 0.3
+WARPS_QUICK, WARPS_FULL = 3, 6
+DAMAGES_QUICK, DAMAGES_FULL = 1, 2
+
+MULTIPLES = (0.7, 0.85, 1.0, 1.2, 1.5)
+"""Of the present limits, at which flags are counted."""
+QUANTILE = 0.99
+"""Of the undamaged population: a limit that is set by it flags 1 % for this reason."""
+MAX_FALSE = {"fine": 0.05, "thick": 0.10}
+"""Largest share of undamaged hemispheres with any flag."""
+MAX_FAR = 0.05
+"""A map is wrong if more than this share of the columns away from the damage is off."""
+MAX_SILENT = 0.03
+"""Largest share of wrong maps among the damaged that are accepted."""
+TIMEOUT = 120.0
+"""s per specimen."""
+
+#: Flags whose limits are set on the population; the others follow a rule or the header.
+CALIBRATED = (
+    "large-repair",
+    "much-repaired",
+    "boundary-doubtful",
+    "thickness-doubtful",
+    "folded",
+    "columns-filled",
+    "noisy-labels",
+    "thin-gap",
+    "loose-part",
+    "section-notch",
+    "section-bump",
+    "section-intrusion",
+    "extent-jump",
+    "extent-dip",
+    "thickness-ridge",
+    "thickness-groove",
+)
+
+Injury = tuple[str, float, Position]
+"""Kind of damage, its size and position."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Specimen:
+    """One hemisphere of the population."""
+
+    body: ValidationBody
+    number: int
+    """Seeds the warp and the pose; 0 leaves the labels as they are."""
+    voxel: tuple[float, float, float] | None
+    """mm; None keeps the grid of the labels."""
+    injuries: tuple[Injury, ...] = ()
+
+    @property
+    def brain(self) -> str:
+        """Name of the brain, both sides and all namings of labels together."""
+        if isinstance(self.body, PhantomSpec):
+            return f"phantom {self.body.kind}"
+        return self.body.subject
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Member:
+    """What one specimen gave, undamaged and damaged."""
+
+    brain: str
+    spacing: float
+    """Longest edge of the voxels, mm."""
+    margins: Mapping[str, float]
+    """Statistic over limit by reason of the undamaged one."""
+    injuries: tuple[Injury, ...]
+    damages: tuple[Damage, ...]
+
+    @property
+    def kind(self) -> str:
+        """Key of ``MAX_FALSE``."""
+        return "fine" if self.spacing <= FINE else "thick"
+
+
+def run(full: bool, labels: Path | None = None) -> Suite:
+    """Measure the population and count flags."""
+    specimens = plan(find_bodies(labels), full)
+    results = run_cases(measure_specimen, specimens, timeout=TIMEOUT)
+    return describe(specimens, results)
+
+
+def find_bodies(labels: Path | None) -> list[ValidationBody]:
+    """Find segmentations of a dataset, and of ``hippunfold`` beside it; phantoms without one."""
+    if labels is None:
+        kinds = (("spiral", 2.0), ("tight", 1.6), ("arc", 1.4))
+        return [PhantomSpec(kind=k, thickness=t, variation=0.3) for k, t in kinds]
+    beside = labels.parent / "hippunfold"
+    folders = [labels, *([beside] if beside.is_dir() else [])]
+    found = [item for path in folders for item in find_hemispheres(InputRequest(bids_dir=path))]
+    return [item for item in found if item.problem is None]
+
+
+def plan(bodies: Sequence[ValidationBody], full: bool) -> list[Specimen]:
+    """List specimens: bodies as they are, and warped, with the damages in turn."""
+    warps, each = (WARPS_FULL, DAMAGES_FULL) if full else (WARPS_QUICK, DAMAGES_QUICK)
+    order = np.random.default_rng(SEED).permutation(len(PLAN))
+    specimens: list[Specimen] = []
+    for body in bodies:
+        sizes: Sequence[tuple[float, float, float] | None] = SIZES if _is_fine(body) else (None,)
+        ways = [(None, 0)] + [(size, 1 + n) for n in range(warps) for size in sizes]
+        for size, number in ways:
+            first = each * len(specimens)
+            injuries = tuple(PLAN[order[(first + n) % len(PLAN)]] for n in range(each))
+            specimens.append(Specimen(body=body, number=number, voxel=size, injuries=injuries))
+    return specimens
+
+
+def _is_fine(body: ValidationBody) -> bool:
+    volume, _ = load_body(body, PHANTOM_VOXEL)
+    return bool(np.linalg.norm(volume.affine[:3, :3], axis=0).max() <= FINE)
+
+
+def measure_specimen(specimen: Specimen) -> Member:
+    """Measure one specimen as it is, and with each of its damages."""
+    volume, hemi = make_labels(specimen)
+    maps = measure_body(volume, hemi)
+    site = Site(volume, maps.sheet)
+    damages, done = [], []
+    for kind, size, position in specimen.injuries:
+        try:
+            defect = make_defect(site, kind, size, position)
+        except SettingsError:  # too small for these voxels, or nothing there to damage
+            continue
+        done.append((kind, size, position))
+        damages.append(_measured(defect.volume, hemi, maps, defect.changed))
+    return Member(
+        brain=specimen.brain,
+        spacing=float(np.linalg.norm(volume.affine[:3, :3], axis=0).max()),
+        margins=maps.qc["flag_margins"],
+        injuries=tuple(done),
+        damages=tuple(damages),
+    )
+
+
+def _measured(volume: LabelVolume, hemi: str, reference: HemisphereMaps, changed: Float) -> Damage:
+    """Measure damaged labels; a refusal is a result, too."""
+    found = attempt(lambda labels: measure_body(labels, hemi), volume)
+    return refused(found) if isinstance(found, Refusal) else compare(found, reference, changed)
+
+
+def make_labels(specimen: Specimen) -> tuple[LabelVolume, str]:
+    """Draw the labels of a specimen; its hemisphere."""
+    volume, hemi = load_body(specimen.body, PHANTOM_VOXEL)
+    if specimen.number == 0:
+        return volume, hemi
+    generator = np.random.default_rng((SEED, specimen.number, *map(ord, specimen.brain)))
+    share = generator.random()
+    sd, scale = (a + share * (b - a) for a, b in (WARP_SD, WARP_SCALE))
+    if specimen.voxel is None:  # within slices only, or labels would mix between them
+        shape, affine = volume.tissue.shape, volume.affine
+    else:
+        shape, affine = _grid(volume, specimen.voxel, generator)
+    points = _centers(shape, affine)
+    moved = points + smooth_warp(points, sd, scale, generator)
+    index = (moved - volume.affine[:3, 3]) @ np.linalg.inv(volume.affine[:3, :3]).T
+    if specimen.voxel is None:
+        across = int(np.linalg.norm(volume.affine[:3, :3], axis=0).argmax())
+        index[..., across] = np.indices(shape)[across]
+    drawn = redraw(volume, index, affine)
+    if generator.random() < 0.5:  # noqa: PLR2004 -- half of them
+        mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
+        return replace(drawn, affine=mirror @ drawn.affine), "LR"[hemi == "L"]
+    return drawn, hemi
+
+
+def smooth_warp(
+    points: Float, sd: float, scale: float, generator: np.random.Generator
+) -> NDArray[np.float64]:
+    """Draw a smooth random displacement (..., 3), mm, of standard deviation ``sd`` at points.
+
+    White noise on a grid of 2 mm, smoothed by a Gaussian of ``scale`` mm full width.
+    """
+    step = 2.0
+    low = points.reshape(-1, 3).min(axis=0) - scale
+    count = np.ceil((points.reshape(-1, 3).max(axis=0) + scale - low) / step).astype(int) + 1
+    sigma = scale / np.sqrt(8 * np.log(2)) / step
+    where = np.moveaxis((points - low) / step, -1, 0)
+    warp = []
+    for _ in range(3):
+        noise = ndimage.gaussian_filter(generator.standard_normal(count), sigma)
+        noise *= sd * np.sqrt((2 * np.sqrt(np.pi) * sigma) ** 3)  # SD of smoothed white noise
+        warp.append(ndimage.map_coordinates(noise, where, order=1, mode="nearest"))
+    return np.stack(warp, axis=-1)
+
+
+def _grid(
+    volume: LabelVolume, voxel: tuple[float, float, float], generator: np.random.Generator
+) -> tuple[tuple[int, ...], Float]:
+    """Shape and affine of a turned grid round all labels; slices lie across the long axis."""
+    if max(voxel) <= FINE:
+        turn = Rotation.from_euler("xyz", generator.uniform(-TURN, TURN, 3), degrees=True)
+        frame = turn.as_matrix()
+    else:
+        axis = extract_body(volume, Settings().body).ends.axis
+        aside = np.cross(axis, [0.0, 0.0, 1.0])
+        aside /= np.linalg.norm(aside)
+        about = generator.uniform(0, np.pi)
+        lean = np.deg2rad(TILT) * generator.standard_normal()
+        tilt = Rotation.from_rotvec(lean * np.array([np.cos(about), np.sin(about), 0.0]))
+        frame = np.column_stack([aside, np.cross(axis, aside), axis]) @ tilt.as_matrix()
+    matrix = frame * np.array(voxel)
+    labeled = np.argwhere(volume.tissue > 0) @ volume.affine[:3, :3].T + volume.affine[:3, 3]
+    inside = labeled @ np.linalg.inv(matrix).T
+    room = 4.0 / np.array(voxel)
+    low = np.floor(inside.min(axis=0) - room) + generator.random(3)
+    shape = np.ceil(inside.max(axis=0) + room - low).astype(int)
+    affine = np.eye(4)
+    affine[:3, :3], affine[:3, 3] = matrix, matrix @ low
+    return tuple(int(n) for n in shape), affine
+
+
+def _centers(shape: tuple[int, ...], affine: Float) -> NDArray[np.float64]:
+    """Centers (I, J, K, 3) of voxels, RAS mm."""
+    index = np.moveaxis(np.indices(shape), 0, -1)
+    return np.asarray(index @ affine[:3, :3].T + affine[:3, 3])
+
+
+def redraw(volume: LabelVolume, index: Float, affine: Float) -> LabelVolume:
+    """Take the most probable label at indices (I, J, K, 3) of a volume, without stairs.
+
+    The mask of each label is smoothed and interpolated; the largest wins.
+    """
+    codes = volume.part.astype(np.intp) * 256 + volume.tissue
+    kinds, number = np.unique(codes, return_inverse=True)
+    number = np.pad(number.reshape(codes.shape), 1, mode="edge")
+    at = np.clip(np.moveaxis(index, -1, 0) + 1, 0, np.array(number.shape)[:, None, None, None] - 1)
+    nearest = np.rint(at).astype(np.intp)
+    found = number[tuple(nearest)]
+    mixed = ndimage.maximum_filter(number, 3) > ndimage.minimum_filter(number, 3)
+    here = mixed[tuple(nearest)]
+    if here.any():
+        where = at[:, here]
+        best = np.full(where.shape[1], -1.0)
+        label = np.zeros(where.shape[1], dtype=np.intp)
+        sharp = np.where(np.array(_edges(volume.affine)) > FINE, 0.0, CRISP)
+        for kind in range(len(kinds)):
+            soft = ndimage.gaussian_filter((number == kind).astype(np.float32), sharp)
+            value = ndimage.map_coordinates(soft, where, order=1)
+            label, best = np.where(value > best, kind, label), np.maximum(value, best)
+        found[here] = label
+    drawn = kinds[found]
+    return LabelVolume(
+        tissue=(drawn % 256).astype(np.uint8),
+        part=(drawn // 256).astype(np.uint8),
+        affine=affine,
+        protocol=volume.protocol,
+    )
+
+
+def _edges(affine: Float) -> list[float]:
+    edges: list[float] = np.linalg.norm(affine[:3, :3], axis=0).tolist()
+    return edges
+
+
+def describe(specimens: Sequence[Specimen], results: Sequence[Member | Refusal]) -> Suite:
+    """Make the tables of a population that was measured."""
+    members = [result for result in results if isinstance(result, Member)]
+    names = {
+        f"{s.brain}, {'own voxels' if s.voxel is None else 'x'.join(f'{v:.2g}' for v in s.voxel)}"
+        f", warp {s.number}": [result]
+        for s, result in zip(specimens, results, strict=True)
+        if isinstance(result, Refusal)
+    }
+    return Suite(
+        name="population",
+        title="Flags on a population",
+        text=_TEXT,
+        tables=(
+            _counts(members),
+            _curves(members),
+            _quantiles(members),
+            _left_out(members, refusal_notes(names)),
+        ),
+    )
+
+
+Limits = Mapping[str, Mapping[str, float]]
+"""Multiples of the present limits, by kind of voxels and reason."""
+
+
+def set_limits(
+    members: Sequence[Member], quantile: float = QUANTILE
+) -> dict[str, dict[str, float]]:
+    """Compute the quantile of each statistic, as a multiple of its present limit."""
+    limits: dict[str, dict[str, float]] = {}
+    for kind in MAX_FALSE:
+        group = [m.margins for m in members if m.kind == kind]
+        limits[kind] = {
+            reason: float(
+                np.quantile(
+                    [margins.get(reason, 0.0) for margins in group], quantile, method="higher"
+                )
+            )
+            for reason in CALIBRATED
+            if group
+        }
+    return limits
+
+
+def is_flagged(margins: Mapping[str, float], limits: Mapping[str, float]) -> bool:
+    """Whether any statistic is beyond its limit, a multiple of the present one (1 if not given)."""
+    return any(value > limits.get(reason, 1.0) for reason, value in margins.items())
+
+
+def is_silent(damage: Damage, limits: Mapping[str, float]) -> bool | None:
+    """Whether an accepted map is wrong far from the damage; None if it is not accepted."""
+    if not damage.margins or is_flagged(damage.margins, limits):
+        return None
+    return damage.far_wrong > MAX_FAR * damage.far
+
+
+def _share(hits: Sequence[object]) -> float:
+    return float(np.mean([bool(hit) for hit in hits])) if len(hits) else float("nan")
+
+
+def _percent(hits: Sequence[object]) -> str | None:
+    return f"{_share(hits):.1%} of {len(hits)}" if len(hits) else None
+
+
+def _counts(members: Sequence[Member]) -> Table:
+    """At the present limits, by size of voxels."""
+    rows: list[Cells] = []
+    for spacing in sorted({round(m.spacing, 2) for m in members}):
+        group = [m for m in members if round(m.spacing, 2) == spacing]
+        damages = [d for m in group for d in m.damages]
+        silent = [s for d in damages if (s := is_silent(d, {})) is not None]
+        rows.append(
+            {
+                "longest edge, mm": f"{spacing:g}",
+                "undamaged, flagged": _percent([is_flagged(m.margins, {}) for m in group]),
+                "damaged, refused": _percent([d.status == Status.FAILED for d in damages]),
+                "damaged, flagged": _percent([d.status == Status.FLAGGED for d in damages]),
+                "accepted, wrong far away": _percent(silent),
+            }
+        )
+    return Table(title="Present limits", rows=rows)
+
+
+def _curves(members: Sequence[Member]) -> Table:
+    """By flag: how often it is raised at multiples of its limit, undamaged and damaged."""
+    reasons = sorted({r for m in members for r, v in m.margins.items()})
+    rows: list[Cells] = []
+    for kind in MAX_FALSE:
+        group = [m for m in members if m.kind == kind]
+        damages = [d for m in group for d in m.damages if d.margins]
+        for reason in reasons:
+            whole, hurt = (
+                [unit.margins.get(reason, 0.0) for unit in units] for units in (group, damages)
+            )
+            shares = [
+                (_share([v > k for v in whole]), _share([v > k for v in hurt])) for k in MULTIPLES
+            ]
+            if shares[0][0] > 0 or shares[0][1] > 0:
+                cells: dict[str, Cell] = {"voxels": kind, "flag": reason}
+                for k, (false, found) in zip(MULTIPLES, shares, strict=True):
+                    cells[f"x {k:g}"] = f"{false:.1%} / {found:.0%}"
+                rows.append(cells)
+    return Table(
+        title="Flags on undamaged / damaged hemispheres at multiples of the present limit",
+        rows=rows,
+        notes=f"Undamaged: {len(members)}. Damaged ones that were measured count; a flag is not "
+        "expected for each damage. Flags that are missing were never raised.",
+    )
+
+
+def _quantiles(members: Sequence[Member]) -> Table:
+    rows: list[Cells] = []
+    for reason in CALIBRATED:
+        cells: dict[str, Cell] = {"flag": reason}
+        for kind in MAX_FALSE:
+            values = [m.margins.get(reason, 0.0) for m in members if m.kind == kind] or [np.nan]
+            for q in (0.5, 0.95, QUANTILE):
+                cells[f"{kind}, {q:g}"] = float(np.quantile(values, q, method="higher"))
+        rows.append(cells)
+    return Table(
+        title="Quantiles of undamaged statistics, multiples of the present limits",
+        rows=rows,
+        digits=2,
+    )
+
+
+def _left_out(members: Sequence[Member], notes: str) -> Table:
+    """Judge limits on brains that did not set them."""
+    rows: list[Cells] = []
+    for kind, most in MAX_FALSE.items():
+        false: list[tuple[bool, bool]] = []
+        silent: list[tuple[bool | None, bool | None]] = []
+        for brain in dict.fromkeys(m.brain for m in members):
+            limits = set_limits([m for m in members if m.brain != brain])[kind]
+            group = [m for m in members if m.brain == brain and m.kind == kind]
+            flags = [(is_flagged(m.margins, {}), is_flagged(m.margins, limits)) for m in group]
+            wrong = [(is_silent(d, {}), is_silent(d, limits)) for m in group for d in m.damages]
+            false, silent = false + flags, silent + wrong
+            rows.append(_judged(brain, kind, flags, wrong))
+        rows.append(
+            {
+                **_judged("all", kind, false, silent),
+                "targets": f"≤ {most:.0%}, ≤ {MAX_SILENT:.0%}",
+                "present met": bool(
+                    _share([a for a, _ in false]) <= most
+                    and not _share([a for a, _ in silent if a is not None]) > MAX_SILENT
+                ),
+                "quantile met": bool(
+                    _share([b for _, b in false]) <= most
+                    and not _share([b for _, b in silent if b is not None]) > MAX_SILENT
+                ),
+            }
+        )
+    return Table(
+        title="Limits judged on brains left out",
+        rows=rows,
+        notes=f"Quantile: limits set to the quantile {QUANTILE:g} of the other brains. Accepted "
+        f"and wrong: damaged, not refused or flagged, and more than {MAX_FAR:.0%} of the columns "
+        f"away from the damage off by > {WRONG:g} mm against the undamaged map of the same "
+        f"labels.{notes}",
+    )
+
+
+def _judged(
+    brain: str,
+    kind: str,
+    false: Sequence[tuple[bool, bool]],
+    silent: Sequence[tuple[bool | None, bool | None]],
+) -> dict[str, Cell]:
+    cells: dict[str, Cell] = {"brain": brain, "voxels": kind}
+    for k, name in enumerate(("present limits", "quantile")):
+        cells[f"{name}: false flags"] = _percent([pair[k] for pair in false])
+        cells[f"{name}: accepted and wrong"] = _percent(
+            [pair[k] for pair in silent if pair[k] is not None]
+        )
+    return cells
+
+
+_TEXT = f"""\
+Segmentations are warped smoothly (standard deviation {WARP_SD[0]:g} to {WARP_SD[1]:g} mm along each
+axis at scales of {WARP_SCALE[0]:g} to {WARP_SCALE[1]:g} mm), turned by up to {TURN:g}° or, in
+slices, tilted by {TILT:g}° (standard deviation), mirrored, and drawn in the voxels of usual
+protocols; each also as it is. Labels with thick slices keep their own, and are warped within them.
+Each is measured undamaged, and with damages of the suite *Damaged labels*, of all kinds and
+severities in turn; the map of the same labels before is the truth. With `--labels DIR`, a folder
+`hippunfold` beside it is measured, too; without, phantoms.
+"""
