@@ -92,6 +92,12 @@ class BodySettings(SettingsTable):
     share (in six real bodies: none, and gaps with one opening are up to 4.0 mm2)."""
     slit_voxel: NonNegativeFloat = 0.8
     """Gaps are filled if no voxel edge is longer, mm: folds between thick slices look alike."""
+    pit_reach: PositiveFloat = 0.9
+    """A voxel without a label lies in a pit if the sheet is within this distance, mm, ..."""
+    pit_sides: Annotated[int, Field(ge=4, le=6)] = 5
+    """... on so many of its six sides (5 is open on one side)."""
+    pit_size: Numbers = (0.2, 1.8)
+    """Pits of this volume are filled, from and to, mm3, where gaps are (in six real bodies two)."""
     uncus_size: NonNegativeFloat = 1.0
     """Smaller pieces of CA2 or CA3 are no uncus, mm3."""
     uncus_offset: PositiveFloat = 5.0

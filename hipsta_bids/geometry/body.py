@@ -19,6 +19,7 @@ from hipsta_bids.geometry.completion import (
     Tissues,
     between,
     fill_cavities,
+    fill_pits,
     fill_slits,
     find_cavities,
     find_uncus,
@@ -189,10 +190,12 @@ def extract_body(volume: LabelVolume, settings: BodySettings) -> Body:
     if region != "body":
         check_reach(points, tissue[inside], ends, settings)
     slits = fill_slits(tissue, inside, volume.tissue == Tissue.BACKGROUND, volume.affine, settings)
-    if len(slits.filled):
-        inside, _ = between(slits.tissue > 0, volume.affine, ends)
+    empty = volume.tissue == Tissue.BACKGROUND
+    tissue, pits = fill_pits(slits.tissue, inside, empty, volume.affine, settings)
+    if len(slits.filled) or len(pits):
+        inside, _ = between(tissue > 0, volume.affine, ends)
     return Body(
-        tissue=slits.tissue,
+        tissue=tissue,
         hippocampal=hippocampal,
         region=region,
         interior=np.isin(volume.tissue, volume.protocol.interior),
@@ -200,7 +203,7 @@ def extract_body(volume: LabelVolume, settings: BodySettings) -> Body:
         ends=ends,
         layer_voxels=layer_voxels,
         inside=inside,
-        filled=slits.filled,
+        filled=np.concatenate([slits.filled, pits]),
         cavities=cavities,
         uncus=uncus,
         handed_over=handed_over,

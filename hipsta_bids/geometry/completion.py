@@ -269,6 +269,45 @@ def fill_slits(
     return Slits(_with_nearest(tissue, filled, around), filled, gap)
 
 
+def fill_pits(
+    tissue: Tissues, inside: Bool, unlabeled: Bool, affine: Float, settings: BodySettings
+) -> tuple[Tissues, Index]:
+    """Fill small pits in the walls with the nearest labels; return them, (N, 3), too.
+
+    A voxel without any label lies in a pit if the sheet is near on most of its six sides. Crevices
+    between folds are open on two sides or more, and larger.
+    """
+    edges = np.linalg.norm(affine[:3, :3], axis=0)
+    if edges.max() > settings.slit_voxel:
+        return tissue, np.zeros((0, 3), np.intp)
+    around = box_around(np.argwhere(inside))
+    steps = np.maximum(np.rint(settings.pit_reach / edges), 1).astype(int)
+    room = [(int(n), int(n)) for n in steps + 1]
+    sheet = np.pad(tissue[around] > 0, room)
+    sides = np.zeros(sheet.shape, dtype=np.int8)
+    for axis, count in enumerate(steps):
+        for sign in (-1, 1):
+            rolled = (np.roll(sheet, sign * n, axis) for n in range(1, count + 1))
+            sides += np.logical_or.reduce(list(rolled))
+    # Between the end planes: next to voxels that lie there.
+    beside = ndimage.binary_dilation(np.pad(inside[around], room), structure=ALL)
+    empty = np.pad(unlabeled[around], room) & ~sheet & beside
+    pieces, _ = ndimage.label(empty & (sides >= settings.pit_sides), structure=FACES)
+    sizes = piece_sizes(pieces) * float(np.prod(edges))
+    least, most = settings.pit_size
+    pits = np.flatnonzero((sizes >= least) & (sizes <= most))
+    where = np.argwhere(np.isin(pieces, pits)) + low_corner(around) - steps - 1
+    if not len(where):
+        return tissue, where
+    donors = np.argwhere(tissue[around] > 0) + low_corner(around)
+    nearest = value_of_nearest(
+        tissue[tuple(donors.T)], to_ras(donors, affine), to_ras(where, affine)
+    )
+    filled = tissue.copy()
+    filled[tuple(where.T)] = nearest
+    return filled, where
+
+
 def _enclosed(sheet: Bool, directions: int, coarse: Bool) -> Bool:
     """Voxels that have the sheet on both sides in at least ``directions`` of 13.
 

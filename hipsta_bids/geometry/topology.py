@@ -70,7 +70,7 @@ class Repair:
     def __str__(self) -> str:
         what = {
             "part": "parted two turns that touch, by a slit",
-            "slit": "filled a slit",
+            "slit": "filled a slit or pit",
             "cut": "cut a bridge",
             "fill": "filled a hole",
             "island": "removed a separate piece",

@@ -15,6 +15,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from hipsta_bids.errors import SettingsError
+from hipsta_bids.geometry.digital import ALL
 from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.types import Bool, Float, LabelVolume, Sheet
 
@@ -312,6 +313,35 @@ def _at_border(site: Site, size: float, position: Position) -> Defect:
     )
 
 
+def _pits(site: Site, size: float, position: Position) -> Defect:
+    """Drill holes of 3 x 3 x 3 voxels into the wall at random places; size is their number."""
+    generator = np.random.default_rng(round(100 * position[0] + 10 * position[1]))
+    inner = site.voxels[(site.v[tuple(site.voxels.T)] > 0) & (site.v[tuple(site.voxels.T)] < 1)]
+    chosen = inner[generator.choice(len(inner), min(round(size), len(inner)), replace=False)]
+    spots = np.zeros(site.wall.shape, dtype=bool)
+    spots[tuple(chosen.T)] = True
+    return site.erased(site.wall & ndimage.binary_dilation(spots, structure=ALL))
+
+
+def _rim_notch(site: Site, size: float, position: Position) -> Defect:
+    """Cut a round notch into the nearer edge of the sheet; size is its radius."""
+    u = 0.0 if position[0] < 0.5 else 1.0  # noqa: PLR2004 -- the middle
+    column = site.column((u, position[1]))
+    aside = column.mean(axis=0) - site.column((abs(u - 0.1), position[1])).mean(axis=0)
+    aside /= np.linalg.norm(aside)
+    rim = column[None] + np.linspace(0.0, 3.0, 13)[:, None, None] * aside
+    return site.erased(site.wall & site.within(rim.reshape(-1, 3), size))
+
+
+def _relabeled_tip(site: Site, size: float, position: Position) -> Defect:
+    """Label the nearer edge as tissue outside over 4 mm of the axis; size is its width, mm."""
+    u = site.sheet_position[:, 0]
+    extent = np.linalg.norm(np.diff(site.columns.mean(axis=2), axis=0), axis=-1).sum(axis=0)
+    share = size / float(np.nanmean(extent))
+    tip = u < share if position[0] < 0.5 else u > 1 - share  # noqa: PLR2004 -- the middle
+    return site.relabeled(site.among(tip) & site.slab(position, 4.0), Tissue.OTHER, Part.UNKNOWN)
+
+
 def _ends_flush(site: Site, size: float, position: Position) -> Defect:
     """Erase head and tail, so that the labels end where the body does; size is ignored."""
     del size, position
@@ -341,5 +371,8 @@ DEFECTS: Mapping[str, Callable[[Site, float, Position], Defect]] = MappingProxyT
         "wrong-voxels": _wrong_voxels,
         "at-border": _at_border,
         "ends-flush": _ends_flush,
+        "pits": _pits,
+        "rim-notch": _rim_notch,
+        "relabeled-tip": _relabeled_tip,
     }
 )

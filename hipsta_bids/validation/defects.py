@@ -78,6 +78,9 @@ PLAN: tuple[tuple[str, float, Position], ...] = (
     *(("wrong-voxels", factor, MIDDLE) for factor in (2.0, 4.0)),
     *(("at-border", lost, MIDDLE) for lost in (0.0, 1.0)),
     ("ends-flush", 1.0, MIDDLE),
+    *(("pits", count, MIDDLE) for count in (10, 25)),
+    *(("rim-notch", r, (u, v)) for r in (1.0, 1.4) for u in (0.05, 0.95) for v in (0.4, 0.7)),
+    *(("relabeled-tip", w, (u, 0.5)) for w in (0.8, 1.4) for u in (0.05, 0.95)),
 )
 
 

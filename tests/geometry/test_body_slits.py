@@ -7,7 +7,7 @@ import pytest
 from geometry_cases import resampled
 
 from hipsta_bids.geometry.body import extract_body
-from hipsta_bids.geometry.completion import fill_slits
+from hipsta_bids.geometry.completion import fill_pits, fill_slits
 from hipsta_bids.geometry.topology import repair_topology
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import BodySettings, TopologySettings
@@ -135,3 +135,48 @@ def test_filled_nodes_are_known_to_the_field(arc):
     nodes = np.argwhere(field.slits).astype(float)
     distance = np.linalg.norm(field.grid.to_ras(nodes)[:, None] - points, axis=-1).min(axis=1)
     assert distance.max() <= 0.5 * np.sqrt(3) * VOXEL + 1e-6  # half the diagonal of a voxel
+
+
+def pits(tissue, settings=BODY, affine=AFFINE):
+    return fill_pits(tissue, tissue > 0, tissue == 0, affine, settings)
+
+
+def with_pit(width=2, depth=2, length=2):
+    """A pit of some voxels in one face of the plate."""
+    tissue = plate()
+    tissue[8 : 8 + width, 4 : 4 + depth, 20 : 20 + length] = 0
+    return tissue
+
+
+def test_a_pit_in_a_wall_is_filled_with_the_labels_beside_it():
+    filled, where = pits(with_pit())
+    assert len(where) == 8
+    np.testing.assert_array_equal(filled, plate())
+
+
+@pytest.mark.parametrize(
+    "tissue",
+    [
+        plate(),
+        with_pit(1, 1, 3),  # roughness of the labels
+        with_pit(2, 2, 18),  # a furrow: open along it
+        with_pit(9, 3, 9),  # a dent
+    ],
+)
+def test_what_is_no_pit_stays(tissue):
+    filled, where = pits(tissue)
+    assert len(where) == 0
+    assert filled is tissue
+
+
+def test_pits_are_not_sought_between_thick_slices():
+    thick = np.diag([0.4, 0.4, 2.0, 1.0])
+    assert len(pits(with_pit(), affine=thick)[1]) == 0
+
+
+def test_a_mirrored_pit_is_filled_alike():
+    tissue = with_pit()
+    tissue[14:16, 4:6, 30:32] = 0  # on the border of two subfields
+    filled, _ = pits(tissue)
+    mirrored, _ = pits(np.ascontiguousarray(tissue[:, :, ::-1]))
+    np.testing.assert_array_equal(mirrored[:, :, ::-1], filled)
