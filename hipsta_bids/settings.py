@@ -427,9 +427,10 @@ class CheckSettings(SettingsTable):
     """A cross-section is compared with those at these distances on both sides, mm."""
     notch_share: Numbers = (0.12, 0.3, 0.35)
     """Flag if more than this share of what both sides have is missing, one per distance."""
-    bump_contrast: NonNegativeFloat = 3.5
+    bump_contrast: NonNegativeFloat = 4.2
     """Flag a cross-section that has more than this many times of what its neighbors lack, or label
-    interior, than the body's other cross-sections (2.7 at most in twelve real bodies)."""
+    interior, than the body's other cross-sections (set on a population of undamaged
+    hemispheres)."""
     stub_nodes: NonNegativeFloat = 6.0
     """What lies within this distance of a bridge that was cut is left out of that comparison, grid
     nodes."""
@@ -439,21 +440,24 @@ class CheckSettings(SettingsTable):
     flag_row_jump: NonNegativeFloat = 0.15
     """Flag if the sheet's width changes by more than this from one row to the next, or by twice as
     much at an end."""
-    flag_row_dip: NonNegativeFloat = 0.15
-    """Flag rows narrower than the widest on both sides by more than this (0.13 at most in twelve
-    real bodies)."""
+    flag_row_dip: NonNegativeFloat = 0.2
+    """Flag rows narrower than the widest on both sides by more than this (set on a population of
+    undamaged hemispheres, as are the next ones: suite ``population``)."""
     row_dip_reach: NonNegativeFloat = 8.0
     """Distance along the axis within which rows are compared, mm."""
+    edge_reach: Numbers = (2.5, 3.5, 5.0)
+    """The medial and the lateral edge are compared with themselves at these distances along the
+    axis on both sides, mm."""
+    flag_edge: Numbers = (1.3, 1.6, 1.9)
+    """Flag an edge that recedes behind both by more than this, one per distance, mm."""
     ridge_reach: Numbers = (1.0, 2.0, 3.0)
     """Thickness is compared with that at these distances along the axis on both sides, mm."""
     ridge_columns: PositiveInt = 9
     """Number of neighboring columns of a row over which thickness is averaged for that."""
-    flag_ridge: Numbers = (0.45, 0.75, 0.7)
-    """Flag a band that is thicker than both by more than this, one per distance, mm (0.31, 0.56 and
-    0.54 at most in twelve real bodies)."""
+    flag_ridge: Numbers = (0.65, 1.1, 1.0)
+    """Flag a band that is thicker than both by more than this, one per distance, mm."""
     flag_groove: Numbers = (0.55, 0.75, 0.75)
-    """Flag a band that is thinner than both by more than this, one per distance, mm (0.38, 0.59 and
-    0.53 at most)."""
+    """Flag a band that is thinner than both by more than this, one per distance, mm."""
     uncus_reach: NonNegativeFloat = 2.0
     """Warn of an uncus that begins farther than this behind the anterior plane, mm."""
     flag_cavity: NonNegativeFloat = 0.03
@@ -464,8 +468,9 @@ class CheckSettings(SettingsTable):
     flag_pinholes: NonNegativeFloat = 0.01
     """Flag labels in which single voxels without a label are more than this share of the sheet's
     voxels (0.0015 at most in twelve real bodies)."""
-    flag_gap: NonNegativeInt = 60
-    """Flag a gap of more voxels than this (44 at most in twelve real bodies, coarse or fine)."""
+    flag_gap: NonNegativeInt = 70
+    """Flag a gap of more voxels than this (set on a population of undamaged hemispheres, coarse or
+    fine)."""
     flag_loose_part: NonNegativeFloat = 0.15
     """Flag a second piece of voxels, connected by faces, above this share of the sheet (0.04 at
     most in twelve real bodies)."""

@@ -40,6 +40,9 @@ from hipsta_bids.types import (
     position_text,
 )
 
+_INWARD = 7
+"""The way into the sheet goes from an edge to this part of the columns beside it."""
+
 
 def check_voxel(volume: LabelVolume, settings: CheckSettings) -> None:
     """Refuse labels that are too coarse for any sheet, before anything goes wrong in them."""
@@ -435,6 +438,44 @@ def check_rows(sheet: Sheet, settings: CheckSettings) -> list[Finding]:
                 what=f"the sheet's width {what.format(f'{change[row]:.0%}')}",
                 remedy="look for missing or added parts in the labels",
                 points=_known(middle[:, row]),
+            )
+        )
+    return found
+
+
+def check_edges(whole: Sheet, settings: CheckSettings) -> list[Finding]:
+    """Flag a sheet whose medial or lateral edge recedes between parts that do not.
+
+    Notches, slits and tips without their label are too small to show in the width of the sheet, but
+    move the columns of their rows. ``whole`` goes from edge to edge.
+    """
+    middle = whole.points[:, :, whole.middle]
+    step, count = _row_step(middle), middle.shape[1]
+    inner = max(middle.shape[0] // _INWARD, 1)
+    found = []
+    for name, edge, beside in (("medial", 0, inner), ("lateral", -1, -1 - inner)):
+        rim, inward = middle[edge], middle[beside] - middle[edge]
+        best = (0.0, 0.0, settings.flag_edge[0], 0, 0)
+        for reach, limit in zip(settings.edge_reach, settings.flag_edge, strict=True):
+            k = max(round(reach / step), 1)
+            if 2 * k >= count:
+                continue
+            towards = ndimage.uniform_filter1d(np.nan_to_num(inward), 2 * k + 1, axis=0)[k:-k]
+            towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-9)
+            behind, ahead = (rim[k:-k] - rim[part] for part in (slice(-2 * k), slice(2 * k, None)))
+            depth = np.minimum(*((gap * towards).sum(axis=1) for gap in (behind, ahead)))
+            row = int(np.nan_to_num(depth).argmax())
+            size = max(float(np.nan_to_num(depth)[row]), 0.0)
+            best = max(best, (size / limit, size, limit, row + k, k))
+        _, size, limit, row, k = best
+        found.append(
+            Finding(
+                reason="edge-notch",
+                value=size,
+                limit=limit,
+                what=f"the {name} edge of the sheet recedes by {size:.1f} mm",
+                remedy="look for a notch or a missing tip in the labels",
+                points=_known(rim[max(row - k // 2, 0) : row + k // 2 + 1]),
             )
         )
     return found

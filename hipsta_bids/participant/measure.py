@@ -24,6 +24,7 @@ from hipsta_bids.geometry.catalog import (
 from hipsta_bids.geometry.checks import (
     check_cavities,
     check_cross_sections,
+    check_edges,
     check_end_labels,
     check_image,
     check_label_order,
@@ -196,6 +197,7 @@ def find_all(evidence: Evidence) -> list[Finding]:
         *check_labels(body, checks),
         *check_cross_sections(solid.field, body, checks, solid.touched & (solid.field.values < 0)),
         *check_rows(sheet, checks),
+        *check_edges(measured.whole, checks),
         *check_ridges(sheet, measured.thickness, checks),
     ]
 

@@ -8,7 +8,12 @@ from geometry_cases import resampled, short_phantom
 from sheet_cases import plates
 
 from hipsta_bids.geometry.body import Body, extract_body
-from hipsta_bids.geometry.checks import check_cross_sections, check_ridges, check_rows
+from hipsta_bids.geometry.checks import (
+    check_cross_sections,
+    check_edges,
+    check_ridges,
+    check_rows,
+)
 from hipsta_bids.geometry.grid import Field
 from hipsta_bids.phantom import Phantom
 from hipsta_bids.protocols.load import load_protocol
@@ -110,7 +115,7 @@ def test_what_is_odd_depends_on_the_body_s_other_cross_sections(ribbon):
     assert raised(check_cross_sections(noisy, ribbon.body, CHECKS)) == []
 
 
-def rows(widths, spacing=0.8):
+def rows_of(widths, spacing=0.8):
     """A flat sheet whose rows have these widths, mm."""
     x = np.linspace(-0.5, 0.5, 11)
     y = spacing * np.arange(len(widths))
@@ -128,21 +133,55 @@ def rows(widths, spacing=0.8):
         ([20.0] * 21, []),
         (np.linspace(24, 16, 21), []),  # tapers
         ([20.0] * 10 + [16.0] * 11, ["extent-jump"]),
-        (20 - 4 * np.exp(-(((np.arange(21) - 10) / 3.0) ** 2)), ["extent-dip"]),
+        (20 - 5 * np.exp(-(((np.arange(21) - 10) / 3.0) ** 2)), ["extent-dip"]),
         (20 - 2 * np.exp(-(((np.arange(21) - 10) / 3.0) ** 2)), []),
         (20 - 4 * np.cos(np.linspace(-1, 1, 21) * np.pi / 4), []),  # narrow all along
     ],
 )
 def test_rows_that_jump_or_dip(widths, wanted):
-    flags = raised(check_rows(rows(widths), CHECKS))
+    flags = raised(check_rows(rows_of(widths), CHECKS))
     assert [flag.reason for flag in flags] == wanted
     for flag in flags:
         assert place_of(flag)[1] == pytest.approx(0.8 * 10, abs=0.8)  # mm, one row
 
 
 def test_dips_are_sought_within_a_reach():
-    widths = 20 - 4 * np.exp(-(((np.arange(21) - 10) / 3.0) ** 2))
-    assert raised(check_rows(rows(widths), CHECKS.changed(row_dip_reach=2.0))) == []
+    widths = 20 - 5 * np.exp(-(((np.arange(21) - 10) / 3.0) ** 2))
+    assert raised(check_rows(rows_of(widths), CHECKS)) != []
+    assert raised(check_rows(rows_of(widths), CHECKS.changed(row_dip_reach=2.0))) == []
+
+
+def notched(depth, rows, edge):
+    """A flat sheet of 20 x 16 mm with an edge that recedes in some rows, 0.8 mm apart."""
+    sheet = rows_of(np.full(21, 20.0))
+    points = sheet.points.copy()
+    x = np.linspace(0, 1, points.shape[0])
+    share = (1 - x) if edge == "medial" else -x
+    points[:, rows, :, 0] += depth * share[:, None, None]
+    return Sheet(points=points, valid=sheet.valid)
+
+
+@pytest.mark.parametrize("edge", ["medial", "lateral"])
+@pytest.mark.parametrize(
+    ("depth", "rows", "flagged"),
+    [
+        (2.0, slice(9, 12), True),
+        (0.5, slice(9, 12), False),  # as rough as real edges
+        (-2.0, slice(9, 12), False),  # a tongue
+        (3.0, slice(12, 21), False),  # the sheet narrows at its end
+    ],
+)
+def test_an_edge_that_recedes_is_flagged_where_it_does(edge, depth, rows, flagged):
+    sheet = notched(depth, rows, edge)
+    found = check_edges(sheet, CHECKS)
+    assert [finding.raised for finding in found] == [
+        flagged and edge == name for name in ("medial", "lateral")
+    ]
+    if flagged:
+        (flag,) = raised(found)
+        assert flag.value == pytest.approx(depth)
+        end = sheet.points[0 if edge == "medial" else -1, 10, 1]
+        assert np.linalg.norm(place_of(flag) - end) < 1.1  # mm, a row and a part of the notch
 
 
 def banded(size, rows=slice(10, 11), columns=slice(10, 30)):
