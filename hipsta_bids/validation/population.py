@@ -171,7 +171,9 @@ def plan(bodies: Sequence[ValidationBody], full: bool) -> list[Specimen]:
     order = np.random.default_rng(SEED).permutation(len(PLAN))
     specimens: list[Specimen] = []
     for body in bodies:
-        sizes: Sequence[tuple[float, float, float] | None] = SIZES if _is_fine(body) else (None,)
+        sizes: Sequence[tuple[float, float, float] | None] = (None,)
+        if is_fine(load_body(body, PHANTOM_VOXEL)[0]):
+            sizes = SIZES
         ways = [(None, 0)] + [(size, 1 + n) for n in range(warps) for size in sizes]
         for size, number in ways:
             first = each * len(specimens)
@@ -180,8 +182,8 @@ def plan(bodies: Sequence[ValidationBody], full: bool) -> list[Specimen]:
     return specimens
 
 
-def _is_fine(body: ValidationBody) -> bool:
-    volume, _ = load_body(body, PHANTOM_VOXEL)
+def is_fine(volume: LabelVolume) -> bool:
+    """Whether labels can be drawn anew in other voxels."""
     return bool(np.linalg.norm(volume.affine[:3, :3], axis=0).max() <= FINE)
 
 

@@ -318,6 +318,32 @@ def test_verdict_names_flags_before_repairs():
     )
 
 
+def test_the_record_says_what_a_flag_means_for_the_map(tmp_path):
+    flag = Flag(
+        reason="a",
+        message="one",
+        value=1.5,
+        limit=1.0,
+        points=np.array([[1.0, 2.0, 3.0], [2.0, 4.0, 3.0]]),
+        share=0.25,
+        change=-0.125,
+    )
+    place = ResultPlace(root=tmp_path, name=NAME)
+    maps = make_maps(flags=(flag, Flag(reason="b", message="two")))
+    write_results(place, maps, make_scheme(), {}, write_meshes=False)
+    first, second = json.loads(place.path("qc").read_text())["flags"]
+    assert first == {
+        "reason": "a",
+        "message": "one",
+        "value": 1.5,
+        "limit": 1.0,
+        "position_ras_mm": [1.5, 3.0, 3.0],
+        "columns_share": 0.25,
+        "mean_change_mm": -0.125,
+    }
+    assert second["value"] is second["position_ras_mm"] is second["columns_share"] is None
+
+
 def test_filling_takes_the_nearest_node():
     points = np.full((3, 2, 3), np.nan)
     assert np.isnan(fill_from_nearest(points)).all()
