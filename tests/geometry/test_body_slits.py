@@ -159,6 +159,7 @@ def test_a_pit_in_a_wall_is_filled_with_the_labels_beside_it():
     [
         plate(),
         with_pit(1, 1, 3),  # roughness of the labels
+        with_pit(2, 5, 2),  # a hole through the plate
         with_pit(2, 2, 18),  # a furrow: open along it
         with_pit(9, 3, 9),  # a dent
     ],
