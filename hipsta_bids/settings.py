@@ -427,10 +427,12 @@ class CheckSettings(SettingsTable):
     """A cross-section is compared with those at these distances on both sides, mm."""
     notch_share: Numbers = (0.12, 0.3, 0.35)
     """Flag if more than this share of what both sides have is missing, one per distance."""
-    bump_contrast: NonNegativeFloat = 4.2
-    """Flag a cross-section that has more than this many times of what its neighbors lack, or label
-    interior, than the body's other cross-sections (set on a population of undamaged
-    hemispheres)."""
+    bump_contrast: NonNegativeFloat = 4.5
+    """Flag a cross-section that has more than this many times of what its neighbors lack than the
+    body's other cross-sections (set on a population of undamaged hemispheres: suite
+    ``population``)."""
+    intrusion_contrast: NonNegativeFloat = 3.7
+    """The same for what both its neighbors label interior."""
     stub_nodes: NonNegativeFloat = 6.0
     """What lies within this distance of a bridge that was cut is left out of that comparison, grid
     nodes."""
@@ -440,7 +442,7 @@ class CheckSettings(SettingsTable):
     flag_row_jump: NonNegativeFloat = 0.15
     """Flag if the sheet's width changes by more than this from one row to the next, or by twice as
     much at an end."""
-    flag_row_dip: NonNegativeFloat = 0.2
+    flag_row_dip: NonNegativeFloat = 0.22
     """Flag rows narrower than the widest on both sides by more than this (set on a population of
     undamaged hemispheres, as are the next ones: suite ``population``)."""
     row_dip_reach: NonNegativeFloat = 8.0
@@ -448,13 +450,13 @@ class CheckSettings(SettingsTable):
     edge_reach: Numbers = (2.5, 3.5, 5.0)
     """The medial and the lateral edge are compared with themselves at these distances along the
     axis on both sides, mm."""
-    flag_edge: Numbers = (1.3, 1.6, 1.9)
+    flag_edge: Numbers = (1.8, 2.2, 2.7)
     """Flag an edge that recedes behind both by more than this, one per distance, mm."""
     ridge_reach: Numbers = (1.0, 2.0, 3.0)
     """Thickness is compared with that at these distances along the axis on both sides, mm."""
     ridge_columns: PositiveInt = 9
     """Number of neighboring columns of a row over which thickness is averaged for that."""
-    flag_ridge: Numbers = (0.65, 1.1, 1.0)
+    flag_ridge: Numbers = (0.85, 1.4, 1.3)
     """Flag a band that is thicker than both by more than this, one per distance, mm."""
     flag_groove: Numbers = (0.55, 0.75, 0.75)
     """Flag a band that is thinner than both by more than this, one per distance, mm."""

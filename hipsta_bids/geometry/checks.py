@@ -360,9 +360,12 @@ def check_cross_sections(
         enclosed = unexplained & interior[:, :, : -2 * k] & interior[:, :, 2 * k :]
         added = unexplained & ~before & ~after
         noise = settings.section_noise
-        for outlier, part, least in ((bump, added, noise * reach), (intrusion, enclosed, noise)):
+        for outlier, part, least, contrast in (
+            (bump, added, noise * reach, settings.bump_contrast),
+            (intrusion, enclosed, noise, settings.intrusion_contrast),
+        ):
             share = part.sum(axis=(0, 1)) / area
-            usual = settings.bump_contrast * (float(np.median(share)) + least)
+            usual = contrast * (float(np.median(share)) + least)
             outlier.update(part, share, usual, k + field.beyond)
     rows = (
         ("section-notch", notch, "lacks what its neighbors have", "complete the labels there"),

@@ -275,8 +275,8 @@ def fill_pits(
     """Fill small pits in the walls with the nearest labels; return them, (N, 3), too.
 
     A voxel without any label lies in a pit if the sheet is near on most of its six sides. Crevices
-    between folds are open on two sides or more, and larger; holes through the sheet are left to
-    the repair of its topology, which makes them as thick as the wall.
+    between folds are open on two sides or more, and larger. Small holes through the sheet may be
+    filled, too.
     """
     edges = np.linalg.norm(affine[:3, :3], axis=0)
     if edges.max() > settings.slit_voxel:
@@ -296,14 +296,7 @@ def fill_pits(
     pieces, _ = ndimage.label(empty & (sides >= settings.pit_sides), structure=FACES)
     sizes = piece_sizes(pieces) * float(np.prod(edges))
     least, most = settings.pit_size
-    rooms = [tuple(slice(s.start - 1, s.stop + 1) for s in p) for p in ndimage.find_objects(pieces)]
-    pits = [
-        number
-        for number in np.flatnonzero((sizes >= least) & (sizes <= most))
-        if not _opens_on_both_sides(
-            pieces[rooms[number - 1]] == number, sheet[rooms[number - 1]], settings.slit_openings
-        )
-    ]
+    pits = np.flatnonzero((sizes >= least) & (sizes <= most))
     where = np.argwhere(np.isin(pieces, pits)) + low_corner(around) - steps - 1
     if not len(where):
         return tissue, where

@@ -84,7 +84,7 @@ CALIBRATED: Mapping[str, tuple[str, float]] = MappingProxyType(
     {
         "section-notch": ("notch_share", 0.12),
         "section-bump": ("bump_contrast", 3.5),
-        "section-intrusion": ("bump_contrast", 3.5),
+        "section-intrusion": ("intrusion_contrast", 3.5),
         "extent-jump": ("flag_row_jump", 0.15),
         "extent-dip": ("flag_row_dip", 0.15),
         "edge-notch": ("flag_edge", 1.0),

@@ -133,7 +133,7 @@ def rows_of(widths, spacing=0.8):
         ([20.0] * 21, []),
         (np.linspace(24, 16, 21), []),  # tapers
         ([20.0] * 10 + [16.0] * 11, ["extent-jump"]),
-        (20 - 5 * np.exp(-(((np.arange(21) - 10) / 3.0) ** 2)), ["extent-dip"]),
+        (20 - 6 * np.exp(-(((np.arange(21) - 10) / 3.0) ** 2)), ["extent-dip"]),
         (20 - 2 * np.exp(-(((np.arange(21) - 10) / 3.0) ** 2)), []),
         (20 - 4 * np.cos(np.linspace(-1, 1, 21) * np.pi / 4), []),  # narrow all along
     ],
@@ -146,7 +146,7 @@ def test_rows_that_jump_or_dip(widths, wanted):
 
 
 def test_dips_are_sought_within_a_reach():
-    widths = 20 - 5 * np.exp(-(((np.arange(21) - 10) / 3.0) ** 2))
+    widths = 20 - 6 * np.exp(-(((np.arange(21) - 10) / 3.0) ** 2))
     assert raised(check_rows(rows_of(widths), CHECKS)) != []
     assert raised(check_rows(rows_of(widths), CHECKS.changed(row_dip_reach=2.0))) == []
 
@@ -165,9 +165,9 @@ def notched(depth, rows, edge):
 @pytest.mark.parametrize(
     ("depth", "rows", "flagged"),
     [
-        (2.0, slice(9, 12), True),
+        (2.5, slice(9, 12), True),
         (0.5, slice(9, 12), False),  # as rough as real edges
-        (-2.0, slice(9, 12), False),  # a tongue
+        (-2.5, slice(9, 12), False),  # a tongue
         (3.0, slice(12, 21), False),  # the sheet narrows at its end
     ],
 )
@@ -181,7 +181,7 @@ def test_an_edge_that_recedes_is_flagged_where_it_does(edge, depth, rows, flagge
         (flag,) = raised(found)
         assert flag.value == pytest.approx(depth)
         end = sheet.points[0 if edge == "medial" else -1, 10, 1]
-        assert np.linalg.norm(place_of(flag) - end) < 1.1  # mm, a row and a part of the notch
+        assert np.linalg.norm(place_of(flag) - end) < 1.3  # mm, a row and a part of the notch
 
 
 def banded(size, rows=slice(10, 11), columns=slice(10, 30)):
@@ -191,7 +191,7 @@ def banded(size, rows=slice(10, 11), columns=slice(10, 30)):
     return thickness
 
 
-@pytest.mark.parametrize(("size", "wanted"), [(1.0, "thickness-ridge"), (-1.0, "thickness-groove")])
+@pytest.mark.parametrize(("size", "wanted"), [(1.5, "thickness-ridge"), (-1.5, "thickness-groove")])
 @pytest.mark.parametrize("rows", [slice(10, 11), slice(9, 13)])
 def test_a_band_across_the_axis_is_flagged_where_it_is(size, wanted, rows):
     sheet = plates(thickness=1.7)
@@ -207,9 +207,9 @@ def test_a_band_across_the_axis_is_flagged_where_it_is(size, wanted, rows):
     "thickness",
     [
         banded(0.3),  # as rough as real bodies are
-        banded(1.0, columns=slice(10, 13)),  # too narrow
-        banded(1.0, rows=slice(0, 5)),  # goes on at the end: no band
-        banded(1.0, columns=slice(None), rows=slice(10, 21)),  # a step
+        banded(1.5, columns=slice(10, 13)),  # too narrow
+        banded(1.5, rows=slice(0, 5)),  # goes on at the end: no band
+        banded(1.5, columns=slice(None), rows=slice(10, 21)),  # a step
         np.broadcast_to(np.linspace(1.0, 3.0, 21), (41, 21)),
         np.broadcast_to(np.linspace(1.0, 3.0, 41)[:, None], (41, 21)),
     ],

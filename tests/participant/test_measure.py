@@ -249,7 +249,7 @@ def test_the_grid_has_the_size_that_is_asked_for(plain):
 
 
 def test_a_hole_is_filled_and_reported(plain, damage):
-    where = damage.shaft(0.5, 0.5, 0.5)
+    where = damage.shaft(0.5, 0.5, 0.8)  # narrower ones are pits
     assert where.sum() > 10
     maps = measure(damage.erase(where))
     assert maps.status == Status.REPAIRED
