@@ -93,11 +93,11 @@ class BodySettings(SettingsTable):
     slit_voxel: NonNegativeFloat = 0.8
     """Gaps are filled if no voxel edge is longer, mm: folds between thick slices look alike."""
     pit_reach: PositiveFloat = 0.9
-    """A voxel without a label lies in a pit if the sheet is within this distance, mm, ..."""
+    """A voxel without a label lies in a pit if the sheet is this near, mm, ..."""
     pit_sides: Annotated[int, Field(ge=4, le=6)] = 5
     """... on so many of its six sides (5 is open on one side)."""
     pit_size: Numbers = (0.2, 1.8)
-    """Pits of this volume are filled, from and to, mm3, where gaps are (in six real bodies two)."""
+    """Pits of this volume are filled, mm3, where gaps are (there are two in six real bodies)."""
     uncus_size: NonNegativeFloat = 1.0
     """Smaller pieces of CA2 or CA3 are no uncus, mm3."""
     uncus_offset: PositiveFloat = 5.0
@@ -392,8 +392,7 @@ class CheckSettings(SettingsTable):
     """What makes a map doubtful (flag) or wrong (refusal)."""
 
     max_voxel: PositiveFloat = 0.9
-    """Refuse labels whose voxels in plane are larger, mm: no sheet is as thick as
-    ``min_voxels_across`` of these (1.9 mm at most in sixteen real bodies)."""
+    """Refuse larger voxels in plane, mm: no sheet is ``min_voxels_across`` of these thick."""
     min_voxels_across: NonNegativeFloat = 2.5
     """Refuse sheets thinner than this many in-plane voxels."""
     min_label_order: Annotated[float, Field(ge=-1, le=1)] = 0.45
@@ -421,35 +420,27 @@ class CheckSettings(SettingsTable):
     beyond_reach: PositiveFloat = 3.0
     """Labels are counted within this distance on both sides of an end plane, mm."""
     beyond_share: NonNegativeFloat = 0.7
-    """Flag an end without a label of its own if fewer lie beyond it than this share of those before
-    it (0.92 at least in twelve real bodies)."""
+    """Flag an end without a label if fewer lie beyond it than this share of those before it."""
     notch_reach: Numbers = (1.0, 2.0, 3.0)
     """A cross-section is compared with those at these distances on both sides, mm."""
     notch_share: Numbers = (0.12, 0.3, 0.35)
     """Flag if more than this share of what both sides have is missing, one per distance."""
     bump_contrast: NonNegativeFloat = 4.5
-    """Flag a cross-section that has more than this many times of what its neighbors lack than the
-    body's other cross-sections (set on a population of undamaged hemispheres: suite
-    ``population``)."""
+    """Flag a section with more of what others lack than so often the usual (suite population)."""
     intrusion_contrast: NonNegativeFloat = 3.7
     """The same for what both its neighbors label interior."""
     stub_nodes: NonNegativeFloat = 6.0
-    """What lies within this distance of a bridge that was cut is left out of that comparison, grid
-    nodes."""
+    """What lies this near to a bridge that was cut is left out of that comparison, grid nodes."""
     section_noise: NonNegativeFloat = 0.02
-    """Share of the area that is added to the usual before such comparisons, per mm of distance
-    (interior: in all), since thickness may change along the body."""
+    """Share of the area added to the usual before, per mm of distance (interior: in all)."""
     flag_row_jump: NonNegativeFloat = 0.15
-    """Flag if the sheet's width changes by more than this from one row to the next, or by twice as
-    much at an end."""
+    """Flag if the width changes by more than this between rows, or by twice as much at an end."""
     flag_row_dip: NonNegativeFloat = 0.22
-    """Flag rows narrower than the widest on both sides by more than this (set on a population of
-    undamaged hemispheres, as are the next ones: suite ``population``)."""
+    """Flag rows narrower than the widest on both sides by more than this (from the population)."""
     row_dip_reach: NonNegativeFloat = 8.0
     """Distance along the axis within which rows are compared, mm."""
     edge_reach: Numbers = (2.5, 3.5, 5.0)
-    """The medial and the lateral edge are compared with themselves at these distances along the
-    axis on both sides, mm."""
+    """Edges are compared with themselves at these distances along the axis on both sides, mm."""
     flag_edge: Numbers = (1.8, 2.2, 2.7)
     """Flag an edge that recedes behind both by more than this, one per distance, mm."""
     ridge_reach: Numbers = (1.0, 2.0, 3.0)
@@ -463,30 +454,24 @@ class CheckSettings(SettingsTable):
     uncus_reach: NonNegativeFloat = 2.0
     """Warn of an uncus that begins farther than this behind the anterior plane, mm."""
     flag_cavity: NonNegativeFloat = 0.03
-    """Flag a wide cavity that was divided beyond this share of the body: half of it is what the
-    mean thickness may be off by."""
+    """Flag a wide cavity beyond this share of the body: the mean may be off by half of it."""
     flag_reach: PositiveFloat = 1.0
     """A flag concerns the columns within this distance of what was found, mm."""
     flag_pinholes: NonNegativeFloat = 0.01
-    """Flag labels in which single voxels without a label are more than this share of the sheet's
-    voxels (0.0015 at most in twelve real bodies)."""
+    """Flag labels with more single voxels without a label than this share of the sheet's."""
     flag_gap: NonNegativeInt = 70
-    """Flag a gap of more voxels than this (set on a population of undamaged hemispheres, coarse or
-    fine)."""
+    """Flag a gap of more voxels than this (from the population, coarse or fine)."""
     flag_loose_part: NonNegativeFloat = 0.15
-    """Flag a second piece of voxels, connected by faces, above this share of the sheet (0.04 at
-    most in twelve real bodies)."""
+    """Flag a second piece of voxels, connected by faces, above this share of the sheet."""
     flag_rim_distance: NonNegativeFloat = 1.25
-    """Flag if the rim paths and the boundary curves differ by more than this, multiples of the
-    sheet's thickness (along a flat rim a path may follow either edge)."""
+    """Flag if rim paths and boundary curves differ by more than this, multiples of thickness."""
 
 
 class MapSettings(SettingsTable):
     """Other volumes on the sheet (``--map``)."""
 
     min_known: Fraction = 0.5
-    """A value is missing if less than this share of the voxels, or of the depth, that it is made
-    of is known."""
+    """A value is missing if less than this share of its voxels, or of the depth, is known."""
     flag_outside: NonNegativeFloat = 0.05
     """Flag if a larger share of the points lies outside the volume's field of view."""
 
