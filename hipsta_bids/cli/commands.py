@@ -247,7 +247,7 @@ def run_surrogate(arguments: Sequence[str]) -> ExitCode:
 
     settings = load_settings(options.settings)
     from hipsta_bids.inputs.search import dataset_notes, find_inputs, selection_table  # noqa: PLC0415  (heavy)
-    from hipsta_bids.validation.slice_thickness import crosscheck  # noqa: PLC0415  (heavy)
+    from hipsta_bids.validation.surrogate import crosscheck  # noqa: PLC0415  (heavy)
 
     request = input_request(options)
     found = find_inputs(request)

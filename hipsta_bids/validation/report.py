@@ -25,14 +25,14 @@ SUITES: Mapping[str, str] = MappingProxyType(
     {
         "accuracy": "accuracy:run",
         "limits": "accuracy:run_limits",
-        "slices": "invariance:run_slices",
+        "slices": "thick_slices:run",
         "convergence": "accuracy:run_convergence",
         "invariance": "invariance:run",
-        "uncertainty": "invariance:run_uncertainty",
+        "uncertainty": "uncertainty:run",
         "defects": "defects:run",
         "population": "population:run",
         "group": "group:run",
-        "surrogate": "slice_thickness:run",
+        "surrogate": "surrogate:run",
     }
 )
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from hipsta_bids.phantom import PhantomSpec
-from hipsta_bids.validation import slice_thickness
+from hipsta_bids.validation import surrogate
 from hipsta_bids.validation.cases import Refusal
 from hipsta_bids.validation.report import render
-from hipsta_bids.validation.slice_thickness import Compared
+from hipsta_bids.validation.surrogate import Compared
 
 SHORT = PhantomSpec(kind="arc", thickness=2.0, variation=0.3, length=8.0)
 
@@ -28,8 +28,8 @@ def compared(*, noise=0.0, problems=()):
 
 
 def run_with(monkeypatch, results, *, full=False):
-    monkeypatch.setattr(slice_thickness, "run_cases", lambda _, bodies: results[: len(bodies)])
-    return slice_thickness.run(full)
+    monkeypatch.setattr(surrogate, "run_cases", lambda _, bodies: results[: len(bodies)])
+    return surrogate.run(full)
 
 
 def row_of(suite, number=0):
@@ -68,7 +68,7 @@ def test_nothing_is_drawn_where_all_is_refused(monkeypatch):
 
 
 def test_a_phantom_is_measured_in_both_ways():
-    found = slice_thickness.compare_body(SHORT)
+    found = surrogate.compare_body(SHORT)
     assert found.surrogate.shape == found.mesh.shape == found.truth.shape == (3, 41)
     assert not found.problems
     known = np.isfinite(found.mesh) & np.isfinite(found.truth)

@@ -7,9 +7,9 @@ import pytest
 
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.types import LabelVolume
-from hipsta_bids.validation import invariance
+from hipsta_bids.validation import thick_slices
 from hipsta_bids.validation.cases import Refusal
-from hipsta_bids.validation.invariance import Outcome, Trial, reslice
+from hipsta_bids.validation.thick_slices import Outcome, Trial, reslice
 
 AXIS = np.array([0.0, 1.0, 0.0])
 
@@ -60,14 +60,14 @@ def maps(thickness, length=20.0):
 
 def test_maps_are_compared_node_by_node():
     reference = np.random.default_rng(1).uniform(1, 2, (41, 21))
-    found = invariance.compare(maps(2 * reference - 1.2), maps(reference), 2.0)
+    found = thick_slices.compare(maps(2 * reference - 1.2), maps(reference), 2.0)
     assert found.correlation == pytest.approx(1.0)
     assert found.change == pytest.approx(reference.mean() - 1.2)
 
 
 def test_sampling_loses_nothing_of_a_map_without_change_along_the_axis():
     thickness = np.repeat(np.linspace(1, 2, 41)[:, None], 21, axis=1)
-    for change, correlation in invariance.compare(maps(thickness), maps(thickness), 2.0).sampled:
+    for change, correlation in thick_slices.compare(maps(thickness), maps(thickness), 2.0).sampled:
         assert change == pytest.approx(0.0, abs=1e-12)
         assert correlation == pytest.approx(1.0)
 
@@ -76,7 +76,7 @@ def test_sampling_a_spike_between_slices_loses_all_of_it():
     thickness = np.repeat(np.linspace(1, 2, 41)[:, None], 21, axis=1)
     thickness[:, 10] += 1.0  # at 10 mm; rows are 1 mm apart
     lost = [
-        change for change, _ in invariance.compare(maps(thickness), maps(thickness), 4.0).sampled
+        change for change, _ in thick_slices.compare(maps(thickness), maps(thickness), 4.0).sampled
     ]
     # Slices at 4 (n + 1/6), 4 (n + 1/2) and 4 (n + 5/6) mm. That at 10 mm makes a tent 8 mm wide,
     # 4 rows in sum; those at 8.67 and 12.67, and at 7.33 and 11.33 mm miss the spike.
@@ -97,10 +97,10 @@ def outcome(change, correlation=0.9, status="ok"):
 
 def row_of(results, step=2.0):
     trials = [
-        Trial(body=invariance.PHANTOMS[0], step=step, offset=0.0, tilt=0.0)
+        Trial(body=thick_slices.PHANTOMS[0], step=step, offset=0.0, tilt=0.0)
         for _ in range(len(results))
     ]
-    table = invariance._table(trials, results)
+    table = thick_slices._table(trials, results)
     assert len(table.rows) == 1
     return table.rows[0], table.rows[0]["met"], table
 
@@ -122,8 +122,8 @@ def test_targets_are_judged(results, met):
 
 
 def test_no_accepted_map_may_be_far_off_whatever_the_distance():
-    assert row_of([outcome(0.16)], step=invariance.PIXEL)[1] is False
-    assert row_of([outcome(0.16, status="flagged")], step=invariance.PIXEL)[1] is True
+    assert row_of([outcome(0.16)], step=thick_slices.PIXEL)[1] is False
+    assert row_of([outcome(0.16, status="flagged")], step=thick_slices.PIXEL)[1] is True
 
 
 def test_refusals_are_counted_and_explained():
@@ -138,10 +138,10 @@ def test_refusals_are_counted_and_explained():
 
 def half_row(*offsets_and_results):
     trials = [
-        Trial(body=invariance.PHANTOMS[0], step=2.0, offset=offset, tilt=0.0)
+        Trial(body=thick_slices.PHANTOMS[0], step=2.0, offset=offset, tilt=0.0)
         for offset, _ in offsets_and_results
     ]
-    table = invariance._half_table(trials, [result for _, result in offsets_and_results])
+    table = thick_slices._half_table(trials, [result for _, result in offsets_and_results])
     return table.rows
 
 
@@ -174,7 +174,7 @@ def test_no_pair_makes_no_row():
 
 
 def test_a_phantom_in_thick_slices_meets_the_targets():
-    trial = Trial(body=invariance.PHANTOMS[0], step=2.0, offset=1 / 3, tilt=10.0)
-    found = invariance.measure_trial(trial)
-    assert abs(found.change) <= invariance.TARGETS[2.0][1]
-    assert found.correlation >= invariance.TARGETS[2.0][3]
+    trial = Trial(body=thick_slices.PHANTOMS[0], step=2.0, offset=1 / 3, tilt=10.0)
+    found = thick_slices.measure_trial(trial)
+    assert abs(found.change) <= thick_slices.TARGETS[2.0][1]
+    assert found.correlation >= thick_slices.TARGETS[2.0][3]
