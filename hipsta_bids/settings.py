@@ -8,21 +8,15 @@ What does not change a result (jobs, verbosity, folders) is in
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import (
-    Field,
-    NonNegativeFloat,
-    NonNegativeInt,
-    PositiveFloat,
-    PositiveInt,
-    Strict,
-    model_validator,
-)
+from pydantic import Field, model_validator
+from pydantic.types import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from hipsta_bids.protocols.toml import (
     Fraction,
     Numbers,
     Odd,
     OpenFraction,
+    OpenFractions,
     PositiveFraction,
     SettingsTable,
     read_settings,
@@ -495,9 +489,7 @@ class UncertaintySettings(SettingsTable):
 class SurrogateSettings(SettingsTable):
     """Thickness from the medial axis of single slices (``hipsta-bids surrogate``)."""
 
-    positions: Annotated[tuple[OpenFraction, ...], Strict(strict=False), Field(min_length=1)] = (
-        0.5,
-    )
+    positions: OpenFractions = (0.5,)
     """Where the slices are, fractions of the body's length from its posterior end."""
     pixel: Annotated[float, Field(ge=0.02, le=1)] = 0.1
     """Edge of the pixels on which the slices are drawn, mm."""
