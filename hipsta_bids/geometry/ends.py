@@ -14,7 +14,7 @@ from scipy.special import expit
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.automatic_ends import find_ends
-from hipsta_bids.geometry.digital import ALL, piece_sizes, voxel_points
+from hipsta_bids.geometry.digital import ALL, box_around, piece_sizes, voxel_points
 from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import BodySettings
 from hipsta_bids.types import Bool, End, Float, GivenEnd, LabelVolume, position_text
@@ -160,8 +160,11 @@ def _largest_ends(part: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Keep the largest piece each of head and tail: stray voxels must not move the end planes."""
     kept = part.copy()
     for end in (Part.HEAD, Part.TAIL):
-        pieces, _ = ndimage.label(part == end, structure=ALL)
-        kept[(pieces > 0) & (pieces != piece_sizes(pieces).argmax())] = Part.UNKNOWN
+        index = np.argwhere(part == end)
+        if len(index):
+            around = box_around(index)
+            pieces, _ = ndimage.label(part[around] == end, structure=ALL)
+            kept[around][(pieces > 0) & (pieces != piece_sizes(pieces).argmax())] = Part.UNKNOWN
     return kept
 
 

@@ -109,8 +109,11 @@ class Evidence:
     """Fraction of the volume in which the coordinates have the opposite orientation."""
 
 
-def find_all(evidence: Evidence) -> list[Finding]:
-    """List what the checks of one hemisphere found, within their limits or not."""
+def find_all(evidence: Evidence, repaired: Bool) -> list[Finding]:
+    """List what the checks of one hemisphere found, within their limits or not.
+
+    ``repaired`` marks the columns (Nx, Ny) that a repair touched.
+    """
     measured, solid, boundaries = evidence.measured, evidence.solid, evidence.boundaries
     body, sheet, settings = measured.body, measured.sheet, measured.settings
     checks = settings.checks
@@ -151,7 +154,7 @@ def find_all(evidence: Evidence) -> list[Finding]:
             settings.topology.flag_fraction,
             f"{solid.changed_fraction:.1%} of the body was changed by repairs",
             "look at the labels",
-            middle[repaired_columns(sheet, solid, settings.measures)],
+            middle[repaired],
         ),
         (
             "boundary-doubtful",
@@ -380,15 +383,15 @@ def measure_hemisphere(
     body, sheet = measured.body, measured.sheet
     with clock("measures"):
         layers, folded_layers = _layers(sheet, settings)
+        repaired = repaired_columns(sheet, solid, settings.measures)
         findings = [
             *check_end_labels(volume, body, settings.checks),
             *check_thickness(measured.thickness, boundaries.sheet_thickness, settings.checks),
             *([check_flipped(sheet, hemi)] if body.region == "extended" else []),
             *_check_edited_mask(volume, body, settings),
-            *find_all(evidence),
+            *find_all(evidence, repaired),
             *folded_layers,
         ]
-        repaired = repaired_columns(sheet, solid, settings.measures)
         maps = measure_maps(measured)
         return HemisphereMaps(
             sheet=sheet,

@@ -43,8 +43,12 @@ def with_measured(evidence, **changes):
     return replace(evidence, measured=replace(evidence.measured, **changes))
 
 
+def findings(evidence):
+    return find_all(evidence, np.zeros(evidence.measured.sheet.valid.shape, dtype=bool))
+
+
 def reasons(evidence):
-    return [found.reason for found in find_all(evidence) if found.raised]
+    return [found.reason for found in findings(evidence) if found.raised]
 
 
 def test_a_sound_hemisphere_has_no_flags(evidence):
@@ -75,7 +79,7 @@ def repair(excess):
 
 def test_large_repairs_are_flagged_one_by_one(evidence):
     repairs = (repair(1.5), repair(0.7), repair(np.inf))
-    found = find_all(replace(evidence, solid=replace(evidence.solid, repairs=repairs)))
+    found = findings(replace(evidence, solid=replace(evidence.solid, repairs=repairs)))
     large = [finding for finding in found if finding.reason == "large-repair"]
     assert [finding.margin for finding in large] == [1.5, 0.7, np.inf]
     assert [finding.raised for finding in large] == [True, False, True]
