@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
-from skimage.segmentation import watershed
 
 from hipsta_bids.geometry.digital import (
     ALL,
@@ -114,11 +113,26 @@ def find_uncus(tissue: Tissues, affine: Float, ends: EndPlanes, settings: BodySe
     if not found.any():
         return np.zeros((0, 3), np.intp)
     beside = depth < depth[found].max() + 1.0
-    grid[at] = np.where(found, 1, np.where((lateral | medial) & beside, 2, 0))
-    mask = np.zeros(grid.shape, dtype=bool)
-    mask[at] = beside
-    basins = watershed(np.zeros_like(grid), grid, ALL, mask=mask)  # type: ignore[no-untyped-call]
-    return np.asarray(index[basins[at] == 1])
+    own, rest, free = (np.zeros(grid.shape, dtype=bool) for _ in range(3))
+    own[at], rest[at], free[at] = found, (lateral | medial) & beside & ~found, beside
+    return np.asarray(index[_nearer_to(own, rest, free)[at]])
+
+
+def _nearer_to(own: Bool, rest: Bool, free: Bool) -> Bool:
+    """Grow two masks through free voxels, a voxel at a time; return the first.
+
+    What both reach at once goes to the second, whatever the order in which voxels are stored.
+    """
+    free = free & ~own & ~rest
+    while True:
+        to_own, to_rest = (
+            ndimage.binary_dilation(part, structure=ALL) & free for part in (own, rest)
+        )
+        if not (to_own | to_rest).any():
+            return own
+        rest = rest | to_rest
+        own = own | (to_own & ~to_rest)
+        free &= ~(to_own | to_rest)
 
 
 def _like_nearest(

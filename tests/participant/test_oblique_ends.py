@@ -6,12 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hipsta_bids.geometry.body import extract_body
 from hipsta_bids.geometry.digital import to_ras
 from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Part, Tissue
-from hipsta_bids.settings import Settings
+from hipsta_bids.settings import BodySettings, Settings
 from hipsta_bids.types import Status
 
 PHANTOM = Phantom(PhantomSpec(kind="arc", thickness=2.0, length=18.0, end_length=4.0))
@@ -67,9 +68,8 @@ def test_rows_begin_and_end_at_the_planes(volume):
     assert maps.summary["volume"] == pytest.approx(straight.summary["volume"], rel=0.01)
 
 
-def test_an_uncus_is_left_out_and_named(volume):
-    """A piece of CA2/3 with its own dentate gyrus lies medially of the body at its front."""
-    whole = cut(volume, 0, "width")
+def with_uncus(whole, bridge=0.0):
+    """Add a piece of CA2/3 medially of the body at its front, with CA1 towards the body (mm)."""
     points = to_ras(np.moveaxis(np.indices(whole.tissue.shape), 0, -1), whole.affine)
     front = PHANTOM.body.place(0.5, 0.8, 0.0)
     medial = PHANTOM.body.place(0.0, 0.8, 0.0)
@@ -79,12 +79,44 @@ def test_an_uncus_is_left_out_and_named(volume):
     axis /= np.linalg.norm(axis)
     along = (points - center) @ axis
     aside = np.linalg.norm(points - center - along[..., None] * axis, axis=-1)
-    piece = (np.abs(along) < 1.8) & (aside < 1.5) & (whole.tissue == 0)
+    free = (np.abs(along) < 1.8) & (whole.tissue == 0)
+    piece = free & (aside < 1.5)
+    inward = (center - points) @ away
+    off = np.linalg.norm(
+        points - center - along[..., None] * axis + inward[..., None] * away, axis=-1
+    )
+    joined = free & ~piece & (off < 1.0) & (inward > 0) & (inward < bridge)
     tissue = np.where(piece, np.uint8(Tissue.CA2_3), whole.tissue)
-    part = np.where(piece & (along > 0), Part.HEAD, np.where(piece, Part.BODY, whole.part))
-    maps, plain = measure(replace(whole, tissue=tissue, part=part)), measure(whole)
+    tissue = np.where(joined, np.uint8(Tissue.CA1), tissue)
+    both = piece | joined
+    part = np.where(both & (along > 0), Part.HEAD, np.where(both, Part.BODY, whole.part))
+    return replace(whole, tissue=tissue, part=part)
+
+
+def test_an_uncus_is_left_out_and_named(volume):
+    whole = cut(volume, 0, "width")
+    maps, plain = measure(with_uncus(whole)), measure(whole)
     assert maps.status == Status.REPAIRED
     (repair,) = maps.repairs
     assert repair.startswith("left out the uncus")
     assert np.abs(maps.thickness - plain.thickness).max() < 0.1
     assert maps.qc["changed_fraction"] == 0
+
+
+def test_what_goes_with_an_uncus_does_not_depend_on_the_order_of_voxels(volume):
+    attached = with_uncus(cut(volume, 0, "width"), bridge=3.5)
+    detached = extract_body(with_uncus(cut(volume, 0, "width")), BodySettings()).uncus
+    found = []
+    for flips in ((), (0,), (1,), (2,), (0, 1, 2)):
+        affine = attached.affine.copy()
+        for axis in flips:
+            affine[:3, 3] += affine[:3, axis] * (attached.tissue.shape[axis] - 1)
+            affine[:3, axis] *= -1
+        tissue, part = (np.flip(values, flips) for values in (attached.tissue, attached.part))
+        body = extract_body(
+            replace(attached, tissue=tissue, part=part, affine=affine), BodySettings()
+        )
+        points = to_ras(body.uncus, affine).round(3)
+        found.append({tuple(point) for point in points.tolist()})
+    assert len(found[0]) > len(detached) + 30  # some of the CA1, too
+    assert all(one == found[0] for one in found)
