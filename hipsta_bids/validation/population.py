@@ -57,8 +57,7 @@ CRISP = 0.6
 FINE = 0.6
 """mm; voxels without a longer edge are fine."""
 PHANTOM_VOXEL = 0.3
-WARPS_QUICK, WARPS_FULL = 3, 6
-DAMAGES_QUICK, DAMAGES_FULL = 1, 2
+WARPS_QUICK, WARPS_FULL = 1, 3
 
 MULTIPLES = (0.7, 0.85, 1.0, 1.2, 1.5)
 """Of the present limits, at which flags are counted."""
@@ -167,7 +166,7 @@ def find_bodies(labels: Path | None) -> list[ValidationBody]:
 
 def plan(bodies: Sequence[ValidationBody], full: bool) -> list[Specimen]:
     """List specimens: bodies as they are, and warped, with the damages in turn."""
-    warps, each = (WARPS_FULL, DAMAGES_FULL) if full else (WARPS_QUICK, DAMAGES_QUICK)
+    warps = WARPS_FULL if full else WARPS_QUICK
     order = np.random.default_rng(SEED).permutation(len(PLAN))
     specimens: list[Specimen] = []
     for body in bodies:
@@ -176,9 +175,8 @@ def plan(bodies: Sequence[ValidationBody], full: bool) -> list[Specimen]:
             sizes = SIZES
         ways = [(None, 0)] + [(size, 1 + n) for n in range(warps) for size in sizes]
         for size, number in ways:
-            first = each * len(specimens)
-            injuries = tuple(PLAN[order[(first + n) % len(PLAN)]] for n in range(each))
-            specimens.append(Specimen(body=body, number=number, voxel=size, injuries=injuries))
+            injury = PLAN[order[len(specimens) % len(PLAN)]]
+            specimens.append(Specimen(body=body, number=number, voxel=size, injuries=(injury,)))
     return specimens
 
 
