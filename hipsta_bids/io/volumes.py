@@ -101,7 +101,7 @@ def read_labels(
     margin : float
         Voxels up to this distance (mm, along the image's axes) are kept around what is not zero.
     box : tuple of slice, optional
-        The part to read instead.
+        The part to read instead, as far as the image goes.
     """
     with _opened(path) as image:
         shape = _label_shape(image, path)
@@ -110,6 +110,12 @@ def read_labels(
         first = None
         if box is None:
             box, first = _labeled_part(image, shape, margin, affine)
+        else:
+            x, y, z = (
+                slice(min(side.start, count), min(side.stop, count))
+                for side, count in zip(box, shape, strict=True)
+            )
+            box = x, y, z
         size = math.prod(side.stop - side.start for side in box)
         if size > MOST_LABELED:
             raise InputError(

@@ -22,7 +22,7 @@ from hipsta_bids.derivatives.hemisphere import (
 from hipsta_bids.derivatives.names import DATASET_FILES
 from hipsta_bids.errors import HipstaError, InputError
 from hipsta_bids.io import files, gifti
-from hipsta_bids.io.volumes import read_labels
+from hipsta_bids.io.volumes import LabelImage, read_labels
 from hipsta_bids.protocols.load import load_protocol, protocol_names
 from hipsta_bids.protocols.protocol import Protocol
 from hipsta_bids.types import Bool, Float, Status
@@ -241,22 +241,22 @@ class Views:
 def read_views(hemisphere: Hemisphere) -> Views | None:
     """Read what slices are drawn from."""
     mask = _read_mask(hemisphere)
-    labels, missing = _read_labels(hemisphere)
-    if labels is None and mask is None:
+    labels, missing = _read_labels(hemisphere, mask)
+    if mask is not None and labels is not None and mask.shape != labels.shape:
+        labels, missing = None, "the image of the labels has changed since"
+    first = mask if mask is not None else labels
+    if first is None:
         return None
-    data, affine = labels or (None, None)
-    if mask is not None and labels is not None and mask[0].shape != labels[0].shape:
-        missing = "the image of the labels has changed since"
-        data = None
-    inside = None if mask is None else mask[0] != 0
-    affine = mask[1] if mask is not None else affine
+    affine = _reoriented(first.data, first.own_affine)[1]
+    data = None if labels is None else _reoriented(labels.data, labels.own_affine)[0]
+    inside = None if mask is None else _reoriented(mask.data, mask.own_affine)[0] != 0
     names = _names(hemisphere, data)
     interest = inside if inside is not None else np.isin(data, list(names))  # type: ignore[arg-type]  # one is there
-    box = _box(interest, np.linalg.norm(affine[:3, :3], axis=0))  # type: ignore[index]  # likewise
+    box = _box(interest, np.linalg.norm(affine[:3, :3], axis=0))
     return Views(
         labels=None if data is None else data[box].astype(np.int32),
         mask=None if inside is None else inside[box],
-        affine=_cropped(affine, box),  # type: ignore[arg-type]  # likewise
+        affine=_cropped(affine, box),
         names=names,
         missing=missing,
     )
@@ -278,23 +278,21 @@ def input_path(hemisphere: Hemisphere) -> Path | None:
     return Path(unquote(urlparse(str(links[dataset])).path)) / inside
 
 
-def _read_mask(hemisphere: Hemisphere) -> tuple[NDArray[np.generic], Float] | None:
+def _read_mask(hemisphere: Hemisphere) -> LabelImage | None:
     path = hemisphere.place.path("body_mask")
-    if not path.exists():
-        return None
-    image = read_labels(path)
-    return _reoriented(image.data, image.own_affine)
+    image = read_labels(path, _MARGIN) if path.exists() else None
+    return image if image is not None and image.data.size else None
 
 
 def _read_labels(
-    hemisphere: Hemisphere,
-) -> tuple[tuple[NDArray[np.generic], Float] | None, str | None]:
+    hemisphere: Hemisphere, mask: LabelImage | None
+) -> tuple[LabelImage | None, str | None]:
+    """Read labels round the body, or why there are none."""
     path = input_path(hemisphere)
     if path is None:
         return None, "the record names no file"
     try:
-        image = read_labels(path)
-        return _reoriented(image.data, image.own_affine), None
+        return read_labels(path, _MARGIN, mask.box if mask is not None else None), None
     except InputError as error:
         reason = "is not there any more" if not path.exists() else f"is unusable: {error.reason}"
         return None, f"{path.name} {reason}"

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 
+import nibabel as nib
 import numpy as np
 import pytest
 from page_outline import Outline
@@ -152,6 +153,21 @@ def test_labels_that_are_gone_cost_the_labels_only(copy):
     text = participant_page(copy, "01", None, read_cohort(copy))
     assert "is not there any more" in text
     assert 'class="line mask"' in text
+
+
+@pytest.mark.parametrize("name", ["sub-01.html", "sub-02.html"])
+def test_labels_are_drawn(out, name):
+    text = (out / name).read_text(encoding="utf-8")
+    assert "No labels are drawn" not in text
+
+
+def test_labels_on_another_grid_than_the_mask_are_not_drawn(copy):
+    (mask,) = copy.rglob("sub-01*hemi-L*desc-body_mask.nii.gz")
+    image = nib.load(mask)
+    smaller = np.asarray(image.dataobj)[:-1]
+    nib.save(nib.Nifti1Image(smaller, image.affine), mask)
+    text = participant_page(copy, "01", None, read_cohort(copy))
+    assert "the image of the labels has changed since" in text
 
 
 def test_a_section_that_fails_costs_itself_only(out, monkeypatch, caplog):
