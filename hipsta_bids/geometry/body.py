@@ -189,8 +189,10 @@ def extract_body(volume: LabelVolume, settings: BodySettings) -> Body:
         )
     if region != "body":
         check_reach(points, tissue[inside], ends, settings)
-    slits = fill_slits(tissue, inside, volume.tissue == Tissue.BACKGROUND, volume.affine, settings)
     empty = volume.tissue == Tissue.BACKGROUND
+    slits = fill_slits(tissue, inside, empty, volume.affine, settings)
+    if volume.edited_mask is not None:  # a person has taken these voxels out
+        empty &= volume.edited_mask.inside
     tissue, pits = fill_pits(slits.tissue, inside, empty, volume.affine, settings)
     if len(slits.filled) or len(pits):
         inside, _ = between(tissue > 0, volume.affine, ends)
