@@ -13,6 +13,7 @@ from hipsta_bids.derivatives.hemisphere import LAYERS, NODES, POSITION, STATE
 from hipsta_bids.derivatives.names import (
     DATASET_FILES,
     EXTRA_OUTPUTS,
+    IGNORED,
     OUTPUTS,
     HemisphereName,
     Output,
@@ -35,6 +36,22 @@ and NaN in GIFTI files. What the numbers mean, with figures: [Measures](measures
 
 Axes mean the same on both sides: x runs from medial (subiculum) to lateral (CA3), y from posterior
 to anterior, z from interior to exterior. Head and tail are part of no number."""
+
+SOURCES_TEXT = """\
+`SourceDatasets` and `DatasetLinks` in `dataset_description.json` say where the segmentations are,
+as a path relative to the output folder, so that both may move together. Where the way there leads
+through the root of the file system, the folder is written as you spelled it, `file:///...`. In a
+container that is a path inside it, unless folders are mounted where they are outside: with
+`-v /data:/data`, `/data/study` and `/data/study-hipsta` mean the same on both sides.
+
+`GeneratedBy` has the version; in a container image also `Container`; and `CodeURL`, where the image
+(`HIPSTA_BIDS_CODE_URL`) or the metadata of the package know it."""
+
+IGNORED_TEXT = """\
+The dataset passes the [BIDS validator](https://github.com/bids-standard/bids-validator) without
+errors. BIDS 1.11 has no names for some of its files. They have entities in its order, and the
+suffixes of the proposal for structural derivatives (BEP011) where it has one. `.bidsignore` lists
+them:"""
 
 COLUMNS_TEXT = """\
 Which table has which is said in [Group level](group.md#what-is-written) and in the `.json` beside
@@ -61,7 +78,8 @@ OPTIONS_TEXT = """\
 
 _DATASET_FILES = {
     "description": "what BIDS asks for, with versions and sources",
-    "ignore": "which files are not in the standard, for the BIDS validator",
+    "readme": "what is where; written unless there is a README",
+    "ignore": "which files are [not in the standard](#names-that-bids-does-not-have)",
     "settings": "all settings of these results, and their hash",
     "citation": "a methods paragraph with references, for your article",
     "status": "one row per hemisphere: status, reason, message, time per stage, peak memory",
@@ -89,6 +107,14 @@ def outputs_page() -> str:
         _table(
             ("file", "content"),
             ((f"`{name}`", _DATASET_FILES[key]) for key, name in DATASET_FILES.items()),
+        ),
+        "## Sources",
+        SOURCES_TEXT,
+        "## Names that BIDS does not have",
+        IGNORED_TEXT,
+        _table(
+            ("files", "why"),
+            ((f"`{pattern.lstrip('/')}`", why) for pattern, why in IGNORED.items()),
         ),
         "## Columns of `desc-sheet_morph.tsv`",
         "One row per point of the sheet.",

@@ -2,14 +2,16 @@
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, metadata
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote, unquote, urlsplit
 
 from hipsta_bids import __version__
 from hipsta_bids.derivatives.names import (
     DATASET_FILES,
     HemisphereName,
-    ignore_patterns,
+    ignore_file,
     output_path,
 )
 from hipsta_bids.errors import InputError, SettingsError, UsageError
@@ -28,6 +30,13 @@ CONTAINER_VARIABLES = {
     "Tag": "HIPSTA_BIDS_CONTAINER_TAG",
     "URI": "HIPSTA_BIDS_CONTAINER_URI",
 }
+
+#: Set by Apptainer, which runs images of Docker too, and by Singularity before it.
+_APPTAINER_VARIABLES = ("APPTAINER_CONTAINER", "SINGULARITY_CONTAINER")
+
+#: Where the code is: set in container images; else it is read from the package's metadata.
+CODE_URL_VARIABLE = "HIPSTA_BIDS_CODE_URL"
+_CODE_LABELS = ("source", "repository")
 
 
 def check_own_dataset(root: Path) -> None:
@@ -102,41 +111,133 @@ def shared_settings(settings: Settings) -> tuple[str, dict[str, Any]]:
 
 
 def write_description(root: Path, sources: Mapping[str, Path]) -> None:
-    """Write ``dataset_description.json`` and ``.bidsignore``.
+    """Write ``dataset_description.json``, and what :func:`write_notes` does.
 
     Sources of earlier runs into the same folder are kept.
     """
     path = root / DATASET_FILES["description"]
     earlier = files.read_json(path) if path.exists() else {}
-    entries = [_source(folder) for folder in sources.values()]
-    known = {entry["URL"] for entry in entries}
-    kept = [e for e in earlier.get("SourceDatasets", []) if e.get("URL") not in known]
-    links = {name: folder.resolve().as_uri() for name, folder in sources.items()}
-    made_by = {
+    links = {name: link_to(folder, root) for name, folder in sources.items()}
+    entries = [_source(folder, links[name]) for name, folder in sources.items()]
+    known = {str(folder.resolve()) for folder in sources.values()}
+    kept = [e for e in earlier.get("SourceDatasets", []) if not _is_at(e.get("URL"), root, known)]
+    description = {
+        "Name": "Hippocampal thickness and curvature maps",
+        "BIDSVersion": BIDS_VERSION,
+        "DatasetType": "derivative",
+        "GeneratedBy": [_maker()],
+        "SourceDatasets": sorted(kept + entries, key=lambda entry: str(entry["URL"])),
+        "DatasetLinks": dict(sorted((earlier.get("DatasetLinks", {}) | links).items())),
+    }
+    files.write_json(path, description)
+    write_notes(root)
+
+
+def write_notes(root: Path) -> None:
+    """Write ``.bidsignore``, and a README unless the dataset has one."""
+    files.write_text(root / DATASET_FILES["ignore"], ignore_file())
+    if not any(root.glob("README*")):
+        files.write_text(root / DATASET_FILES["readme"], _README)
+
+
+_README = f"""\
+# Hippocampal thickness and curvature maps
+
+Made by {NAME} from segmentations of hippocampal subfields: maps of thickness, curvature and
+extents on the sheet of the hippocampal body, per hemisphere.
+
+- `{DATASET_FILES["report"]}` shows all hemispheres, with a page per participant beside it.
+- `{DATASET_FILES["status"]}` says how each hemisphere ended.
+- `{DATASET_FILES["citation"]}` describes the methods, with references.
+- `{DATASET_FILES["settings"]}` has all settings.
+- `sub-*/` has tables, surfaces and maps; a JSON file beside each table defines its columns.
+- `{DATASET_FILES["group"]}/` has results over participants, where there are some.
+
+The paths in `DatasetLinks` of `{DATASET_FILES["description"]}` are relative to this folder where
+they do not begin with a scheme such as `file:`.
+"""
+
+
+def _maker() -> dict[str, Any]:
+    """Say what made the dataset: an entry of ``GeneratedBy``."""
+    maker: dict[str, Any] = {
         "Name": NAME,
         "Version": __version__,
         "Description": "Thickness, curvature and shape of the hippocampal body from subfields",
     }
+    if url := _code_url():
+        maker["CodeURL"] = url
     container = {
         key: os.environ[variable]
         for key, variable in CONTAINER_VARIABLES.items()
         if os.environ.get(variable)
     }
-    description = {
-        "Name": "Hippocampal thickness and curvature maps",
-        "BIDSVersion": BIDS_VERSION,
-        "DatasetType": "derivative",
-        "GeneratedBy": [made_by | ({"Container": container} if container else {})],
-        "SourceDatasets": sorted(kept + entries, key=lambda entry: str(entry["URL"])),
-        "DatasetLinks": dict(sorted((earlier.get("DatasetLinks", {}) | links).items())),
-    }
-    files.write_json(path, description)
-    files.write_text(root / DATASET_FILES["ignore"], "\n".join(ignore_patterns()) + "\n")
+    if any(os.environ.get(variable) for variable in _APPTAINER_VARIABLES):
+        container["Type"] = "apptainer"
+    return maker | ({"Container": container} if container else {})
 
 
-def _source(folder: Path) -> dict[str, str]:
+def _code_url() -> str | None:
+    if url := os.environ.get(CODE_URL_VARIABLE):
+        return url
+    try:
+        entries = metadata(NAME).get_all("Project-URL") or []
+    except PackageNotFoundError:  # run from a folder, not installed
+        return None
+    pairs = (entry.partition(",") for entry in entries)
+    urls = {label.strip().lower(): url.strip() for label, _, url in pairs}
+    return next((urls[label] for label in _CODE_LABELS if label in urls), None)
+
+
+def link_to(folder: Path, root: Path) -> str:
+    """Write where a folder is, as seen from the dataset: a relative path, else a ``file:`` URI.
+
+    The path is relative if it leads there and does not go through the root of the file system:
+    in a container the folders there are mounted one by one. Otherwise the folder is spelled as
+    the user did, symbolic links included. :func:`linked_folder` is the inverse.
+    """
+    spelled = Path(os.path.abspath(folder)), Path(os.path.abspath(root))  # noqa: PTH100  (no links followed)
+    for here, there in (spelled, (folder.resolve(), root.resolve())):
+        if Path(os.path.commonpath([here, there])) == Path(here.anchor):
+            continue
+        relative = os.path.relpath(here, there)
+        if (root / relative).resolve() == folder.resolve():
+            return quote(relative)
+    return spelled[0].as_uri()
+
+
+def linked_folder(link: str, root: Path) -> Path | None:
+    """Find the folder that an entry of ``DatasetLinks`` leads to; ``None`` if it is remote."""
+    parts = urlsplit(link)
+    if not link or parts.scheme not in ("", "file"):
+        return None
+    return root / unquote(parts.path)  # an absolute path stays as it is
+
+
+def read_links(root: Path) -> dict[str, str]:
+    """Read ``DatasetLinks``: addresses of other datasets, by name."""
+    links = files.read_json(root / DATASET_FILES["description"]).get("DatasetLinks")
+    return {name: str(link) for name, link in links.items()} if isinstance(links, dict) else {}
+
+
+def linked_path(address: str, root: Path, links: Mapping[str, str]) -> Path | None:
+    """Find the file of a BIDS address, the inverse of :func:`source_address`."""
+    if not address.startswith("bids:"):
+        return Path(address) if address else None
+    _, dataset, inside = address.split(":", 2)
+    folder = linked_folder(links.get(dataset, ""), root)
+    return folder / inside if folder is not None else None
+
+
+def _is_at(url: object, root: Path, folders: Iterable[str]) -> bool:
+    """Check whether an address leads to one of these folders, however it is written."""
+    folder = linked_folder(str(url or ""), root)
+    return folder is not None and str(folder.resolve()) in folders
+
+
+def _source(folder: Path, link: str) -> dict[str, str]:
     """Describe where a source dataset is, with its identifier and version if these are known."""
-    entry = {"URL": folder.resolve().as_uri()}
+    entry = {"URL": link}
     description = read_description(folder) or {}  # most FreeSurfer and ASHS folders have none
     for key, theirs in (("DOI", "DatasetDOI"), ("Version", "DatasetVersion")):
         if isinstance(description.get(theirs), str):

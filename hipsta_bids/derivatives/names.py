@@ -1,7 +1,7 @@
 """The table of outputs, and the names and paths of results.
 
 Entities follow the order of BIDS 1.11 (``sub ses hemi space seg label desc``). What the standard
-has no rule for is listed in ``.bidsignore`` from the same table.
+has no rule for is listed in ``.bidsignore``, with the reason, from the table beside it.
 """
 
 import re
@@ -182,6 +182,7 @@ EXTRA_OUTPUTS: tuple[Output, ...] = (
 #: Files of the whole dataset, by the name of what they hold.
 DATASET_FILES: dict[str, str] = {
     "description": "dataset_description.json",
+    "readme": "README.md",
     "ignore": ".bidsignore",
     "settings": "desc-settings.json",
     "citation": "CITATION.md",
@@ -191,6 +192,30 @@ DATASET_FILES: dict[str, str] = {
     "group": "group",
     "report": "report.html",
 }
+
+#: Lines of ``.bidsignore``, and why BIDS has no name for what each hides. The validator (3.0)
+#: passes over what is in a folder with a final slash, but not over the folder; and a wildcard
+#: before another one ends at the first character that follows it in the pattern. So folders have
+#: no slash, and patterns one wildcard and perhaps one at the end.
+IGNORED: dict[str, str] = {
+    f"/{DATASET_FILES['settings']}": "Settings of the program; BIDS has no file for them.",
+    f"/{DATASET_FILES['citation']}": "Text for a methods section; CITATION.cff cites a dataset.",
+    "/status.*": "How each hemisphere ended; BIDS has no table of a program's runs.",
+    "/*.html": "Pages to look at; BIDS leaves reports to the program.",
+    f"/{DATASET_FILES['group']}": "Results over participants; BIDS has names for single ones only.",
+    "*_morph.*": "Morphometry; a proposal (BEP011), not yet in BIDS.",
+    "*.surf.gii": "Surfaces; a proposal (BEP011), not yet in BIDS.",
+    "*.shape.gii": "Maps on a surface, in the suffixes of BEP011; not yet in BIDS.",
+    "*_map.*": "Other volumes sampled on the sheet; BIDS has no suffix for any quantity.",
+    "*_mesh.vtu": "Tetrahedral meshes; BIDS has no volume meshes.",
+    "*_metrics.json": "Quality of one hemisphere; BIDS has no quality metrics of derivatives.",
+    "*_desc-body_mask.*": "Masks per hemisphere; in BIDS, masks of voxels have no hemi and seg.",
+    "*_label-extended_dseg.*": "Subfields and cortex; in BIDS, labels on surfaces have no label.",
+    "*_label-entorhinal_dseg.*": "The cortex alone; likewise.",
+}
+
+_IGNORE_HEAD = """\
+# For the BIDS validator: what is in this dataset, but has no name in BIDS 1.11."""
 
 _RECORD = re.compile(
     r"sub-(?P<subject>[^_]+)(?:_ses-(?P<session>[^_]+))?_hemi-(?P<hemi>[LR])_seg-(?P<seg>[^_]+)"
@@ -258,17 +283,7 @@ def group_report(model: str) -> str:
     return f"{DATASET_FILES['group']}/{model}.html"
 
 
-def ignore_patterns() -> tuple[str, ...]:
-    """List the patterns of ``.bidsignore``: each output that BIDS 1.11 has no rule for."""
-    dataset = [DATASET_FILES[key] for key in ("settings", "citation", "status", "status_sidecar")]
-    patterns = dict.fromkeys(
-        f"*_{output.suffix}{output.extension}"
-        for output in (*OUTPUTS, *EXTRA_OUTPUTS)
-        if not output.in_standard
-    )
-    regions = [
-        f"*_label-*_{output.suffix}{output.extension}" for output in OUTPUTS if output.in_standard
-    ]
-    pages = ("*.html",)
-    folders = [f"{DATASET_FILES[key]}/" for key in ("logs", "group")]
-    return (*dataset, *pages, *folders, *patterns, *regions)
+def ignore_file() -> str:
+    """Compose ``.bidsignore``: patterns of names that BIDS 1.11 has no rule for, and why."""
+    lines = [_IGNORE_HEAD, *(f"# {why}\n{pattern}" for pattern, why in IGNORED.items())]
+    return "\n".join(lines) + "\n"

@@ -3,11 +3,11 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from urllib.parse import unquote, urlsplit
 
 import numpy as np
 import pandas as pd
 
+from hipsta_bids.derivatives.dataset import linked_path, read_links
 from hipsta_bids.errors import InputError, ModelError
 from hipsta_bids.group.data import PARTICIPANT, SESSION
 from hipsta_bids.group.formula import typed
@@ -38,8 +38,8 @@ def locate_sources(sources: Sequence[str], roots: Sequence[Path]) -> list[Path |
     result = []
     for source, root in zip(sources, roots, strict=True):
         if root not in links:
-            links[root] = files.read_json(root / "dataset_description.json").get("DatasetLinks", {})
-        result.append(_resolve(source, links[root]))
+            links[root] = read_links(root)
+        result.append(linked_path(source, root, links[root]))
     return result
 
 
@@ -53,14 +53,6 @@ def relocate(source: str, folders: Sequence[Path]) -> str:
         if (folder / inside.parts[0]).is_dir():
             return str(folder / inside)
     return source
-
-
-def _resolve(source: str, links: Mapping[str, str]) -> Path | None:
-    if not source.startswith("bids:"):
-        return Path(source) if source else None
-    _, dataset, inside = source.split(":", 2)
-    link = links.get(dataset, "")
-    return Path(unquote(urlsplit(link).path)) / inside if link.startswith("file:") else None
 
 
 def read_covariates(visits: pd.DataFrame, bids_dir: Path, extra: Sequence[Path]) -> pd.DataFrame:

@@ -403,6 +403,7 @@ def _describe(options: GroupOptions) -> None:
         roots += [options.bids_dir] if options.maps else []
         names = dataset.source_names((root.resolve().name, root) for root in roots)
         dataset.write_description(options.out_dir, names)
+    dataset.write_notes(options.out_dir)
 
 
 def _check_templates(templates: Mapping[str, Any], cohort: Cohort, path: Path) -> None:

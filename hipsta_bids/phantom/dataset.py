@@ -236,7 +236,6 @@ def _write_truth(
         f"sub-{item.subject}_hemi-{item.hemi}": asdict(item.spec) for item in hemispheres
     }
     files.write_json((out / TRUTH_TABLE).with_suffix(".json"), sidecar)
-    files.write_text(out / ".bidsignore", "phantom_truth.*\nphantom_effect.*\nphantom_maps/\n")
 
 
 def _write_participants(
@@ -248,12 +247,16 @@ def _write_participants(
         ["participant_id", *participants.columns],
         [[f"sub-{name}", *participants.rows.get(name, ())] for name in subjects],
     )
+    for name in subjects:
+        # A subject's folder has to be there, and folders without files are lost by archives.
+        files.write_tsv(out / f"sub-{name}" / f"sub-{name}_scans.tsv", ["filename"], [])
     about = {"Description": "synthetic subject; there is no image behind it"}
     files.write_json(out / "participants.json", {"participant_id": about, **participants.columns})
 
 
 def _write_descriptions(out: Path, layouts: Sequence[str]) -> None:
     files.write_text(out / "README", _README)
+    files.write_text(out / ".bidsignore", _IGNORED)
     files.write_json(
         out / "dataset_description.json",
         {
@@ -264,13 +267,19 @@ def _write_descriptions(out: Path, layouts: Sequence[str]) -> None:
     )
     for name in layouts:
         # Not made by us as far as finding inputs goes, which passes over its own outputs.
+        folder = out / "derivatives" / name
         maker = {
             "Name": "phantom",
             "Version": __version__,
             "Description": f"Analytic shapes in the labels and folders of {name}",
         }
+        readme = f"Segmentations of the phantoms in the dataset above, in the layout of {name}.\n"
+        files.write_text(folder / "README", readme)
+        inner = Path(LAYOUTS[name].path).parts[1]
+        ignored = f"# Folders and names are those of {name}, not of BIDS.\n/sub-*/{inner}\n"
+        files.write_text(folder / ".bidsignore", ignored)
         files.write_json(
-            out / "derivatives" / name / "dataset_description.json",
+            folder / "dataset_description.json",
             {
                 "Name": f"Synthetic segmentations in the layout of {name}",
                 "BIDSVersion": BIDS_VERSION,
@@ -280,7 +289,13 @@ def _write_descriptions(out: Path, layouts: Sequence[str]) -> None:
         )
 
 
+_IGNORED = """\
+# The truth behind the phantoms, as tables and maps: BIDS has no names for it.
+/phantom_*
+"""
+
 _README = """\
 Synthetic hippocampal bodies: analytic shapes drawn as segmentations, nobody's brain.
 The exact thickness, extents, areas and volume of each are in phantom_truth.tsv.
+The segmentations are in derivatives/. There are no images: the subjects' scans.tsv list none.
 """

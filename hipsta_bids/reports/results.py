@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote, urlparse
 
 import numpy as np
 from nibabel.orientations import apply_orientation, inv_ornt_aff, io_orientation
 from numpy.typing import NDArray
 
+from hipsta_bids.derivatives.dataset import linked_path, read_links
 from hipsta_bids.derivatives.hemisphere import (
     ResultPlace,
     list_results,
@@ -19,7 +19,6 @@ from hipsta_bids.derivatives.hemisphere import (
     read_sheet,
     read_summary,
 )
-from hipsta_bids.derivatives.names import DATASET_FILES
 from hipsta_bids.errors import HipstaError, InputError
 from hipsta_bids.io import files, gifti
 from hipsta_bids.io.volumes import LabelImage, read_labels
@@ -268,14 +267,8 @@ def input_path(hemisphere: Hemisphere) -> Path | None:
     edited = [e for e in record.get("edited") or [] if e.get("what") == "labels"]
     entries = edited or record.get("inputs") or []
     address = str(entries[0].get("file", "")) if entries else ""
-    if not address.startswith("bids:"):
-        return Path(address) if address else None
-    _, dataset, inside = address.split(":", 2)
     root = hemisphere.place.root
-    links = files.read_json(root / DATASET_FILES["description"]).get("DatasetLinks") or {}
-    if dataset not in links:
-        return None
-    return Path(unquote(urlparse(str(links[dataset])).path)) / inside
+    return linked_path(address, root, read_links(root))
 
 
 def _read_mask(hemisphere: Hemisphere) -> LabelImage | None:

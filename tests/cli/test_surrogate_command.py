@@ -52,7 +52,7 @@ def test_it_stands_alone(bids_dir, tmp_path, capsys):
         sidecar = json.loads(path_of(tmp_path / "out", "surrogate_sidecar", hemi).read_text())
         assert list(sidecar) == list(table.columns)
     ignored = (tmp_path / "out" / ".bidsignore").read_text().splitlines()
-    assert "*_morph.tsv" in ignored
+    assert "*_morph.*" in ignored
 
 
 def test_it_agrees_with_the_mesh_and_goes_when_the_mesh_is_redone(bids_dir, tmp_path, capsys):

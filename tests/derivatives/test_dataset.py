@@ -1,5 +1,7 @@
 import json
 import multiprocessing
+from email.message import Message
+from pathlib import Path
 
 import pytest
 from stand_ins import make_scheme
@@ -20,6 +22,9 @@ def description(root):
 def test_description_has_what_the_standard_asks_for(tmp_path, monkeypatch):
     monkeypatch.setenv("HIPSTA_BIDS_CONTAINER_TYPE", "docker")
     monkeypatch.setenv("HIPSTA_BIDS_CONTAINER_TAG", "lab/hipsta_bids:1")
+    monkeypatch.setenv("HIPSTA_BIDS_CODE_URL", "https://example.org/code")
+    monkeypatch.delenv("APPTAINER_CONTAINER", raising=False)
+    monkeypatch.delenv("SINGULARITY_CONTAINER", raising=False)
     source = tmp_path / "in put"
     source.mkdir()
     (source / "dataset_description.json").write_text('{"DatasetDOI": "doi:10.1/x"}')
@@ -32,19 +37,96 @@ def test_description_has_what_the_standard_asks_for(tmp_path, monkeypatch):
     assert maker["Name"] == "hipsta_bids"
     assert maker["Version"] == __version__
     assert maker["Container"] == {"Type": "docker", "Tag": "lab/hipsta_bids:1"}
-    assert written["SourceDatasets"] == [{"URL": source.as_uri(), "DOI": "doi:10.1/x"}]
-    assert "%20" in written["SourceDatasets"][0]["URL"]
-    assert written["DatasetLinks"] == {"freesurfer": source.as_uri()}
-    assert "*_morph.tsv" in (tmp_path / "out" / ".bidsignore").read_text().splitlines()
+    assert maker["CodeURL"] == "https://example.org/code"
+    assert written["SourceDatasets"] == [{"URL": "../in%20put", "DOI": "doi:10.1/x"}]
+    assert written["DatasetLinks"] == {"freesurfer": "../in%20put"}
+    assert "*_morph.*" in (tmp_path / "out" / ".bidsignore").read_text().splitlines()
+    assert "DatasetLinks" in (tmp_path / "out" / "README.md").read_text()
 
 
 def test_description_keeps_earlier_sources_and_needs_no_container(tmp_path, monkeypatch):
-    monkeypatch.delenv("HIPSTA_BIDS_CONTAINER_TYPE", raising=False)
+    for variable in (*dataset.CONTAINER_VARIABLES.values(), *dataset._APPTAINER_VARIABLES):
+        monkeypatch.delenv(variable, raising=False)
     for name in ("b", "a", "a"):
         dataset.write_description(tmp_path / "out", {name: tmp_path / name})
     urls = [entry["URL"] for entry in description(tmp_path / "out")["SourceDatasets"]]
-    assert urls == [(tmp_path / "a").as_uri(), (tmp_path / "b").as_uri()]
+    assert urls == ["../a", "../b"]
     assert "Container" not in description(tmp_path / "out")["GeneratedBy"][0]
+
+
+def test_apptainer_and_the_address_in_the_package_are_named(tmp_path, monkeypatch):
+    monkeypatch.setenv("HIPSTA_BIDS_CONTAINER_TYPE", "docker")  # of the image it was made from
+    monkeypatch.setenv("APPTAINER_CONTAINER", "/images/hipsta_bids.sif")
+    monkeypatch.delenv("HIPSTA_BIDS_CODE_URL", raising=False)
+    about = Message()
+    about["Project-URL"] = "Documentation, https://example.org/docs"
+    monkeypatch.setattr(dataset, "metadata", lambda _: about)
+    dataset.write_description(tmp_path, {})
+    (maker,) = description(tmp_path)["GeneratedBy"]
+    assert maker["Container"]["Type"] == "apptainer"
+    assert "CodeURL" not in maker
+    about["Project-URL"] = "Source, https://example.org/code"
+    dataset.write_description(tmp_path, {})
+    assert description(tmp_path)["GeneratedBy"][0]["CodeURL"] == "https://example.org/code"
+
+
+def test_links_lead_back_also_when_both_folders_move(tmp_path):
+    study = tmp_path / "study"
+    source, root = study / "derivatives" / "free surfer: 100%", study / "derivatives" / "out"
+    source.mkdir(parents=True)
+    dataset.write_description(root, {"fs": source})
+    (tmp_path / "elsewhere").mkdir()
+    moved = study.rename(tmp_path / "elsewhere" / "study") / "derivatives"
+    links = dataset.read_links(moved / "out")
+    assert not links["fs"].startswith(("/", "file:"))
+    path = dataset.linked_path("bids:fs:sub-01/mri/x.mgz", moved / "out", links)
+    assert path.resolve() == moved / source.name / "sub-01/mri/x.mgz"
+    assert dataset.linked_path("bids:other:x", moved / "out", links) is None
+    assert dataset.linked_path("/a/b.mgz", moved, links) == Path("/a/b.mgz")
+    assert dataset.linked_path("", moved, links) is None
+    assert dataset.linked_path("bids:far:x", moved, {"far": "doi:10.18112/ds000001"}) is None
+
+
+def test_links_are_spelled_as_the_user_did(tmp_path):
+    """The same with symbolic links: relative where that leads there, absolute across the root."""
+    disk, study = tmp_path / "disk", tmp_path / "study"
+    (disk / "fs").mkdir(parents=True)
+    (disk / "results").mkdir()
+    study.mkdir()
+    (study / "fs").symlink_to(disk / "fs")
+    (study / "out").symlink_to(disk / "results")
+    assert dataset.link_to(study / "fs", study) == "fs"
+    assert dataset.link_to(study / "fs", study / "plain") == "../fs"
+    # From behind a link, two dots lead to where the folder really is.
+    link = dataset.link_to(study / "fs", study / "out")
+    assert dataset.linked_folder(link, study / "out").resolve() == disk / "fs"
+    assert dataset.link_to(Path("/data/x"), Path("/out")) == "file:///data/x"
+    assert dataset.linked_folder("file:///data/x", Path("/out")) == Path("/data/x")
+
+
+def test_links_of_earlier_versions_are_read_and_replaced(tmp_path):
+    source, root = tmp_path / "in", tmp_path / "out"
+    source.mkdir()
+    root.mkdir()
+    uri, other = source.as_uri(), "file:///other/machine"
+    content = {
+        "GeneratedBy": [{"Name": "hipsta_bids"}],
+        "SourceDatasets": [{"URL": uri}, {"URL": other}],
+        "DatasetLinks": {"fs": uri, "far": other},
+    }
+    (root / "dataset_description.json").write_text(json.dumps(content))
+    links = dataset.read_links(root)
+    assert dataset.linked_path("bids:fs:a.mgz", root, links) == source / "a.mgz"
+    dataset.write_description(root, {"fs": source})
+    assert description(root)["DatasetLinks"] == {"far": other, "fs": "../in"}
+    assert description(root)["SourceDatasets"] == [{"URL": "../in"}, {"URL": other}]
+
+
+def test_a_readme_of_the_user_stays(tmp_path):
+    (tmp_path / "README").write_text("mine")
+    dataset.write_notes(tmp_path)
+    assert [path.name for path in tmp_path.glob("README*")] == ["README"]
+    assert (tmp_path / "README").read_text() == "mine"
 
 
 def test_dataset_of_other_software_is_refused(tmp_path):

@@ -1,15 +1,18 @@
-import json
+from dataclasses import replace
 from fnmatch import fnmatch
 
 import pytest
 
 from hipsta_bids.derivatives.names import (
     DATASET_FILES,
+    EXTRA_OUTPUTS,
+    IGNORED,
     OUTPUTS,
     HemisphereName,
-    ignore_patterns,
+    ignore_file,
     output_name,
     output_path,
+    participant_report,
 )
 
 FULL = HemisphereName(subject="01", session="02", hemi="R", seg="freesurfer")
@@ -72,9 +75,27 @@ def test_entities_follow_the_standard():
 
 
 def test_outputs_without_a_rule_are_ignored_by_validators():
-    patterns = ignore_patterns()
-    for output in OUTPUTS:
-        name = output_name(FULL, output.key)
-        assert any(fnmatch(name, pattern) for pattern in patterns) != output.in_standard, name
-    assert json.dumps(patterns).count("status.tsv") == 1
-    assert f"{DATASET_FILES['logs']}/" in patterns
+    for region in ("body", "extended", "entorhinal"):
+        for output in (*OUTPUTS, *EXTRA_OUTPUTS):
+            name = output_name(replace(FULL, region=region), output.key, output.desc)
+            named = output.in_standard and region == "body"
+            assert any(fnmatch(name, pattern) for pattern in IGNORED) != named, name
+    tops = {f"/{name}" for name in (*DATASET_FILES.values(), participant_report("01", None))}
+    hidden = {name for name in tops if any(fnmatch(name, pattern) for pattern in IGNORED)}
+    named = ("dataset_description.json", "README.md", ".bidsignore", "logs")
+    assert hidden == tops - {f"/{name}" for name in named}
+
+
+def test_every_line_of_the_ignore_file_hides_something_and_says_why():
+    regions = [replace(FULL, region=region) for region in ("body", "extended", "entorhinal")]
+    rows = (*OUTPUTS, *EXTRA_OUTPUTS)
+    names = [output_name(name, row.key, row.desc) for name in regions for row in rows]
+    names += [f"/{name}" for name in DATASET_FILES.values()]
+    for pattern in IGNORED:
+        assert any(fnmatch(name, pattern) for name in names), pattern
+        assert pattern.rstrip("*").count("*") <= 1, "the validator does not match it"
+        assert not pattern.endswith("/"), "the validator would not pass over the folder itself"
+    lines = ignore_file().splitlines()
+    assert [line for line in lines if not line.startswith("#")] == list(IGNORED)
+    for pattern, why in IGNORED.items():
+        assert lines[lines.index(pattern) - 1] == f"# {why}"

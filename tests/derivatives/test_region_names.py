@@ -11,7 +11,6 @@ from hipsta_bids.derivatives.names import (
     DATASET_FILES,
     OUTPUTS,
     HemisphereName,
-    ignore_patterns,
     output_name,
 )
 from hipsta_bids.errors import SettingsError
@@ -28,7 +27,6 @@ def test_the_region_is_the_label_entity():
     expected = "sub-01_hemi-L_seg-P_label-extended_desc-sheet_morph.tsv"
     assert output_name(LONGER, "sheet") == expected
     assert "label-" not in output_name(BODY, "sheet")
-    assert "*_label-*_dseg.label.gii" in ignore_patterns()
 
 
 def test_leftovers_of_other_regions_stay(tmp_path):

@@ -64,6 +64,7 @@ def test_one_good_hemisphere_gives_a_complete_dataset(tmp_path):
     assert result.exit_code == ExitCode.OK
     assert names(out) == {
         "dataset_description.json",
+        "README.md",
         ".bidsignore",
         "desc-settings.json",
         "CITATION.md",

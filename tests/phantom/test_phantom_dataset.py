@@ -62,7 +62,12 @@ def test_demo_describes_itself_as_a_dataset(demo):
         "sub-demo1",
         "sub-demo2",
     ]
-    assert "phantom_truth" in (demo / ".bidsignore").read_text()
+    assert "/phantom_*" in (demo / ".bidsignore").read_text().splitlines()
+    # A folder per participant, or the table of participants would not fit the dataset.
+    assert [p.name for p in sorted(demo.glob("sub-*/*"))] == [
+        "sub-demo1_scans.tsv",
+        "sub-demo2_scans.tsv",
+    ]
 
 
 def test_demo_is_found_and_read_as_freesurfer(demo):
