@@ -41,5 +41,10 @@ RUN python -m compileall -q -j 0 -x 'site-packages|dist-packages|/test' \
 COPY --from=build /opt/hipsta_bids /opt/hipsta_bids
 # Where login shells look too, which set the path anew: platforms call by them.
 RUN ln -s /opt/hipsta_bids/bin/hipsta-bids /usr/local/bin/
-ENV LANG=C.UTF-8
+# Written into datasets, as GeneratedBy: the image, and where its code is.
+ARG CODE_URL
+ENV LANG=C.UTF-8 \
+    HIPSTA_BIDS_CONTAINER_TYPE=docker \
+    HIPSTA_BIDS_CONTAINER_TAG=hipsta_bids:0.1.0 \
+    HIPSTA_BIDS_CODE_URL=${CODE_URL}
 ENTRYPOINT ["hipsta-bids"]

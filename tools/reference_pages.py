@@ -51,7 +51,9 @@ IGNORED_TEXT = """\
 The dataset passes the [BIDS validator](https://github.com/bids-standard/bids-validator) without
 errors. BIDS 1.11 has no names for some of its files. They have entities in its order, and the
 suffixes of the proposal for structural derivatives (BEP011) where it has one. `.bidsignore` lists
-them:"""
+them, below. Each table has a JSON file beside it. Masks, surfaces and maps on them have none: units
+of maps are in the GIFTI files and, with definitions, in `desc-sheet_morph.json`; the space is that
+of the segmentation, scanner RAS in mm; which one it is, `desc-qc_metrics.json` says (`inputs`)."""
 
 COLUMNS_TEXT = """\
 Which table has which is said in [Group level](group.md#what-is-written) and in the `.json` beside
@@ -80,6 +82,7 @@ _DATASET_FILES = {
     "description": "what BIDS asks for, with versions and sources",
     "readme": "what is where; written unless there is a README",
     "ignore": "which files are [not in the standard](#names-that-bids-does-not-have)",
+    "labels_sidecar": "description and space of all `_dseg.label.gii`",
     "settings": "all settings of these results, and their hash",
     "citation": "a methods paragraph with references, for your article",
     "status": "one row per hemisphere: status, reason, message, time per stage, peak memory",

@@ -184,6 +184,7 @@ DATASET_FILES: dict[str, str] = {
     "description": "dataset_description.json",
     "readme": "README.md",
     "ignore": ".bidsignore",
+    "labels_sidecar": "dseg.json",
     "settings": "desc-settings.json",
     "citation": "CITATION.md",
     "status": "status.tsv",

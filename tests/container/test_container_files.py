@@ -10,6 +10,7 @@ import yaml
 from container_runs import ROOT
 
 from hipsta_bids import __version__
+from hipsta_bids.derivatives.dataset import CODE_URL_VARIABLE, CONTAINER_VARIABLES
 
 DOCKERFILE = (ROOT / "Dockerfile").read_text(encoding="utf-8")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -34,6 +35,18 @@ def test_labels_are_those_of_the_project():
         "authors": PROJECT["authors"][0]["name"],
         "licenses": PROJECT["license"],
     }
+
+
+def test_datasets_name_the_image_and_its_code():
+    last = DOCKERFILE.rpartition("FROM ")[2]
+    given = dict(re.findall(r"\b(HIPSTA_BIDS_\w+)=(\S+)", last))
+    assert given == {
+        CONTAINER_VARIABLES["Type"]: "docker",
+        CONTAINER_VARIABLES["Tag"]: f"hipsta_bids:{__version__}",
+        CODE_URL_VARIABLE: "${CODE_URL}",
+    }
+    build = next(s for s in steps("release") if "BUILD_OPTIONS" in s.get("env", {}))
+    assert "--build-arg CODE_URL=" in build["env"]["BUILD_OPTIONS"]
 
 
 def test_both_stages_have_the_same_base():

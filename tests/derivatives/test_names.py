@@ -82,7 +82,7 @@ def test_outputs_without_a_rule_are_ignored_by_validators():
             assert any(fnmatch(name, pattern) for pattern in IGNORED) != named, name
     tops = {f"/{name}" for name in (*DATASET_FILES.values(), participant_report("01", None))}
     hidden = {name for name in tops if any(fnmatch(name, pattern) for pattern in IGNORED)}
-    named = ("dataset_description.json", "README.md", ".bidsignore", "logs")
+    named = ("dataset_description.json", "README.md", "dseg.json", ".bidsignore", "logs")
     assert hidden == tops - {f"/{name}" for name in named}
 
 

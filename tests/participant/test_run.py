@@ -65,6 +65,7 @@ def test_one_good_hemisphere_gives_a_complete_dataset(tmp_path):
     assert names(out) == {
         "dataset_description.json",
         "README.md",
+        "dseg.json",
         ".bidsignore",
         "desc-settings.json",
         "CITATION.md",
