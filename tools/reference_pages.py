@@ -39,7 +39,9 @@ to anterior, z from interior to exterior. Head and tail are part of no number.""
 
 SOURCES_TEXT = """\
 `SourceDatasets` and `DatasetLinks` in `dataset_description.json` say where the segmentations are,
-as a path relative to the output folder, so that both may move together. Where the way there leads
+as a path relative to the output folder, so that both may move together. If the output moves alone,
+pages made anew (`--reports-only`) draw no labels, and the group level needs `--segmentations DIR`,
+until the participant level has run there or the links are corrected. Where the way there leads
 through the root of the file system, the folder is written as you spelled it, `file:///...`. In a
 container that is a path inside it, unless folders are mounted where they are outside: with
 `-v /data:/data`, `/data/study` and `/data/study-hipsta` mean the same on both sides.

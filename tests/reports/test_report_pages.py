@@ -114,7 +114,8 @@ def test_the_same_files_give_the_same_pages(out):
 
 @pytest.fixture
 def copy(out, tmp_path):
-    """A copy to do harm to."""
+    """A copy to do harm to, with its sources where they were: links to them are relative."""
+    (tmp_path / "in").symlink_to(out.with_name("in"))
     return shutil.copytree(out, tmp_path / "copy")
 
 
