@@ -246,7 +246,12 @@ def run_surrogate(arguments: Sequence[str]) -> ExitCode:
     from hipsta_bids.settings import load_settings  # noqa: PLC0415  (start-up time)
 
     settings = load_settings(options.settings)
-    from hipsta_bids.inputs.search import dataset_notes, find_inputs, selection_table  # noqa: PLC0415  (heavy)
+    from hipsta_bids.inputs.search import (  # noqa: PLC0415  (heavy)
+        dataset_notes,
+        find_inputs,
+        ignored_table,
+        selection_table,
+    )
     from hipsta_bids.validation.surrogate import crosscheck  # noqa: PLC0415  (heavy)
 
     request = input_request(options)
@@ -255,6 +260,7 @@ def run_surrogate(arguments: Sequence[str]) -> ExitCode:
         echo(f"note: {note}")
     if options.dry_run:
         echo_table(selection_table(found.items))
+        echo_table(ignored_table(found.ignored))
         return ExitCode.OK
     check_output_is_no_input(options.output_dir, found.items)
     return crosscheck(found.items, options.output_dir, settings, echo, warn)

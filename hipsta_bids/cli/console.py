@@ -12,6 +12,10 @@ if TYPE_CHECKING:
     from hipsta_bids.participant.run import RunResult
 
 
+#: How many warnings of a kind are printed.
+_SHOWN = 3
+
+
 def echo(text: str) -> None:
     """Print a line of results."""
     sys.stdout.write(f"{text}\n")
@@ -94,14 +98,20 @@ def echo_result(result: "RunResult", out_dir: Path) -> None:
     page = out_dir / "report.html"
     if page.exists():
         echo(f"report: {page}")
+    for copy in result.copies[:_SHOWN]:
+        warn(f"warning: {copy}")
+    if len(result.copies) > _SHOWN:
+        warn(f"warning: {len(result.copies) - _SHOWN} more such groups, see status.tsv")
     for problem in result.page_problems:
         warn(f"warning: report: {problem}")
     echo(f"log: {result.log}")
 
 
 def echo_table(rows: Sequence[Mapping[str, str]]) -> None:
-    """Print rows as aligned columns; empty columns are left out."""
-    columns = [c for c in (rows[0] if rows else ()) if any(row[c] for row in rows)]
+    """Print rows as aligned columns; empty columns are left out, and tables without rows."""
+    if not rows:
+        return
+    columns = [c for c in rows[0] if any(row[c] for row in rows)]
     widths = {c: max(len(c), *(len(row[c]) for row in rows)) for c in columns}
     for row in [{c: c for c in columns}, *rows]:
         echo("  ".join(row[c].ljust(widths[c]) for c in columns).rstrip())

@@ -144,6 +144,14 @@ def bids_label(prefix: str) -> Callable[[str], str]:
     return convert
 
 
+def subject_label(text: str) -> str:
+    """Read a subject's BIDS label, or what may be the name of its FreeSurfer folder."""
+    label = text.removeprefix("sub-")
+    if not any(map(str.isalnum, label)) or "/" in label:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a BIDS label (letters and digits)")
+    return label
+
+
 def named_pattern(text: str) -> tuple[str, str]:
     """Read ``NAME=PATTERN``."""
     return _pair(text, "NAME=PATTERN")

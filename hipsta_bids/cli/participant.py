@@ -22,6 +22,7 @@ from hipsta_bids.cli.parser import (
     named_pattern,
     positive_float,
     positive_int,
+    subject_label,
 )
 from hipsta_bids.errors import ExitCode, NothingToDoError, UsageError
 from hipsta_bids.participant.cluster import Cluster, Shard, check_cluster, parse_shard
@@ -83,13 +84,13 @@ def add_selection(parser: Parser) -> None:
         "--participant-label",
         "LABEL...",
         "subjects, with or without sub- (default: all)",
-        type=bids_label("sub-"),
+        type=subject_label,
     )
     add(
         "--exclude-participant-label",
         "LABEL...",
         "subjects to leave out",
-        type=bids_label("sub-"),
+        type=subject_label,
     )
     add(
         "--session-label",
@@ -333,7 +334,7 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
     echo_start(options.analysis_level, options.bids_dir)
     from hipsta_bids.inputs.ends import attach_ends  # noqa: PLC0415  (heavy)
     from hipsta_bids.inputs.maps import attach, map_requests  # noqa: PLC0415  (heavy)
-    from hipsta_bids.inputs.search import dataset_notes, selection_table  # noqa: PLC0415  (heavy)
+    from hipsta_bids.inputs.search import dataset_notes, ignored_table, selection_table  # noqa: PLC0415  (heavy)
 
     requests = map_requests(options.map, options.map_sampling, options.map_interpolation)
     found = _find(request, options.shard)
@@ -342,15 +343,18 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
         return ExitCode.OK
     items, end_notes = attach_ends(found.items, options.ends)
     items, map_notes = attach(items, requests, options.roi, options.bids_dir)
-    for note in (*dataset_notes(request, items), *found.notes, *end_notes, *map_notes):
+    notes = (*dataset_notes(request, items), *found.notes, *end_notes, *map_notes)
+    for note in notes:
         echo(f"note: {note}")
     if options.dry_run:
         echo_table(selection_table(items))
+        echo_table(ignored_table(found.ignored))
         return ExitCode.OK
     check_output_is_no_input(options.output_dir, items)
     from hipsta_bids.participant.run import collect, run_participants  # noqa: PLC0415  (heavy)
 
-    out, run_options = options.output_dir, _run_options(options, arguments)
+    notes += tuple(f"not used: {entry.path}: {entry.reason}" for entry in found.ignored)
+    out, run_options = options.output_dir, _run_options(options, arguments, notes)
     if collects:
         result = collect(items, out, settings, run_options)
     else:
@@ -384,6 +388,7 @@ def _rebuild_reports(options: "Namespace") -> ExitCode:
     from hipsta_bids.participant.run import log_file  # noqa: PLC0415  (heavy)
 
     root = options.output_dir
+    _settle_labels(options)
     visits = [
         (subject, session)
         for subject, session in visits_of(root)
@@ -432,6 +437,7 @@ def input_request(options: "Namespace") -> "InputRequest":
     """Collect the options that say which inputs are asked for."""
     from hipsta_bids.inputs.scan import InputRequest  # noqa: PLC0415  (heavy)
 
+    _settle_labels(options)
     derivatives = dict(options.derivatives)
     if len(derivatives) != len(options.derivatives):
         raise UsageError("--derivatives: a name occurs twice; give each its own", reason="usage")
@@ -447,7 +453,25 @@ def input_request(options: "Namespace") -> "InputRequest":
     )
 
 
-def _run_options(options: "Namespace", arguments: Sequence[str]) -> "RunOptions":
+def _settle_labels(options: "Namespace") -> None:
+    """Read names of FreeSurfer's folders as labels where they have their option, else refuse."""
+    from hipsta_bids.inputs.scan import plain_label  # noqa: PLC0415  (heavy)
+
+    for option in ("participant_label", "exclude_participant_label"):
+        labels = getattr(options, option)
+        wrong = [label for label in labels if label != plain_label(label)]
+        if wrong and options.freesurfer_dir is None:
+            raise UsageError(
+                f"--{option.replace('_', '-')}: {wrong[0]!r} is not a BIDS label (letters and"
+                " digits)",
+                reason="bad-label",
+            )
+        setattr(options, option, [plain_label(label) for label in labels])
+
+
+def _run_options(
+    options: "Namespace", arguments: Sequence[str], notes: tuple[str, ...]
+) -> "RunOptions":
     from hipsta_bids.io.files import check_scratch, hide_home  # noqa: PLC0415  (start-up time)
     from hipsta_bids.participant.run import WORKER_GB, RunOptions  # noqa: PLC0415  (heavy)
 
@@ -471,4 +495,5 @@ def _run_options(options: "Namespace", arguments: Sequence[str]) -> "RunOptions"
         reports=not options.no_reports,
         # The home folder names a person.
         command=hide_home(shlex.join(("hipsta-bids", *arguments))) if arguments else None,
+        notes=tuple(map(hide_home, notes)),
     )

@@ -17,15 +17,14 @@ from hipsta_bids.inputs.labels import label_values
 from hipsta_bids.inputs.scan import (
     HemisphereInput,
     InputRequest,
-    Selection,
     Source,
     VisitFolders,
     list_visits,
-    measurable,
     several_files,
     subject_folders,
     unknown_protocol,
 )
+from hipsta_bids.inputs.selection import Selection, measurable
 from hipsta_bids.protocols.load import agrees, load_protocol, protocol_names
 from hipsta_bids.protocols.protocol import Protocol, Tissue
 

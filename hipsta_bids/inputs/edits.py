@@ -16,12 +16,13 @@ from hipsta_bids.inputs.generic import is_edited, table_protocol
 from hipsta_bids.inputs.scan import (
     Edit,
     HemisphereInput,
+    Ignored,
     InputRequest,
-    Selection,
     VisitFolders,
     list_visits,
-    subject_folders,
+    sort_folders,
 )
+from hipsta_bids.inputs.selection import Selection
 from hipsta_bids.io.files import entities
 from hipsta_bids.types import Visit
 
@@ -57,23 +58,29 @@ def edits_of_visit(
             yield EditedFile(edit=edit, subject=visit.subject, session=visit.session, beside=beside)
 
 
-def list_edits(request: InputRequest, selection: Selection) -> list[EditedFile]:
+def list_edits(
+    request: InputRequest, selection: Selection, ignored: list[Ignored]
+) -> list[EditedFile]:
     """List the edited files of ``--edited-dir`` and of the output dataset."""
     found = []
     if request.edited_dir is not None:
-        found += _edits_of_dataset(request.edited_dir, _EDITED, selection)
+        found += _edits_of_dataset(request.edited_dir, _EDITED, selection, ignored)
     # Whether the output folder can be used is checked where results are written.
     with contextlib.suppress(InputError):
         if request.output_dir is not None:
-            found += _edits_of_dataset(request.output_dir, _OUTPUT, selection)
+            found += _edits_of_dataset(request.output_dir, _OUTPUT, selection, ignored)
     return each_once(found)
 
 
-def _edits_of_dataset(root: Path, name: str, selection: Selection) -> list[EditedFile]:
-    folders = [folder for folder in subject_folders(root) if selection.wants_folder(folder)]
+def _edits_of_dataset(
+    root: Path, name: str, selection: Selection, ignored: list[Ignored]
+) -> list[EditedFile]:
+    folders, others = sort_folders(root)
+    ignored += others
+    wanted = filter(selection.wants_folder, folders)
     return [
         file
-        for visit in filter(selection.wants_visit, list_visits(folders))
+        for visit in filter(selection.wants_visit, list_visits(wanted, ignored))
         for file in edits_of_visit(visit, root, name, beside=False)
     ]
 

@@ -9,7 +9,7 @@ folders, which have the same layout.
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,10 +17,11 @@ from hipsta_bids.errors import HipstaError, InputError
 from hipsta_bids.inputs.scan import (
     Folder,
     HemisphereInput,
-    Selection,
     Source,
+    SubjectFolder,
     VisitFolders,
 )
+from hipsta_bids.inputs.selection import Selection
 from hipsta_bids.protocols.load import load_protocol
 
 _NAME = re.compile(
@@ -115,6 +116,32 @@ def volume_table(path: Path) -> Path | None:
     if match is None:
         return None
     return path.with_name(f"{match['hemi']}h.hippoSfVolumes{match['analysis']}.txt")
+
+
+def without_labels(visit: VisitFolders) -> Iterator[Path]:
+    """List the subjects' folders of FreeSurfer that hold no segmentation of subfields."""
+    for folder in visit.folders:
+        if folder.path.name == "mri" and not any(map(_NAME.fullmatch, folder.names)):
+            yield folder.path.parent
+
+
+def same_labels(folders: Iterable[SubjectFolder]) -> dict[str, HipstaError]:
+    """Describe, by label, the folders of several names that would get the same label."""
+    spellings: dict[str, set[str]] = {}
+    renamed = set()
+    for folder in folders:
+        spellings.setdefault(folder.subject, set()).add(folder.spelling)
+        if folder.renamed:
+            renamed.add(folder.subject)
+    return {
+        label: InputError(
+            f"{' and '.join(sorted(names))} would all be sub-{label}; give links with other names"
+            " in place of all but one",
+            reason="same-label",
+        )
+        for label, names in spellings.items()
+        if len(names) > 1 and label in renamed
+    }
 
 
 def find_freesurfer(

@@ -10,12 +10,12 @@ from pathlib import Path
 from hipsta_bids.errors import HipstaError, InputError, ProtocolError
 from hipsta_bids.inputs.scan import (
     HemisphereInput,
-    Selection,
     Source,
     VisitFolders,
     list_folder,
     unknown_protocol,
 )
+from hipsta_bids.inputs.selection import Selection
 from hipsta_bids.inputs.tools import is_hippunfold
 from hipsta_bids.io.files import entities
 from hipsta_bids.protocols.load import NamedCode, protocol_from_names

@@ -1,21 +1,18 @@
-"""Which datasets to search, which subjects and sessions they hold, and which of these are wanted.
+"""Which datasets to search, which subjects and sessions they hold, and what is ignored there.
 
-Folders are listed once each, and no image is opened.
+Folders are listed once each, and no image is opened. An entry that cannot be listed, or whose name
+is not understood, hides nothing but itself, and is named.
 """
 
-import difflib
-import json
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import stat
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache
 from pathlib import Path
-from typing import Any
 
 from hipsta_bids.derivatives.dataset import NAME, generated_by, read_description
-from hipsta_bids.errors import HipstaError, InputError, ProtocolError, UsageError
-from hipsta_bids.protocols.load import load_protocol
+from hipsta_bids.errors import HipstaError, InputError
 from hipsta_bids.protocols.protocol import Protocol
 from hipsta_bids.types import GivenEnd, Hemisphere, Visit
 
@@ -154,6 +151,15 @@ class HemisphereInput(Hemisphere):
 _SUBJECT = re.compile(
     r"sub-(?P<subject>[A-Za-z0-9+]+)(?:_ses-(?P<session>[A-Za-z0-9+]+))?(?P<long>\.long\..+)?"
 )
+
+#: The same for FreeSurfer's folders of any name.
+_ANY_NAME = re.compile(
+    r"(?:sub-)?(?P<subject>.+?)(?:_ses-(?P<session>[A-Za-z0-9+]+))?(?P<long>\.long\..+)?"
+)
+
+#: What comes with FreeSurfer and is nobody's: its template brains and averages.
+_TEMPLATE = re.compile(r"fsaverage.*|cvs_avg35.*|[lr]h\.EC_average|V1_average")
+
 _SESSION = re.compile(r"ses-(?P<session>[A-Za-z0-9+]+)")
 
 #: Folders below a subject or a session that can hold segmentations.
@@ -163,16 +169,11 @@ LAYOUTS = ("freesurfer", "ashs", "hippunfold", "tools", "named")
 """Kinds of folders that can be searched; ``tools`` are those without an option of their own, and
 ``named`` is any ``_hemi-?_..._dseg`` file with names."""
 
-#: The entry of the filter file that applies to segmentations.
-_QUERY = "dseg"
-
 #: Never indexed: nothing in them says who takes part.
 _IGNORED = tuple(
     re.compile(rf"^/{name}(/|$)")
     for name in ("derivatives", "sourcedata", "code", "stimuli", r"\.\w+")
 )
-
-_Wanted = Callable[[str | None], bool]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,6 +182,29 @@ class SubjectFolder(Visit):
 
     longitudinal: bool
     path: Path
+
+    @property
+    def renamed(self) -> bool:
+        """Whether the label is not what the folder is called."""
+        return _SUBJECT.fullmatch(self.path.name) is None
+
+    @property
+    def spelling(self) -> str:
+        """The part of its name that stands for the subject."""
+        return re.split(r"_ses-|\.long\.", self.path.name)[0]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ignored:
+    """An entry that looks as if it were meant to be used, but was not."""
+
+    path: Path
+    reason: str
+    """In one phrase."""
+    subject: str | None = None
+    """Label of the subject that it seems to belong to; ``None`` for a whole dataset."""
+    template: bool = False
+    """One of FreeSurfer's template brains, which nobody misses."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -232,26 +256,83 @@ def _is_folder(entry: os.DirEntry[str]) -> bool:
         return False
 
 
-def subject_folders(root: Path) -> list[SubjectFolder]:
+def plain_label(name: str) -> str:
+    """Make a BIDS label of a name: ``AD_05`` and ``sub-AD_05`` become ``AD05``."""
+    return re.sub(r"[^A-Za-z0-9+]", "", name.removeprefix("sub-"))
+
+
+def subject_folders(root: Path, *, any_name: bool = False) -> list[SubjectFolder]:
     """List the subjects' folders of a dataset, sorted by name."""
-    matches = ((name, _SUBJECT.fullmatch(name)) for name in list_folder(root)[0])
-    return [
-        SubjectFolder(
-            subject=match["subject"],
-            session=match["session"],
-            longitudinal=match["long"] is not None,
-            path=root / name,
-        )
-        for name, match in matches
-        if match
-    ]
+    return sort_folders(root, any_name=any_name)[0]
 
 
-def list_visits(folders: Iterable[SubjectFolder]) -> list[VisitFolders]:
-    """List the candidate files of some subjects."""
+def sort_folders(
+    root: Path, *, any_name: bool = False
+) -> tuple[list[SubjectFolder], list[Ignored]]:
+    """List the subjects' folders of a dataset, and what looks like one, each sorted by name.
+
+    With ``any_name``, FreeSurfer's folders (they hold ``mri``) need not be called ``sub-*``.
+    """
+    names, files = list_folder(root)
+    entries = [_read_name(root / name, any_name=any_name) for name in names]
+    no_folder = "no folder, or a link that leads nowhere"
+    return (
+        [entry for entry in entries if isinstance(entry, SubjectFolder)],
+        [entry for entry in entries if isinstance(entry, Ignored)]
+        + [
+            Ignored(path=root / name, reason=no_folder, subject=match["subject"])
+            for name in files
+            if (match := _SUBJECT.fullmatch(name))
+        ],
+    )
+
+
+def _read_name(path: Path, *, any_name: bool) -> SubjectFolder | Ignored | None:
+    """Tell by the name whose folder it is, or why it is nobody's; ``None`` if it claims nothing."""
+    match = _SUBJECT.fullmatch(path.name)
+    label = match["subject"] if match else ""
+    if match is None:
+        claims = path.name.startswith("sub-")
+        freesurfer = _holds_mri(path, if_closed=any_name)
+        if not (claims or freesurfer):
+            return None
+        match = _ANY_NAME.fullmatch(path.name)
+        label = plain_label(match["subject"]) if match else ""
+        if _TEMPLATE.fullmatch(path.name):
+            reason = "comes with FreeSurfer, and is no subject"
+            return Ignored(path=path, reason=reason, subject=label, template=True)
+        if match is None or not label:
+            return Ignored(path=path, reason="no letter or digit in its name", subject=label)
+        if not (any_name and freesurfer):
+            reason = "its name is not sub-LABEL or sub-LABEL_ses-LABEL, of letters and digits"
+            if freesurfer:
+                reason += f"; --freesurfer-dir {path.parent} takes it as sub-{label}"
+            return Ignored(path=path, reason=reason, subject=label)
+    return SubjectFolder(
+        subject=label,
+        session=match["session"],
+        longitudinal=match["long"] is not None,
+        path=path,
+    )
+
+
+def _holds_mri(path: Path, *, if_closed: bool) -> bool:
+    """Whether it looks like a subject's folder of FreeSurfer."""
+    try:
+        return stat.S_ISDIR((path / "mri").stat().st_mode)
+    except PermissionError:
+        return if_closed
+    except OSError:
+        return False
+
+
+def list_visits(
+    folders: Iterable[SubjectFolder], ignored: list[Ignored] | None = None
+) -> list[VisitFolders]:
+    """List the candidate files of some subjects; what cannot be listed is added to ``ignored``."""
     found: dict[tuple[str, str | None], list[Folder]] = {}
     for folder in folders:
-        for session, inner in _inner_folders(folder):
+        for session, inner in _inner_folders(folder, [] if ignored is None else ignored):
             found.setdefault((folder.subject, session), []).append(inner)
     return [
         VisitFolders(subject=subject, session=session, folders=tuple(inner))
@@ -259,12 +340,17 @@ def list_visits(folders: Iterable[SubjectFolder]) -> list[VisitFolders]:
     ]
 
 
-def _inner_folders(folder: SubjectFolder) -> Iterator[tuple[str | None, Folder]]:
+def _inner_folders(
+    folder: SubjectFolder, ignored: list[Ignored]
+) -> Iterator[tuple[str | None, Folder]]:
     """Walk over a subject's folder: itself, its sessions, and the folders inside both."""
     waiting = [(folder.session, folder.path, True)]
     while waiting:
         session, path, outer = waiting.pop()
-        names, files = list_folder(path)
+        listed = _try_to_list(path, ignored, folder.subject)
+        if listed is None:
+            continue
+        names, files = listed
         if files:
             yield (
                 session,
@@ -276,6 +362,18 @@ def _inner_folders(folder: SubjectFolder) -> Iterator[tuple[str | None, Folder]]
                 waiting.append((match["session"], path / name, True))
             elif _INNER.fullmatch(name):
                 waiting.append((session, path / name, False))
+
+
+def _try_to_list(
+    path: Path, ignored: list[Ignored], subject: str | None = None
+) -> tuple[list[str], list[str]] | None:
+    """List a folder, or add it to what is ignored."""
+    try:
+        return list_folder(path)
+    except InputError as error:
+        reason = str(error).removeprefix(f"{path}: ")
+        ignored.append(Ignored(path=path, reason=reason, subject=subject))
+        return None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -291,18 +389,24 @@ class Source:
     generators: frozenset[str] = frozenset()
     """Software named in its ``dataset_description.json``."""
 
+    @property
+    def any_name(self) -> bool:
+        """Whether subjects' folders may have other names than ``sub-*``."""
+        return self.layouts == ("freesurfer",)
 
-def list_sources(request: InputRequest) -> tuple[Source, ...]:
+
+def list_sources(request: InputRequest, ignored: list[Ignored] | None = None) -> tuple[Source, ...]:
     """List the datasets to search; earlier ones take precedence.
 
     What the user names comes first (``-d``, then ``--freesurfer-dir``, ``--ashs-dir`` and
     ``--hippunfold-dir``), then ``BIDS_DIR/derivatives``, ``BIDS_DIR/sourcedata``, and ``BIDS_DIR``
     itself where it is a derivative dataset. Folders of these that hold no ``sub-*`` are searched
     two levels down, and ``sourcedata`` inside of derivatives too (fMRIPrep keeps FreeSurfer's
-    folder there). Our own outputs are left out.
+    folder there). Our own outputs are left out. What cannot be listed, unless the user named it,
+    and what looks like a subject outside of these datasets is added to ``ignored``.
     """
     sources: dict[Path, Source] = {}
-    for source in _candidates(request):
+    for source in _candidates(request, [] if ignored is None else ignored):
         description = read_description(source.path)
         made_by = frozenset(name.lower() for name in generated_by(description))
         key = Path(os.path.realpath(source.path))  # also where links go round in circles
@@ -311,197 +415,68 @@ def list_sources(request: InputRequest) -> tuple[Source, ...]:
     return tuple(sources.values())
 
 
-def _candidates(request: InputRequest) -> Iterator[Source]:
+def _candidates(request: InputRequest, ignored: list[Ignored]) -> Iterator[Source]:
     top, _ = list_folder(request.bids_dir)
     options = (request.freesurfer_dir, request.ashs_dir, request.hippunfold_dir)
     named: list[tuple[str, Path, tuple[str, ...]]]
     named = [(name, path, LAYOUTS) for name, path in request.derivatives.items()]
     named += [(name, path, (name,)) for name, path in zip(LAYOUTS, options, strict=False) if path]
     for name, path, layouts in named:
-        for root in _datasets(path, depth=1) or [path]:
-            yield Source(name=name, path=root, explicit=True, layouts=layouts)
+        list_folder(path)  # what the user named has to be readable
+        source = Source(name=name, path=path, explicit=True, layouts=layouts)
+        for root in _datasets(path, 1, ignored, any_name=source.any_name) or [path]:
+            yield replace(source, path=root)
     for folder in ("derivatives", "sourcedata"):
         if folder in top:
-            for root in _datasets(request.bids_dir / folder, depth=2, lenient=True):
+            for root in _datasets(request.bids_dir / folder, 2, ignored):
                 yield Source(name=root.name, path=root, explicit=False)
     # A dataset without a description may be a bare folder of subjects.
     description = read_description(request.bids_dir)
     derived = description is None or description.get("DatasetType") == "derivative"
     if derived or generated_by(description):
         yield Source(name=request.bids_dir.resolve().name, path=request.bids_dir, explicit=False)
-
-
-def _datasets(root: Path, *, depth: int, lenient: bool = False) -> list[Path]:
-    """Find the folders that hold ``sub-*`` folders.
-
-    ``lenient`` leaves out what cannot be listed: ``sourcedata`` is often closed to all but a few.
-    """
-    try:
-        folders, _ = list_folder(root)
-    except InputError:
-        if lenient:
-            return []
-        raise
-    if any(name.startswith("sub-") for name in folders):
-        inner, found, depth = [name for name in folders if name == "sourcedata"], [root], 2
     else:
-        inner, found = folders if depth else [], []
-    for name in inner:
-        found += _datasets(root / name, depth=depth - 1, lenient=lenient)
+        ignored += sort_folders(request.bids_dir)[1]
+
+
+def _datasets(
+    root: Path, depth: int, ignored: list[Ignored], *, any_name: bool = False
+) -> list[Path]:
+    """Find the folders that hold ``sub-*`` folders, or with ``any_name`` FreeSurfer's.
+
+    Searched are ``depth`` levels below the root, and the folders in each ``sourcedata`` on the way.
+    What cannot be listed is left out: ``sourcedata`` is often closed to all but a few.
+    """
+    found: list[Path] = []
+    unused: list[Ignored] = []
+    seen: set[str] = set()
+    waiting = [(root, depth)]
+    while waiting:
+        path, below = waiting.pop()
+        key = os.path.realpath(path)
+        listed = None if key in seen else _try_to_list(path, ignored)
+        seen.add(key)
+        if listed is None:
+            continue
+        entries = {name: _read_name(path / name, any_name=any_name) for name in listed[0]}
+        inner = [name for name, entry in entries.items() if entry is None]
+        known = any(isinstance(entry, SubjectFolder) for entry in entries.values())
+        if known or any(name.startswith("sub-") for name in entries):
+            found.append(path)
+            inner, below = [name for name in inner if name == "sourcedata"], 0
+        else:
+            unused += [entry for entry in entries.values() if isinstance(entry, Ignored)]
+            inner = list(entries)
+        for name in reversed(inner):
+            if name == "sourcedata":
+                waiting.append((path / name, 1))
+            elif below:
+                waiting.append((path / name, below - 1))
+    # A folder of datasets may hold one that is called mri.
+    ignored += [
+        entry for entry in unused if not any(path.is_relative_to(entry.path) for path in found)
+    ]
     return found
-
-
-@dataclass(frozen=True, kw_only=True)
-class Selection:
-    """What the user asked for, ready to be applied."""
-
-    subjects: frozenset[str] = frozenset()
-    """Empty for all, as in ``sessions``."""
-    excluded: frozenset[str] = frozenset()
-    sessions: frozenset[str] = frozenset()
-    hemis: tuple[str, ...] = HEMIS
-    rules: Mapping[str, _Wanted] = field(default_factory=dict)
-    """By entity, in pybids's long names; from the filter file."""
-    fs_analysis: str | None = None
-    """The FreeSurfer analysis to take."""
-    protocol: Protocol | None = None
-    """The user's protocol."""
-
-    def describes(self, tool: str) -> bool:
-        """Check whether the user's protocol is one for the files of a tool."""
-        return self.protocol is not None and self.protocol.tool in ("", tool)
-
-    def wants_folder(self, folder: SubjectFolder) -> bool:
-        """Check whether a subject's folder has to be looked into."""
-        return (
-            (not self.subjects or folder.subject in self.subjects)
-            and folder.subject not in self.excluded
-            and (not self.sessions or folder.session is None or folder.session in self.sessions)
-            and self._passes("subject", folder.subject)
-        )
-
-    def wants_visit(self, visit: VisitFolders) -> bool:
-        """Check whether a session of a subject is wanted."""
-        asked = not self.sessions or visit.session in self.sessions
-        return asked and self._passes("session", visit.session)
-
-    def wanted_hemis(self) -> tuple[str, ...]:
-        """List the hemispheres that are wanted."""
-        return tuple(hemi for hemi in HEMIS if hemi in self.hemis and self._passes("hemi", hemi))
-
-    def wants_file(self, path: Path) -> bool:
-        """Check whether a file with BIDS entities in its name is wanted."""
-        if not self.rules:
-            return True
-        found = _parse(path)
-        return all(rule(found.get(key)) for key, rule in self.rules.items())
-
-    def _passes(self, entity: str, value: str | None) -> bool:
-        rule = self.rules.get(entity)
-        return rule is None or rule(value)
-
-
-def make_selection(request: InputRequest) -> Selection:
-    """Prepare what the user asked for."""
-    wrong = [hemi for hemi in request.hemis if hemi not in HEMIS]
-    if wrong or not request.hemis:
-        raise UsageError(
-            f"--hemi {' '.join(map(str, wrong))}: choose among {', '.join(HEMIS)}",
-            reason="bad-hemisphere",
-        )
-    return Selection(
-        subjects=_labels(request.participant_labels, "sub-", "--participant-label"),
-        excluded=_labels(request.excluded_labels, "sub-", "--exclude-participant-label"),
-        sessions=_labels(request.session_labels, "ses-", "--session-label"),
-        hemis=request.hemis,
-        rules=_rules(request.bids_filter_file) if request.bids_filter_file else {},
-        fs_analysis=request.fs_analysis,
-        protocol=_chosen_protocol(request.protocol) if request.protocol else None,
-    )
-
-
-def _chosen_protocol(choice: str | Path) -> Protocol:
-    """Load a protocol by the name of a file or of a bundled one."""
-    return measurable(load_protocol(Path(choice) if Path(choice).is_file() else str(choice)))
-
-
-def measurable(protocol: Protocol) -> Protocol:
-    """Return a protocol, unless it is known to have no subfields."""
-    if protocol.refused:
-        raise ProtocolError(protocol.refused, reason="no-subfields")
-    return protocol
-
-
-def _labels(labels: Iterable[str], prefix: str, option: str) -> frozenset[str]:
-    bare = frozenset(label.removeprefix(prefix) for label in labels)
-    wrong = sorted(label for label in bare if not re.fullmatch("[A-Za-z0-9+]+", label))
-    if wrong:
-        raise UsageError(
-            f"{option} {' '.join(wrong)}: labels consist of letters and digits "
-            f"(with or without {prefix!r})",
-            reason="bad-label",
-        )
-    return bare
-
-
-def _rules(path: Path) -> dict[str, _Wanted]:
-    """Read a filter file: ``{"dseg": {"session": "01", "space": ["T1w", "T2w"]}}``."""
-    try:
-        contents = json.loads(path.read_text("utf-8"))
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot read the filter file ({error.strerror}); check the path",
-            reason="unreadable-filter",
-        ) from error
-    except ValueError as error:
-        raise InputError(
-            f"{path}: the filter file is not JSON ({error})", reason="unreadable-filter"
-        ) from error
-    query = contents.get(_QUERY, {}) if isinstance(contents, dict) else None
-    if not isinstance(query, dict):
-        raise UsageError(
-            f'{path}: the filter file is not of the form {{"{_QUERY}": {{ENTITY: VALUE}}}}',
-            reason="bad-filter",
-        )
-    known = _entities()
-    for key in query:
-        if key not in known:
-            near = difflib.get_close_matches(key, known, n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise UsageError(
-                f"{path}: {key!r} in {_QUERY!r} is not a BIDS entity{hint}", reason="bad-filter"
-            )
-    return {key: _rule(value) for key, value in query.items()}
-
-
-def _rule(value: Any) -> _Wanted:  # noqa: ANN401 (JSON)
-    """Make one entity's test; null, ``*`` and ``Query.…`` mean what they mean in fMRIPrep."""
-    if value is None or value == "Query.NONE":
-        return lambda found: found is None
-    if value in ("*", "Query.ANY"):
-        return lambda found: found is not None
-    if value == "Query.OPTIONAL":
-        return lambda _: True
-    values = value if isinstance(value, list) else [value]
-    rules = [_rule(entry) for entry in values] if isinstance(value, list) else []
-    texts = {str(entry) for entry in values}
-    return lambda found: found in texts or any(rule(found) for rule in rules)
-
-
-# pybids takes seconds to import and is needed only where a filter is given.
-@cache
-def _entities() -> dict[str, Any]:
-    from bids.layout import Config  # noqa: PLC0415 (see above)
-
-    configs = (Config.load(name) for name in ("bids", "derivatives"))
-    return {name: entity for config in configs for name, entity in config.entities.items()}
-
-
-def _parse(path: Path) -> dict[str, str]:
-    from bids.layout import parse_file_entities  # noqa: PLC0415 (see above)
-
-    found = parse_file_entities(str(path), entities=list(_entities().values()))
-    return {key: str(value) for key, value in found.items()}
 
 
 def list_participants(request: InputRequest) -> frozenset[str]:

@@ -6,28 +6,32 @@ files are segmentations (one module per layout: ``freesurfer``, ``ashs``, ``hipp
 can only be told from the labels.
 """
 
+import os
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from hipsta_bids.derivatives.dataset import read_description
 from hipsta_bids.errors import NothingToDoError, UsageError
 from hipsta_bids.inputs.ashs import AtlasFinder, choose_atlas, find_ashs, sample_files
 from hipsta_bids.inputs.edits import EditedFile, attach_edits, each_once, edits_of_visit, list_edits
-from hipsta_bids.inputs.freesurfer import find_freesurfer
+from hipsta_bids.inputs.freesurfer import find_freesurfer, same_labels, without_labels
 from hipsta_bids.inputs.generic import find_named, forget_tables
 from hipsta_bids.inputs.scan import (
     HEMIS,
     HemisphereInput,
+    Ignored,
     InputRequest,
-    Selection,
     Source,
+    SubjectFolder,
+    VisitFolders,
     list_participants,
     list_sources,
     list_visits,
-    make_selection,
+    sort_folders,
     subject_folders,
 )
+from hipsta_bids.inputs.selection import Selection, make_selection
 from hipsta_bids.inputs.tools import find_hippunfold, find_tools
 from hipsta_bids.protocols.protocol import Protocol
 
@@ -39,6 +43,7 @@ __all__ = [
     "dataset_notes",
     "find_hemispheres",
     "find_inputs",
+    "ignored_table",
     "list_subjects",
     "selection_table",
 ]
@@ -48,6 +53,8 @@ _LOOKED_FOR = (
     "*_desc-subfields*_dseg, HSF's *_hippocampus_seg, NextBrain's seg*, and *_hemi-*_dseg with a "
     "table"
 )
+
+_NO_LABELS = "its mri folder holds no hippocampal subfields"
 
 #: How many names an error message lists.
 _SHOWN = 6
@@ -60,7 +67,9 @@ class Findings:
     items: tuple[HemisphereInput, ...]
     """Sorted by subject, session, hemisphere, protocol. Some may have a ``problem``."""
     notes: tuple[str, ...] = ()
-    """One line for each edited file that is not used."""
+    """One line for each edited file that is not used, and for what is named anew or ignored."""
+    ignored: tuple[Ignored, ...] = ()
+    """What was not used though it seems meant to be, sorted by path."""
 
 
 def find_hemispheres(request: InputRequest) -> tuple[HemisphereInput, ...]:
@@ -89,20 +98,83 @@ def find_hemispheres(request: InputRequest) -> tuple[HemisphereInput, ...]:
 
 
 def find_inputs(request: InputRequest) -> Findings:
-    """Find all segmentations that are asked for, and the edited files that correct none."""
+    """Find all segmentations that are asked for, and what is like them but not used."""
     selection = make_selection(request)
     option = choose_atlas(request)
     forget_tables()
-    sources = list_sources(request)
-    edited = list_edits(request, selection)
-    found: list[HemisphereInput] = []
+    found = _Found()
+    sources = list_sources(request, found.ignored)
+    found.edited = list_edits(request, selection, found.ignored)
     for source in sources:
-        found += _search(source, selection, option, edited)
-    if not found:
-        raise _nothing(request, sources)
-    _check_analysis(found, request)
-    items, notes = attach_edits(_without_clashes(found, sources), each_once(edited), selection)
-    return Findings(items=items, notes=notes)
+        _search(source, selection, option, found)
+    ignored = _each_entry(filter(selection.misses, found.ignored), found.renamed)
+    if not found.items:
+        raise _nothing(request, sources, ignored)
+    _check_analysis(found.items, request)
+    items, notes = attach_edits(
+        _without_clashes(found.items, sources), each_once(found.edited), selection
+    )
+    notes += (*_renaming_note(found.renamed, items), *_ignored_note(ignored))
+    return Findings(items=items, notes=notes, ignored=ignored)
+
+
+@dataclass(kw_only=True)
+class _Found:
+    """What the search has found so far."""
+
+    items: list[HemisphereInput] = field(default_factory=list)
+    edited: list[EditedFile] = field(default_factory=list)
+    ignored: list[Ignored] = field(default_factory=list)
+    renamed: list[SubjectFolder] = field(default_factory=list)
+    """Folders of wanted subjects whose names are not their labels."""
+
+
+def _renaming(folders: Iterable[SubjectFolder]) -> dict[tuple[str, str | None], str]:
+    """Write a note for each visit whose folders have names that are not its labels."""
+    names: dict[tuple[str, str | None], list[str]] = {}
+    for folder in folders:
+        if folder.renamed:
+            names.setdefault((folder.subject, folder.session), []).append(folder.path.name)
+    return {
+        key: f"FreeSurfer's folder {' and '.join(known)} is called sub-{key[0]} here"
+        for key, known in names.items()
+    }
+
+
+def _renaming_note(
+    renamed: Iterable[SubjectFolder], items: Iterable[HemisphereInput]
+) -> Iterator[str]:
+    subjects = {item.subject for item in items}
+    names = [f"{f.path.name} as sub-{f.subject}" for f in renamed if f.subject in subjects]
+    if names:
+        yield f"called otherwise here: {_count(names, 'FreeSurfer folder')}"
+
+
+def _each_entry(entries: Iterable[Ignored], used: Iterable[SubjectFolder]) -> tuple[Ignored, ...]:
+    """Keep each entry once, and none that another option names and uses."""
+    once: dict[str, Ignored] = {}
+    for entry in entries:
+        once.setdefault(_place(entry.path), entry)
+    taken = {_place(folder.path) for folder in used} if once else set()
+    return tuple(
+        sorted((e for key, e in once.items() if key not in taken), key=lambda entry: entry.path)
+    )
+
+
+def _place(path: Path) -> str:
+    """Where an entry is, however its folder was reached; the entry itself may be any link."""
+    return os.path.join(os.path.realpath(path.parent), path.name)  # noqa: PTH118 (many of them)
+
+
+def _ignored_note(ignored: Iterable[Ignored]) -> Iterator[str]:
+    names = [entry.path.name for entry in ignored if not entry.template]
+    if names:
+        yield f"not used: {_count(names, 'folder')}; --dry-run and the log say why"
+
+
+def ignored_table(ignored: Iterable[Ignored]) -> list[dict[str, str]]:
+    """Describe what was not used, one row per folder."""
+    return [{"not used": str(entry.path), "why": entry.reason} for entry in ignored]
 
 
 def list_subjects(request: InputRequest) -> tuple[str, ...]:
@@ -113,7 +185,7 @@ def list_subjects(request: InputRequest) -> tuple[str, ...]:
             {
                 folder.subject
                 for source in list_sources(request)
-                for folder in subject_folders(source.path)
+                for folder in subject_folders(source.path, any_name=source.any_name)
                 if selection.wants_folder(folder)
             }
         )
@@ -155,24 +227,45 @@ def dataset_notes(request: InputRequest, items: Iterable[HemisphereInput]) -> tu
     return tuple(notes)
 
 
-def _search(
-    source: Source, selection: Selection, option: Protocol | None, edited: list[EditedFile]
-) -> Iterator[HemisphereInput]:
+def _search(source: Source, selection: Selection, option: Protocol | None, found: _Found) -> None:
     """Search one dataset for all kinds of segmentations, and add the edited files beside them."""
-    folders = [folder for folder in subject_folders(source.path) if selection.wants_folder(folder)]
+    every, others = sort_folders(source.path, any_name=source.any_name)
+    refused = same_labels(every)
+    folders = list(filter(selection.wants_folder, every))
+    found.ignored += others
+    found.renamed += [folder for folder in folders if folder.renamed]
+    anew = _renaming(folders)
     atlases = AtlasFinder(source.path, option, sample_files(source))
-    for visit in filter(selection.wants_visit, list_visits(folders)):
-        edited += edits_of_visit(visit, source.path, source.name, beside=True)
-        if "freesurfer" in source.layouts:
-            yield from find_freesurfer(visit, source, selection)
-        if "ashs" in source.layouts:
-            yield from find_ashs(visit, source, atlases, selection)
-        if "hippunfold" in source.layouts:
-            yield from find_hippunfold(visit, source, selection)
-        if "tools" in source.layouts:
-            yield from find_tools(visit, source, selection)
-        if "named" in source.layouts:
-            yield from find_named(visit, source, selection)
+    for visit in filter(selection.wants_visit, list_visits(folders, found.ignored)):
+        found.edited += edits_of_visit(visit, source.path, source.name, beside=True)
+        items = list(_search_visit(visit, source, selection, atlases))
+        used = [file for item in items for file in item.files]
+        found.ignored += [
+            Ignored(path=path, reason=_NO_LABELS, subject=visit.subject)
+            for path in (without_labels(visit) if "freesurfer" in source.layouts else ())
+            if not any(file.is_relative_to(path) for file in used)
+        ]
+        for item in items:
+            problem = item.problem or refused.get(item.subject)
+            note = anew.get((item.subject, item.session))
+            notes = item.notes if note is None else (*item.notes, note)
+            found.items.append(replace(item, problem=problem, notes=notes))
+
+
+def _search_visit(
+    visit: VisitFolders, source: Source, selection: Selection, atlases: AtlasFinder
+) -> Iterator[HemisphereInput]:
+    """Search the folders of one visit for all kinds of segmentations."""
+    if "freesurfer" in source.layouts:
+        yield from find_freesurfer(visit, source, selection)
+    if "ashs" in source.layouts:
+        yield from find_ashs(visit, source, atlases, selection)
+    if "hippunfold" in source.layouts:
+        yield from find_hippunfold(visit, source, selection)
+    if "tools" in source.layouts:
+        yield from find_tools(visit, source, selection)
+    if "named" in source.layouts:
+        yield from find_named(visit, source, selection)
 
 
 def _without_clashes(
@@ -205,8 +298,10 @@ def _check_analysis(found: list[HemisphereInput], request: InputRequest) -> None
         )
 
 
-def _nothing(request: InputRequest, sources: tuple[Source, ...]) -> NothingToDoError:
-    """Describe what was looked for, and where."""
+def _nothing(
+    request: InputRequest, sources: tuple[Source, ...], ignored: tuple[Ignored, ...]
+) -> NothingToDoError:
+    """Describe what was looked for, and where, and what was not used."""
     searched = ", ".join(str(source.path) for source in sources)
     restricted = (
         *(f"--participant-label {label}" for label in request.participant_labels[:_SHOWN]),
@@ -215,22 +310,30 @@ def _nothing(request: InputRequest, sources: tuple[Source, ...]) -> NothingToDoE
         *(f"--hemi {hemi}" for hemi in request.hemis if request.hemis != HEMIS),
         *([f"--bids-filter-file {request.bids_filter_file}"] if request.bids_filter_file else []),
     )
+    missed = [entry for entry in ignored if not entry.template]
+    names = [entry.path.name for entry in missed]
+    unused = f". Not used: {_count(names, 'folder')}" if names else ""
+    unused += f": {missed[0].reason}" if names else ""
     if not sources:
         return NothingToDoError(
             f"{request.bids_dir}: no derivatives/* or sourcedata/* with sub-* folders; "
-            "name the dataset with the segmentations: -d NAME=PATH",
+            f"name the dataset with the segmentations: -d NAME=PATH{unused}",
             reason="no-segmentation",
         )
     if restricted:
-        subjects = {folder.subject for source in sources for folder in subject_folders(source.path)}
+        subjects = {
+            folder.subject
+            for source in sources
+            for folder in subject_folders(source.path, any_name=source.any_name)
+        }
         return NothingToDoError(
             f"no hippocampal segmentation matches {' '.join(restricted)} in {searched} "
-            f"(which hold {_count(sorted(subjects), 'subject')}; looked for {_LOOKED_FOR})",
+            f"(which hold {_count(sorted(subjects), 'subject')}; looked for {_LOOKED_FOR}){unused}",
             reason="no-match",
         )
     return NothingToDoError(
         f"no hippocampal segmentation in {searched} (looked for {_LOOKED_FOR}); "
-        "name another dataset: -d NAME=PATH",
+        f"name another dataset: -d NAME=PATH{unused}",
         reason="no-segmentation",
     )
 

@@ -16,12 +16,12 @@ from hipsta_bids.errors import HipstaError, InputError, ProtocolError
 from hipsta_bids.inputs.scan import (
     Folder,
     HemisphereInput,
-    Selection,
     Source,
     VisitFolders,
     several_files,
     unknown_protocol,
 )
+from hipsta_bids.inputs.selection import Selection
 from hipsta_bids.io.files import entities
 from hipsta_bids.protocols.load import load_protocol, protocol_names
 from hipsta_bids.protocols.protocol import Protocol

@@ -5,7 +5,7 @@ import logging
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -120,6 +120,8 @@ def _log(outcome: Outcome) -> None:
     if outcome.skipped:
         _LOGGER.info("%s: unchanged, skipped (%s)", title, outcome.status)
         return
+    for note in outcome.job.item.notes:
+        _LOGGER.info("%s: note: %s", title, note)
     for edit in outcome.job.item.edits:
         _LOGGER.info("%s: edited %s: %s", title, edit.kind, edit.path)
     for stage, seconds in outcome.stages.items():
@@ -214,6 +216,8 @@ class RunOptions:
     """Make pages to look at afterwards."""
     command: str | None = None
     """The command line, for the log."""
+    notes: tuple[str, ...] = ()
+    """What the search for inputs had to say, for the log."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -226,6 +230,8 @@ class RunResult:
     log: Path
     page_problems: tuple[str, ...] = ()
     """One line per page that could not be made."""
+    copies: tuple[str, ...] = ()
+    """One line per group of hemispheres with the same labels."""
 
     @property
     def counts(self) -> Counter[str]:
@@ -316,10 +322,13 @@ def _run(
     jobs = _prepare(items, out_dir, settings, options)
     shard = None if options.shard is None else options.shard.name
     outcomes: list[Outcome] = []
+    copies: list[str] = []
     with log_file(out_dir, options.verbosity, shard) as log:
         _LOGGER.info("hipsta_bids %s, %d hemispheres", __version__, len(jobs))
         if options.command:
             _LOGGER.info("command: %s", options.command)
+        for note in options.notes:
+            _LOGGER.info("note: %s", note)
         table = StatusTable(out_dir, shard)
         # Closed at once, whatever ends the loop, so that no worker outlives it.
         with (
@@ -337,14 +346,28 @@ def _run(
                     break  # the next one would fail just so
                 if options.stop_on_first_crash and outcome.status == Status.FAILED:
                     break
+            if pages.wanted and shard is None:
+                table.close()
+                copies += _find_copies(jobs, out_dir)
         result = RunResult(
             outcomes=tuple(outcomes),
             n_requested=len(jobs),
             log=log,
             page_problems=tuple(pages.problems),
+            copies=tuple(copies),
         )
         _LOGGER.info("done: %s, exit code %d", dict(result.counts), result.exit_code)
     return result
+
+
+def _find_copies(jobs: Sequence[Job], out_dir: Path) -> Iterator[str]:
+    """Mark hemispheres with the same labels in the table, and describe those of this run."""
+    own = {job.place.name for job in jobs}
+    for names in dataset.mark_copies(out_dir):
+        if own.intersection(names):
+            line = dataset.describe_copies(names)
+            _LOGGER.warning("%s", line)
+            yield line
 
 
 def _prepare(

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from hipsta_bids.derivatives.dataset import describe_copies, same_labels
 from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName, participant_report
 from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.catalog import SUMMARY
@@ -240,6 +241,10 @@ def cohort_page(cohort: Cohort) -> str | None:
         n=len(hemispheres),
         n_participants=len({h.place.name.subject for h in hemispheres}),
         counts=[(str(status), counts[str(status)]) for status in Status if counts[str(status)]],
+        copies=[
+            describe_copies(names)
+            for names in same_labels((h.place.name, h.record) for h in hemispheres)
+        ],
         n_apart=sum(distance.value > OUTLIER for distance in apart.values()),
         apart=OUTLIER,
         smallest=SMALLEST_COMPARED,

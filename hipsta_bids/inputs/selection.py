@@ -1,0 +1,196 @@
+"""Which of what is found is wanted: labels of options, and entities of the filter file."""
+
+import difflib
+import json
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from hipsta_bids.errors import InputError, ProtocolError, UsageError
+from hipsta_bids.inputs.scan import (
+    HEMIS,
+    Ignored,
+    InputRequest,
+    SubjectFolder,
+    VisitFolders,
+    plain_label,
+)
+from hipsta_bids.protocols.load import load_protocol
+from hipsta_bids.protocols.protocol import Protocol
+
+#: The entry of the filter file that applies to segmentations.
+_QUERY = "dseg"
+
+_Wanted = Callable[[str | None], bool]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Selection:
+    """What the user asked for, ready to be applied."""
+
+    subjects: frozenset[str] = frozenset()
+    """Empty for all, as in ``sessions``."""
+    excluded: frozenset[str] = frozenset()
+    sessions: frozenset[str] = frozenset()
+    hemis: tuple[str, ...] = HEMIS
+    rules: Mapping[str, _Wanted] = field(default_factory=dict)
+    """By entity, in pybids's long names; from the filter file."""
+    fs_analysis: str | None = None
+    """The FreeSurfer analysis to take."""
+    protocol: Protocol | None = None
+    """The user's protocol."""
+
+    def describes(self, tool: str) -> bool:
+        """Check whether the user's protocol is one for the files of a tool."""
+        return self.protocol is not None and self.protocol.tool in ("", tool)
+
+    def wants_folder(self, folder: SubjectFolder) -> bool:
+        """Check whether a subject's folder has to be looked into."""
+        return (
+            (not self.subjects or folder.subject in self.subjects)
+            and folder.subject not in self.excluded
+            and (not self.sessions or folder.session is None or folder.session in self.sessions)
+            and self._passes("subject", folder.subject)
+        )
+
+    def misses(self, entry: Ignored) -> bool:
+        """Check whether an entry that was not used belongs to a subject that is wanted."""
+        subject = entry.subject
+        return subject is None or (
+            (not self.subjects or subject in self.subjects) and subject not in self.excluded
+        )
+
+    def wants_visit(self, visit: VisitFolders) -> bool:
+        """Check whether a session of a subject is wanted."""
+        asked = not self.sessions or visit.session in self.sessions
+        return asked and self._passes("session", visit.session)
+
+    def wanted_hemis(self) -> tuple[str, ...]:
+        """List the hemispheres that are wanted."""
+        return tuple(hemi for hemi in HEMIS if hemi in self.hemis and self._passes("hemi", hemi))
+
+    def wants_file(self, path: Path) -> bool:
+        """Check whether a file with BIDS entities in its name is wanted."""
+        if not self.rules:
+            return True
+        found = _parse(path)
+        return all(rule(found.get(key)) for key, rule in self.rules.items())
+
+    def _passes(self, entity: str, value: str | None) -> bool:
+        rule = self.rules.get(entity)
+        return rule is None or rule(value)
+
+
+def make_selection(request: InputRequest) -> Selection:
+    """Prepare what the user asked for."""
+    wrong = [hemi for hemi in request.hemis if hemi not in HEMIS]
+    if wrong or not request.hemis:
+        raise UsageError(
+            f"--hemi {' '.join(map(str, wrong))}: choose among {', '.join(HEMIS)}",
+            reason="bad-hemisphere",
+        )
+    return Selection(
+        subjects=_labels(
+            _plain(request, request.participant_labels), "sub-", "--participant-label"
+        ),
+        excluded=_labels(
+            _plain(request, request.excluded_labels), "sub-", "--exclude-participant-label"
+        ),
+        sessions=_labels(request.session_labels, "ses-", "--session-label"),
+        hemis=request.hemis,
+        rules=_rules(request.bids_filter_file) if request.bids_filter_file else {},
+        fs_analysis=request.fs_analysis,
+        protocol=_chosen_protocol(request.protocol) if request.protocol else None,
+    )
+
+
+def _chosen_protocol(choice: str | Path) -> Protocol:
+    """Load a protocol by the name of a file or of a bundled one."""
+    return measurable(load_protocol(Path(choice) if Path(choice).is_file() else str(choice)))
+
+
+def measurable(protocol: Protocol) -> Protocol:
+    """Return a protocol, unless it is known to have no subfields."""
+    if protocol.refused:
+        raise ProtocolError(protocol.refused, reason="no-subfields")
+    return protocol
+
+
+def _plain(request: InputRequest, labels: tuple[str, ...]) -> tuple[str, ...]:
+    """Read names of FreeSurfer's folders as labels, where these may have any name."""
+    return labels if request.freesurfer_dir is None else tuple(map(plain_label, labels))
+
+
+def _labels(labels: Iterable[str], prefix: str, option: str) -> frozenset[str]:
+    bare = frozenset(label.removeprefix(prefix) for label in labels)
+    wrong = sorted(label for label in bare if not re.fullmatch("[A-Za-z0-9+]+", label))
+    if wrong:
+        raise UsageError(
+            f"{option} {' '.join(wrong)}: labels consist of letters and digits "
+            f"(with or without {prefix!r})",
+            reason="bad-label",
+        )
+    return bare
+
+
+def _rules(path: Path) -> dict[str, _Wanted]:
+    """Read a filter file: ``{"dseg": {"session": "01", "space": ["T1w", "T2w"]}}``."""
+    try:
+        contents = json.loads(path.read_text("utf-8"))
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot read the filter file ({error.strerror}); check the path",
+            reason="unreadable-filter",
+        ) from error
+    except ValueError as error:
+        raise InputError(
+            f"{path}: the filter file is not JSON ({error})", reason="unreadable-filter"
+        ) from error
+    query = contents.get(_QUERY, {}) if isinstance(contents, dict) else None
+    if not isinstance(query, dict):
+        raise UsageError(
+            f'{path}: the filter file is not of the form {{"{_QUERY}": {{ENTITY: VALUE}}}}',
+            reason="bad-filter",
+        )
+    known = _entities()
+    for key in query:
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise UsageError(
+                f"{path}: {key!r} in {_QUERY!r} is not a BIDS entity{hint}", reason="bad-filter"
+            )
+    return {key: _rule(value) for key, value in query.items()}
+
+
+def _rule(value: Any) -> _Wanted:  # noqa: ANN401 (JSON)
+    """Make one entity's test; null, ``*`` and ``Query.…`` mean what they mean in fMRIPrep."""
+    if value is None or value == "Query.NONE":
+        return lambda found: found is None
+    if value in ("*", "Query.ANY"):
+        return lambda found: found is not None
+    if value == "Query.OPTIONAL":
+        return lambda _: True
+    values = value if isinstance(value, list) else [value]
+    rules = [_rule(entry) for entry in values] if isinstance(value, list) else []
+    texts = {str(entry) for entry in values}
+    return lambda found: found in texts or any(rule(found) for rule in rules)
+
+
+# pybids takes seconds to import and is needed only where a filter is given.
+@cache
+def _entities() -> dict[str, Any]:
+    from bids.layout import Config  # noqa: PLC0415 (see above)
+
+    configs = (Config.load(name) for name in ("bids", "derivatives"))
+    return {name: entity for config in configs for name, entity in config.entities.items()}
+
+
+def _parse(path: Path) -> dict[str, str]:
+    from bids.layout import parse_file_entities  # noqa: PLC0415 (see above)
+
+    found = parse_file_entities(str(path), entities=list(_entities().values()))
+    return {key: str(value) for key, value in found.items()}
