@@ -107,7 +107,7 @@ def make_input(folder, subject="01", *, hemi="L", act="ok", problem=None, sessio
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"sub-{subject}_{hemi}.txt"
-    path.write_text(act)
+    path.write_text(f"{act} is what sub-{subject} {session} {hemi} does")  # each file another one
     return HemisphereInput(
         subject=subject,
         session=session,
@@ -147,7 +147,7 @@ def act_out(act, hemi, clock):
 def replace_measurement():
     """Put stand-ins in the place of reading and measuring, in this process."""
     images = types.ModuleType("hipsta_bids.inputs.labels")
-    images.read_label_volume = lambda item, _region: item.files[0].read_text()
+    images.read_label_volume = lambda item, _region: item.files[0].read_text().split()[0]
     participant = types.ModuleType("hipsta_bids.participant.measure")
     participant.find_body = lambda *_: None
     participant.measure_hemisphere = lambda volume, hemi, _, clock: act_out(volume, hemi, clock)

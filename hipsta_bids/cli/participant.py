@@ -337,7 +337,7 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
     from hipsta_bids.inputs.search import dataset_notes, ignored_table, selection_table  # noqa: PLC0415  (heavy)
 
     requests = map_requests(options.map, options.map_sampling, options.map_interpolation)
-    found = _find(request, options.shard)
+    found = _find(request, options.shard, say=echo if options.dry_run else None)
     if found is None:
         echo(f"part {options.shard.name} of the dataset has nothing to process")
         return ExitCode.OK
@@ -365,12 +365,23 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
     return result.exit_code
 
 
-def _find(request: "InputRequest", shard: Shard | None) -> "Findings | None":
-    """Find inputs, of one part of the subjects if asked for; ``None`` if that has none."""
+def _find(
+    request: "InputRequest", shard: Shard | None, say: Callable[[str], None] | None
+) -> "Findings | None":
+    """Find inputs, of one part of the subjects if asked for; ``None`` if that has none.
+
+    Where there are none at all, ``say`` gets a line for each entry that was not used.
+    """
     from hipsta_bids.inputs.search import find_inputs, list_subjects  # noqa: PLC0415  (heavy)
 
     if shard is None:
-        return find_inputs(request)
+        try:
+            return find_inputs(request)
+        except NothingToDoError as error:
+            if say is not None:
+                for line in getattr(error, "__notes__", ()):
+                    say(line)
+            raise
     subjects = shard.take(list_subjects(request))
     if not subjects:
         return None

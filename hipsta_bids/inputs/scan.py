@@ -205,6 +205,13 @@ class Ignored:
     """Label of the subject that it seems to belong to; ``None`` for a whole dataset."""
     template: bool = False
     """One of FreeSurfer's template brains, which nobody misses."""
+    inside: Path | None = None
+    """The subject's folder that it is in, if it is not that itself."""
+
+    @property
+    def name(self) -> str:
+        """Its name, with that of the subject's folder."""
+        return str(self.path.relative_to(self.inside.parent)) if self.inside else self.path.name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -347,7 +354,7 @@ def _inner_folders(
     waiting = [(folder.session, folder.path, True)]
     while waiting:
         session, path, outer = waiting.pop()
-        listed = _try_to_list(path, ignored, folder.subject)
+        listed = _try_to_list(path, ignored, folder)
         if listed is None:
             continue
         names, files = listed
@@ -365,14 +372,15 @@ def _inner_folders(
 
 
 def _try_to_list(
-    path: Path, ignored: list[Ignored], subject: str | None = None
+    path: Path, ignored: list[Ignored], folder: SubjectFolder | None = None
 ) -> tuple[list[str], list[str]] | None:
     """List a folder, or add it to what is ignored."""
     try:
         return list_folder(path)
     except InputError as error:
         reason = str(error).removeprefix(f"{path}: ")
-        ignored.append(Ignored(path=path, reason=reason, subject=subject))
+        whose = (folder.subject, folder.path) if folder else (None, None)
+        ignored.append(Ignored(path=path, reason=reason, subject=whose[0], inside=whose[1]))
         return None
 
 

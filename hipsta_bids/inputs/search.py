@@ -103,13 +103,16 @@ def find_inputs(request: InputRequest) -> Findings:
     option = choose_atlas(request)
     forget_tables()
     found = _Found()
-    sources = list_sources(request, found.ignored)
+    sources = list_sources(request, found.others)
     found.edited = list_edits(request, selection, found.ignored)
     for source in sources:
         _search(source, selection, option, found)
-    ignored = _each_entry(filter(selection.misses, found.ignored), found.renamed)
+    ignored = tuple(filter(selection.misses, found.unused()))
     if not found.items:
-        raise _nothing(request, sources, ignored)
+        nothing = _nothing(request, sources, ignored)
+        for entry in ignored:
+            nothing.add_note(f"not used: {entry.path}: {entry.reason}")
+        raise nothing
     _check_analysis(found.items, request)
     items, notes = attach_edits(
         _without_clashes(found.items, sources), each_once(found.edited), selection
@@ -125,8 +128,18 @@ class _Found:
     items: list[HemisphereInput] = field(default_factory=list)
     edited: list[EditedFile] = field(default_factory=list)
     ignored: list[Ignored] = field(default_factory=list)
+    others: list[Ignored] = field(default_factory=list)
+    """Entries that are no subject's by their names, unless an option says otherwise."""
     renamed: list[SubjectFolder] = field(default_factory=list)
     """Folders of wanted subjects whose names are not their labels."""
+
+    def unused(self) -> list[Ignored]:
+        """List each entry that was not used once, sorted by path."""
+        taken = {_place(folder.path) for folder in self.renamed} if self.others else set()
+        once = {_place(entry.path): entry for entry in reversed(self.others)}
+        once = {place: entry for place, entry in once.items() if place not in taken}
+        once |= {_place(entry.path): entry for entry in reversed(self.ignored)}
+        return sorted(once.values(), key=lambda entry: entry.path)
 
 
 def _renaming(folders: Iterable[SubjectFolder]) -> dict[tuple[str, str | None], str]:
@@ -136,7 +149,7 @@ def _renaming(folders: Iterable[SubjectFolder]) -> dict[tuple[str, str | None], 
         if folder.renamed:
             names.setdefault((folder.subject, folder.session), []).append(folder.path.name)
     return {
-        key: f"FreeSurfer's folder {' and '.join(known)} is called sub-{key[0]} here"
+        key: f"FreeSurfer's name of sub-{key[0]} is {' and '.join(known)}"
         for key, known in names.items()
     }
 
@@ -147,18 +160,7 @@ def _renaming_note(
     subjects = {item.subject for item in items}
     names = [f"{f.path.name} as sub-{f.subject}" for f in renamed if f.subject in subjects]
     if names:
-        yield f"called otherwise here: {_count(names, 'FreeSurfer folder')}"
-
-
-def _each_entry(entries: Iterable[Ignored], used: Iterable[SubjectFolder]) -> tuple[Ignored, ...]:
-    """Keep each entry once, and none that another option names and uses."""
-    once: dict[str, Ignored] = {}
-    for entry in entries:
-        once.setdefault(_place(entry.path), entry)
-    taken = {_place(folder.path) for folder in used} if once else set()
-    return tuple(
-        sorted((e for key, e in once.items() if key not in taken), key=lambda entry: entry.path)
-    )
+        yield f"renamed: {_count(names, 'FreeSurfer folder')}"
 
 
 def _place(path: Path) -> str:
@@ -167,7 +169,7 @@ def _place(path: Path) -> str:
 
 
 def _ignored_note(ignored: Iterable[Ignored]) -> Iterator[str]:
-    names = [entry.path.name for entry in ignored if not entry.template]
+    names = [entry.name for entry in ignored if not entry.template]
     if names:
         yield f"not used: {_count(names, 'folder')}; --dry-run and the log say why"
 
@@ -232,7 +234,7 @@ def _search(source: Source, selection: Selection, option: Protocol | None, found
     every, others = sort_folders(source.path, any_name=source.any_name)
     refused = same_labels(every)
     folders = list(filter(selection.wants_folder, every))
-    found.ignored += others
+    found.others += others
     found.renamed += [folder for folder in folders if folder.renamed]
     anew = _renaming(folders)
     atlases = AtlasFinder(source.path, option, sample_files(source))
@@ -311,7 +313,7 @@ def _nothing(
         *([f"--bids-filter-file {request.bids_filter_file}"] if request.bids_filter_file else []),
     )
     missed = [entry for entry in ignored if not entry.template]
-    names = [entry.path.name for entry in missed]
+    names = [entry.name for entry in missed]
     unused = f". Not used: {_count(names, 'folder')}" if names else ""
     unused += f": {missed[0].reason}" if names else ""
     if not sources:
