@@ -201,6 +201,14 @@ def test_folders_of_any_name_with_their_option(tmp_path, place):
     assert list_subjects(request) == ("01", "AD05", "MCI7", "X1", "bert", "empty1", "tp1a")
 
 
+def test_what_one_option_uses_is_not_listed_for_another_place(tmp_path):
+    fs = freesurfer(tmp_path / "derivatives" / "fs", "bert", "ernie")
+    touch(fs / "empty" / "mri", "aseg.mgz")
+    found = search(tmp_path, freesurfer_dir=fs)
+    assert subjects(found) == ["bert", "ernie"]
+    assert reasons(found, fs) == {"empty": "its mri folder holds no hippocampal subfields"}
+
+
 @pytest.mark.parametrize("label", ["AD05", "AD_05", "sub-AD05", "sub-AD_05"])
 def test_subjects_by_label_or_by_folder(tmp_path, label):
     (tmp_path / "bids").mkdir()
