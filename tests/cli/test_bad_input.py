@@ -155,8 +155,11 @@ def test_bad_hemispheres_fail_alone(good, tmp_path, capsys):
     for hemi in ("L", "R"):
         assert found["sub-good", hemi]["status"] != "failed"
         assert outputs(out, "good", hemi) == COMPLETE
-    lines = said.err.splitlines()
+    *lines, warning = said.err.splitlines()
     assert len(lines) == len(expected)
+    # The file of the swapped side is a copy of another participant's.
+    names = "sub-good_hemi-R_seg-freesurfer, sub-swapped_hemi-L_seg-freesurfer"
+    assert warning.startswith(f"warning: {names} have the same labels, byte for byte; ")
     for subject, reason in expected.items():
         (line,) = [line for line in lines if line.startswith(f"sub-{subject}_")]
         assert f"[{reason}]" in line
