@@ -1,6 +1,5 @@
 """The files of a dataset as a whole: description, settings, methods text with references."""
 
-import contextlib
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, metadata
@@ -512,81 +511,6 @@ def update_status(root: Path, rows: Iterable[Row], *, shard: str | None = None) 
             columns,
             ([row.get(column, files.MISSING) for column in columns] for row in ordered),
         )
-
-
-#: Begins what the message of a row says of labels that another hemisphere has, too.
-_COPY = "the labels are the same, byte for byte, as those of "
-
-_SHOWN = 6  # names in a message
-
-
-def same_labels(
-    records: Iterable[tuple[HemisphereName, Mapping[str, Any]]],
-) -> list[tuple[HemisphereName, ...]]:
-    """Group hemispheres whose label files have the same content, by their quality records.
-
-    One file with both hemispheres of a visit is no copy, nor is it one if the same hemisphere is
-    measured in several ways.
-    """
-    groups: dict[tuple[str, ...], list[tuple[HemisphereName, tuple[str, ...]]]] = {}
-    for name, record in records:
-        edited = [e for e in record.get("edited") or [] if e.get("what") == "labels"]
-        entries = edited or record.get("inputs") or []
-        hashes = tuple(str(entry.get("sha256") or "") for entry in entries)
-        if hashes and all(hashes):
-            addresses = tuple(str(entry.get("file")) for entry in entries)
-            groups.setdefault(hashes, []).append((name, addresses))
-    return [
-        tuple(name for name, _ in members)
-        for members in groups.values()
-        if len({(name.subject, name.session, addresses) for name, addresses in members}) > 1
-        and len({(name.subject, name.session, name.hemi) for name, _ in members}) > 1
-    ]
-
-
-def describe_copies(names: Sequence[HemisphereName]) -> str:
-    """Write one line about hemispheres with the same labels."""
-    return f"{_list(names)} have the same labels, byte for byte; check that no file was copied"
-
-
-def _list(names: Sequence[HemisphereName]) -> str:
-    titles = [f"{name.stem}_{name.protocol}" for name in names]
-    more = len(titles) - _SHOWN
-    return ", ".join(titles[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
-
-
-def mark_copies(root: Path) -> list[tuple[HemisphereName, ...]]:
-    """Say in the messages of ``status.tsv`` which hemispheres have the same labels.
-
-    Rows that do not agree with their quality record are left as they are: another run is at them.
-
-    Returns
-    -------
-    list of tuple of HemisphereName
-        The groups, see :func:`same_labels`.
-    """
-    rows, records = {}, {}
-    for row in read_status(root):
-        name = name_of(row)
-        with contextlib.suppress(InputError):
-            record = files.read_json(root / output_path(name, "qc"))
-            if agrees(row, record):
-                rows[name], records[name] = row, record
-    groups = same_labels(records.items())
-    others = {name: [n for n in group if n != name] for group in groups for name in group}
-    marked = []
-    for name, row in rows.items():
-        before = row.get("message", files.MISSING)
-        words = [text for text in (before.partition(_COPY)[0].removesuffix("; "),) if text]
-        if name in others:
-            words = [text for text in words if text != files.MISSING]
-            words.append(f"{_COPY}{_list(others[name])}; check that no file was copied")
-        after = "; ".join(words) or files.MISSING
-        if after != before:
-            marked.append({**row, "message": after})
-    if marked:
-        update_status(root, marked)
-    return groups
 
 
 def write_sidecar(root: Path) -> None:

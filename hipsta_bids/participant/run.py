@@ -15,6 +15,7 @@ from socket import gethostname
 
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset, hemisphere
+from hipsta_bids.derivatives.copies import describe_copies, mark_copies
 from hipsta_bids.derivatives.dataset import (
     NOT_FINISHED,
     RECORDED,
@@ -363,9 +364,9 @@ def _run(
 def _find_copies(jobs: Sequence[Job], out_dir: Path) -> Iterator[str]:
     """Mark hemispheres with the same labels in the table, and describe those of this run."""
     own = {job.place.name for job in jobs}
-    for names in dataset.mark_copies(out_dir):
+    for names in mark_copies(out_dir):
         if own.intersection(names):
-            line = dataset.describe_copies(names)
+            line = describe_copies(names)
             _LOGGER.warning("%s", line)
             yield line
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hipsta_bids.derivatives.dataset import describe_copies, same_labels
+from hipsta_bids.derivatives.copies import describe_copies, same_labels
 from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName, participant_report
 from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.catalog import SUMMARY
