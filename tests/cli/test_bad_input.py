@@ -59,6 +59,7 @@ def bids_dir(good, tmp_path):
     folder = tmp_path / "bids"
     shutil.copytree(good, folder)
     shutil.rmtree(label_file(folder, "short").parents[1])
+    shutil.rmtree(folder / "sub-short")
     return folder
 
 
