@@ -105,12 +105,13 @@ def read_label_volume(item: HemisphereInput, region: str = "body") -> LabelVolum
 
 def _beside(other: Path, path: Path, image: LabelImage, *, edited: bool) -> NDArray[Any]:
     """Read a second file where the first has labels, at nearest voxels if that one was edited."""
-    more = read_labels(other, MARGIN)
-    if more.shape == image.shape and np.allclose(
-        more.affine, image.affine, rtol=0, atol=_SAME_GRID
+    beside = read_labels(other, box=image.box)
+    if beside.shape == image.shape and np.allclose(
+        beside.affine, image.affine, rtol=0, atol=_SAME_GRID
     ):
-        return read_labels(other, box=image.box).data
+        return beside.data
     if edited:
+        more = read_labels(other, MARGIN)
         to_own = np.linalg.inv(more.own_affine) @ image.own_affine
         sampled: NDArray[Any] = ndimage.affine_transform(
             _integers(more.data, other),
