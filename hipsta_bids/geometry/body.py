@@ -31,6 +31,7 @@ from hipsta_bids.geometry.digital import (
     FACES,
     box_around,
     low_corner,
+    positions,
     to_ras,
     voxel_points,
 )
@@ -142,10 +143,18 @@ class Body:
         """Voxel indices (N, 3) and RAS mm (N, 3) of the sheet between the end planes."""
         return self._inside_points
 
+    def nearest(self, points: Float, count: int = 1) -> Index:
+        """Numbers (M,), or (M, count), of the inside points that are nearest to points (M, 3)."""
+        return np.asarray(self._tree.query(points, k=count)[1])
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.inside_points()[1])
+
     @cached_property
     def _inside_points(self) -> tuple[Index, Float]:
         """Cached: a dozen steps ask for it, and the volume is large."""
-        index = np.argwhere(self.inside)
+        index = positions(self.inside)
         points = to_ras(index, self.affine)
         index.flags.writeable = False
         points.flags.writeable = False
@@ -334,7 +343,7 @@ def _apply_mask(
     that of the nearest voxel of the mask that has one. Beyond the end planes nothing changes.
     """
     region, points = between(mask.inside | (tissue > 0), volume.affine, ends)
-    index = np.argwhere(region)
+    index = positions(region)
     old, inside = tissue[tuple(index.T)], mask.inside[tuple(index.T)]
     kept = inside & (old > 0)
     if not kept.any():

@@ -15,13 +15,14 @@ from scipy.spatial import cKDTree
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.digital import (
-    ALL,
     FACES,
     box_around,
     low_corner,
     piece_sizes,
+    positions,
     to_ras,
     voxel_points,
+    widened,
 )
 from hipsta_bids.geometry.grid import Field, continued_nodes, cut_across, in_plane_voxel
 from hipsta_bids.geometry.mesh import mean_wall_thickness
@@ -132,11 +133,10 @@ def check_thickness(thickness: Float, expected: float, settings: CheckSettings) 
 
 def name_subfields(body: Body) -> Callable[[Float], str]:
     """Make a function that names the subfields at (N, 3) points, RAS mm, medial first."""
-    index, points = body.inside_points()
-    tree, tissue = cKDTree(points), body.tissue[tuple(index.T)]
+    tissue = body.tissue[body.inside]
 
     def names(at: Float) -> str:
-        found = np.unique(tissue[tree.query(at)[1]])
+        found = np.unique(tissue[body.nearest(at)])
         return ", ".join(Tissue(int(kind)).name for kind in found)
 
     return names
@@ -283,8 +283,8 @@ def check_labels(body: Body, settings: CheckSettings) -> list[Finding]:
     sides = sum(
         np.roll(within, step, axis).astype(np.int8) for axis in range(3) for step in (-1, 1)
     )
-    near = ndimage.binary_dilation(within, structure=ALL)
-    pinholes = np.argwhere(~sheet & near & (sides >= 5))  # noqa: PLR2004 -- of six faces
+    near = widened(within)
+    pinholes = positions(~sheet & near & (sides >= 5))  # noqa: PLR2004 -- of six faces
     noise = len(pinholes) / int(np.count_nonzero(within))
     # The second piece of voxels that share faces.
     pieces, _ = ndimage.label(within, structure=FACES)
@@ -310,7 +310,7 @@ def check_labels(body: Body, settings: CheckSettings) -> list[Finding]:
             "loose-part",
             (loose, settings.flag_loose_part),
             f"{loose:.0%} of the sheet do not touch the rest by any face of a voxel",
-            np.argwhere(pieces == second) + low if loose else np.zeros((0, 3)),
+            positions(pieces == second) + low if loose else np.zeros((0, 3)),
             "fill the gap in the labels",
         ),
     )
@@ -342,7 +342,7 @@ def check_cross_sections(
     if cuts is not None and cuts.any():
         counted = ndimage.distance_transform_edt(~cuts) > settings.stub_nodes
     if field.cavities is not None:
-        counted &= ~ndimage.binary_dilation(field.cavities, structure=ALL, iterations=2)
+        counted &= ~widened(widened(field.cavities))
     levels = slice(field.beyond, solid.shape[2] - field.beyond)
     solid, interior, counted = (part[:, :, levels] for part in (solid, interior, counted))
     step = field.grid.step
@@ -416,7 +416,7 @@ class _Outlier:
         at = int(share.argmax())
         if share[at] / limit > self.share / self.limit:
             self.share, self.limit = float(share[at]), limit
-            nodes = np.argwhere(part[:, :, at]).astype(float)
+            nodes = positions(part[:, :, at]).astype(float)
             self.nodes = np.column_stack([nodes, np.full(len(nodes), at + first)])
 
 

@@ -21,7 +21,9 @@ from hipsta_bids.geometry.digital import (
     box_around,
     low_corner,
     piece_sizes,
+    positions,
     to_ras,
+    widened,
 )
 from hipsta_bids.geometry.ends import EndPlanes
 from hipsta_bids.protocols.protocol import Tissue
@@ -41,7 +43,7 @@ _DIRECTIONS = [step for step in product((-1, 0, 1), repeat=3) if step > (0, 0, 0
 
 def between(mask: Bool, affine: Float, ends: EndPlanes) -> tuple[Bool, Float]:
     """Part of a mask between the end planes, (I, J, K), and its voxels in RAS mm, (N, 3)."""
-    index = np.argwhere(mask)
+    index = positions(mask)
     points = to_ras(index, affine)
     between = ends.depth(points) > 0
     inside = np.zeros(mask.shape, dtype=bool)
@@ -83,7 +85,7 @@ def find_uncus(tissue: Tissues, affine: Float, ends: EndPlanes, settings: BodySe
     first. The part of CA1 that is nearer to it than to the rest, on the way through the sheet, goes
     with it.
     """
-    index = np.argwhere(tissue)
+    index = positions(tissue > 0)
     points = to_ras(index, affine)
     near = ends.beyond(1.0).depth(points) > 0
     index, points = index[near], points[near]
@@ -125,9 +127,7 @@ def _nearer_to(own: Bool, rest: Bool, free: Bool) -> Bool:
     """
     free = free & ~own & ~rest
     while True:
-        to_own, to_rest = (
-            ndimage.binary_dilation(part, structure=ALL) & free for part in (own, rest)
-        )
+        to_own, to_rest = (widened(part) & free for part in (own, rest))
         if not (to_own | to_rest).any():
             return own
         rest = rest | to_rest
@@ -140,7 +140,7 @@ def _like_nearest(
 ) -> tuple[LabelVolume, Tissues]:
     """Give voxels (N, 3) the label and the part of the sheet that the nearest donor has."""
     around = box(np.maximum(where.min(axis=0) - _NEAR, 0), where.max(axis=0) + _NEAR + 1)
-    index = np.argwhere(donors[around]) + low_corner(around)
+    index = positions(donors[around]) + low_corner(around)
     pairs = volume.tissue.astype(np.intp) * 256 + tissue
     nearest = value_of_nearest(
         pairs[tuple(index.T)], to_ras(index, volume.affine), to_ras(where, volume.affine)
@@ -164,7 +164,7 @@ def hand_over(
 
     No plane separates labels perfectly; left out, these voxels would be holes in the sheet.
     """
-    index = np.argwhere(volume.tissue == Tissue.HIPPOCAMPUS)
+    index = positions(volume.tissue == Tissue.HIPPOCAMPUS)
     depth = ends.depth(to_ras(index, volume.affine))
     where = index[(depth > 0) & (depth < reach)]
     if not len(where):
@@ -182,7 +182,7 @@ def find_cavities(
     enclosed in three dimensions, or in a slice if little of it is open to the next slices.
     """
     solid = _subfields(volume) | np.isin(volume.tissue, (Tissue.HIPPOCAMPUS, Tissue.FISSURE))
-    around = box_around(np.argwhere(between(solid, volume.affine, ends)[0]))
+    around = box_around(positions(between(solid, volume.affine, ends)[0]))
     solid, sheet = solid[around], tissue[around] > 0
     inner = np.isin(volume.tissue[around], volume.protocol.interior)
     edges = np.linalg.norm(volume.affine[:3, :3], axis=0)
@@ -195,12 +195,12 @@ def find_cavities(
     most_open = 1.0 if edges[through] > settings.slit_voxel else settings.cavity_openness
     narrow, wide = list[Index](), list[Index]()
     for number, part in enumerate(ndimage.find_objects(pieces), 1):
-        room = box_around(np.argwhere(pieces[part] == number) + low_corner(part))
+        room = box_around(positions(pieces[part] == number) + low_corner(part))
         piece = pieces[room] == number
-        ring = ndimage.binary_dilation(piece, structure=ALL) & ~piece
+        ring = widened(piece) & ~piece
         is_open = (ring & ~solid[room] & ~enclosed[room]).sum() > most_open * ring.sum()
         beside = ring & solid[room]
-        index = np.argwhere(piece) + low_corner(around) + low_corner(room)
+        index = positions(piece) + low_corner(around) + low_corner(room)
         index = index[ends.depth(to_ras(index, volume.affine)) > 0]
         if not len(index) or is_open or not (beside & sheet[room]).any():
             continue
@@ -259,10 +259,10 @@ def fill_slits(
     directions. A slit opens on both sides of the sheet; a crevice between two folds, which opens
     on one side, is left as it is.
     """
-    around = box_around(np.argwhere(inside))
+    around = box_around(positions(inside))
     sheet = np.pad(tissue[around] > 0, 1)
     # Between the end planes: next to voxels that lie there.
-    beside = ndimage.binary_dilation(np.pad(inside[around], 1), structure=ALL)
+    beside = widened(np.pad(inside[around], 1))
     empty = np.pad(unlabeled[around], 1)
     edges = np.linalg.norm(affine[:3, :3], axis=0)
     coarse = edges > settings.slit_voxel
@@ -277,9 +277,9 @@ def fill_slits(
         if not coarse.any()
         and _opens_on_both_sides(pieces == number, sheet, settings.slit_openings)
     ]
-    filled = np.argwhere(np.isin(pieces, through)) + low_corner(around) - 1
+    filled = positions(np.isin(pieces, through)) + low_corner(around) - 1
     sizes[through] = 0
-    gap = np.argwhere((pieces == sizes.argmax()) & (pieces > 0)) + low_corner(around) - 1
+    gap = positions((pieces == sizes.argmax()) & (pieces > 0)) + low_corner(around) - 1
     return Slits(_with_nearest(tissue, filled, around), filled, gap)
 
 
@@ -295,7 +295,7 @@ def fill_pits(
     edges = np.linalg.norm(affine[:3, :3], axis=0)
     if edges.max() > settings.slit_voxel:
         return tissue, np.zeros((0, 3), np.intp)
-    around = box_around(np.argwhere(inside))
+    around = box_around(positions(inside))
     steps = np.maximum(np.rint(settings.pit_reach / edges), 1).astype(int)
     room = [(int(n), int(n)) for n in steps + 1]
     sheet = np.pad(tissue[around] > 0, room)
@@ -305,16 +305,16 @@ def fill_pits(
             rolled = (np.roll(sheet, sign * n, axis) for n in range(1, count + 1))
             sides += np.logical_or.reduce(list(rolled))
     # Between the end planes: next to voxels that lie there.
-    beside = ndimage.binary_dilation(np.pad(inside[around], room), structure=ALL)
+    beside = widened(np.pad(inside[around], room))
     empty = np.pad(unlabeled[around], room) & ~sheet & beside
     pieces, _ = ndimage.label(empty & (sides >= settings.pit_sides), structure=FACES)
     sizes = piece_sizes(pieces) * float(np.prod(edges))
     least, most = settings.pit_size
     pits = np.flatnonzero((sizes >= least) & (sizes <= most))
-    where = np.argwhere(np.isin(pieces, pits)) + low_corner(around) - steps - 1
+    where = positions(np.isin(pieces, pits)) + low_corner(around) - steps - 1
     if not len(where):
         return tissue, where
-    donors = np.argwhere(tissue[around] > 0) + low_corner(around)
+    donors = positions(tissue[around] > 0) + low_corner(around)
     nearest = value_of_nearest(
         tissue[tuple(donors.T)], to_ras(donors, affine), to_ras(where, affine)
     )
@@ -341,7 +341,7 @@ def _enclosed(sheet: Bool, directions: int, coarse: Bool) -> Bool:
 
 def _opens_on_both_sides(piece: Bool, sheet: Bool, least: float) -> bool:
     """Whether what surrounds a gap, outside of the sheet, has two pieces of at least this share."""
-    border = ndimage.binary_dilation(piece, structure=ALL) & ~sheet & ~piece
+    border = widened(piece) & ~sheet & ~piece
     openings, count = ndimage.label(border, structure=ALL)
     sizes = np.sort(piece_sizes(openings))
     return count > 1 and bool(sizes[-2] >= least * sizes.sum())

@@ -14,7 +14,7 @@ from scipy.special import expit
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.automatic_ends import find_ends
-from hipsta_bids.geometry.digital import ALL, box_around, piece_sizes, voxel_points
+from hipsta_bids.geometry.digital import ALL, box_around, piece_sizes, positions, voxel_points
 from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import BodySettings
 from hipsta_bids.types import Bool, End, Float, GivenEnd, LabelVolume, position_text
@@ -160,7 +160,7 @@ def _largest_ends(part: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Keep the largest piece each of head and tail: stray voxels must not move the end planes."""
     kept = part.copy()
     for end in (Part.HEAD, Part.TAIL):
-        index = np.argwhere(part == end)
+        index = positions(part == end)
         if len(index):
             around = box_around(index)
             pieces, _ = ndimage.label(part[around] == end, structure=ALL)

@@ -155,8 +155,9 @@ def continued_nodes(grid: WedgeGrid, body: Body, depth: float) -> Float:
     for end, outward in body.outward.items():
         inside = body.ends.height(points, end)
         slope = body.ends.height(outward, end) - body.ends.height(np.zeros(3), end)
-        missing = np.maximum(depth - inside * np.sign(-slope), 0.0)
-        points -= (missing / abs(slope))[..., None] * outward
+        missing = depth - inside * np.sign(-slope)
+        short = missing > 0
+        points[short] -= (missing[short] / abs(slope))[:, None] * outward
     return points
 
 

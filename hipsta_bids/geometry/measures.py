@@ -6,7 +6,6 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.mesh import tetra_volumes
@@ -295,9 +294,8 @@ def labels_at(points: Float, body: Body) -> NDArray[np.uint8]:
     labels = body.tissue[index]
     beside = np.flatnonzero(~body.inside[index] | ((voxel < 0) | (voxel > last)).any(axis=1))
     if len(beside):
-        voxels, centers = body.inside_points()
-        _, nearest = cKDTree(centers).query(points[beside])
-        labels[beside] = body.tissue[tuple(voxels[nearest].T)]
+        voxels, _ = body.inside_points()
+        labels[beside] = body.tissue[tuple(voxels[body.nearest(points[beside])].T)]
     return np.asarray(labels, dtype=np.uint8)
 
 

@@ -1,5 +1,7 @@
 """From a solid field to a closed triangle surface with planar end caps, and to its tetrahedra."""
 
+from itertools import combinations
+
 import numpy as np
 from scipy import sparse
 from skimage.measure import marching_cubes
@@ -30,8 +32,9 @@ def extract_surface(field: Field, settings: SurfaceSettings) -> Surface:
     posterior, anterior = nodes[:, 2] < 1e-3, nodes[:, 2] > last - 1e-3  # noqa: PLR2004
     nodes[posterior, 2], nodes[anterior, 2] = 0, last
     faces = faces.astype(np.int32)
-    _check_sphere(len(nodes), faces)
-    nodes = _taubin(nodes, faces, (posterior, anterior), settings)
+    edges = unique_edges(faces)
+    _check_sphere(len(nodes), faces, edges)
+    nodes = _taubin(nodes, faces, edges, (posterior, anterior), settings)
     vertices = field.grid.to_ras(nodes)
     if signed_volume(vertices, faces) < 0:
         faces = faces[:, ::-1]
@@ -77,9 +80,8 @@ def unique_edges(cells: Int) -> Int:
     return np.column_stack([code >> 32, code & 0xFFFFFFFF]).astype(np.int32)
 
 
-def _check_sphere(count: int, faces: Int) -> None:
+def _check_sphere(count: int, faces: Int, edges: Int) -> None:
     """Refuse triangles between ``count`` vertices that are not one closed sphere."""
-    edges = unique_edges(faces)
     euler = count - len(edges) + len(faces)
     pieces, _ = sparse.csgraph.connected_components(_adjacency(edges, count), directed=False)
     if euler != 2 or pieces != 1 or 2 * len(edges) != 3 * len(faces):  # noqa: PLR2004
@@ -96,9 +98,10 @@ def _adjacency(edges: Int, count: int) -> sparse.csr_array:
     return sparse.csr_array((ones, (both[:, 0], both[:, 1])), shape=(count, count))
 
 
-def _taubin(nodes: Float, faces: Int, caps: tuple[Bool, Bool], settings: SurfaceSettings) -> Float:
+def _taubin(
+    nodes: Float, faces: Int, edges: Int, caps: tuple[Bool, Bool], settings: SurfaceSettings
+) -> Float:
     """Smooth in grid coordinates; caps stay in their planes, outlines on themselves."""
-    edges = unique_edges(faces)
     cap = caps[0] | caps[1]
     on_cap = caps[0][faces].all(axis=1) | caps[1][faces].all(axis=1)
     outline = np.zeros(len(nodes), dtype=bool)
@@ -216,8 +219,7 @@ def tetra_quality(mesh: TetMesh) -> Float:
 
     Liu & Joe 1994, BIT 34:268-287: 12 (3 volume)^(2/3) / sum of squared edge lengths.
     """
-    first, second = np.triu_indices(4, k=1)
-    corners = mesh.vertices[mesh.tetrahedra]
-    edges = corners[:, second] - corners[:, first]
+    corners = mesh.vertices[mesh.tetrahedra.T]
+    squares = sum(((b - a) ** 2).sum(axis=1) for a, b in combinations(corners, 2))
     volume = tetra_volumes(mesh.vertices, mesh.tetrahedra)
-    return np.asarray(12 * np.cbrt(3 * volume) ** 2 / (edges**2).sum(axis=(1, 2)))
+    return np.asarray(12 * np.cbrt(3 * volume) ** 2 / squares)

@@ -28,6 +28,8 @@ from hipsta_bids.geometry.digital import (
     box_around,
     euler,
     low_corner,
+    positions,
+    widened,
     with_plates,
 )
 from hipsta_bids.geometry.grid import Field
@@ -192,7 +194,7 @@ def _before_smoothing(field: Field) -> list[Edit]:
     """List what was removed between turns that touch, and what was filled, before smoothing."""
     edits = []
     if field.separated is not None and field.separated.any():
-        edits.append(Edit("part", np.argwhere(field.separated) + FIRST))
+        edits.append(Edit("part", positions(field.separated) + FIRST))
     kinds: tuple[tuple[Kind, Bool | None], ...] = (
         ("slit", field.slits),
         ("cavity", field.cavities),
@@ -200,7 +202,7 @@ def _before_smoothing(field: Field) -> list[Edit]:
     for kind, nodes in kinds:
         if nodes is not None:
             pieces, count = ndimage.label(nodes, structure=ALL)
-            edits += [Edit(kind, np.argwhere(pieces == n + 1) + FIRST) for n in range(count)]
+            edits += [Edit(kind, positions(pieces == n + 1) + FIRST) for n in range(count)]
     return edits
 
 
@@ -231,7 +233,7 @@ def _refuse_strips(
         return
     pieces, _, through = _through_pieces(state)
     gap, nearest = ndimage.distance_transform_edt(pieces != through[0], return_indices=True)
-    facing = np.argwhere((pieces == through[1]) & (gap <= gap[pieces == through[1]].min() + 1))
+    facing = positions((pieces == through[1]) & (gap <= gap[pieces == through[1]].min() + 1))
     other = nearest[:, *facing.T].T
     center = 0.5 * (facing.mean(axis=0) + other.mean(axis=0))
     names = locate(field.grid.to_ras(np.vstack([facing, other]).astype(float))) if locate else ""
@@ -247,7 +249,7 @@ def _unrepaired(
     edits: list[Edit], state: Bool, field: Field, locate: Locate | None
 ) -> GeometryError:
     """Report the largest of the repairs that did not lead to one solid piece."""
-    nothing = Edit("cut", np.argwhere(state))
+    nothing = Edit("cut", positions(state))
     where = max(edits, key=lambda edit: len(edit.where), default=nothing).where
     point = field.grid.to_ras((where - FIRST).mean(axis=0, keepdims=True))
     at = position_text(point[0], locate(point) if locate else "")
@@ -262,7 +264,7 @@ def _unrepaired(
 def _interrupted(pieces: Index, field: Field, locate: Locate | None) -> GeometryError:
     """Report where the body ends that begins at the posterior plane."""
     first = int(np.flatnonzero((pieces > 0).any(axis=(0, 1)))[0])
-    nodes = np.argwhere(np.isin(pieces, np.unique(pieces[:, :, first])) & (pieces > 0))
+    nodes = positions(np.isin(pieces, np.unique(pieces[:, :, first])) & (pieces > 0))
     level = nodes[:, 2].max() if first == 0 else first
     point = field.grid.to_ras(nodes[nodes[:, 2] == level].astype(float))
     at = position_text(point.mean(axis=0), locate(point) if locate else "")
@@ -284,7 +286,7 @@ def _remove_islands(state: Bool, field: Field, locate: Locate | None) -> list[Ed
     main = pieces == through[0]
     state[INNER] &= main
     return [
-        Edit("uncus" if _is_uncus(piece, main) else "island", np.argwhere(piece) + FIRST)
+        Edit("uncus" if _is_uncus(piece, main) else "island", positions(piece) + FIRST)
         for piece in (pieces == n for n in range(1, count + 1) if n != through[0])
     ]
 
@@ -295,8 +297,8 @@ def _is_uncus(piece: Bool, main: Bool) -> bool:
     if levels[-1] < piece.shape[2] - 1:
         return False
     # The first direction across the axis points laterally.
-    medial = np.argwhere(piece)[:, 0].mean()
-    return bool(medial < np.argwhere(main[:, :, levels[0] :])[:, 0].mean())
+    medial = positions(piece)[:, 0].mean()
+    return bool(medial < positions(main[:, :, levels[0] :])[:, 0].mean())
 
 
 def _fill_cavities(state: Bool, *, plates: bool = False) -> list[Edit]:
@@ -307,7 +309,7 @@ def _fill_cavities(state: Bool, *, plates: bool = False) -> list[Edit]:
         return []
     outside = int(pieces[0, 0, 0])
     state |= (pieces > 0) & (pieces != outside)
-    return [Edit("cavity", np.argwhere(pieces == n)) for n in range(1, count + 1) if n != outside]
+    return [Edit("cavity", positions(pieces == n)) for n in range(1, count + 1) if n != outside]
 
 
 def _describe(
@@ -338,7 +340,7 @@ def _beside_slit(nodes: Index, field: Field) -> bool:
     """Whether a hole lies next to a slit between turns, which then went through a wall."""
     if field.separated is None:
         return False
-    near = ndimage.binary_dilation(field.separated, structure=ALL, iterations=2)
+    near = widened(widened(field.separated))
     return bool(near[tuple(nodes.T)].any())
 
 
@@ -381,7 +383,7 @@ def repaired_columns(sheet: Sheet, solid: SolidField, settings: MeasureSettings)
     marked = np.zeros(sheet.valid.shape, dtype=bool)
     if not solid.touched.any():
         return marked
-    known = np.isfinite(sheet.points).all(axis=(2, 3))
+    known = np.asarray(np.isfinite(sheet.points).all(axis=(2, 3)))
     if not known.any():
         return marked
     nodes, radii = _changed_nodes(solid, sheet.points[known].reshape(-1, 3), settings)
@@ -390,15 +392,16 @@ def repaired_columns(sheet: Sheet, solid: SolidField, settings: MeasureSettings)
     reach = float(radii.max() + gaps[known].max())
     tree = cKDTree(nodes)
     near = np.asarray(tree.query(sheet.points[known], distance_upper_bound=reach)[0])
-    candidates = np.argwhere(known)[near.min(axis=1) <= radii.max() + gaps[known].mean(axis=-1)]
+    candidates = positions(known)[near.min(axis=1) <= radii.max() + gaps[known].mean(axis=-1)]
     if not len(candidates):
         return marked
     widest = gaps[tuple(candidates.T)].max(axis=0)
     parts = np.maximum(np.ceil(widest / settings.repair_reach), 1).astype(int)
     dense = _cells(sheet.points, candidates, parts)
     defined = np.isfinite(dense).all(axis=-1)
-    hits = cKDTree(dense[defined]).query_ball_point(nodes, radii)
-    hit = np.unique(np.concatenate([np.asarray(found, dtype=np.intp) for found in hits]))
+    # A balanced tree takes longer to make than it saves.
+    tree = cKDTree(dense[defined], balanced_tree=False, compact_nodes=False)
+    hit = np.unique(np.concatenate(tree.query_ball_point(nodes, radii)).astype(np.intp))
     owner = candidates[np.nonzero(defined)[0][hit]]
     marked[tuple(owner.T)] = True
     return marked
@@ -418,14 +421,14 @@ def _changed_nodes(
     solid: SolidField, points: Float, settings: MeasureSettings
 ) -> tuple[Float, Float]:
     """Points (N, 3), RAS mm, of changed nodes and faces of cuts, and the reach (N,) of each, mm."""
-    box = box_around(np.argwhere(solid.touched))
+    box = box_around(positions(solid.touched))
     inside, touched = solid.field.values[box] > 0, solid.touched[box]
-    faces = ndimage.binary_dilation(touched & ~inside, structure=ALL) & inside
+    faces = widened(touched & ~inside) & inside
     cuts, _ = ndimage.label(faces & ~touched)
     low = low_corner(box)
-    changed = solid.field.grid.to_ras((np.argwhere(touched) + low).astype(np.float64))
+    changed = solid.field.grid.to_ras((positions(touched) + low).astype(np.float64))
     radius = np.full(len(changed), settings.repair_reach)
-    where = np.argwhere(cuts)
+    where = positions(cuts > 0)
     if not len(where):
         return changed, radius
     face = solid.field.grid.to_ras((where + low).astype(np.float64))
