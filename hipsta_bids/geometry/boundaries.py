@@ -102,11 +102,9 @@ def middle_lines(wall: Wall, zones: Sequence[Bool]) -> Pair | None:
 
 def _most_lateral(points: Float, body: Body, settings: BoundarySettings) -> NDArray[np.intp]:
     """Vertices whose surroundings carry the most lateral labels."""
-    _, labeled = body.inside_points()
-    count = min(settings.label_neighbors, len(labeled))
+    count = min(settings.label_neighbors, len(body.lateral))
     asked = np.arange(0, len(points), settings.label_stride)
-    _, nearest = cKDTree(labeled).query(points[asked], k=count)
-    mean = body.lateral[nearest].mean(axis=1)
+    mean = body.lateral[body.nearest(points[asked], count)].mean(axis=1)
     return np.asarray(asked[mean >= np.quantile(mean, 1 - settings.lateral_share)])
 
 
@@ -162,7 +160,8 @@ def facing_strips(
         lines = _near(wall, curves, settings.least_strip * thickness)
         limits = _near(wall, curves, reach * thickness)
         medial, lateral = (wall.index[strip] for strip in strips)
-        flow = laplace.gradient(laplace.between(medial, lateral, DIRECTION_RESIDUAL))
+        values = laplace.between(medial, lateral, DIRECTION_RESIDUAL)
+        flow = laplace.gradient(values, settings.strip_stride)
         strips = (
             finder.strip(starts[0], flow, lines[0], limits[0]),
             finder.strip(starts[1], -flow, lines[1], limits[1]),
@@ -218,7 +217,7 @@ class _Finder:
 
     def _mean(self, points: Float, flow: Float) -> Float:
         _, nearest = self._centers.query(points, k=self._settings.strip_neighbors)
-        return _unit(flow[:: self._settings.strip_stride][nearest].mean(axis=1))
+        return _unit(flow[nearest].mean(axis=1))
 
 
 def _unit(vectors: Float) -> Float:
@@ -363,9 +362,7 @@ def _gap(points: Float, curve: Float) -> float:
 
 def _rank(curve: Float, body: Body) -> float:
     """How lateral the voxels nearest to a curve lie, on average."""
-    _, points = body.inside_points()
-    _, nearest = cKDTree(points).query(curve)
-    return float(body.lateral[nearest].mean())
+    return float(body.lateral[body.nearest(curve)].mean())
 
 
 def _interior_first(

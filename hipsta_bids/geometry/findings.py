@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 from scipy import sparse
@@ -77,25 +78,30 @@ def columns_near(sheet: Sheet, points: Float, reach: float) -> Bool:
     """Columns (Nx, Ny) of which any point lies within ``reach`` mm of points (N, 3)."""
     known = np.isfinite(sheet.points).all(axis=-1)
     near = np.zeros(known.shape, dtype=bool)
-    near[known] = cKDTree(points).query(sheet.points[known])[0] <= reach
+    gap = cKDTree(points).query(sheet.points[known], distance_upper_bound=reach)[0]
+    near[known] = np.isfinite(gap)
     return np.asarray(near.any(axis=2))
 
 
 def spread_over(values: Float, where: Bool) -> Float:
     """Replace values (Nx, Ny) by the smoothest continuation of the others, a harmonic function."""
-    number = np.arange(values.size).reshape(values.shape)
-    first = np.concatenate([number[1:].ravel(), number[:, 1:].ravel()])
-    second = np.concatenate([number[:-1].ravel(), number[:, :-1].ravel()])
-    edges = sparse.coo_array((np.ones(first.size), (first, second)), shape=(values.size,) * 2)
-    weights = (edges + edges.T).tocsr()
-    laplace = (sparse.diags_array(weights.sum(axis=1)) - weights).tocsr()
     inner, outer = np.flatnonzero(where), np.flatnonzero(~where)
     result = values.ravel().copy()
     if len(inner) and len(outer):
-        result[inner] = spsolve(
-            laplace[inner][:, inner].tocsc(), -laplace[inner][:, outer] @ result[outer]
-        )
+        rows = _grid_laplace(values.shape)[inner]
+        result[inner] = spsolve(rows[:, inner].tocsc(), -rows[:, outer] @ result[outer])
     return np.asarray(result.reshape(values.shape))
+
+
+@lru_cache(maxsize=1)
+def _grid_laplace(shape: tuple[int, int]) -> sparse.csr_array:
+    """Laplace operator of the graph of columns."""
+    number = np.arange(shape[0] * shape[1]).reshape(shape)
+    first = np.concatenate([number[1:].ravel(), number[:, 1:].ravel()])
+    second = np.concatenate([number[:-1].ravel(), number[:, :-1].ravel()])
+    edges = sparse.coo_array((np.ones(first.size), (first, second)), shape=(number.size,) * 2)
+    weights = (edges + edges.T).tocsr()
+    return sparse.csr_array(sparse.diags_array(weights.sum(axis=1)) - weights)
 
 
 def consequence_text(found: Finding) -> str:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from lapy import TriaMesh
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy import ndimage
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import Delaunay, QhullError, cKDTree
@@ -16,7 +17,7 @@ from skimage.measure import find_contours
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.digital import piece_sizes
-from hipsta_bids.geometry.fem import Laplace
+from hipsta_bids.geometry.fem import Laplace, bare_mesh
 from hipsta_bids.settings import SliceSettings
 from hipsta_bids.types import Float, Int
 
@@ -97,7 +98,7 @@ def _triangles(field: Float, pixel: float) -> _Mesh | None:
 def _nodes(mesh: _Mesh, lateral: Float, settings: SliceSettings) -> Float:
     """Invert the coordinates along and across the ribbon on a regular grid; NaN where they fold."""
     flat = np.column_stack([mesh.points, np.zeros(len(mesh.points))])
-    laplace = Laplace(TriaMesh(flat, mesh.cells))
+    laplace = Laplace(bare_mesh(TriaMesh, flat, mesh.cells))
     slow = laplace.eigenfunctions(1)[1][:, 0]
     if _rises(slow, mesh.points, lateral) < 0:
         slow = -slow
@@ -189,10 +190,11 @@ def match_lines(first: Float, second: Float, stretching: float) -> Float:
     stretch = stretching * (at[1] * moves / steps[:, None]) ** 2
     total = np.where(np.arange(count) == 0, cost[0], np.inf)
     chosen = np.zeros((len(first), count), dtype=np.intp)
+    before = np.full(len(moves) - 1 + count, np.inf)
+    moved = sliding_window_view(before, count)[::-1]  # by each of the moves
     for number in range(1, len(first)):
-        ways = np.full((len(moves), count), np.inf)
-        for move in moves:
-            ways[move, move:] = total[: count - move] + stretch[number - 1, move]
+        before[-count:] = total
+        ways = moved + stretch[number - 1][:, None]
         chosen[number] = ways.argmin(axis=0)
         total = ways.min(axis=0) + cost[number]
     place = count - 1

@@ -102,7 +102,8 @@ class Wall:
     def near(self, curve: Float, reach: float) -> Bool:
         """Vertices within ``reach`` mm of a curve and connected to it along the wall."""
         close = np.zeros(len(self.vertices), dtype=bool)
-        close[np.concatenate(self._tree.query_ball_point(curve, reach)).astype(np.intp)] = True
+        pairs = self._tree.sparse_distance_matrix(cKDTree(curve), reach, output_type="ndarray")
+        close[pairs["i"]] = True
         closest = int(self._tree.query(curve[len(curve) // 2])[1])
         close[closest] = True
         seed = np.zeros(len(close), dtype=bool)
@@ -168,7 +169,8 @@ def end_to_end(wall: Wall, values: Float) -> tuple[Float, Float] | None:
     first, second = wall.edges[crossing].T
     share = values[first] / (values[first] - values[second])
     points = wall.vertices[first] + share[:, None] * (wall.vertices[second] - wall.vertices[first])
-    mixed = np.flatnonzero(np.ptp(side[wall.triangles].astype(np.int8), axis=1))
+    a, b, c = side[wall.triangles.T]
+    mixed = np.flatnonzero((a != b) | (a != c))
     pieces = _connected_crossings(wall, mixed, crossing)
     curves = []
     for piece in range(pieces.max() + 1):
