@@ -18,7 +18,15 @@ from scipy.sparse import csgraph
 from scipy.special import ndtri
 
 from hipsta_bids.geometry.body import Body
-from hipsta_bids.geometry.digital import Box, box, low_corner, piece_sizes, to_ras, voxel_points
+from hipsta_bids.geometry.digital import (
+    Box,
+    box,
+    low_corner,
+    piece_sizes,
+    positions,
+    to_ras,
+    voxel_points,
+)
 from hipsta_bids.geometry.ribbon import (
     align_nodes,
     keep_whole,
@@ -229,10 +237,17 @@ def _moved(images: Stack, by: Stack) -> Stack:
     return _interpolated(images, *where)
 
 
-def _interpolated(images: Stack, *where: Stack) -> Stack:
-    """Interpolate linearly at one coordinate per axis, with the border's values beyond it."""
+def _interpolated(images: Stack, number: Stack, row: Stack, column: Stack) -> Stack:
+    """Interpolate linearly in images with these numbers, with the border's values beyond it.
+
+    In one tall image of all: there are four pixels round a place, but eight in a stack.
+    """
+    height, width = images.shape[1:]
+    row = np.clip(row, 0, height - 1) + number.astype(np.float64) * height
     return np.asarray(
-        ndimage.map_coordinates(images, np.stack(where), order=1, mode="nearest", output=np.float32)
+        ndimage.map_coordinates(
+            images.reshape(-1, width), [row, column], order=1, mode="nearest", output=np.float32
+        )
     )
 
 
@@ -247,9 +262,10 @@ def _shrunk(images: Stack, factor: int) -> Stack:
 
 def _doubled(flow: Stack, shape: tuple[int, ...]) -> Stack:
     """Displacements at pixels of half the size, in these pixels."""
+    images = flow.reshape(-1, *flow.shape[2:])
     at = (0.5 * np.arange(n, dtype=np.float32) - 0.25 for n in shape)
-    whole = (np.arange(n, dtype=np.float32) for n in flow.shape[:2])
-    return 2 * _interpolated(flow, *np.meshgrid(*whole, *at, indexing="ij"))
+    where = np.meshgrid(np.arange(len(images)), *at, indexing="ij")
+    return 2 * _interpolated(images, *where).reshape(*flow.shape[:2], *shape)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -272,6 +288,8 @@ class _SliceStack:
     def blend(self, level: Stack, where: Stack) -> Stack:
         """Signed distance, mm, within the plane of the slices, from the outline at any level.
 
+        Slits are left out of what is farther outside than the setting ``edge``.
+
         ``level`` (N,) counts slices, ``where`` (2, N) fine pixels.
         """
         last = len(self.outlines) - 1
@@ -286,13 +304,18 @@ class _SliceStack:
             middle = (where - (share - 0.5) * step + 0.5) * coarse - 0.5
             step = np.stack([_interpolated(part, below, *middle) for part in self.flows])
         middle = where - (share - 0.5) * step
-        distance, medial, lateral = (
-            (1 - share) * _interpolated(images, below, *(middle - 0.5 * step))
-            + share * _interpolated(images, below + 1, *(middle + 0.5 * step))
-            for images in (self.outlines, *self.ends)
-        )
-        slit = _slit(medial, lateral, self.settings)
-        return np.asarray(np.minimum(distance, slit), dtype=np.float32)
+        first, second = middle - 0.5 * step, middle + 0.5 * step
+
+        def mixed(images: Stack, at: Bool) -> Stack:
+            before = _interpolated(images, below[at], *first[:, at])
+            after = _interpolated(images, below[at] + 1, *second[:, at])
+            return np.asarray((1 - share[at]) * before + share[at] * after, dtype=np.float32)
+
+        distance = mixed(self.outlines, np.ones(len(level), dtype=bool))
+        near = distance > -self.settings.edge
+        medial, lateral = (mixed(images, near) for images in self.ends)
+        distance[near] = np.minimum(distance[near], _slit(medial, lateral, self.settings))
+        return distance
 
     def _departure(self, below: Stack, share: Stack, middle: Stack) -> Stack:
         """Departure of the paths through the slices from straight ones, fine pixels, (2, N).
@@ -404,7 +427,10 @@ def _stacked(tissue: NDArray[np.uint8], pixel: float, settings: SliceSettings) -
         if nodes is not None:
             keep_whole(outline, nodes, fine, settings)
             part_turns(outline, nodes, fine, settings)
-    flows = register_slices(outlines, pixel, settings)
+    if any(nodes is None for nodes in ribbons):
+        flows = register_slices(outlines, pixel, settings)
+    else:
+        flows = np.zeros((2, len(outlines) - 1, *tissue.shape[1:]), dtype=np.float32)
     bends = np.zeros((2, len(outlines), *flows.shape[2:]), dtype=np.float32)
     _align(flows, bends, align_nodes(ribbons, fine, settings), settings)
     return _SliceStack(outlines=outlines, ends=ends, flows=flows, bends=bends, settings=settings)
@@ -480,7 +506,7 @@ def _bounds(
     levels = np.flatnonzero(inside.any(axis=(1, 2)))
     first = max(int(levels[0]) - labeled[0], 0)
     last = min(int(levels[-1]) + labeled[1], len(inside) - 1)
-    index = np.argwhere(sheet[first : last + 1]) + np.array([first, 0, 0])
+    index = positions(sheet[first : last + 1] > 0) + np.array([first, 0, 0])
     room = np.ceil([0, margin, margin]).astype(int)
     low, high = index.min(axis=0) - room, index.max(axis=0) + 1 + room
     return box(np.maximum(low, 0), np.minimum(high, inside.shape))
