@@ -223,7 +223,9 @@ def between_planes(mesh: TetMesh, coordinates: Coordinates, ends: EndPlanes) -> 
     at right angles to the walls, however obliquely a plane cuts them.
     """
     x, y = np.linspace(-0.98, 0.98, 41), np.linspace(-0.998, 0.998, 121)
-    middle = _filled(_invert(mesh, coordinates.values, (x, y, np.array([-0.5, 0.0, 0.5]))))[:, :, 1]
+    # No point has z of 2: only the level in the middle is sought.
+    levels = _invert(mesh, coordinates.values, (x, y, np.array([-2.0, 0.0, 2.0])))
+    middle = _filled(levels[:, :, 1:2])[:, :, 0]
     limits = []
     for height in (ends.height(middle, "posterior"), ends.height(middle, "anterior")):
         rising = np.maximum.accumulate(np.nan_to_num(height, nan=-np.inf), axis=1)

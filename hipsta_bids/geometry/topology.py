@@ -362,7 +362,9 @@ def _consistent_values(values: NDArray[np.float32], after: Bool) -> NDArray[np.f
         squares = sliding_window_view(marked, (2, 2), axis=(1, 2), writeable=True)
         squares[(a == d) & (b == c) & (a != b)] = True
     cube = sliding_window_view(after, (2, 2, 2))
-    total = cube.sum(axis=(-3, -2, -1), dtype=np.int8)
+    total = np.zeros(cube.shape[:3], dtype=np.int8)
+    for corner in np.ndindex(2, 2, 2):
+        total += cube[(..., *corner)]
     opposite = np.zeros(total.shape, dtype=bool)
     for dx, dy in ((0, 0), (0, 1), (1, 0), (1, 1)):
         first, last = cube[..., dx, dy, 0], cube[..., 1 - dx, 1 - dy, 1]
