@@ -8,13 +8,30 @@ from hypothesis.extra import numpy as arrays
 from scipy import ndimage
 from skimage import measure
 
-from hipsta_bids.geometry.digital import NEIGHBORS, are_simple, euler_number, grow, shrink
+from hipsta_bids.geometry.digital import (
+    NEIGHBORS,
+    are_simple,
+    euler_number,
+    grow,
+    positions,
+    shrink,
+    widened,
+)
 
 FACES = ndimage.generate_binary_structure(3, 1)
 EDGES = ndimage.generate_binary_structure(3, 2)
 ALL = np.ones((3, 3, 3), dtype=bool)
 
 masks = arrays.arrays(np.bool_, st.tuples(*[st.integers(3, 8)] * 3), elements=st.booleans())
+
+
+@given(masks, st.permutations(range(3)))
+@settings(max_examples=50, deadline=None)
+def test_positions_and_widening_are_those_of_the_libraries(mask, axes):
+    turned, before = mask.transpose(axes), mask.copy()  # views, in other orders than C's, too
+    np.testing.assert_array_equal(positions(turned), np.argwhere(turned))
+    np.testing.assert_array_equal(widened(turned), ndimage.binary_dilation(turned, structure=ALL))
+    np.testing.assert_array_equal(mask, before)
 
 
 def simple_by_counting(block):

@@ -94,6 +94,14 @@ def test_gradient_and_energy_of_a_linear_function_are_its_slope(seed):
     assert energy == pytest.approx(slope @ slope * np.prod(SIZE), rel=EXACT)
 
 
+def test_gradient_in_every_third_cell_is_that_of_the_whole():
+    mesh = wobbled()
+    laplace, values = volume_laplace(mesh), (mesh.vertices**2).sum(axis=1)
+    whole = laplace.gradient(values)
+    np.testing.assert_array_equal(laplace.gradient(values, 3), whole[::3])
+    np.testing.assert_array_equal(laplace.gradient(values), whole)
+
+
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_gradient_is_right_whatever_the_sign_of_lapys(monkeypatch, sign):
     mesh = wobbled()
