@@ -150,6 +150,9 @@ class SliceSettings(SettingsTable):
     """Half width of a bridge between fragments, mm."""
     max_gap: NonNegativeFloat = 1.2
     """Fragments are joined across at most this distance, mm."""
+    max_break: NonNegativeFloat = 3.0
+    """So are pieces with a subfield that the rest lacks, if a slice beside shows the ribbon there,
+    mm."""
     crumb_area: NonNegativeFloat = 1.5
     """Fragments farther away are dropped if they are smaller than this, mm2."""
     hole_area: NonNegativeFloat = 3.0
@@ -216,7 +219,7 @@ class TopologySettings(SettingsTable):
     sever_reach: NonNegativeInt = 2
     """A cut severs the ribbon only if the body goes on for this many grid nodes before and behind
     it."""
-    sever_share: NonNegativeFloat = 0.4
+    sever_share: NonNegativeFloat = 0.1
     """Share of the cut's nodes at which the body has to go on."""
     sever_factor: NonNegativeFloat = 1000.0
     """Such cuts cost this much more: where one is the only way, the hemisphere is flagged."""

@@ -1,11 +1,11 @@
-"""Between thick slices: outline each slice, and move its shape into the next one.
+"""Between thick slices: the shape of each slice is moved into the next one.
 
 Where slices are much thicker than their pixels, the ribbon moves sideways by its own thickness from
 one slice to the next, and blending slices in place would break it. Each slice becomes a signed
-distance from its outline; the ribbons of neighboring slices are aligned (``ribbon``), or registered
-where one is none, and the shapes between them are blends of both, moved along. Where head or tail
-labels hide how the sheet continues, its shapes are extrapolated from inside. Turns of the ribbon
-that touch are kept apart.
+distance from its outline (``outlines``); the ribbons of neighboring slices are aligned
+(``ribbon``), or registered where one is none, and the shapes between them are blends of both, moved
+along. Where head or tail labels hide how the sheet continues, its shapes are extrapolated from
+inside. Turns of the ribbon that touch are kept apart.
 """
 
 from dataclasses import dataclass, replace
@@ -13,19 +13,25 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, sparse
-from scipy.sparse import csgraph
-from scipy.special import ndtri
+from scipy import ndimage
 
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.digital import (
     Box,
     box,
     low_corner,
-    piece_sizes,
     positions,
     to_ras,
     voxel_points,
+)
+from hipsta_bids.geometry.outlines import (
+    Stack,
+    cut_rings,
+    drop_doubles,
+    keep_apart,
+    outline_slice,
+    part_distance,
+    ranks_of,
 )
 from hipsta_bids.geometry.ribbon import (
     align_nodes,
@@ -34,161 +40,14 @@ from hipsta_bids.geometry.ribbon import (
     part_turns,
     ribbon_nodes,
 )
-from hipsta_bids.protocols.protocol import Tissue, lateral_rank
+from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import SliceSettings
 from hipsta_bids.types import Bool, Float
-
-Stack = NDArray[np.float32]
-"""Images, on fine pixels or on those of the segmentation."""
 
 _LEVELS = (2, 1)
 """Sizes of pixels in the registration, from coarse to those of the segmentation."""
 _ENDS = ((Tissue.PRESUBICULUM, Tissue.SUBICULUM), (Tissue.CA2, Tissue.CA2_3, Tissue.CA3))
 """Subfields of the medial and the lateral end of the ribbon; CA1 lies between them."""
-
-
-def outline_slice(tissue: NDArray[np.uint8], pixel: float, settings: SliceSettings) -> Stack:
-    """Signed distance, mm, from the ribbon's outline in a slice with pixels of ``pixel`` mm.
-
-    It is sampled at finer pixels, positive inside, and clipped at the setting ``reach``. Across a
-    straight edge, a mask smoothed by a Gaussian is the normal distribution function of the distance
-    over sigma. Its inverse finds the outline between pixels; whole pixels would shift it by up to
-    half of one, which the smoothing of the working grid cannot undo along the slice.
-    """
-    block = np.ones((settings.upsampling,) * 2, dtype=np.uint8)
-    labels = np.kron(tissue, block)
-    if not labels.any():
-        return np.full(labels.shape, -settings.reach, dtype=np.float32)
-    fine = pixel / settings.upsampling
-    sigma = settings.smoothing * settings.upsampling
-    smooth = ndimage.gaussian_filter((labels > 0).astype(np.float64), sigma)
-    distance = _signed_distance(smooth > 0.5, fine)  # noqa: PLR2004 -- the outline
-    exact = sigma * fine * ndtri(np.clip(smooth, 1e-6, 1 - 1e-6))
-    distance = np.where(np.abs(distance) < sigma * fine, exact, distance)
-    distance = _join(distance, lateral_rank(labels).astype(int), labels > 0, fine, settings)
-    return np.asarray(np.clip(distance, -settings.reach, settings.reach), dtype=np.float32)
-
-
-def _part_distance(
-    tissue: NDArray[np.uint8], kinds: tuple[Tissue, ...], pixel: float, settings: SliceSettings
-) -> Stack:
-    """Signed distance, mm, from some subfields of a slice, accurate to a fine pixel."""
-    fine = np.kron(np.isin(tissue, kinds), np.ones((settings.upsampling,) * 2, dtype=bool))
-    distance = _signed_distance(fine, pixel / settings.upsampling)
-    return np.asarray(np.clip(distance, -settings.reach, settings.reach), dtype=np.float32)
-
-
-def _signed_distance(mask: Bool, pixel: float) -> Float:
-    """Distance from the border between pixels, mm, positive inside."""
-    if not mask.any():
-        return np.full(mask.shape, -np.inf)
-    inside = ndimage.distance_transform_edt(mask)
-    outside = ndimage.distance_transform_edt(~mask)
-    return np.asarray((np.maximum(inside - 0.5, 0) - np.maximum(outside - 0.5, 0)) * pixel)
-
-
-def _join(
-    distance: Float, ranks: NDArray[np.intp], labeled: Bool, pixel: float, settings: SliceSettings
-) -> Float:
-    """Join near pieces of a slice to the largest, drop fragments farther away, fill small holes.
-
-    A large piece farther away is left alone: only three dimensions show whether it belongs to the
-    ribbon, which may bend into the uncus.
-    """
-    for _ in range(settings.max_fragments):
-        pieces, count = ndimage.label(distance > 0)
-        if count < 2:  # noqa: PLR2004 -- one piece is the aim
-            break
-        sizes = piece_sizes(pieces) * pixel**2
-        main = pieces == sizes.argmax()
-        gap, nearest = ndimage.distance_transform_edt(~main, return_indices=True)
-        gap *= pixel
-        # The sheet is one ribbon: a fragment belongs to a neighbor in medial-to-lateral order,
-        # not to the part that happens to lie across the sulcus.
-        jump = np.abs(ranks - ranks[tuple(nearest)]) > settings.max_rank_jump
-        cost = gap + np.where(jump & labeled, settings.reach, 0)
-        fragments = (sizes < settings.crumb_area)[pieces]
-        cost[(pieces == 0) | main | ((cost > settings.max_gap) & ~fragments)] = np.inf
-        end = np.array(np.unravel_index(np.argmin(cost), cost.shape))
-        nearest_cost = cost[tuple(end)]
-        if not np.isfinite(nearest_cost):
-            break
-        if nearest_cost > settings.max_gap:
-            distance = np.where(pieces == pieces[tuple(end)], -0.5 * pixel, distance)
-        else:
-            start = np.array([axis[tuple(end)] for axis in nearest])
-            bridge = _segment_distance(distance.shape, start, end) * pixel
-            distance = np.maximum(distance, settings.bridge - bridge)
-    holes, _ = ndimage.label(distance <= 0)
-    area = np.bincount(holes.ravel()) * pixel**2
-    small = (area < settings.hole_area)[holes] & (distance <= 0)
-    return np.where(small, 0.5 * pixel, distance)
-
-
-def _segment_distance(
-    shape: tuple[int, ...], start: NDArray[np.intp], end: NDArray[np.intp]
-) -> Float:
-    """Distance of each pixel from a segment, in pixels."""
-    grid = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1)
-    along = end - start
-    share = ((grid - start) @ along) / max(float(along @ along), 1e-9)
-    foot = start + np.clip(share, 0, 1)[..., None] * along
-    return np.asarray(np.linalg.norm(grid - foot, axis=-1))
-
-
-def cut_rings(outlines: Stack, pixel: float, settings: SliceSettings) -> Stack:
-    """Open each outline (N, I, J), mm, that closes round a hole; fine pixels of ``pixel`` mm.
-
-    The sheet is a ribbon: where it closes to a ring, turns touch. The cut follows the cheapest path
-    from the hole to the outside, through what is thin here and lies outside in the slices beside.
-    """
-    cut = outlines.copy()
-    for number in range(len(outlines)):
-        beside = [outlines[k] for k in (number - 1, number + 1) if 0 <= k < len(outlines)]
-        near = np.mean(beside, axis=0) if beside else np.zeros_like(outlines[0])
-        for _ in range(settings.max_fragments):
-            path = _way_out(cut[number], near, settings)
-            if path is None:
-                break
-            gap = pixel * ndimage.distance_transform_edt(~path)
-            cut[number] = np.minimum(cut[number], gap - settings.slit)
-    return cut
-
-
-def _way_out(outline: Stack, beside: Stack, settings: SliceSettings) -> Bool | None:
-    """Pixels of the cheapest path through the ribbon from its largest hole; None without holes."""
-    empty, count = ndimage.label(np.pad(outline <= 0, 1, constant_values=True))
-    if count == 1:
-        return None
-    sizes = piece_sizes(empty)
-    sizes[empty[0, 0]] = 0
-    outside, hole = empty == empty[0, 0], empty == sizes.argmax()
-    depth, height = np.pad(outline, 1), np.pad(beside, 1, mode="edge")
-    cost = settings.ring_length + np.maximum(depth, 0)
-    cost += settings.ring_beside * np.clip(height + settings.slit, 0, 1.5)
-    cost[outside | (empty > 0)] = settings.ring_length
-    nodes = np.arange(cost.size).reshape(cost.shape)
-    steps = []
-    for di, dj in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        first = nodes[: cost.shape[0] - di, max(-dj, 0) : cost.shape[1] - max(dj, 0)]
-        second = nodes[di:, max(dj, 0) : cost.shape[1] + min(dj, 0)]
-        length = np.hypot(di, dj) * 0.5 * (cost.ravel()[first] + cost.ravel()[second])
-        steps.append((first.ravel(), second.ravel(), length.ravel()))
-    first, second, length = (np.concatenate(part) for part in zip(*steps, strict=True))
-    graph = sparse.csr_array((length, (first, second)), shape=(cost.size,) * 2)
-    away, before, _ = csgraph.dijkstra(
-        graph,
-        directed=False,
-        indices=nodes[hole],
-        return_predecessors=True,
-        min_only=True,
-    )
-    at = int(nodes[outside][np.argmin(away[nodes[outside]])])
-    path = np.zeros(cost.size, dtype=bool)
-    while at >= 0:
-        path[at] = True
-        at = int(before[at])
-    return np.asarray(path.reshape(cost.shape)[1:-1, 1:-1])
 
 
 def register_slices(outlines: Stack, pixel: float, settings: SliceSettings) -> Stack:
@@ -314,7 +173,7 @@ class _SliceStack:
         distance = mixed(self.outlines, np.ones(len(level), dtype=bool))
         near = distance > -self.settings.edge
         medial, lateral = (mixed(images, near) for images in self.ends)
-        distance[near] = np.minimum(distance[near], _slit(medial, lateral, self.settings))
+        distance[near] = np.minimum(distance[near], keep_apart(medial, lateral, self.settings))
         return distance
 
     def _departure(self, below: Stack, share: Stack, middle: Stack) -> Stack:
@@ -332,13 +191,6 @@ class _SliceStack:
             weight = s * near**3 / 6 - (1 - s) * 0.5 * near**2 * (1 - near)
             departure += weight * np.stack([_interpolated(b, level, *middle) for b in self.bends])
         return departure
-
-
-def _slit(medial: Stack, lateral: Stack, settings: SliceSettings) -> Stack:
-    """Distance from a slit midway between the two ends of the ribbon, where both are near, mm."""
-    apart = 0.5 * np.abs(medial - lateral) - settings.slit
-    far = -np.minimum(medial, lateral) - settings.touch
-    return np.asarray(np.maximum(apart, far))
 
 
 def points_of_ends(body: Body) -> tuple[Float, Float]:
@@ -409,16 +261,21 @@ def _stacked(tissue: NDArray[np.uint8], pixel: float, settings: SliceSettings) -
     """Outline and align slices; a single one is taken twice."""
     if len(tissue) == 1:
         tissue = np.concatenate([tissue, tissue])
-    outlines = np.stack([outline_slice(image, pixel, settings) for image in tissue])
+    outlines = np.stack(
+        [
+            outline_slice(image, pixel, settings, list(tissue[max(n - 1, 0) : n + 2]))
+            for n, image in enumerate(tissue)
+        ]
+    )
     ends = np.array(
-        [[_part_distance(image, end, pixel, settings) for image in tissue] for end in _ENDS]
+        [[part_distance(image, end, pixel, settings) for image in tissue] for end in _ENDS]
     )
     fine = pixel / settings.upsampling
-    outlines = np.minimum(outlines, _slit(ends[0], ends[1], settings))
+    outlines = np.minimum(outlines, keep_apart(ends[0], ends[1], settings))
     outlines = cut_rings(outlines, fine, settings)
-    ranks = [_ranks(image, settings.upsampling) for image in tissue]
+    ranks = [ranks_of(image, settings.upsampling) for image in tissue]
     for outline, rank in zip(outlines, ranks, strict=True):
-        _drop_doubles(outline, rank, settings)
+        drop_doubles(outline, rank, settings)
     ribbons = [
         ribbon_nodes(outline, rank, fine, settings)
         for outline, rank in zip(outlines, ranks, strict=True)
@@ -434,28 +291,6 @@ def _stacked(tissue: NDArray[np.uint8], pixel: float, settings: SliceSettings) -
     bends = np.zeros((2, len(outlines), *flows.shape[2:]), dtype=np.float32)
     _align(flows, bends, align_nodes(ribbons, fine, settings), settings)
     return _SliceStack(outlines=outlines, ends=ends, flows=flows, bends=bends, settings=settings)
-
-
-def _drop_doubles(outline: Stack, rank: Float, settings: SliceSettings) -> None:
-    """Drop, in place, pieces of a slice (I, J) that have no subfield that the largest one lacks.
-
-    The ribbon has each subfield once: such a piece is the uncus, which passes beside the body.
-    """
-    pieces, count = ndimage.label(outline > 0)
-    if count < 2:  # noqa: PLR2004 -- one piece is the ribbon
-        return
-    main = int(piece_sizes(pieces).argmax())
-    known = np.unique(rank[(pieces == main) & np.isfinite(rank)])
-    for number in range(1, count + 1):
-        piece = pieces == number
-        if number != main and np.isin(rank[piece & np.isfinite(rank)], known).all():
-            outline[piece] = -settings.reach
-
-
-def _ranks(tissue: NDArray[np.uint8], upsampling: int) -> Float:
-    """How lateral each fine pixel's label is; NaN without a label."""
-    labels = np.kron(tissue, np.ones((upsampling,) * 2, dtype=np.uint8))
-    return np.where(labels > 0, lateral_rank(labels), np.nan)
 
 
 def _align(

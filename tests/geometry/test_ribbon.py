@@ -7,6 +7,7 @@ import pytest
 from geometry_cases import plain_body, straight_ends
 from scipy import ndimage
 
+from hipsta_bids.geometry.outlines import cut_rings, outline_slice
 from hipsta_bids.geometry.ribbon import (
     align_nodes,
     keep_whole,
@@ -15,7 +16,7 @@ from hipsta_bids.geometry.ribbon import (
     part_turns,
     ribbon_nodes,
 )
-from hipsta_bids.geometry.slices import cut_rings, outline_slice, sample_slices
+from hipsta_bids.geometry.slices import sample_slices
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import Settings
 

@@ -6,9 +6,9 @@ from geometry_cases import plain_body, solve_case, straight_ends
 from scipy import ndimage
 
 from hipsta_bids.geometry.measures import measure_thickness
+from hipsta_bids.geometry.outlines import outline_slice
 from hipsta_bids.geometry.slices import (
     has_thick_slices,
-    outline_slice,
     register_slices,
     sample_slices,
 )
@@ -73,6 +73,27 @@ def test_fragments_are_joined_if_near_and_next_in_order(gap, other, joined):
     tissue[20:26, 5:30] = Tissue.CA3 if other == Tissue.SUBICULUM else Tissue.CA2
     tissue[20:26, 30 + gap : 50] = other
     assert (ndimage.label(outline(tissue) > 0)[1] == 1) == joined
+
+
+@pytest.mark.parametrize(
+    ("medial", "lateral", "beside", "joined"),
+    [
+        (Tissue.CA1, Tissue.CA2, True, True),
+        (Tissue.CA1, Tissue.CA2, False, False),
+        (Tissue.CA1, Tissue.CA1, True, False),
+        (Tissue.SUBICULUM, Tissue.CA3, True, False),
+    ],
+    ids=["broken", "nothing beside", "no other subfield", "not next in order"],
+)
+def test_a_broken_ribbon_is_joined_where_a_slice_beside_shows_it(medial, lateral, beside, joined):
+    """2.4 mm wide; the uncus has no subfield that the ribbon lacks."""
+    tissue = np.zeros((60, 60), dtype=np.uint8)
+    tissue[20:26, 5:28] = medial
+    tissue[20:26, 34:50] = lateral
+    whole = tissue.copy()
+    whole[20:26, 28:34] = medial
+    found = outline_slice(tissue, PIXEL, SETTINGS, [whole if beside else tissue])
+    assert (ndimage.label(found > 0)[1] == 1) == joined
 
 
 def test_fragments_are_dropped_and_small_holes_filled():

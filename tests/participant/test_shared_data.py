@@ -18,6 +18,8 @@ from hipsta_bids.inputs.labels import read_label_volume
 from hipsta_bids.inputs.search import InputRequest, find_hemispheres
 from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.settings import Settings
+from hipsta_bids.validation.cases import measure_body
+from hipsta_bids.validation.damage import Site, make_defect
 
 DATA = Path(__file__).parents[2] / ".." / "shared" / "data" / "cobralab"
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="shared test data not found")
@@ -139,3 +141,15 @@ def test_the_mirror_image_has_the_same_map(hemi):
     np.testing.assert_allclose(mirrored.thickness, maps.thickness, atol=1e-6)
     back = mirrored.sheet.points * [-1.0, 1, 1]
     np.testing.assert_allclose(back, maps.sheet.points, atol=1e-5)
+
+
+def test_a_hole_beside_the_edge_moves_nothing_far_away():
+    """Cut to the edge instead of filled, it moved two fifths of the map without a flag."""
+    request = InputRequest(bids_dir=DATA, participant_labels=("01",), hemis=("L",))
+    (item,) = [item for item in find_hemispheres(request) if item.source == "freesurfer"]
+    volume = read_label_volume(item)
+    whole = measure_body(volume, "L")
+    damaged = make_defect(Site(volume, whole.sheet), "hole", 1.6, (0.2, 0.35)).volume
+    maps = measure_body(damaged, "L")
+    assert "large-repair" in {flag.reason for flag in maps.flags}
+    assert (np.abs(maps.thickness - whole.thickness) > 0.3).mean() < 0.03

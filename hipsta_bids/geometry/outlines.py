@@ -1,0 +1,219 @@
+"""The outline of the ribbon in single slices: joined where it is broken, cut where it closes."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, sparse
+from scipy.sparse import csgraph
+from scipy.special import ndtri
+
+from hipsta_bids.geometry.digital import piece_sizes
+from hipsta_bids.protocols.protocol import Tissue, lateral_rank
+from hipsta_bids.settings import SliceSettings
+from hipsta_bids.types import Bool, Float, Int
+
+Stack = NDArray[np.float32]
+"""Images, on fine pixels or on those of the segmentation."""
+
+_SHOWN = 0.2
+"""Share of the way across a gap that a slice beside shows as ribbon, where it is broken."""
+
+
+def outline_slice(
+    tissue: NDArray[np.uint8],
+    pixel: float,
+    settings: SliceSettings,
+    beside: Sequence[NDArray[np.uint8]] = (),
+) -> Stack:
+    """Signed distance, mm, from the ribbon's outline in a slice with pixels of ``pixel`` mm.
+
+    Where the ribbon is broken, the slices ``beside`` it show that.
+
+    It is sampled at finer pixels, positive inside, and clipped at the setting ``reach``. Across a
+    straight edge, a mask smoothed by a Gaussian is the normal distribution function of the distance
+    over sigma. Its inverse finds the outline between pixels; whole pixels would shift it by up to
+    half of one, which the smoothing of the working grid cannot undo along the slice.
+    """
+    block = np.ones((settings.upsampling,) * 2, dtype=np.uint8)
+    labels = np.kron(tissue, block)
+    if not labels.any():
+        return np.full(labels.shape, -settings.reach, dtype=np.float32)
+    fine = pixel / settings.upsampling
+    sigma = settings.smoothing * settings.upsampling
+    smooth = ndimage.gaussian_filter((labels > 0).astype(np.float64), sigma)
+    distance = _signed_distance(smooth > 0.5, fine)  # noqa: PLR2004 -- the outline
+    exact = sigma * fine * ndtri(np.clip(smooth, 1e-6, 1 - 1e-6))
+    distance = np.where(np.abs(distance) < sigma * fine, exact, distance)
+    ribbons = [np.kron(image, block) > 0 for image in beside]
+    ranks = ranks_of(tissue, settings.upsampling)
+    distance = _join(distance, ranks, ribbons, fine, settings)
+    return np.asarray(np.clip(distance, -settings.reach, settings.reach), dtype=np.float32)
+
+
+def part_distance(
+    tissue: NDArray[np.uint8], kinds: tuple[Tissue, ...], pixel: float, settings: SliceSettings
+) -> Stack:
+    """Signed distance, mm, from some subfields of a slice, accurate to a fine pixel."""
+    fine = np.kron(np.isin(tissue, kinds), np.ones((settings.upsampling,) * 2, dtype=bool))
+    distance = _signed_distance(fine, pixel / settings.upsampling)
+    return np.asarray(np.clip(distance, -settings.reach, settings.reach), dtype=np.float32)
+
+
+def _signed_distance(mask: Bool, pixel: float) -> Float:
+    """Distance from the border between pixels, mm, positive inside."""
+    if not mask.any():
+        return np.full(mask.shape, -np.inf)
+    inside = ndimage.distance_transform_edt(mask)
+    outside = ndimage.distance_transform_edt(~mask)
+    return np.asarray((np.maximum(inside - 0.5, 0) - np.maximum(outside - 0.5, 0)) * pixel)
+
+
+def _join(
+    distance: Float,
+    ranks: Float,
+    beside: Sequence[Bool],
+    pixel: float,
+    settings: SliceSettings,
+) -> Float:
+    """Join near pieces of a slice to the largest, drop fragments farther away, fill small holes.
+
+    A large piece farther away is left alone: only three dimensions show whether it belongs to the
+    ribbon, which may bend into the uncus. But where it has a subfield that the largest one lacks,
+    and a slice beside shows the ribbon between them, the ribbon is broken here.
+    """
+    for _ in range(settings.max_fragments):
+        pieces, count = ndimage.label(distance > 0)
+        if count < 2:  # noqa: PLR2004 -- one piece is the aim
+            break
+        sizes = piece_sizes(pieces) * pixel**2
+        largest = sizes.argmax()
+        main = pieces == largest
+        gap, nearest = ndimage.distance_transform_edt(~main, return_indices=True)
+        # The sheet is one ribbon: a fragment belongs to a neighbor in medial-to-lateral order,
+        # not to the part that happens to lie across the sulcus.
+        jump = np.abs(ranks - ranks[tuple(nearest)]) > settings.max_rank_jump
+        cost = pixel * gap + np.where(jump, settings.reach, 0)
+        lacked = np.unique(pieces[np.isfinite(ranks) & ~np.isin(ranks, ranks[main])])
+        found: list[tuple[float, int, Float | None]] = []
+        for number in range(1, count + 1):
+            if number == largest:
+                continue
+            place = np.unravel_index(np.where(pieces == number, cost, np.inf).argmin(), cost.shape)
+            start = np.array([axis[place] for axis in nearest])
+            way = pixel * _segment_distance(distance.shape, start, np.array(place))
+            broken = number in lacked and not jump[place] and _shown(way < pixel, beside)
+            limit = settings.max_break if broken else settings.max_gap
+            if cost[place] <= limit:
+                found.append((float(cost[place]), number, way))
+            elif sizes[number] < settings.crumb_area:
+                found.append((float(cost[place]), number, None))
+        if not found:
+            break
+        _, number, bridge = min(found, key=lambda item: item[0])
+        if bridge is None:
+            distance = np.where(pieces == number, -0.5 * pixel, distance)
+        else:
+            distance = np.maximum(distance, settings.bridge - bridge)
+    holes, _ = ndimage.label(distance <= 0)
+    area = np.bincount(holes.ravel()) * pixel**2
+    small = (area < settings.hole_area)[holes] & (distance <= 0)
+    return np.where(small, 0.5 * pixel, distance)
+
+
+def _shown(way: Bool, beside: Sequence[Bool]) -> bool:
+    """Whether any of the slices beside shows enough of the way as ribbon."""
+    return any(ribbon[way].mean() > _SHOWN for ribbon in beside)
+
+
+def _segment_distance(shape: tuple[int, ...], start: Int, end: Int) -> Float:
+    """Distance of each pixel from a segment, in pixels."""
+    grid = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1)
+    along = end - start
+    share = ((grid - start) @ along) / max(float(along @ along), 1e-9)
+    foot = start + np.clip(share, 0, 1)[..., None] * along
+    return np.asarray(np.linalg.norm(grid - foot, axis=-1))
+
+
+def cut_rings(outlines: Stack, pixel: float, settings: SliceSettings) -> Stack:
+    """Open each outline (N, I, J), mm, that closes round a hole; fine pixels of ``pixel`` mm.
+
+    The sheet is a ribbon: where it closes to a ring, turns touch. The cut follows the cheapest path
+    from the hole to the outside, through what is thin here and lies outside in the slices beside.
+    """
+    cut = outlines.copy()
+    for number in range(len(outlines)):
+        beside = [outlines[k] for k in (number - 1, number + 1) if 0 <= k < len(outlines)]
+        near = np.mean(beside, axis=0) if beside else np.zeros_like(outlines[0])
+        for _ in range(settings.max_fragments):
+            path = _way_out(cut[number], near, settings)
+            if path is None:
+                break
+            gap = pixel * ndimage.distance_transform_edt(~path)
+            cut[number] = np.minimum(cut[number], gap - settings.slit)
+    return cut
+
+
+def _way_out(outline: Stack, beside: Stack, settings: SliceSettings) -> Bool | None:
+    """Pixels of the cheapest path through the ribbon from its largest hole; None without holes."""
+    empty, count = ndimage.label(np.pad(outline <= 0, 1, constant_values=True))
+    if count == 1:
+        return None
+    sizes = piece_sizes(empty)
+    sizes[empty[0, 0]] = 0
+    outside, hole = empty == empty[0, 0], empty == sizes.argmax()
+    depth, height = np.pad(outline, 1), np.pad(beside, 1, mode="edge")
+    cost = settings.ring_length + np.maximum(depth, 0)
+    cost += settings.ring_beside * np.clip(height + settings.slit, 0, 1.5)
+    cost[outside | (empty > 0)] = settings.ring_length
+    nodes = np.arange(cost.size).reshape(cost.shape)
+    steps = []
+    for di, dj in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        first = nodes[: cost.shape[0] - di, max(-dj, 0) : cost.shape[1] - max(dj, 0)]
+        second = nodes[di:, max(dj, 0) : cost.shape[1] + min(dj, 0)]
+        length = np.hypot(di, dj) * 0.5 * (cost.ravel()[first] + cost.ravel()[second])
+        steps.append((first.ravel(), second.ravel(), length.ravel()))
+    first, second, length = (np.concatenate(part) for part in zip(*steps, strict=True))
+    graph = sparse.csr_array((length, (first, second)), shape=(cost.size,) * 2)
+    away, before, _ = csgraph.dijkstra(
+        graph,
+        directed=False,
+        indices=nodes[hole],
+        return_predecessors=True,
+        min_only=True,
+    )
+    at = int(nodes[outside][np.argmin(away[nodes[outside]])])
+    path = np.zeros(cost.size, dtype=bool)
+    while at >= 0:
+        path[at] = True
+        at = int(before[at])
+    return np.asarray(path.reshape(cost.shape)[1:-1, 1:-1])
+
+
+def drop_doubles(outline: Stack, rank: Float, settings: SliceSettings) -> None:
+    """Drop, in place, pieces of a slice (I, J) that have no subfield that the largest one lacks.
+
+    The ribbon has each subfield once: such a piece is the uncus, which passes beside the body.
+    """
+    pieces, count = ndimage.label(outline > 0)
+    if count < 2:  # noqa: PLR2004 -- one piece is the ribbon
+        return
+    main = int(piece_sizes(pieces).argmax())
+    known = np.unique(rank[(pieces == main) & np.isfinite(rank)])
+    for number in range(1, count + 1):
+        piece = pieces == number
+        if number != main and np.isin(rank[piece & np.isfinite(rank)], known).all():
+            outline[piece] = -settings.reach
+
+
+def ranks_of(tissue: NDArray[np.uint8], upsampling: int) -> Float:
+    """How lateral each fine pixel's label is; NaN without a label."""
+    labels = np.kron(tissue, np.ones((upsampling,) * 2, dtype=np.uint8))
+    return np.where(labels > 0, lateral_rank(labels), np.nan)
+
+
+def keep_apart(medial: Stack, lateral: Stack, settings: SliceSettings) -> Stack:
+    """Distance from a slit midway between the two ends of the ribbon, where both are near, mm."""
+    apart = 0.5 * np.abs(medial - lateral) - settings.slit
+    far = -np.minimum(medial, lateral) - settings.touch
+    return np.asarray(np.maximum(apart, far))
