@@ -136,7 +136,7 @@ def validate_parser() -> Parser:
     add(
         "--labels",
         "BIDS_DIR",
-        "a dataset with fine segmentations, to be measured in thick slices as well",
+        "a dataset with segmentations, to be measured as well, as is a folder hippunfold beside it",
         type=Path,
     )
     return parser

@@ -33,7 +33,8 @@ EDGE = 2
 #: What suites damage or reslice: a phantom, or a segmentation of a dataset.
 ValidationBody = PhantomSpec | HemisphereInput
 
-_MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
+#: (4, 4) mirror image across the plane between left and right, RAS mm.
+MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
 
 Key = TypeVar("Key", bound=Hashable)
 
@@ -105,14 +106,14 @@ def draw(phantom: Phantom, case: Case) -> LabelVolume:
         axes=case.axes,
         grid_rotation=case.grid_rotation,
     )
-    return replace(volume, affine=_MIRROR @ volume.affine) if case.mirrored else volume
+    return replace(volume, affine=MIRROR @ volume.affine) if case.mirrored else volume
 
 
 def compare(phantom: Phantom, case: Case, maps: HemisphereMaps) -> Measured:
     """Set maps beside the truth at the points where the mid-surface was found."""
     points = maps.sheet.points[:, :, maps.sheet.middle]
     if case.mirrored:
-        points = points * _MIRROR.diagonal()[:3]
+        points = points * MIRROR.diagonal()[:3]
     truth, inside = truth_at(phantom, points, hemi=case.hemi, pose=case.pose)
     names = (*CURVATURES, *GAUSSIAN_CURVATURES)
     return Measured(
@@ -169,6 +170,12 @@ def _motion(turn: Float, shift: Float) -> Float:
     motion = np.eye(4)
     motion[:3, :3], motion[:3, 3] = turn, shift
     return motion
+
+
+def hippunfold_beside(labels: Path) -> list[Path]:
+    """Look for a folder ``hippunfold`` with outputs of that program beside a dataset."""
+    folder = labels.absolute().parent / "hippunfold"
+    return [folder] if folder.is_dir() else []
 
 
 def fine_segmentations(labels: Path, largest: float) -> list[HemisphereInput]:

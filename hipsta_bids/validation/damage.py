@@ -348,6 +348,62 @@ def _ends_flush(site: Site, size: float, position: Position) -> Defect:
     return site.erased(np.isin(site.volume.part, (Part.HEAD, Part.TAIL)))
 
 
+def _vessel(site: Site, size: float, position: Position) -> Defect:
+    """Leave a tube along 6 mm of the inner wall without a label; size is its radius."""
+    half = 3.0 / site.length
+    steps = np.linspace(max(position[1] - half, 0.0), min(position[1] + half, 1.0), 41)
+    line = np.array([site.column((position[0], v))[0] for v in steps])
+    return site.erased(site.within(line, size) & (site.volume.tissue > 0))
+
+
+def _cyst(site: Site, size: float, position: Position) -> Defect:
+    """Leave a ball at the inner wall without a label; size is its radius."""
+    middle = site.column(position)[:1]
+    return site.erased(site.within(middle, size) & (site.volume.tissue > 0))
+
+
+def _stratum(site: Site, size: float, position: Position) -> Defect:
+    """Leave the molecular layer within 0.15 of u without a label; size is its length, mm."""
+    near = site.among(np.abs(site.sheet_position[:, 0] - position[0]) < 0.15)  # noqa: PLR2004
+    layer = site.volume.tissue == Tissue.MOLECULAR_LAYER
+    return site.erased(near & layer & site.slab(position, size))
+
+
+def _ragged_end(site: Site, size: float, position: Position) -> Defect:
+    """Let the tail label reach into the body within 0.15 of u; size is how far, mm."""
+    u, v = site.sheet_position.T
+    inside = site.v[tuple(site.voxels.T)] > 0
+    tongue = (np.abs(u - position[0]) < 0.15) & inside & (v * site.length < size)  # noqa: PLR2004
+    return site.relabeled(site.among(tongue), Tissue.HIPPOCAMPUS, Part.TAIL)
+
+
+def _uncus(site: Site, size: float, position: Position, *, bridge: float) -> Defect:
+    """Add CA2/3 medially of the front, joined by CA1 over ``bridge`` mm; size is its reach, mm.
+
+    A round bar 3 mm thick, from 2 mm before the anterior end to ``size`` behind it.
+    """
+    del position
+    medial, front = (site.column((u, 1.0)).mean(axis=0) for u in (0.0, 0.5))
+    away = medial - front
+    away -= (away @ site.axis) * site.axis
+    away /= np.linalg.norm(away)
+    offset = site.points - medial - 4.0 * away
+    along = offset @ site.axis
+    across = offset - along[..., None] * site.axis
+    inward = -across @ away
+    free = (along > -size) & (along < 2.0) & (site.volume.tissue == 0)  # noqa: PLR2004
+    bar = free & (np.linalg.norm(across, axis=-1) < 1.5)  # noqa: PLR2004
+    beside = np.linalg.norm(across + inward[..., None] * away, axis=-1)
+    joined = free & ~bar & (beside < 1.0) & (inward > 0) & (inward < bridge)
+    part = np.where(along > 0, np.uint8(Part.HEAD), np.uint8(Part.BODY))
+    old, both = site.volume, bar | joined
+    tissue = np.where(
+        bar, np.uint8(Tissue.CA2_3), np.where(joined, np.uint8(Tissue.CA1), old.tissue)
+    )
+    volume = replace(old, tissue=tissue, part=np.where(both, part, old.part))
+    return Defect(volume=volume, changed=site.points[both])
+
+
 #: Functions by kind of damage; their docstrings say what the size means.
 DEFECTS: Mapping[str, Callable[[Site, float, Position], Defect]] = MappingProxyType(
     {
@@ -374,5 +430,11 @@ DEFECTS: Mapping[str, Callable[[Site, float, Position], Defect]] = MappingProxyT
         "pits": _pits,
         "rim-notch": _rim_notch,
         "relabeled-tip": _relabeled_tip,
+        "vessel": _vessel,
+        "cyst": _cyst,
+        "stratum": _stratum,
+        "ragged-end": _ragged_end,
+        "uncus": partial(_uncus, bridge=0.0),
+        "attached-uncus": partial(_uncus, bridge=3.8),
     }
 )

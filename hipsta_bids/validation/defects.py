@@ -167,12 +167,13 @@ def run(full: bool, labels: Path | None = None) -> Suite:
 def measure_trial(trial: Trial) -> Damage:
     """Measure one damaged body and compare it with the undamaged one."""
     _, hemi, reference = measure_reference(trial.body, VOXEL)
-    defect = make_defect(_site(trial.body), trial.kind, trial.size, trial.position)
+    defect = make_defect(site_of(trial.body), trial.kind, trial.size, trial.position)
     return compare(measure_body(defect.volume, hemi), reference, defect.changed)
 
 
 @lru_cache(maxsize=2)
-def _site(body: ValidationBody) -> Site:
+def site_of(body: ValidationBody) -> Site:
+    """Measure a body as it is, to damage it; the cases of one body should follow each other."""
     volume, _, reference = measure_reference(body, VOXEL)
     return Site(volume, reference.sheet)
 

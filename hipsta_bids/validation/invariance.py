@@ -1,19 +1,28 @@
 """What may not change a map: where the subject lies, and how voxels are stored."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hipsta_bids.inputs.labels import read_label_volume
+from hipsta_bids.inputs.search import HemisphereInput
 from hipsta_bids.phantom import PhantomSpec
-from hipsta_bids.types import Float
+from hipsta_bids.types import Float, LabelVolume
 from hipsta_bids.validation.cases import (
+    MIRROR,
     Case,
     Measured,
     Refusal,
     any_pose,
+    fine_segmentations,
+    measure_body,
     measure_case,
     random_motion,
+    refusal_notes,
+    run_cases,
     run_groups,
 )
 from hipsta_bids.validation.report import Cell, Cells, Picture, Suite, Table, show_map
@@ -32,6 +41,11 @@ MAX_POINTWISE_SD = 0.05
 MAX_CHANGE = 0.02
 """mm, mean absolute change where the voxels are the same and only their form is another."""
 
+MAX_RMS = 0.03
+"""mm, root mean square change of the map of a real hemisphere in another form."""
+FINE = 0.6
+"""mm; segmentations without a longer edge are measured."""
+
 AXES = ("RAS", "PIR", "ASL")
 """Orders and directions of voxel axes that are compared with LIA."""
 
@@ -40,8 +54,8 @@ SPEC = PhantomSpec(kind="spiral", thickness=2.0, variation=0.15)
 MOTIONS = {"any rotation": random_motion, "up to 25° about each axis": any_pose}
 
 
-def run(full: bool) -> Suite:
-    """Measure one phantom in many positions, and pairs of equal voxels in different form."""
+def run(full: bool, labels: Path | None = None) -> Suite:
+    """Measure a phantom in many positions, and equal voxels, also real ones, in another form."""
     count, pairs = (MOTIONS_FULL, PAIRS_FULL) if full else (MOTIONS_QUICK, PAIRS_QUICK)
     cases = {}
     for number, (name, motion) in enumerate(MOTIONS.items()):
@@ -49,13 +63,17 @@ def run(full: bool) -> Suite:
         cases[name] = [Case(spec=SPEC, pose=motion(generator)) for _ in range(count)]
     results = run_groups(measure_case, cases | {f"pair {n}": _pair(n) for n in range(pairs)})
     motions = {name: results[name] for name in MOTIONS}
+    real = fine_segmentations(labels, FINE) if labels else []
+    real = real if full else real[:1]
     return Suite(
         name="invariance",
         title="Invariance",
-        text=_TEXT,
+        text=_TEXT.strip()
+        + ("" if labels else " Real labels were left out: they need `--labels`."),
         tables=(
             _motion_table(motions),
             _pair_table([results[f"pair {number}"] for number in range(pairs)]),
+            *([_real_table(run_cases(measure_forms, real))] if labels else ()),
         ),
         pictures=(_picture(motions),),
     )
@@ -69,6 +87,51 @@ def _pair(number: int) -> list[Case]:
         Case(spec=SPEC, pose=pose, mirrored=True),
         *(Case(spec=SPEC, pose=pose, axes=axes) for axes in AXES),
     ]
+
+
+def measure_forms(item: HemisphereInput) -> tuple[float, float]:
+    """RMS change of a segmentation's map, mm: as its mirror image, and stored in another order."""
+    volume = read_label_volume(item)
+    flip = np.diag([-1.0, -1.0, -1.0, 1.0])
+    flip[:3, 3] = np.array(volume.tissue.shape) - 1
+    order = np.eye(4)[[1, 2, 0, 3]]  # the old index of a new one: new axes are 1, 2 and 0
+    tissue, part = (np.flip(v).transpose(1, 2, 0) for v in (volume.tissue, volume.part))
+    stored = LabelVolume(
+        tissue=tissue,
+        part=part,
+        affine=volume.affine @ flip @ order.T,
+        protocol=volume.protocol,
+    )
+    mirrored = replace(volume, affine=MIRROR @ volume.affine)
+    reference = measure_body(volume, item.hemi).thickness
+    other = "LR"[item.hemi == "L"]
+    maps = measure_body(mirrored, other).thickness, measure_body(stored, item.hemi).thickness
+    first, second = (float(np.sqrt(((map_ - reference) ** 2).mean())) for map_ in maps)
+    return first, second
+
+
+def _real_table(results: Sequence[tuple[float, float] | Refusal]) -> Table:
+    measured = [result for result in results if not isinstance(result, Refusal)]
+    rows: list[Cells] = []
+    for column, form in enumerate(("mirror image", "voxels in another order")):
+        change = np.array([result[column] for result in measured] or [np.nan])
+        met = len(measured) == len(results) and bool(change.max() <= MAX_RMS)
+        rows.append(
+            {
+                "form": form,
+                "hemispheres": len(results),
+                "RMS, mean": f"{change.mean():.5f}",
+                "RMS, largest": f"{change.max():.5f}",
+                "target, largest": f"≤ {MAX_RMS:g}",
+                "met": met,
+            }
+        )
+    return Table(
+        title="Real labels in another form: change of thickness, mm",
+        rows=rows,
+        notes="A mirror image has to be measured as the other side; the order of voxels is that "
+        "of other axes, all of them backward." + refusal_notes({"labels": results}),
+    )
 
 
 def _maps(group: Sequence[Measured | Refusal]) -> Float | None:
@@ -154,5 +217,6 @@ _TEXT = """\
 One spiral of 2.0 mm ± 15 % in voxels of 0.4 mm. First in random positions: the phantom moves and
 the grid stays, so that every position gives other voxels. Motions are uniform over all rotations
 with shifts of up to 20 mm, and, as subjects lie in a scanner, of up to 25° and 2 mm. Then the very
-same voxels mirrored (a left hemisphere becomes a right one) and stored in another order.
+same voxels mirrored (a left hemisphere becomes a right one) and stored in another order; so, too,
+real labels.
 """

@@ -26,6 +26,7 @@ from hipsta_bids.validation.cases import (
     Refusal,
     ValidationBody,
     attempt,
+    hippunfold_beside,
     load_body,
     measure_body,
     refusal_notes,
@@ -158,8 +159,7 @@ def find_bodies(labels: Path | None) -> list[ValidationBody]:
     if labels is None:
         kinds = (("spiral", 2.0), ("tight", 1.6), ("arc", 1.4))
         return [PhantomSpec(kind=k, thickness=t, variation=0.3) for k, t in kinds]
-    beside = labels.parent / "hippunfold"
-    folders = [labels, *([beside] if beside.is_dir() else [])]
+    folders = [labels, *hippunfold_beside(labels)]
     found = [item for path in folders for item in find_hemispheres(InputRequest(bids_dir=path))]
     return [item for item in found if item.problem is None]
 

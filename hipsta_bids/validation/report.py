@@ -26,18 +26,32 @@ SUITES: Mapping[str, str] = MappingProxyType(
         "accuracy": "accuracy:run",
         "limits": "accuracy:run_limits",
         "slices": "thick_slices:run",
+        "ends": "ends:run",
         "convergence": "accuracy:run_convergence",
         "invariance": "invariance:run",
         "uncertainty": "uncertainty:run",
+        "mending": "mending:run",
         "defects": "defects:run",
         "population": "population:run",
         "group": "group:run",
         "surrogate": "surrogate:run",
+        "hippunfold": "hippunfold:run",
     }
 )
 
 #: Suites that measure real segmentations too, where there are any.
-WITH_LABELS = frozenset({"defects", "population", "slices", "surrogate"})
+WITH_LABELS = frozenset(
+    {
+        "defects",
+        "ends",
+        "hippunfold",
+        "invariance",
+        "mending",
+        "population",
+        "slices",
+        "surrogate",
+    }
+)
 
 #: What is written, below the output folder.
 PAGE = "validation.md"
@@ -176,7 +190,7 @@ def page(suites: Sequence[Suite], *, full: bool, labels: bool = False) -> str:
             "missed": table.missed,
         }
         for suite in suites
-        for table in suite.tables
+        for table in suite.tables or (Table(title="left out", rows=()),)
     ]
     intro = (
         f"Written by `{command}` of hipsta_bids {__version__} ({libraries}). The same command"

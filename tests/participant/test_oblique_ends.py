@@ -11,9 +11,10 @@ from hipsta_bids.geometry.digital import to_ras
 from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.protocols.load import load_protocol
-from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import BodySettings, Settings
 from hipsta_bids.types import Status
+from hipsta_bids.validation.damage import Site, make_defect
+from hipsta_bids.validation.ends import cut_obliquely
 
 PHANTOM = Phantom(PhantomSpec(kind="arc", thickness=2.0, length=18.0, end_length=4.0))
 
@@ -25,19 +26,7 @@ def volume():
 
 def cut(volume, degrees, about):
     """Labels whose head and tail begin at planes that are tilted about a direction of the sheet."""
-    points = to_ras(np.moveaxis(np.indices(volume.tissue.shape), 0, -1), volume.affine)
-    first, last = (PHANTOM.body.place(0.5, v, 0.0) for v in (0.2, 0.8))
-    axis = (last - first) / np.linalg.norm(last - first)
-    across = PHANTOM.body.place(0.5, 0.5, 1.0) - PHANTOM.body.place(0.5, 0.5, -1.0)
-    across -= axis * (across @ axis)
-    across /= np.linalg.norm(across)
-    lean = across if about == "width" else np.cross(axis, across)
-    normal = np.cos(np.deg2rad(degrees)) * axis + np.sin(np.deg2rad(degrees)) * lean
-    below, above = (points - first) @ normal < 0, (points - last) @ normal > 0
-    part = np.where(below, Part.TAIL, np.where(above, Part.HEAD, Part.BODY))
-    labeled = (volume.tissue > 0) & (volume.tissue < Tissue.HIPPOCAMPUS)
-    tissue = np.where(labeled & below, Tissue.HIPPOCAMPUS, volume.tissue)
-    return replace(volume, tissue=tissue, part=np.where(tissue > 0, part, 0))
+    return cut_obliquely(PHANTOM, volume, degrees, about)
 
 
 def measure(volume):
@@ -55,7 +44,7 @@ def test_rows_at_oblique_planes_are_as_thick_as_others(volume, degrees, about):
     assert np.abs(maps.thickness - 2.0).max() < 0.25
 
 
-def test_rows_begin_and_end_at_the_planes(volume):
+def test_rows_begin_and_end_at_the_planes(volume, plain):
     tilted = cut(volume, 25, "thickness")
     maps = measure(tilted)
     for row, end in ((0, "posterior"), (-1, "anterior")):
@@ -64,38 +53,22 @@ def test_rows_begin_and_end_at_the_planes(volume):
         height = (middle - plane["point_ras_mm"]) @ np.array(plane["normal_ras"])
         assert np.abs(height).max() < 0.15
     # The volume is that between the planes, wherever the mesh ends.
-    straight = measure(cut(volume, 0, "width"))
-    assert maps.summary["volume"] == pytest.approx(straight.summary["volume"], rel=0.01)
+    assert maps.summary["volume"] == pytest.approx(plain.summary["volume"], rel=0.01)
 
 
-def with_uncus(whole, bridge=0.0):
-    """Add a piece of CA2/3 medially of the body at its front, with CA1 towards the body (mm)."""
-    points = to_ras(np.moveaxis(np.indices(whole.tissue.shape), 0, -1), whole.affine)
-    front = PHANTOM.body.place(0.5, 0.8, 0.0)
-    medial = PHANTOM.body.place(0.0, 0.8, 0.0)
-    away = (medial - front) / np.linalg.norm(medial - front)
-    center = medial + 3.5 * away
-    axis = PHANTOM.body.place(0.5, 0.8, 0.0) - PHANTOM.body.place(0.5, 0.7, 0.0)
-    axis /= np.linalg.norm(axis)
-    along = (points - center) @ axis
-    aside = np.linalg.norm(points - center - along[..., None] * axis, axis=-1)
-    free = (np.abs(along) < 1.8) & (whole.tissue == 0)
-    piece = free & (aside < 1.5)
-    inward = (center - points) @ away
-    off = np.linalg.norm(
-        points - center - along[..., None] * axis + inward[..., None] * away, axis=-1
-    )
-    joined = free & ~piece & (off < 1.0) & (inward > 0) & (inward < bridge)
-    tissue = np.where(piece, np.uint8(Tissue.CA2_3), whole.tissue)
-    tissue = np.where(joined, np.uint8(Tissue.CA1), tissue)
-    both = piece | joined
-    part = np.where(both & (along > 0), Part.HEAD, np.where(both, Part.BODY, whole.part))
-    return replace(whole, tissue=tissue, part=part)
+@pytest.fixture(scope="module")
+def plain(volume):
+    """Maps between straight end planes."""
+    return measure(cut(volume, 0, "width"))
 
 
-def test_an_uncus_is_left_out_and_named(volume):
-    whole = cut(volume, 0, "width")
-    maps, plain = measure(with_uncus(whole)), measure(whole)
+def with_uncus(whole, plain, kind="uncus"):
+    """Add a piece of CA2/3 medially of the body at its front."""
+    return make_defect(Site(whole, plain.sheet), kind, 1.8).volume
+
+
+def test_an_uncus_is_left_out_and_named(volume, plain):
+    maps = measure(with_uncus(cut(volume, 0, "width"), plain))
     assert maps.status == Status.REPAIRED
     (repair,) = maps.repairs
     assert repair.startswith("left out the uncus")
@@ -103,9 +76,10 @@ def test_an_uncus_is_left_out_and_named(volume):
     assert maps.qc["changed_fraction"] == 0
 
 
-def test_what_goes_with_an_uncus_does_not_depend_on_the_order_of_voxels(volume):
-    attached = with_uncus(cut(volume, 0, "width"), bridge=3.5)
-    detached = extract_body(with_uncus(cut(volume, 0, "width")), BodySettings()).uncus
+def test_what_goes_with_an_uncus_does_not_depend_on_the_order_of_voxels(volume, plain):
+    whole = cut(volume, 0, "width")
+    attached = with_uncus(whole, plain, "attached-uncus")
+    detached = extract_body(with_uncus(whole, plain), BodySettings()).uncus
     found = []
     for flips in ((), (0,), (1,), (2,), (0, 1, 2)):
         affine = attached.affine.copy()

@@ -2,6 +2,7 @@
 
 import struct
 import sys
+from inspect import signature
 from types import SimpleNamespace
 
 import pytest
@@ -10,6 +11,7 @@ from hipsta_bids.cli import main
 from hipsta_bids.errors import ExitCode
 from hipsta_bids.validation.report import (
     SUITES,
+    WITH_LABELS,
     Picture,
     Suite,
     Table,
@@ -132,7 +134,8 @@ def test_every_suite_can_be_imported(name):
     from importlib import import_module  # noqa: PLC0415
 
     module, function = SUITES[name].split(":")
-    assert callable(getattr(import_module(f"hipsta_bids.validation.{module}"), function))
+    run = getattr(import_module(f"hipsta_bids.validation.{module}"), function)
+    assert len(signature(run).parameters) == 1 + (name in WITH_LABELS)
 
 
 @pytest.mark.usefixtures("one_suite")

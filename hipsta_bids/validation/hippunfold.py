@@ -1,0 +1,222 @@
+"""Thickness of HippUnfold's labels beside HippUnfold's own, and beside walls that it drew."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import nibabel as nib
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from hipsta_bids.geometry.digital import to_ras
+from hipsta_bids.inputs.labels import read_label_volume
+from hipsta_bids.inputs.search import HemisphereInput, InputRequest, find_hemispheres
+from hipsta_bids.protocols.load import load_protocol
+from hipsta_bids.protocols.protocol import translate
+from hipsta_bids.types import Float, HemisphereMaps, LabelVolume
+from hipsta_bids.validation.cases import Refusal, hippunfold_beside, measure_body, run_cases
+from hipsta_bids.validation.report import Cell, Cells, Suite, Table
+
+VOXEL = 0.4
+"""mm, of labels that are drawn from surfaces: fine enough for walls of 1.5 mm."""
+LAST = 4
+"""HippUnfold's code of CA3, the last subfield of the sheet; what lies in it has higher ones."""
+MAX_SD, LEAST_CORRELATION = 0.09, 0.93
+"""mm; of a person's two maps of thickness."""
+MAX_BIAS = 0.03
+"""mm, against known walls."""
+_ROUNDING = 1e-6
+"""Of barycentric coordinates: what lies on the face of two tetrahedra belongs to one at least."""
+_INNER = (slice(4, -4), slice(2, -2))
+"""Nodes away from the edges, 65 % of all."""
+
+
+Codes = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Pair:
+    """One hemisphere measured twice."""
+
+    maps: HemisphereMaps
+    """Ours."""
+    theirs: Float
+    """(Nx, Ny) HippUnfold's thickness where our mid-surface is, mm."""
+
+
+def run(full: bool, labels: Path | None = None) -> Suite:
+    """Measure HippUnfold's labels, and labels that are drawn between its surfaces."""
+    folders = hippunfold_beside(labels) if labels else []
+    persons: list[HemisphereInput] = []
+    templates: list[tuple[Path, str]] = []
+    for folder in folders:
+        found = find_hemispheres(InputRequest(bids_dir=folder))
+        persons += [item for item in found if item.problem is None]
+        templates += [(path, h) for path in sorted(folder.glob("templates/tpl-*")) for h in "LR"]
+    persons, templates = (persons, templates) if full else (persons[:1], [])
+    if not persons:
+        return Suite(name="hippunfold", title="HippUnfold", text=_LEFT_OUT)
+    known = run_cases(measure_template, templates, timeout=120.0)
+    own = run_cases(measure_person, persons)
+    rows = [
+        *(_row(f"{p.subject} {p.hemi}", OWN, r) for p, r in zip(persons, own, strict=True)),
+        *(
+            _row(f"{path.name.removeprefix('tpl-')} {hemi}", DRAWN, r)
+            for (path, hemi), r in zip(templates, known, strict=True)
+        ),
+    ]
+    return Suite(
+        name="hippunfold",
+        title="HippUnfold",
+        text=_TEXT,
+        tables=(Table(title="Thickness against HippUnfold's own, mm", rows=rows, notes=_NOTES),),
+    )
+
+
+def measure_person(item: HemisphereInput) -> Pair:
+    """Measure a person's labels; HippUnfold's own thickness is in ``surf`` beside their folder."""
+    name = str(item.files[0].parent.parent / f"surf/*_hemi-{item.hemi}_*_label-hipp_")
+    subfield = _values(f"{name}*subfields.label.gii")
+    points = _values(f"{name}midthickness.surf.gii", "pointset")[subfield <= LAST]
+    thickness = _values(f"{name}thickness.shape.gii")[subfield <= LAST]
+    return _pair(measure_body(read_label_volume(item), item.hemi), points, thickness)
+
+
+def measure_template(case: tuple[Path, str]) -> Pair:
+    """Measure labels that are drawn between a template's walls."""
+    volume, points, thickness = draw_template(*case)
+    return _pair(measure_body(volume, case[1]), points, thickness)
+
+
+def _values(pattern: str, kind: str | None = None) -> Float:
+    """Read the data of the one GIFTI file that a pattern fits, of one intent or of all."""
+    (path,) = Path("/").glob(pattern.removeprefix("/"))
+    return np.asarray(nib.GiftiImage.from_filename(path).agg_data(kind), dtype=np.float64)
+
+
+def _pair(maps: HemisphereMaps, points: Float, thickness: Float) -> Pair:
+    """Take thickness at the one of (N, 3) vertices that is nearest to each mid-surface node."""
+    middle = maps.sheet.points[:, :, maps.sheet.middle]
+    nearest = cKDTree(points).query(middle.reshape(-1, 3))[1]
+    return Pair(maps=maps, theirs=thickness[nearest].reshape(maps.thickness.shape))
+
+
+def draw_template(folder: Path, hemi: str) -> tuple[LabelVolume, Float, Float]:
+    """Draw labels between a template's walls.
+
+    Also the vertices (N, 3) of its sheet, RAS mm, and their thickness (N,), mm: the distance of
+    corresponding vertices. What lies within the sheet keeps the template's own labels.
+    """
+    name = str(folder / f"*_hemi-{hemi}_*_label-hipp_")
+    inner, outer, middle = (
+        _values(f"{name}{wall}.surf.gii", "pointset") for wall in ("inner", "outer", "midthickness")
+    )
+    triangles = _values(f"{name}midthickness.surf.gii", "triangle").astype(np.intp)
+    subfield = _values(str(folder.parent / f"hemi-{hemi}_*subfields.label.gii")).astype(np.intp)
+    low = np.floor(np.minimum(inner, outer).min(axis=0) / VOXEL) * VOXEL - 4.0
+    room = (np.maximum(inner, outer).max(axis=0) + 4.0 - low) / VOXEL
+    shape = tuple(int(n) for n in np.ceil(room))
+    affine = np.diag([VOXEL, VOXEL, VOXEL, 1.0])
+    affine[:3, 3] = low
+    codes = _codes_within(next(folder.glob(f"*_hemi-{hemi}_*_dseg.nii.gz")), shape, affine)
+    # A prism between two corresponding triangles is three tetrahedra.
+    a, b, c = triangles.T
+    for corners in (
+        (inner[a], inner[b], inner[c], outer[c]),
+        (inner[a], inner[b], outer[c], outer[b]),
+        (inner[a], outer[b], outer[c], outer[a]),
+    ):
+        _fill(codes, (np.stack(corners, axis=1) - low) / VOXEL, subfield[triangles[:, 0]])
+    protocol = load_protocol("hippunfold")
+    tissue, part = translate(codes, protocol)
+    volume = LabelVolume(tissue=tissue, part=part, affine=affine, protocol=protocol)
+    sheet = subfield <= LAST
+    return volume, middle[sheet], np.linalg.norm(outer - inner, axis=1)[sheet]
+
+
+def _codes_within(path: Path, shape: tuple[int, ...], affine: Float) -> Codes:
+    """Codes of what lies within the sheet, from a label file, on another grid; 0 elsewhere."""
+    image = nib.Nifti1Image.from_filename(path)
+    place = np.moveaxis(np.indices(shape), 0, -1)
+    voxel = np.rint(to_ras(place, np.linalg.inv(image.affine) @ affine)).astype(int)
+    held = ((voxel >= 0) & (voxel < image.shape)).all(axis=-1)
+    codes = np.zeros(shape, dtype=np.intp)
+    codes[held] = np.asarray(image.dataobj)[tuple(voxel[held].T)]
+    return np.where(codes > LAST, codes, 0)
+
+
+def _fill(codes: Codes, tetra: Float, values: Codes) -> None:
+    """Write values (N,) into the voxels whose centers lie in tetrahedra (N, 4, 3), in voxels."""
+    first = np.ceil(tetra.min(axis=1)).astype(int)
+    count = np.floor(tetra.max(axis=1)).astype(int) - first + 1
+    edges = np.swapaxes(tetra[:, 1:] - tetra[:, :1], 1, 2)
+    inverse = np.linalg.inv(edges + 1e-9 * np.eye(3))  # some are flat
+    for step in np.ndindex(*count.max(axis=0)):
+        near = np.flatnonzero((np.array(step) < count).all(axis=1))
+        at = first[near] + step
+        weight = np.einsum("nij,nj->ni", inverse[near], at - tetra[near, 0])
+        inside = (weight >= -_ROUNDING).all(axis=1) & (weight.sum(axis=1) <= 1 + _ROUNDING)
+        codes[tuple(at[inside].T)] = values[near[inside]]
+
+
+def _row(name: str, walls: str, result: Pair | Refusal) -> Cells:
+    """Compare two maps; of a person by SD and correlation, of a template by the mean."""
+    cells: dict[str, Cell] = {"hemisphere": name, "labels": walls}
+    met = False
+    if isinstance(result, Pair):
+        ours, theirs = result.maps.thickness, result.theirs
+        both = [_two(ours[part], theirs[part]) for part in ((slice(None),) * 2, _INNER)]
+        bias = float((ours - theirs).mean())
+        of_rows = (ours - theirs).mean(axis=0)
+        met = (
+            abs(bias) <= MAX_BIAS
+            if walls == DRAWN
+            else both[0][0] <= MAX_SD and both[0][1] >= LEAST_CORRELATION
+        )
+        outer = (ours - theirs - bias) ** 2
+        cells |= {
+            "bias": f"{bias:+.3f}",
+            "SD": both[0][0],
+            "r": both[0][1],
+            "SD, inner nodes": both[1][0],
+            "r, inner nodes": both[1][1],
+            "variance in outer nodes": f"{1 - outer[_INNER].sum() / outer.sum():.0%}",
+            "posterior row": f"{of_rows[0]:+.2f}",
+        }
+    cells["target"] = _TARGETS[walls]
+    return {**cells, "met": met}
+
+
+def _two(ours: Float, theirs: Float) -> tuple[float, float]:
+    """SD of the difference, mm, and correlation."""
+    return float((ours - theirs).std()), float(np.corrcoef(ours.ravel(), theirs.ravel())[0, 1])
+
+
+OWN, DRAWN = "HippUnfold's", "between its walls"
+_TARGETS = {
+    OWN: f"SD ≤ {MAX_SD:g}, r ≥ {LEAST_CORRELATION:g}",
+    DRAWN: f"bias within {MAX_BIAS:g}",
+}
+
+_LEFT_OUT = """\
+Left out: it needs `--labels DIR` and, beside DIR, a folder `hippunfold` with outputs of that
+program (its labels, and its surfaces in `surf`).
+"""
+
+_TEXT = """\
+HippUnfold (DeKraker et al. 2022) has a thickness of its own: the distance of its inner and its
+outer surface. A person's labels are measured, and compared with it node by node. Of templates,
+whose two surfaces are known, labels are drawn between these in voxels of 0.4 mm: then the walls
+are the same.
+"""
+
+_NOTES = """\
+Of each node of our mid-surface and the nearest vertex of HippUnfold's. Inner nodes: without the
+outer 4 on each side along x and the outer 2 along y, 65 % of all; what the other 35 % have of the
+variance of the difference is told beside it. A person's labels are thicker than HippUnfold's
+thickness, since its walls lie inside its labels: between walls that are known, the bias is gone. So
+the two must not be pooled. SD and correlation of a person miss their targets at the edges: most of
+the variance is there, and among inner nodes the correlation comes near to its target or meets it.
+Between HippUnfold's own walls they miss them at the edges as well, where the nearest vertex is not
+on the same line across the wall.
+"""
