@@ -1,50 +1,88 @@
-# See docs/containers.md for how to build, run and test it.
-ARG BASE_IMAGE=python:3.11-slim-bookworm
+# tools/build-image builds it with all labels: see docs/containers.md.
+# The base is the whole reference: --build-arg BASE_IMAGE=python:3.11-slim-bookworm takes today's.
+ARG BASE_IMAGE=python:3.11-slim-bookworm@sha256:a36c24f9cbdf4fd0f52d67f0823eeac19c2028c637cecc392d97f980d4fec56b
+# Written into datasets and descriptors: the image, and where its code is.
+ARG IMAGE=hipsta_bids:0.1.0
+ARG CODE_URL=
 
-FROM ${BASE_IMAGE} AS build
+# Packages, which change less often than the program: nothing here depends on its code.
+FROM ${BASE_IMAGE} AS packages
 SHELL ["/bin/sh", "-euxc"]
 # For a mirror: docker build --build-arg PIP_INDEX_URL=...
 ARG PIP_INDEX_URL
 ENV PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_CACHE_DIR=1 PIP_NO_COMPILE=1 PIP_ROOT_USER_ACTION=ignore
 WORKDIR /build
-
-# Packages first: they change less often than the program. The lock's only package without a wheel is
-# built by the setuptools of the lock for development, so that nothing comes unchecked.
+# The lock's only package without a wheel is built by the setuptools of the lock for development, so
+# that nothing comes unchecked.
 COPY requirements.lock requirements-dev.lock ./
 RUN python -m venv /opt/hipsta_bids; \
     sed -n '/^setuptools==/,/# via/p' requirements-dev.lock > build.lock; \
     /opt/hipsta_bids/bin/pip install --require-hashes -r build.lock; \
-    /opt/hipsta_bids/bin/pip install --require-hashes --no-build-isolation --use-pep517 -r requirements.lock; \
-    find /opt/hipsta_bids -type d -name tests -prune -exec rm -r {} +
+    /opt/hipsta_bids/bin/pip install --require-hashes --no-build-isolation --use-pep517 -r requirements.lock
 
-COPY . .
-# Plotly (64 MB) is required by LaPy's metadata, but imported by lapy.plot alone, which nothing here uses.
-# Isolated (-I), since Apptainer hands on the environment: the caller's PYTHONPATH is for another Python.
-RUN /opt/hipsta_bids/bin/pip install --no-deps --no-build-isolation .; \
-    /opt/hipsta_bids/bin/pip check; \
-    /opt/hipsta_bids/bin/pip uninstall --yes plotly setuptools pip; \
-    sed -i '1s/$/ -I/' /opt/hipsta_bids/bin/hipsta-bids; \
+# What of them is never run; docs/containers.md has what stays. Libraries in *.libs were moved by their
+# makers (auditwheel), and strip damages such files.
+FROM packages AS slim
+RUN command -v strip || { apt-get update; apt-get install --yes --no-install-recommends binutils; }; \
+    /opt/hipsta_bids/bin/pip uninstall --yes imageio networkx pip plotly pygments setuptools tifffile; \
+    find /opt/hipsta_bids/bin -type f ! -name dask -delete; \
+    sed -i '1s/$/ -I/' /opt/hipsta_bids/bin/dask; \
+    cd /opt/hipsta_bids/lib/python3*/site-packages; \
+    find . -type d \( -name test -o -name tests -o -name testdata \) -prune -exec rm -r {} +; \
+    find . -type f \( -name '*.[achx]' -o -name '*.[ch]pp' -o -name '*.px[di]' -o -name '*.pyx' \) -delete; \
+    # Stubs are for type checkers, but for one package that finds its functions by them.
+    find . -path ./skimage -prune -o -type f -name '*.pyi' -exec rm {} +; \
+    # Data to try things on, and fonts for PDF and PostScript.
+    find matplotlib/mpl-data/sample_data skimage/data sklearn/datasets statsmodels/datasets \
+        -type f ! -name '*.py' ! -name '*.pyi' -delete; \
+    rm -r matplotlib/mpl-data/fonts/afm matplotlib/mpl-data/fonts/pdfcorefonts; \
+    # Network protocols, cloud storage, and two more names of one library, which have become copies of it.
+    rm pyarrow/_flight.* pyarrow/_s3fs.* pyarrow/lib*_flight.* pyarrow/libarrow_s3.*; \
+    find pyarrow \( -name 'libarrow_python*.so' -o -name 'libarrow_python*.so.*.*' \) -delete; \
+    # Of fontTools matplotlib loads a table of glyphs, unless it writes PDF or PostScript.
+    find fontTools -mindepth 1 -maxdepth 1 -type d ! -name misc -exec rm -r {} +; \
+    rm -r PIL/_avif.* PIL/_imagingft.* pillow.libs/libavif-* pillow.libs/libfreetype-* pillow.libs/libharfbuzz-*; \
+    # Compilers, other databases, graphs of regions, time series.
+    rm -r numpy/distutils skimage/graph skimage/segmentation statsmodels/tsa \
+        sqlalchemy/dialects/m*sql sqlalchemy/dialects/oracle sqlalchemy/dialects/postgresql sqlalchemy/testing; \
+    find . -path '*.libs/*' -prune -o -type f -name '*.so*' -exec strip --strip-unneeded {} +; \
     python -m compileall -q -j 0 --invalidation-mode unchecked-hash /opt/hipsta_bids
+
+# The program alone. Isolated (-I), since Apptainer hands on the environment: the caller's PYTHONPATH
+# is for another Python.
+FROM packages AS program
+COPY . .
+ARG IMAGE
+ARG CODE_URL
+RUN /opt/hipsta_bids/bin/python tools/make-descriptors --image "$IMAGE" --url "$CODE_URL"; \
+    /opt/hipsta_bids/bin/pip install --no-deps --no-build-isolation --prefix /program .; \
+    PYTHONPATH=$(echo /program/lib/python3*/site-packages) /opt/hipsta_bids/bin/pip check; \
+    sed -i '1s/$/ -I/' /program/bin/hipsta-bids; \
+    python -m compileall -q -j 0 --invalidation-mode unchecked-hash \
+        -s /program -p /opt/hipsta_bids /program
 
 FROM ${BASE_IMAGE}
 ARG BASE_IMAGE
+# The official base comes without the byte code of the standard library, and a read-only container
+# could not keep it. Login shells set the path anew, and look in /usr/local/bin: platforms call by them.
+RUN python -m compileall -q -j 0 -x 'site-packages|dist-packages|/test' \
+        "$(python -c 'import sysconfig; print(sysconfig.get_path("stdlib"))')"; \
+    ln -s /opt/hipsta_bids/bin/hipsta-bids /opt/hipsta_bids/bin/dask /usr/local/bin/
+COPY --from=slim /opt/hipsta_bids /opt/hipsta_bids
+COPY --from=program /program /opt/hipsta_bids
 LABEL org.opencontainers.image.title="hipsta_bids" \
       org.opencontainers.image.description="BIDS App for hippocampal thickness, curvature and shape maps from subfield segmentations" \
       org.opencontainers.image.version="0.1.0" \
       org.opencontainers.image.authors="The hipsta_bids developers" \
+      org.opencontainers.image.vendor="The hipsta_bids developers" \
       org.opencontainers.image.licenses="AGPL-3.0-or-later" \
       org.opencontainers.image.base.name="${BASE_IMAGE}"
-# The official base comes without the byte code of the standard library, and a read-only container
-# could not keep it.
-RUN python -m compileall -q -j 0 -x 'site-packages|dist-packages|/test' \
-    "$(python -c 'import sysconfig; print(sysconfig.get_path("stdlib"))')"
-COPY --from=build /opt/hipsta_bids /opt/hipsta_bids
-# Where login shells look too, which set the path anew: platforms call by them.
-RUN ln -s /opt/hipsta_bids/bin/hipsta-bids /usr/local/bin/
-# Written into datasets, as GeneratedBy: the image, and where its code is.
+ARG IMAGE
 ARG CODE_URL
 ENV LANG=C.UTF-8 \
     HIPSTA_BIDS_CONTAINER_TYPE=docker \
-    HIPSTA_BIDS_CONTAINER_TAG=hipsta_bids:0.1.0 \
+    HIPSTA_BIDS_CONTAINER_TAG=${IMAGE} \
     HIPSTA_BIDS_CODE_URL=${CODE_URL}
+# The first user of most machines, by number since nothing is kept for them here: any other will do (-u).
+USER 1000:1000
 ENTRYPOINT ["hipsta-bids"]

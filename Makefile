@@ -67,13 +67,13 @@ format: $(STAMP)
 	"$(BIN)/python" -m ruff check --fix .
 
 # The locks hold every version and hash, for Python 3.11 and later on Linux and macOS. The second
-# repeats the first and adds the tools for development.
+# repeats the first, which is what is in the image, and adds the tools for development.
 COMPILE = "$(BIN)/python" -m uv pip compile pyproject.toml --quiet --universal \
 	--python-version 3.11 --fork-strategy fewest --generate-hashes --no-emit-index-url \
 	--no-emit-find-links --custom-compile-command "make lock" $(LOCK_FLAGS)
 lock: $(STAMP)
 	"$(BIN)/python" -m pip install -qq --disable-pip-version-check "uv>=0.8"
-	$(COMPILE) --output-file requirements.lock
+	$(COMPILE) --extra cluster --output-file requirements.lock
 	$(COMPILE) --extra dev --extra docs --constraints requirements.lock --output-file requirements-dev.lock
 
 clean:

@@ -12,7 +12,8 @@ BIN = Path(sys.executable).parent
 
 
 def descriptor_path(name):
-    return ROOT / "descriptors" / f"{name}.json"
+    """Path of a descriptor of the repository; any other is given as a path."""
+    return name if isinstance(name, Path) else ROOT / "descriptors" / f"{name}.json"
 
 
 def read_descriptor(name):

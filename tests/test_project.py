@@ -56,7 +56,10 @@ def tracked_files() -> list[Path]:
 @pytest.mark.parametrize(
     ("lock", "requirements"),
     [
-        ("requirements.lock", PROJECT["dependencies"]),
+        (
+            "requirements.lock",
+            [*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["cluster"]],
+        ),
         (
             "requirements-dev.lock",
             [

@@ -164,66 +164,75 @@ def _values(action: argparse.Action) -> Entry:
 
 _ROOT = "[OUTPUT_DIR]"
 
-#: Files of the output dataset: name, description.
+#: Files of the output dataset: name, description. A part of the subjects (``shard``) has a table
+#: and a log of its own, without pages and maybe without hemispheres; ``dry_run`` writes nothing.
 _DATASET = {
     "status": ("status.tsv", "one row per hemisphere: status, reason, message, time, memory"),
     "settings": ("desc-settings.json", "all settings of these results, and their hash"),
     "description": ("dataset_description.json", "the dataset's description, as BIDS asks for"),
     "citation": ("CITATION.md", "a methods paragraph with references"),
+    "readme": ("README.md", "what is in the dataset"),
+    "page": ("report.html", "all hemispheres on one page, to look at"),
+    "pages": ("sub-*.html", "a page per subject and session, to look at"),
     "logs": ("logs/*", "one file per run"),
 }
 
-#: Files of a hemisphere: what follows the protocol in their names, description, on request only.
+#: Files of a hemisphere: what follows the protocol in their names, description.
 _HEMISPHERE = {
-    "sheets": ("_desc-sheet_morph.tsv", "thickness, curvatures and subfield per point", False),
-    "summaries": ("_desc-summary_morph.tsv", "one row of measures per hemisphere", False),
-    "profiles": ("_desc-profile_morph.tsv", "maps averaged along one axis", False),
-    "sections": ("_desc-sections_morph.tsv", "one row per cross-section", False),
-    "surfaces": ("_midthickness.surf.gii", "surfaces of the sheet, with two walls beside", False),
-    "maps": ("_*.shape.gii", "thickness, curvatures and extents per vertex", False),
-    "subfields": ("_dseg.label.gii", "subfield per vertex", False),
-    "masks": ("_desc-body_mask.nii.gz", "the measured body on the grid of the labels", False),
-    "records": ("_desc-qc_metrics.json", "status, flags, inputs, quality metrics", False),
-    "layers": ("_desc-layers_morph.tsv", "points of all layers (write_meshes)", True),
-    "meshes": ("_desc-tet_mesh.vtu", "tetrahedral meshes (write_meshes)", True),
-    "other_maps": ("_desc-*_map.tsv", "other images on the sheet (map)", True),
-    "regions": ("_desc-roi_morph.tsv", "maps summed up in regions (roi)", True),
+    "sheets": ("_desc-sheet_morph.tsv", "thickness, curvatures and subfield per point"),
+    "summaries": ("_desc-summary_morph.tsv", "one row of measures per hemisphere"),
+    "profiles": ("_desc-profile_morph.tsv", "maps averaged along one axis"),
+    "sections": ("_desc-sections_morph.tsv", "one row per cross-section"),
+    "surfaces": ("_midthickness.surf.gii", "surfaces of the sheet, with two walls beside"),
+    "maps": ("_*.shape.gii", "thickness, curvatures and extents per vertex"),
+    "subfields": ("_dseg.label.gii", "subfield per vertex"),
+    "masks": ("_desc-body_mask.nii.gz", "the measured body on the grid of the labels"),
+    "records": ("_desc-qc_metrics.json", "status, flags, inputs, quality metrics"),
+    "layers": ("_desc-layers_morph.tsv", "points of all layers (write_meshes)"),
+    "meshes": ("_desc-tet_mesh.vtu", "tetrahedral meshes (write_meshes)"),
+    "other_maps": ("_desc-*_map.tsv", "other images on the sheet (map)"),
+    "regions": ("_desc-roi_morph.tsv", "maps summed up in regions (roi)"),
+    "uncertainties": ("_desc-*uncertainty_morph.tsv", "SD over perturbed labels (uncertainty)"),
 }
 
-#: Files of one model of the group level: name, description, not in every analysis.
+#: Files of one model of the group level: name, description, written whatever the model. Models of
+#: volumes have no maps; those without groups, of one session or not registered lack others.
 _MODEL = {
-    "methods": ("methods.md", "what was done and found; to be read first", False),
+    "methods": ("methods.md", "what was done and found; to be read first", True),
     "peaks": ("peaks.tsv", "one row per cluster", False),
     "statistics": ("maps.tsv", "one row per map: points tested and found", False),
     "measures": ("measures.tsv", "the model for each summary measure", False),
     "descriptives": ("descriptives.tsv", "means and standard deviations by group", False),
-    "classification": ("classification.tsv", "pairs of groups, by logistic regression", True),
-    "registration": ("registration.tsv", "variance explained before and after", True),
-    "excluded": ("excluded.tsv", "who is not in it, and why", False),
-    "covariates": ("covariates.tsv", "the table that was fitted", False),
+    "classification": ("classification.tsv", "pairs of groups, by logistic regression", False),
+    "registration": ("registration.tsv", "variance explained before and after", False),
+    "excluded": ("excluded.tsv", "who is not in it, and why", True),
+    "covariates": ("covariates.tsv", "the table that was fitted", True),
+    "design": ("design.tsv", "the same as a design matrix", True),
     "statistical_maps": ("hemi-*_statmap.tsv", "statistics at each point", False),
     "all_maps": ("maps.parquet", "all maps, original and registered", False),
-    "template": ("template.json", "the template of registration", True),
-    "model_file": ("model.json", "the model, in the form of BIDS Stats Models", False),
-    "record": ("analysis.json", "command, settings, seeds, versions", False),
-    "figures": ("figures/*", "figures (PNG, SVG), where matplotlib is installed", True),
+    "template": ("template.json", "the template of registration", False),
+    "model_file": ("model.json", "the model, in the form of BIDS Stats Models", True),
+    "record": ("analysis.json", "command, settings, seeds, versions", True),
+    "figures": ("figures/*", "figures (PNG, SVG), where matplotlib is installed", False),
 }
 
 
-def output_folder() -> Entry:
+def output_folder(*, optional: bool = False) -> Entry:
     """Describe the output dataset as a whole."""
-    return _output("dataset", _ROOT, "the output dataset", optional=False)
+    return _output("dataset", _ROOT, "the output dataset", optional=optional)
 
 
 def participant_outputs() -> list[Entry]:
     """List what the participant level writes, of hemispheres with and without sessions.
 
-    A wildcard of Boutiques stays within one folder.
+    A wildcard of Boutiques stays within one folder. All are optional, since there is an option
+    without each of them; what a run has left undone is in its exit code and in ``status.tsv``.
     """
-    outputs = [output_folder()]
+    outputs = [output_folder(optional=True)]
     for key, (name, text) in _DATASET.items():
-        outputs.append(_output(key, f"{_ROOT}/{name}", text, optional=False))
-    for key, (ending, text, _) in _HEMISPHERE.items():
+        entry = _output(key, f"{_ROOT}/{name}", text, optional=True)
+        outputs.append(entry | ({"list": True} if "*" in name else {}))
+    for key, (ending, text) in _HEMISPHERE.items():
         for suffix, folder, where in (
             ("", "sub-*", "datasets without sessions"),
             ("_of_sessions", "sub-*/ses-*", "datasets with sessions"),
@@ -237,9 +246,10 @@ def participant_outputs() -> list[Entry]:
 def group_outputs() -> list[Entry]:
     """List what the group level writes; a model's folder has its formula's name or --name."""
     models = _output("models", f"{_ROOT}/group/*", "one folder per model", optional=False)
-    outputs = [output_folder(), models]
-    for key, (name, text, optional) in _MODEL.items():
-        entry = _output(key, f"{_ROOT}/group/*/{name}", text, optional=optional)
+    pages = _output("pages", f"{_ROOT}/group/*.html", "a page per model, to look at", optional=True)
+    outputs = [output_folder(), models | {"list": True}, pages | {"list": True}]
+    for key, (name, text, always) in _MODEL.items():
+        entry = _output(key, f"{_ROOT}/group/*/{name}", text, optional=not always)
         outputs.append(entry | ({"list": True} if "*" in name else {}))
     return outputs
 
@@ -290,8 +300,19 @@ _COHORT = {"bids_dir": "cohort", "output_dir": "cohort/derivatives/hipsta_bids"}
 _NOWHERE = {"bids_dir": "no-such-folder", "output_dir": "no-such-output"}
 
 
-def describe(level: str | None = None) -> Entry:
-    """Describe the command line of one level, or of both with the level as an input."""
+IMAGE = f"hipsta_bids:{__version__}"
+"""The image, as it is called where it was built."""
+
+#: Of the paper that describes the method; the code has none of its own yet.
+_DOI = "10.1016/j.neuroimage.2023.120182"
+
+
+def describe(level: str | None = None, *, image: str = IMAGE, url: str = "") -> Entry:
+    """Describe the command line of one level, or of both with the level as an input.
+
+    ``image`` is the name by which it is had, ``url`` the public address of the code; no address is
+    known here, so that there is none unless it is given.
+    """
     levels = [level] if level else list(_PARSERS)
     name = next(key for key, value in DESCRIPTORS.items() if value == level)
     inputs, groups = _both() if level is None else _one(level)
@@ -302,8 +323,10 @@ def describe(level: str | None = None) -> Entry:
         "tool-version": __version__,
         "schema-version": "0.5",
         "author": "The hipsta_bids developers",
+        **({"url": url} if url else {}),
+        "tool-doi": _DOI,
         "command-line": _command(level, inputs),
-        "container-image": {"type": "docker", "image": f"hipsta_bids:{__version__}"},
+        "container-image": {"type": "docker", "image": image},
         "inputs": inputs,
         "groups": groups,
         "output-files": outputs,
@@ -325,9 +348,10 @@ def describe(level: str | None = None) -> Entry:
     }
 
 
-def descriptor_text(level: str | None = None) -> str:
+def descriptor_text(level: str | None = None, *, image: str = IMAGE, url: str = "") -> str:
     """Return the text of a descriptor's file."""
-    return json.dumps(describe(level), indent=2, ensure_ascii=False) + "\n"
+    content = describe(level, image=image, url=url)
+    return json.dumps(content, indent=2, ensure_ascii=False) + "\n"
 
 
 def _one(level: str) -> tuple[list[Entry], list[Entry]]:

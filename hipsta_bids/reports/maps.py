@@ -339,10 +339,17 @@ def _draw_borders(axis: "Axes", names: NDArray[np.str_], x: Float, y: Float) -> 
         )  # fmt: skip
 
 
+def usual_subfields(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Find the most frequent name of each row; of several as frequent, the one that comes first.
+
+    A set would give another of these in another process, as its order does.
+    """
+    return [max(dict.fromkeys(row), key=list(row).count) for row in rows]
+
+
 def _mark_subfields(axis: "Axes", hemisphere: Hemisphere) -> None:
     """Name the most frequent subfield of each x above the axes, with ticks where it changes."""
-    names = hemisphere.sheet.subfield
-    usual = [max(set(row.tolist()), key=row.tolist().count) for row in names]
+    usual = usual_subfields(hemisphere.sheet.subfield.tolist())
     x = np.linspace(0, 100, len(usual))
     changes = [0, *(i for i in range(1, len(usual)) if usual[i] != usual[i - 1]), len(usual)]
     for start, stop in pairwise(changes):

@@ -2,12 +2,15 @@
 
 import csv
 import io
+import json
 import os
 import re
 import subprocess
 import sys
 import time
 from pathlib import Path
+
+from hipsta_bids.derivatives.dataset import linked_folder
 
 ROOT = Path(__file__).parents[2]
 
@@ -26,6 +29,7 @@ PYTHON = "/opt/hipsta_bids/bin/python"
 """The interpreter in the image."""
 
 _CLOCKS = ("seconds", "cpu_seconds", "peak_memory")
+_OF_THE_IMAGE = ("Container", "CodeURL")
 
 
 def run(*command, **options):
@@ -76,7 +80,7 @@ def outside(*arguments):
 
 
 def contents(out, data):
-    """Bytes of all results by path, but for logs, times and the folders' names."""
+    """Bytes of all results by path, but for logs, times, the folders' names and the container's."""
     names = {str(data): "/data", str(out): "/out"}
     return {
         str(path.relative_to(out)): _impersonal(path, names)
@@ -95,10 +99,23 @@ def _impersonal(path: Path, names):
         return sorted(timeless, key=str)
     if path.name in {"dataset_description.json", "analysis.json"} or path.suffix == ".html":
         text = path.read_text(encoding="utf-8")
+        if path.name == "dataset_description.json":
+            text = _anywhere(json.loads(text), path.parent)
         for name, stand_in in names.items():
             text = text.replace(name, stand_in)
         return re.sub(r"\d{4}-\d{2}-\d{2} \d{2}:\d{2}", "TIME", text)
     return path.read_bytes()
+
+
+def _anywhere(description, root):
+    """Text of a description without the image, with folders instead of the ways that lead there."""
+    for key in _OF_THE_IMAGE:
+        description["GeneratedBy"][0].pop(key, None)
+    links = description["DatasetLinks"].items()
+    folders = {name: os.path.normpath(linked_folder(link, root)) for name, link in links}
+    sources = [source["URL"] for source in description["SourceDatasets"]]
+    urls = [os.path.normpath(linked_folder(url, root)) for url in sources]
+    return json.dumps(description | {"DatasetLinks": folders, "SourceDatasets": urls})
 
 
 def differences(one, other):

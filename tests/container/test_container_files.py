@@ -1,5 +1,6 @@
 """What keeps container, workflows and project together; none of it needs Docker."""
 
+import os
 import re
 import shutil
 import subprocess
@@ -33,6 +34,7 @@ def test_labels_are_those_of_the_project():
         "description": PROJECT["description"],
         "version": __version__,
         "authors": PROJECT["authors"][0]["name"],
+        "vendor": PROJECT["authors"][0]["name"],
         "licenses": PROJECT["license"],
     }
 
@@ -42,16 +44,123 @@ def test_datasets_name_the_image_and_its_code():
     given = dict(re.findall(r"\b(HIPSTA_BIDS_\w+)=(\S+)", last))
     assert given == {
         CONTAINER_VARIABLES["Type"]: "docker",
-        CONTAINER_VARIABLES["Tag"]: f"hipsta_bids:{__version__}",
+        CONTAINER_VARIABLES["Tag"]: "${IMAGE}",
         CODE_URL_VARIABLE: "${CODE_URL}",
     }
-    build = next(s for s in steps("release") if "BUILD_OPTIONS" in s.get("env", {}))
-    assert "--build-arg CODE_URL=" in build["env"]["BUILD_OPTIONS"]
+    assert f"\nARG IMAGE=hipsta_bids:{__version__}\n" in DOCKERFILE
 
 
-def test_both_stages_have_the_same_base():
-    stages = re.findall(r"^FROM (\S+)(?: AS (\w+))?$", DOCKERFILE, re.MULTILINE)
-    assert stages == [("${BASE_IMAGE}", "build"), ("${BASE_IMAGE}", "")]
+def test_the_base_is_one_by_its_digest():
+    [base] = re.findall(r"^ARG BASE_IMAGE=(\S+)$", DOCKERFILE, re.MULTILINE)
+    assert re.fullmatch(r"python:3\.\d+-slim-\w+@sha256:[0-9a-f]{64}", base)
+    # The argument is the whole reference, so that any other can be given, also without a digest.
+    bases = re.findall(r"^FROM (.+)$", DOCKERFILE, re.MULTILINE)
+    own = {"packages"}
+    assert {name.split(" AS ")[0] for name in bases} == {"${BASE_IMAGE}", *own}
+    assert bases[-1] == "${BASE_IMAGE}"
+
+
+def test_packages_do_not_depend_on_own_code():
+    """What is installed from the lock comes before, and apart from, what is copied of the code."""
+    packages, _, rest = DOCKERFILE.partition("\nFROM packages AS slim\n")
+    slim, _, rest = rest.partition("\nFROM packages AS program\n")
+    program, _, last = rest.partition("\nFROM ${BASE_IMAGE}\n")
+    assert re.findall(r"^COPY (.+)$", packages, re.MULTILINE) == [
+        "requirements.lock requirements-dev.lock ./"
+    ]
+    assert "COPY" not in slim
+    assert re.findall(r"^COPY (.+)$", program, re.MULTILINE) == [". ."]
+    assert re.findall(r"^COPY --from=(\w+)", last, re.MULTILINE) == ["slim", "program"]
+    # Nor on what the image is called: neither is known before the layers that take long.
+    assert "ARG IMAGE" not in slim
+    assert last.index("COPY --from=slim") < last.index("ARG IMAGE")
+
+
+def test_user_of_the_image_is_a_number_and_not_root():
+    """Numbers, since an orchestrator that forbids root cannot tell who a name is."""
+    assert re.findall(r"^USER (.+)$", DOCKERFILE, re.MULTILINE) == ["1000:1000"]
+    assert DOCKERFILE.index("\nUSER ") > DOCKERFILE.rindex("\nRUN ")
+
+
+def test_the_image_has_the_dask_engine():
+    lock = (ROOT / "requirements.lock").read_text(encoding="utf-8")
+    for requirement in PROJECT["optional-dependencies"]["cluster"]:
+        name = re.match(r"[\w-]+", requirement)[0]
+        assert re.search(rf"^{name}==", lock, re.MULTILINE), name
+
+
+FAKE_DOCKER = """\
+#!/bin/sh
+echo "$@" >> "$LOG"
+case "$*" in
+    "image inspect --format"*) echo sha256:{number} ;;
+    "image inspect {known}") ;;
+    "image inspect"*|pull*) exit 1 ;;
+esac
+"""
+
+
+@pytest.fixture
+def build(tmp_path):
+    """Run tools/build-image with a stand-in for Docker that knows one base."""
+
+    def run(known, *options, **variables):
+        script = FAKE_DOCKER.format(known=known, number="7" * 64)
+        (tmp_path / "docker").write_text(script)
+        (tmp_path / "docker").chmod(0o755)
+        log = tmp_path / "log"
+        names = ("IMAGE", "CODE_URL")
+        kept = {key: value for key, value in os.environ.items() if key not in names}
+        path = os.pathsep.join([str(tmp_path), os.environ["PATH"]])
+        done = subprocess.run(
+            [ROOT / "tools" / "build-image", *options],
+            env=kept | {"PATH": path, "LOG": str(log)} | variables,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        lines = log.read_text(encoding="utf-8").splitlines()
+        return done, [line for line in lines if line.startswith("build ")]
+
+    return run
+
+
+PINNED = re.findall(r"^ARG BASE_IMAGE=(\S+)$", DOCKERFILE, re.MULTILINE)[0]
+LABEL = "--label org.opencontainers.image."
+
+
+def test_local_builds_have_all_labels(build):
+    done, [line] = build(PINNED, "--network", "host")
+    assert done.returncode == 0, done.stderr
+    assert f"--tag hipsta_bids:{__version__} " in line
+    assert f"{LABEL}base.digest={PINNED.partition('@')[2]} " in line
+    assert f"{LABEL}created=" in line
+    assert "BASE_IMAGE" not in line
+    assert "image.source" not in line
+    assert line.endswith("--network host .")
+    published = {"IMAGE": "registry.example/lab/app:1", "CODE_URL": "https://example.org/code"}
+    line = build(PINNED, **published)[1][-1]
+    assert f"--build-arg IMAGE={published['IMAGE']} " in line
+    assert f"--build-arg CODE_URL={published['CODE_URL']} " in line
+    assert f"{LABEL}source={published['CODE_URL']} " in line
+
+
+def test_a_base_without_digest_is_taken_if_it_is_here(build):
+    """As one that was loaded from a file: it is said, and the label has its number."""
+    name = PINNED.partition("@")[0]
+    done, [line] = build(name)
+    assert done.returncode == 0, done.stderr
+    assert f"taking the {name} that is here" in done.stderr
+    assert f"--build-arg BASE_IMAGE={name} " in line
+    assert f"{LABEL}base.digest=sha256:{'7' * 64} " in line
+
+
+def test_no_other_base_is_taken_than_the_one_that_was_asked_for(build):
+    done, lines = build("something:else")
+    assert (done.returncode, lines) == (1, [])
+    name = PINNED.partition("@")[0]
+    done, lines = build(name, "--build-arg", f"BASE_IMAGE={name}@sha256:{'0' * 64}")
+    assert (done.returncode, lines) == (1, [])
 
 
 def test_only_what_the_package_is_made_of_goes_to_the_build():
@@ -64,6 +173,7 @@ def test_only_what_the_package_is_made_of_goes_to_the_build():
     allowed = {rule[1:] for rule in rules if rule.startswith("!")}
     copied = set(re.search(r"^COPY (.+) \./$", DOCKERFILE, re.MULTILINE)[1].split())
     made_of = {"pyproject.toml", PROJECT["readme"], *PROJECT["license-files"], PROJECT["name"]}
+    made_of |= {"tools/make-descriptors", "tools/descriptors.py"}  # which run in it
     assert allowed == made_of | copied
     assert all((ROOT / name).exists() for name in allowed)
 
@@ -107,6 +217,46 @@ def test_workflows_call_what_there_is():
     assert all(re.search(rf"^{target}:", makefile, re.MULTILINE) for target in targets)
     assert tools == {"tools/test-container"}
     assert all((ROOT / tool).stat().st_mode & 0o100 for tool in tools)
+
+
+def test_what_is_released_is_what_was_tested_with_its_contents_and_origin():
+    job = WORKFLOWS["release"]["jobs"]["container"]
+    uses = [step.get("uses", step.get("run", "")) for step in job["steps"]]
+    places = [
+        next(i for i, text in enumerate(uses) if word in text)
+        for word in (
+            "IMAGE=$name:",
+            "tools/test-container",
+            'docker push "$IMAGE"',
+            "anchore/sbom-action@",
+            "actions/attest-sbom@",
+            "actions/attest-build-provenance@",
+            'make-descriptors --image "$IMAGE" --url "$CODE_URL"',
+        )
+    ]
+    assert places == sorted(places)
+    assert not any("docker build" in text for text in uses)  # nothing is built anew
+    assert job["env"]["CODE_URL"] == "${{ github.server_url }}/${{ github.repository }}"
+    needed = {"packages", "id-token", "attestations"}
+    assert {key for key, value in job["permissions"].items() if value == "write"} == needed
+    attested = [step["with"] for step in job["steps"] if "actions/attest" in step.get("uses", "")]
+    for given in attested:
+        assert given["subject-name"] == "${{ env.NAME }}"  # without a tag
+        assert given["subject-digest"] == "${{ steps.published.outputs.digest }}"
+        assert given["push-to-registry"] is True
+    listed = next(s["with"] for s in job["steps"] if "sbom-action" in s.get("uses", ""))
+    assert listed["image"] == "${{ env.IMAGE }}"
+    assert listed["output-file"] == attested[0]["sbom-path"]
+
+
+def test_the_release_page_has_the_descriptors_of_the_published_image():
+    jobs = WORKFLOWS["release"]["jobs"]
+    kept = [s["with"] for s in jobs["container"]["steps"] if "upload-artifact" in s.get("uses", "")]
+    assert [(one["name"], one["path"]) for one in kept] == [("descriptors", "descriptors/")]
+    page = jobs["page"]["steps"]
+    taken = [s["with"] for s in page if "download-artifact" in s.get("uses", "")]
+    assert {"name": "descriptors", "path": "descriptors"} in taken
+    assert page[-1]["run"].endswith("dist/* descriptors/*")
 
 
 def test_a_release_waits_for_the_tests():

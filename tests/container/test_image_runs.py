@@ -1,5 +1,6 @@
 """Whole runs in the container: as nobody known, with a read-only root and without network."""
 
+import json
 import shutil
 import subprocess
 import time
@@ -20,6 +21,7 @@ from container_runs import (
     statuses,
 )
 
+from hipsta_bids.derivatives.dataset import CODE_URL_VARIABLE, CONTAINER_VARIABLES
 from hipsta_bids.errors import ExitCode
 
 if not IMAGE:
@@ -49,6 +51,54 @@ def test_group_level(both_levels):
 def test_files_are_those_of_a_run_outside(both_levels, phantoms, reference):
     assert len(reference) > 600
     assert differences(contents(both_levels[0], phantoms), reference) == []
+
+
+def test_datasets_name_the_image_that_made_them(both_levels, out, damaged):
+    """The default is the name that it was built by; it is that of a registry with ``-e``."""
+    text = (both_levels[0] / "dataset_description.json").read_text(encoding="utf-8")
+    maker = json.loads(text)["GeneratedBy"][0]
+    assert maker["Container"] == {"Type": "docker", "Tag": IMAGE}
+    names = {CONTAINER_VARIABLES["Tag"]: "lab/hipsta_bids:1", CODE_URL_VARIABLE: "https://a.org/b"}
+    flags = [flag for name, value in names.items() for flag in ("--env", f"{name}={value}")]
+    done = on_data(damaged, out, "participant", "--hemi", "L", options=flags)
+    assert ended(done), done
+    text = (out / "dataset_description.json").read_text(encoding="utf-8")
+    maker = json.loads(text)["GeneratedBy"][0]
+    assert maker["Container"] == {"Type": "docker", "Tag": "lab/hipsta_bids:1"}
+    assert maker["CodeURL"] == "https://a.org/b"
+
+
+def test_default_user(damaged, out):
+    """Without ``-u`` results belong to the image's user, who is not root."""
+    mounts = (*mount(damaged, "/data", "ro"), *mount(out, "/out"))
+    locks = LOCKED[2:]  # but for the user
+    done = in_container("/data", "/out", "participant", "--hemi", "L", options=mounts, locks=locks)
+    assert ended(done), done
+    assert {path.stat().st_uid for path in out.rglob("*")} == {1000}
+    out.chmod(0o755)
+    refused = in_container("/data", "/out", "participant", options=mounts, locks=locks)
+    assert ended(refused, ExitCode.NOT_WRITABLE), refused
+    assert refused.stderr.count("\n") == 1
+
+
+DASK = """
+dask scheduler --scheduler-file /tmp/scheduler.json --no-dashboard >/tmp/scheduler.log 2>&1 &
+dask worker --scheduler-file /tmp/scheduler.json --nthreads 1 --nworkers 2 --no-dashboard \
+    >/tmp/worker.log 2>&1 &
+exec hipsta-bids /data /out participant --participant-label 01 --dask-scheduler /tmp/scheduler.json
+"""
+
+
+def test_dask_engine(phantoms, out, reference):
+    """Scheduler and workers are of the image, too; the network is the container's own."""
+    mounts = (*mount(phantoms, "/data", "ro"), *mount(out, "/out"))
+    options = ("--init", "--entrypoint", "/bin/sh", *mounts)
+    done = in_container("-c", DASK, options=options)
+    assert ended(done), done
+    found = contents(out, phantoms)
+    same = {name for name in reference if name.startswith("sub-01/")}
+    assert len(same) > 20
+    assert not same & set(differences(found, reference))
 
 
 def test_files_belong_to_the_caller(both_levels):

@@ -38,6 +38,25 @@ def test_group_level_of_several_parts_leaves_all_outputs(folder):
     assert outputs_missing(done) == ""
 
 
+def test_a_model_of_volumes_lacks_nothing_that_is_promised(folder):
+    """It has no maps: what such a model leaves out is optional."""
+    done = launch(
+        folder,
+        "hipsta_bids_group",
+        bids_dir="bids",
+        output_dir="volumes",
+        derivatives=["part 1", "part 2"],
+        formula="volume ~ age",
+        no_reports=True,
+    )
+    assert "Exit code\n0\n" in done.stdout, done.stdout
+    assert outputs_missing(done) == ""
+    found = outputs_found(done)
+    assert {"output_measures", "output_record"} <= found
+    maps = {"peaks", "statistics", "statistical_maps", "all_maps", "registration", "template"}
+    assert not {f"output_{key}" for key in (*maps, "pages")} & found
+
+
 def test_group_level_in_place_by_the_descriptor_of_both(folder):
     for path in (folder / "part 1").glob("sub-*"):
         stats = folder / "subjects" / path.name / "stats" / "aseg.stats"

@@ -183,7 +183,9 @@ def test_missing_folder_is_reported_with_the_meaning_of_its_code(level, tmp_path
     done = launch(tmp_path, f"hipsta_bids_{level}", bids_dir="nowhere", output_dir="out")
     assert f"Exit code\n{int(ExitCode.BAD_DATA)}\n" in done.stdout
     assert EXIT_MEANINGS[ExitCode.BAD_DATA] in done.stdout
-    assert "output_dataset" in outputs_missing(done)
+    assert outputs_found(done) == set()
+    # At the participant level there is an option without each output, --dry-run.
+    assert ("output_dataset" in outputs_missing(done)) == (level == "group")
 
 
 @pytest.fixture(scope="module")
@@ -212,12 +214,44 @@ def test_participant_level_leaves_all_outputs(dataset):
         map_interpolation=["codes=nearest"],
         roi="roi.tsv",
         write_meshes=True,
+        uncertainty=2,
         n_procs=1,
     )
     assert "Exit code\n0\n" in done.stdout, done.stdout
     listed = {entry["id"] for entry in read_descriptor("hipsta_bids_participant")["output-files"]}
     assert outputs_found(done) == {key for key in listed if not key.endswith("_of_sessions")}
     assert outputs_missing(done) == ""
+
+
+@pytest.mark.parametrize(
+    ("descriptor", "options", "found"),
+    [
+        ("hipsta_bids_participant", {"dry_run": True}, set()),
+        ("hipsta_bids_participant", {"shard": "2/2"}, set()),  # of one subject
+        ("hipsta_bids", {"dry_run": True, "analysis_level": "participant"}, {"output_dataset"}),
+    ],
+)
+def test_runs_that_leave_no_results_lack_nothing(dataset, tmp_path, descriptor, options, found):
+    folders = {"bids_dir": "bids", "output_dir": tmp_path.name, "freesurfer_dir": "subjects dir"}
+    done = launch(dataset, descriptor, **folders, **options)
+    assert "Exit code\n0\n" in done.stdout, done.stdout
+    assert (outputs_found(done), outputs_missing(done)) == (found, "")
+
+
+def test_no_pages_on_request(dataset):
+    done = launch(
+        dataset,
+        "hipsta_bids_participant",
+        bids_dir="bids",
+        output_dir="no pages",
+        freesurfer_dir="subjects dir",
+        no_reports=True,
+    )
+    assert "Exit code\n0\n" in done.stdout, done.stdout
+    assert outputs_missing(done) == ""
+    found = outputs_found(done)
+    assert {"output_status", "output_sheets"} <= found
+    assert not {"output_page", "output_pages"} & found
 
 
 def test_participant_level_by_the_descriptor_of_both_with_sessions(dataset):
@@ -240,7 +274,7 @@ def test_participant_level_by_the_descriptor_of_both_with_sessions(dataset):
         entry["path-template"].replace("[OUTPUT_DIR]", "new/out")
         for entry in outputs
         if entry["id"].endswith("_of_sessions")
-        and not re.search(r"\((write_meshes|map|roi)\)", entry["description"])
+        and not re.search(r"\((write_meshes|map|roi|uncertainty)\)", entry["description"])
     ]
     assert len(templates) == 9
     assert all(list(dataset.glob(template)) for template in templates)

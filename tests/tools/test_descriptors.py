@@ -3,17 +3,36 @@
 import argparse
 import fnmatch
 import json
+import shutil
 import subprocess
 import sys
 
 import pytest
-from bosh_cases import read_descriptor
+import yaml
+from bosh_cases import ROOT, read_descriptor
 
-from descriptors import DESCRIPTORS, describe, descriptor_text, groups_of, inputs_of, merge_inputs
+from descriptors import (
+    DESCRIPTORS,
+    SHIPPED,
+    describe,
+    descriptor_text,
+    groups_of,
+    inputs_of,
+    merge_inputs,
+)
+from hipsta_bids import __version__
 from hipsta_bids.cli.group import group_parser
 from hipsta_bids.cli.main import main
 from hipsta_bids.cli.participant import build_parser
-from hipsta_bids.derivatives.names import DATASET_FILES, OUTPUTS, HemisphereName, output_name
+from hipsta_bids.derivatives.names import (
+    DATASET_FILES,
+    EXTRA_OUTPUTS,
+    OUTPUTS,
+    HemisphereName,
+    group_report,
+    output_name,
+    participant_report,
+)
 from hipsta_bids.errors import EXIT_MEANINGS, ExitCode
 
 PARSERS = {"participant": build_parser, "group": group_parser}
@@ -139,12 +158,64 @@ def test_each_output_of_the_table_has_a_template():
     name = HemisphereName(subject="X", session=None, hemi="L", seg="P")
     shown = {"interior_surface", "exterior_surface"} | {f"{s}_unfold" for s in (
         "interior", "midthickness", "exterior")}  # fmt: skip
-    for output in OUTPUTS:
-        found = [t for t in templates if fnmatch.fnmatch(output_name(name, output.key), t)]
-        # Sidecars lie beside their table, and other surfaces beside the middle one.
-        beside = output.key.endswith("_sidecar") or output.key in shown
+    for output in (*OUTPUTS, *EXTRA_OUTPUTS):
+        if "hipsta-bids surrogate" in output.description or output.key.startswith("surrogate"):
+            continue  # another command
+        found = [t for t in templates if fnmatch.fnmatch(output_name(name, output.key, "m"), t)]
+        # Sidecars and series lie beside their table, and other surfaces beside the middle one.
+        beside = output.key.endswith(("_sidecar", "_series")) or output.key in shown
         assert found or beside, output.key
-    assert {DATASET_FILES[key] for key in ("status", "settings", "citation")} <= set(templates)
+    whole = ("status", "settings", "description", "citation", "readme", "report")
+    assert {DATASET_FILES[key] for key in whole} <= set(templates)
+
+
+@pytest.mark.parametrize(
+    ("level", "page"),
+    [
+        ("participant", DATASET_FILES["report"]),
+        ("participant", participant_report("01", "a")),
+        ("group", group_report("mine")),
+    ],
+)
+def test_pages_are_outputs(level, page):
+    outputs = describe(level)["output-files"]
+    root = "[OUTPUT_DIR]/"
+    found = [
+        entry
+        for entry in outputs
+        if fnmatch.fnmatch(page, entry["path-template"].removeprefix(root))
+        and entry["path-template"].endswith(".html")
+    ]
+    assert [entry["optional"] for entry in found] == [True]  # --no-reports
+
+
+@pytest.mark.parametrize("level", [None, *PARSERS])
+def test_descriptors_name_the_paper_the_published_image_and_the_code(level):
+    local = describe(level)
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert local["tool-doi"] in {entry["doi"] for entry in citation["references"]}
+    assert local["container-image"]["image"] == f"hipsta_bids:{__version__}"
+    assert "url" not in local  # nobody has said where it is
+    names = {"image": "registry.example/lab/hipsta_bids:1.2", "url": "https://example.org/code"}
+    published = describe(level, **names)
+    assert published["container-image"]["image"] == names["image"]
+    assert published["url"] == names["url"]
+    same = local.keys() - {"container-image"}
+    assert {key: published[key] for key in same} == {key: local[key] for key in same}
+
+
+def test_published_descriptors_are_written_everywhere(tmp_path):
+    for part in ("tools", "hipsta_bids"):
+        ignored = shutil.ignore_patterns("__pycache__", "*.png")
+        shutil.copytree(ROOT / part, tmp_path / part, ignore=ignored)
+    image, url = "registry.example/lab/hipsta_bids:1.2", "https://example.org/code"
+    script = [sys.executable, tmp_path / "tools" / "make-descriptors", "--image", image]
+    subprocess.run([*script, "--url", url], check=True, capture_output=True)
+    written = [*tmp_path.glob("descriptors/*.json"), tmp_path / SHIPPED]
+    assert len(written) == len(DESCRIPTORS) + 1
+    for path in written:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        assert (content["container-image"]["image"], content["url"]) == (image, url)
 
 
 @pytest.mark.parametrize("name", DESCRIPTORS)
