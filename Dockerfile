@@ -1,6 +1,6 @@
-# tools/build-image builds it with all labels: see docs/containers.md.
-# The base is the whole reference: --build-arg BASE_IMAGE=python:3.11-slim-bookworm takes today's.
-ARG BASE_IMAGE=python:3.11-slim-bookworm@sha256:a36c24f9cbdf4fd0f52d67f0823eeac19c2028c637cecc392d97f980d4fec56b
+# tools/build-image builds it with all labels, on a base by digest: see docs/containers.md.
+# Without it, the base is the one that has this name today, or was loaded by it.
+ARG BASE_IMAGE=python:3.11-slim-bookworm
 # Written into datasets and descriptors: the image, and where its code is.
 ARG IMAGE=hipsta_bids:0.1.0
 ARG CODE_URL=
