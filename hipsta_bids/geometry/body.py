@@ -37,7 +37,7 @@ from hipsta_bids.geometry.digital import (
 )
 from hipsta_bids.geometry.ends import EndPlanes, find_end_planes
 from hipsta_bids.protocols.load import for_region
-from hipsta_bids.protocols.protocol import Tissue, lateral_rank
+from hipsta_bids.protocols.protocol import MEDIAL_END, Tissue, lateral_rank
 from hipsta_bids.settings import BodySettings
 from hipsta_bids.types import Bool, EditedMask, End, Finding, Float, LabelVolume
 
@@ -104,7 +104,7 @@ class Body:
         """
         if self.region != "entorhinal":
             return lateral_rank(self.tissue[self.inside]).astype(np.float64)
-        medial = np.isin(self.hippocampal, (Tissue.PRESUBICULUM, Tissue.SUBICULUM))
+        medial = np.isin(self.hippocampal, MEDIAL_END)
         near = cKDTree(voxel_points(medial, self.affine))
         return np.asarray(-near.query(self.inside_points()[1])[0])
 
@@ -233,7 +233,7 @@ def check_side(body: Body, hemi: str) -> float:
     if body.region != "body":
         inside, points = between(body.hippocampal > 0, body.affine, body.ends)
     values = body.hippocampal[inside]
-    medial = np.isin(values, (Tissue.PRESUBICULUM, Tissue.SUBICULUM))
+    medial = np.isin(values, MEDIAL_END)
     lateral = values == Tissue.CA1
     if not (medial.any() and lateral.any()):
         return float("nan")

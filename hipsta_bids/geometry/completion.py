@@ -26,7 +26,7 @@ from hipsta_bids.geometry.digital import (
     widened,
 )
 from hipsta_bids.geometry.ends import EndPlanes
-from hipsta_bids.protocols.protocol import Tissue
+from hipsta_bids.protocols.protocol import LATERAL_END, MEDIAL_END, Tissue
 from hipsta_bids.settings import BodySettings
 from hipsta_bids.types import Bool, Float, LabelVolume
 
@@ -91,8 +91,8 @@ def find_uncus(tissue: Tissues, affine: Float, ends: EndPlanes, settings: BodySe
     index, points = index[near], points[near]
     low = index.min(axis=0) if len(index) else np.zeros(3, np.intp)
     kinds, at = tissue[tuple(index.T)], tuple((index - low).T)
-    lateral = np.isin(kinds, (Tissue.CA2, Tissue.CA2_3, Tissue.CA3))
-    medial = np.isin(kinds, (Tissue.PRESUBICULUM, Tissue.SUBICULUM))
+    lateral = np.isin(kinds, LATERAL_END)
+    medial = np.isin(kinds, MEDIAL_END)
     grid = np.zeros(index.max(axis=0, initial=-1) - low + 1, dtype=np.int32)
     grid[at] = lateral & (ends.depth(points) > 0)
     pieces = ndimage.label(grid, structure=ALL)[0][at]

@@ -40,14 +40,12 @@ from hipsta_bids.geometry.ribbon import (
     part_turns,
     ribbon_nodes,
 )
-from hipsta_bids.protocols.protocol import Tissue
+from hipsta_bids.protocols.protocol import LATERAL_END, MEDIAL_END
 from hipsta_bids.settings import SliceSettings
 from hipsta_bids.types import Bool, Float
 
 _LEVELS = (2, 1)
 """Sizes of pixels in the registration, from coarse to those of the segmentation."""
-_ENDS = ((Tissue.PRESUBICULUM, Tissue.SUBICULUM), (Tissue.CA2, Tissue.CA2_3, Tissue.CA3))
-"""Subfields of the medial and the lateral end of the ribbon; CA1 lies between them."""
 
 
 def register_slices(outlines: Stack, pixel: float, settings: SliceSettings) -> Stack:
@@ -197,7 +195,7 @@ def points_of_ends(body: Body) -> tuple[Float, Float]:
     """Voxels (N, 3) of the medial and of the lateral end of the ribbon, RAS mm."""
     index, points = body.inside_points()
     tissue = body.tissue[tuple(index.T)]
-    medial, lateral = (points[np.isin(tissue, kinds)] for kinds in _ENDS)
+    medial, lateral = (points[np.isin(tissue, kinds)] for kinds in (MEDIAL_END, LATERAL_END))
     return medial, lateral
 
 
@@ -268,7 +266,10 @@ def _stacked(tissue: NDArray[np.uint8], pixel: float, settings: SliceSettings) -
         ]
     )
     ends = np.array(
-        [[part_distance(image, end, pixel, settings) for image in tissue] for end in _ENDS]
+        [
+            [part_distance(image, end, pixel, settings) for image in tissue]
+            for end in (MEDIAL_END, LATERAL_END)
+        ]
     )
     fine = pixel / settings.upsampling
     outlines = np.minimum(outlines, keep_apart(ends[0], ends[1], settings))

@@ -63,7 +63,7 @@ from hipsta_bids.geometry.sheet import (
 )
 from hipsta_bids.geometry.topology import Repair, SolidField, repair_topology, repaired_columns
 from hipsta_bids.protocols.load import for_region
-from hipsta_bids.protocols.protocol import Tissue
+from hipsta_bids.protocols.protocol import LATERAL_END, MEDIAL_END, Tissue
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import (
     BodyMask,
@@ -83,9 +83,9 @@ from hipsta_bids.types import (
 
 #: What every protocol labels along the sheet, from medial to lateral.
 _PARTS = {
-    "subiculum": (Tissue.PRESUBICULUM, Tissue.SUBICULUM),
+    "subiculum": MEDIAL_END,
     "CA1": (Tissue.CA1,),
-    "CA2 or CA3": (Tissue.CA2, Tissue.CA2_3, Tissue.CA3),
+    "CA2 or CA3": LATERAL_END,
 }
 
 

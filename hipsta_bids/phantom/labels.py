@@ -10,7 +10,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from hipsta_bids.errors import ProtocolError, SettingsError
 from hipsta_bids.phantom.shape import Body, PhantomSpec, check_rotation
-from hipsta_bids.protocols.protocol import Label, Part, Protocol, Tissue
+from hipsta_bids.protocols.protocol import LATERAL_END, Label, Part, Protocol, Tissue
 from hipsta_bids.types import Bool, Float, Int, LabelVolume
 
 
@@ -97,10 +97,6 @@ _STAND_INS: Mapping[Tissue, tuple[Tissue, ...]] = MappingProxyType(
     }
 )
 
-#: Without head and tail labels, the body is known by slices that hold these (Diers et al. 2023,
-#: section 2.1: NeuroImage 276:120182), so they must not extend beyond it.
-_BODY_ONLY = (Tissue.CA2, Tissue.CA2_3, Tissue.CA3)
-
 #: mm of dentate gyrus before CA4 begins, going inwards.
 _GYRUS_DEPTH = 0.8
 
@@ -184,14 +180,15 @@ def label_for(protocol: Protocol, tissue: Tissue, part: Part) -> Label | None:
     """Label of a tissue of a part in a protocol; None if it has none.
 
     First the tissue (or its stand-in) in this part, then a label for the whole part, then the
-    tissue wherever it is.
+    tissue wherever it is. Without head and tail labels the body is known by CA2 and CA3, so these
+    must not extend beyond it (Diers et al. 2023, section 2.1: NeuroImage 276:120182).
     """
     by_meaning = {(label.tissue, label.part): label for label in reversed(protocol.labels)}
     tissues = (tissue, *_STAND_INS.get(tissue, ()))
     wanted = [(choice, part) for choice in tissues]
     if tissue not in CORTEX:
         wanted += [(Tissue.HIPPOCAMPUS, part)]
-    if part is Part.BODY or tissue not in _BODY_ONLY:
+    if part is Part.BODY or tissue not in LATERAL_END:
         wanted += [(choice, Part.UNKNOWN) for choice in tissues]
     return next((by_meaning[key] for key in wanted if key in by_meaning), None)
 

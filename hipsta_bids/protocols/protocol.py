@@ -47,15 +47,12 @@ class Part(IntEnum):
     TAIL = 3
 
 
+#: Subfields of the medial and of the lateral end of the sheet; CA1 lies between them.
+MEDIAL_END: tuple[Tissue, ...] = (Tissue.PRESUBICULUM, Tissue.SUBICULUM)
+LATERAL_END: tuple[Tissue, ...] = (Tissue.CA2, Tissue.CA2_3, Tissue.CA3)
+
 #: Order of the sheet's subfields from medial to lateral (Diers et al. 2023, section 2.1).
-MEDIAL_TO_LATERAL: tuple[Tissue, ...] = (
-    Tissue.PRESUBICULUM,
-    Tissue.SUBICULUM,
-    Tissue.CA1,
-    Tissue.CA2,
-    Tissue.CA2_3,
-    Tissue.CA3,
-)
+MEDIAL_TO_LATERAL: tuple[Tissue, ...] = (*MEDIAL_END, Tissue.CA1, *LATERAL_END)
 
 #: Cortex that the sheet goes on into beyond its medial end, from far to near. The entorhinal cortex
 #: lies before the parahippocampal cortex rather than beside it.
