@@ -26,7 +26,7 @@ def changed(site, defect):
     return (defect.volume.tissue != site.volume.tissue) | (defect.volume.part != site.volume.part)
 
 
-@pytest.mark.parametrize("kind", DEFECTS)
+@pytest.mark.parametrize("kind", [kind for kind in DEFECTS if kind != "stratum"])
 def test_every_kind_changes_the_labels_and_tells_where(site, kind):
     before = site.volume.tissue.copy()
     defect = make_defect(site, kind, SIZES.get(kind, 0.8))
@@ -36,6 +36,11 @@ def test_every_kind_changes_the_labels_and_tells_where(site, kind):
     if defect.volume.tissue.shape == before.shape and kind not in ("salt", "wrong-voxels"):
         where = changed(site, defect)
         np.testing.assert_array_equal(defect.changed, site.points[where])
+
+
+def test_a_stratum_needs_labels_of_the_molecular_layer(site):
+    with pytest.raises(SettingsError, match="changes no voxel"):
+        make_defect(site, "stratum", 6.0)
 
 
 def test_places_agree_with_the_phantoms_own_coordinates(case, site):
