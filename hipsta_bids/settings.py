@@ -211,8 +211,6 @@ class TopologySettings(SettingsTable):
     """A filled hole becomes as thick as the wall within this distance of it, grid nodes."""
     plug_neighbors: PositiveInt = 12
     """Number of nearest nodes of the wall's middle that a filled hole takes its thickness from."""
-    oriented_nodes: NonNegativeInt = 4
-    """Membranes of fewer nodes have no direction."""
     cut_across: NonNegativeFloat = 0.3
     """A cut severs the ribbon rather than a bridge if this share of it lies across the axis
     (projected areas, squared)."""

@@ -425,7 +425,7 @@ def _implausibility(kind: Kind, where: Index, solid: Bool, settings: TopologySet
     behind it, severs a strip of the ribbon beside a hole; a fill across the axis spans the inside
     of a bend, unless it is the lid of a tunnel that opens at an end plane.
     """
-    if len(where) < settings.oriented_nodes:
+    if len(where) == 1:  # it has no direction
         return 1.0
     areas = np.array(
         [len(np.unique(np.delete(where, axis, axis=1), axis=0)) for axis in range(3)],
