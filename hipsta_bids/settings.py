@@ -151,8 +151,7 @@ class SliceSettings(SettingsTable):
     max_gap: NonNegativeFloat = 1.2
     """Fragments are joined across at most this distance, mm."""
     max_break: NonNegativeFloat = 3.0
-    """So are pieces with a subfield that the rest lacks, if a slice beside shows the ribbon there,
-    mm."""
+    """The same where a slice beside shows the ribbon, for pieces with a subfield of their own."""
     crumb_area: NonNegativeFloat = 1.5
     """Fragments farther away are dropped if they are smaller than this, mm2."""
     hole_area: NonNegativeFloat = 3.0
@@ -211,14 +210,17 @@ class TopologySettings(SettingsTable):
     """A filled hole becomes as thick as the wall within this distance of it, grid nodes."""
     plug_neighbors: PositiveInt = 12
     """Number of nearest nodes of the wall's middle that a filled hole takes its thickness from."""
+    oriented_nodes: NonNegativeInt = 4
+    """Membranes of fewer nodes have no direction."""
     cut_across: NonNegativeFloat = 0.3
-    """A cut severs the ribbon rather than a bridge if this share of it lies across the axis
-    (projected areas, squared)."""
+    """A cut severs the ribbon, no bridge, if this share lies across the axis (squared areas)."""
     sever_reach: NonNegativeInt = 2
-    """A cut severs the ribbon only if the body goes on for this many grid nodes before and behind
-    it."""
+    """A cut severs the ribbon if the body goes on this many grid nodes before and behind it."""
     sever_share: NonNegativeFloat = 0.1
     """Share of the cut's nodes at which the body has to go on."""
+    sever_along: Numbers = (0.25, 0.5)
+    """Squared cosines between the axis and the line that joins the stumps of a cut: it severs
+    nothing up to the first one, and does in any case beyond the second."""
     sever_factor: NonNegativeFloat = 1000.0
     """Such cuts cost this much more: where one is the only way, the hemisphere is flagged."""
     contact_reach: NonNegativeFloat = 1.2

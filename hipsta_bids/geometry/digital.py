@@ -52,6 +52,7 @@ NEIGHBORS = np.vstack([_CORNERS, _CLOSE])
 """Offsets of the 26 neighbors in the order in which their bits are numbered."""
 
 _LEVELS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4)
+_STUMP = 3  # nodes from a cut within which its stumps are looked at
 _SLOPE = 0.4  # of a smoothed step per node, at the body's surface
 
 
@@ -421,24 +422,49 @@ def _implausibility(kind: Kind, where: Index, solid: Bool, settings: TopologySet
     """Factor by which the price of membranes across the long axis rises.
 
     The ribbon runs along the axis, so what fills a hole in it lies along the axis too, and so does
-    what cuts a bridge between two of its turns. A cut across the axis, with ribbon before and
-    behind it, severs a strip of the ribbon beside a hole; a fill across the axis spans the inside
-    of a bend, unless it is the lid of a tunnel that opens at an end plane.
+    what cuts a bridge between two of its turns. A cut whose stumps face each other along the axis
+    severs a strip of the ribbon beside a hole. So does one that lies across the axis with ribbon
+    before and behind it, unless its stumps face each other across. A fill across the axis spans
+    the inside of a bend, unless it is the lid of a tunnel that opens at an end plane.
     """
-    if len(where) == 1:  # it has no direction
-        return 1.0
     areas = np.array(
         [len(np.unique(np.delete(where, axis, axis=1), axis=0)) for axis in range(3)],
         dtype=float,
     )
+    oriented = len(where) >= settings.oriented_nodes
     across = areas[2] ** 2 / float(areas @ areas)
     if kind == "cut":
-        severs = across > settings.cut_across and _continues(where, solid, settings)
+        along, (least, enough) = _stumps_along(where, solid), settings.sever_along
+        lies_across = oriented and across > settings.cut_across and along > least
+        severs = along > enough or (lies_across and _continues(where, solid, settings))
         return settings.sever_factor if severs else 1.0
     level = float(where[:, 2].mean()) - FIRST[2]
     last = solid.shape[2] - 2 * FIRST[2] - 1
     lid = min(level, last - level) < settings.lid_nodes
-    return settings.across_factor if across > settings.fill_across and not lid else 1.0
+    spans = oriented and across > settings.fill_across and not lid
+    return settings.across_factor if spans else 1.0
+
+
+def _stumps_along(where: Index, solid: Bool) -> float:
+    """Squared cosine between the axis and the line that joins the two stumps of a cut.
+
+    Stumps are the largest two pieces of what lies within a few nodes of the cut; 0 if there is only
+    one, or the cut is a single node, which has no direction.
+    """
+    if len(where) == 1:
+        return 0.0
+    low = np.maximum(where.min(axis=0) - _STUMP, 0)
+    high = np.minimum(where.max(axis=0) + _STUMP + 1, solid.shape)
+    cut = np.zeros(high - low, dtype=bool)
+    cut[tuple((where - low).T)] = True
+    near = ndimage.distance_transform_edt(~cut) <= _STUMP
+    pieces, count = ndimage.label(solid[box(low, high)] & near & ~cut, structure=FACES)
+    if count < 2:  # noqa: PLR2004 -- one on each side
+        return 0.0
+    largest = np.argsort(-piece_sizes(pieces), kind="stable")[:2]
+    first, second = (np.argwhere(pieces == number).mean(axis=0) for number in largest)
+    line = second - first
+    return float(line[2] ** 2 / (line @ line))
 
 
 def _continues(where: Index, solid: Bool, settings: TopologySettings) -> bool:
