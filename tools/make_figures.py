@@ -6,7 +6,6 @@ Run it on an output dataset, for example after ``make demo``::
 """
 
 import argparse
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,18 +15,12 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.colors import CenteredNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 from numpy.typing import NDArray
 
-#: Column of the sheet table, title with unit, color map, and whether its middle means zero.
-QUANTITIES = (
-    ("thickness", "Thickness [mm]", "viridis", False),
-    ("curvature", "Mean curvature, mid-surface [1/mm]", "RdBu_r", True),
-)
+from hipsta_bids.reports.display import MAP_KINDS, X_ENDS, Y_ENDS, scale_of
 
-#: In the order in which the brain is seen from above: left first, the medial sides facing.
 HEMISPHERES = {"L": "left hemisphere", "R": "right hemisphere"}
 
 
@@ -101,32 +94,24 @@ def draw(maps: dict[str, SheetMaps], title: str) -> Figure:
     """
     mpl.rcParams.update({"font.size": 11, "axes.titlesize": 12})
     figure = Figure(figsize=(9.6, 7.2), layout="compressed")
-    axes = figure.subplots(len(QUANTITIES), len(maps), squeeze=False)
+    axes = figure.subplots(len(MAP_KINDS), len(maps), squeeze=False)
     figure.suptitle(title)
-    for row, (column, label, colors, centered) in zip(axes, QUANTITIES, strict=True):
-        norm = _scale([m.values(column) for m in maps.values()], centered=centered)
-        for axis, (hemi, sheet) in zip(row, maps.items(), strict=True):
+    for row, kind in zip(axes, MAP_KINDS, strict=True):
+        low, high = scale_of(kind, [m.values(kind.column).astype(float) for m in maps.values()])
+        for axis, sheet in zip(row, maps.values(), strict=True):
             x, y = (np.linspace(0, mm, n) for mm, n in zip(sheet.extent, sheet.shape, strict=True))
-            values = sheet.values(column).astype(float).T
-            image = axis.pcolormesh(x, y, values, cmap=colors, norm=norm, shading="nearest")
+            values = sheet.values(kind.column).astype(float).T
+            image = axis.pcolormesh(
+                x, y, values, cmap=kind.colors, vmin=low, vmax=high, shading="nearest"
+            )
             _draw_subfields(axis, sheet, x, y)
-            _scale_axis(axis, hemi)
-        row[0].set_ylabel("posterior  ←  mm  →  anterior")
-        figure.colorbar(image, ax=list(row), label=label, shrink=0.9)
+            _scale_axis(axis)
+        row[0].set_ylabel("  ←  mm  →  ".join(Y_ENDS))
+        figure.colorbar(image, ax=list(row), label=f"{kind.title} [{kind.unit}]", shrink=0.9)
     for top, bottom, hemi in zip(axes[0], axes[-1], maps, strict=True):
         top.set_title(HEMISPHERES[hemi])
-        sides = ("lateral", "medial") if hemi == "L" else ("medial", "lateral")
-        bottom.set_xlabel("  ←  mm  →  ".join(sides))
+        bottom.set_xlabel("  ←  mm  →  ".join(X_ENDS))
     return figure
-
-
-def _scale(arrays: Sequence[NDArray[Any]], *, centered: bool) -> Normalize:
-    """One scale for all; a few extreme points at the edges may saturate."""
-    values = np.concatenate([a.astype(float).ravel() for a in arrays])
-    low, high = np.nanpercentile(values, [1, 99])
-    if centered:
-        return CenteredNorm(vcenter=0, halfrange=float(max(abs(low), abs(high))))
-    return Normalize(float(low), float(high))
 
 
 def _draw_subfields(
@@ -162,12 +147,10 @@ def _edges(nodes: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.append(nodes - step / 2, nodes[-1] + step / 2)
 
 
-def _scale_axis(axis: Axes, hemi: str) -> None:
-    """Set up one panel; the left sheet is mirrored so that the medial sides face."""
+def _scale_axis(axis: Axes) -> None:
+    """Set up one panel."""
     axis.set_aspect("equal")
     axis.set_facecolor("0.8")
-    if hemi == "L":
-        axis.invert_xaxis()
     for direction in (axis.xaxis, axis.yaxis):
         direction.set_major_locator(MultipleLocator(5))
 
@@ -177,7 +160,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("out_dir", type=Path, help="an output dataset")
     parser.add_argument("picture", type=Path, help="the PNG file to write")
-    parser.add_argument("--subject", default="01", help="label without sub- (default: 01)")
+    parser.add_argument("--subject", default="demo1", help="label without sub- (default: demo1)")
     parser.add_argument("--title", default="Synthetic hippocampal bodies (make demo)")
     options = parser.parse_args()
     figure = draw(read_maps(options.out_dir, options.subject), options.title)

@@ -113,7 +113,7 @@ def _add_sheets(parser: Parser) -> None:
     add(
         "--exclude",
         "FILE.tsv",
-        "leave out: columns participant_id, perhaps session_id, hemi, reason",
+        "leave out: columns participant_id, perhaps session_id, hemi, protocol, region, reason",
     )
 
 

@@ -255,15 +255,21 @@ class Calibration:
     """Whether predicted chances are right, on subjects that were not fitted."""
 
     intercept: float
-    """Log odds by which cases are more frequent than predicted, given the slope of one."""
+    """Log odds by which cases are more frequent than predicted, given the slope of one; NaN where
+    a group is too small to judge calibration, as the slope."""
     slope: float
     """Below one if predictions are too extreme (Cox 1958)."""
     brier: float
     """Mean squared error of the predicted chance."""
     predicted: Float
-    """(bins,) mean predicted chance in groups of equal size."""
+    """(bins,) mean predicted chance in groups of equal size; empty where a group is too small."""
     observed: Float
     """(bins,) share of cases in them."""
+
+    @property
+    def judged(self) -> bool:
+        """Whether both groups are large enough."""
+        return len(self.predicted) > 0
 
 
 @dataclass(frozen=True)
@@ -402,18 +408,21 @@ def _predict(train: Float, case: Bool, test: Float, settings: ClassificationSett
 
 
 def calibrate(score: Float, case: Bool, settings: ClassificationSettings) -> Calibration:
-    """Compare predicted chances with what happened."""
+    """Compare predicted chances with what happened; the Brier score alone if groups are small."""
+    chance = special.expit(score)
+    brier = float(metrics.brier_score_loss(case, chance))
+    if min(case.sum(), (~case).sum()) < settings.least_calibrated:
+        return Calibration(np.nan, np.nan, brier, np.empty(0), np.empty(0))
     line = np.column_stack([np.ones(len(score)), score])
     slope = np.nan
     if np.ptp(score) > 0:
         slope = float(fit_overlapping_or_firth(line, case, settings).coefficients[1])
-    chance = special.expit(score)
     count = min(settings.bins, max(len(score) // _LEAST_IN_BIN, 2))
     bins = np.array_split(np.argsort(score, kind="stable"), count)
     return Calibration(
         intercept=_shift(score, case),
         slope=slope,
-        brier=float(metrics.brier_score_loss(case, chance)),
+        brier=brier,
         predicted=np.array([chance[members].mean() for members in bins]),
         observed=np.array([case[members].mean() for members in bins]),
     )

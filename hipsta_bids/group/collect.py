@@ -49,7 +49,8 @@ def read_exclusions(path: Path | None) -> list[dict[str, str]]:
     rows = files.read_tsv(path)
     if rows and "participant_id" not in rows[0]:
         raise InputError(
-            f"{path}: no column participant_id; it may have session_id, hemi and reason besides",
+            f"{path}: no column participant_id; it may have session_id, hemi, protocol, region and"
+            " reason besides",
             reason="bad-table",
         )
     return rows
@@ -58,7 +59,10 @@ def read_exclusions(path: Path | None) -> list[dict[str, str]]:
 def lost_exclusions(
     path: Path | None, rows: Sequence[Mapping[str, str]], found: Sequence[HemisphereName]
 ) -> tuple[str, ...]:
-    """Note rows of the user's table that match no hemisphere: labels may be misspelled."""
+    """Note rows of the user's table that match no hemisphere: labels may be misspelled.
+
+    Those ``found`` are of all protocols and regions, as rows of a saved list may be.
+    """
     if path is None:
         return ()
     if not rows:
@@ -73,8 +77,12 @@ def lost_exclusions(
 
 
 def is_listed(name: HemisphereName, row: Mapping[str, str]) -> bool:
-    """Whether a row of the user's table means this hemisphere; empty cells mean any."""
+    """Whether a row of the user's table means this hemisphere; empty cells mean any.
+
+    One without a protocol, of other programs' maps, is meant by rows of any protocol and region.
+    """
     own = {"participant_id": name.subject, "session_id": name.session or "", "hemi": name.hemi}
+    own |= {"protocol": name.seg, "region": name.region} if name.seg else {}
     for key, value in own.items():
         cell = row.get(key, files.MISSING).removeprefix("sub-").removeprefix("ses-")
         if cell not in {files.MISSING, "", value}:
@@ -259,7 +267,7 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
         versions=tuple(sorted({record.version for record in kept})),
         notes=(
             *notes,
-            *lost_exclusions(request.exclude_table, unwanted, [place.name for place in found]),
+            *lost_exclusions(request.exclude_table, unwanted, [place.name for place in everything]),
         ),
     )
 

@@ -1,12 +1,12 @@
 """Figures: maps, profiles, warps, cross-sections, receiver operating characteristics, calibration.
 
-How values become colors is that of the page (``reports.group_maps``).
+How values become colors, and how maps lie, is that of the pages (``reports.display``).
 """
 
 import io
 from collections.abc import Iterator, Mapping
 from itertools import cycle
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,17 +16,9 @@ from hipsta_bids.group.data import Cohort, Float, Int
 from hipsta_bids.group.glm import FittedMaps, PointTest
 from hipsta_bids.group.inference import MapKey
 from hipsta_bids.group.shapes import AverageShape
-from hipsta_bids.reports.group_maps import (
-    CHANGE_COLORS,
-    EFFECT_COLORS,
-    EFFECT_NAMES,
-    MEAN_COLORS,
-    P_COLORS,
-    effect_reach,
-    mean_limits,
-    signed_logarithm,
-    significance_reach,
-)
+from hipsta_bids.reports import display
+from hipsta_bids.reports.display import COLORS, X_ENDS, Y_ENDS
+from hipsta_bids.reports.group_maps import EFFECT_NAMES, signed_logarithm
 from hipsta_bids.reports.group_tables import BOTH, SIDES, display_name
 from hipsta_bids.reports.maps import new_figure
 from hipsta_bids.types import Mesh
@@ -35,13 +27,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-
-#: Colors of groups, safe for color-blind readers (Okabe and Ito 2008).
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 #: Font sizes in points: of titles, of axes, and inside.
 TITLE, LABEL, SMALL = 9, 7.5, 6.5
 _DOTS_PER_INCH = 150
-_MAP_PANEL, _SQUARE_PANEL = (2.6, 3.4), (3.1, 3.2)  # inches
+_MAP_PANEL, _SQUARE_PANEL = (2.6, 3.4), (3.1, 4.0)  # inches
 #: A surface is flat if it is thinner than this share of its length.
 _FLAT = 1e-3
 #: Positions of cross-sections along the long axis, as a fraction from posterior to anterior.
@@ -83,7 +72,7 @@ def shown(analysis: Analysis, measure: str) -> Mapping[str, FittedMaps]:
 
 def mark_medial(axis: "Axes", cohort: Cohort) -> None:
     """Say on the x axis which end is medial."""
-    axis.set_xticks([cohort.x[0], cohort.x[-1]], ["medial", "lateral"], fontsize=LABEL)
+    axis.set_xticks([cohort.x[0], cohort.x[-1]], X_ENDS, fontsize=LABEL)
     left, right = axis.get_xticklabels()
     left.set_horizontalalignment("left")
     right.set_horizontalalignment("right")
@@ -100,7 +89,7 @@ def draw_roc(analysis: Analysis) -> "Figure":
             curve = roc_curve(result.score, pair.is_case)
             axis.plot(*curve, color=color, label=text, linewidth=1.2)
         title = "area, participants fitted and left out"
-        _finish(axis, ("1 - specificity", "sensitivity"), title, "lower right")
+        _finish(axis, ("1 - specificity", "sensitivity"), title)
     return figure
 
 
@@ -108,12 +97,15 @@ def draw_calibration(analysis: Analysis) -> "Figure":
     """Draw predicted chances, cross-validated, against what happened."""
     figure, panels_of_pairs = _pair_panels(analysis)
     for axis, measure, pair in panels_of_pairs:
+        if not pair.comparison.full.calibration.judged:
+            axis.set_axis_off()  # too few participants
+            continue
         for color, name, result in _models(measure, pair):
             found = result.calibration
             text = f"{name}: {found.slope:.2f}, {found.brier:.2f}"
             axis.plot(found.predicted, found.observed, "o-", color=color, label=text, markersize=3)
         labels = ("predicted chance, cross-validated", "share of cases")
-        _finish(axis, labels, "slope, Brier score", "upper left")
+        _finish(axis, labels, "slope, Brier score")
     return figure
 
 
@@ -148,14 +140,19 @@ def _models(measure: str, pair: PairComparison) -> Iterator[tuple[str, str, Clas
     yield COLORS[1], f"with {display_name(measure)}", pair.comparison.full
 
 
-def _finish(
-    axis: "Axes", labels: tuple[str, str], title: str, corner: Literal["lower right", "upper left"]
-) -> None:
+def _finish(axis: "Axes", labels: tuple[str, str], title: str) -> None:
+    """Label the axes of a panel, about square, and put its legend below them, off the curves."""
     axis.set_xlabel(labels[0], fontsize=LABEL)
     axis.set_ylabel(labels[1], fontsize=LABEL)
-    axis.set_aspect("equal")
     axis.tick_params(labelsize=LABEL)
-    axis.legend(fontsize=SMALL, loc=corner, title=title, title_fontsize=SMALL)
+    axis.legend(
+        fontsize=SMALL,
+        title=title,
+        title_fontsize=SMALL,
+        loc="upper center",
+        bbox_to_anchor=(0.5, -0.15),
+        frameon=False,
+    )
 
 
 def draw_profiles(cohort: Cohort, analysis: Analysis) -> "Figure":
@@ -329,9 +326,8 @@ def draw_means(cohort: Cohort, analysis: Analysis, measure: str) -> "Figure":
             values = mean_of_known(one.values(measure)[own], 0)
             means[hemi, group] = values.reshape(one.maps.shape)
             counts[hemi, group] = int(own.sum())
-    centered = bool(analysis.comparison.pair) or set(sides) == {BOTH}
-    limits = mean_limits(list(means.values()), centered=centered)
-    scale = scale_of(CHANGE_COLORS if centered else MEAN_COLORS, *limits)
+    kind = display.kind_of(measure, change=bool(analysis.comparison.pair) or set(sides) == {BOTH})
+    scale = scale_of(kind.colors, *display.scale_of(kind, list(means.values())))
     images: list[Any] = []
     for i, (hemi, one) in enumerate(sides.items()):
         for j, group in enumerate(groups):
@@ -349,38 +345,58 @@ def draw_contrasts(cohort: Cohort, analysis: Analysis, measure: str) -> "Figure"
     sides = shown(analysis, measure)
     tests = next(iter(sides.values())).fits[measure].tests
     figure, axes = panels(len(tests), 2 * len(sides), _MAP_PANEL)
-    reach = effect_reach([_effect(t) for one in sides.values() for t in one.fits[measure].tests])
+    reaches = _reaches(analysis)
     signed = {}
     for hemi, one in sides.items():
         for i, test in enumerate(one.fits[measure].tests):
             found = analysis.found[MapKey(measure, test.contrast.name, hemi)]
             signed[hemi, i] = signed_logarithm(found.adjusted, found.rejected, test.statistic)
-    top = significance_reach(list(signed.values()))
-    effect_scale, p_scale = scale_of(EFFECT_COLORS, -reach, reach), scale_of(P_COLORS, -top, top)
-    images: list[Any] = []
+    top = display.significance_reach(list(signed.values()))
+    p_scale = scale_of(display.P_COLORS, -top, top)
+    effects, significances = {}, []
     for j, (hemi, one) in enumerate(sides.items()):
         for i, test in enumerate(one.fits[measure].tests):
             left, right = axes[i, 2 * j], axes[i, 2 * j + 1]
             effect = _effect(test).reshape(one.maps.shape)
             p = signed[hemi, i].reshape(one.maps.shape)
-            images.append(_draw(left, cohort, one, effect, effect_scale))
-            images.append(_draw(right, cohort, one, p, p_scale))
+            reach = reaches[test.contrast.name]
+            scale = scale_of(display.EFFECT_COLORS, -reach, reach)
+            effects[i] = _draw(left, cohort, one, effect, scale)
+            significances.append(_draw(right, cohort, one, p, p_scale))
             for axis, what in ((left, "effect size"), (right, "significance")):
                 axis.set_title(f"{test.contrast.name}\n{SIDES[hemi]}, {what}", fontsize=TITLE)
-    label = ", ".join(EFFECT_NAMES[kind] for kind in sorted({t.kind for t in tests}, reverse=True))
-    _bar(figure, images[1], axes, "-log10 of corrected p,\nwith the sign of the effect")
-    _bar(figure, images[0], axes, label, extend="both")
+    bar = _bar(figure, significances[0], axes, "-log10 of corrected p, with the sign of the effect")
+    alpha = next(iter(analysis.found.values())).alpha
+    for sign in (-1, 1):
+        bar.ax.axhline(-sign * np.log10(alpha), color="black", linewidth=1)
+        place = (-0.15, -sign * np.log10(alpha))
+        bar.ax.text(*place, f"p {alpha:g}", fontsize=SMALL, ha="right", va="center")
+    for i, test in enumerate(tests):
+        _bar(figure, effects[i], axes[i], EFFECT_NAMES[test.kind], extend="both")
     return figure
+
+
+def _reaches(analysis: Analysis) -> dict[str, float]:
+    """Effect sizes at the ends of the colors by contrast, the same for all measures."""
+    maps: dict[str, list[display.Effects]] = {}
+    for one in analysis.fitted.values():
+        for test in (test for fit in one.fits.values() for test in fit.tests):
+            effects = display.Effects(test.kind, _effect(test), test.statistic, test.df)
+            maps.setdefault(test.contrast.name, []).append(effects)
+    return {name: display.effect_reach(own) for name, own in maps.items()}
 
 
 def _effect(test: PointTest) -> Float:
     return test.cohen_d if test.kind == "t" else test.eta_squared
 
 
-def _bar(figure: "Figure", image: Any, axes: Any, label: str, extend: str = "neither") -> None:  # noqa: ANN401  (of matplotlib)
-    bar = figure.colorbar(image, ax=axes, shrink=min(1.0, 2 / len(axes)), extend=extend)
+def _bar(figure: "Figure", image: Any, axes: Any, label: str, extend: str = "neither") -> Any:  # noqa: ANN401  (of matplotlib)
+    bar = figure.colorbar(
+        image, ax=axes, shrink=min(1.0, 2 / len(axes)) if np.ndim(axes) > 1 else 1.0, extend=extend
+    )
     bar.set_label(label, fontsize=TITLE)
     bar.ax.tick_params(labelsize=LABEL)
+    return bar
 
 
 def _draw(
@@ -397,7 +413,7 @@ def _draw(
     image = axis.pcolormesh(x, y, values.T, **scale, shading="nearest", rasterized=True)
     axis.set_facecolor("0.92")
     mark_medial(axis, cohort)
-    axis.set_yticks([y[0], y[-1]], ["posterior", "anterior"], fontsize=LABEL, rotation=90)
+    axis.set_yticks([y[0], y[-1]], Y_ENDS, fontsize=LABEL, rotation=90)
     lower, upper = axis.get_yticklabels()
     lower.set_verticalalignment("bottom")
     upper.set_verticalalignment("top")
@@ -447,4 +463,5 @@ def draw_figures(
         yield from encode("sections", draw_sections(cohort, analysis, shapes))
     if analysis.pairs:
         yield from encode("roc", draw_roc(analysis))
-        yield from encode("calibration", draw_calibration(analysis))
+        if any(pair.comparison.full.calibration.judged for *_, pair in analysis.pairs):
+            yield from encode("calibration", draw_calibration(analysis))

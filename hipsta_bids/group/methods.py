@@ -34,6 +34,10 @@ REFERENCES: Mapping[str, str] = {
     "tfce": "Smith SM, Nichols TE. Threshold-free cluster enhancement: addressing problems of"
     " smoothing, threshold dependence and localisation in cluster inference. NeuroImage"
     " 2009;44(1):83-98. doi:10.1016/j.neuroimage.2008.03.061",
+    "snell": "Snell KIE, Archer L, Ensor J, Bonnett LJ, Debray TPA, Phillips B, et al. External"
+    " validation of clinical prediction models: simulation-based sample size calculations were more"
+    " reliable than rules-of-thumb. Journal of Clinical Epidemiology 2021;135:79-89."
+    " doi:10.1016/j.jclinepi.2021.02.011",
     "mixed": "Kuznetsova A, Brockhoff PB, Christensen RHB. lmerTest package: tests in linear mixed"
     " effects models. Journal of Statistical Software 2017;82(13):1-26."
     " doi:10.18637/jss.v082.i13",
@@ -88,7 +92,9 @@ def methods_text(
     if analysis.scores is not None:
         paragraphs.append(_normative(analysis.scores, settings, cite("normative")))
     if analysis.pairs:
-        paragraphs.append(_classification(analysis, settings, cite("delong"), cite("firth")))
+        paragraphs.append(
+            _classification(analysis, settings, cite("delong"), cite("firth"), cite("snell"))
+        )
     if analysis.found:
         paragraphs.append(_findings(analysis))
     lines = ["# Methods and findings", "", "This text may be used freely, as it stands or changed."]
@@ -239,7 +245,9 @@ def _normative(scores: Scores, settings: GroupSettings, source: str) -> str:
     )
 
 
-def _classification(analysis: Analysis, settings: GroupSettings, delong: str, firth: str) -> str:
+def _classification(
+    analysis: Analysis, settings: GroupSettings, delong: str, firth: str, snell: str
+) -> str:
     how = settings.classification
     separated = sum(pair.comparison.separated for _, _, pair in analysis.pairs)
     by_firth = (
@@ -252,7 +260,8 @@ def _classification(analysis: Analysis, settings: GroupSettings, delong: str, fi
         " same with one measure added; a likelihood-ratio test compares the two, on the same"
         f" participants. Areas under the curve have DeLong intervals {delong}, and are also given"
         f" from {how.folds}-fold stratified cross-validation repeated {how.repeats} times (seed"
-        f" {how.seed}).{by_firth}"
+        f" {how.seed}).{by_firth} Calibration is judged where both groups have"
+        f" {how.least_calibrated} members or more {snell}."
     )
 
 

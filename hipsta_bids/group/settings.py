@@ -226,6 +226,9 @@ class ClassificationSettings(SettingsTable):
     """Of the cross-validation."""
     bins: AtLeastTwo = 10
     """Groups of equal size in the table of calibration."""
+    least_calibrated: AtLeastTwo = 100
+    """Calibration is judged where both groups have this many: a rule of thumb, below which its
+    curve and slope are too uncertain (Snell et al. 2021)."""
     iterations: NonNegativeInt = 100
     """Most steps of a fit."""
     firth_iterations: NonNegativeInt = 2000

@@ -99,7 +99,8 @@ COLUMNS: Mapping[str, str] = {
     "auc_full_cv_sd": "standard deviation over repeats",
     "calibration_intercept": "log odds by which cases are more frequent than the full model says,"
     " cross-validated; 0 if it is right on average",
-    "calibration_slope": "of the full model, cross-validated; below 1 if it is too sure",
+    "calibration_slope": "of the full model, cross-validated; below 1 if it is too sure; as the"
+    " intercept, missing where a group has fewer than ``classification.least_calibrated`` members",
     "brier": "mean squared error of the chance, full model, cross-validated",
     "classifier": "base, or full with the measure added",
     "false_positives": "share of the first group at or above a score, one minus specificity",
@@ -144,7 +145,8 @@ def result_tables(cohort: Cohort, analysis: Analysis, settings: GroupSettings) -
     if analysis.pairs:
         yield "classification", _classification(analysis, settings)
         yield "roc", _stacked(_curves(analysis, _roc))
-        yield "calibration", _stacked(_curves(analysis, _calibration))
+        if any(pair.comparison.full.calibration.judged for *_, pair in analysis.pairs):
+            yield "calibration", _stacked(_curves(analysis, _calibration))
     yield from _statistics(cohort, analysis)
 
 

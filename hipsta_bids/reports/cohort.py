@@ -36,7 +36,7 @@ _SHOWN = {
     "curvature_mean": "Curvature",
     "volume": "Volume",
     "area_mid": "Area",
-    "extent_y": "Length",
+    "extent_y": "Sheet length",
 }
 _QUALITY = {
     "voxels_across": "Voxels across",
@@ -60,8 +60,8 @@ _TITLES = {
     "curvature_mean": ("Mean curvature", 3),
     "volume": ("Volume", 0),
     "area_mid": ("Area of the mid-surface", 0),
-    "extent_x": ("Width, medial to lateral", 1),
-    "extent_y": ("Length, posterior to anterior", 1),
+    "extent_x": ("Width of the sheet, medial to lateral", 1),
+    "extent_y": ("Length of the sheet, posterior to anterior", 1),
     "interior_exterior_ratio_mean": ("Interior to exterior length", 2),
     "shape_index_mean": ("Shape index", 2),
 }

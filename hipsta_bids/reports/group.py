@@ -17,6 +17,7 @@ from hipsta_bids.derivatives.names import DATASET_FILES, group_report
 from hipsta_bids.errors import HipstaError
 from hipsta_bids.io import files
 from hipsta_bids.io.files import hide_home
+from hipsta_bids.reports.display import DESIGN_COLORS, colors_of
 from hipsta_bids.reports.group_maps import embedded, map_scenes
 from hipsta_bids.reports.group_tables import (
     GroupResults,
@@ -31,7 +32,6 @@ from hipsta_bids.reports.group_tables import (
     scores,
     summaries,
 )
-from hipsta_bids.reports.maps import colors_of
 from hipsta_bids.reports.page import Section, build_sections, render
 
 _LOGGER = logging.getLogger(__name__)
@@ -87,7 +87,7 @@ def _matrix_picture(table: pd.DataFrame, columns: list[str]) -> dict[str, Any]:
     share = np.where(high > low, (matrix - low) / np.where(high > low, high - low, 1.0), 1.0)
     shades = (share * (_SHADES - 1)).round().astype(np.uint8)
     image = Image.fromarray(shades, mode="P")
-    colors = colors_of("cividis", _SHADES)
+    colors = colors_of(DESIGN_COLORS, _SHADES)
     image.putpalette([int(color[i : i + 2], 16) for color in colors.tolist() for i in (1, 3, 5)])
     buffer = io.BytesIO()
     image.save(buffer, format="png", optimize=True)
@@ -158,7 +158,15 @@ def _classification(results: GroupResults) -> Mapping[str, Any] | None:
     pictures += embedded(
         results, "calibration", calibration, "Share of cases against cross-validated chance"
     )
-    return {"rows": rows, "pictures": pictures}
+    settings = (results.record.get("settings") or {}).get("classification") or {}
+    return {
+        "rows": rows,
+        "pictures": pictures,
+        "bases": list(dict.fromkeys(row["base"] for row in rows)),
+        "least": settings.get("least_calibrated"),
+        "judged": any(row["slope"] for row in rows),
+        "chance": any(row["chance"] for row in rows),
+    }
 
 
 def _registration(results: GroupResults) -> Mapping[str, Any] | None:

@@ -1,7 +1,4 @@
-"""Maps of an analysis as the page draws them: means of groups, effects and significance.
-
-How values become colors is shared with the figures.
-"""
+"""Maps of an analysis as the page draws them: means of groups, effects and significance."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -10,6 +7,17 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from hipsta_bids.reports.display import (
+    EFFECT_COLORS,
+    P_COLORS,
+    Effects,
+    colors_of,
+    effect_reach,
+    kind_of,
+    known,
+    scale_of,
+    significance_reach,
+)
 from hipsta_bids.reports.group_tables import (
     BOTH,
     MINUS,
@@ -19,37 +27,15 @@ from hipsta_bids.reports.group_tables import (
     number_text,
     records,
     unit_of,
+    with_brackets,
     with_unit,
 )
-from hipsta_bids.reports.maps import Picture, colors_of, picture_of_file
+from hipsta_bids.reports.maps import Picture, picture_of_file
 from hipsta_bids.types import Float
 
 #: Kinds of effect sizes, by the test.
 EFFECT_NAMES = {"t": "Cohen's d", "F": "partial eta squared"}
-#: Color maps of means, of differences, of effect sizes and of significance.
-MEAN_COLORS, CHANGE_COLORS, EFFECT_COLORS, P_COLORS = "viridis", "PRGn", "RdBu_r", "PuOr_r"
-
-_SHARED = (2.0, 98.0)  # percentiles that the colors of means span
-_EFFECTS = 99.0  # percentile of sizes that the colors of effects span
-_SMALLEST = 1e-6  # reach of colors where all values are zero
 _SMALLEST_P = 1e-10
-_LEAST_REACH = 3.0  # powers of ten of p that colors span at least
-
-
-def mean_limits(values: Sequence[Float], *, centered: bool) -> tuple[float, float]:
-    """Choose the ends of the colors of means; those of differences are symmetric about zero."""
-    known = _known(values)
-    low, high = np.percentile(known, _SHARED).tolist() if len(known) else (0.0, 1.0)
-    if not centered:
-        return low, max(high, low + _SMALLEST)
-    high = max(abs(low), abs(high), _SMALLEST)
-    return -high, high
-
-
-def effect_reach(values: Sequence[Float]) -> float:
-    """Return the effect size at the end of the colors."""
-    sizes = np.abs(_known(values))
-    return max(float(np.percentile(sizes, _EFFECTS)) if len(sizes) else 0.0, _SMALLEST)
 
 
 def signed_logarithm(adjusted: Float, significant: NDArray[np.bool_], statistic: Float) -> Float:
@@ -58,27 +44,27 @@ def signed_logarithm(adjusted: Float, significant: NDArray[np.bool_], statistic:
     return np.where(significant, size * np.sign(statistic), np.nan)
 
 
-def significance_reach(values: Sequence[Float]) -> float:
-    """Return the power of ten of p at the end of the colors."""
-    return max(_LEAST_REACH, float(np.abs(_known(values)).max(initial=0)))
-
-
 def map_scenes(results: GroupResults) -> Mapping[str, Any] | None:
     """Collect the maps of all measures: scenes on regular grids, and figures of other surfaces."""
     maps = results.table("maps")
     if not len(maps):
         return None
-    blocks, pictures = [], []
+    sides, pictures = {}, []
     for measure in maps["measure"].unique().tolist():
         own = maps[maps["measure"] == measure]
         if "node_x" in results.table(str(own["file"].iloc[0])):
-            blocks.append(_block(results, measure, own))
+            sides[measure] = [
+                _side(results, str(hemi), _means(results, measure), rows)
+                for hemi, rows in own.groupby("hemi", sort=False)
+            ]
         else:
             title = display_name(measure).capitalize()
             pictures += embedded(results, f"{measure}_means", f"{title}: means")
             pictures += embedded(
                 results, f"{measure}_contrasts", f"{title}: effects and significance"
             )
+    every = [test for own in sides.values() for side in own for test in side["tests"]]
+    blocks = [_block(results, measure, own, every) for measure, own in sides.items()]
     return {
         "blocks": [block for block, _ in blocks],
         "data": [scene for _, scene in blocks],
@@ -92,20 +78,23 @@ def embedded(results: GroupResults, name: str, caption: str, alt: str = "") -> l
     return [picture_of_file(path, alt=alt or caption, caption=caption)] if path.exists() else []
 
 
-def _block(
-    results: GroupResults, measure: str, maps: pd.DataFrame
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Everything about one measure: for the template, and for the script."""
+def _means(results: GroupResults, measure: str) -> pd.DataFrame:
     means = results.table("means")
-    means = means[means["measure"] == measure] if len(means) else means
+    return means[means["measure"] == measure] if len(means) else means
+
+
+def _block(
+    results: GroupResults,
+    measure: str,
+    sides: Sequence[Mapping[str, Any]],
+    every: Sequence[Mapping[str, Any]],
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Everything about one measure, beside the tests of all: for the template and the script."""
+    means = _means(results, measure)
     unit = str(means["unit"].iloc[0]) if len(means) else "1"
-    sides = [
-        _side(results, str(hemi), means, rows) for hemi, rows in maps.groupby("hemi", sort=False)
-    ]
-    contrasts = maps["contrast"].unique().tolist()
     scene = {
         "unit": unit_of(unit),
-        "scales": _scales(results, sides, unit),
+        "scales": _scales(results, measure, sides, every, unit),
         "sides": [_rounded(side) for side in sides],
     }
     block = {
@@ -113,7 +102,7 @@ def _block(
         "means": list(_mean_panels(measure, unit, sides)),
         "contrasts": [
             {"name": name, "panels": list(_contrast_panels(measure, name, sides))}
-            for name in contrasts
+            for name in dict.fromkeys(t["contrast"] for side in sides for t in side["tests"])
         ],
         "scales": scene["scales"],
     }
@@ -167,36 +156,62 @@ def _test(results: GroupResults, row: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _scales(results: GroupResults, sides: Sequence[Mapping[str, Any]], unit: str) -> dict[str, Any]:
+def _scales(
+    results: GroupResults,
+    measure: str,
+    sides: Sequence[Mapping[str, Any]],
+    every: Sequence[Mapping[str, Any]],
+    unit: str,
+) -> dict[str, Any]:
     """Choose ends, colors and words of the color bars; sides share them."""
     pair = (results.record.get("comparison") or {}).get("pair")
-    centered = bool(pair) or {side["hemi"] for side in sides} == {BOTH}
-    means = mean_limits([g["values"] for side in sides for g in side["means"]], centered=centered)
+    change = bool(pair) or {side["hemi"] for side in sides} == {BOTH}
+    kind = kind_of(measure, change=change)
+    means = scale_of(kind, [g["values"] for side in sides for g in side["means"]])
     tests = [test for side in sides for test in side["tests"]]
     top = significance_reach([test["significance"] for test in tests])
     mean_label = "mean change" if pair else "mean"
     effects = {}
-    # Each contrast has its own ends: effects per year and of groups differ by far.
+    # Each contrast has its own ends, the same for all measures: effects per year and of groups
+    # differ by far.
     for test in tests:
-        same = [one["effect"] for one in tests if one["contrast"] == test["contrast"]]
-        reach = effect_reach(same)
+        same = [one for one in every if one["contrast"] == test["contrast"]]
+        reach = effect_reach([_effects(one) for one in same])
         label = f"effect size, {EFFECT_NAMES[test['kind']]}"
         effects[test["contrast"]] = _scale(EFFECT_COLORS, (-reach, reach), label)
     return {
         "mean": _scale(
-            CHANGE_COLORS if centered else MEAN_COLORS,
+            kind.colors,
             means,
-            f"{mean_label} [{unit_of(unit)}]" if unit_of(unit) else mean_label,
+            with_brackets(mean_label, unit),
         ),
         "effect": effects,
         "significance": _scale(
-            P_COLORS, (-top, top), f"{MINUS}log₁₀ of corrected p, with the sign of the effect"
+            P_COLORS,
+            (-top, top),
+            f"{MINUS}log₁₀ of corrected p, with the sign of the effect",
+            _level_marks(results, top),
         ),
     }
 
 
-def _scale(colors: str, ends: tuple[float, float], label: str) -> dict[str, Any]:
+def _effects(test: Mapping[str, Any]) -> Effects:
+    values = test["values"]
+    return Effects(test["kind"], test["effect"], values["statistic"], values["df"])
+
+
+def _level_marks(results: GroupResults, top: float) -> list[tuple[float, str]]:
+    """Positions on the bar of significance, in percent, of the level on both sides of zero."""
+    alpha = ((results.record.get("settings") or {}).get("multiplicity") or {}).get("alpha", 0.05)
+    share = -50 * np.log10(alpha) / top
+    return [(round(50 + sign * share, 2), f"p {number_text(alpha)}") for sign in (-1, 1)]
+
+
+def _scale(
+    colors: str, ends: tuple[float, float], label: str, marks: Sequence[tuple[float, str]] = ()
+) -> dict[str, Any]:
     return {
+        "marks": marks,
         "low": ends[0],
         "high": ends[1],
         "words": [number_text(value) for value in (ends[0], sum(ends) / 2, ends[1])],
@@ -205,15 +220,10 @@ def _scale(colors: str, ends: tuple[float, float], label: str) -> dict[str, Any]
     }
 
 
-def _known(arrays: Sequence[Float]) -> Float:
-    every = np.concatenate([np.ravel(a) for a in arrays]) if arrays else np.empty(0)
-    return np.asarray(every[np.isfinite(every)], dtype=np.float64)
-
-
 def _span(values: Float) -> str:
     """Spell the smallest and the largest value."""
-    known = _known([values])
-    return f"{number_text(known.min())} to {number_text(known.max())}" if len(known) else "n/a"
+    some = known([values])
+    return f"{number_text(some.min())} to {number_text(some.max())}" if len(some) else "n/a"
 
 
 def _rounded(side: Mapping[str, Any]) -> dict[str, Any]:

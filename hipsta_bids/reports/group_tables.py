@@ -5,12 +5,15 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from string import ascii_uppercase
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from hipsta_bids.io import files
+from hipsta_bids.protocols.protocol import Tissue
+from hipsta_bids.reports.display import subfield_title
 
 #: Names of the sides in tables of maps; in those of summary measures LR may be a mean.
 SIDES = {"L": "left", "R": "right", "LR": "left minus right"}
@@ -22,7 +25,13 @@ _THIRD = 1 / 3
 _ALPHA = 0.05  # of tests that are not corrected, for a word only
 _MOST_ROWS = 200  # of lists, so that pages stay small
 _IDS = ("participant_id", "session_id")
+_CHANCE = 0.5  # area under the curve of guesses
 _FAR = 2.0  # w-scores beyond are listed: about one in twenty of the reference
+
+#: Names of tissues inside names of measures; ``CA2_3`` before ``CA2``.
+_SUBFIELD = re.compile(
+    f"_({'|'.join(sorted((tissue.name for tissue in Tissue), key=len, reverse=True))})(?=_|$)"
+)
 
 #: Columns that are never numbers.
 _TEXT = (
@@ -87,13 +96,19 @@ def records(table: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def display_name(measure: str) -> str:
-    """Write a measure with spaces."""
-    return measure.replace("_", " ")
+    """Write a measure in words, with its subfield after a comma."""
+    words = _SUBFIELD.sub(lambda found: f", {subfield_title(found[1])}", measure)
+    return words.replace("_", " ")
 
 
 def unit_of(unit: str) -> str:
     """Write a unit with superscripts; nothing for pure numbers."""
     return "" if unit == "1" else unit.replace("^2", "²").replace("^3", "³")
+
+
+def with_brackets(title: str, unit: str) -> str:
+    """Append a unit to the title of a column or row."""
+    return f"{title} [{unit_of(unit)}]" if unit_of(unit) else title
 
 
 def with_unit(text: str, unit: str) -> str:
@@ -264,10 +279,13 @@ def _summaries(results: GroupResults) -> Iterator[str]:
     table = results.table("measures")
     if not len(table):
         return
-    for (contrast, measure), rows in table.groupby(["contrast", "measure"], sort=False):
+    several = len(table["model"].unique()) > 1
+    by = ["contrast", "measure", "model"]
+    for (contrast, measure, model), rows in table.groupby(by, sort=False):
         own = rows[rows["p"] < _ALPHA]
         if len(own):
-            yield f"{display_name(str(measure))}, {contrast}: " + "; ".join(
+            said = f", model {model}" if several else ""
+            yield f"{display_name(str(measure))}, {contrast}{said}: " + "; ".join(
                 f"{summary_side(row['hemi'], str(measure))} {effect_name(row['effect'])}"
                 f" {number_text(row['effect_size'])}, p {p_text(row['p'])}"
                 for row in records(own)
@@ -391,8 +409,7 @@ def summaries(results: GroupResults) -> Mapping[str, Any] | None:
             continue
         rows.append(
             {
-                "measure": display_name(row["measure"]),
-                "unit": unit_of(row["unit"]),
+                "measure": with_brackets(display_name(row["measure"]), row["unit"]),
                 "side": summary_side(row["hemi"], row["measure"]),
                 "contrast": row["contrast"],
                 "model": row["model"],
@@ -408,7 +425,10 @@ def summaries(results: GroupResults) -> Mapping[str, Any] | None:
                 "effect": effect_text(row),
             }
         )
-    models = list(dict.fromkeys(row["model"] for row in rows))
+    letters = dict(zip(dict.fromkeys(row["model"] for row in rows), ascii_uppercase, strict=False))
+    for row in rows:
+        row["letter"] = letters[row["model"]]
+    models = [(letter, model) for model, letter in letters.items()]
     return {"groups": groups, "rows": rows, "models": models if len(models) > 1 else []}
 
 
@@ -421,13 +441,16 @@ def classification(results: GroupResults) -> list[dict[str, Any]]:
             "side": summary_side(row["hemi"], row["added"]),
             "base": " + ".join(display_name(name) for name in row["base"].split(" + ")),
             "added": display_name(row["added"]),
-            "n": f"{row['n']} ({row['n_cases']} {row['case']})",
+            "n": f"{row['n'] - row['n_cases']} and {row['n_cases']}",
             "areas": [
                 f"{row[f'auc_{m}']:.2f} ({row[f'auc_{m}_low']:.2f} to {row[f'auc_{m}_high']:.2f})"
                 for m in ("base", "full")
             ],
             "validated": [f"{row[f'auc_{model}_cv']:.2f}" for model in ("base", "full")],
-            "slope": number_text(row["calibration_slope"]),
+            "slope": number_text(row["calibration_slope"])
+            if np.isfinite(row["calibration_slope"])
+            else "",
+            "chance": bool(min(row["auc_base_cv"], row["auc_full_cv"]) < _CHANCE),
             "brier": f"{row['brier']:.3f}",
             "ratio": f"{row['likelihood_ratio']:.2f}",
             "p": p_text(row["p"]),

@@ -20,6 +20,16 @@ from numpy.typing import NDArray
 from hipsta_bids.derivatives.hemisphere import read_sheet
 from hipsta_bids.errors import InputError
 from hipsta_bids.io.files import scratch_folder
+from hipsta_bids.reports.display import (
+    HEMISPHERE_COLORS,
+    MAP_KINDS,
+    X_ENDS,
+    Y_ENDS,
+    MapKind,
+    colors_of,
+    gradient_of,
+    scale_of,
+)
 from hipsta_bids.reports.results import Hemisphere
 from hipsta_bids.types import Float, Status
 
@@ -29,9 +39,6 @@ if TYPE_CHECKING:
 
 #: What a user may have in the environment that would change figures.
 _PREFERENCES = ("MPLBACKEND", "MATPLOTLIBRC")
-
-#: Colors of the hemispheres (Okabe and Ito 2008).
-HEMISPHERE_COLORS = {"L": "#0072B2", "R": "#D55E00"}
 
 _STYLE: Any = {
     "font.family": "sans-serif",
@@ -78,54 +85,6 @@ def _own_settings() -> Iterator[None]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MapKind:
-    """How a map is shown."""
-
-    column: str
-    """Of the sheet table."""
-    title: str
-    unit: str
-    colors: str
-    """Color map of matplotlib, perceptually uniform or diverging, safe for color-blind readers."""
-    centered: bool
-    """Whether the middle of the colors means zero."""
-    digits: int
-    percentiles: tuple[float, float]
-    """Values at the ends of the colors, so that a few points at the edges may saturate."""
-
-
-THICKNESS = MapKind(
-    column="thickness",
-    title="Thickness",
-    unit="mm",
-    colors="viridis",
-    centered=False,
-    digits=2,
-    percentiles=(1, 99),
-)
-CURVATURE = MapKind(
-    column="curvature",
-    title="Mean curvature",
-    unit="1/mm",
-    colors="RdBu_r",
-    centered=True,
-    digits=3,
-    percentiles=(4, 96),
-)
-MAP_KINDS = (THICKNESS, CURVATURE)
-#: Drawn where it was estimated (``--uncertainty``).
-UNCERTAINTY = MapKind(
-    column="thickness_sd",
-    title="SD of thickness",
-    unit="mm",
-    colors="magma",
-    centered=False,
-    digits=2,
-    percentiles=(1, 99),
-)
-
-
-@dataclass(frozen=True, kw_only=True)
 class Picture:
     """A figure in a page."""
 
@@ -137,38 +96,6 @@ class Picture:
     """CSS pixels at which its letters have their size."""
 
 
-def scale_of(kind: MapKind, values: Sequence[Float]) -> tuple[float, float]:
-    """Choose the values at both ends of the color bar."""
-    every = np.concatenate([np.ravel(array) for array in values])
-    every = every[np.isfinite(every)]
-    if not len(every):
-        return -1.0, 1.0
-    low, high = (float(v) for v in np.percentile(every, kind.percentiles))
-    if kind.centered:
-        reach = max(abs(low), abs(high), 1e-6)
-        return -reach, reach
-    return low, max(high, low + 1e-6)
-
-
-def color_table(kind: MapKind, n: int = 64) -> NDArray[np.str_]:
-    """List the colors of a map as ``#rrggbb``."""
-    return colors_of(kind.colors, n)
-
-
-def colors_of(name: str, n: int = 64) -> NDArray[np.str_]:
-    """List the colors of one of matplotlib's color maps as ``#rrggbb``."""
-    from matplotlib import colormaps  # noqa: PLC0415  (slow to load)
-    from matplotlib.colors import to_hex  # noqa: PLC0415
-
-    return np.array([to_hex(color) for color in colormaps[name](np.linspace(0, 1, n))])
-
-
-def gradient_of(colors: NDArray[np.str_]) -> str:
-    """Write a color table as a CSS gradient from left to right."""
-    stops = colors[np.linspace(0, len(colors) - 1, 9).round().astype(int)]
-    return f"linear-gradient(to right,{','.join(stops.tolist())})"
-
-
 def draw_map(kind: MapKind, hemispheres: Sequence[Hemisphere]) -> Picture:
     """Draw one map of both hemispheres, unfolded, side by side on one color scale."""
     figure, axes = _new_figure(1, len(hemispheres), (2.6 * len(hemispheres) + 0.9, 3.1))
@@ -176,7 +103,7 @@ def draw_map(kind: MapKind, hemispheres: Sequence[Hemisphere]) -> Picture:
     image: Any = None
     for axis, hemisphere in zip(axes[0], hemispheres, strict=True):
         image = _draw_sheet(axis, hemisphere, kind, (low, high))
-    axes[0, 0].set_ylabel("posterior  ←  mm  →  anterior")
+    axes[0, 0].set_ylabel("  ←  mm  →  ".join(Y_ENDS))
     figure.colorbar(
         image, ax=list(axes[0]), label=f"{kind.title.lower()} [{kind.unit}]", extend="both"
     )
@@ -218,7 +145,7 @@ def draw_profiles(
     # Columns beside the edges of the sheet may be far off; they must not squeeze the rest.
     bottom, top = np.nanpercentile(np.concatenate(bands), [3, 97])
     axis.set_ylim(bottom - 0.15 * (top - bottom), top + 0.2 * (top - bottom))
-    axis.set_xlabel("medial  ←  % of the width  →  lateral")
+    axis.set_xlabel("  ←  % of the width  →  ".join(X_ENDS))
     axis.set_ylabel(f"{kind.title.lower()} [{kind.unit}]")
     if kind.centered:
         axis.axhline(0, color="0.6", linewidth=0.7, zorder=0)
@@ -288,12 +215,7 @@ def _draw_sheet(
     _draw_borders(axis, sheet.subfield, x, y)
     axis.set_aspect("equal")
     axis.set_title(hemisphere.side)
-    sides = ("medial", "lateral")
-    # Seen from above: the medial sides of both hemispheres face each other.
-    if hemisphere.place.name.hemi == "L":
-        axis.invert_xaxis()
-        sides = sides[::-1]
-    axis.set_xlabel(f"{sides[0]}  ←  mm  →  {sides[1]}")
+    axis.set_xlabel("  ←  mm  →  ".join(X_ENDS))
     return image
 
 
@@ -411,35 +333,32 @@ def make_sprites(
         tiles={row: tile for tile, row in enumerate(shown)},
     )
     step = 1 if len(shown) <= _FULL_SIZE else 2
-    mirrored = [hemispheres[row].place.name.hemi == "L" for row in shown]
     trusted = [row for row in shown if hemispheres[row].status != Status.FLAGGED] or shown
     sprites = []
     for kind in MAP_KINDS if shown else ():
         # Flagged hemispheres may be far off; they must not stretch the colors of all others.
         scale = scale_of(kind, [maps[row][kind.column] for row in trusted])
         tiles = [maps[row][kind.column][::step, ::step] for row in shown]
-        sprites.append(_sprites(kind, tiles, mirrored, grid, scale))
+        sprites.append(_sprites(kind, tiles, grid, scale))
     return sprites, grid
 
 
 def _sprites(
     kind: MapKind,
     maps: Sequence[Float],
-    mirrored: Sequence[bool],
     grid: Grid,
     scale: tuple[float, float],
 ) -> Sprites:
     low, high = scale
     width, height = maps[0].shape
     picture = np.full((grid.rows * height, grid.columns * width), _COLORS, dtype=np.uint8)
-    for number, (values, mirror) in enumerate(zip(maps, mirrored, strict=True)):
+    for number, values in enumerate(maps):
         share = np.clip((values - low) / (high - low), 0, 1)
         shade = np.where(np.isnan(values), _COLORS, np.nan_to_num(share) * (_COLORS - 1))
-        tile = shade.round().astype(np.uint8).T[::-1]
         row, column = divmod(number, _COLUMNS)
         window = np.s_[row * height : (row + 1) * height, column * width : (column + 1) * width]
-        picture[window] = tile[:, ::-1] if mirror else tile
-    colors = color_table(kind, _COLORS)
+        picture[window] = shade.round().astype(np.uint8).T[::-1]
+    colors = colors_of(kind.colors, _COLORS)
     return Sprites(
         name=kind.column,
         title=kind.title,

@@ -13,6 +13,7 @@ from importlib.resources import files
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from hipsta_bids import __version__
+from hipsta_bids.reports.display import ORIENTATION
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Status
 
@@ -88,7 +89,7 @@ def _environment() -> "Environment":
         source = files("hipsta_bids.reports") / "assets" / name
         return Markup(source.read_text(encoding="utf-8"))  # noqa: S704  (no user's text in it)
 
-    environment.globals["asset"] = asset
+    environment.globals |= {"asset": asset, "orientation": ORIENTATION}
     return environment
 
 
@@ -195,15 +196,15 @@ def usual_ranges(thickness: float, settings: Mapping[str, Any]) -> tuple[Usual, 
         ),
         Usual(
             name="body_length_mm",
-            title="Length of the body",
-            meaning="from one end plane to the other",
+            title="Distance of the end planes",
+            meaning="along the body, from the posterior plane to the anterior one",
             low=body["min_length"],
             unit="mm",
         ),
         Usual(
             name="length_difference_mm",
-            title="Difference of lengths",
-            meaning="length of the body minus that of the other side; look at ends without labels",
+            title="Difference of these distances",
+            meaning="this side minus the other; look at ends without labels",
             low=-checks["usual_length_difference"],
             high=checks["usual_length_difference"],
             unit="mm",

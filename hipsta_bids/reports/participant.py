@@ -13,17 +13,17 @@ from numpy.typing import NDArray
 
 from hipsta_bids.derivatives.names import output_name
 from hipsta_bids.reports.cohort import MEASURES, SMALLEST_COHORT, Cohort, Measure
-from hipsta_bids.reports.maps import (
+from hipsta_bids.reports.display import (
     MAP_KINDS,
     THICKNESS,
     UNCERTAINTY,
-    color_table,
-    draw_map,
-    draw_profiles,
+    colors_of,
     gradient_of,
+    palette,
     scale_of,
+    subfield_title,
 )
-from hipsta_bids.reports.maps import scale_of as scale_of_map
+from hipsta_bids.reports.maps import draw_map, draw_profiles
 from hipsta_bids.reports.page import VERDICTS, Section, build_sections, number, render, usual_ranges
 from hipsta_bids.reports.results import (
     SURFACES,
@@ -42,9 +42,6 @@ from hipsta_bids.types import Float, Status
 
 #: Finer masks of failed hemispheres are thinned to about this edge before they are drawn, mm.
 _EDGE = 0.6
-
-#: Colors of subfields, from medial to lateral (Okabe and Ito 2008).
-_SUBFIELD_COLORS = ("#E69F00", "#56B4E9", "#009E73", "#CC79A7", "#F0E442", "#0072B2", "#D55E00")
 
 
 def scene_of(hemisphere: Hemisphere, views: Views | None, names: Sequence[str]) -> dict[str, Any]:
@@ -77,7 +74,7 @@ def scales_of(hemispheres: Sequence[Hemisphere]) -> dict[str, Any]:
             "low": low,
             "high": high,
             "digits": kind.digits,
-            "colors": color_table(kind).tolist(),
+            "colors": colors_of(kind.colors).tolist(),
         }
     return scales
 
@@ -92,8 +89,8 @@ def _sheet_scene(hemisphere: Hemisphere, names: Sequence[str]) -> dict[str, Any]
         "surfaces": {name: _flat(sheet.points[name], 2) for name in SURFACES},
         "maps": {kind.column: _flat(sheet.columns[kind.column], 4) for kind in MAP_KINDS},
         "subfields": [
-            {"name": name, "color": _SUBFIELD_COLORS[n % len(_SUBFIELD_COLORS)]}
-            for n, name in enumerate(names)
+            {"name": name, "color": color}
+            for name, color in palette(hemisphere.protocol, names).items()
         ],
         "subfield": [index.get(str(name), -1) for name in sheet.subfield.ravel()],
         "valid": sheet.valid.astype(int).ravel().tolist(),
@@ -201,8 +198,7 @@ def _subfield_measures(series: Series) -> list[Measure]:
     )
     measures = []
     for name in names:
-        shown = name.replace("_", "/") if name.startswith(("CA", "BA")) else name.lower()
-        title = f"Mean thickness, {shown}"
+        title = f"Mean thickness, {subfield_title(name)}"
         measures.append(Measure(name=f"{prefix}{name}", title=title, unit="mm", digits=2))
     return measures
 
@@ -363,6 +359,7 @@ def _input(series: Series) -> Mapping[str, Any]:
     for hemisphere in series.hemispheres:
         view = series.view(hemisphere)
         path = input_path(hemisphere)
+        panels = slice_panels(hemisphere, view) if view else []
         groups.append(
             {
                 "side": hemisphere.side,
@@ -370,7 +367,8 @@ def _input(series: Series) -> Mapping[str, Any]:
                 "why": hemisphere.record.get("chosen_because") or "",
                 "voxel": " by ".join(f"{edge:.2g}" for edge in view.voxel) if view else None,
                 "missing": view.missing if view else "neither labels nor mask are available",
-                "panels": slice_panels(hemisphere, view) if view else [],
+                "empty": view is not None and not panels,
+                "panels": panels,
                 "measured": hemisphere.measured,
             }
         )
@@ -380,9 +378,10 @@ def _input(series: Series) -> Mapping[str, Any]:
 def _legend(series: Series) -> list[Mapping[str, str]]:
     """Names and colors of the labels, each name once."""
     names: dict[str, str] = {}
-    for view in series.views.values():
-        for label in view.names.values() if view else ():
-            names[label.name] = label.color
+    for hemisphere in series.hemispheres:
+        view = series.view(hemisphere)
+        shown = [label.name for label in view.names.values()] if view else []
+        names |= palette(hemisphere.protocol, list(dict.fromkeys(shown)))
     return [{"name": name, "color": color} for name, color in names.items()]
 
 
@@ -418,15 +417,16 @@ def _view(series: Series) -> Mapping[str, Any] | None:
     scenes = [scene for scene in scenes if "surfaces" in scene or "body" in scene]
     if not scenes:
         return None
-    return {"data": {"scenes": scenes, "scales": scales_of(series.measured)}}
+    data = {"scenes": scenes, "scales": scales_of(series.measured)}
+    return {"data": data, "measured": bool(series.measured)}
 
 
 def _sections(series: Series) -> Mapping[str, Any] | None:
     measured = series.measured
     if not measured:
         return None
-    scale = scale_of_map(THICKNESS, [h.sheet.columns["thickness"] for h in measured])
-    colors = color_table(THICKNESS)
+    scale = scale_of(THICKNESS, [h.sheet.columns["thickness"] for h in measured])
+    colors = colors_of(THICKNESS.colors)
     return {
         "groups": [{"side": h.side, "panels": section_panels(h, colors, scale)} for h in measured],
         "scale": {

@@ -24,6 +24,7 @@ from hipsta_bids.io import files, gifti
 from hipsta_bids.io.volumes import LabelImage, read_labels
 from hipsta_bids.protocols.load import load_protocol, protocol_names
 from hipsta_bids.protocols.protocol import Protocol
+from hipsta_bids.reports.display import palette
 from hipsta_bids.types import Bool, Float, Status
 
 SURFACES = ("interior", "midthickness", "exterior")
@@ -37,9 +38,6 @@ _FOLDERS = re.compile(r"(?:[^\s:;,()/]*/){2,}(?=[^\s:;,()/])")
 
 #: mm of the image that are kept round the body.
 _MARGIN = 5.0
-
-#: Colors of labels whose protocol is not available (Okabe and Ito 2008).
-_COLORS = ("#E69F00", "#56B4E9", "#009E73", "#F0E442", "#0072B2", "#D55E00", "#CC79A7", "#999999")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,6 +99,15 @@ class Hemisphere:
         """Numbers of the quality record; empty for failed hemispheres."""
         found: Mapping[str, Any] = self.record.get("metrics") or {}
         return found
+
+    @property
+    def protocol(self) -> Protocol | None:
+        """Its protocol; ``None`` if that is not one of the package's own."""
+        name = str(self.record.get("scheme", ""))
+        try:
+            return load_protocol(name) if name in protocol_names() else None
+        except HipstaError:
+            return None
 
     @property
     def message(self) -> str:
@@ -303,10 +310,13 @@ def _names(hemisphere: Hemisphere, data: NDArray[np.generic] | None) -> dict[int
     if data is None:
         return {}
     codes = [int(code) for code in np.unique(data) if code != 0]
-    protocol = _protocol(str(hemisphere.record.get("scheme", "")))
+    protocol = hemisphere.protocol
     if protocol is None:
-        colors = {code: _COLORS[n % len(_COLORS)] for n, code in enumerate(codes)}
-        return {code: LabelName(name=f"label {code}", color=colors[code]) for code in codes}
+        colors = palette(None, [f"label {code}" for code in codes])
+        return {
+            code: LabelName(name=name, color=color)
+            for code, (name, color) in zip(codes, colors.items(), strict=True)
+        }
     known = {label.code: label for label in protocol.labels}
     offset = protocol.shift(hemisphere.place.name.hemi)
     # Files of one hemisphere may have the same codes on both sides.
@@ -316,13 +326,6 @@ def _names(hemisphere: Hemisphere, data: NDArray[np.generic] | None) -> dict[int
         for code in codes
         if (label := known.get(code - shift)) is not None
     }
-
-
-def _protocol(name: str) -> Protocol | None:
-    try:
-        return load_protocol(name) if name in protocol_names() else None
-    except HipstaError:
-        return None
 
 
 def _box(interest: NDArray[np.bool_], voxel: Float) -> tuple[slice, ...]:

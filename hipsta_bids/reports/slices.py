@@ -44,6 +44,8 @@ class Panel:
     marks: tuple[tuple[float, float], ...] = ()
     letters: tuple[str, str, str, str] | None = None
     """What is at the left, right, lower and upper edge."""
+    note: str = ""
+    """A word in the middle, where there is nothing to draw."""
 
 
 def cut(points: Float, axis: int, level: float) -> Float:
@@ -99,6 +101,8 @@ def png_address(pixels: NDArray[np.uint8]) -> str:
 def slice_panels(hemisphere: Hemisphere, views: Views) -> list[Panel]:
     """Draw five slices across the body, and one along it."""
     centers = _centers(hemisphere, views)
+    if not centers:
+        return []
     middle = centers[len(centers) // 2]
     across = [
         _slice(hemisphere, views, "coronal", center, words=f"{share:.0%} from posterior")
@@ -134,13 +138,15 @@ def section_panels(
 
 
 def _centers(hemisphere: Hemisphere, views: Views) -> list[Float]:
-    """Voxel indices of points inside the body at the positions that are shown."""
+    """Voxel indices of points inside the body at the positions that are shown; none without one."""
     if hemisphere.measured:
         middle = views.to_index(hemisphere.sheet.points["midthickness"])
         rows = [round(share * (middle.shape[1] - 1)) for share in POSITIONS]
         return [np.asarray(np.nanmean(middle[:, row], axis=0)) for row in rows]
     inside = views.mask if views.mask is not None else np.isin(views.labels, list(views.names))  # type: ignore[arg-type]  # one is there
     index = np.argwhere(inside)
+    if not len(index):
+        return []
     low, high = index[:, 1].min(), index[:, 1].max()
     levels = [round(low + share * (high - low)) for share in POSITIONS]
     middle = index.mean(axis=0)
@@ -194,6 +200,12 @@ def _slice(
     width, height = views.shape[right] * edge[0], views.shape[up] * edge[1]
     shown = np.array([[0.0, 0.0], [width, height]])
     paths = {}
+    point = flat(np.asarray(center))
+    body = views.mask if views.mask is not None else np.isin(views.labels, list(views.names))  # type: ignore[arg-type]  # one is there
+    empty = not np.take(body, level, axis=across).any()
+    if empty:
+        shown = np.stack([point - _MARGIN, point + _MARGIN])
+        words = f"{words}: nothing of the body in this slice".removeprefix(": ")
     if views.mask is not None:
         edges = outline(_picture(views.mask, across, level, right, up))
         index = np.zeros((*edges.shape[:2], 3))
@@ -209,7 +221,6 @@ def _slice(
             paths[name] = path_data(flat(cut(index, across, level)))
         if orientation == "sagittal":
             paths["plane"] = path_data(flat(_plane_lines(hemisphere, views)))
-    point = flat(np.asarray(center))
     where = views.affine[:3, :3] @ np.asarray(center) + views.affine[:3, 3]
     caption = (
         f"{orientation}{', ' if words else ''}{words} ({'RAS'[across]} {where[across]:.1f} mm)"
@@ -225,6 +236,7 @@ def _slice(
         paths=paths,
         marks=((round(float(point[0]), 2), round(float(point[1]), 2)),) if mark else (),
         letters=(*_LETTERS[right], *_LETTERS[up]),
+        note="empty" if empty and not mark else "",
     )
 
 

@@ -219,6 +219,19 @@ def test_groups_of_calibration_are_quantiles():
     assert found.brier == pytest.approx(np.mean((chance - case) ** 2), rel=1e-12)
 
 
+def test_calibration_is_not_judged_where_a_group_is_small():
+    """One member less than the setting in either group leaves the Brier score alone."""
+    random = np.random.default_rng(8)
+    score = random.normal(0, 1.5, 400)
+    case = np.arange(400) < 99
+    for cases in (case, ~case):
+        found = calibrate(score, cases, SETTINGS)
+        assert not found.judged
+        assert np.isnan([found.slope, found.intercept]).all()
+        assert found.brier == pytest.approx(np.mean((special.expit(score) - cases) ** 2))
+    assert calibrate(score, np.arange(400) < 100, SETTINGS).judged
+
+
 def test_curve_steps_at_each_score():
     score = np.array([1.0, 2.0, 2.0, 3.0, 0.0])
     case = np.array([False, True, False, True, True])

@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hipsta_bids.group.figures import draw_mesh, draw_sections, panels, scale_of
+from hipsta_bids.group.classify import Area, calibrate
+from hipsta_bids.group.figures import (
+    draw_calibration,
+    draw_mesh,
+    draw_roc,
+    draw_sections,
+    panels,
+    scale_of,
+)
+from hipsta_bids.group.settings import ClassificationSettings
 from hipsta_bids.group.shapes import AverageShape
 from hipsta_bids.io.gifti import sheet_triangles
 from hipsta_bids.types import Mesh
@@ -62,6 +71,30 @@ def test_triangles_without_a_value_are_left_out():
     assert len(colors.get_array()) == len(mesh.triangles) - (mesh.triangles == 0).any(axis=1).sum()
     _, colors = drawn(mesh, np.full(len(mesh.points), np.nan))
     assert not colors.get_visible()
+
+
+def test_legends_of_curves_are_beside_them_and_small_groups_have_no_calibration():
+    score = np.linspace(-1, 1, 12)
+    calibration = calibrate(score, score > 0, ClassificationSettings(least_calibrated=2))
+    one = SimpleNamespace(
+        auc=Area(0.6, 0.1, 0.4, 0.8),
+        cross_validation=SimpleNamespace(auc=0.07),
+        score=score,
+        calibration=calibration,
+    )
+    model = SimpleNamespace(base=one, full=one, separated=False)
+    pair = SimpleNamespace(control="CN", case="AD", comparison=model, is_case=score > 0)
+    analysis = SimpleNamespace(pairs=[("L", "thickness_mean", pair)])
+    for draw in (draw_roc, draw_calibration):
+        figure = draw(analysis)
+        figure.draw_without_rendering()
+        (axis,) = figure.axes
+        legend = axis.get_legend().get_window_extent()
+        assert not legend.overlaps(axis.get_window_extent())
+        assert legend.y0 >= 0  # not cut off
+        assert legend.x0 >= 0
+    one.calibration = calibrate(score, score > 0, ClassificationSettings())
+    assert not draw_calibration(analysis).axes[0].axison
 
 
 def test_subfields_are_named_inside_them_and_end_at_lines_across_the_wall():

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,6 +18,8 @@ from small_cohorts import (
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.derivatives.dataset import identity, update_status
+from hipsta_bids.derivatives.names import HemisphereName
+from hipsta_bids.group.collect import is_listed
 from hipsta_bids.io import files
 
 
@@ -236,6 +239,17 @@ def test_table_of_a_spreadsheet_is_read(study, quick):
     (table,) = (study.out / "group").glob("*/excluded.tsv")
     left_out = table.read_text()
     assert left_out.count("\n") == 1
+
+
+def test_exclusions_name_one_protocol_and_region():
+    name = HemisphereName(subject="01", session=None, hemi="L", seg="fs", region="extended")
+    row = {"participant_id": "sub-01", "session_id": "n/a", "hemi": "L"}
+    assert is_listed(name, row)
+    assert is_listed(name, row | {"protocol": "fs", "region": "extended"})
+    assert not is_listed(name, row | {"protocol": "fs", "region": "body"})
+    assert not is_listed(name, row | {"protocol": "other", "region": "n/a"})
+    # Maps of other programs have no protocol.
+    assert is_listed(replace(name, seg=""), row | {"protocol": "other", "region": "body"})
 
 
 def test_exclusions_of_nobody_are_told(study, quick, tmp_path, capsys):

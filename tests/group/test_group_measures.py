@@ -152,7 +152,7 @@ def test_figures_are_those_of_the_measures(dataset, quick):
     code, group = run(dataset, quick, "--measures", "T2", "--name", "drawn")
     assert code == 0
     names = {path.stem for path in (group / "drawn" / "figures").glob("*.png")}
-    assert names == {"T2_means", "T2_contrasts", "profiles", "warps", "roc", "calibration"}
+    assert names == {"T2_means", "T2_contrasts", "profiles", "warps", "roc"}
     drawing = (group / "drawn" / "figures" / "T2_means.svg").read_text()
     assert re.search("mean T2 \\[arbitrary\\]", drawing)
 

@@ -19,7 +19,9 @@ from hipsta_bids.cli.main import main
 from hipsta_bids.group import write
 from hipsta_bids.io import files
 from hipsta_bids.reports import group as page_module
+from hipsta_bids.reports.display import ORIENTATION, colors_of
 from hipsta_bids.reports.group import group_page, write_group_report
+from hipsta_bids.reports.group_tables import display_name
 from hipsta_bids.reports.page import Section
 
 MODEL = "group-age-sex"
@@ -168,6 +170,80 @@ def rename(path):
     path.write_text(re.sub(r"\b(AD|age)\b", rf"\1{EVIL}", text), encoding="utf-8")
 
 
+def rows_of(page, label):
+    """Titles of the columns of a table, and its rows by title."""
+    part = re.search(rf'aria-label="{label}">(.*?)</table>', page, re.DOTALL)[1]
+    titles = re.findall(r"<th scope=\"col\"[^>]*>(.*?)</th>", part)
+    rows = [re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", row) for row in part.split("<tr")[2:]]
+    return titles, [dict(zip(titles, row, strict=True)) for row in rows]
+
+
+@pytest.mark.parametrize("label", ["Summary measures", "Classification"])
+def test_what_decides_comes_before_what_may_be_cut_off(page, label):
+    titles, rows = rows_of(page, label)
+    assert titles.index("p") == 2
+    assert "Contrast" not in titles[:6]
+    assert rows
+
+
+def test_classification_of_few_says_what_cannot_be_judged(page):
+    titles, _ = rows_of(page, "Classification")
+    assert "Slope" not in titles
+    assert "is judged where both groups have 100 members or more, which none has" in page
+
+
+def change_table(path, column, values):
+    content = pd.read_csv(path, sep="\t", keep_default_na=False, dtype=str)
+    content[column] = values(content)
+    content.to_csv(path, sep="\t", index=False)
+
+
+@pytest.mark.parametrize(("area", "said"), [("0.07", True), ("0.61", False)])
+def test_areas_below_chance_are_explained(copy, area, said):
+    path = copy / "group" / MODEL / "classification.tsv"
+    for column in ("auc_base_cv", "auc_full_cv"):
+        change_table(path, column, lambda content: [area] * len(content))
+    text = group_page(copy / "group" / MODEL)
+    assert ("means that nothing was learned" in text) == said
+
+
+def test_effects_of_two_models_name_their_model(copy):
+    path = copy / "group" / MODEL / "measures.tsv"
+    models = ["a + b", "a + b + icv"]
+    change_table(path, "model", lambda content: [models[n % 2] for n in range(len(content))])
+    change_table(path, "p", lambda content: ["0.01"] * len(content))
+    text = group_page(copy / "group" / MODEL)
+    found = re.findall(r"<li>[^<]*, model (a \+ b[^:]*): [^<]*</li>", text)
+    assert set(found) == set(models)
+    _, rows = rows_of(text, "Summary measures")
+    assert {row["Model"] for row in rows} == {"A", "B"}
+    assert "A <code>a + b</code>; B <code>a + b + icv</code>" in text
+
+
+def test_measures_of_subfields_are_spelled():
+    assert display_name("area_CA2_3") == "area, CA2/3"
+    assert display_name("thickness_mean_PRESUBICULUM") == "thickness mean, presubiculum"
+    assert display_name("volume_CA1_asymmetry") == "volume, CA1 asymmetry"
+    assert display_name("extent_x") == "extent x"
+
+
+def test_scales_are_those_of_all_pages_and_mark_the_level(page):
+    thickness, curvature = (block["scales"] for block in scenes(page)[:2])
+    assert thickness["mean"]["colors"] == colors_of("viridis").tolist()
+    assert curvature["mean"]["colors"] == colors_of("RdBu_r").tolist()
+    assert curvature["mean"]["low"] == -curvature["mean"]["high"]
+    # Where nothing survives, colors are not those of large effects.
+    (name,) = thickness["effect"]
+    assert curvature["effect"][name]["high"] == thickness["effect"][name]["high"]
+    marks = thickness["significance"]["marks"]
+    reach = thickness["significance"]["high"]
+    assert [at for at, _ in marks] == pytest.approx(
+        [50 + s * 65.05 / reach for s in (-1, 1)], abs=0.01
+    )
+    assert ">p 0.05</span>" in page
+    assert ORIENTATION in page
+
+
 def test_users_text_is_escaped(copy):
     folder = copy / "group" / MODEL
     for path in (*folder.glob("*.tsv"), folder / "analysis.json", folder / "methods.md"):
@@ -224,6 +300,12 @@ def visit(browser, out):
 @pytest.mark.parametrize("width", [1280, 390])
 def test_the_page_fits_its_window(visit, width):
     assert fits(visit(width), width)
+
+
+@pytest.mark.parametrize("label", ["Clusters and peaks", "Summary measures", "Classification"])
+def test_no_column_is_cut_off(visit, label):
+    table_of = one(visit(), f"[aria-label='{label}']")
+    assert int(table_of.get_property("scrollWidth")) <= int(table_of.get_property("clientWidth"))
 
 
 def test_maps_are_drawn(visit):

@@ -103,8 +103,8 @@ def test_a_click_on_the_map_picks_that_corner(visit):
     webdriver.ActionChains(browser).move_to_element_with_offset(
         flat, size["width"] // 2 - 3, -(size["height"] // 2 - 3)
     ).click().perform()
-    # In the left hemisphere, the medial and anterior corner.
-    assert values(browser)["Node"] == "x 1, y 21"
+    # In the left hemisphere as in the right one, the lateral and anterior corner.
+    assert values(browser)["Node"] == "x 41, y 21"
 
 
 def test_a_failed_hemisphere_shows_its_body_and_the_defect(visit):
@@ -180,8 +180,8 @@ def test_the_selection_is_a_list_that_the_group_level_takes(visit, out):
     path = browser.downloads / "exclude.tsv"
     until(path.exists)
     header, line = (row.split("\t") for row in path.read_text().splitlines())
-    assert header == ["participant_id", "session_id", "hemi", "reason"]
-    assert line[:3] == ["sub-02", "n/a", "L"]
+    assert header == ["participant_id", "session_id", "hemi", "protocol", "region", "reason"]
+    assert line[:5] == ["sub-02", "n/a", "L", "freesurfer", "body"]
     found = collect_sheets(GroupRequest(roots=(out,), exclude_table=path))
     left_out = {(e.participant, e.hemi): e.reason for e in found.exclusions}
     assert left_out["sub-02", "L"] == "listed"

@@ -67,7 +67,7 @@ def test_bodies_of_both_sides_of_quite_different_length_are_marked(lengths, mark
     def row(*sides):
         series = SimpleNamespace(measured=list(sides), cohort=SimpleNamespace(settings={}))
         rows = _quality_numbers(series)["rows"]
-        return {row["title"]: row for row in rows}.get("Difference of lengths")
+        return {row["title"]: row for row in rows}.get("Difference of these distances")
 
     both = row(*measured)
     difference = lengths[0] - lengths[1]

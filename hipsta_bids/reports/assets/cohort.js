@@ -18,7 +18,7 @@
     if (value === null || value === undefined) return "";
     return column.percent ? `${(100 * value).toFixed(column.digits)}%` : value.toFixed(column.digits);
   };
-  const whose = (row) => [row.participant, row.session, row.hemi === "L" ? "left" : "right", row.seg].filter(Boolean).join(" ");
+  const whose = (row) => [row.participant, row.session, row.hemi === "L" ? "left" : "right", row.seg, row.region === "body" ? "" : row.region].filter(Boolean).join(" ");
 
   function fillTable() {
     const heads = columns.map((column) => {
@@ -120,8 +120,8 @@
   function exclusions() {
     const cell = (text) => String(text || "n/a").split(/\s+/).join(" ");
     const why = (row) => row.status === "ok" && row.distance > apart ? `outlier in ${row.farthest}` : row.reason || "selected by hand";
-    const lines = rows.filter((row) => selected.has(row)).map((row) => [row.participant, row.session, row.hemi, `${row.status}: ${why(row)}`].map(cell).join("\t"));
-    return ["participant_id\tsession_id\themi\treason", ...new Set(lines)].join("\n") + "\n";
+    const lines = rows.filter((row) => selected.has(row)).map((row) => [row.participant, row.session, row.hemi, row.seg, row.region, `${row.status}: ${why(row)}`].map(cell).join("\t"));
+    return ["participant_id\tsession_id\themi\tprotocol\tregion\treason", ...new Set(lines)].join("\n") + "\n";
   }
 
   function save() {

@@ -114,6 +114,7 @@
       if (!this.renderer || !this.renderer.gl) {
         this.renderer = null;
         this.root.querySelector(".fallback").hidden = false;
+        for (const name of [".scene", ".show", ".reset"]) this.root.querySelector(name).hidden = true;
         return;
       }
       this.gl = this.renderer.gl;
@@ -136,8 +137,7 @@
       this.root.querySelector(".reset").addEventListener("click", () => this.look());
       this.flat.addEventListener("click", (event) => {
         const box = this.flat.getBoundingClientRect(), [nx, ny] = this.scene.shape;
-        let x = (event.clientX - box.left) / box.width;
-        if (this.scene.hemi === "L") x = 1 - x;
+        const x = (event.clientX - box.left) / box.width;
         const y = 1 - (event.clientY - box.top) / box.height;
         this.pick(Math.min(nx - 1, Math.floor(x * nx)), Math.min(ny - 1, Math.floor(y * ny)));
       });
@@ -145,9 +145,9 @@
         const step = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
         if (!step || !this.scene.shape) return;
         event.preventDefault();
-        const [nx, ny] = this.scene.shape, side = this.scene.hemi === "L" ? -1 : 1;
+        const [nx, ny] = this.scene.shape;
         const [i, j] = this.node || [Math.floor(nx / 2), Math.floor(ny / 2)];
-        this.pick(Math.max(0, Math.min(nx - 1, i + side * step[0])), Math.max(0, Math.min(ny - 1, j + step[1])));
+        this.pick(Math.max(0, Math.min(nx - 1, i + step[0])), Math.max(0, Math.min(ny - 1, j + step[1])));
       });
       if (!this.renderer) return;
       let down = null;
@@ -382,25 +382,25 @@
       Object.assign(this.flat, { width: width * dpr, height: tall * dpr });
       Object.assign(this.flat.style, { width: `${width}px`, height: `${tall}px` });
       const context = this.flat.getContext("2d"), w = this.flat.width / nx, h = this.flat.height / ny;
-      const left = scene.hemi === "L", column = (i) => (left ? nx - 1 - i : i), colors = this.colors();
+      const colors = this.colors();
       for (let i = 0; i < nx; i++) {
         for (let j = 0; j < ny; j++) {
           context.fillStyle = `rgb(${colors[i * ny + j].map((v) => Math.round(255 * v)).join(" ")})`;
-          context.fillRect(Math.floor(column(i) * w), Math.floor((ny - 1 - j) * h), Math.ceil(w) + 1, Math.ceil(h) + 1);
+          context.fillRect(Math.floor(i * w), Math.floor((ny - 1 - j) * h), Math.ceil(w) + 1, Math.ceil(h) + 1);
         }
       }
       context.lineWidth = 1.2 * dpr;
       context.beginPath();
       for (let i = 0; i < nx; i++) {
         for (let j = 0; j < ny; j++) {
-          const own = scene.subfield[i * ny + j], x = column(i) * w, y = (ny - 1 - j) * h;
-          if (i + 1 < nx && scene.subfield[(i + 1) * ny + j] !== own) { const e = left ? x : x + w; context.moveTo(e, y); context.lineTo(e, y + h); }
+          const own = scene.subfield[i * ny + j], x = i * w, y = (ny - 1 - j) * h;
+          if (i + 1 < nx && scene.subfield[(i + 1) * ny + j] !== own) { context.moveTo(x + w, y); context.lineTo(x + w, y + h); }
           if (j + 1 < ny && scene.subfield[i * ny + j + 1] !== own) { context.moveTo(x, y); context.lineTo(x + w, y); }
         }
       }
       context.stroke();
       if (this.node) {
-        const [i, j] = this.node, x = (column(i) + 0.5) * w, y = (ny - 0.5 - j) * h;
+        const [i, j] = this.node, x = (i + 0.5) * w, y = (ny - 0.5 - j) * h;
         for (const [size, style] of [[3 * dpr, "#fff"], [1.4 * dpr, "#000"]]) {
           context.lineWidth = size;
           context.strokeStyle = style;
@@ -410,8 +410,6 @@
         }
         context.strokeStyle = "#000";
       }
-      const [start, end] = this.root.querySelectorAll(".side > .ends span");
-      [start.textContent, end.textContent] = left ? ["lateral", "medial"] : ["medial", "lateral"];
       this.drawBar();
     }
 

@@ -1,0 +1,184 @@
+"""How values look, the same on all pages and figures: color scales, palettes, and orientation."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from hipsta_bids.protocols.protocol import Part, Protocol
+from hipsta_bids.types import Float
+
+#: How every unfolded map lies, of either hemisphere.
+ORIENTATION = (
+    "Unfolded maps of both hemispheres lie alike: medial left, lateral right, posterior below,"
+    " anterior above."
+)
+#: Both ends of the axes of unfolded maps: of x to the right, and of y upward.
+X_ENDS, Y_ENDS = ("medial", "lateral"), ("posterior", "anterior")
+
+#: Colors that color-blind readers can tell apart (Okabe and Ito 2008): of groups, and of labels
+#: whose protocol is not available.
+COLORS = (
+    *("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#F0E442"),
+    *("#999999", "#000000"),
+)
+HEMISPHERE_COLORS = {"L": COLORS[0], "R": COLORS[1]}
+
+#: Color maps of effect sizes, of significance and of design matrices.
+EFFECT_COLORS, P_COLORS, DESIGN_COLORS = "RdBu_r", "PuOr_r", "cividis"
+
+_EFFECTS = 99.0  # percentile of sizes that the colors of effects span
+_LEVEL = 0.05
+_SMALLEST = 1e-6  # reach of colors where all values are zero
+_LEAST_REACH = 3.0  # powers of ten of p that colors span at least
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapKind:
+    """How a map is shown."""
+
+    column: str
+    """Of the sheet table."""
+    title: str
+    unit: str
+    colors: str
+    """Color map of matplotlib, perceptually uniform or diverging, safe for color-blind readers."""
+    centered: bool
+    """Whether zero means something, and has the middle of the colors."""
+    digits: int
+    percentiles: tuple[float, float]
+    """Values at the ends of the colors, so that a few points at the edges may saturate."""
+
+
+THICKNESS = MapKind(
+    column="thickness",
+    title="Thickness",
+    unit="mm",
+    colors="viridis",
+    centered=False,
+    digits=2,
+    percentiles=(1, 99),
+)
+#: Zero is flat; the sign tells which way the sheet curls.
+CURVATURE = MapKind(
+    column="curvature",
+    title="Mean curvature",
+    unit="1/mm",
+    colors="RdBu_r",
+    centered=True,
+    digits=3,
+    percentiles=(4, 96),
+)
+MAP_KINDS = (THICKNESS, CURVATURE)
+#: Drawn where it was estimated (``--uncertainty``).
+UNCERTAINTY = MapKind(
+    column="thickness_sd",
+    title="SD of thickness",
+    unit="mm",
+    colors="magma",
+    centered=False,
+    digits=2,
+    percentiles=(1, 99),
+)
+#: Of any measure, between two visits or sides.
+_CHANGE = MapKind(
+    column="", title="", unit="", colors="PRGn", centered=True, digits=3, percentiles=(2, 98)
+)
+
+
+def kind_of(measure: str, *, change: bool = False) -> MapKind:
+    """Choose how a measure of the group level is shown: as on the pages of participants."""
+    if change:
+        return _CHANGE
+    return CURVATURE if "curvature" in measure else THICKNESS
+
+
+def known(values: Sequence[Float]) -> Float:
+    """Join arrays of any shape to the (N,) numbers in them, without NaN."""
+    every = np.concatenate([np.empty(0), *(np.ravel(array) for array in values)])
+    return np.asarray(every[np.isfinite(every)], dtype=np.float64)
+
+
+def scale_of(kind: MapKind, values: Sequence[Float]) -> tuple[float, float]:
+    """Choose the values at both ends of the colors; any where nothing is known."""
+    every = known(values)
+    low, high = np.percentile(every, kind.percentiles).tolist() if len(every) else (-1.0, 1.0)
+    if kind.centered:
+        high = max(abs(low), abs(high), _SMALLEST)
+        return -high, high
+    return low, max(high, low + _SMALLEST)
+
+
+@dataclass(frozen=True)
+class Effects:
+    """A map of effect sizes, with what it takes to tell large from small."""
+
+    kind: str
+    """Of the test, ``t`` or ``F``."""
+    sizes: Float
+    statistic: Float
+    df: Float
+    """Degrees of freedom, of the error."""
+
+    @property
+    def certain(self) -> float:
+        """Size at which one point survives any correction: p times the number of points is 0.05.
+
+        With several degrees of freedom in the numerator of F, it is a lower limit.
+        """
+        ready = np.isfinite(self.sizes) & np.isfinite(self.statistic) & (self.statistic != 0)
+        if not ready.any():
+            return 0.0
+        df = float(np.median(np.broadcast_to(self.df, ready.shape)[ready]))
+        t = float(stats.t.isf(_LEVEL / ready.sum() / 2, df))
+        if self.kind == "F":
+            return t**2 / (t**2 + df)
+        return t * float(np.median(np.abs(self.sizes[ready] / self.statistic[ready])))
+
+
+def effect_reach(maps: Sequence[Effects]) -> float:
+    """Return the effect size at the end of the colors, for all maps of one contrast.
+
+    Noise alone does not reach it: it is at least what a single point takes to survive.
+    """
+    sizes = np.abs(known([effects.sizes for effects in maps]))
+    usual = float(np.percentile(sizes, _EFFECTS)) if len(sizes) else 0.0
+    return max(usual, *(effects.certain for effects in maps), _SMALLEST)
+
+
+def significance_reach(values: Sequence[Float]) -> float:
+    """Return the power of ten of p at the end of the colors."""
+    return max(_LEAST_REACH, float(np.abs(known(values)).max(initial=0)))
+
+
+def colors_of(name: str, n: int = 64) -> NDArray[np.str_]:
+    """List the colors of one of matplotlib's color maps as ``#rrggbb``."""
+    from matplotlib import colormaps  # noqa: PLC0415  (slow to load)
+    from matplotlib.colors import to_hex  # noqa: PLC0415
+
+    return np.array([to_hex(color) for color in colormaps[name](np.linspace(0, 1, n))])
+
+
+def gradient_of(colors: NDArray[np.str_]) -> str:
+    """Write a color table as a CSS gradient from left to right."""
+    stops = colors[np.linspace(0, len(colors) - 1, 9).round().astype(int)]
+    return f"linear-gradient(to right,{','.join(stops.tolist())})"
+
+
+def subfield_title(name: str) -> str:
+    """Write the name of a tissue as in a text: ``CA2/3``, ``subiculum``."""
+    return (
+        name.replace("_", "/") if name.startswith(("CA", "BA")) else name.lower().replace("_", " ")
+    )
+
+
+def palette(protocol: Protocol | None, names: Sequence[str]) -> dict[str, str]:
+    """Choose the colors of subfields: the protocol's own, of the body where parts differ."""
+    labels = protocol.labels if protocol is not None else ()
+    own = {
+        label.abbreviation or label.name: label.color
+        for label in sorted(labels, key=lambda label: label.part is Part.BODY)
+    }
+    return {name: own.get(name, COLORS[n % len(COLORS)]) for n, name in enumerate(names)}
