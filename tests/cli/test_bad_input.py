@@ -151,7 +151,7 @@ def test_bad_hemispheres_fail_alone(good, tmp_path, capsys):
     for subject in expected:
         assert found[f"sub-{subject}", "L"]["status"] == "failed"
         # Where the labels tell, the body is left for a person to look at.
-        body = {"body_mask"} if subject == "swapped" else set()
+        body = {"body_mask", "body_sources"} if subject == "swapped" else set()
         assert outputs(out, subject, "L") == {"qc"} | body
     for hemi in ("L", "R"):
         assert found["sub-good", hemi]["status"] != "failed"
