@@ -393,6 +393,7 @@ def _prepare(
             dataset.write_citation(out_dir, settings, [protocols[k] for k in sorted(protocols)])
         write_sidecar(out_dir)
         write_shared(out_dir)
+    memory = options.mem_gb and options.mem_gb / n_workers(options, len(items))
     return [
         Job(
             item=item,
@@ -412,6 +413,7 @@ def _prepare(
             write_meshes=options.write_meshes,
             copies=options.uncertainty,
             force=options.force,
+            memory_gb=memory,
         )
         for item in items
     ]
