@@ -14,6 +14,7 @@ from reference_pages import PAGES
 
 import hipsta_bids
 from hipsta_bids.derivatives.names import DATASET_FILES, OUTPUTS, HemisphereName, output_name
+from hipsta_bids.derivatives.sidecars import SHARED
 from hipsta_bids.errors import ExitCode
 
 ROOT = Path(__file__).parents[1]
@@ -171,7 +172,7 @@ def test_readme_lists_the_outputs_of_the_table():
 def test_readme_lists_the_files_of_the_dataset():
     section = README.split("For the whole dataset:")[1].split("\n### ")[0]
     listed = {name.rstrip("/") for name in re.findall(r"`([^`]+)`(?=[, ].*\|)", section)}
-    assert listed == set(DATASET_FILES.values())
+    assert listed == {*DATASET_FILES.values(), *(row.for_all for row in SHARED)}
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from hipsta_bids.derivatives.names import (
     Output,
     output_name,
 )
+from hipsta_bids.derivatives.sidecars import SHARED
 from hipsta_bids.errors import EXIT_MEANINGS
 from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY, Column
 from hipsta_bids.group.settings import GroupSettings
@@ -53,9 +54,15 @@ IGNORED_TEXT = """\
 The dataset passes the [BIDS validator](https://github.com/bids-standard/bids-validator) without
 errors. BIDS 1.11 has no names for some of its files. They have entities in its order, and the
 suffixes of the proposal for structural derivatives (BEP011) where it has one. `.bidsignore` lists
-them, below. Each table has a JSON file beside it. Masks, surfaces and maps on them have none: units
-of maps are in the GIFTI files and, with definitions, in `desc-sheet_morph.json`; the space is that
-of the segmentation, scanner RAS in mm; which one it is, `desc-qc_metrics.json` says (`inputs`)."""
+them, below; a sidecar has the ending of what it is about, so both are hidden by one line.
+
+Each table has a JSON file beside it. Surfaces, maps, labels and masks follow the inheritance
+principle: what is the same for all (`Description`, `Units`, `SpatialReference`) is said once, by
+`thickness.json` and others in the root; `Sources`, which differ, by a file beside the images. No
+image has two sidecars in a folder, so images share one if the name of one of them has no `desc`:
+`curv.json` is about all curvatures and says by `desc` what differs, `interior.json` about the
+surface in both spaces. `SpatialReference` is `orig`, the scanner RAS of the segmentation, in mm, or
+in words. Units of maps are in the GIFTI files, too."""
 
 COLUMNS_TEXT = """\
 Which table has which is said in [Group level](group.md#what-is-written) and in the `.json` beside
@@ -80,11 +87,12 @@ OPTIONS_TEXT = """\
 `demo`, `phantom`, `surrogate`, `validate`, `settings`, `protocols`. All print these texts with
 `--help`. Underscores do in place of hyphens (`--n_procs`)."""
 
+_SHARED_TEXT = "of all images with these endings: what they are, unit, space"
+
 _DATASET_FILES = {
     "description": "what BIDS asks for, with versions and sources",
     "readme": "what is where; written unless there is a README",
     "ignore": "which files are [not in the standard](#names-that-bids-does-not-have)",
-    "labels_sidecar": "description and space of all `_dseg.label.gii`",
     "settings": "all settings of these results, and their hash",
     "citation": "a methods paragraph with references, for your article",
     "status": "one row per hemisphere: status, reason, message, time per stage, peak memory",
@@ -111,7 +119,10 @@ def outputs_page() -> str:
         "## Files of the dataset",
         _table(
             ("file", "content"),
-            ((f"`{name}`", _DATASET_FILES[key]) for key, name in DATASET_FILES.items()),
+            (
+                *((f"`{name}`", _DATASET_FILES[key]) for key, name in DATASET_FILES.items()),
+                (", ".join(f"`{row.for_all}`" for row in SHARED), _SHARED_TEXT),
+            ),
         ),
         "## Sources",
         SOURCES_TEXT,

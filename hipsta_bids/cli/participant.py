@@ -223,7 +223,8 @@ def _add_processing(parser: Parser) -> None:
     add(
         "--mem --mem-mb",
         "SIZE",
-        "memory for all processes together: 8000 (MB) or 8G",
+        "memory for all processes together: 8000 (MB) or 8G; labels that need more than half of one"
+        " process' part to be read fail",
         type=_gigabytes,
     )
     add(
@@ -335,7 +336,9 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
     from hipsta_bids.inputs.ends import attach_ends  # noqa: PLC0415  (heavy)
     from hipsta_bids.inputs.maps import attach, map_requests  # noqa: PLC0415  (heavy)
     from hipsta_bids.inputs.search import dataset_notes, ignored_table, selection_table  # noqa: PLC0415  (heavy)
+    from hipsta_bids.io.volumes import limit_memory  # noqa: PLC0415  (heavy)
 
+    limit_memory(options.mem)
     requests = map_requests(options.map, options.map_sampling, options.map_interpolation)
     found = _find(request, options.shard, say=echo if options.dry_run else None)
     if found is None:

@@ -134,20 +134,11 @@ def write_description(root: Path, sources: Mapping[str, Path]) -> None:
 
 
 def write_notes(root: Path) -> None:
-    """Write ``.bidsignore``, what all labels share, and a README unless the dataset has one."""
+    """Write ``.bidsignore``, and a README unless the dataset has one."""
     files.write_text(root / DATASET_FILES["ignore"], ignore_file())
-    files.write_json(root / DATASET_FILES["labels_sidecar"], _LABELS)
     if not any(root.glob("README*")):
         files.write_text(root / DATASET_FILES["readme"], _README)
 
-
-#: By BIDS' inheritance, a sidecar of every ``_dseg.label.gii`` below.
-_LABELS = {
-    "Description": "Subfield at each vertex of the surfaces of the same hemisphere, protocol and"
-    " region; names and colors are in the file's label table, the segmentation it comes from in"
-    " desc-qc_metrics.json",
-    "SpatialReference": "orig",
-}
 
 _README = f"""\
 # Hippocampal thickness and curvature maps
@@ -160,6 +151,7 @@ extents on the sheet of the hippocampal body, per hemisphere.
 - `{DATASET_FILES["citation"]}` describes the methods, with references.
 - `{DATASET_FILES["settings"]}` has all settings.
 - `sub-*/` has tables, surfaces and maps; a JSON file beside each table defines its columns.
+- `*.json` here, such as `thickness.json`, say of surfaces, maps and masks what they are.
 - `{DATASET_FILES["group"]}/` has results over participants, where there are some.
 
 The paths in `DatasetLinks` of `{DATASET_FILES["description"]}` are relative to this folder where

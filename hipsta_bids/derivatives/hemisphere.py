@@ -20,6 +20,7 @@ from hipsta_bids.derivatives.names import (
     output_path,
     output_pattern,
 )
+from hipsta_bids.derivatives.sidecars import SHARED, describe, sources
 from hipsta_bids.errors import HipstaError, InputError
 from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY, Column
 from hipsta_bids.geometry.sheet import is_left_handed, layer_depth
@@ -279,6 +280,7 @@ def write_results(
         _write_layers(place, maps.layers)
         files.write_bytes(place.path("mesh"), gifti.mesh_bytes(maps.mesh, maps.coordinates))
     write_more()
+    _write_sources(place, record)
     undefined = int(np.isnan(maps.sheet.points[:, :, [0, -1]]).any(axis=(2, 3)).sum())
     status, reason, message = verdict(maps)
     files.write_json(
@@ -294,6 +296,17 @@ def write_results(
             "metrics": maps.qc,
         },
     )
+
+
+def _write_sources(place: ResultPlace, record: Mapping[str, Any]) -> None:
+    """Write beside the images that are there what they come from.
+
+    What else is to be said is in the root of the dataset, but for images that few datasets have.
+    """
+    for row in (*OUTPUTS, *EXTRA_OUTPUTS):
+        if any(place.path(image.key).exists() for image in row.images):
+            about = {} if row in SHARED else describe(row)
+            files.write_json(place.path(row.key), {**about, "Sources": sources(record)})
 
 
 def spread_name(measure: str) -> str:
@@ -356,6 +369,7 @@ def write_failure(
     remove_results(place)
     if body is not None:
         files.write_bytes(place.path("body_mask"), mask_bytes(body))
+        _write_sources(place, record)
     verdict = {"status": Status.FAILED, "reason": error.reason, "message": str(error)}
     files.write_json(place.path("qc"), verdict | dict(record))
 

@@ -5,6 +5,7 @@ has no rule for is listed in ``.bidsignore``, with the reason, from the table be
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from pathlib import PurePosixPath
 
@@ -56,12 +57,21 @@ class Output:
     extension: str
     description: str
     _: KW_ONLY
+    unit: str | None = None
+    """Unit of the numbers of an image."""
     desc: str | None = None
     space: str | None = None
     optional: bool = False
     """Written on request only."""
     in_standard: bool = False
     """Whether BIDS 1.11 has a rule for this name."""
+    images: "tuple[Output, ...]" = ()
+    """Images that a sidecar is about."""
+
+    @property
+    def for_all(self) -> str:
+        """Name in the root of the dataset of a sidecar about these images of every hemisphere."""
+        return f"desc-{self.desc}_{self.suffix}.json" if self.desc else f"{self.suffix}.json"
 
 
 def _table(
@@ -75,11 +85,69 @@ def _table(
     )
 
 
+def _sidecars(images: Sequence[Output]) -> tuple[Output, ...]:
+    """Describe the sidecars of images.
+
+    By BIDS' inheritance, one without ``desc`` is also about files with ``desc`` or ``space``, and
+    no file may have two in a folder. So where an image of some suffix has no ``desc``, all images
+    with that suffix share a sidecar.
+    """
+    shared = {row.suffix for row in images if row.desc is None}
+    groups: dict[tuple[str, str | None], list[Output]] = {}
+    for row in images:
+        groups.setdefault((row.suffix, None if row.suffix in shared else row.desc), []).append(row)
+    return tuple(
+        Output(
+            f"{desc or suffix}_sources",
+            suffix,
+            ".json",
+            "inputs that the images with this ending come from (`Sources`)",
+            desc=desc,
+            in_standard=rows[0].in_standard,
+            images=tuple(rows),
+        )
+        for (suffix, desc), rows in groups.items()
+    )
+
+
 _SURFACES = {
     "surface": ("surface of the sheet in the scanner space of the subject", None),
     "unfold": ("surface laid flat: medial to lateral, posterior to anterior", "unfold"),
 }
 _MESHES = " (`--write-meshes`)"
+
+_IMAGES = (
+    *(
+        Output(f"{name}_{kind}", name, ".surf.gii", f"{name} {description}", unit="mm", space=space)
+        for kind, (description, space) in _SURFACES.items()
+        for name in ("interior", "midthickness", "exterior")
+    ),
+    *(
+        Output(
+            row.name,
+            row.suffix,
+            ".shape.gii",
+            f"{row.definition}; per surface vertex, {row.unit}",
+            unit=row.unit,
+            desc=row.desc,
+        )
+        for row in MAPS
+    ),
+    Output(
+        "subfields",
+        "dseg",
+        ".label.gii",
+        "subfield per surface vertex; names and colors are in the file's label table",
+        in_standard=True,
+    ),
+    Output(
+        "body_mask",
+        "mask",
+        ".nii.gz",
+        "the measured body on the grid of the labels; edit a copy to correct it",
+        desc="body",
+    ),
+)
 
 #: Every file of one hemisphere. The quality record comes last: it is written when all else is
 #: there, so that its presence means that the set is complete.
@@ -92,29 +160,8 @@ OUTPUTS: tuple[Output, ...] = (
     ),
     *_table("profile", "means along the sheet: one row per x (over y), then one per y (over x)"),
     *_table("sections", "one row per cross-section: lengths, area, ratio, shape index"),
-    *(
-        Output(f"{name}_{kind}", name, ".surf.gii", f"{name} {description}", space=space)
-        for kind, (description, space) in _SURFACES.items()
-        for name in ("interior", "midthickness", "exterior")
-    ),
-    *(
-        Output(
-            row.name,
-            row.suffix,
-            ".shape.gii",
-            f"{row.definition}; per surface vertex, {row.unit}",
-            desc=row.desc,
-        )
-        for row in MAPS
-    ),
-    Output("subfields", "dseg", ".label.gii", "subfield per surface vertex", in_standard=True),
-    Output(
-        "body_mask",
-        "mask",
-        ".nii.gz",
-        "the measured body on the grid of the labels; edit a copy to correct it",
-        desc="body",
-    ),
+    *_IMAGES,
+    *_sidecars(_IMAGES),
     *_table(
         "layers",
         "one row per point of the three-dimensional grid: layer, depth, position",
@@ -136,6 +183,15 @@ OUTPUTS: tuple[Output, ...] = (
         "status, reason, flags, inputs, and every number that says whether to trust the maps",
         desc="qc",
     ),
+)
+
+_SPREAD = Output(
+    "thickness_sd",
+    "morph",
+    ".shape.gii",
+    "SD of thickness over perturbed copies of the labels; per surface vertex, mm (`--uncertainty`)",
+    unit="mm",
+    desc="thicknessSd",
 )
 
 _SAMPLED = (
@@ -165,13 +221,8 @@ EXTRA_OUTPUTS: tuple[Output, ...] = (
         "one row: SD of each summary measure over the same copies (`--uncertainty`)",
         called="that table",
     ),
-    Output(
-        "thickness_sd",
-        "morph",
-        ".shape.gii",
-        "SD of thickness over the same copies; per surface vertex, mm (`--uncertainty`)",
-        desc="thicknessSd",
-    ),
+    _SPREAD,
+    *_sidecars([_SPREAD]),
     *_table(
         "surrogate",
         "thickness from the medial axis of single slices (`hipsta-bids surrogate`)",
@@ -184,7 +235,6 @@ DATASET_FILES: dict[str, str] = {
     "description": "dataset_description.json",
     "readme": "README.md",
     "ignore": ".bidsignore",
-    "labels_sidecar": "dseg.json",
     "settings": "desc-settings.json",
     "citation": "CITATION.md",
     "status": "status.tsv",
@@ -205,12 +255,14 @@ IGNORED: dict[str, str] = {
     "/*.html": "Pages to look at; BIDS leaves reports to the program.",
     f"/{DATASET_FILES['group']}": "Results over participants; BIDS has names for single ones only.",
     "*_morph.*": "Morphometry; a proposal (BEP011), not yet in BIDS.",
-    "*.surf.gii": "Surfaces; a proposal (BEP011), not yet in BIDS.",
-    "*.shape.gii": "Maps on a surface, in the suffixes of BEP011; not yet in BIDS.",
+    "*thickness.*": "Thickness and midthickness surfaces, with sidecars; likewise (BEP011).",
+    "*curv.*": "Curvature on surfaces, with sidecars; likewise (BEP011).",
+    "*interior.*": "Interior surfaces, with sidecars; BIDS has no surfaces yet.",
+    "*exterior.*": "Exterior surfaces, with sidecars; likewise.",
     "*_map.*": "Other volumes sampled on the sheet; BIDS has no suffix for any quantity.",
     "*_mesh.vtu": "Tetrahedral meshes; BIDS has no volume meshes.",
     "*_metrics.json": "Quality of one hemisphere; BIDS has no quality metrics of derivatives.",
-    "*_desc-body_mask.*": "Masks per hemisphere; in BIDS, masks of voxels have no hemi and seg.",
+    "*desc-body_mask.*": "Masks per hemisphere; in BIDS, masks of voxels have no hemi and seg.",
     "*_label-extended_dseg.*": "Subfields and cortex; in BIDS, labels on surfaces have no label.",
     "*_label-entorhinal_dseg.*": "The cortex alone; likewise.",
 }

@@ -5,6 +5,7 @@ import gzip
 import math
 import zlib
 from collections.abc import Iterator, Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -50,6 +51,40 @@ MOST_VOXELS, _MOST_IN_SLICE, MOST_LABELED = 4_000_000_000, 50_000_000, 100_000_0
 
 #: Voxels that are read at once.
 _SLAB = 8_000_000
+
+#: Share of a process' memory that an image may need, be it one slice or the part with labels; the
+#: rest is for libraries and for what comes later. A slab of slices takes a quarter of this share.
+READ_SHARE = 0.5
+
+#: Bytes per voxel that reading and translating labels takes beside the voxel itself: measured, 16
+#: for integers of 1 and 4 bytes, 20 for floats of 4.
+_BESIDE = 20
+
+_memory: ContextVar[float] = ContextVar("memory", default=math.inf)
+
+
+def limit_memory(gigabytes: float | None) -> None:
+    """Say what memory (GB) this process may use from here on; ``None`` is no limit."""
+    _memory.set(math.inf if gigabytes is None else 1e9 * gigabytes)
+
+
+def _check_fits(image: Any, path: Path, voxels: int, what: str) -> None:  # noqa: ANN401 (untyped)
+    """Refuse to read so many voxels at once if they need more than their share of memory."""
+    need, share = voxels * _voxel_bytes(image), READ_SHARE * _memory.get()
+    if need > share:
+        raise InputError(
+            f"{path}: reading {what} ({voxels / 1e6:.1f} million voxels) takes {need / 1e6:.0f} MB,"
+            f" but {READ_SHARE:.0%} of a process' part of --mem is {share / 1e6:.0f} MB;"
+            " raise --mem, lower --n-procs, or crop it to the hippocampus",
+            reason="image-too-large",
+        )
+
+
+def _voxel_bytes(image: Any) -> int:  # noqa: ANN401 (untyped)
+    """Bytes of memory that reading takes per voxel; scaled numbers become double precision."""
+    kind = image.get_data_dtype().itemsize
+    scaled = (image.dataobj.slope, image.dataobj.inter) != (1, 0)
+    return _BESIDE + (max(kind, 8) if scaled else int(kind))
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +158,7 @@ def read_labels(
                 f"{MOST_LABELED / 1e6:.0f} are the limit; are these labels?",
                 reason="image-too-large",
             )
+        _check_fits(image, path, size, "the part with labels")
         data = first[box] if first is not None else _voxels(image, shape, box)
     start = (box[0].start, box[1].start, box[2].start)
     return LabelImage(data=data, start=start, shape=shape, affine=affine)
@@ -159,6 +195,7 @@ def _label_shape(image: Any, path: Path) -> tuple[int, int, int]:  # noqa: ANN40
             "limit; make the file again, or crop it to the hippocampus",
             reason="image-too-large",
         )
+    _check_fits(image, path, shape[0] * shape[1], "one slice")
     return shape[0], shape[1], shape[2]
 
 
@@ -170,7 +207,8 @@ def _voxels(image: Any, shape: tuple[int, int, int], box: tuple[slice, ...]) -> 
 
 def _slabs(image: Any, shape: tuple[int, int, int]) -> Iterator[tuple[int, NDArray[Any]]]:  # noqa: ANN401 (untyped)
     """Read slab by slab along the last axis; yields where each begins."""
-    step = max(_SLAB // max(shape[0] * shape[1], 1), 1)
+    most = min(_SLAB, READ_SHARE / 4 * _memory.get() / _voxel_bytes(image))
+    step = max(int(most // max(shape[0] * shape[1], 1)), 1)
     for start in range(0, shape[2], step):
         stop = min(start + step, shape[2])
         yield (

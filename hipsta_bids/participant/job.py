@@ -55,6 +55,8 @@ class Job:
     """Perturbed copies from which uncertainty is estimated; 0 for none."""
     force: bool = False
     """Redo it even if an earlier run has done the same."""
+    memory_gb: float | None = None
+    """Memory that reading may count on; ``None`` is no limit."""
 
     @property
     def title(self) -> str:
@@ -274,8 +276,10 @@ def run_job(job: Job) -> Outcome:
 
 def _measure(job: Job) -> Outcome:
     from hipsta_bids.inputs.labels import read_label_volume  # noqa: PLC0415  (workers only)
+    from hipsta_bids.io.volumes import limit_memory  # noqa: PLC0415  (likewise)
     from hipsta_bids.participant.measure import find_body, measure_hemisphere  # noqa: PLC0415
 
+    limit_memory(job.memory_gb)
     clock = CostClock()
     record = base_record(job)
     hashed, volume = None, None

@@ -30,6 +30,7 @@ from hipsta_bids.derivatives.dataset import (
 )
 from hipsta_bids.derivatives.hemisphere import ResultPlace
 from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName
+from hipsta_bids.derivatives.sidecars import write_shared
 from hipsta_bids.errors import ExitCode, HipstaError, InputError, OutputError, ProtocolError
 from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.io import files
@@ -391,6 +392,8 @@ def _prepare(
         if options.shard is None or not (out_dir / DATASET_FILES["citation"]).exists():
             dataset.write_citation(out_dir, settings, [protocols[k] for k in sorted(protocols)])
         write_sidecar(out_dir)
+        write_shared(out_dir)
+    memory = options.mem_gb and options.mem_gb / n_workers(options, len(items))
     return [
         Job(
             item=item,
@@ -410,6 +413,7 @@ def _prepare(
             write_meshes=options.write_meshes,
             copies=options.uncertainty,
             force=options.force,
+            memory_gb=memory,
         )
         for item in items
     ]

@@ -151,7 +151,7 @@ def test_bad_hemispheres_fail_alone(good, tmp_path, capsys):
     for subject in expected:
         assert found[f"sub-{subject}", "L"]["status"] == "failed"
         # Where the labels tell, the body is left for a person to look at.
-        body = {"body_mask"} if subject == "swapped" else set()
+        body = {"body_mask", "body_sources"} if subject == "swapped" else set()
         assert outputs(out, subject, "L") == {"qc"} | body
     for hemi in ("L", "R"):
         assert found["sub-good", hemi]["status"] != "failed"
@@ -165,6 +165,41 @@ def test_bad_hemispheres_fail_alone(good, tmp_path, capsys):
         (line,) = [line for line in lines if line.startswith(f"sub-{subject}_")]
         assert f"[{reason}]" in line
     assert f"{len(expected)} failed" in said.out
+
+
+def enlarge(path, *shape):
+    """Put the labels into the middle of a large image, where they were."""
+    image = nib.load(path)
+    start = [(count - own) // 2 for count, own in zip(shape, image.shape, strict=True)]
+    data = np.zeros(shape, np.int16)
+    inner = tuple(slice(a, a + own) for a, own in zip(start, image.shape, strict=True))
+    data[inner] = np.asarray(image.dataobj)
+    affine = image.affine.copy()
+    affine[:3, 3] -= affine[:3, :3] @ start
+    nib.save(nib.MGHImage(data, affine), path)
+
+
+def test_memory_decides_what_is_read(good, tmp_path, capsys):
+    """0.6 GB for one process: half of it is 12.5 million voxels of 24 bytes."""
+    bids_dir, out = tmp_path / "bids", tmp_path / "out"
+    shutil.copytree(good, bids_dir)
+    enlarge(label_file(bids_dir, "good"), 600, 600, 300)
+    declare(label_file(bids_dir, "good", "rh"), 4000, 4000, 10)
+    wanted = ("--participant-label", "good", "--n-procs", "1")
+    line = arguments(bids_dir, out, *wanted, "--mem", "600")
+    assert main.main(line) == ExitCode.SOME_FAILED
+    (said,) = capsys.readouterr().err.splitlines()
+    path = label_file(bids_dir, "good", "rh")
+    assert f"{path}: reading one slice (16.0 million voxels) takes 384 MB" in said
+    assert "is 300 MB; raise --mem" in said
+    rows = {row["hemi"]: row for row in read_status(out)}
+    assert rows["R"]["reason"] == "image-too-large"
+    assert rows["L"]["status"] != "failed"
+    assert outputs(out, "good", "L") == COMPLETE
+    assert float(rows["L"]["peak_memory_mb"]) < 600  # which is --mem
+    # With more of it, the voxels are looked for, and are not there.
+    assert main.main([*line[:-3], "1", "--mem", "800"]) == ExitCode.SOME_FAILED
+    assert read_status(out)[1]["reason"] == "unreadable-image"
 
 
 def test_all_inputs_unusable_is_bad_data(good, tmp_path, capsys):

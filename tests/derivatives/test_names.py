@@ -14,6 +14,7 @@ from hipsta_bids.derivatives.names import (
     output_path,
     participant_report,
 )
+from hipsta_bids.derivatives.sidecars import SHARED
 
 FULL = HemisphereName(subject="01", session="02", hemi="R", seg="freesurfer")
 
@@ -80,7 +81,9 @@ def test_outputs_without_a_rule_are_ignored_by_validators():
             name = output_name(replace(FULL, region=region), output.key, output.desc)
             named = output.in_standard and region == "body"
             assert any(fnmatch(name, pattern) for pattern in IGNORED) != named, name
-    tops = {f"/{name}" for name in (*DATASET_FILES.values(), participant_report("01", None))}
+    shared = [row.for_all for row in SHARED]
+    own = (*DATASET_FILES.values(), participant_report("01", None), *shared)
+    tops = {f"/{name}" for name in own}
     hidden = {name for name in tops if any(fnmatch(name, pattern) for pattern in IGNORED)}
     named = ("dataset_description.json", "README.md", "dseg.json", ".bidsignore", "logs")
     assert hidden == tops - {f"/{name}" for name in named}

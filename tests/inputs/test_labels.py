@@ -1,6 +1,7 @@
 import gzip
 import subprocess
 import sys
+from contextvars import ContextVar
 from dataclasses import replace
 
 import nibabel as nib
@@ -12,7 +13,7 @@ from hipsta_bids.errors import InputError, ProtocolError
 from hipsta_bids.inputs.labels import MARGIN, label_values, read_label_volume
 from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.io import volumes
-from hipsta_bids.io.volumes import read_labels
+from hipsta_bids.io.volumes import limit_memory, read_labels
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Part, Tissue
 
@@ -430,3 +431,38 @@ def test_labels_that_are_no_numbers(tmp_path, kind):
     with pytest.raises(InputError, match="colors or complex numbers") as caught:
         label_values(path)
     assert caught.value.reason == "non-integer-labels"
+
+
+def test_memory_bounds_slabs_and_what_is_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(volumes, "_memory", ContextVar("memory", default=np.inf))
+    path = save(tmp_path / "a.nii.gz", make_labels(np.int16))  # slices of 3000 voxels, 22 B each
+    whole = read_labels(path, 1.0)
+    slabs = []
+    read = volumes._voxels
+    monkeypatch.setattr(volumes, "_voxels", lambda *a: slabs.append(read(*a)) or slabs[-1])
+    limit_memory(8 * 2.5 * 3000 * 22e-9)  # an eighth: two slices
+    np.testing.assert_array_equal(read_labels(path, 1.0).data, whole.data)
+    assert [part.shape[2] for part in slabs[:-1]] == [2] * 20
+    assert label_values(path) == {1, 2}
+    limit_memory(2 * 2999 * 22e-9)  # a half: less than a slice
+    del slabs[:]
+    for reader in (read_labels, label_values):
+        with pytest.raises(InputError, match=r"reading one slice .* raise --mem") as caught:
+            reader(path)
+        assert caught.value.reason == "image-too-large"
+    assert not slabs
+
+
+def test_memory_bounds_the_part_with_labels(tmp_path, monkeypatch):
+    monkeypatch.setattr(volumes, "_memory", ContextVar("memory", default=np.inf))
+    labels = make_labels(np.int16)
+    labels[0, 0, 0] = labels[-1, -1, -1] = 2  # all of it: 120 000 voxels
+    path = save(tmp_path / "a.nii.gz", labels)
+    limit_memory(2 * 119_999 * 22e-9)
+    with pytest.raises(InputError, match="reading the part with labels") as caught:
+        read_labels(path)
+    assert caught.value.reason == "image-too-large"
+    limit_memory(2 * 120_001 * 22e-9)
+    assert read_labels(path).data.shape == SHAPE
+    limit_memory(None)
+    assert read_labels(path).data.shape == SHAPE

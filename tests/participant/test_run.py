@@ -13,6 +13,7 @@ from stand_ins import THICKNESS, make_input, stand_in_job, thread_job
 
 from hipsta_bids.derivatives.dataset import COLUMNS, read_status
 from hipsta_bids.derivatives.names import OUTPUTS
+from hipsta_bids.derivatives.sidecars import SHARED
 from hipsta_bids.errors import ExitCode, InputError, OutputError, SettingsError
 from hipsta_bids.inputs.scan import Edit
 from hipsta_bids.io import files
@@ -65,7 +66,7 @@ def test_one_good_hemisphere_gives_a_complete_dataset(tmp_path):
     assert names(out) == {
         "dataset_description.json",
         "README.md",
-        "dseg.json",
+        *(row.for_all for row in SHARED),
         ".bidsignore",
         "desc-settings.json",
         "CITATION.md",
