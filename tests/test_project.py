@@ -89,10 +89,12 @@ def test_imports_are_the_declared_dependencies():
     distributions = {
         "PIL": "pillow",
         "bids": "pybids",
+        "mpl_toolkits": "matplotlib",
         "skimage": "scikit-image",
         "sklearn": "scikit-learn",
     }
-    declared = {canonical(requirement) for requirement in PROJECT["dependencies"]}
+    optional = PROJECT["optional-dependencies"]["xarray"]
+    declared = {canonical(requirement) for requirement in (*PROJECT["dependencies"], *optional)}
     trees = (
         ast.parse(path.read_text(encoding="utf-8")) for path in (ROOT / "hipsta_bids").rglob("*.py")
     )
