@@ -13,8 +13,6 @@ import yaml
 from reference_pages import PAGES
 
 import hipsta_bids
-from hipsta_bids.derivatives.names import DATASET_FILES, OUTPUTS, HemisphereName, output_name
-from hipsta_bids.derivatives.sidecars import SHARED
 from hipsta_bids.errors import ExitCode
 
 ROOT = Path(__file__).parents[1]
@@ -90,10 +88,12 @@ def test_imports_are_the_declared_dependencies():
     distributions = {
         "PIL": "pillow",
         "bids": "pybids",
+        "mpl_toolkits": "matplotlib",
         "skimage": "scikit-image",
         "sklearn": "scikit-learn",
     }
-    declared = {canonical(requirement) for requirement in PROJECT["dependencies"]}
+    optional = PROJECT["optional-dependencies"]["xarray"]
+    declared = {canonical(requirement) for requirement in (*PROJECT["dependencies"], *optional)}
     trees = (
         ast.parse(path.read_text(encoding="utf-8")) for path in (ROOT / "hipsta_bids").rglob("*.py")
     )
@@ -154,25 +154,42 @@ def test_citation_file_is_complete_and_up_to_date():
     assert all({"type", "title", "authors"} <= entry.keys() for entry in citation["references"])
 
 
-def test_readme_lists_the_exit_codes():
-    section = README.split("### Exit codes")[1].split("\n## ")[0]
+def test_exit_codes_are_listed():
+    page = (ROOT / "docs" / "running.md").read_text(encoding="utf-8")
+    section = page.split("## Exit codes")[1].split("\n## ")[0]
     codes = {int(code) for cell in re.findall(r"^\| ([\d, ]+) \|", section, re.MULTILINE)
              for code in cell.split(", ")}  # fmt: skip
     signals = {128 + 2, 128 + 15}  # SIGINT and SIGTERM, as shells report them
     assert codes == set(ExitCode) | signals
 
 
-def test_readme_lists_the_outputs_of_the_table():
-    name = HemisphereName(subject="X", session=None, hemi="L", seg="P")
-    expected = [output_name(name, output.key).removeprefix(name.stem) for output in OUTPUTS]
-    section = README.split("## Outputs")[1].split("For the whole dataset:")[0]
-    assert re.findall(r"^\| `([^`]+)` \|", section, re.MULTILINE) == expected
+def test_readme_says_of_accuracy_what_the_validation_found():
+    page = (ROOT / "docs" / "validation.md").read_text(encoding="utf-8")
+    table = page.split("**Thickness over the whole grid, mm**")[1].split("\n\n")[1]
+    rows = [[cell.strip() for cell in row.split("|")] for row in table.splitlines()]
+    fine = [row for row in rows if row[2:3] == ["0.4 iso"]]
+    assert len(fine) == 4
+    assert {row[1].split()[1] for row in fine} == {"1.2", "2.0"}
+    bias, spread = ([abs(float(row[k])) for row in fine] for k in (3, 4))
+    said = README.replace("\n", " ")
+    assert f"by {min(bias):.3f} to {max(bias):.3f} mm on average" in said
+    assert f"by {min(spread):.3f} to {max(spread):.3f} mm (SD)" in said
 
 
-def test_readme_lists_the_files_of_the_dataset():
-    section = README.split("For the whole dataset:")[1].split("\n### ")[0]
-    listed = {name.rstrip("/") for name in re.findall(r"`([^`]+)`(?=[, ].*\|)", section)}
-    assert listed == {*DATASET_FILES.values(), *(row.for_all for row in SHARED)}
+def test_readme_says_of_speed_what_the_page_on_scaling_does():
+    page = (ROOT / "docs" / "scaling.md").read_text(encoding="utf-8")
+    seconds = re.search(r"\| ([\d.]+) s, median of twelve \|", page)
+    assert seconds is not None
+    assert f"{seconds[1]} s of processor time per hemisphere" in README
+
+
+def test_the_figure_of_the_readme_is_small_and_licensed():
+    figure = ROOT / "docs" / "images" / "readme.png"
+    assert figure.stat().st_size < 200_000
+    license_ = figure.with_name("readme.LICENSE.txt").read_text(encoding="utf-8")
+    assert "Khan Computational Imaging Lab" in license_
+    assert "WITHOUT WARRANTY OF ANY KIND" in license_
+    assert README.index("readme.png") < README.index("readme.LICENSE.txt")
 
 
 @pytest.mark.parametrize(

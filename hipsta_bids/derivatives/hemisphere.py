@@ -103,7 +103,7 @@ def remove_results(place: ResultPlace) -> None:
         files.remove_leftovers(folder, place.name.pattern)
 
 
-def _sheet_labels(protocol: Protocol) -> dict[Tissue, Label]:
+def sheet_labels(protocol: Protocol) -> dict[Tissue, Label]:
     """Choose one label per sheet tissue: that of the body, since the sheet is the body's."""
     found: dict[Tissue, Label] = {}
     for label in sorted(protocol.labels, key=lambda label: label.part != Part.BODY):
@@ -133,7 +133,7 @@ def _write_sheet(place: ResultPlace, maps: HemisphereMaps, protocol: Protocol) -
     """Write one row per sheet point, y fastest."""
     points = maps.sheet.points
     nx, ny, nz = points.shape[:3]
-    labels = _sheet_labels(protocol)
+    labels = sheet_labels(protocol)
     short = {int(tissue): label.abbreviation for tissue, label in labels.items()}
     columns = {
         **_numbers(NODES, (nx, ny)),
@@ -414,7 +414,7 @@ def _gifti_files(
     for row in MAPS:
         values = maps.maps[row.name].ravel()
         yield row.name, gifti.shape_bytes(values, hemi=hemi, name=row.name, unit=row.unit)
-    labels = _sheet_labels(protocol)
+    labels = sheet_labels(protocol)
     table = {int(tissue): (label.name, label.color) for tissue, label in labels.items()}
     yield (
         "subfields",

@@ -262,7 +262,7 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
     return Collection(
         records=tuple(kept),
         exclusions=tuple(left_out),
-        settings=_settings_of(kept[0].place.root),
+        settings=settings_of(kept[0].place.root),
         settings_hash=digest,
         versions=tuple(sorted({record.version for record in kept})),
         notes=(
@@ -425,7 +425,8 @@ def _one_settings(kept: Sequence[SheetRecord]) -> str:
     return next(iter(counts))
 
 
-def _settings_of(root: Path) -> Mapping[str, Any]:
+def settings_of(root: Path) -> Mapping[str, Any]:
+    """Read the settings that the results of an output dataset share."""
     settings = files.read_json(root / DATASET_FILES["settings"]).get("settings")
     if not isinstance(settings, Mapping):
         raise InputError(

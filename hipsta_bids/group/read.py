@@ -137,8 +137,8 @@ def read_sheets(
     return Measured(
         visits=table,
         sides=sides,
-        x=_coordinates(grid["x_extent"], shape[0]),
-        y=_coordinates(grid["y_extent"], shape[1]),
+        x=node_coordinates(grid["x_extent"], shape[0]),
+        y=node_coordinates(grid["y_extent"], shape[1]),
         units=(read_units(records[0].place) if records else {})
         | {n: ARBITRARY for n in names if n not in SHEET_MAPS},
         sources={
@@ -191,7 +191,7 @@ def visits_of(records: Sequence[SheetRecord]) -> list[VisitKey]:
     return list(dict.fromkeys((r.place.name.subject, r.place.name.session) for r in records))
 
 
-def _coordinates(extent: float, nodes: int) -> Float:
+def node_coordinates(extent: float, nodes: int) -> Float:
     """Coordinates of the nodes, without the rounding errors that would show in tables."""
     return np.asarray(np.linspace(-extent, extent, nodes).round(10) + 0.0, dtype=np.float64)
 

@@ -1,5 +1,6 @@
 """Segmentations as label volumes, with what a person corrected: labels, and the body's mask."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +69,6 @@ def read_label_volume(item: HemisphereInput, region: str = "body") -> LabelVolum
     """
     if item.problem is not None:
         raise item.problem
-    sheet = for_region(item.protocol, region).sheet
     labels, mask = item.edit("labels"), item.edit("mask")
     path = labels.path if labels else item.files[0]
     image = read_labels(path, MARGIN)
@@ -80,24 +80,74 @@ def read_label_volume(item: HemisphereInput, region: str = "body") -> LabelVolum
         more = _beside(other, path, image, edited=labels is not None)
         _, parts = _translate(_integers(more, other), item.parts_protocol or item.protocol, other)
         part = np.where(parts == Part.UNKNOWN, part, parts)
-    part = np.where(tissue == Tissue.BACKGROUND, np.uint8(Part.UNKNOWN), part)
-    hippocampal = ~np.isin(tissue, tuple(OUTSIDE.difference(sheet)))
-    inner = _bounding_box(hippocampal, image.affine, path)
-    first, second, third = (a + b.start for a, b in zip(image.start, inner, strict=True))
-    cropped = moved(image.affine, (first, second, third))
+    volume = _cropped(tissue, part, image, item.protocol, region=region, path=path)
     if labels:
-        _check_same_place(hippocampal[inner], cropped, item, path)
+        wanted = _wanted(volume.tissue, item.protocol, region)
+        _check_same_place(wanted, volume.affine, item, path)
+    if mask is None and not item.ends:
+        return volume
+    edited = None
+    if mask:
+        around = read_labels(mask.path, 1.0)
+        edited = _sample_mask(around, volume.affine, volume.tissue.shape, mask.path)
+    return replace(volume, edited_mask=edited, given_ends=item.ends)
+
+
+def label_volume(
+    image: LabelImage,
+    protocol: Protocol,
+    hemi: str,
+    region: str = "body",
+    *,
+    path: Path = Path("the labels"),
+) -> LabelVolume:
+    """Translate and crop an image, as :func:`read_label_volume` does a hemisphere of a dataset.
+
+    Where codes of the side that the protocol shifts occur, the other side is left out. ``path`` is
+    what messages call the image.
+    """
+    whole = _integers(image.data, path)
+    bilateral = bool(protocol.offset) and bool((whole > protocol.offset).any())
+    item = HemisphereInput(
+        subject="",
+        session=None,
+        hemi=hemi,
+        protocol=protocol,
+        files=(path,),
+        bilateral=bilateral,
+        code_offset=protocol.shift(hemi) if bilateral else 0,
+        source="",
+        source_path=path,
+        why="given",
+    )
+    tissue, part = _translate(_one_hemisphere(whole, item, path), protocol, path)
+    return _cropped(tissue, part, image, protocol, region=region, path=path)
+
+
+def _wanted(tissue: NDArray[np.uint8], protocol: Protocol, region: str) -> Bool:
+    """Mark the hippocampal labels, and the cortical ones of the region."""
+    sheet = for_region(protocol, region).sheet
+    return np.asarray(~np.isin(tissue, tuple(OUTSIDE.difference(sheet))))
+
+
+def _cropped(
+    tissue: NDArray[np.uint8],
+    part: NDArray[np.uint8],
+    image: LabelImage,
+    protocol: Protocol,
+    *,
+    region: str,
+    path: Path,
+) -> LabelVolume:
+    """Crop what was translated to the labels that are wanted, and a margin."""
+    part = np.where(tissue == Tissue.BACKGROUND, np.uint8(Part.UNKNOWN), part)
+    inner = _bounding_box(_wanted(tissue, protocol, region), image.affine, path)
+    first, second, third = (a + b.start for a, b in zip(image.start, inner, strict=True))
     return LabelVolume(
         tissue=tissue[inner],
         part=part[inner],
-        affine=cropped,
-        protocol=item.protocol,
-        edited_mask=(
-            _sample_mask(read_labels(mask.path, 1.0), cropped, tissue[inner].shape, mask.path)
-            if mask
-            else None
-        ),
-        given_ends=item.ends,
+        affine=moved(image.affine, (first, second, third)),
+        protocol=protocol,
         start=(first, second, third),
         file_shape=image.shape,
     )

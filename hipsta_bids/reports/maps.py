@@ -30,7 +30,7 @@ from hipsta_bids.reports.display import (
     gradient_of,
     scale_of,
 )
-from hipsta_bids.reports.results import Hemisphere
+from hipsta_bids.reports.results import SIDES, Hemisphere, SheetTable
 from hipsta_bids.types import Float, Status
 
 if TYPE_CHECKING:
@@ -102,7 +102,9 @@ def draw_map(kind: MapKind, hemispheres: Sequence[Hemisphere]) -> Picture:
     low, high = scale_of(kind, [h.sheet.columns[kind.column] for h in hemispheres])
     image: Any = None
     for axis, hemisphere in zip(axes[0], hemispheres, strict=True):
-        image = _draw_sheet(axis, hemisphere, kind, (low, high))
+        extents = [hemisphere.summary.get(f"extent_{a}", np.nan) for a in "xy"]
+        hemi = hemisphere.place.name.hemi
+        image = draw_sheet(axis, hemisphere.sheet, kind, (low, high), extents=extents, hemi=hemi)
     axes[0, 0].set_ylabel("  ←  mm  →  ".join(Y_ENDS))
     figure.colorbar(
         image, ax=list(axes[0]), label=f"{kind.title.lower()} [{kind.unit}]", extend="both"
@@ -194,15 +196,19 @@ def _encode(figure: "Figure", *, alt: str, caption: str) -> Picture:
     )
 
 
-def _draw_sheet(
-    axis: "Axes", hemisphere: Hemisphere, kind: MapKind, scale: tuple[float, float]
+def draw_sheet(
+    axis: "Axes",
+    sheet: SheetTable,
+    kind: MapKind,
+    scale: tuple[float, float],
+    *,
+    extents: Sequence[float],
+    hemi: str,
 ) -> Any:  # noqa: ANN401  (matplotlib's mappables have no common public type)
-    sheet = hemisphere.sheet
-    extent = [hemisphere.summary.get(f"extent_{a}", np.nan) for a in "xy"]
-    width, length = (
-        e if np.isfinite(e) else float(n) for e, n in zip(extent, sheet.shape, strict=True)
-    )
-    x, y = (np.linspace(0, mm, n) for mm, n in zip((width, length), sheet.shape, strict=True))
+    """Draw one map of a sheet, its extents along x and y in mm or else in nodes."""
+    known = bool(np.isfinite(extents).all())
+    sizes = extents if known else [float(n) for n in sheet.shape]
+    x, y = (np.linspace(0, size, n) for size, n in zip(sizes, sheet.shape, strict=True))
     values = sheet.columns[kind.column].T
     axis.set_facecolor("0.85")
     image = axis.pcolormesh(
@@ -214,8 +220,8 @@ def _draw_sheet(
             _hatch(axis, where, x, y, hatch)
     _draw_borders(axis, sheet.subfield, x, y)
     axis.set_aspect("equal")
-    axis.set_title(hemisphere.side)
-    axis.set_xlabel("  ←  mm  →  ".join(X_ENDS))
+    axis.set_title(SIDES.get(hemi, hemi))
+    axis.set_xlabel(f"  ←  {'mm' if known else 'nodes'}  →  ".join(X_ENDS))
     return image
 
 

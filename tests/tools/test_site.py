@@ -1,4 +1,4 @@
-"""The documentation site: a build without warnings or network, and an example that runs."""
+"""The documentation site: a build without warnings or network."""
 
 import os
 import re
@@ -9,16 +9,6 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-
-
-def test_the_example_of_the_python_page_runs(capsys):
-    page = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
-    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    exec(compile(example, "api.md", "exec"), {})  # noqa: S102  (our own page)
-    thickness, volume = map(float, capsys.readouterr().out.split())
-    # An arc of 2 mm in voxels of 0.4 mm: errors are a tenth of this (docs/measures.md).
-    assert thickness == pytest.approx(2.0, abs=0.05)
-    assert volume > 100
 
 
 @pytest.fixture(scope="module")
@@ -58,6 +48,7 @@ def test_nothing_is_loaded_from_elsewhere(site):
 def test_docstrings_are_on_the_python_page(site):
     text = (site / "api.html").read_text(encoding="utf-8")
     assert 'id="hipsta_bids.participant.measure.measure_hemisphere"' in text
+    assert 'id="hipsta_bids.api.maps.measure"' in text
     assert "With the reason why this hemisphere cannot be measured." in text
 
 

@@ -1,0 +1,1 @@
+"""The Python interface: measuring, loading, drawing; reached as ``import hipsta_bids as hb``."""

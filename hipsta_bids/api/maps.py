@@ -1,0 +1,449 @@
+"""Measures labels in memory, and reads an output dataset, as labeled arrays."""
+
+from collections.abc import Mapping
+from contextlib import nullcontext
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike, NDArray
+
+from hipsta_bids.derivatives.dataset import identity
+from hipsta_bids.derivatives.hemisphere import POSITION, STATE, read_sheet, sheet_labels, verdict
+from hipsta_bids.errors import InputError, NothingToDoError
+from hipsta_bids.geometry.catalog import MAPS
+from hipsta_bids.geometry.sheet import is_left_handed, layer_depth
+from hipsta_bids.group.collect import settings_of
+from hipsta_bids.group.read import node_coordinates
+from hipsta_bids.inputs.labels import MARGIN, label_volume
+from hipsta_bids.io.gifti import sheet_triangles
+from hipsta_bids.io.volumes import LabelImage, read_labels
+from hipsta_bids.participant.measure import measure_hemisphere
+from hipsta_bids.protocols.load import for_region, load_protocol
+from hipsta_bids.protocols.protocol import Protocol
+from hipsta_bids.reports.results import SIDES, Hemisphere, SheetTable, find_results
+from hipsta_bids.settings import Settings, load_settings
+from hipsta_bids.types import Flag, Float, HemisphereMaps, LabelVolume, Mesh, Sheet
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from hipsta_bids.io.xarrays import Variable
+
+#: Surfaces of the sheet, by their position among its layers.
+_LEVELS = {"interior": 0.0, "midthickness": 0.5, "exterior": 1.0}
+#: What is no column of the sheet's table: definition and unit.
+_MORE = {
+    "position": ("position, scanner RAS", "mm"),
+    "depth": ("distance from the interior wall along the column", "mm"),
+}
+_NODES = {
+    "x": {"long_name": "medial to lateral", "units": "1"},
+    "y": {"long_name": "posterior to anterior", "units": "1"},
+}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Measurement:
+    """One measured hemisphere."""
+
+    side: str
+    """``L`` or ``R``."""
+    protocol: Protocol
+    """With the sheet of what was measured."""
+    settings: Settings
+    hemisphere: HemisphereMaps
+    """All that was measured, as the stages of the method hand it on."""
+
+    @property
+    def maps(self) -> Mapping[str, Float]:
+        """Maps (x, y) by name, read-only; NaN is missing. Units are in :attr:`units`."""
+        return self.hemisphere.maps
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Units of the maps, by name."""
+        return {row.name: row.unit for row in MAPS}
+
+    @property
+    def status(self) -> str:
+        """``ok``, ``repaired`` or ``flagged``."""
+        return self.hemisphere.status.value
+
+    @property
+    def flags(self) -> tuple[Flag, ...]:
+        """What to look at before use; empty unless the status is ``flagged``."""
+        return self.hemisphere.flags
+
+    @property
+    def message(self) -> str:
+        """Why it was flagged or repaired; empty if it was not."""
+        return verdict(self.hemisphere)[2] or ""
+
+    @cached_property
+    def summary(self) -> pd.Series:
+        """One number per summary measure, named as the columns of the summary table."""
+        return pd.Series(dict(self.hemisphere.summary), name=self.side, dtype=np.float64)
+
+    @cached_property
+    def subfield(self) -> NDArray[np.str_]:
+        """(x, y) abbreviations of subfields; empty where there is none."""
+        labels = sheet_labels(self.protocol)
+        names = {int(tissue): label.abbreviation for tissue, label in labels.items()}
+        codes = self.hemisphere.subfield
+        return np.array([names.get(c, "") for c in codes.ravel().tolist()]).reshape(codes.shape)
+
+    def surface(self, level: str = "midthickness") -> Mesh:
+        """Return one surface of the sheet.
+
+        Parameters
+        ----------
+        level : {"interior", "midthickness", "exterior"}
+
+        Returns
+        -------
+        Mesh
+            Points (x * y, 3), RAS mm, in the order of ``maps[name].ravel()``, and triangles whose
+            normals point to the exterior; NaN where a column has no position.
+
+        Raises
+        ------
+        ValueError
+            If no surface has this name.
+        """
+        check_choice("level", level, _LEVELS)
+        points = self.hemisphere.sheet.points
+        nx, ny, nz = points.shape[:3]
+        triangles = sheet_triangles(nx, ny, flip=is_left_handed(points))
+        at = round(_LEVELS[level] * (nz - 1))
+        return Mesh(points=points[:, :, at].reshape(-1, 3), triangles=triangles.astype(np.int64))
+
+    @cached_property
+    def table(self) -> SheetTable:
+        """The sheet as the pages draw it."""
+        sheet = self.hemisphere.sheet
+        return SheetTable(
+            columns=self.maps,
+            subfield=self.subfield,
+            valid=sheet.valid,
+            repaired=self.hemisphere.repaired,
+            points={"midthickness": sheet.points[:, :, sheet.middle]},
+        )
+
+    @cached_property
+    def dataset(self) -> "xr.Dataset":
+        """The maps as a dataset of xarray.
+
+        Coordinates are ``x`` (medial to lateral) and ``y`` (posterior to anterior), from -1 to 1,
+        and ``layer``, the share of the column from the interior (0) to the exterior wall (1).
+        Each map has dimensions (x, y), ``position`` (x, y, layer, ras) in scanner RAS mm, and
+        ``depth`` (x, y, layer) in mm from the interior wall. Attributes hold units, definitions
+        and sources of maps.
+        """
+        from hipsta_bids.io.xarrays import make_dataset  # noqa: PLC0415  (an optional extra)
+
+        sheet, layers = self.hemisphere.sheet, self.hemisphere.layers
+        nx, ny, nz = sheet.points.shape[:3]
+        grid = ("x", "y")
+        state = {"subfield": self.subfield, "valid": sheet.valid, "repaired": self.table.repaired}
+        variables: dict[str, Variable] = {
+            row.name: (grid, self.maps[row.name], attributes(row.name)) for row in MAPS
+        }
+        variables |= {name: (grid, values, attributes(name)) for name, values in state.items()}
+        variables |= _three_dimensional(layers)
+        coordinates = {
+            **node_axes(self.settings.sheet.model_dump(), (nx, ny)),
+            "layer": (["layer"], np.linspace(0, 1, nz), {"long_name": "interior to exterior"}),
+            "ras": (["ras"], list(POSITION), {}),
+        }
+        about = {"side": self.side, "protocol": self.protocol.name, "status": self.status}
+        return make_dataset(variables, coordinates, about)
+
+
+def _three_dimensional(layers: Sheet) -> "dict[str, Variable]":
+    grid = ("x", "y", "layer")
+    return {
+        "position": ((*grid, "ras"), layers.points, attributes("position")),
+        "depth": (grid, layer_depth(layers), attributes("depth")),
+    }
+
+
+def attributes(name: str) -> dict[str, str]:
+    """Describe a variable: unit, definition and source."""
+    for row in MAPS:
+        if row.name == name:
+            return {"units": row.unit, "long_name": row.definition, "source": row.source}
+    words, unit = (_MORE | STATE)[name]
+    return {"long_name": words, **({"units": unit} if unit else {})}
+
+
+def node_axes(grid: Mapping[str, Any], shape: tuple[int, int]) -> dict[str, Any]:
+    """Coordinates of the nodes, by the settings of the sheet."""
+    return {
+        axis: ([axis], node_coordinates(float(grid[f"{axis}_extent"]), count), _NODES[axis])
+        for axis, count in zip("xy", shape, strict=True)
+    }
+
+
+def check_choice(name: str, value: object, choices: Mapping[str, object]) -> None:
+    """Refuse a value that is not among the choices."""
+    if value not in choices:
+        raise ValueError(f"{name} is {value!r}; choose {' or '.join(map(repr, choices))}")
+
+
+def measure(
+    labels: Any,  # noqa: ANN401  (nibabel's images have no types)
+    side: str = "L",
+    protocol: str | Path | Protocol | None = None,
+    *,
+    affine: ArrayLike | None = None,
+    region: str = "body",
+    settings: Settings | str | Path | None = None,
+) -> Measurement:
+    """Measure thickness, curvature and shape of one hippocampus; writes no file.
+
+    Parameters
+    ----------
+    labels
+        Path of an image, an image of nibabel, or an array (I, J, K) of the protocol's codes; or a
+        :class:`~hipsta_bids.types.LabelVolume`, which needs no protocol.
+    side : {"L", "R"}
+        Hemisphere. Of an image with codes of both, in a protocol that shifts those of one side,
+        the other is left out.
+    protocol : str, Path or Protocol
+        What the codes mean: a name of ``hipsta-bids protocols``, as ``"freesurfer"`` or
+        ``"hippunfold"``, or a TOML file. A wrong one may give a plausible, wrong map.
+    affine : array, optional
+        (4, 4), voxel index to RAS mm; for arrays only.
+    region : {"body", "extended", "entorhinal"}
+        What to measure; the latter two need labels of the cortex beside it.
+    settings : Settings, str or Path, optional
+        Settings of the participant level, or a TOML file with some.
+
+    Returns
+    -------
+    Measurement
+        ``maps`` as arrays, ``dataset`` with coordinates and units, ``summary``, ``status``.
+
+    Raises
+    ------
+    ValueError
+        If side, protocol or affine are missing or wrong.
+    InputError, ProtocolError
+        If the labels cannot be read, or do not fit the protocol.
+    GeometryError
+        With the reason why this hemisphere cannot be measured.
+
+    Examples
+    --------
+    A synthetic body with a wall of 2 mm everywhere, in voxels of 0.5 mm:
+
+    >>> import hipsta_bids as hb
+    >>> from hipsta_bids.phantom import Phantom, PhantomSpec, encode
+    >>> from hipsta_bids.protocols.load import load_protocol
+    >>> phantom = Phantom(PhantomSpec(kind="arc", thickness=2.0, length=10.0))
+    >>> volume = phantom.label_volume(load_protocol("freesurfer"), voxel_size=(0.5, 0.5, 0.5))
+    >>> codes = encode(volume)
+    >>> left = hb.measure(codes, side="L", protocol="freesurfer", affine=volume.affine)
+    >>> left.status
+    'ok'
+    >>> left.maps["thickness"].shape
+    (41, 21)
+    >>> print(f"{left.summary['thickness_mean']:.1f} {left.units['thickness']}")
+    2.0 mm
+
+    With xarray, values are found by their coordinates:
+
+    >>> middle = left.dataset.sel(y=0.0)
+    >>> dict(middle.sizes)
+    {'x': 41, 'layer': 9, 'ras': 3}
+    >>> print(f"{float(middle.thickness.mean()):.1f} {middle.thickness.units}")
+    2.0 mm
+    """
+    check_choice("side", side, SIDES)
+    if isinstance(settings, str | Path) or settings is None:
+        settings = load_settings(None if settings is None else Path(settings))
+    settings = settings.changed(body={"region": region})
+    volume = (
+        labels
+        if isinstance(labels, LabelVolume)
+        else _read_volume(labels, side, _as_protocol(protocol), affine, region)
+    )
+    return Measurement(
+        side=side,
+        protocol=for_region(volume.protocol, region),
+        settings=settings,
+        hemisphere=measure_hemisphere(volume, side, settings, lambda _: nullcontext()),
+    )
+
+
+def _as_protocol(protocol: str | Path | Protocol | None) -> Protocol:
+    if protocol is None:
+        raise ValueError("name the protocol of the codes, such as protocol='freesurfer'")
+    return protocol if isinstance(protocol, Protocol) else load_protocol(protocol)
+
+
+def _read_volume(
+    labels: Any,  # noqa: ANN401  (as above)
+    side: str,
+    protocol: Protocol,
+    affine: ArrayLike | None,
+    region: str,
+) -> LabelVolume:
+    own = getattr(labels, "affine", None)
+    if isinstance(labels, str | Path) or own is not None:
+        if affine is not None:
+            raise ValueError("an image has an affine of its own; give affine with arrays only")
+    elif affine is None:
+        raise ValueError("an array needs affine, (4, 4), from voxel indices to RAS mm")
+    if isinstance(labels, str | Path):
+        path = Path(labels)
+        image = read_labels(path, MARGIN)
+        if not image.data.size:
+            raise InputError(f"{path}: all labels are zero", reason="empty-labels")
+        return label_volume(image, protocol, side, region, path=path)
+    data = np.asanyarray(labels if own is None else labels.dataobj)
+    if data.ndim != 3:  # noqa: PLR2004  (a volume)
+        raise InputError(f"labels of shape {data.shape}; a volume has 3 axes", reason="not-3d")
+    matrix = np.asarray(affine if own is None else own, dtype=np.float64)
+    if matrix.shape != (4, 4) or not abs(np.linalg.det(matrix[:3, :3])) > 0:
+        raise ValueError("affine has to be an invertible matrix (4, 4), voxel indices to RAS mm")
+    image = LabelImage(data=data, start=(0, 0, 0), shape=data.shape, affine=matrix)
+    return label_volume(image, protocol, side, region)
+
+
+class Results(NamedTuple):
+    """An output dataset."""
+
+    maps: "xr.Dataset"
+    """(participant, session, side, x, y), read when values are used."""
+    table: pd.DataFrame
+    """One row per hemisphere: who, status, reason, message, and the summary measures."""
+
+
+def load(out_dir: str | Path, *, protocol: str | None = None, region: str = "body") -> Results:
+    """Load an output dataset as one table and one lazy dataset of xarray.
+
+    Nothing but the small records and summaries is read at once. Maps are read when their values
+    are used, and only those of the participants, sides and measures that are used: select first,
+    then compute. ``.load()`` reads all that is left.
+
+    Parameters
+    ----------
+    out_dir : str or Path
+        The output folder of ``hipsta-bids ... participant``.
+    protocol : str, optional
+        Name of the segmentation protocol, if the folder has results of several.
+    region : {"body", "extended", "entorhinal"}
+        What was measured.
+
+    Returns
+    -------
+    Results
+        ``maps``: every map of the sheet, ``subfield``, ``valid``, ``repaired`` and ``position``
+        (RAS mm of the mid-surface), by participant (``sub-01``), session (``ses-1``; ``n/a`` in
+        datasets without), side (``L``, ``R``), x and y (-1 to 1), with units; NaN where there is
+        no map. ``status`` has no x and y. ``table``: one row per hemisphere, failed ones included,
+        whose ``participant_id`` is that of ``participants.tsv``.
+
+    Raises
+    ------
+    NothingToDoError
+        ``no-hemisphere``: no results are there, or none of this protocol and region.
+    InputError
+        ``several-protocols``: choose one.
+
+    Examples
+    --------
+    ::
+
+        maps, table = hb.load("out")
+        thickness = maps.thickness.sel(side="L").mean(("participant", "session"))
+        hb.plot_sheet(maps.sel(participant="sub-01", side="L").squeeze("session"))
+    """
+    root = Path(out_dir)
+    found = [one for one in find_results(root) if one.place.name.region == region]
+    seg = _one_protocol(root, found, protocol)
+    own = [one for one in found if one.place.name.seg == seg]
+    table = pd.DataFrame([_row(one) for one in own])
+    return Results(maps=_lazy_dataset(root, own, table), table=table)
+
+
+def _one_protocol(root: Path, found: list[Hemisphere], wanted: str | None) -> str:
+    names = sorted({one.place.name.seg for one in found})
+    if not names or wanted not in {None, *names}:
+        there = f"there is {', '.join(names)}" if names else "run the participant level first"
+        raise NothingToDoError(f"{root}: no such hemisphere; {there}", reason="no-hemisphere")
+    if wanted is None and len(names) > 1:
+        raise InputError(
+            f"{root}: hemispheres of several protocols, {', '.join(names)}; choose one by protocol",
+            reason="several-protocols",
+        )
+    return wanted or names[0]
+
+
+def _row(one: Hemisphere) -> dict[str, object]:
+    who = identity(one.place.name)
+    return {
+        "participant_id": who["subject"],
+        "session_id": who["session"],
+        "hemi": who["hemi"],
+        "protocol": who["seg"],
+        "region": who["region"],
+        "status": one.status.value,
+        "reason": one.record.get("reason") or "",
+        "message": one.message,
+        **one.summary,
+    }
+
+
+def _lazy_dataset(root: Path, own: list[Hemisphere], table: pd.DataFrame) -> "xr.Dataset":
+    from hipsta_bids.io.xarrays import make_dataset, read_later  # noqa: PLC0415  (optional)
+
+    grid = settings_of(root)["sheet"]
+    shape = (int(grid["x_nodes"]), int(grid["y_nodes"]))
+    labels = [sorted(table[column].unique()) for column in ("participant_id", "session_id", "hemi")]
+    outer = tuple(len(names) for names in labels)
+    axes = ("participant", "session", "side")
+    index = [
+        tuple(names.index(cell) for names, cell in zip(labels, cells, strict=True))
+        for cells in table[["participant_id", "session_id", "hemi"]].itertuples(index=False)
+    ]
+    status = np.full(outer, "", dtype="<U8")
+    for at, word in zip(index, table["status"], strict=True):
+        status[at] = word
+    measured = {at: one for at, one in zip(index, own, strict=True) if one.measured}
+
+    def read(name: str, at: tuple[int, ...]) -> NDArray[Any] | None:
+        if at not in measured:
+            return None
+        path = measured[at].place.path("sheet")
+        if name == "position":
+            columns = read_sheet(path, tuple(POSITION), shape=shape)
+            return np.stack([columns[axis] for axis in POSITION], axis=-1)
+        if name in STATE:
+            words = read_sheet(path, (), (name,), shape)[name]
+            return words if name == "subfield" else words == "true"
+        return read_sheet(path, (name,), shape=shape)[name]
+
+    def variable(name: str) -> tuple[tuple[str, ...], Any, Mapping[str, str]]:
+        kind = {"subfield": np.object_, "valid": np.bool_, "repaired": np.bool_}
+        last = ("ras",) if name == "position" else ()
+        inner = (*shape, *(len(POSITION) for _ in last))
+        values = read_later(outer, inner, kind.get(name, np.float64), partial(read, name))
+        return (*axes, "x", "y", *last), values, attributes(name)
+
+    variables: dict[str, Any] = {
+        name: variable(name) for name in (*(row.name for row in MAPS), *STATE, "position")
+    }
+    variables["status"] = (axes, status, {"long_name": "how the hemisphere ended; empty: none"})
+    coordinates = {
+        **{name: ([name], values, {}) for name, values in zip(axes, labels, strict=True)},
+        **node_axes(grid, shape),
+        "ras": (["ras"], list(POSITION), {}),
+    }
+    about = {"protocol": table["protocol"].iloc[0], "region": table["region"].iloc[0]}
+    return make_dataset(variables, coordinates, about)

@@ -1,0 +1,362 @@
+"""Draws maps on axes of matplotlib: unfolded sheets, surfaces, and results of a model."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hipsta_bids.api.maps import Measurement, attributes, check_choice
+from hipsta_bids.geometry.catalog import MAPS
+from hipsta_bids.group.models import GroupFit
+from hipsta_bids.io.gifti import sheet_triangles
+from hipsta_bids.reports.display import (
+    EFFECT_COLORS,
+    MAP_KINDS,
+    Y_ENDS,
+    Effects,
+    MapKind,
+    effect_reach,
+    kind_of,
+    scale_of,
+)
+from hipsta_bids.reports.group_maps import EFFECT_NAMES
+from hipsta_bids.reports.group_tables import display_name, unit_of
+from hipsta_bids.reports.maps import draw_sheet
+from hipsta_bids.reports.results import SheetTable
+from hipsta_bids.types import Float
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from mpl_toolkits.mplot3d import Axes3D
+
+_STATE = ("subfield", "valid", "repaired")
+_MIDDLE = 0.5  # coordinate of the layer of the mid-surface
+_BEYOND = 0.12  # of the length, from an end to its letter
+_SHADE = 0.45  # of the light that depends on direction
+_VIEW = {"L": (38.0, -140.0), "R": (38.0, -40.0)}
+"""Elevation and azimuth, degrees: from behind, above and lateral."""
+
+
+def plot_sheet(
+    data: Any,  # noqa: ANN401  (a measurement, or a dataset of an optional library)
+    measure: str = "thickness",
+    *,
+    ax: "Axes | None" = None,
+    limits: tuple[float, float] | None = None,
+    colorbar: bool = True,
+) -> "Axes":
+    """Draw a map on the unfolded sheet, with borders and names of subfields.
+
+    Sheets are seen from above, anterior up: the medial side of a left one is on the right. Columns
+    that were repaired are hatched, those that were filled from their neighbors crossed.
+
+    Parameters
+    ----------
+    data : Measurement or xarray.Dataset
+        What :func:`hipsta_bids.measure` gave, or one hemisphere of :func:`hipsta_bids.load`.
+    measure : str
+        Name of a map.
+    ax : Axes, optional
+        Where to draw; else the current axes of pyplot.
+    limits : tuple of float, optional
+        Values at both ends of the colors; else percentiles of this map. Give the same to maps
+        that are compared.
+    colorbar : bool
+        Whether to add one.
+
+    Returns
+    -------
+    Axes
+
+    Raises
+    ------
+    ValueError
+        If there is no such map, or the data are not those of one hemisphere.
+
+    Examples
+    --------
+    >>> import hipsta_bids as hb
+    >>> from matplotlib.figure import Figure
+    >>> from hipsta_bids.phantom import Phantom, PhantomSpec
+    >>> from hipsta_bids.protocols.load import load_protocol
+    >>> phantom = Phantom(PhantomSpec(kind="arc", thickness=2.0, length=10.0))
+    >>> left = hb.measure(phantom.label_volume(load_protocol("freesurfer")), side="L")
+    >>> ax = hb.plot_sheet(left, ax=Figure().subplots(), limits=(1.5, 2.5))
+    >>> ax.get_title(), ax.get_xlabel()
+    ('left', 'medial  ←  mm  →  lateral')
+    """
+    columns, side = _columns(data, measure)
+    sheet = _sheet(data, columns)
+    kind = _kind(measure)
+    if ax is None:
+        from matplotlib import pyplot as plt  # noqa: PLC0415  (loads a window system)
+
+        ax = plt.gca()
+    extents = [float(np.nanmean(columns.get(f"extent_{axis}", np.nan))) for axis in "xy"]
+    scale = limits or scale_of(kind, [columns[measure]])
+    image = draw_sheet(ax, sheet, kind, scale, extents=extents, hemi=side)
+    ax.set_ylabel("  ←  →  ".join(Y_ENDS))
+    if colorbar:
+        _bar(ax, image, kind)
+    return ax
+
+
+def plot_surface(
+    data: Any,  # noqa: ANN401  (as above)
+    measure: str = "thickness",
+    *,
+    level: str = "midthickness",
+    ax: "Axes3D | None" = None,
+    limits: tuple[float, float] | None = None,
+    view: tuple[float, float] | None = None,
+    colorbar: bool = True,
+) -> "Axes3D":
+    """Draw a map on a surface of the sheet in three dimensions, shaded, without a GPU.
+
+    Parameters
+    ----------
+    data, measure, limits, colorbar
+        As of :func:`plot_sheet`.
+    level : {"midthickness", "interior", "exterior"}
+        Surface; of datasets from :func:`hipsta_bids.load` the first only.
+    ax : Axes3D, optional
+        Axes with ``projection="3d"``; else new ones in the current figure of pyplot.
+    view : tuple of float, optional
+        Elevation and azimuth, degrees; else from behind, above and lateral.
+
+    Returns
+    -------
+    Axes3D
+        In scanner RAS mm; A and P mark the anterior and the posterior end.
+
+    Raises
+    ------
+    ValueError
+        As :func:`plot_sheet`; if the surface is not there, or the axes are flat.
+
+    Examples
+    --------
+    ::
+
+        left = hb.measure("lh.hippoSfLabels-T1.v22.mgz", side="L", protocol="freesurfer")
+        hb.plot_surface(left, "curvature", view=(60, -90))
+    """
+    from matplotlib import colormaps  # noqa: PLC0415  (slow to load)
+    from matplotlib.cm import ScalarMappable  # noqa: PLC0415
+    from matplotlib.colors import Normalize  # noqa: PLC0415
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # noqa: PLC0415
+
+    columns, side = _columns(data, measure)
+    kind = _kind(measure)
+    points = _points(data, level)
+    triangles = sheet_triangles(*points.shape[:2])
+    corners = points.reshape(-1, 3)[triangles]
+    values = columns[measure].ravel()[triangles].mean(axis=1)
+    known = np.isfinite(corners).all(axis=(1, 2))
+    if ax is None:
+        from matplotlib import pyplot as plt  # noqa: PLC0415  (as above)
+
+        ax = plt.gcf().add_subplot(projection="3d")
+    if not hasattr(ax, "zaxis"):
+        raise ValueError("a surface needs axes in three dimensions: projection='3d'")
+    elevation, azimuth = view or _VIEW.get(side, _VIEW["R"])
+    ax.view_init(elev=elevation, azim=azimuth)
+    scale = Normalize(*(limits or scale_of(kind, [columns[measure]])))
+    colors = colormaps[kind.colors](scale(np.nan_to_num(values)))
+    colors[~np.isfinite(values)] = (0.8, 0.8, 0.8, 1.0)
+    colors[:, :3] *= _light(corners, elevation, azimuth)[:, None]
+    faces = Poly3DCollection(
+        corners[known],
+        facecolors=colors[known],
+        edgecolors=colors[known],
+        linewidths=0.3,
+        clip_on=False,
+    )
+    ax.add_collection3d(faces)
+    low, high = (limit(points, axis=(0, 1)) for limit in (np.nanmin, np.nanmax))
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    ax.set_box_aspect(high - low, zoom=1.1)
+    ax.set_axis_off()
+    ends = {"P": np.nanmean(points[:, 0], axis=0), "A": np.nanmean(points[:, -1], axis=0)}
+    beyond = (ends["A"] - ends["P"]) * _BEYOND
+    for letter, place in (("P", ends["P"] - beyond), ("A", ends["A"] + beyond)):
+        ax.text(*place, letter, ha="center", va="center", weight="bold")
+    if colorbar:
+        _bar(ax, ScalarMappable(scale, kind.colors), kind)
+    return ax
+
+
+def plot_group(
+    fit: GroupFit,
+    contrast: str | None = None,
+    *,
+    side: str | None = None,
+    ax: "Axes | None" = None,
+    subfield: Sequence[Sequence[str]] | NDArray[np.str_] | None = None,
+    limits: tuple[float, float] | None = None,
+    colorbar: bool = True,
+) -> "Axes":
+    """Draw the effect size of a contrast on the sheet, with a line round what is significant.
+
+    Parameters
+    ----------
+    fit : GroupFit
+        What :func:`hipsta_bids.group` gave, of maps on the sheet.
+    contrast : str, optional
+        Its name; else the first.
+    side : str, optional
+        Its name; else the first.
+    ax : Axes, optional
+        Where to draw; else the current axes of pyplot.
+    subfield : array of str, optional
+        (x, y) names, to draw borders and names of subfields.
+    limits : tuple of float, optional
+        Effect sizes at both ends of the colors.
+    colorbar : bool
+        Whether to add one.
+
+    Returns
+    -------
+    Axes
+        Whose title names side, contrast, and how many points survive.
+
+    Raises
+    ------
+    ValueError
+        If there is no such side or contrast, or the maps are not on the sheet.
+
+    Examples
+    --------
+    >>> import numpy as np, pandas as pd
+    >>> import hipsta_bids as hb
+    >>> from matplotlib.figure import Figure
+    >>> random = np.random.default_rng(1)
+    >>> table = pd.DataFrame({"group": ["CN"] * 10 + ["AD"] * 10})
+    >>> maps = random.normal(2.0, 0.1, (20, 10, 4))
+    >>> maps[10:, :2] -= 0.5
+    >>> fit = hb.group({"L": maps}, table, "group", contrasts=["thinner = group[CN] - group[AD]"])
+    >>> ax = hb.plot_group(fit, "thinner", side="L", ax=Figure().subplots())
+    >>> print(ax.get_title())
+    left, thinner: 9 of 40 points survive
+    """
+    side = fit.sides[0] if side is None else side
+    contrast = fit.contrasts[0] if contrast is None else contrast
+    check_choice("side", side, dict.fromkeys(fit.sides))
+    check_choice("contrast", contrast, dict.fromkeys(fit.contrasts))
+    at = fit.sides.index(side), fit.contrasts.index(contrast)
+    effect, significant = fit.maps["effect"][at], fit.significant[at]
+    if effect.ndim == 1:
+        raise ValueError("maps on vertices are not on the sheet; draw fit.maps['effect'] instead")
+    if ax is None:
+        from matplotlib import pyplot as plt  # noqa: PLC0415  (as above)
+
+        ax = plt.gca()
+    known = np.isfinite(effect)
+    names = np.full(effect.shape, "") if subfield is None else np.asarray(subfield, dtype=np.str_)
+    kind = MapKind(
+        column="effect",
+        title=EFFECT_NAMES[fit.test(side, contrast).kind],
+        unit="",
+        colors=EFFECT_COLORS,
+        centered=True,
+        digits=2,
+        percentiles=(1, 99),
+    )
+    sheet = SheetTable(
+        columns={"effect": effect},
+        subfield=names,
+        valid=np.ones(effect.shape, dtype=bool),
+        repaired=np.zeros(effect.shape, dtype=bool),
+        points={},
+    )
+    statistic, df = (fit.maps[name][at] for name in ("statistic", "df"))
+    reach = effect_reach([Effects(fit.test(side, contrast).kind, effect, statistic, df)])
+    scale = limits or (-reach, reach)
+    image = draw_sheet(ax, sheet, kind, scale, extents=(np.nan, np.nan), hemi=side)
+    if significant.any() and not significant.all():
+        x, y = (np.linspace(0, n, n) for n in effect.shape)
+        ax.contour(x, y, significant.T.astype(float), levels=[0.5], colors="black", linewidths=1.8)
+    count = f"{int(significant.sum())} of {int(known.sum())} points survive"
+    ax.set_title(f"{ax.get_title()}, {contrast}: {count}")
+    ax.set_aspect("auto")
+    ax.set_ylabel("  ←  nodes  →  ".join(Y_ENDS))
+    if colorbar:
+        _bar(ax, image, kind)
+    return ax
+
+
+def _columns(data: Any, measure: str) -> tuple[dict[str, Float], str]:  # noqa: ANN401
+    """Arrays (x, y) by name, the measure and extents, and the side."""
+    if isinstance(data, Measurement):
+        check_choice("measure", measure, data.maps)
+        return dict(data.maps), data.side
+    check_choice("measure", measure, dict.fromkeys(map(str, data.data_vars)))
+    if sorted(data[measure].dims) != ["x", "y"]:
+        raise ValueError(
+            f"{measure} has the axes {', '.join(map(str, data[measure].dims))}; select one"
+            " participant, session and side"
+        )
+    wanted = [name for name in (measure, "extent_x", "extent_y") if name in data]
+    columns = {name: data[name].transpose("x", "y").to_numpy() for name in wanted}
+    side = data.coords["side"].item() if "side" in data.coords else data.attrs.get("side", "")
+    return columns, str(side)
+
+
+def _sheet(data: Any, columns: dict[str, Float]) -> SheetTable:  # noqa: ANN401
+    if isinstance(data, Measurement):
+        return data.table
+    shape = next(iter(columns.values())).shape
+    state = {name: data[name].transpose("x", "y").to_numpy() for name in _STATE if name in data}
+    return SheetTable(
+        columns=columns,
+        subfield=state.get("subfield", np.full(shape, "")).astype(np.str_),
+        valid=state.get("valid", np.ones(shape)).astype(np.bool_),
+        repaired=state.get("repaired", np.zeros(shape)).astype(np.bool_),
+        points={},
+    )
+
+
+def _points(data: Any, level: str) -> Float:  # noqa: ANN401
+    """(x, y, 3) RAS mm."""
+    if isinstance(data, Measurement):
+        shape = data.maps["thickness"].shape
+        return data.surface(level).points.reshape(*shape, 3)
+    if level != "midthickness" or "position" not in data:
+        raise ValueError(f"this dataset has no surface {level!r}; hipsta_bids.measure gives all")
+    position = data["position"]
+    if "layer" in position.dims:
+        position = position.sel(layer=_MIDDLE)
+    return np.asarray(position.transpose("x", "y", "ras"), dtype=np.float64)
+
+
+def _light(corners: Float, elevation: float, azimuth: float) -> Float:
+    """Brightness of faces (N, 3, 3) that a lamp beside the viewer lights on both sides."""
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normals, axis=1)
+    high, around = np.radians([elevation + 15, azimuth + 15])
+    lamp = [np.cos(high) * np.cos(around), np.cos(high) * np.sin(around), np.sin(high)]
+    facing = np.abs(normals @ np.array(lamp)) / np.where(length > 0, length, 1)
+    return np.asarray(1 - _SHADE + _SHADE * facing)
+
+
+def _kind(measure: str) -> MapKind:
+    """How a map is shown: as the pages do, or after its unit."""
+    own = {kind.column: kind for kind in MAP_KINDS}
+    if measure in own:
+        return own[measure]
+    known = measure in {row.name for row in MAPS}
+    return replace(
+        kind_of(measure),
+        column=measure,
+        title=display_name(measure).capitalize(),
+        unit=unit_of(attributes(measure)["units"]) if known else "",
+        digits=3,
+    )
+
+
+def _bar(ax: Any, image: Any, kind: MapKind) -> None:  # noqa: ANN401  (of matplotlib)
+    label = kind.title.lower() if kind.unit else kind.title
+    unit = f" [{kind.unit}]" if kind.unit else ""
+    ax.figure.colorbar(image, ax=ax, label=f"{label}{unit}", extend="both", shrink=0.8)
