@@ -14,7 +14,7 @@ from scipy.special import ndtr
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.digital import voxel_points
-from hipsta_bids.protocols.protocol import LATERAL_END, Tissue
+from hipsta_bids.protocols.protocol import CORE, LATERAL_END, Tissue
 from hipsta_bids.settings import BodySettings
 from hipsta_bids.types import Bool, End, Float, LabelVolume
 
@@ -43,7 +43,6 @@ class _Profile(NamedTuple):
     """(T,) root mean square distance of a tissue from its center, mm."""
 
 
-_CORE = (Tissue.DENTATE_GYRUS, Tissue.CA4)
 _NEEDED = ("sheet", "CA1", "CA2-3")
 _STEP = 0.25  # mm between the levels of a profile
 _BESIDE = 2.0  # mm beyond an end, where it is asked why it is there
@@ -109,7 +108,7 @@ def _profile(
         "sheet": sheet > 0,
         "CA1": sheet == Tissue.CA1,
         "CA2-3": np.isin(sheet, LATERAL_END),
-        "core": np.isin(volume.tissue, _CORE),
+        "core": np.isin(volume.tissue, CORE),
     }
     points = {name: voxel_points(mask, volume.affine) for name, mask in tissues.items()}
     middle = points["sheet"].mean(axis=0)

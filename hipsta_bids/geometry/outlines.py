@@ -1,6 +1,7 @@
 """The outline of the ribbon in single slices: joined where it is broken, cut where it closes."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,9 +46,8 @@ def outline_slice(
     distance = _signed_distance(smooth > 0.5, fine)  # noqa: PLR2004 -- the outline
     exact = sigma * fine * ndtri(np.clip(smooth, 1e-6, 1 - 1e-6))
     distance = np.where(np.abs(distance) < sigma * fine, exact, distance)
-    ribbons = [np.kron(image, block) > 0 for image in beside]
     ranks = ranks_of(tissue, settings.upsampling)
-    distance = _join(distance, ranks, ribbons, fine, settings)
+    distance = _join(distance, ranks, beside, fine, settings)
     return np.asarray(np.clip(distance, -settings.reach, settings.reach), dtype=np.float32)
 
 
@@ -72,7 +72,7 @@ def _signed_distance(mask: Bool, pixel: float) -> Float:
 def _join(
     distance: Float,
     ranks: Float,
-    beside: Sequence[Bool],
+    beside: Sequence[NDArray[np.uint8]],
     pixel: float,
     settings: SliceSettings,
 ) -> Float:
@@ -94,7 +94,7 @@ def _join(
         # not to the part that happens to lie across the sulcus.
         jump = np.abs(ranks - ranks[tuple(nearest)]) > settings.max_rank_jump
         cost = pixel * gap + np.where(jump, settings.reach, 0)
-        lacked = np.unique(pieces[np.isfinite(ranks) & ~np.isin(ranks, ranks[main])])
+        lacked = _with_others(pieces, main, ranks)
         found: list[tuple[float, int, Float | None]] = []
         for number in range(1, count + 1):
             if number == largest:
@@ -102,7 +102,8 @@ def _join(
             place = np.unravel_index(np.where(pieces == number, cost, np.inf).argmin(), cost.shape)
             start = np.array([axis[place] for axis in nearest])
             way = pixel * _segment_distance(distance.shape, start, np.array(place))
-            broken = number in lacked and not jump[place] and _shown(way < pixel, beside)
+            broken = number in lacked and not jump[place]
+            broken = broken and _shown(way < pixel, beside, settings.upsampling)
             limit = settings.max_break if broken else settings.max_gap
             if cost[place] <= limit:
                 found.append((float(cost[place]), number, way))
@@ -121,9 +122,15 @@ def _join(
     return np.where(small, 0.5 * pixel, distance)
 
 
-def _shown(way: Bool, beside: Sequence[Bool]) -> bool:
+def _with_others(pieces: NDArray[Any], main: Bool, ranks: Float) -> NDArray[Any]:
+    """Numbers of the pieces (I, J) with a subfield that the largest one lacks."""
+    return np.asarray(np.unique(pieces[np.isfinite(ranks) & ~np.isin(ranks, ranks[main])]))
+
+
+def _shown(way: Bool, beside: Sequence[NDArray[np.uint8]], upsampling: int) -> bool:
     """Whether any of the slices beside shows enough of the way as ribbon."""
-    return any(ribbon[way].mean() > _SHOWN for ribbon in beside)
+    shares = (np.kron(image > 0, np.ones((upsampling,) * 2))[way].mean() for image in beside)
+    return any(share > _SHOWN for share in shares)
 
 
 def _segment_distance(shape: tuple[int, ...], start: Int, end: Int) -> Float:
@@ -198,12 +205,9 @@ def drop_doubles(outline: Stack, rank: Float, settings: SliceSettings) -> None:
     pieces, count = ndimage.label(outline > 0)
     if count < 2:  # noqa: PLR2004 -- one piece is the ribbon
         return
-    main = int(piece_sizes(pieces).argmax())
-    known = np.unique(rank[(pieces == main) & np.isfinite(rank)])
-    for number in range(1, count + 1):
-        piece = pieces == number
-        if number != main and np.isin(rank[piece & np.isfinite(rank)], known).all():
-            outline[piece] = -settings.reach
+    main = pieces == piece_sizes(pieces).argmax()
+    kept = np.isin(pieces, _with_others(pieces, main, rank)) | main
+    outline[(pieces > 0) & ~kept] = -settings.reach
 
 
 def ranks_of(tissue: NDArray[np.uint8], upsampling: int) -> Float:

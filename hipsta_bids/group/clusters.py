@@ -162,7 +162,6 @@ def peak_table(test: PointTest, found: "Discoveries", frame: Frame, edges: Int) 
         clusters = [Cluster(0, int(np.nanargmax(np.abs(test.statistic))), {})]
     where = {**(frame.number if "vertex" in frame.number else {}), **frame.position}
     is_t = test.kind == "t"
-    size = test.cohen_d if is_t else test.eta_squared
     limits = test.cohen_d_limits if is_t else test.eta_squared_limits
     return pd.DataFrame(
         [
@@ -176,7 +175,7 @@ def peak_table(test: PointTest, found: "Discoveries", frame: Frame, edges: Int) 
                 "p": test.p[point],
                 "p_corrected": found.adjusted.ravel()[point],
                 "effect": "cohen_d" if is_t else "partial_eta_squared",
-                "effect_size": size[point],
+                "effect_size": test.effect[point],
                 "effect_low": limits[0, point],
                 "effect_high": limits[1, point],
                 "extent": cluster.extent,

@@ -13,7 +13,7 @@ import numpy as np
 from hipsta_bids.group.analysis import Analysis, mean_of_known, members_of, rows_of, spread_of_known
 from hipsta_bids.group.classify import ClassifierResult, PairComparison, roc_curve
 from hipsta_bids.group.data import Cohort, Float, Int
-from hipsta_bids.group.glm import FittedMaps, PointTest
+from hipsta_bids.group.glm import FittedMaps
 from hipsta_bids.group.inference import MapKey
 from hipsta_bids.group.shapes import AverageShape
 from hipsta_bids.reports import display
@@ -357,7 +357,7 @@ def draw_contrasts(cohort: Cohort, analysis: Analysis, measure: str) -> "Figure"
     for j, (hemi, one) in enumerate(sides.items()):
         for i, test in enumerate(one.fits[measure].tests):
             left, right = axes[i, 2 * j], axes[i, 2 * j + 1]
-            effect = _effect(test).reshape(one.maps.shape)
+            effect = test.effect.reshape(one.maps.shape)
             p = signed[hemi, i].reshape(one.maps.shape)
             reach = reaches[test.contrast.name]
             scale = scale_of(display.EFFECT_COLORS, -reach, reach)
@@ -381,13 +381,9 @@ def _reaches(analysis: Analysis) -> dict[str, float]:
     maps: dict[str, list[display.Effects]] = {}
     for one in analysis.fitted.values():
         for test in (test for fit in one.fits.values() for test in fit.tests):
-            effects = display.Effects(test.kind, _effect(test), test.statistic, test.df)
+            effects = display.Effects(test.kind, test.effect, test.statistic, test.df)
             maps.setdefault(test.contrast.name, []).append(effects)
     return {name: display.effect_reach(own) for name, own in maps.items()}
-
-
-def _effect(test: PointTest) -> Float:
-    return test.cohen_d if test.kind == "t" else test.eta_squared
 
 
 def _bar(figure: "Figure", image: Any, axes: Any, label: str, extend: str = "neither") -> Any:  # noqa: ANN401  (of matplotlib)

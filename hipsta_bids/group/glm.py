@@ -107,6 +107,11 @@ class PointTest:
         """``t`` or ``F``."""
         return "t" if self.contrast.n_rows == 1 else "F"
 
+    @property
+    def effect(self) -> Float:
+        """(points,) Cohen's d, or of F partial eta squared."""
+        return self.cohen_d if self.kind == "t" else self.eta_squared
+
 
 @dataclass(frozen=True)
 class PointwiseFit:

@@ -96,8 +96,6 @@ class GroupFit:
     def _values(self, name: str, side: str, test: PointTest) -> Float:
         if name == "p_corrected":
             return self.found[self._key(side, test.contrast.name)].adjusted
-        if name == "effect":
-            return test.cohen_d if test.kind == "t" else test.eta_squared
         if name in {"estimate", "se"}:
             rows = getattr(test, name)
             return rows[0] if test.kind == "t" else np.full(rows.shape[1], np.nan)

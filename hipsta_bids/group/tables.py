@@ -309,7 +309,7 @@ def _measures(cohort: Cohort, analysis: Analysis) -> Iterator[Columns]:
                 "df": test.df,
                 "p": test.p,
                 "effect": "cohen_d" if single else "partial_eta_squared",
-                "effect_size": test.cohen_d if single else test.eta_squared,
+                "effect_size": test.effect,
                 "effect_low": limits[0],
                 "effect_high": limits[1],
             }

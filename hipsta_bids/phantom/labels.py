@@ -10,7 +10,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from hipsta_bids.errors import ProtocolError, SettingsError
 from hipsta_bids.phantom.shape import Body, PhantomSpec, check_rotation
-from hipsta_bids.protocols.protocol import LATERAL_END, Label, Part, Protocol, Tissue
+from hipsta_bids.protocols.protocol import CORE, LATERAL_END, Label, Part, Protocol, Tissue
 from hipsta_bids.types import Bool, Float, Int, LabelVolume
 
 
@@ -227,7 +227,7 @@ def _label_table(protocol: Protocol) -> NDArray[np.intp]:
         # A phantom's layer is part of its wall, as it is of the sheet in these protocols only.
         layered = Tissue.MOLECULAR_LAYER in protocol.layer
         layer = label_for(protocol, Tissue.MOLECULAR_LAYER, part) if layered else None
-        inner = [label_for(protocol, tissue, part) for tissue in (Tissue.DENTATE_GYRUS, Tissue.CA4)]
+        inner = [label_for(protocol, tissue, part) for tissue in CORE]
         if part is Part.BODY and None in sheet:
             raise ProtocolError(
                 f"phantom: protocol {protocol.name} has no label for some subfield of the sheet; "

@@ -13,6 +13,7 @@ from pydantic import ValidationError
 
 from hipsta_bids.errors import ProtocolError
 from hipsta_bids.protocols.protocol import (
+    CORE,
     FAR_TO_NEAR,
     MEDIAL_TO_LATERAL,
     Label,
@@ -234,7 +235,7 @@ def protocol_from_names(rows: Iterable[NamedCode], *, name: str, origin: str) ->
             "describe the labels in a TOML file and pass it with --scheme",
             reason="unclear-names",
         )
-    inside = (Tissue.DENTATE_GYRUS, Tissue.CA4, Tissue.MOLECULAR_LAYER)
+    inside = (*CORE, Tissue.MOLECULAR_LAYER)
     protocol = Protocol(
         name=name,
         title=f"Labels named in {origin}",

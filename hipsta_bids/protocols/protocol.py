@@ -50,6 +50,8 @@ class Part(IntEnum):
 #: Subfields of the medial and of the lateral end of the sheet; CA1 lies between them.
 MEDIAL_END: tuple[Tissue, ...] = (Tissue.PRESUBICULUM, Tissue.SUBICULUM)
 LATERAL_END: tuple[Tissue, ...] = (Tissue.CA2, Tissue.CA2_3, Tissue.CA3)
+#: What the sheet curls round.
+CORE: tuple[Tissue, ...] = (Tissue.DENTATE_GYRUS, Tissue.CA4)
 
 #: Order of the sheet's subfields from medial to lateral (Diers et al. 2023, section 2.1).
 MEDIAL_TO_LATERAL: tuple[Tissue, ...] = (*MEDIAL_END, Tissue.CA1, *LATERAL_END)

@@ -188,6 +188,11 @@ def fine_segmentations(labels: Path, largest: float) -> list[HemisphereInput]:
     ]
 
 
+def left_out(labels: Path | None) -> str:
+    """Say below a suite's text that it has no real labels, if it was given none."""
+    return "" if labels else " Real labels were left out: they need `--labels`."
+
+
 def load_body(body: ValidationBody, voxel: float) -> tuple[LabelVolume, str]:
     """Labels of a body and its hemisphere; a phantom is drawn in voxels of ``voxel`` mm."""
     if isinstance(body, PhantomSpec):

@@ -19,6 +19,7 @@ from hipsta_bids.types import End, Float, LabelVolume
 from hipsta_bids.validation.cases import (
     Refusal,
     ValidationBody,
+    left_out,
     load_body,
     measure_body,
     refusal_notes,
@@ -136,11 +137,10 @@ def run(full: bool, labels: Path | None = None) -> Suite:
         for degrees in (DEGREES if full else DEGREES[-1:])
         for about in (ABOUT if full else ABOUT[:1])
     ]
-    left_out = "" if labels else " Real labels were left out: they need `--labels`."
     return Suite(
         name="ends",
         title="Ends of the body",
-        text=_TEXT.strip() + left_out,
+        text=_TEXT.strip() + left_out(labels),
         tables=(
             _copies_table(found),
             _places_table(found),

@@ -18,6 +18,7 @@ from hipsta_bids.validation.cases import (
     Refusal,
     any_pose,
     fine_segmentations,
+    left_out,
     measure_body,
     measure_case,
     random_motion,
@@ -68,8 +69,7 @@ def run(full: bool, labels: Path | None = None) -> Suite:
     return Suite(
         name="invariance",
         title="Invariance",
-        text=_TEXT.strip()
-        + ("" if labels else " Real labels were left out: they need `--labels`."),
+        text=_TEXT.strip() + left_out(labels),
         tables=(
             _motion_table(motions),
             _pair_table([results[f"pair {number}"] for number in range(pairs)]),

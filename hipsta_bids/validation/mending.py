@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 
 from hipsta_bids.phantom import Phantom, PhantomSpec
-from hipsta_bids.protocols.protocol import Tissue
+from hipsta_bids.protocols.protocol import CORE, Tissue
 from hipsta_bids.types import GivenEnd, HemisphereMaps, LabelVolume, Status
 from hipsta_bids.validation.cases import (
     Refusal,
     ValidationBody,
     fine_segmentations,
+    left_out,
     measure_body,
     measure_reference,
     refusal_notes,
@@ -57,9 +58,6 @@ MAX_MEAN = 0.02
 """mm, change of the mean thickness by what was mended."""
 FAR = 2.0
 """mm behind the anterior end, from which on an uncus is warned of."""
-
-
-_CORE = (Tissue.DENTATE_GYRUS, Tissue.CA4)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,11 +123,10 @@ def run(full: bool, labels: Path | None = None) -> Suite:
         for planted in UNCUS[some]
     ]
     results = run_groups(measure_trial, {"hollow": hollow, "ragged": ragged, "beside": beside})
-    left_out = "" if labels else " Real labels were left out: they need `--labels`."
     return Suite(
         name="mending",
         title="Mended labels",
-        text=_TEXT.strip() + left_out,
+        text=_TEXT.strip() + left_out(labels),
         tables=(
             _cavities(hollow, results["hollow"]),
             _ragged(ragged, results["ragged"]),
@@ -154,7 +151,7 @@ def measure_trial(trial: Trial) -> Outcome:
     return Outcome(
         damage=compare(maps, _truth(trial, reference), defect.changed),
         planted=voxel * len(defect.changed),
-        interior=voxel * np.count_nonzero(np.isin(volume.tissue, _CORE) & (labels.tissue == 0)),
+        interior=voxel * np.count_nonzero(np.isin(volume.tissue, CORE) & (labels.tissue == 0)),
         same_plane=_same_plane(volume, hemi, maps) if kind == "ragged-end" else 0.0,
         moved=_moved(reference.qc["posterior_plane"], maps.qc["posterior_plane"]),
         found=found.get(kind, maps.qc["cavities_mm3"]),
