@@ -218,14 +218,14 @@ class TopologySettings(SettingsTable):
     """A cut severs the ribbon if the body goes on this many grid nodes before and behind it."""
     sever_share: NonNegativeFloat = 0.1
     """Share of the cut's nodes at which the body has to go on."""
-    sever_along: Numbers = (0.25, 0.5)
-    """Squared cosines between the axis and the line that joins the stumps of a cut: it severs
-    nothing up to the first one, and does in any case beyond the second."""
+    sever_along: NonNegativeFloat = 0.5
+    """A cut severs in any case if the line between its stumps is more along the axis than this,"""
+    bridge_along: NonNegativeFloat = 0.25
+    """and in no case if it is less than this (squared cosines with the axis)."""
     sever_factor: NonNegativeFloat = 1000.0
     """Such cuts cost this much more: where one is the only way, the hemisphere is flagged."""
     contact_reach: NonNegativeFloat = 1.2
-    """A cut with both the subiculum and CA2 or CA3 within this distance of its middle severs no
-    ribbon but turns that touch, mm."""
+    """A cut this near, mm, to both the subiculum and CA2 or CA3 severs but turns that touch."""
     fill_across: NonNegativeFloat = 0.5
     """A fill spans the inside of a bend rather than a hole if this share lies across the axis."""
     lid_nodes: NonNegativeFloat = 6.0

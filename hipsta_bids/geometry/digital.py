@@ -434,9 +434,11 @@ def _implausibility(kind: Kind, where: Index, solid: Bool, settings: TopologySet
     oriented = len(where) >= settings.oriented_nodes
     across = areas[2] ** 2 / float(areas @ areas)
     if kind == "cut":
-        along, (least, enough) = _stumps_along(where, solid), settings.sever_along
-        lies_across = oriented and across > settings.cut_across and along > least
-        severs = along > enough or (lies_across and _continues(where, solid, settings))
+        along = _stumps_along(where, solid)
+        lies_across = oriented and across > settings.cut_across and along > settings.bridge_along
+        severs = along > settings.sever_along or (
+            lies_across and _continues(where, solid, settings)
+        )
         return settings.sever_factor if severs else 1.0
     level = float(where[:, 2].mean()) - FIRST[2]
     last = solid.shape[2] - 2 * FIRST[2] - 1

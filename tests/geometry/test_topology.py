@@ -150,7 +150,7 @@ def test_a_strip_beside_a_hole_is_not_severed():
 
 
 def test_a_cut_that_severs_the_ribbon_is_large_where_nothing_else_helps():
-    only_cuts = {"sever_along": (-1.0, -1.0), "sever_factor": 1.001}
+    only_cuts = {"sever_along": -1.0, "sever_factor": 1.001}
     mask, *_ = with_bridge()
     assert only_repair(repaired(mask, flag_cut_cost=1e9, **only_cuts), "cut").large
     assert not only_repair(repaired(mask, flag_cut_cost=1e9), "cut").large
