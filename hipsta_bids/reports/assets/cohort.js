@@ -31,17 +31,16 @@
       return head;
     });
     table.append(make("thead", {}, make("tr", {}, ...heads)), make("tbody"));
-    const choice = make("select", {}, ...["", ...ratings].map((value) => make("option", { value, textContent: value || "–" })));
     for (const row of rows) {
-      row.choice = choice.cloneNode(true);
-      row.choice.ariaLabel = `rating of ${whose(row)}`;
+      // A list for each of hundreds of rows would make sorting slow: there is one, of the row in hand.
+      row.rate = make("button", { type: "button", className: "rate", ariaLabel: `rating of ${whose(row)}` });
+      row.rate.addEventListener("click", () => offer(row));
       row.remark = make("span", { className: "remark" });
-      row.choice.addEventListener("change", () => { rate(row, row.choice.value); show(); });
       const cells = columns.map((column) => {
         const cell = make("td", { className: column.digits === undefined ? "" : "n" });
         if (column.key === "participant") cell.append(make("a", { href: `${row.page}#${row.key}`, textContent: row.participant }));
         else if (column.key === "verdict") cell.append(make("span", { className: `badge ${row.kind}`, textContent: row.verdict, title: row.because }));
-        else if (column.key === "rating") cell.append(row.choice, row.remark);
+        else if (column.key === "rating") cell.append(row.rate, row.remark);
         else if (column.key === "status") cell.append(make("span", { className: `badge ${row.status}`, textContent: row.status }));
         else if (column.key === "reason") cell.append(make("span", { className: "reason", textContent: row.reason, title: row.message }));
         else cell.textContent = words(row, column);
@@ -123,9 +122,18 @@
   function readRating(row) {
     const { rating = "", note = "", input_hash = "" } = kept.read(row.key) ?? {};
     Object.assign(row, { rating, note, rated: input_hash, earlier: Boolean(rating) && input_hash !== row.hash });
-    row.choice.value = row.earlier ? "" : rating;
+    row.rate.textContent = (!row.earlier && rating) || "–";
     row.remark.textContent = [row.earlier ? `(${rating}, of earlier labels)` : "", note].filter(Boolean).join(" ");
     row.remark.title = row.remark.textContent;
+  }
+
+  function offer(row) {
+    const choice = make("select", { ariaLabel: row.rate.ariaLabel }, ...["", ...ratings].map((value) => make("option", { value, textContent: value || "–" })));
+    choice.value = row.earlier ? "" : row.rating;
+    choice.addEventListener("change", () => { rate(row, choice.value); show(); });
+    choice.addEventListener("blur", () => choice.replaceWith(row.rate));
+    row.rate.replaceWith(choice);
+    choice.focus();
   }
 
   function rate(row, rating, note = row.note, input_hash = row.hash) {
@@ -169,7 +177,8 @@
   }
 
   for (const seg of [...new Set(rows.map((row) => row.seg))]) $("seg").append(make("option", { value: seg, textContent: seg }));
-  document.querySelector(".filters").addEventListener("input", show);
+  document.querySelector(".filters").addEventListener("change", show);
+  $("search").addEventListener("input", show);
   document.querySelector(".filters").addEventListener("submit", (event) => event.preventDefault());
   $("rate-shown").addEventListener("change", ({ target }) => {
     if (target.value) for (const row of shown) if (!row.rating || row.earlier) rate(row, target.value);
