@@ -13,6 +13,7 @@ finding, and among equals the first flag goes first. Below 1, as with 0.1 mm and
 map, a hemisphere is for use, from 1 on a person should look at it, and 100 is for no use.
 """
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -159,9 +160,17 @@ def consequences(hemisphere: Hemisphere, reach: float) -> list[tuple[str, Conseq
     ]
     repairs = [str(repair) for repair in hemisphere.record.get("repairs") or []]
     if repairs:
-        what = repairs[0].split(";")[0] if len(repairs) == 1 else f"{len(repairs)} repairs"
-        rows.append((_sentence(what), _of_columns(hemisphere, None, reach)))
+        largest = max(repairs, key=_nodes).split(";")[0]
+        several = f"{len(repairs)} repairs of the labels, the largest: {largest}"
+        what = _sentence(largest if len(repairs) == 1 else several)
+        rows.append((what, _of_columns(hemisphere, None, reach)))
     return rows or [(_sentence(hemisphere.message or "no message"), Consequence())]
+
+
+def _nodes(repair: str) -> int:
+    """Size of a repair, nodes of the grid, as its message says."""
+    size = re.search(r"(\d+) grid nodes", repair)
+    return int(size[1]) if size else 0
 
 
 def _sentence(text: str) -> str:

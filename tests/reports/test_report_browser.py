@@ -208,7 +208,7 @@ def ratings(browser):
     return browser.execute_script(
         "return [...document.querySelectorAll('#table tbody tr')].map(row => [...row.cells])"
         ".map(([who, side, , , rating]) => [who.textContent, side.textContent,"
-        " rating.querySelector('.rate').textContent.replace('–', ''),"
+        " rating.querySelector('.rate').textContent.replace('none', ''),"
         " rating.querySelector('.remark').textContent])"
     )
 

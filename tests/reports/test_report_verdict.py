@@ -184,3 +184,15 @@ def test_commands_open_the_files_from_the_output_folder(out):
     assert " ".join(words[words.index("-ras") + 1 :]) in record["repairs"][0]
     labels, mask = files[:2]
     assert snap == (f"mri_convert {labels} labels.nii.gz && itksnap -g labels.nii.gz -s {mask}")
+
+
+def test_of_several_repairs_the_largest_is_named(out):
+    repairs = [
+        "filled a cavity of 4 grid nodes at RAS 1 2 3 mm (CA1); it concerns 1.0% of the columns",
+        "cut a bridge of 25 grid nodes at RAS 4 5 6 mm (CA1); it concerns 0.1% of the columns",
+        "left out the uncus, 11 mm3 at RAS 7 8 9 mm",
+    ]
+    found = changed(hemisphere(out, "01", "R"), repairs=repairs)
+    assert verdict_of(found).reason == (
+        "3 repairs of the labels, the largest: cut a bridge of 25 grid nodes at RAS 4 5 6 mm (CA1)."
+    )

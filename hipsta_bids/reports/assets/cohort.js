@@ -19,7 +19,8 @@
     if (value === null || value === undefined) return "";
     return column.percent ? `${(100 * value).toFixed(column.digits)}%` : value.toFixed(column.digits);
   };
-  const whose = (row) => [row.participant, row.session, row.hemi === "L" ? "left" : "right", row.seg, row.region === "body" ? "" : row.region].filter(Boolean).join(" ");
+  const several = columns.some((column) => column.key === "seg");
+  const whose = (row) => [row.participant, row.session, row.hemi === "L" ? "left" : "right", several ? row.seg : "", row.region === "body" ? "" : row.region].filter(Boolean).join(" ");
 
   function fillTable() {
     const heads = columns.map((column) => {
@@ -122,13 +123,13 @@
   function readRating(row) {
     const { rating = "", note = "", input_hash = "" } = kept.read(row.key) ?? {};
     Object.assign(row, { rating, note, rated: input_hash, earlier: Boolean(rating) && input_hash !== row.hash });
-    row.rate.textContent = (!row.earlier && rating) || "–";
+    row.rate.textContent = (!row.earlier && rating) || "none";
     row.remark.textContent = [row.earlier ? `(${rating}, of earlier labels)` : "", note].filter(Boolean).join(" ");
     row.remark.title = row.remark.textContent;
   }
 
   function offer(row) {
-    const choice = make("select", { ariaLabel: row.rate.ariaLabel }, ...["", ...ratings].map((value) => make("option", { value, textContent: value || "–" })));
+    const choice = make("select", { ariaLabel: row.rate.ariaLabel }, ...["", ...ratings].map((value) => make("option", { value, textContent: value || "none" })));
     choice.value = row.earlier ? "" : row.rating;
     choice.addEventListener("change", () => { rate(row, choice.value); show(); });
     choice.addEventListener("blur", () => choice.replaceWith(row.rate));
