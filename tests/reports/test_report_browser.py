@@ -260,6 +260,16 @@ def test_links_follow_the_table_as_it_was_left_or_severity_without_it(review, vi
         link = one(browser, f"{own} .{name}")
         assert link.get_attribute("href").endswith(f"{order[n]['page']}#{order[n]['key']}")
         assert order[n]["words"] in link.text
+    # Without an order, or with one that leads elsewhere, links go by severity.
+    browser.execute_script(
+        "const [key] = Object.keys(localStorage).filter((key) => key.endsWith(' order'));"
+        "const order = JSON.parse(localStorage[key]);"
+        "order.forEach((row) => { row.page = 'javascript:alert(1)//'; });"
+        "localStorage[key] = JSON.stringify(order)"
+    )
+    visit("sub-02.html")
+    next_one = one(browser, "[data-key=sub-02_hemi-L_seg-freesurfer] .next")
+    assert next_one.get_attribute("href").endswith("sub-01.html#sub-01_hemi-R_seg-freesurfer")
     browser.execute_script("localStorage.clear()")
     visit("sub-02.html")
     link = one(browser, "[data-key=sub-02_hemi-L_seg-freesurfer] .next")

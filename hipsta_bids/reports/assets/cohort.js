@@ -126,6 +126,7 @@
     row.rate.textContent = (!row.earlier && rating) || "none";
     row.remark.textContent = [row.earlier ? `(${rating}, of earlier labels)` : "", note].filter(Boolean).join(" ");
     row.remark.title = row.remark.textContent;
+    row.remark.hidden = !row.remark.textContent;
   }
 
   function offer(row) {

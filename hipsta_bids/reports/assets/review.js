@@ -29,8 +29,9 @@
 
   function lead() {
     // The table's order, as it was left; without it, links are those by severity.
+    const kind = /^sub-[\w-]+\.html$/;  // any page on this disk may write what this one reads
     const order = kept.read("order");
-    if (!Array.isArray(order)) return;
+    if (!Array.isArray(order) || !order.every((row) => kind.test(row?.page))) return;
     for (const card of cards) {
       const here = order.findIndex((row) => row.key === card.dataset.key);
       if (here < 0) continue;
@@ -38,7 +39,7 @@
         const link = card.querySelector(`.${name}`), row = order[here + step];
         link.hidden = !row;
         if (!row) continue;
-        link.href = `${row.page}#${row.key}`;
+        link.href = `${row.page}#${encodeURIComponent(row.key)}`;
         link.querySelector("span").textContent = row.words;
       }
     }
