@@ -34,7 +34,7 @@
     table.append(make("thead", {}, make("tr", {}, ...heads)), make("tbody"));
     for (const row of rows) {
       // A list for each of hundreds of rows would make sorting slow: there is one, of the row in hand.
-      row.rate = make("button", { type: "button", className: "rate", ariaLabel: `rating of ${whose(row)}` });
+      row.rate = make("button", { type: "button", className: "rate" });
       row.rate.addEventListener("click", () => offer(row));
       row.remark = make("span", { className: "remark" });
       const cells = columns.map((column) => {
@@ -124,6 +124,7 @@
     const { rating = "", note = "", input_hash = "" } = kept.read(row.key) ?? {};
     Object.assign(row, { rating, note, rated: input_hash, earlier: Boolean(rating) && input_hash !== row.hash });
     row.rate.textContent = (!row.earlier && rating) || "none";
+    row.rate.ariaLabel = `rating of ${whose(row)}: ${row.rate.textContent}`;
     row.remark.textContent = [row.earlier ? `(${rating}, of earlier labels)` : "", note].filter(Boolean).join(" ");
     row.remark.title = row.remark.textContent;
     row.remark.hidden = !row.remark.textContent;
