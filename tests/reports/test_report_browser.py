@@ -1,5 +1,8 @@
 """How pages behave in a real browser; see :mod:`browsing`."""
 
+import json
+import re
+
 import numpy as np
 import pytest
 from browsing import colored, fits, one, open_browser, open_page, pixels, texts, until, watched
@@ -342,3 +345,23 @@ def test_the_command_that_opens_the_files_is_copied(visit):
     remark.send_keys(Keys.CONTROL, "v")
     assert remark.get_attribute("value").startswith("freeview -v ")
     remark.clear()
+
+
+def test_all_of_hundreds_of_rows_are_shown_and_sorted(visit, out, tmp_path):
+    text = (out / "report.html").read_text()
+    found = re.search(r'id="data">(.*?)</script>', text, re.DOTALL)
+    data = json.loads(found[1])
+    data["rows"] = [
+        {**data["rows"][n % 4], "key": f"k{n}", "participant": f"sub-{n:03d}", "volume": n}
+        for n in range(200)
+    ]
+    page = tmp_path / "report.html"
+    page.write_text(text.replace(found[1], json.dumps(data)))
+    browser = visit(page)
+    until(lambda: len(rows(browser)) == 200)
+    one(browser, "[data-key=volume] button").click()
+    assert rows(browser)[0] == "sub-199"
+    one(browser, "[data-key=volume] button").click()
+    until(lambda: rows(browser) == [f"sub-{n:03d}" for n in range(200)])
+    one(browser, "#search").send_keys("sub-19")
+    until(lambda: len(texts(browser, "#tiles li")) == 10)

@@ -11,7 +11,8 @@
   const table = $("table"), tiles = $("tiles");
   let order = { key: "severity", down: true };
   const collator = new Intl.Collator("en", { numeric: true });
-  let shown = rows;
+  const FIRST = 60;
+  let shown = rows, rest = 0;
 
   const words = (row, column) => {
     const value = row[column.key];
@@ -108,10 +109,17 @@
       && (!$("apart").checked || row.distance > apart)
       && (!text || [row.participant, row.session, row.reason, row.message, row.farthest, row.note].join(" ").toLowerCase().includes(text)));
     shown = [...shown].sort(compare);
-    table.tBodies[0].replaceChildren(...shown.map((row) => row.line));
-    if (tiles) tiles.replaceChildren(...shown.map((row) => row.item));
+    fill();
     kept.write("order", shown.map((row) => ({ key: row.key, page: row.page, words: `${whose(row)}: ${row.verdict.toLowerCase()}` })));
     tell();
+  }
+
+  function fill() {
+    // What fits a window first: to lay out hundreds of rows takes longer than to sort them.
+    const parts = [[table.tBodies[0], shown.map((row) => row.line)], ...(tiles ? [[tiles, shown.map((row) => row.item)]] : [])];
+    for (const [parent, items] of parts) parent.replaceChildren(...items.slice(0, FIRST));
+    clearTimeout(rest);
+    if (shown.length > FIRST) rest = setTimeout(() => { for (const [parent, items] of parts) parent.append(...items.slice(FIRST)); }, 50);
   }
 
   function tell() {
