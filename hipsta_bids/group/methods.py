@@ -73,6 +73,7 @@ def methods_text(
     *,
     others: Sequence[str] = (),
     region: str = "body",
+    ratings: Mapping[str, int] | None = None,
 ) -> str:
     """Word what was done and what came out."""
     cited: list[str] = []
@@ -84,6 +85,7 @@ def methods_text(
 
     paragraphs = [_sample(cohort, analysis, n_out, cite("method"), others)]
     paragraphs[0] = paragraphs[0].replace("the hippocampus", _MEASURED[region], 1)
+    paragraphs[0] += _rated(ratings)
     if analysis.sides or others:
         paragraphs.append(_alignment(analysis, settings, cite, others))
     paragraphs.append(_models(analysis, settings, cite))
@@ -127,6 +129,16 @@ def _sample(
     if sheets := ", ".join(f"{len(one.used)} {hemi}" for hemi, one in analysis.fitted.items()):
         text += f", with hemispheres {sheets}"
     return f"{text}. {n_out} hemispheres or visits were left out; the table of exclusions says why."
+
+
+def _rated(ratings: Mapping[str, int] | None) -> str:
+    if ratings is None:
+        return ""
+    counts = ", ".join(f"{n} {rating}" for rating, n in ratings.items())
+    return (
+        f" Hemispheres were rated on their report pages ({counts}); those rated exclude were left"
+        " out."
+    )
 
 
 def _words(names: Sequence[str]) -> str:

@@ -372,6 +372,7 @@ def participants(results: GroupResults) -> Mapping[str, Any]:
             {"title": name, "cells": [_described(part[name], people[name]) for part in members]}
             for name in _variables(results, people, column)
         ],
+        "ratings": list((results.record.get("ratings") or {}).items()),
         "reasons": [(str(reason).replace("-", " "), n) for reason, n in reasons],
         "excluded": records(excluded.fillna("").head(_MOST_ROWS)),
         "more": max(0, len(excluded) - _MOST_ROWS),
