@@ -170,10 +170,23 @@ def _registration(analysis: Analysis, settings: GroupSettings, cite: Callable[[s
         for hemi, side in analysis.sides.items()
     )
     extreme = sum(int(side.registration.extreme.sum()) for side in analysis.sides.values())
+    own = ", each less its mean and over its standard deviation," if how.standardize else ""
+    groups = "; ".join(
+        f"{hemi}: {side.difference.largest:.2f} nodes, p = {side.difference.p:.2g}"
+        for hemi, side in analysis.sides.items()
+        if side.difference is not None
+    )
+    moved = (
+        " The largest difference of mean displacement between groups, with its p-value corrected"
+        f" for all positions by {how.group_permutations} permutations of participants, was"
+        f" {groups}."
+        if groups
+        else ""
+    )
     return (
-        "Curvature profiles from medial to lateral (means from posterior to anterior) were"
+        f"Curvature profiles from medial to lateral (means from posterior to anterior){own} were"
         f" registered by {method}, and the warps were applied to all maps. The share of the"
-        f" variance of the profiles that their mean explains went from {shares}."
+        f" variance of the profiles that their mean explains went from {shares}.{moved}"
         f" Warps out of line with the others: {extreme}."
     )
 
