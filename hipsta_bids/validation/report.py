@@ -11,7 +11,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from hipsta_bids import __version__
-from hipsta_bids.errors import UsageError
+from hipsta_bids.errors import UsageError, did_you_mean
 from hipsta_bids.io import files
 from hipsta_bids.reports.maps import new_figure
 from hipsta_bids.types import Float
@@ -151,7 +151,8 @@ def validate(
     unknown = [name for name in names if name not in SUITES]
     if unknown:
         raise UsageError(
-            f"validate: suite {unknown[0]!r} is unknown; choose from {', '.join(SUITES)}",
+            f"validate: suite {unknown[0]!r} is unknown; choose from {', '.join(SUITES)}"
+            f"{did_you_mean(unknown, SUITES)}",
             reason="unknown-suite",
         )
     files.check_writable(out)
