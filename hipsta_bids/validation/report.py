@@ -263,8 +263,8 @@ def opening(suites: Sequence[Suite]) -> str:
     holds = [f"{_asked(suite)} ({suite.targets})" for suite in judged if not suite.missed]
     short = [_shortfall(suite) for suite in judged if suite.missed]
     total = (
-        f"**{targets - missed} of {targets} targets are met.** Each line is what was asked, with its"
-        " number of targets, and leads to the tables."
+        f"**{targets - missed} of {targets} targets are met.** Each line is what was asked, with"
+        " its number of targets, and leads to the tables."
     )
     parts = [
         total,
