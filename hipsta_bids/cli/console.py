@@ -37,6 +37,10 @@ _WORD = re.compile(
     r"^(hipsta-bids:|warning:|note:)|(?<![^\s(])(ok|repaired|flagged|failed)(?=[,\s)]|$)"
 )
 
+#: Bars of stages with parts, and of those without.
+_PARTS = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]"
+_WHOLE = "{desc} [{elapsed}]"
+
 #: Narrowest that a column of a table is made, and the space between two.
 _NARROWEST, _GAP = 16, 2
 
@@ -138,7 +142,7 @@ def _bar(stage: str, total: int) -> Any:  # noqa: ANN401  (tqdm's)
     from tqdm import tqdm  # noqa: PLC0415  (not needed elsewhere)
 
     tqdm.monitor_interval = 0  # its thread would keep workers from being forked
-    style = None if total else "{desc}: {n_fmt} done [{elapsed}]"
+    style = _PARTS if total else _WHOLE
     return tqdm(total=total or None, desc=stage, file=sys.stderr, leave=False, bar_format=style)
 
 
