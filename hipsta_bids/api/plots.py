@@ -49,8 +49,8 @@ def plot_sheet(
 ) -> "Axes":
     """Draw a map on the unfolded sheet, with borders and names of subfields.
 
-    Sheets are seen from above, anterior up: the medial side of a left one is on the right. Columns
-    that were repaired are hatched, those that were filled from their neighbors crossed.
+    Maps of both sides lie alike: medial left, lateral right, anterior up. Columns that were
+    repaired are hatched, those that were filled from their neighbors crossed.
 
     Parameters
     ----------

@@ -44,6 +44,7 @@ from hipsta_bids.group.registration import (
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.summaries import MeasureFit, classify_groups, fit_summaries
 from hipsta_bids.group.warps import Template, warp_labels, warp_values
+from hipsta_bids.progress import each, tell
 
 #: Group of all, where there are no groups.
 ALL = "all"
@@ -158,7 +159,7 @@ def analyze_cohort(
     _check_weights(comparison, settings)
     sides = {
         hemi: _register_side(cohort, hemi, groups=groups, settings=settings, templates=templates)
-        for hemi in (cohort.sides if measures.maps else ())
+        for hemi in each("registration", list(cohort.sides) if measures.maps else [])
     }
     registered = {hemi: side.registered for hemi, side in sides.items()} or cohort.sides
     compared = compare_sessions(replace(cohort, sides=registered), comparison)
@@ -171,6 +172,7 @@ def analyze_cohort(
         unregistered = correct(refitted, rows, table, settings)
     scores = None
     if comparison.normative is not None:
+        tell("w-scores")
         scores = score_cohort(
             compared,
             model,
@@ -179,6 +181,7 @@ def analyze_cohort(
             measures=measures,
             references=references,
         )
+    tell("summary measures")
     summaries, notes = fit_summaries(
         compared,
         model,
@@ -218,6 +221,7 @@ def analyze_points(cohort: Cohort, analysis: Analysis, settings: GroupSettings) 
     measured = Measures(maps=maps, summaries=())
     scores = None
     if analysis.comparison.normative is not None:
+        tell("w-scores")
         scores = score_cohort(
             compared,
             analysis.model,
@@ -269,8 +273,7 @@ def _fit_sides(
     """Fit each hemisphere, and left minus right if that is asked for."""
     fitted = {
         hemi: fit_maps(hemi, side.only(maps), rows, settings)
-        for hemi, side in compared.sides.items()
-        if maps
+        for hemi, side in each("models", list(compared.sides.items()) if maps else [])
     }
     if comparison.asymmetry and maps:
         both = asymmetry_maps(compared, maps, settings.asymmetry.relative)

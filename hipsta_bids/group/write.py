@@ -30,6 +30,7 @@ from hipsta_bids.group.tables import (
 )
 from hipsta_bids.group.warps import templates_to_json
 from hipsta_bids.io import files, gifti
+from hipsta_bids.progress import tell
 
 #: Folder of all models, in the output dataset.
 GROUP_FOLDER = DATASET_FILES["group"]
@@ -132,8 +133,10 @@ def draw(
     others: Mapping[str, tuple[Cohort, Analysis]],
 ) -> None:
     """Draw the figures."""
+    tell("figures")
     for one in ((cohort, analysis, shapes), *((*one, {}) for one in others.values())):
-        for name, content in draw_figures(*one):
+        for number, (name, content) in enumerate(draw_figures(*one), start=1):
+            tell("figures", number)
             files.write_bytes(folder / "figures" / name, content)
 
 

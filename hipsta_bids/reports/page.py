@@ -96,6 +96,8 @@ def _environment() -> "Environment":
 class Reason:
     """What a machine-readable reason means, and what to do about it."""
 
+    action: str
+    """What kind of thing to do, a key of :func:`reason_actions`."""
     meaning: str
     remedy: str
 
@@ -113,15 +115,26 @@ class ReasonSection:
 @cache
 def reason_sections() -> tuple[ReasonSection, ...]:
     """Read the table of all reasons, in the order of the reference page."""
-    text = (files("hipsta_bids.reports") / "reasons.toml").read_text(encoding="utf-8")
     return tuple(
         ReasonSection(
             title=section["title"],
             text=section["text"],
             reasons={name: Reason(**row) for name, row in section["reasons"].items()},
         )
-        for section in tomllib.loads(text)["section"]
+        for section in _reason_table()["section"]
     )
+
+
+def reason_actions() -> Mapping[str, str]:
+    """Titles of what to do, in the order of the reference page, by the keys that reasons name."""
+    actions: Mapping[str, str] = _reason_table()["actions"]
+    return actions
+
+
+@cache
+def _reason_table() -> dict[str, Any]:
+    text = (files("hipsta_bids.reports") / "reasons.toml").read_text(encoding="utf-8")
+    return tomllib.loads(text)
 
 
 @dataclass(frozen=True, kw_only=True)

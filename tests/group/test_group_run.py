@@ -1,6 +1,7 @@
 """The group level from files to files, on sheets with a planted effect."""
 
 import json
+import re
 import shutil
 
 import numpy as np
@@ -235,7 +236,20 @@ def test_flagged_hemispheres_are_told(dataset, quick, capsys):
     said = capsys.readouterr().out
     assert "note: 1 flagged hemispheres are in it" in said
     assert f"what was done and found: {out / 'group' / 'flagged.html'}\n" in said
+    # The time of each stage, as it ends.
+    timed = re.findall(r"^  ([\w -]+?) +\d+\.\d s$", said, re.MULTILINE)
+    assert timed[:3] == ["reading", "registration", "models"]
+    assert timed[-3:] == ["tables and maps", "figures", "page"]
+    assert len(timed) <= 12
     path.write_bytes(before)
+
+
+def test_a_quiet_run_prints_nothing(dataset, quick, capsys):
+    data, out = dataset
+    options = ["--measures", "thickness_mean", "--no-reports", "--name", "quiet", "-q"]
+    assert main([str(data), str(out), "group", *quick, *options]) == 0
+    assert capsys.readouterr() == ("", "")
+    assert (out / "group" / "quiet" / "measures.tsv").exists()
 
 
 def test_left_out_hemispheres_are_listed_with_the_reason(tmp_path, quick):

@@ -198,7 +198,8 @@ def test_reports_only_makes_the_pages_anew(copy, capsys):
     options = ["--reports-only", "--participant-label", "02", "--n-procs", "1"]
     assert main.main(["gone", str(copy), "participant", *options]) == 0
     assert sorted(path.name for path in copy.glob("*.html")) == ["report.html", "sub-02.html"]
-    assert "reports of 1 visits" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert re.match(r"  pages +\d+\.\d s\nreports of 1 visits", said)
 
 
 def test_reports_only_of_nothing_says_so(tmp_path, capsys):
