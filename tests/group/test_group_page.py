@@ -9,7 +9,19 @@ import time
 import numpy as np
 import pandas as pd
 import pytest
-from browsing import colored, fits, one, open_browser, open_page, pixels, texts, until, watched
+from browsing import (
+    colored,
+    faint,
+    fits,
+    one,
+    open_browser,
+    open_page,
+    pixels,
+    texts,
+    until,
+    use_theme,
+    watched,
+)
 from page_outline import Outline
 from selenium import webdriver
 from selenium.webdriver.common.keys import Keys
@@ -300,6 +312,16 @@ def visit(browser, out):
 @pytest.mark.parametrize("width", [1280, 390])
 def test_the_page_fits_its_window(visit, width):
     assert fits(visit(width), width)
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_texts_can_be_read_in_both_themes(visit, theme):
+    browser = visit()
+    use_theme(browser, theme)
+    seen, found = faint(browser)
+    use_theme(browser, "light")
+    assert seen > 100
+    assert found == []
 
 
 @pytest.mark.parametrize("label", ["Clusters and peaks", "Summary measures", "Classification"])
