@@ -38,10 +38,14 @@ EFFECT_NAMES = {"t": "Cohen's d", "F": "partial eta squared"}
 _SMALLEST_P = 1e-10
 
 
-def signed_logarithm(adjusted: Float, significant: NDArray[np.bool_], statistic: Float) -> Float:
-    """Minus log10 of corrected p with the sign of the statistic; NaN where it does not survive."""
-    size = -np.log10(np.clip(adjusted, _SMALLEST_P, 1))
-    return np.where(significant, size * np.sign(statistic), np.nan)
+def signed_logarithm(adjusted: Float, statistic: Float) -> Float:
+    """Minus log10 of corrected p with the sign of the statistic; NaN without a test."""
+    return np.asarray(-np.log10(np.clip(adjusted, _SMALLEST_P, 1)) * np.sign(statistic))
+
+
+def map_id(kind: str, index: int, hemi: str) -> str:
+    """Name an unfolded map inside a drawing: a mean of a group, or a contrast's effect or p."""
+    return f"map-{kind}-{index}-{hemi}"
 
 
 def map_scenes(results: GroupResults) -> Mapping[str, Any] | None:
