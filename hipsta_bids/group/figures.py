@@ -147,7 +147,7 @@ def _draw_pairs(
     n = max(map(len, first.values()))
     width = TWO_COLUMNS if n > 1 else ONE_COLUMN
     side = (width - 6.0) / (n + 1)
-    figure, axes = _panels(len(first), n + 1, (width, len(first) * max(side + 13, 58)))
+    figure, axes = _panels(len(first), n + 1, (width, len(first) * max(side + 13, 18 + 14 * n)))
     for row, ((control, case), by_side) in zip(axes, first.items(), strict=True):
         texts: dict[str, list[str]] = {}
         for axis, (hemi, (measure, pair)) in zip(row, by_side.items(), strict=False):
@@ -175,7 +175,7 @@ def _draw_pairs(
             ],
             [text for name, lines in texts.items() for text in (name, *lines)],
             title=f"{control} against {case}{method}\n{what}",
-            loc="upper left", borderaxespad=0, alignment="left", handlelength=1.2,
+            loc="upper left", borderaxespad=0, alignment="left", handlelength=1.2, labelspacing=0.2,
         )  # fmt: skip
     _name([axis for axis in axes.flat if axis.axison])
     return [figure]

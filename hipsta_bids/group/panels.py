@@ -425,8 +425,8 @@ def _draw_sheet(
     axes.pcolormesh(
         x, y, values.reshape(fields.shape).T, **scale, shading="nearest", rasterized=True
     )
-    axes.autoscale(enable=False)
     edges = _beyond(x), _beyond(y)
+    axes.set(xlim=edges[0][[0, -1]], ylim=edges[1][[0, -1]])
     line = {"levels": [_HALF], "colors": "black", "linewidths": _FIELD_LINE}
     width = axes.get_position().width * axes.figure.get_figwidth() * 72  # points
     for number, name in enumerate(one.maps.names):

@@ -96,6 +96,8 @@ class Picture:
     caption: str
     width: int
     """CSS pixels at which its letters have their size."""
+    content: bytes = b""
+    """The drawing, where it was made before."""
 
 
 def draw_map(kind: MapKind, hemispheres: Sequence[Hemisphere]) -> Picture:
@@ -171,6 +173,7 @@ def picture_of_file(path: Path, *, alt: str, caption: str) -> Picture:
         alt=alt,
         caption=caption,
         width=round(float(width[1]) / 0.75) if width else 800,
+        content=content,
     )
 
 
