@@ -49,7 +49,7 @@ _RULERS, _RULER_SPACE = (10.0, 5.0, 2.0, 1.0), 15.0  # of surfaces, and on paper
 
 _FIELD_LINE, _FOUND_LINE = 0.6, 1.3  # borders of subfields and of what survives, points
 _POINT = DOTS_PER_INCH / 72  # pixels
-_LETTER_WIDTH = 0.62  # of type, over its size
+_LETTER_WIDTH = 0.57  # of type, over its size
 _UNKNOWN = 0.92  # brightness where there is no value
 _FLAT = 1e-3  # a surface is flat if it is thinner than this share of its length
 _HALF = 0.5
@@ -57,6 +57,8 @@ _HEAD_PIXELS = round(_HEAD * MM)
 _FAR_APART = 0.35  # of the most extreme ticks of p
 
 
+Scale = Mapping[str, Any]
+"""Color map and the values at its ends, as matplotlib's arguments."""
 Views = dict[tuple[Any, ...], "Seen"]
 """Views by side, direction, size, and what they are of."""
 
@@ -72,7 +74,7 @@ class Row:
     title: str
     label: str
     """Of the color bar."""
-    scale: Mapping[str, Any]
+    scale: Scale
     """Color map and the values at its ends, as matplotlib's arguments."""
     values: Mapping[str, Float]
     """(points,) by side."""
@@ -164,8 +166,8 @@ def _contrasts(
         reach = display.effect_reach(every)
         low, colors, p_colors = display.effect_colors(test.kind)
         survive = {hemi: found[name, hemi].rejected for hemi in sides}
-        tested = {hemi: int(np.isfinite(found[name, hemi].adjusted).sum()) for hemi in sides}
-        counts = ", ".join(f"{int(survive[h].sum())} of {tested[h]} {SIDES[h]}" for h in sides)
+        counts = ", ".join(f"{int(own.sum())} {SIDES[hemi]}" for hemi, own in survive.items())
+        tested = max(int(np.isfinite(found[name, hemi].adjusted).sum()) for hemi in sides)
         yield [
             Row(
                 kind="effect",
@@ -179,8 +181,8 @@ def _contrasts(
             Row(
                 kind="significance",
                 index=index,
-                title=f"Significance, {name}: points that survive {counts}",
-                label="corrected p" + (", signed as the effect" if low else ""),
+                title=f"Significance: {counts} of {tested} points survive",
+                label="corrected p" + (", signed" if low else ""),
                 scale={"cmap": p_colors, "vmin": low * top, "vmax": top},
                 values={hemi: signed[name, hemi] for hemi in sides},
                 survive=survive,
@@ -258,7 +260,7 @@ class Seen:
         colors[~np.isfinite(shown)] = _UNKNOWN
         lines = self.borders
         if survive is not None:
-            inside = self.view.region(survive.ravel(), 1)
+            inside = self.view.region(survive.ravel().astype(np.int64), 1)
             lines = lines | self.view.border(inside, _FOUND_LINE * _POINT)
         return self.view.picture(colors, lines)
 
@@ -313,6 +315,7 @@ def _draw(
     n_flat, n_views = int(any(map(_unfolded, sides.values()))), 2 * bool(surfaces)
     unit = (space - _GAP * (n_flat + n_views - 1)) / (n_flat + _VIEW_WIDTH * n_views)
     most = (_TALLEST - _TOP - _BOTTOM) / len(rows) - _HEAD
+    unit = min(unit, most)
     height = round(min(unit * _UPRIGHT, most) * MM)
     size = height, round(_VIEW_WIDTH * unit * MM)
     scale = min((surface.fitting(size) for surface in surfaces.values()), default=1.0)
@@ -331,7 +334,8 @@ def _draw(
                 views[key] = Seen.build(view, one)
             # The right side's lateral is to the right in the scanner, and the left one's is not.
             turned = (axes[0, 0] > 0) != (hemi == "R")
-            ends = tuple(word[:3] + "." for word in (X_ENDS[::-1] if turned else X_ENDS))
+            medial, lateral = (f"{word[:3]}." for word in X_ENDS)
+            ends = (lateral, medial) if turned else (medial, lateral)
             box = round(left), size[1]
             columns.append(
                 _Column(hemi=hemi, one=one, box=box, title=title, ends=ends, seen=views[key])
@@ -427,8 +431,8 @@ def _draw_sheet(
     )
     edges = _beyond(x), _beyond(y)
     axes.set(xlim=edges[0][[0, -1]], ylim=edges[1][[0, -1]])
-    line = {"levels": [_HALF], "colors": "black", "linewidths": _FIELD_LINE}
-    width = axes.get_position().width * axes.figure.get_figwidth() * 72  # points
+    line: Any = {"levels": [_HALF], "colors": "black", "linewidths": _FIELD_LINE}
+    width = axes.get_position().width * axes.get_figure(root=True).get_figwidth() * 72  # points
     for number, name in enumerate(one.maps.names):
         own = fields == number
         if not own.any():
@@ -450,14 +454,15 @@ def _enclose(axes: "Axes", cohort: Cohort, one: FittedMaps, survive: Bool) -> No
     """Draw a line round the points that survive."""
     if not survive.any():
         return
-    line = {"levels": [_HALF], "colors": "black", "linewidths": _FOUND_LINE}
+    line: Any = {"levels": [_HALF], "colors": "black", "linewidths": _FOUND_LINE}
     if one.maps.mesh is not None:
         plane, triangles, _ = laid_out(one.maps.mesh)
-        axes.tricontour(*plane.T, triangles, survive.ravel().astype(np.float64), **line)
+        inside = survive.ravel().astype(np.float64)
+        axes.tricontour(plane[:, 0], plane[:, 1], inside, triangles=triangles, **line)
         return
-    inside = np.pad(survive.reshape(one.maps.shape), 1).astype(np.float64)
     # Closed where it meets the edges of the sheet.
-    axes.contour(_beyond(cohort.x), _beyond(cohort.y), inside.T, **line)
+    closed = np.pad(survive.reshape(one.maps.shape), 1).astype(np.float64)
+    axes.contour(_beyond(cohort.x), _beyond(cohort.y), closed.T, **line)
 
 
 def _beyond(nodes: Float) -> Float:
@@ -478,7 +483,13 @@ def draw_mesh(axes: "Axes", mesh: Mesh, values: Float, scale: Mapping[str, Any])
         some = triangles[known]
         colors = values.ravel()[some].mean(axis=1)
         axes.tripcolor(
-            *plane.T, some, facecolors=colors, **scale, edgecolors="none", rasterized=True
+            plane[:, 0],
+            plane[:, 1],
+            triangles=some,
+            facecolors=colors,
+            **scale,
+            edgecolors="none",
+            rasterized=True,
         )
     axes.set_xlim(left, right)
     axes.set_ylim(*((top, bottom) if words[1].startswith("x") else (bottom, top)))
@@ -506,7 +517,8 @@ def _draw_bar(axes: "Axes", row: Row) -> None:
     colors = ScalarMappable(Normalize(low, high), row.scale["cmap"])
     extend = "neither" if row.kind == "significance" else "both" if low else "max"
     bar = axes.figure.colorbar(colors, cax=axes, extend=extend, extendfrac=0.06)
-    bar.solids.set_rasterized(True)
+    if bar.solids is not None:
+        bar.solids.set_rasterized(True)
     bar.set_label(row.label, fontsize=SMALL, labelpad=2)
     axes.tick_params(labelsize=SMALL, length=2, pad=1.5)
     if row.level is not None:
@@ -521,7 +533,9 @@ def _draw_bar(axes: "Axes", row: Row) -> None:
 
 def _p_ticks(level: float, top: float) -> dict[float, str]:
     """Positions and texts of ticks of p: one, the level, and powers of ten well beyond it."""
-    ticks = {0.0: "1", -np.log10(level): f"{level:g}"}
+    ticks = {-np.log10(level): f"{level:g}"}
+    if max(ticks) > _FAR_APART * top / 2:
+        ticks[0.0] = "1"
     for power in range(1, int(top) + 1):
         if power - max(ticks) > _FAR_APART * top / 2:
             ticks[float(power)] = f"{10.0**-power:g}"

@@ -44,12 +44,12 @@ def map_scenes(results: GroupResults) -> Mapping[str, Any] | None:
     maps = results.table("maps")
     if not len(maps):
         return None
-    blocks, data = [], []
-    for measure in maps["measure"].unique().tolist():
+    blocks, data = [], list[dict[str, Any]]()
+    for measure in maps["measure"].unique().tolist()[:_MOST_FIGURES]:
         own = maps[maps["measure"] == measure]
         means = results.table("means")
         means = means[means["measure"] == measure] if len(means) else means
-        scene = None
+        scene: dict[str, Any] | None = None
         if "node_x" in results.table(str(own["file"].iloc[0])):
             unit = unit_of(str(means["unit"].iloc[0]) if len(means) else "1")
             sides = [
@@ -66,8 +66,8 @@ def map_scenes(results: GroupResults) -> Mapping[str, Any] | None:
         ]
         blocks.append({"title": title, "plates": plates})
         if scene and plates:
-            data.append({**scene, "sides": [_rounded(side) for side in scene["sides"]]})
-    return {"blocks": blocks[:_OPEN], "more": blocks[_OPEN:_MOST_FIGURES], "data": data}
+            data.append({**scene, "sides": list(map(_rounded, scene["sides"]))})
+    return {"blocks": blocks[:_OPEN], "more": blocks[_OPEN:], "data": data}
 
 
 def embedded(results: GroupResults, name: str, caption: str, alt: str = "") -> list[Picture]:
