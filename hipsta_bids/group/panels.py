@@ -432,7 +432,7 @@ def _draw_sheet(
     edges = _beyond(x), _beyond(y)
     axes.set(xlim=edges[0][[0, -1]], ylim=edges[1][[0, -1]])
     line: Any = {"levels": [_HALF], "colors": "black", "linewidths": _FIELD_LINE}
-    width = axes.get_position().width * axes.get_figure(root=True).get_figwidth() * 72  # points
+    width = axes.bbox.width * 72 / axes.figure.dpi  # points
     for number, name in enumerate(one.maps.names):
         own = fields == number
         if not own.any():
@@ -456,9 +456,11 @@ def _enclose(axes: "Axes", cohort: Cohort, one: FittedMaps, survive: Bool) -> No
         return
     line: Any = {"levels": [_HALF], "colors": "black", "linewidths": _FOUND_LINE}
     if one.maps.mesh is not None:
+        from matplotlib.tri import Triangulation  # noqa: PLC0415  (slow to load)
+
         plane, triangles, _ = laid_out(one.maps.mesh)
-        inside = survive.ravel().astype(np.float64)
-        axes.tricontour(plane[:, 0], plane[:, 1], inside, triangles=triangles, **line)
+        where = Triangulation(plane[:, 0], plane[:, 1], triangles)
+        axes.tricontour(where, survive.ravel().astype(np.float64), **line)
         return
     # Closed where it meets the edges of the sheet.
     closed = np.pad(survive.reshape(one.maps.shape), 1).astype(np.float64)
