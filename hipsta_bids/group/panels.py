@@ -166,8 +166,13 @@ def _contrasts(
         reach = display.effect_reach(every)
         low, colors, p_colors = display.effect_colors(test.kind)
         survive = {hemi: found[name, hemi].rejected for hemi in sides}
-        counts = ", ".join(f"{int(own.sum())} {SIDES[hemi]}" for hemi, own in survive.items())
-        tested = max(int(np.isfinite(found[name, hemi].adjusted).sum()) for hemi in sides)
+        tested = {hemi: int(np.isfinite(found[name, hemi].adjusted).sum()) for hemi in sides}
+        same = len(set(tested.values())) == 1
+        counts = ", ".join(
+            f"{int(own.sum())} {'' if same else f'of {tested[hemi]} '}{SIDES[hemi]}"
+            for hemi, own in survive.items()
+        )
+        counts += f" of {max(tested.values())} points" if same else ""
         yield [
             Row(
                 kind="effect",
@@ -181,7 +186,7 @@ def _contrasts(
             Row(
                 kind="significance",
                 index=index,
-                title=f"Significance: {counts} of {tested} points survive",
+                title=f"Significant: {counts}",
                 label="corrected p" + (", signed" if low else ""),
                 scale={"cmap": p_colors, "vmin": low * top, "vmax": top},
                 values={hemi: signed[name, hemi] for hemi in sides},
@@ -323,7 +328,8 @@ def _draw(
     for number, (hemi, one) in enumerate(sides.items()):
         left = (_LEFT + number * (space + _BETWEEN)) * MM
         if _unfolded(one):
-            ends = X_ENDS if one.maps.mesh is None else ("", "")
+            mesh = one.maps.mesh
+            ends = X_ENDS if mesh is None else (laid_out(mesh)[2][0], "")
             box = round(left), round(unit * MM)
             columns.append(_Column(hemi=hemi, one=one, box=box, title="unfolded", ends=ends))
             left += (unit + _GAP) * MM
@@ -478,7 +484,6 @@ def draw_mesh(axes: "Axes", mesh: Mesh, values: Float, scale: Mapping[str, Any])
     plane, triangles, words = laid_out(mesh)
     known = np.isfinite(values.ravel()[triangles]).all(axis=1)
     axes.set_aspect("equal")
-    axes.set_xlabel(words[0], labelpad=2)
     axes.set_ylabel(words[1], labelpad=2)
     (left, bottom), (right, top) = plane.min(axis=0), plane.max(axis=0)
     if known.any():

@@ -25,7 +25,7 @@ EFFECT_NAMES = {"t": "Cohen's d", "F": "partial eta squared"}
 KINDS = ("mean", "effect", "significance")
 _SMALLEST_P = 1e-10
 #: Measures whose figures are shown at once, and at all; the folder has them all.
-_OPEN, _MOST_FIGURES = 3, 9
+_OPEN, _MOST_FIGURES = 2, 9
 _HALF = 0.5  # of a cell, to its middle
 
 
