@@ -123,11 +123,13 @@ def _means(
     for index, (group, values) in enumerate(means.items()):
         n = counts[group]
         by_side = ", ".join(f"{count} {SIDES[hemi]}" for hemi, count in n.items())
-        differ = len(set(n.values())) > 1
+        number = by_side if len(set(n.values())) > 1 else str(max(n.values()))
+        visits = analysis.comparison.longitudinal
+        how_many = f"{number} visits" if visits else f"n = {number}"
         yield Row(
             kind="mean",
             index=index,
-            title=f"{what.capitalize()}, {group} (n = {by_side if differ else max(n.values())})",
+            title=f"{what.capitalize()}, {group} ({how_many})",
             label=with_brackets(
                 f"{what},\n{display_name(measure)}", cohort.units.get(measure, "1")
             ),

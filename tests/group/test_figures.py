@@ -169,7 +169,7 @@ def measured(survive, sides="LR", *, kind="t", mesh=None, groups=("CN", "AD"), c
         found=found,
         compared=SimpleNamespace(table=table),
         groups=SimpleNamespace(column="group", levels=groups),
-        comparison=SimpleNamespace(pair=None),
+        comparison=SimpleNamespace(pair=None, longitudinal=False),
     )
     cohort = SimpleNamespace(
         x=np.linspace(-0.9, 0.9, GRID[0]),
