@@ -523,6 +523,7 @@ def _draw_bar(axes: "Axes", row: Row) -> None:
     from matplotlib.colors import Normalize  # noqa: PLC0415
 
     low, high = row.scale["vmin"], row.scale["vmax"]
+    signs = (-1, 1) if low else (1,)
     colors = ScalarMappable(Normalize(low, high), row.scale["cmap"])
     extend = "neither" if row.kind == "significance" else "both" if low else "max"
     bar = axes.figure.colorbar(colors, cax=axes, extend=extend, extendfrac=0.06)
@@ -531,21 +532,18 @@ def _draw_bar(axes: "Axes", row: Row) -> None:
     bar.set_label(row.label, fontsize=SMALL, labelpad=2)
     axes.tick_params(labelsize=SMALL, length=2, pad=1.5)
     if row.level is not None:
-        ticks = _p_ticks(row.level, high)
-        both = {
-            sign * at: text for at, text in ticks.items() for sign in ((-1, 1) if low else (1,))
-        }
-        bar.set_ticks(list(both), labels=list(both.values()))
-        for sign in (-1, 1) if low else (1,):
+        ticks = {sign * at: text for at, text in _p_ticks(row.level, high) for sign in signs}
+        bar.set_ticks(list(ticks), labels=list(ticks.values()))
+        for sign in signs:
             axes.axhline(-sign * np.log10(row.level), color="black", linewidth=_FOUND_LINE)
 
 
-def _p_ticks(level: float, top: float) -> dict[float, str]:
+def _p_ticks(level: float, top: float) -> list[tuple[float, str]]:
     """Positions and texts of ticks of p: one, the level, and powers of ten well beyond it."""
-    ticks = {-np.log10(level): f"{level:g}"}
-    if max(ticks) > _FAR_APART * top / 2:
-        ticks[0.0] = "1"
+    last, far = -float(np.log10(level)), _FAR_APART * top / 2
+    ticks = [(last, f"{level:g}"), *([(0.0, "1")] if last > far else [])]
     for power in range(1, int(top) + 1):
-        if power - max(ticks) > _FAR_APART * top / 2:
-            ticks[float(power)] = f"{10.0**-power:g}"
+        if power - last > far:
+            last = float(power)
+            ticks.append((last, f"{10.0**-power:g}"))
     return ticks

@@ -1,6 +1,9 @@
 """Where figures put what they show, and that letters, lines and colors are those of the values."""
 
+import contextlib
 import io
+import re
+import zlib
 from types import SimpleNamespace
 
 import numpy as np
@@ -268,8 +271,21 @@ def test_files_are_the_same_each_time_and_small(monkeypatch):
     assert max(map(len, first.values())) < 1e6
     svg = first["maps.svg"].decode()
     assert ">Mean, CN (n = 2)<" in svg
+    assert {"Sub", "CA1", "Left"} <= words_of(first["maps.pdf"])
     assert b"/FontFile2" in first["maps.pdf"]
     assert b"/Type3" not in first["maps.pdf"]
+
+
+def words_of(printed):
+    """Texts of a PDF whose fonts keep the letters' codes, as its tables of letters say."""
+    streams = []
+    for found in re.finditer(rb">>\s*stream\r?\n", printed):
+        with contextlib.suppress(zlib.error):
+            streams.append(zlib.decompressobj().decompress(printed[found.end() :]))
+    assert any(b"begincmap" in stream for stream in streams)
+    (page,) = (stream for stream in streams if b" Tf" in stream)
+    lines = re.findall(rb"\[(.*?)\] TJ", page)
+    return {b"".join(re.findall(rb"\x00([^\x00()])", line)).decode() for line in lines}
 
 
 def test_both_sides_and_both_views_are_seen():
