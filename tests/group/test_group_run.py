@@ -272,12 +272,10 @@ def test_figures_are_drawn_as_pictures_and_drawings(results):
         # Words stay words, so that they can be searched and edited.
         assert ">medial<" in drawing or name == "roc"
         assert not re.search(r"font-size: (?![789](\.0)?px)", drawing)
-        picture = Image.open(results / "figures" / f"{name}.png")
-        assert picture.info["dpi"] == pytest.approx((300, 300), rel=1e-3)
-        assert picture.width / 300 * 25.4 in (
-            pytest.approx(85, abs=0.1),
-            pytest.approx(180, abs=0.1),
-        )
+        with Image.open(results / "figures" / f"{name}.png") as picture:
+            assert picture.info["dpi"] == pytest.approx((300, 300), rel=1e-3)
+            widths = pytest.approx(85, abs=0.1), pytest.approx(180, abs=0.1)
+            assert picture.width / 300 * 25.4 in widths
         printed = (results / "figures" / f"{name}.pdf").read_bytes()
         assert b"/FontFile2" in printed  # TrueType, whole letters
         assert b"/Type3" not in printed
