@@ -55,12 +55,16 @@ class EditedMask:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BodyMask:
-    """The measured body, on the whole grid of the file with its labels."""
+    """The measured body: the part of the labels' file in which it lies."""
 
     inside: Bool
-    """(I, J, K) whether a voxel belongs to the body."""
+    """(I, J, K) whether a voxel of this part belongs to the body."""
+    start: tuple[int, int, int]
+    """Index, in the file, of the first voxel of this part."""
+    shape: tuple[int, int, int]
+    """Of the file."""
     affine: Float
-    """(4, 4), voxel index to RAS mm."""
+    """(4, 4), voxel index in the file to RAS mm."""
 
     def __post_init__(self) -> None:
         _set(self, "inside", np.bool_, (None, None, None))
@@ -131,13 +135,16 @@ class LabelVolume:
             raise ValueError("LabelVolume.affine is singular or not finite")
 
     def in_file(self, inside: Bool) -> BodyMask:
-        """Put a mask (I, J, K) back into the whole grid of the file."""
-        whole = np.zeros(self.file_shape or inside.shape, dtype=np.bool_)
-        part = (slice(a, a + n) for a, n in zip(self.start, inside.shape, strict=True))
-        whole[tuple(part)] = inside
+        """Say where in the file a mask (I, J, K) of this part lies."""
+        first, second, third = inside.shape
         affine = self.affine.copy()
         affine[:3, 3] -= affine[:3, :3] @ np.array(self.start)
-        return BodyMask(inside=whole, affine=affine)
+        return BodyMask(
+            inside=inside,
+            start=self.start,
+            shape=self.file_shape or (first, second, third),
+            affine=affine,
+        )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

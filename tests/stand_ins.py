@@ -77,7 +77,12 @@ def make_maps(*, hemi="L", flags=(), repairs=(), holes=(), repaired=()):
         sections={row.name: np.arange(NY) + k for k, row in enumerate(SECTIONS)},
         subfield=subfield,
         repaired=touched,
-        body_mask=BodyMask(inside=np.eye(3)[None] > 0, affine=np.diag([0.4, 0.5, 2.0, 1.0])),
+        body_mask=BodyMask(
+            inside=np.eye(3)[None] > 0,
+            start=(1, 0, 2),
+            shape=(2, 4, 6),
+            affine=np.diag([0.4, 0.5, 2.0, 1.0]),
+        ),
         summary={
             "thickness_mean": THICKNESS,
             "extent_x": 4.0,

@@ -33,6 +33,7 @@ from hipsta_bids.group.tables import (
 )
 from hipsta_bids.group.warps import templates_to_json
 from hipsta_bids.io import files, gifti
+from hipsta_bids.progress import tell
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -88,6 +89,7 @@ def write_results(
     *,
     others: Mapping[str, tuple[Cohort, Analysis]],
     region: str = "body",
+    ratings: Mapping[str, int] | None = None,
 ) -> None:
     """Write tables, maps and text."""
     for name, table in result_tables(cohort, analysis, settings):
@@ -116,7 +118,13 @@ def write_results(
         _write_gifti(folder, *one)
         _write_scores(folder, *one)
     text = methods_text(
-        cohort, analysis, settings, len(exclusions), others=tuple(others), region=region
+        cohort,
+        analysis,
+        settings,
+        len(exclusions),
+        others=tuple(others),
+        region=region,
+        ratings=ratings,
     )
     files.write_text(folder / "methods.md", text)
 
@@ -130,9 +138,12 @@ def draw(
     others: Mapping[str, tuple[Cohort, Analysis]],
 ) -> list[str]:
     """Draw the figures, and say which are missing or lack letters; one line each."""
-    problems, missing = [], set()
+    tell("figures")
+    problems, missing, number = [], set(), 0
     for one in ((cohort, analysis, shapes), *((*one, {}) for one in others.values())):
         for name, drawing in draw_figures(*one):
+            number += 1
+            tell("figures", number)
             try:
                 with warnings.catch_warnings(record=True) as warned:
                     warnings.simplefilter("always")

@@ -1,7 +1,6 @@
 """Images: label volumes, masks and maps, opened for reading here only."""
 
 import contextlib
-import gzip
 import math
 import zlib
 from collections.abc import Iterator, Sequence
@@ -60,6 +59,9 @@ READ_SHARE = 0.5
 #: for integers of 1 and 4 bytes, 20 for floats of 4.
 _BESIDE = 20
 
+#: The same of a map: its values in double precision.
+_BESIDE_MAP = 8
+
 _memory: ContextVar[float] = ContextVar("memory", default=math.inf)
 
 
@@ -68,23 +70,31 @@ def limit_memory(gigabytes: float | None) -> None:
     _memory.set(math.inf if gigabytes is None else 1e9 * gigabytes)
 
 
-def _check_fits(image: Any, path: Path, voxels: int, what: str) -> None:  # noqa: ANN401 (untyped)
+def _check_fits(
+    image: Any,  # noqa: ANN401 (untyped)
+    path: Path,
+    voxels: int,
+    what: str,
+    *,
+    beside: int = _BESIDE,
+    remedy: str = "crop it to the hippocampus",
+) -> None:
     """Refuse to read so many voxels at once if they need more than their share of memory."""
-    need, share = voxels * _voxel_bytes(image), READ_SHARE * _memory.get()
+    need, share = voxels * _voxel_bytes(image, beside), READ_SHARE * _memory.get()
     if need > share:
         raise InputError(
             f"{path}: reading {what} ({voxels / 1e6:.1f} million voxels) takes {need / 1e6:.0f} MB,"
             f" but {READ_SHARE:.0%} of a process' part of --mem is {share / 1e6:.0f} MB;"
-            " raise --mem, lower --n-procs, or crop it to the hippocampus",
+            f" raise --mem, lower --n-procs, or {remedy}",
             reason="image-too-large",
         )
 
 
-def _voxel_bytes(image: Any) -> int:  # noqa: ANN401 (untyped)
+def _voxel_bytes(image: Any, beside: int) -> int:  # noqa: ANN401 (untyped)
     """Bytes of memory that reading takes per voxel; scaled numbers become double precision."""
     kind = image.get_data_dtype().itemsize
     scaled = (image.dataobj.slope, image.dataobj.inter) != (1, 0)
-    return _BESIDE + (max(kind, 8) if scaled else int(kind))
+    return beside + (max(kind, 8) if scaled else int(kind))
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,7 +217,7 @@ def _voxels(image: Any, shape: tuple[int, int, int], box: tuple[slice, ...]) -> 
 
 def _slabs(image: Any, shape: tuple[int, int, int]) -> Iterator[tuple[int, NDArray[Any]]]:  # noqa: ANN401 (untyped)
     """Read slab by slab along the last axis; yields where each begins."""
-    most = min(_SLAB, READ_SHARE / 4 * _memory.get() / _voxel_bytes(image))
+    most = min(_SLAB, READ_SHARE / 4 * _memory.get() / _voxel_bytes(image, _BESIDE))
     step = max(int(most // max(shape[0] * shape[1], 1)), 1)
     for start in range(0, shape[2], step):
         stop = min(start + step, shape[2])
@@ -259,6 +269,14 @@ def read_scalars(path: Path, points: Float) -> ScalarVolume:
         _check_affine(image, affine, path, MAP_VOXEL_SIZES)
         shape = tuple(int(n) for n in image.shape)
         box = _box(affine, points, shape)
+        _check_fits(
+            image,
+            path,
+            math.prod(b - a for a, b in box) * math.prod(shape[_SPACE:]),
+            "the part round the sheet",
+            beside=_BESIDE_MAP,
+            remedy="give fewer volumes at once",
+        )
         data = np.asarray(image.dataobj[tuple(slice(a, b) for a, b in box)], dtype=np.float64)
     start = np.array([a for a, _ in box])
     affine[:3, 3] += affine[:3, :3] @ start
@@ -288,10 +306,21 @@ def _opened(path: Path) -> Iterator[Any]:
         ) from error
 
 
+class _MGHHeader(nib.freesurfer.mghformat.MGHHeader):
+    """nibabel's gives counts of 32 bits: positions in files beyond 2 GB would be wrong."""
+
+    def get_data_shape(self) -> tuple[int, ...]:
+        return tuple(map(int, super().get_data_shape()))  # type: ignore[no-untyped-call]
+
+
+class _MGHImage(nib.MGHImage):
+    header_class = _MGHHeader
+
+
 def _format(path: Path, start: bytes) -> type[Any]:
     """Choose the format by the file's name and, between the versions of NIfTI, its first bytes."""
     if path.suffix in {".mgz", ".mgh"}:
-        return nib.MGHImage
+        return _MGHImage
     # NIfTI begins with the size of its header, which tells the versions apart.
     sizes = {int.from_bytes(start, order) for order in ("little", "big")}
     newer = nib.Nifti2Header.template_dtype.itemsize in sizes
@@ -372,10 +401,31 @@ def _check_affine(
 
 
 def mask_bytes(mask: BodyMask) -> bytes:
-    """Encode a mask as a compressed NIfTI image."""
-    image: Any = nib.Nifti1Image(mask.inside.astype(np.uint8), mask.affine)
-    image.set_sform(mask.affine, code=1)
+    """Encode a mask, on the whole grid of its file, as a compressed NIfTI image.
+
+    It is compressed slice by slice, since the file may be much larger than the body.
+    """
+    header = nib.Nifti1Header()
+    header.set_data_dtype(np.uint8)
+    header.set_data_shape(mask.shape)
+    header.set_sform(mask.affine, code=1)
     # Some viewers read the qform only.
-    image.set_qform(mask.affine, code=1)
-    image.header.set_xyzt_units("mm")
-    return gzip.compress(image.to_bytes(), compresslevel=6, mtime=0)
+    header.set_qform(mask.affine, code=1)
+    header.set_xyzt_units("mm")
+    header["magic"] = header.single_magic
+    header["vox_offset"] = header.single_vox_offset
+    packed = zlib.compressobj(6, wbits=16 + zlib.MAX_WBITS)
+    no_extension = bytes(header.single_vox_offset - header.sizeof_hdr)
+    parts = [packed.compress(header.binaryblock + no_extension)]
+    columns, rows = (
+        slice(a, a + n) for a, n in zip(mask.start[:2], mask.inside.shape, strict=False)
+    )
+    empty = bytes(mask.shape[0] * mask.shape[1])
+    for k in range(mask.shape[2]):
+        voxels = empty
+        if 0 <= k - mask.start[2] < mask.inside.shape[2]:
+            slab = np.zeros(mask.shape[:2], dtype=np.uint8)
+            slab[columns, rows] = mask.inside[..., k - mask.start[2]]
+            voxels = slab.tobytes(order="F")
+        parts.append(packed.compress(voxels))
+    return b"".join([*parts, packed.flush()])

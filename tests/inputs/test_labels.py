@@ -13,7 +13,7 @@ from hipsta_bids.errors import InputError, ProtocolError
 from hipsta_bids.inputs.labels import MARGIN, label_values, read_label_volume
 from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.io import volumes
-from hipsta_bids.io.volumes import limit_memory, read_labels
+from hipsta_bids.io.volumes import limit_memory, read_labels, read_scalars
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Part, Tissue
 
@@ -466,3 +466,29 @@ def test_memory_bounds_the_part_with_labels(tmp_path, monkeypatch):
     assert read_labels(path).data.shape == SHAPE
     limit_memory(None)
     assert read_labels(path).data.shape == SHAPE
+
+
+def test_voxels_beyond_two_gigabytes_are_read_where_they_are(tmp_path):
+    path, edge = tmp_path / "a.mgh", 1300
+    header = nib.freesurfer.MGHImage(np.zeros((1, 1, 1), np.uint8), np.eye(4)).header
+    header.set_data_shape((edge, edge, edge))
+    with path.open("wb") as file:  # the rest is a hole, which takes no space
+        header.writehdr_to(file)
+        file.seek(header.get_data_offset() + edge**3 - 3)
+        file.write(bytes([1, 2, 3]))
+    last = (slice(edge - 4, edge), slice(edge - 1, edge), slice(edge - 1, edge))
+    assert read_labels(path, box=last).data.ravel().tolist() == [0, 1, 2, 3]
+
+
+def test_memory_bounds_maps_of_several_volumes(tmp_path, monkeypatch):
+    monkeypatch.setattr(volumes, "_memory", ContextVar("memory", default=np.inf))
+    path = tmp_path / "map.nii"
+    nib.save(nib.Nifti1Image(np.ones((20, 20, 20, 50), np.float32), np.eye(4)), path)
+    points = np.array([[5.0, 5, 5], [8, 8, 8]])  # 6 x 6 x 6 voxels, 12 B each
+    limit_memory(2 * 12 * 6**3 * 50e-9 - 1e-9)
+    said = r"the part round the sheet .* give fewer volumes"
+    with pytest.raises(InputError, match=said) as caught:
+        read_scalars(path, points)
+    assert caught.value.reason == "image-too-large"
+    limit_memory(2 * 12 * 6**3 * 50e-9 + 1e-9)
+    assert read_scalars(path, points).values.shape == (6, 6, 6, 50)

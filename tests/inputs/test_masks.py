@@ -1,5 +1,8 @@
 """Edited labels and masks as they are read, on any grid."""
 
+import gzip
+import tracemalloc
+
 import nibabel as nib
 import numpy as np
 import pytest
@@ -183,14 +186,31 @@ def test_edited_labels_are_checked_like_others(labels, data, reason):
 
 
 def test_written_masks_lie_where_the_body_is(tmp_path):
-    inside = block() > 0
-    content = mask_bytes(BodyMask(inside=inside, affine=AFFINE))
-    assert content == mask_bytes(BodyMask(inside=inside, affine=AFFINE))
+    body = block() > 0
+    start, shape = (2, 0, 7), (body.shape[0] + 5, body.shape[1], body.shape[2] + 9)
+    whole = np.zeros(shape, np.uint8)
+    whole[tuple(slice(a, a + n) for a, n in zip(start, body.shape, strict=True))] = body
+    content = mask_bytes(BodyMask(inside=body, start=start, shape=shape, affine=AFFINE))
     path = tmp_path / "m.nii.gz"
     path.write_bytes(content)
     image = nib.load(path)
-    np.testing.assert_array_equal(np.asarray(image.dataobj) > 0, inside)
+    np.testing.assert_array_equal(np.asarray(image.dataobj), whole)
     for affine in (image.get_sform(), image.get_qform()):
         np.testing.assert_allclose(affine, AFFINE, atol=1e-5)  # single precision
     assert (int(image.header["sform_code"]), int(image.header["qform_code"])) == (1, 1)
     assert image.get_data_dtype() == np.uint8
+    # Slice by slice or at once, the bytes are the same.
+    expected = nib.Nifti1Image(whole, None, image.header).to_bytes()
+    assert content == gzip.compress(expected, compresslevel=6, mtime=0)
+
+
+def test_masks_need_memory_for_the_body_not_for_the_file():
+    shape = (700, 700, 200)  # 98 MB
+    mask = BodyMask(inside=block() > 0, start=(300, 300, 90), shape=shape, affine=AFFINE)
+    tracemalloc.start()
+    try:
+        mask_bytes(mask)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 5e6
