@@ -206,7 +206,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         write_shapes(folder, shapes)
         if analysis.sides and inputs.found.records and not shapes:
             notes.append("no average surfaces: those of the participant level are missing")
-        draw(folder, cohort, analysis, shapes, others=others)
+        notes += draw(folder, cohort, analysis, shapes, others=others)
         record = _record(options, inputs.found, settings, analysis, notes)
         files.write_json(folder / "analysis.json", record)
     page, problem = _report(options, name)

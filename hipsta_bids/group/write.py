@@ -1,8 +1,11 @@
 """Writes the results of one model, all or none: tables, maps, surfaces, figures and text."""
 
 import contextlib
+import logging
 import os
+import re
 import shutil
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -15,7 +18,7 @@ from hipsta_bids.derivatives.names import DATASET_FILES
 from hipsta_bids.group.analysis import Analysis, tested_maps
 from hipsta_bids.group.collect import Exclusion
 from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float, Int, SideMaps
-from hipsta_bids.group.figures import draw_figures
+from hipsta_bids.group.figures import draw_figures, encode
 from hipsta_bids.group.glm import FittedMaps
 from hipsta_bids.group.methods import methods_text
 from hipsta_bids.group.settings import GroupSettings
@@ -31,6 +34,8 @@ from hipsta_bids.group.tables import (
 from hipsta_bids.group.warps import templates_to_json
 from hipsta_bids.io import files, gifti
 from hipsta_bids.progress import tell
+
+_LOGGER = logging.getLogger(__name__)
 
 #: Folder of all models, in the output dataset.
 GROUP_FOLDER = DATASET_FILES["group"]
@@ -131,13 +136,30 @@ def draw(
     shapes: Mapping[str, AverageShape],
     *,
     others: Mapping[str, tuple[Cohort, Analysis]],
-) -> None:
-    """Draw the figures."""
+) -> list[str]:
+    """Draw the figures, and say which are missing or lack letters; one line each."""
     tell("figures")
+    problems, missing, number = [], set(), 0
     for one in ((cohort, analysis, shapes), *((*one, {}) for one in others.values())):
-        for number, (name, content) in enumerate(draw_figures(*one), start=1):
+        for name, drawing in draw_figures(*one):
+            number += 1
             tell("figures", number)
-            files.write_bytes(folder / "figures" / name, content)
+            try:
+                with warnings.catch_warnings(record=True) as warned:
+                    warnings.simplefilter("always")
+                    encoded = encode(name, drawing)
+            except Exception as error:  # results are worth more than figures
+                _LOGGER.exception("figure %s", name)
+                problems.append(f"figure {name}: not drawn ({type(error).__name__}: {error})")
+                continue
+            for warning in warned:
+                missing |= set(re.findall(r"^Glyph (\d+) ", str(warning.message)))
+            for title, content in encoded:
+                files.write_bytes(folder / "figures" / title, content)
+    if missing:
+        letters = "".join(sorted(chr(int(number)) for number in missing))
+        problems.append(f"figures: PDF and PNG show boxes for {letters}; SVG has them as text")
+    return problems
 
 
 def _write_table(folder: Path, name: str, table: pd.DataFrame, *, described: bool = True) -> None:

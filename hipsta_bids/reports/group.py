@@ -225,14 +225,12 @@ def _moved(row: Mapping[str, Any]) -> str:
 
 
 def _registration(results: GroupResults) -> Mapping[str, Any] | None:
-    """Describe what registration has done, with the profiles before and after it, and warps."""
+    """Describe what registration has done, with curvature before and after it, and warps."""
     values = _registered(results)
     if values is None:
         return None
-    profiles = "Means of groups from medial to lateral, before and after registration"
-    warps = "How far sheets were moved to lateral: each sheet, and means of groups"
-    pictures = embedded(results, "profiles", "Profiles before and after", profiles)
-    return {**values, "pictures": pictures + embedded(results, "warps", "Warps", warps)}
+    alt = "Curvature from medial to lateral before and after registration, and warps, by group"
+    return {**values, "pictures": embedded(results, "registration", "Registration", alt)}
 
 
 def _sections_of_groups(results: GroupResults) -> Mapping[str, Any] | None:
