@@ -208,6 +208,7 @@ def _add_methods(parser: Parser) -> None:
         "MEASURE...",
         "measures and covariates of the base model of classification (default: volume)",
     )
+    add("--no-classification", "", "do not tell groups apart by logistic models")
     add(
         "--settings", "FILE.toml", "settings that change results (see `hipsta-bids settings group`)"
     )
@@ -270,6 +271,8 @@ def run_group_level(arguments: Sequence[str]) -> ExitCode:
     check_scratch()
     settings = _settings(parsed)
     result = run_group(_options(parsed, arguments), settings)
+    for warning in result.warnings:
+        warn(f"warning: {warning}")
     for note in result.notes:
         echo(f"note: {note}")
     echo(f"{result.n_participants} participants in the model, {result.n_excluded} left out")
@@ -318,7 +321,10 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
         },
         "longitudinal": {"random": parsed.longitudinal},
         "glm": {"weights": parsed.weights},
-        "classification": {"base": tuple(parsed.base) or None},
+        "classification": {
+            "base": tuple(parsed.base) or None,
+            "added": () if parsed.no_classification else None,
+        },
     }
     settings = load_group_settings(parsed.settings)
     for section, options in chosen.items():

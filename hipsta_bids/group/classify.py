@@ -13,18 +13,19 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize, special, stats
-from sklearn import config_context, metrics
+from sklearn import metrics
 from sklearn.model_selection import RepeatedStratifiedKFold
 from statsmodels.discrete.discrete_model import Logit
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.data import Bool, Float
+from hipsta_bids.group.data import Bool, Float, Int
 from hipsta_bids.group.settings import ClassificationSettings
 
 #: Largest sum of margins, per subject, that still counts as rounding of the linear program.
 _NO_MARGIN = 1e-7
-#: Where all fitted chances are farther from 0 and 1 than this, groups are not separated.
-_INSIDE = 1e-3
+#: Most steps of Newton's method, which takes some eight, and the length of the last; columns have
+#: a mean square of one.
+_NEWTON_STEPS, _SETTLED = 25, 1e-8
 #: Maximum likelihood has converged when coefficients of unit columns change by less.
 _CONVERGED = 1e-10
 #: Longest step of Firth's method, in standard deviations of a column, as in ``logistf``.
@@ -94,17 +95,49 @@ def fit_overlapping_or_firth(
     matrix: Float, case: Bool, settings: ClassificationSettings
 ) -> LogisticFit:
     """Fit by maximum likelihood if the groups overlap, else by Firth's method."""
-    fit = _fit_maximum(matrix, case, settings)
-    if fit is not None:
-        # A maximum inside proves overlap; only near the edge must the linear program decide.
-        chance = special.expit(matrix @ fit.coefficients)
-        if min(chance.min(), 1 - chance.max()) > _INSIDE:
-            return fit
-    if is_separated(matrix, case):
+    if not overlaps(matrix, case) and is_separated(matrix, case):
         return _fit_firth(matrix, case, settings)
-    if fit is None:
-        raise _no_convergence(settings.iterations)
-    return fit
+    return fit_logistic(matrix, case, settings, firth=False)
+
+
+def overlaps(matrix: Float, case: Bool) -> bool:
+    """Whether maximum likelihood converges, which it does not if the groups are separated.
+
+    Where it does not, :func:`is_separated` decides.
+    """
+    return bool(_maxima(_orthonormal(matrix), case, np.ones((1, len(case))))[1][0])
+
+
+def _orthonormal(matrix: Float) -> Float:
+    """Give an orthonormal basis of the columns, times the root of the number of rows."""
+    basis, size, _ = np.linalg.svd(matrix / _scales(matrix), full_matrices=False)
+    return np.asarray(basis[:, size > _RANK * size[0]] * np.sqrt(len(matrix)), dtype=np.float64)
+
+
+def _maxima(basis: Float, case: Bool, kept: Float) -> tuple[Float, Bool]:
+    """Maximize the likelihood in several sets of subjects at once, by Newton's method.
+
+    ``kept`` is (sets, subjects), 1 for members. Gives coefficients (sets, columns), and in which
+    sets the steps converged: with separated groups each step is about as long as the one before.
+    """
+    columns = basis.shape[1]
+    products = (basis[:, :, None] * basis[:, None, :]).reshape(len(basis), -1)
+    beta = np.zeros((len(kept), columns))
+    settled = np.zeros(len(kept), dtype=bool)
+    lost = np.zeros(len(kept), dtype=bool)
+    for _ in range(_NEWTON_STEPS):
+        chance = special.expit(beta @ basis.T)
+        information = ((kept * chance * (1 - chance)) @ products).reshape(-1, columns, columns)
+        size = np.linalg.eigvalsh(information)
+        lost |= ~(size[:, 0] > _RANK * size[:, -1])
+        information[lost] = np.eye(columns)
+        score = (kept * (case - chance)) @ basis
+        step = np.linalg.solve(information, score[:, :, None])[:, :, 0]
+        beta[~lost] += step[~lost]
+        settled = ~lost & (np.abs(step).max(axis=1) < _SETTLED)
+        if (settled | lost).all():
+            break
+    return beta, settled
 
 
 def _no_convergence(limit: int) -> ModelError:
@@ -311,7 +344,7 @@ def compare_models(
     """
     full = np.column_stack([base, added])
     _check(full, case)
-    separated = is_separated(full, case)
+    separated = not overlaps(full, case) and is_separated(full, case)
     whole = fit_logistic(full, case, settings, firth=separated)
     free = np.arange(full.shape[1]) < base.shape[1]
     if separated:
@@ -382,18 +415,37 @@ def _cross_validated(
     """Keep results: the base model is the same for each measure that is added."""
     matrix, case = np.frombuffer(values).reshape(-1, columns), np.frombuffer(cases, dtype=bool)
     folds = min(settings.folds, int(case.sum()), int((~case).sum()))
-    splits = RepeatedStratifiedKFold(
-        n_splits=folds, n_repeats=settings.repeats, random_state=settings.seed
-    )
-    total, areas = np.zeros(len(case)), []
-    with config_context(assume_finite=True, skip_parameter_validation=True):
-        for train, test in splits.split(matrix, case):
-            score = _predict(matrix[train], case[train], matrix[test], settings)
-            total[test] += score
-            areas.append(metrics.roc_auc_score(case[test], score))
-    means = np.reshape(areas, (settings.repeats, folds)).mean(axis=1)
-    spread = float(means.std(ddof=1)) if settings.repeats > 1 else float("nan")
-    return CrossValidation(float(means.mean()), spread, total / settings.repeats, folds)
+    basis = _orthonormal(matrix)
+    total, means = np.zeros(len(case)), []
+    for fold_of in _folds(cases, folds, settings.repeats, settings.seed):
+        train = fold_of != np.arange(folds)[:, None]
+        beta, settled = _maxima(basis, case, train.astype(np.float64))
+        score = np.einsum("sj,sj->s", basis, beta[fold_of])
+        for fold in np.flatnonzero(~settled):
+            test = ~train[fold]
+            score[test] = _predict(matrix[~test], case[~test], matrix[test], settings)
+        total += score
+        means.append(np.mean([_area(score[~own & case], score[~own & ~case]) for own in train]))
+    spread = float(np.std(means, ddof=1)) if settings.repeats > 1 else float("nan")
+    return CrossValidation(float(np.mean(means)), spread, total / settings.repeats, folds)
+
+
+@lru_cache(maxsize=16)
+def _folds(cases: bytes, folds: int, repeats: int, seed: int) -> Int:
+    """(repeats, subjects) fold of each subject, the same for all measures."""
+    case = np.frombuffer(cases, dtype=bool)
+    splits = RepeatedStratifiedKFold(n_splits=folds, n_repeats=repeats, random_state=seed)
+    numbers = np.empty((repeats, len(case)), dtype=np.int64)
+    for i, (_, test) in enumerate(splits.split(case, case)):
+        numbers[i // folds, test] = i % folds
+    return numbers
+
+
+def _area(cases: Float, controls: Float) -> float:
+    """Chance that a case scores higher than a control, ties counted half."""
+    ordered = np.sort(controls)
+    below = np.searchsorted(ordered, cases, "left") + np.searchsorted(ordered, cases, "right")
+    return float(below.mean()) / (2 * len(controls))
 
 
 def _predict(train: Float, case: Bool, test: Float, settings: ClassificationSettings) -> Float:

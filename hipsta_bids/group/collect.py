@@ -224,6 +224,8 @@ class Collection:
     versions: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     """What to know, one line each."""
+    warnings: tuple[str, ...] = ()
+    """What may make results wrong, one line each."""
 
 
 def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collection:
@@ -269,7 +271,24 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
             *notes,
             *lost_exclusions(request.exclude_table, unwanted, [place.name for place in everything]),
         ),
+        warnings=_several_versions(kept),
     )
+
+
+def _several_versions(kept: Sequence[SheetRecord]) -> tuple[str, ...]:
+    """Say which hemispheres another version has measured: versions may give other numbers."""
+    counts = Counter(record.version for record in kept)
+    if len(counts) < 2:  # noqa: PLR2004 -- one is as it should be
+        return ()
+    usual = counts.most_common(1)[0][0]
+    others = [record.place.name.stem for record in kept if record.version != usual]
+    more = f" and {len(others) - _SHOWN} more" if len(others) > _SHOWN else ""
+    found = ", ".join(f"{version} ({n})" for version, n in sorted(counts.items()))
+    text = (
+        f"hemispheres were measured by several versions, {found}; measure"
+        f" {', '.join(others[:_SHOWN])}{more} with {usual}: a version may change numbers"
+    )
+    return (text,)
 
 
 def wanted_by(request: GroupRequest) -> Callable[[str, str | None, str], bool]:

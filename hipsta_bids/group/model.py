@@ -3,7 +3,7 @@
 import difflib
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +14,19 @@ from formulaic import Formula
 from hipsta_bids.errors import ModelError, UsageError
 from hipsta_bids.group.comparison import Comparison
 from hipsta_bids.group.covariates import VisitTime
-from hipsta_bids.group.data import Float, Int
+from hipsta_bids.group.data import PARTICIPANT, SESSION, Float, Int
 from hipsta_bids.group.formula import (
     Contrast,
     ContrastSpec,
     ModelSpec,
+    as_factor,
     check_left,
     check_names,
+    check_spelling,
+    coding_note,
+    in_order,
     left_side,
+    level_name,
     listed,
     model_from_shortcut,
     parse_model,
@@ -66,13 +71,8 @@ def find_groups(
         values = typed(table[column], settings.design).dropna() if column else None
         if column is None or values is None or values.nunique() < 2:  # noqa: PLR2004 -- two groups
             continue
-        if pd.api.types.is_numeric_dtype(values):
-            raise ModelError(
-                f"model: column {column!r} holds numbers, which do not name groups; give names, or"
-                " a model by --formula",
-                reason="group-numeric",
-            )
-        counts = Counter(str(value) for value in values)
+        counts = Counter(level_name(value) for value in values)
+        check_spelling(counts, column)
         first = reference or _reference(counts, settings.model)
         if first not in counts:
             raise ModelError(
@@ -80,7 +80,8 @@ def find_groups(
                 f" {', '.join(sorted(counts))}",
                 reason="unknown-level",
             )
-        return Groups(column, (first, *sorted(level for level in counts if level != first)))
+        others = sorted((level for level in counts if level != first), key=in_order)
+        return Groups(column, (first, *others))
     return None
 
 
@@ -119,6 +120,13 @@ def default_contrasts(groups: Groups | None, time: str | None) -> list[str]:
         found.append(f"{time} in {level} = {time} + {slope}")
         found.append(f"{time} in {groups.reference}-{level} = -1*{slope}")
     return found
+
+
+def empty_covariates(table: pd.DataFrame, settings: GroupSettings) -> list[str]:
+    """Name covariates of the default model whose column holds nothing."""
+    wanted = {name.casefold() for name in settings.model.covariates}
+    named = [str(name) for name in table.columns if str(name).casefold() in wanted]
+    return [name for name in named if typed(table[name], settings.design).isna().all()]
 
 
 def _varying(table: pd.DataFrame, names: Sequence[str], settings: GroupSettings) -> list[str]:
@@ -193,10 +201,11 @@ def model_document(
     comparison = comparison or Comparison()
     within = comparison.longitudinal or comparison.pair or comparison.asymmetry
     if groups is None and not within:
+        own = [str(name) for name in table.columns if name not in {PARTICIPANT, SESSION}]
+        there = f"there are {listed(own)}" if own else "BIDS_DIR has no participants.tsv"
         raise ModelError(
-            "participants.tsv has no column that tells groups"
-            f" ({', '.join(settings.model.group_columns)}) with two levels; give a model by"
-            ' --formula "age + sex" --contrast age',
+            f"no column tells groups ({', '.join(settings.model.group_columns)}) with two levels;"
+            f' {there}; or give a model by --formula "age + sex" --contrast age',
             reason="no-groups",
         )
     time = visits.column if visits else None
@@ -234,6 +243,8 @@ class Design:
     references: Mapping[str, str]
     """Reference level of each factor."""
     contrasts: tuple[Contrast, ...]
+    notes: Mapping[str, str] = field(default_factory=dict)
+    """What to know about the coding of variables, by their names."""
 
 
 def build_design(
@@ -246,11 +257,14 @@ def build_design(
     check_names(names, table.columns)
     used = table[names].copy()
     for name in names:
-        used[name] = typed(used[name], settings)
+        column = as_factor(used[name]) if name in closed.factors else used[name]
+        used[name] = typed(column, settings)
     complete = used.notna().all(axis=1).to_numpy()
     dropped = rows_by_lack(used, complete)
     used = used.loc[complete].copy()
     check_left(used, dropped)
+    numeric = used.select_dtypes("number")
+    notes = {name: coding_note(numeric[name], settings) for name in map(str, numeric.columns)}
     chosen = set_levels(used, references, settings)
     try:
         made = formula.get_model_matrix(used, na_action="raise", context=dict(CONTEXT))
@@ -270,6 +284,7 @@ def build_design(
         dropped=dropped,
         references={name: levels[0] for name, levels in chosen.items()},
         contrasts=tuple(terms.contrast(spec) for spec in specs),
+        notes={name: note for name, note in notes.items() if note},
     )
 
 

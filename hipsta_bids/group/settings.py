@@ -3,7 +3,14 @@
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import (
+    Field,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    Strict,
+)
 
 from hipsta_bids.protocols.toml import (
     Fraction,
@@ -14,6 +21,8 @@ from hipsta_bids.protocols.toml import (
     read_settings,
 )
 
+#: Numbers of either sign; TOML has lists.
+Codes = Annotated[tuple[float, ...], Strict(strict=False)]
 Splines = Annotated[int, Field(ge=4)]
 AtLeastTwo = Annotated[int, Field(ge=2)]
 #: How to allow for many tests, as the command line spells it.
@@ -85,6 +94,28 @@ class DesignSettings(SettingsTable):
     """A column is a combination of others if less than this fraction of its length is its own."""
     numeric_share: Fraction = 0.5
     """A column with text is taken for a damaged number if more of it than this is numbers."""
+    factors: Texts = (
+        *("group", "diagnosis", "dx", "diagnostic_group", "arm", "cohort", "study"),
+        *("sex", "gender", "ethnicity", "race"),
+        *("site", "site_id", "scanner", "scanner_id", "center", "center_id", "centre", "vendor"),
+    )
+    """Columns whose values are names, in any case of letters, even if they are written as numbers;
+    others are if the ``Levels`` of the table's sidecar have all their values."""
+    few_values: NonNegativeInt = 5
+    """A note names other columns of three to this many different numbers, fitted as a line."""
+    missing_codes: Codes = (
+        *(-9.0, -99.0, -999.0, -9999.0, -99999.0),
+        *(99.0, 999.0, 9999.0, 99999.0, 777.0, 7777.0, 888.0, 8888.0),
+    )
+    """Numbers that often stand for missing ones; refused where they are farther from all other
+    values than these are from each other."""
+    largest_thickness: PositiveFloat = 20.0
+    """Hemispheres with a thickness beyond this (mm), or below zero, are left out: no wall of a
+    hippocampus is a third as thick, so that the file is damaged."""
+    largest_curvature: PositiveFloat = 100.0
+    """Likewise mean curvature, 1/mm, of either sign."""
+    farthest: PositiveFloat = 1e4
+    """Numbers farther than this from the median, in ranges between quartiles, are refused."""
 
 
 class DefaultModelSettings(SettingsTable):

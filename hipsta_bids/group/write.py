@@ -3,6 +3,7 @@
 import contextlib
 import os
 import shutil
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -37,6 +38,13 @@ GROUP_FOLDER = DATASET_FILES["group"]
 SHEET = "sheet"
 #: Values per row group of maps, and participants per row group of scores; bounds the memory.
 _BLOCK, _ROWS_OF_SCORES = 500_000, 500
+
+#: First character of the blocks of Chinese, Japanese and Korean, and usual fonts with these.
+_FIRST_CJK = "\u2e80"
+_CJK_FONTS = (
+    *("Noto Sans CJK SC", "Noto Sans CJK JP", "Noto Sans CJK KR", "Source Han Sans SC"),
+    *("WenQuanYi Zen Hei", "Microsoft YaHei", "PingFang SC", "Hiragino Sans", "Malgun Gothic"),
+)
 
 _WORD = pa.dictionary(pa.int32(), pa.string())
 _SUFFIXES = {"": "as measured", "_registered": "after registration"}
@@ -123,11 +131,37 @@ def draw(
     shapes: Mapping[str, AverageShape],
     *,
     others: Mapping[str, tuple[Cohort, Analysis]],
-) -> None:
-    """Draw the figures."""
-    for one in ((cohort, analysis, shapes), *((*one, {}) for one in others.values())):
-        for name, content in draw_figures(*one):
-            files.write_bytes(folder / "figures" / name, content)
+) -> tuple[str, ...]:
+    """Draw the figures, and note if fonts lack characters of names."""
+    levels = analysis.groups.levels if analysis.groups else ()
+    with _fonts_for("".join(levels)), warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for one in ((cohort, analysis, shapes), *((*one, {}) for one in others.values())):
+            for name, content in draw_figures(*one):
+                files.write_bytes(folder / "figures" / name, content)
+    lacking = [warned for warned in caught if str(warned.message).startswith("Glyph ")]
+    for warned in caught:
+        if warned not in lacking:
+            warnings.warn_explicit(warned.message, warned.category, warned.filename, warned.lineno)
+    note = (
+        "figures: no font here has all characters of the names, which PNG files show as boxes; the"
+        " page and SVG files show them; install a font that has them, as Noto Sans CJK"
+    )
+    return (note,) if lacking else ()
+
+
+@contextlib.contextmanager
+def _fonts_for(text: str) -> Iterator[None]:
+    """Let matplotlib look for Chinese, Japanese and Korean characters in fonts that have them."""
+    if max(text, default="") < _FIRST_CJK:
+        yield
+        return
+    from matplotlib import font_manager, rc_context  # noqa: PLC0415  (optional, slow to load)
+
+    there = set(font_manager.get_font_names())
+    own = [name for name in _CJK_FONTS if name in there]
+    with rc_context({"font.family": ["DejaVu Sans", *own]}):
+        yield
 
 
 def _write_table(folder: Path, name: str, table: pd.DataFrame, *, described: bool = True) -> None:
