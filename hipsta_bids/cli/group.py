@@ -140,6 +140,13 @@ def _add_model(parser: Parser) -> None:
         "TEXT...",
         'such as "group[CU]-group[DAT]"; rows of an F test are separated by commas',
     )
+    add(
+        "--age-model",
+        "",
+        "how age stands in the default model (default: linear); quadratic and spline (natural,"
+        " cubic) come with a test for nonlinearity",
+        choices=["linear", "quadratic", "spline"],
+    )
     add("--reference", "FACTOR=LEVEL...", "reference levels", type=factor_level)
     add(
         "--measures",
@@ -156,11 +163,11 @@ def _add_comparison(parser: Parser) -> None:
     add(
         "--longitudinal",
         "",
-        "all sessions, by a mixed model in which participants have an intercept (default) or"
-        " also a slope of their own",
+        "all sessions, by a mixed model in which participants have an intercept or also a slope of"
+        " their own (default: auto, slopes where 10 participants have three visits)",
         nargs="?",
-        const="intercept",
-        choices=["intercept", "slope"],
+        const="auto",
+        choices=["auto", "intercept", "slope"],
     )
     add("--paired", "SES1 SES2", "the second session minus the first", type=bids_label("ses-"))
     add("--asymmetry", "", "also maps of left minus right")
@@ -259,6 +266,12 @@ def run_group_level(arguments: Sequence[str]) -> ExitCode:
     parsed = group_parser().parse_args(arguments)
     if parsed.model is not None and (parsed.formula or parsed.contrast):
         raise UsageError("give --model, or --formula and --contrast", reason="usage")
+    if parsed.age_model is not None and (parsed.model or parsed.formula):
+        raise UsageError(
+            "--age-model is of the default model; write poly(age, 2) in the formula, and --contrast"
+            ' "nonlinear(age)"',
+            reason="usage",
+        )
     if parsed.reports_only:
         return _rebuild_reports(parsed.output_dir, parsed.name)
     # Thousands of tiny fits: threads of the linear algebra would only get in each other's way.
@@ -319,6 +332,7 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
             "permutations": parsed.permutations,
             "blocks": parsed.blocks,
         },
+        "model": {"age": parsed.age_model},
         "longitudinal": {"random": parsed.longitudinal},
         "glm": {"weights": parsed.weights},
         "classification": {

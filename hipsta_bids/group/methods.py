@@ -8,7 +8,7 @@ import numpy as np
 from hipsta_bids import __version__
 from hipsta_bids.group.analysis import Analysis
 from hipsta_bids.group.data import PARTICIPANT, Cohort
-from hipsta_bids.group.inference import PERMUTATIONS
+from hipsta_bids.group.inference import PERMUTATIONS, control_fdr
 from hipsta_bids.group.normative import Scores
 from hipsta_bids.group.settings import GroupSettings, MultiplicitySettings
 
@@ -181,7 +181,8 @@ def _models(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], s
         first, second = analysis.comparison.pair
         what = f" to the change from {first} to {second}, with the covariates of {first}"
     if analysis.comparison.longitudinal:
-        own = "intercepts and slopes" if settings.longitudinal.random == "slope" else "intercepts"
+        slopes = getattr(analysis.row_model, "times", None) is not None
+        own = "intercepts and slopes" if slopes else "intercepts"
         kind = f"linear mixed model with {own} of participants"
         errors = (
             " by restricted maximum likelihood, with Satterthwaite's degrees of freedom"
@@ -194,7 +195,26 @@ def _models(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], s
         f" {_correction(settings.multiplicity, cite)} Effect sizes are"
         f" Cohen's d ({d}) or partial eta squared, with"
         f" {settings.glm.confidence:.0%} confidence limits from non-central distributions. Summary"
-        " measures were tested in the same model, volumes also with intracranial volume."
+        " measures were tested in the same model, volumes also with intracranial volume; their"
+        " false discovery rate was held over all measures, sides and models of a contrast."
+        f"{_nonlinear(analysis, settings)}"
+    )
+
+
+def _nonlinear(analysis: Analysis, settings: GroupSettings) -> str:
+    """Say how age was modeled, and in how many summary measures it bends."""
+    names = [one.name for one in analysis.design.contrasts if one.name.endswith(" nonlinear")]
+    if not names or settings.model.age == "linear":
+        return ""
+    how = "its square" if settings.model.age == "quadratic" else "a natural cubic spline"
+    p = [
+        test.p for one in analysis.measures for test in one.fit.tests if test.contrast.name in names
+    ]
+    found = control_fdr(np.concatenate(p or [np.empty(0)]), settings.multiplicity.alpha)
+    return (
+        f" Age was in the model with {how}; the contrast {names[0]} tests whether that differs from"
+        f" a line, as it did in {int(found.rejected.sum())} of {found.n_tests} tests of summary"
+        " measures (false discovery rate)."
     )
 
 

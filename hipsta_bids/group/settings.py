@@ -97,7 +97,7 @@ class DesignSettings(SettingsTable):
     factors: Texts = (
         *("group", "diagnosis", "dx", "diagnostic_group", "arm", "cohort", "study"),
         *("sex", "gender", "ethnicity", "race"),
-        *("site", "site_id", "scanner", "scanner_id", "center", "center_id", "centre", "vendor"),
+        *("site", "site_id", "scanner", "scanner_id", "center", "center_id", "vendor"),
     )
     """Columns whose values are names, in any case of letters, even if they are written as numbers;
     others are if the ``Levels`` of the table's sidecar have all their values."""
@@ -110,8 +110,8 @@ class DesignSettings(SettingsTable):
     """Numbers that often stand for missing ones; refused where they are farther from all other
     values than these are from each other."""
     largest_thickness: PositiveFloat = 20.0
-    """Hemispheres with a thickness beyond this (mm), or below zero, are left out: no wall of a
-    hippocampus is a third as thick, so that the file is damaged."""
+    """Hemispheres with a thickness beyond this, mm, are left out: no wall of a hippocampus is a
+    third as thick, so that the file is damaged."""
     largest_curvature: PositiveFloat = 100.0
     """Likewise mean curvature, 1/mm, of either sign."""
     farthest: PositiveFloat = 1e4
@@ -128,6 +128,9 @@ class DefaultModelSettings(SettingsTable):
     groups; else the most frequent one is."""
     covariates: Texts = ("age", "sex", "site")
     """Further columns of the model, where the table has them and they vary."""
+    age: Literal["linear", "quadratic", "spline"] = "linear"
+    """How age stands in the model: as a line, with its square, or as a natural cubic spline of
+    three columns."""
     icv_columns: Texts = ("icv", "etiv", "tiv", "intracranial_volume")
     """The first of these columns is the covariate of volumes; else what FreeSurfer or ASHS
     estimated."""
@@ -161,8 +164,12 @@ class GlmSettings(SettingsTable):
 class LongitudinalSettings(SettingsTable):
     """Repeated sessions of the same participants."""
 
-    random: Literal["intercept", "slope"] = "intercept"
-    """What participants have of their own: an ``intercept``, or also a ``slope`` over time."""
+    random: Literal["auto", "intercept", "slope"] = "auto"
+    """What participants have of their own: an ``intercept``, or also a ``slope`` over time;
+    ``auto`` takes slopes where ``slope_participants`` have three visits. Without them tests of
+    changes take differences between participants for noise, and find too much."""
+    slope_participants: PositiveInt = 10
+    """Participants with three visits or more that ``auto`` wants for slopes."""
     time_columns: Texts = ("time", "years", "months", "days")
     """The first of these columns, in any case, that varies between sessions is the time; else it
     is made, in years since the first session, from ``acq_time`` or age."""

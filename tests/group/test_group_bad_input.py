@@ -325,7 +325,7 @@ def test_damaged_hemispheres_are_left_out_by_name_and_other_versions_told(study,
     assert main([str(study.data), str(study.out), "group", *FAST]) == 0
     said = capsys.readouterr()
     assert "29 participants in the model, 3 left out" in said.out
-    assert "sub-05, hemisphere L, is left out: thickness goes from" in said.out
+    assert "sub-05, hemisphere L, is left out: thickness reaches 1e+30 mm" in said.out
     assert "sub-06, hemisphere R, is left out: 100% of the curvature profile" in said.out
     assert said.err.startswith("warning: hemispheres were measured by several versions, 0.0.9 (1),")
     assert "measure sub-07_hemi-R with 0.1.0" in said.err
