@@ -66,7 +66,9 @@ class SideMaps:
         return replace(own, rows=(np.cumsum(keep) - 1)[own.rows])
 
     def sheets(self, own: NDArray[np.bool_]) -> "SideMaps":
-        """Keep some sheets."""
+        """Keep some sheets; of all, no copy is made."""
+        if own.all():
+            return self
         return replace(
             self,
             rows=self.rows[own],

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 import pandas as pd
@@ -388,7 +387,11 @@ class RepeatedRows(RowModel):
     """(rows,)"""
     times: Float | None
     """(rows,) of each visit, for random slopes; else random intercepts."""
-    independent: ClassVar[bool] = False
+
+    @property
+    def people(self) -> Int | None:
+        """(rows,) number of each row's participant."""
+        return np.asarray(np.unique(self.participants, return_inverse=True)[1], dtype=np.int64)
 
     def fit(
         self, values: Float, rows: Int, contrasts: tuple[Contrast, ...], settings: GroupSettings
