@@ -34,6 +34,11 @@ _LONGEST_STEP = 5.0
 _SHARE = 0.1
 #: Log likelihoods differ by rounding by no more than this, relatively.
 _ROUNDING = 1e-12
+#: Steps of Firth's method by the information, before those of Newton's method.
+_FISHER_STEPS = 20
+#: Step of derivatives, least curvature and flattest direction of Firth's method, where one is that
+#: of the information.
+_DIFFERENCE, _LEAST_BEND, _FLATTEST = 1e-4, 1e-3, 1e-12
 #: Halvings of a step that does not gain.
 _HALVINGS = 30
 #: Directions of a training set with less than this share of the largest are no columns.
@@ -188,8 +193,9 @@ def _fit_firth(
     kept = np.ones(matrix.shape[1], dtype=bool) if free is None else free
     beta = np.zeros(matrix.shape[1])
     value = _penalized(scaled, case, beta)
-    for _ in range(settings.firth_iterations):
-        step, promised = _firth_step(scaled, case, beta, kept)
+    for number in range(settings.firth_iterations):
+        bent = number >= _FISHER_STEPS
+        step, promised = _firth_step(scaled, case, beta, kept, bent=bent)
         for halving in range(_HALVINGS):
             new = _penalized(scaled, case, beta + step)
             least = _SHARE * promised / 2**halving - _ROUNDING * (1 + abs(value))
@@ -224,17 +230,47 @@ def _penalized(matrix: Float, case: Bool, beta: Float) -> float:
     return float(special.log_expit(margin).sum()) + penalty
 
 
-def _firth_step(matrix: Float, case: Bool, beta: Float, kept: Bool) -> tuple[Float, float]:
-    """Newton's next step, and the gain that the slope promises."""
+def _firth_step(
+    matrix: Float, case: Bool, beta: Float, kept: Bool, *, bent: bool
+) -> tuple[Float, float]:
+    """Next step by the information, or by Newton's method, and the gain that the slope promises.
+
+    The penalty bends as much as the likelihood where groups are far apart, so that steps by the
+    information alone may take thousands. For Newton's, the slope is differentiated along directions
+    in which the information is one.
+    """
+    size, axes = np.linalg.eigh(_information(matrix, beta)[np.ix_(kept, kept)])
+    directions = np.zeros((len(beta), len(size)))
+    directions[kept] = axes / np.sqrt(np.maximum(size, _FLATTEST * size[-1]))
+    gradient = directions.T @ _firth_score(matrix, case, beta)
+    if not bent:
+        step = directions @ gradient
+        share = min(1.0, _LONGEST_STEP / max(float(np.abs(step).max()), 1e-300))
+        return step * share, float(gradient @ gradient) * share
+    changes = [
+        directions.T
+        @ (
+            _firth_score(matrix, case, beta + _DIFFERENCE * one)
+            - _firth_score(matrix, case, beta - _DIFFERENCE * one)
+        )
+        for one in directions.T
+    ]
+    bend = -np.array(changes) / (2 * _DIFFERENCE)
+    curvature, turned = np.linalg.eigh((bend + bend.T) / 2)
+    along = (turned.T @ gradient) / np.maximum(np.abs(curvature), _LEAST_BEND)
+    shortened = turned @ along
+    step = directions @ shortened
+    share = min(1.0, _LONGEST_STEP / max(float(np.abs(step).max()), 1e-300))
+    return step * share, float(gradient @ shortened) * share
+
+
+def _firth_score(matrix: Float, case: Bool, beta: Float) -> Float:
+    """Slope of the penalized log likelihood."""
     chance = special.expit(matrix @ beta)
     information = _information(matrix, beta)
-    leverage = np.sum(matrix @ np.linalg.pinv(information) * matrix, axis=1)
+    leverage = np.sum(matrix @ np.linalg.pinv(information, hermitian=True) * matrix, axis=1)
     residual = case - chance + chance * (1 - chance) * leverage * (0.5 - chance)
-    score = (matrix.T @ residual)[kept]
-    step = np.zeros(len(beta))
-    step[kept] = np.linalg.pinv(information[np.ix_(kept, kept)], hermitian=True) @ score
-    step *= min(1.0, _LONGEST_STEP / max(float(np.abs(step).max()), 1e-300))
-    return step, float(score @ step[kept])
+    return np.asarray(matrix.T @ residual, dtype=np.float64)
 
 
 @dataclass(frozen=True)
