@@ -14,11 +14,9 @@ from hipsta_bids.group.classify import (
     compare_pairs,
     cross_validate,
     delong,
-    fit_logistic,
-    fit_overlapping_or_firth,
-    is_separated,
     roc_curve,
 )
+from hipsta_bids.group.logistic import fit_logistic, fit_overlapping_or_firth, is_separated
 from hipsta_bids.group.settings import ClassificationSettings
 
 SETTINGS = ClassificationSettings(repeats=2, folds=5)
