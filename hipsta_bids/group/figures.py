@@ -38,7 +38,18 @@ if TYPE_CHECKING:
 _STYLE: Any = {
     "font.family": "sans-serif",
     # The first is everywhere; the others are for readers of drawings who lack it.
-    "font.sans-serif": ["DejaVu Sans", "Verdana", "Arial", "Helvetica"],
+    # Chinese, Japanese and Korean characters come from the first of these that is installed.
+    "font.sans-serif": [
+        "DejaVu Sans",
+        "Verdana",
+        "Arial",
+        "Helvetica",
+        "Noto Sans CJK SC",
+        "Source Han Sans SC",
+        "Microsoft YaHei",
+        "PingFang SC",
+        "Malgun Gothic",
+    ],
     "font.size": SMALL,
     "axes.titlesize": TITLE,
     "axes.labelsize": SMALL,

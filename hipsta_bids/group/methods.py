@@ -8,7 +8,7 @@ import numpy as np
 from hipsta_bids import __version__
 from hipsta_bids.group.analysis import Analysis
 from hipsta_bids.group.data import PARTICIPANT, Cohort
-from hipsta_bids.group.inference import PERMUTATIONS
+from hipsta_bids.group.inference import PERMUTATIONS, control_fdr
 from hipsta_bids.group.normative import Scores
 from hipsta_bids.group.settings import GroupSettings, MultiplicitySettings
 
@@ -31,6 +31,8 @@ REFERENCES: Mapping[str, str] = {
     "permutation": "Winkler AM, Ridgway GR, Webster MA, Smith SM, Nichols TE. Permutation inference"
     " for the general linear model. NeuroImage 2014;92:381-397."
     " doi:10.1016/j.neuroimage.2014.01.060",
+    "repeated": "Winkler AM, Webster MA, Vidaurre D, Nichols TE, Smith SM. Multi-level block"
+    " permutation. NeuroImage 2015;123:253-268. doi:10.1016/j.neuroimage.2015.05.092",
     "tfce": "Smith SM, Nichols TE. Threshold-free cluster enhancement: addressing problems of"
     " smoothing, threshold dependence and localisation in cluster inference. NeuroImage"
     " 2009;44(1):83-98. doi:10.1016/j.neuroimage.2008.03.061",
@@ -206,24 +208,46 @@ def _models(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], s
         first, second = analysis.comparison.pair
         what = f" to the change from {first} to {second}, with the covariates of {first}"
     if analysis.comparison.longitudinal:
-        own = "intercepts and slopes" if settings.longitudinal.random == "slope" else "intercepts"
+        slopes = getattr(analysis.row_model, "times", None) is not None
+        own = "intercepts and slopes" if slopes else "intercepts"
         kind = f"linear mixed model with {own} of participants"
         errors = (
             " by restricted maximum likelihood, with Satterthwaite's degrees of freedom"
             f" {cite('mixed')}"
         )
         d = "estimate over the standard deviation of single visits"
+    repeated = analysis.comparison.longitudinal
+    corrected = _correction(settings.multiplicity, cite, repeated=repeated)
     return (
         f"At each point of the sheet a {kind} `{analysis.model.formula}` was fitted{what}{errors}"
         f" (reference levels: {levels or 'none'}); contrasts: {names}."
-        f" {_correction(settings.multiplicity, cite)} Effect sizes are"
+        f" {corrected} Effect sizes are"
         f" Cohen's d ({d}) or partial eta squared, with"
         f" {settings.glm.confidence:.0%} confidence limits from non-central distributions. Summary"
-        " measures were tested in the same model, volumes also with intracranial volume."
+        " measures were tested in the same model, volumes also with intracranial volume; their"
+        " false discovery rate was held over all measures, sides and models of a contrast."
+        f"{_nonlinear(analysis, settings)}"
     )
 
 
-def _correction(how: MultiplicitySettings, cite: Callable[[str], str]) -> str:
+def _nonlinear(analysis: Analysis, settings: GroupSettings) -> str:
+    """Say how age was modeled, and in how many summary measures it bends."""
+    names = [one.name for one in analysis.design.contrasts if one.name.endswith(" nonlinear")]
+    if not names or settings.model.age == "linear":
+        return ""
+    how = "its square" if settings.model.age == "quadratic" else "a natural cubic spline"
+    p = [
+        test.p for one in analysis.measures for test in one.fit.tests if test.contrast.name in names
+    ]
+    found = control_fdr(np.concatenate(p or [np.empty(0)]), settings.multiplicity.alpha)
+    return (
+        f" Age was in the model with {how}; the contrast {names[0]} tests whether that differs from"
+        f" a line, as it did in {int(found.rejected.sum())} of {found.n_tests} tests of summary"
+        " measures (false discovery rate)."
+    )
+
+
+def _correction(how: MultiplicitySettings, cite: Callable[[str], str], *, repeated: bool) -> str:
     family = "each map" if how.scope == "map" else "both hemispheres together"
     if how.method in PERMUTATIONS:
         statistic = "the largest absolute statistic"
@@ -233,10 +257,18 @@ def _correction(how: MultiplicitySettings, cite: Callable[[str], str]) -> str:
                 f" {how.tfce_extent:g}, height {how.tfce_height:g})"
             )
         inside = f" within levels of {how.blocks}" if how.blocks else ""
+        shuffled = (
+            "the residuals of the model without the contrast (Freedman and Lane's; of signs, where"
+            " a mean was tested"
+        )
+        if repeated:
+            shuffled = (
+                "the signs of each participant's residuals, of all visits together, of the linear"
+                f" model without the contrast {cite('repeated')} ("
+            )
         return (
             f"The family-wise error rate was held at {how.alpha:g} by {statistic} in"
-            f" {how.permutations} permutations{inside} of the residuals of the model without the"
-            " contrast (Freedman and Lane's; of signs, where a mean was tested; seed"
+            f" {how.permutations} permutations{inside} of {shuffled}{'' if repeated else '; '}seed"
             f" {how.seed}) {cite('permutation')}, for {family}."
         )
     kind = (

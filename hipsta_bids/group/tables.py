@@ -18,9 +18,10 @@ from hipsta_bids.group.analysis import (
 from hipsta_bids.group.classify import ClassifierResult, roc_curve
 from hipsta_bids.group.clusters import edges_of, frame_of, peak_table
 from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort
+from hipsta_bids.group.inference import control_fdr
 from hipsta_bids.group.registration import ShiftDifference
 from hipsta_bids.group.settings import GroupSettings
-from hipsta_bids.group.summaries import hemispheres, summary_values
+from hipsta_bids.group.summaries import hemispheres, participants_with, summary_values
 
 Named = tuple[str, pd.DataFrame]
 """File name without extension, and table."""
@@ -44,7 +45,8 @@ COLUMNS: Mapping[str, str] = {
     "node_x": "node along x, 1 is most medial; coordinates are registered",
     "node_y": "node along y, 1 is most posterior",
     "subfield": "subfield, most frequent after registration",
-    "n": "participants with a value",
+    "n": "participants with a value; in maps of statistics, with --longitudinal, visits",
+    "visits": "visits with a value, as many as participants unless --longitudinal",
     "n_cases": "of these, in the second group",
     "n_incomplete": "participants of the two groups that lack a value",
     "estimate": "contrast of the model's coefficients, unit of the measure; n/a for F",
@@ -53,6 +55,8 @@ COLUMNS: Mapping[str, str] = {
     "df": "degrees of freedom; of F, the denominator's",
     "p": "two-sided p-value, not corrected",
     "p_corrected": "p-value corrected for the number of points, by the method of analysis.json",
+    "p_fdr": "p-value with the false discovery rate held over all tests of the contrast in the"
+    " table: all measures, sides and models",
     "significant": "true where the corrected p-value is at most the level",
     "effect": "kind of effect size",
     "effect_size": "Cohen's d (estimate over residual SD), or partial eta squared",
@@ -139,7 +143,7 @@ def result_tables(cohort: Cohort, analysis: Analysis, settings: GroupSettings) -
     if analysis.sides:
         yield from _registration_tables(cohort, analysis)
     if analysis.measures:
-        yield "measures", _stacked(_measures(cohort, analysis))
+        yield "measures", _with_fdr(_stacked(_measures(cohort, analysis)), settings)
         if grouped:
             yield "descriptives", _stacked(_descriptives(analysis))
     if analysis.scores is not None and len(analysis.scores.table):
@@ -235,7 +239,9 @@ def _means(cohort: Cohort, analysis: Analysis) -> Iterator[Columns]:
     """Means and standard deviations of groups at each point of the maps that were fitted."""
     for hemi, one in analysis.fitted.items():
         frame = frame_of(cohort, one)
-        members = members_of(analysis, rows_of(analysis, one))
+        rows = rows_of(analysis, one)
+        people = rows[PARTICIPANT].to_numpy()
+        members = members_of(analysis, rows)
         for measure in one.fits:
             values = one.values(measure)
             for group, own in members.items():
@@ -246,7 +252,7 @@ def _means(cohort: Cohort, analysis: Analysis) -> Iterator[Columns]:
                     "group": group,
                     **frame.number,
                     **frame.position,
-                    "n": np.isfinite(values[own]).sum(axis=0),
+                    "n": participants_with(values[own], people[own]),
                     "mean": mean_of_known(values[own], 0),
                     "sd": spread_of_known(values[own]),
                 }
@@ -304,12 +310,14 @@ def _measures(cohort: Cohort, analysis: Analysis) -> Iterator[Columns]:
                 "model": one.formula,
                 "contrast": test.contrast.name,
                 "test": test.kind,
-                "n": one.fit.n,
+                "n": one.participants,
+                "visits": one.fit.n,
                 "estimate": test.estimate[0] if single else np.nan,
                 "se": test.se[0] if single else np.nan,
                 "statistic": test.statistic,
                 "df": test.df,
                 "p": test.p,
+                "p_fdr": np.nan,
                 "effect": "cohen_d" if single else "partial_eta_squared",
                 "effect_size": test.effect,
                 "effect_low": limits[0],
@@ -317,12 +325,25 @@ def _measures(cohort: Cohort, analysis: Analysis) -> Iterator[Columns]:
             }
 
 
+def _with_fdr(table: pd.DataFrame, settings: GroupSettings) -> pd.DataFrame:
+    """Correct the tests of one contrast for the number of measures, sides and models."""
+    how = settings.multiplicity
+    method = "bh" if how.method == "bh" else "fdr2"
+    for _, rows in table.groupby("contrast", sort=False):
+        found = control_fdr(rows["p"].to_numpy(dtype=np.float64), how.alpha, method)
+        table.loc[rows.index, "p_fdr"] = found.adjusted
+    return table
+
+
 def _descriptives(analysis: Analysis) -> Iterator[Columns]:
+    """Describe the first visit of each participant in the model."""
     cohort = analysis.compared
-    members = members_of(analysis, cohort.table.iloc[analysis.design.rows])
+    in_model = analysis.design.rows
+    first = in_model[~cohort.table[PARTICIPANT].iloc[in_model].duplicated().to_numpy()]
+    members = members_of(analysis, cohort.table.iloc[first])
     for hemi in hemispheres(cohort):
         values = summary_values(cohort, hemi, analysis.measured.summaries)
-        values = values.iloc[analysis.design.rows]
+        values = values.iloc[first]
         for group, rows in members.items():
             own = values[rows]
             yield {

@@ -73,7 +73,8 @@ def _what(comparison: Mapping[str, Any]) -> str:
     """Describe what a row of the model is."""
     if comparison.get("longitudinal"):
         return (
-            "A row is a visit; a mixed model gives each participant an intercept, or a slope too."
+            "A row is a visit; a mixed model gives each participant an intercept, or a slope too"
+            " (see the methods paragraph)."
         )
     if comparison.get("pair"):
         first, second = comparison["pair"]

@@ -231,7 +231,7 @@ def test_effects_of_two_models_name_their_model(copy):
     path = copy / "group" / MODEL / "measures.tsv"
     models = ["a + b", "a + b + icv"]
     change_table(path, "model", lambda content: [models[n % 2] for n in range(len(content))])
-    change_table(path, "p", lambda content: ["0.01"] * len(content))
+    change_table(path, "p_fdr", lambda content: ["0.01"] * len(content))
     text = group_page(copy / "group" / MODEL)
     found = re.findall(r"<li>[^<]*, model (a \+ b[^:]*): [^<]*</li>", text)
     assert set(found) == set(models)
