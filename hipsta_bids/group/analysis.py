@@ -21,6 +21,12 @@ from hipsta_bids.group.data import PARTICIPANT, Cohort, Float, Measures, SideMap
 from hipsta_bids.group.formula import ModelSpec
 from hipsta_bids.group.glm import FittedMaps, PointTest, RowModel, fit_maps, with_mean
 from hipsta_bids.group.grammar import closed_formula
+from hipsta_bids.group.harmonize import (
+    Harmonization,
+    check_in_model,
+    harmonize_cohort,
+    plan_sites,
+)
 from hipsta_bids.group.inference import (
     PERMUTATIONS,
     Discoveries,
@@ -40,6 +46,7 @@ from hipsta_bids.group.registration import (
     shift_by_group,
 )
 from hipsta_bids.group.settings import GroupSettings
+from hipsta_bids.group.site_effects import SavedEffects
 from hipsta_bids.group.summaries import MeasureFit, classify_groups, fit_summaries
 from hipsta_bids.group.warps import Template, warp_labels, warp_values
 
@@ -70,6 +77,8 @@ class Analysis:
     groups: Groups | None
     sides: Mapping[str, SideResult]
     """Registered sheets by hemisphere."""
+    harmonization: Harmonization | None
+    """Effects of sites that were taken out after registration, if this was asked for."""
     measured: Measures
     """What the model was fitted to."""
     compared: Cohort
@@ -105,6 +114,7 @@ def analyze_cohort(
     time: str | None = None,
     icv: str | None = None,
     templates: Mapping[str, Template] | None = None,
+    site_effects: SavedEffects | None = None,
 ) -> Analysis:
     """Register, fit a model at each point and to each summary measure, and classify.
 
@@ -130,6 +140,8 @@ def analyze_cohort(
         Column of intracranial volume, for volumes.
     templates : mapping of str to Template, optional
         By hemisphere; else they are made from this cohort.
+    site_effects : SavedEffects, optional
+        Parameters of harmonization of another cohort.
 
     Raises
     ------
@@ -139,7 +151,18 @@ def analyze_cohort(
     comparison = comparison or Comparison()
     references = _references(model, groups, references)
     table = modeled_table(cohort.table, comparison)
+    plan = plan_sites(
+        cohort,
+        model,
+        settings,
+        references=references,
+        comparison=comparison,
+        icv=icv,
+        saved=site_effects,
+    )
     design = build_design(table, model, settings.design, references)
+    if plan is not None:
+        check_in_model(plan, design, comparison)
     if comparison.pair or not design.contrasts:
         design = replace(design, contrasts=with_mean(design))
 
@@ -154,7 +177,12 @@ def analyze_cohort(
         for hemi in (cohort.sides if measures.maps else ())
     }
     registered = {hemi: side.registered for hemi, side in sides.items()} or cohort.sides
-    compared = compare_sessions(replace(cohort, sides=registered), comparison)
+    measured = replace(cohort, sides=registered)
+    done = None
+    if plan is not None:
+        how = {hemi: side.registration for hemi, side in sides.items()}
+        done = harmonize_cohort(measured, plan, settings, measures, how)
+    compared = compare_sessions(measured if done is None else done.cohort, comparison)
     fitted = _fit_sides(compared, measures.maps, rows, comparison, settings)
     found = correct(fitted, rows, table, settings)
     scores = None
@@ -177,7 +205,10 @@ def analyze_cohort(
         icv=icv,
         rows_of=rows_of,
     )
-    once = compared.take(~table[PARTICIPANT].duplicated().to_numpy())
+    told = compared
+    if done is not None and groups is not None and done.leaks(groups.column):
+        told = compare_sessions(measured, comparison)
+    once = told.take(~table[PARTICIPANT].duplicated().to_numpy())
     pairs, more = classify_groups(once, groups, settings) if groups else ([], [])
     return Analysis(
         model=model,
@@ -185,6 +216,7 @@ def analyze_cohort(
         design=design,
         groups=groups,
         sides=sides,
+        harmonization=done,
         measured=measures,
         compared=compared,
         row_model=rows,
@@ -193,16 +225,18 @@ def analyze_cohort(
         scores=scores,
         measures=summaries,
         pairs=pairs,
-        skipped=[*notes, *more],
+        skipped=[*(done.notes if done else ()), *notes, *more],
     )
 
 
 def analyze_points(cohort: Cohort, analysis: Analysis, settings: GroupSettings) -> Analysis:
     """Fit the model of an analysis to further maps, which are not registered."""
     maps = tuple(dict.fromkeys(name for side in cohort.sides.values() for name in side.maps))
-    compared = compare_sessions(cohort, analysis.comparison)
+    done, measured = None, Measures(maps=maps, summaries=())
+    if analysis.harmonization is not None:
+        done = harmonize_cohort(cohort, analysis.harmonization.plan, settings, measured, {})
+    compared = compare_sessions(cohort if done is None else done.cohort, analysis.comparison)
     fitted = _fit_sides(compared, maps, analysis.row_model, analysis.comparison, settings)
-    measured = Measures(maps=maps, summaries=())
     scores = None
     if analysis.comparison.normative is not None:
         scores = score_cohort(
@@ -216,6 +250,7 @@ def analyze_points(cohort: Cohort, analysis: Analysis, settings: GroupSettings) 
     return replace(
         analysis,
         sides={},
+        harmonization=done,
         measured=measured,
         compared=compared,
         fitted=fitted,

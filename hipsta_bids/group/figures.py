@@ -439,6 +439,51 @@ def _borders(axis: "Axes", cohort: Cohort, one: FittedMaps) -> None:
             )
 
 
+def draw_sites(cohort: Cohort, analysis: Analysis) -> "Figure":
+    """Draw means and SDs of the residuals of sites over points, before and after harmonization."""
+    done = analysis.harmonization
+    if done is None:
+        raise ValueError("nothing was harmonized")
+    shown_sites = [site for site in done.plan.sites if site in done.plan.counts]
+    height = 0.9 + 0.3 * len(shown_sites)
+    figure, axes = panels(2, len(done.maps), (2.9, height))
+    for j, ((hemi, measure), (effects, moments)) in enumerate(done.maps.items()):
+        states = {"before": moments, "after": moments.after(effects)}
+        unit = cohort.units.get(measure, "1")
+        for number, (name, one) in enumerate(states.items()):
+            for axis, values in ((axes[0, j], one.mean * effects.sd), (axes[1, j], one.sd)):
+                for row, site in enumerate(shown_sites):
+                    _spread(axis, values[done.plan.sites.index(site)], row, number, name)
+        for axis, label, ideal in (
+            (axes[0, j], f"mean, {display_name(measure)} [{unit}]", 0.0),
+            (axes[1, j], "SD, over that of all", 1.0),
+        ):
+            axis.axvline(ideal, color="black", linewidth=0.5)
+            axis.set_yticks(
+                range(len(shown_sites)), shown_sites if j == 0 else [""] * len(shown_sites)
+            )
+            axis.invert_yaxis()
+            axis.locator_params(axis="x", nbins=4)
+            axis.set_xlabel(label, fontsize=LABEL)
+            axis.tick_params(labelsize=LABEL)
+        axes[0, j].set_title(f"{display_name(measure)}, {SIDES[hemi]}", fontsize=TITLE)
+    handles = dict(zip(*axes[0, 0].get_legend_handles_labels()[::-1], strict=True))
+    figure.legend(handles.values(), handles, loc="outside lower center", ncols=2, fontsize=LABEL)
+    return figure
+
+
+def _spread(axis: "Axes", values: Float, row: int, number: int, name: str) -> None:
+    """Draw the 5th to the 95th percentile, the quartiles and the median of points as lines."""
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return
+    low, first, middle, third, high = np.percentile(known, [5, 25, 50, 75, 95])
+    y, color = row - 0.16 + 0.32 * number, ("0.6", COLORS[0])[number]
+    axis.plot([low, high], [y, y], color=color, linewidth=1.0)
+    axis.plot([first, third], [y, y], color=color, linewidth=4.5, label=name, solid_capstyle="butt")
+    axis.plot([middle], [y], "|", color="white", markersize=4.5)
+
+
 def draw_figures(
     cohort: Cohort, analysis: Analysis, shapes: Mapping[str, AverageShape]
 ) -> Iterator[tuple[str, bytes]]:
@@ -447,6 +492,9 @@ def draw_figures(
         yield from encode(f"{measure}_means", draw_means(cohort, analysis, measure))
         if any(one.fits[measure].tests for one in analysis.fitted.values() if measure in one.fits):
             yield from encode(f"{measure}_contrasts", draw_contrasts(cohort, analysis, measure))
+    if analysis.harmonization is not None and analysis.harmonization.maps:
+        name = "sites" if analysis.sides else f"{next(iter(analysis.measured.maps))}_sites"
+        yield from encode(name, draw_sites(cohort, analysis))
     if analysis.sides:
         yield from encode("profiles", draw_profiles(cohort, analysis))
     if (

@@ -3,7 +3,7 @@
 import difflib
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -234,6 +234,8 @@ class Design:
     references: Mapping[str, str]
     """Reference level of each factor."""
     contrasts: tuple[Contrast, ...]
+    levels: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    """Levels of each factor, the reference first."""
 
 
 def build_design(
@@ -270,6 +272,7 @@ def build_design(
         dropped=dropped,
         references={name: levels[0] for name, levels in chosen.items()},
         contrasts=tuple(terms.contrast(spec) for spec in specs),
+        levels=chosen,
     )
 
 

@@ -17,7 +17,8 @@ from hipsta_bids.group.analysis import (
 )
 from hipsta_bids.group.classify import ClassifierResult, roc_curve
 from hipsta_bids.group.clusters import edges_of, frame_of, peak_table
-from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort
+from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float
+from hipsta_bids.group.harmonize import Harmonization
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.summaries import hemispheres, summary_values
 
@@ -115,6 +116,16 @@ COLUMNS: Mapping[str, str] = {
     "w": "observed minus expected from the reference group, in its residual standard deviations",
     "low": "share of points with a two-sided p below the level, and w below zero",
     "high": "the same, and w above zero",
+    "kind": "map, or summary measure",
+    "site": "level of the column that was harmonized",
+    "estimated": "true if its effects were estimated from these participants, not read from a file",
+    "site_shift": "added by the site and taken out: mean over points, unit of the measure",
+    "site_shift_rms": "the same, root mean square over points",
+    "site_scale": "factor of the site on residuals, divided out: mean over points",
+    "offset_before": "mean of the site's residuals, in SD of all: root mean square over points",
+    "offset_after": "the same after harmonization",
+    "spread_before": "SD of the site's residuals, in SD of all: mean over points",
+    "spread_after": "the same after harmonization",
     "participant_id": "participant",
     "session_id": "session",
     "reason": "why",
@@ -136,6 +147,7 @@ def result_tables(cohort: Cohort, analysis: Analysis, settings: GroupSettings) -
         yield "profiles", _stacked(_profiles(cohort, analysis))
         if grouped:
             yield "shifts", _stacked(_shifts(analysis))
+    yield from _sites("sites", cohort, analysis)
     if analysis.measures:
         yield "measures", _stacked(_measures(cohort, analysis))
         if grouped:
@@ -157,6 +169,7 @@ def point_tables(
     yield f"{name}_peaks", _stacked(_peaks(cohort, analysis, settings))
     if analysis.scores is not None:
         yield f"{name}_wscores", analysis.scores.table
+    yield from _sites(f"{name}_sites", cohort, analysis)
     yield f"{name}_means", _stacked(_means(cohort, analysis))
     yield from _statistics(cohort, analysis)
 
@@ -375,6 +388,44 @@ def _shifts(analysis: Analysis) -> Iterator[Columns]:
                 "shift": shift.mean,
                 "shift_se": shift.se,
             }
+
+
+def _sites(name: str, cohort: Cohort, analysis: Analysis) -> Iterator[Named]:
+    if analysis.harmonization is not None:
+        yield name, pd.DataFrame(list(_site_rows(analysis.harmonization, cohort.units)))
+
+
+def _site_rows(done: Harmonization, units: Mapping[str, str]) -> Iterator[Columns]:
+    """List shifts and scales of sites: means over the points of a map, or of a summary measure."""
+    for kind, part in (("map", done.maps), ("summary", done.summaries)):
+        for (hemi, measure), (effects, moments) in part.items():
+            shift, after = effects.shift * effects.sd, moments.after(effects)
+            for number, site in enumerate(done.plan.sites):
+                if moments.n[number].any():
+                    yield {
+                        "measure": measure,
+                        "unit": units.get(measure, "1"),
+                        "kind": kind,
+                        "hemi": hemi,
+                        "site": site,
+                        "estimated": site in done.plan.estimated,
+                        "n": int(moments.n[number].max()),
+                        "site_shift": _mean_known(shift[number]),
+                        "site_shift_rms": _root_mean_square(shift[number]),
+                        "site_scale": _mean_known(effects.scale[number]),
+                        "offset_before": _root_mean_square(moments.mean[number]),
+                        "offset_after": _root_mean_square(after.mean[number]),
+                        "spread_before": _mean_known(moments.sd[number]),
+                        "spread_after": _mean_known(after.sd[number]),
+                    }
+
+
+def _mean_known(values: Float) -> float:
+    return float(mean_of_known(values, 0))
+
+
+def _root_mean_square(values: Float) -> float:
+    return float(np.sqrt(mean_of_known(values**2, 0)))
 
 
 def _curves(analysis: Analysis, curve: CurveOf) -> Iterator[Columns]:
