@@ -7,16 +7,16 @@ import numpy as np
 from scipy import ndimage
 
 from hipsta_bids.group.combat import Visits, fit_effects, harmonize
+from hipsta_bids.group.data import Float, Int
 from hipsta_bids.group.formula import Contrast
 from hipsta_bids.group.glm import fit_points
 from hipsta_bids.group.mixed import fit_mixed
 from hipsta_bids.group.settings import GroupSettings
-from hipsta_bids.types import Float, Int
 from hipsta_bids.validation.report import Cell, Cells, Suite, Table
 
 COHORTS, FEW_COHORTS = 40, 10
 MAX_LEFT, MAX_BIAS, MAX_ERROR = 0.05, 0.05, 0.03
-"""Targets: shares of what was planted, and distance of the rate of false positives from the level."""
+"""Targets: shares of what was planted, and distance of the false positive rate from the level."""
 LEVEL = 0.05
 _VISITS, _FEW_NODES = 3, (15, 9)
 
@@ -72,15 +72,16 @@ def simulate_sites(plan: SitesPlan, seed: int, *, repeated: bool = False) -> Sit
     """Draw one cohort; with repeated sessions of three each, all at one site."""
     random = np.random.default_rng(seed)
     sites, n = len(plan.sizes), sum(plan.sizes)
-    site = np.repeat(np.arange(sites), plan.sizes)
+    site: Int = np.repeat(np.arange(sites), plan.sizes).astype(np.int64)
     group = (random.random(n) < np.take(plan.cases, site)).astype(np.float64)
     age = random.normal(0.0, 1.0, n) + 0.5 * group
-    person = np.arange(n)
+    person: Int = np.arange(n)
     base = _noise(random, n, plan)
-    columns = np.column_stack([group, age])
+    columns: Float = np.column_stack([group, age])
     if repeated:
         times = np.tile(np.linspace(-1, 1, _VISITS), n) / 2
-        site, person, columns = (np.repeat(one, _VISITS, axis=0) for one in (site, person, columns))
+        site, person = np.repeat(site, _VISITS), np.repeat(person, _VISITS)
+        columns = np.repeat(columns, _VISITS, axis=0)
         columns = np.column_stack([columns, times, columns[:, 0] * times])
         own = _noise(random, len(site), plan) * np.sqrt(1 - plan.person)
         base = np.repeat(base, _VISITS, axis=0) * np.sqrt(plan.person)
@@ -147,7 +148,7 @@ class Tested:
     """Share of points with p below the level."""
 
 
-def tested_effect(
+def analyze_sites(
     plan: SitesPlan,
     seeds: Sequence[int],
     settings: GroupSettings,
@@ -200,8 +201,8 @@ def run(full: bool) -> Suite:
                 title="What is left of sites",
                 rows=list(_left_rows(plan, range(cohorts), settings)),
                 notes="Share of the planted differences between sites that is left: the slope of"
-                " what is left on what was planted, over sites and cohorts, for means over the map and"
-                " for what varies over it (scales as logarithms). Target for means: at most"
+                " what is left on what was planted, over sites and cohorts, for means over the map"
+                " and for what varies over it (scales as logarithms). Target for means: at most"
                 f" {MAX_LEFT:g} either way. Of the local part more is left the smaller a site is,"
                 " since empirical Bayes trusts the mean of the map more than a single point; the"
                 " sites in the model take the shifts that are left.",
@@ -219,9 +220,7 @@ def run(full: bool) -> Suite:
     )
 
 
-def _left_rows(
-    plan: SitesPlan, seeds: Sequence[int], settings: GroupSettings
-) -> Iterator[Cells]:
+def _left_rows(plan: SitesPlan, seeds: Sequence[int], settings: GroupSettings) -> Iterator[Cells]:
     for title, sizes, judged in (
         ("as above", plan.sizes, True),
         ("25 each", (25,) * len(plan.sizes), False),
@@ -241,9 +240,7 @@ def _left_rows(
         yield row
 
 
-def _effect_rows(
-    plan: SitesPlan, seeds: Sequence[int], settings: GroupSettings
-) -> Iterator[Cells]:
+def _effect_rows(plan: SitesPlan, seeds: Sequence[int], settings: GroupSettings) -> Iterator[Cells]:
     null = replace(plan, effect=0.0)
     for title, combat, site, repeated, judged in (
         ("nothing done", False, False, False, False),
@@ -256,8 +253,8 @@ def _effect_rows(
         how = {"with_combat": combat, "with_site": site, "repeated": repeated}
         # Mixed models take long.
         nodes = _FEW_NODES if repeated else plan.nodes
-        with_effect = tested_effect(replace(plan, nodes=nodes), seeds, settings, **how)
-        without = tested_effect(replace(null, nodes=nodes), seeds, settings, **how)
+        with_effect = analyze_sites(replace(plan, nodes=nodes), seeds, settings, **how)
+        without = analyze_sites(replace(null, nodes=nodes), seeds, settings, **how)
         bias = with_effect.estimate / plan.effect - 1
         row: dict[str, Cell] = {
             "analysis": title,

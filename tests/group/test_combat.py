@@ -12,11 +12,11 @@ SHIFTS, SCALES = np.array([0.4, -0.3, 0.1, 0.0]), np.array([1.4, 0.7, 1.0, 1.1])
 
 
 def cohort(n=160, points=12, visits=1, seed=0):
-    """Values with a group, an age, and effects of four sites; rows of a participant are together."""
+    """Values with a group, an age, and effects of four sites; a participant's rows are together."""
     random = np.random.default_rng(seed)
     person = np.repeat(np.arange(n), visits)
     site = np.repeat(random.integers(0, 4, n), visits)
-    group = np.repeat(random.random(n) < 0.2 + 0.2 * np.repeat(site, 1)[::visits], visits)
+    group = np.repeat(random.random(n) < 0.2 + 0.2 * site[::visits], visits)
     age = np.repeat(random.normal(70, 6, n), visits) + np.tile(np.arange(visits), n)
     columns = np.column_stack([group, age]).astype(float)
     own = np.repeat(random.normal(0, 0.3, (n, points)), visits, axis=0) if visits > 1 else 0
@@ -74,7 +74,7 @@ def longitudinal_by_loops(values, site, columns, person):
     counts = np.array([(site == one).sum() for one in sites])
     expected, spread, standard = (np.empty_like(values) for _ in range(3))
     for point in range(values.shape[1]):
-        fit = MixedLM(values[:, point], design, person).fit(reml=True, gtol=1e-10)
+        fit = MixedLM(values[:, point], design, person).fit(reml=True)
         batch = np.concatenate([[0.0], fit.fe_params[1 : len(sites)]])
         batch = (batch - counts @ batch / len(site))[site]
         residual = values[:, point] - fit.fittedvalues
@@ -142,7 +142,9 @@ def test_missing_values_are_left_out_point_by_point():
     apart = harmonize(holes, visits, parts)
     np.testing.assert_allclose(apart[:, :2], harmonize(values, visits, whole)[:, :2], rtol=1e-12)
     kept = np.isfinite(holes[:, 2])
-    alone = fit_effects(values[kept, 2:3], visits.take(np.flatnonzero(kept)), 4, SETTINGS, pooled=False)
+    alone = fit_effects(
+        values[kept, 2:3], visits.take(np.flatnonzero(kept)), 4, SETTINGS, pooled=False
+    )
     np.testing.assert_allclose(
         apart[kept, 2],
         harmonize(values[kept, 2:3], visits.take(np.flatnonzero(kept)), alone[0])[:, 0],
