@@ -339,7 +339,7 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
         settings = settings.changed(**{section: given})
     if parsed.harmonize:
         # The default model has what is harmonized instead of other names of the same.
-        same = {"site", "scanner", "center", "centre"}
+        same = {"site", "scanner", "center"}
         names = [name for name in settings.model.covariates if name.casefold() not in same]
         settings = settings.changed(model={"covariates": (*names, parsed.harmonize)})
     return settings

@@ -203,9 +203,9 @@ def run(full: bool) -> Suite:
                 notes="Share of the planted differences between sites that is left: the slope of"
                 " what is left on what was planted, over sites and cohorts, for means over the map"
                 " and for what varies over it (scales as logarithms). Target for means: at most"
-                f" {MAX_LEFT:g} either way. Of the local part more is left the smaller a site is,"
-                " since empirical Bayes trusts the mean of the map more than a single point; the"
-                " sites in the model take the shifts that are left.",
+                f" {MAX_LEFT:g} either way. Of the local part about half is left, since"
+                " empirical Bayes trusts the mean of the map more than a single point; the sites in"
+                " the model take the shifts that are left.",
             ),
             Table(
                 title="Effects after harmonization",
