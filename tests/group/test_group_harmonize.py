@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pandas as pd
 import pytest
+from hippunfold_like import PATTERNS, flat_surface, names, write_map, write_surface
 from pyarrow import parquet
 from small_cohorts import (
     NODES,
@@ -329,3 +330,46 @@ def test_refuses_files_that_do_not_fit(case, results, tmp_path, quick, capsys):
     assert main([str(out.parent / "bids"), str(out), "group", *given, *quick]) == code
     (line,) = capsys.readouterr().err.splitlines()
     assert words in line
+
+
+def test_maps_of_other_programs(study, tmp_path, quick):
+    data, _ = study
+    random = np.random.default_rng(2)
+    points, triangles = flat_surface(120, 1)
+    for row in read_participants(data):
+        for hemi in "LR":
+            path, surface = names(tmp_path / "hippunfold", row[0][4:], hemi, version=1)
+            other = row[4] == "B"
+            noise = (SCALE if other else 1) * 0.1 * random.standard_normal(len(points))
+            write_map(path, 1.5 + noise + SHIFT * other - EFFECT * (row[1] == "AD"))
+            write_surface(surface, points, triangles)
+    out = tmp_path / "out"
+    maps = str(tmp_path / PATTERNS[1])
+    call = [str(data), str(out), "group", "--maps", f"hipp={maps}", "--no-reports", *quick]
+    assert main([*call, "--harmonize", "site"]) == 0
+    sites = table(out / "group" / MODEL / "hipp_sites.tsv")
+    own = sites[sites.hemi == "L"].set_index("site")
+    assert own.site_shift["B"] - own.site_shift["A"] == pytest.approx(SHIFT, abs=0.02)
+    assert own.site_scale["B"] / own.site_scale["A"] == pytest.approx(SCALE, abs=0.1)
+    name = "hemi-L_contrast-CNAD_desc-hipp_statmap.tsv"
+    first = table(out / "group" / MODEL / name)
+    assert first.estimate.mean() == pytest.approx(EFFECT, abs=0.02)
+    saved = str(out / "group" / MODEL / "harmonization.json")
+    assert main([*call, "--harmonize-model", saved, "--name", "again"]) == 0
+    again = table(out / "group" / "again" / name)
+    np.testing.assert_allclose(again.statistic, first.statistic, rtol=1e-6)
+
+
+def test_classifiers_get_measures_whose_parameters_do_not_know_the_groups(study, results, quick):
+    data, out = study
+    call = [str(data), str(out), "group", "--align", "none", "--no-reports", *quick]
+    without = ["--formula", "age + site", "--contrast", "age", "--name", "ages"]
+    assert main([*call, "--harmonize", "site", *without]) == 0
+    saved = str(out / "group" / "ages" / "harmonization.json")
+    assert main([*call, "--harmonize-model", saved, "--name", "fair"]) == 0
+    fair = out / "group" / "fair"
+    assert json.loads((fair / "analysis.json").read_text())["harmonization"]["classified"] is True
+    assert "Classifiers were given" not in (fair / "methods.md").read_text()
+    areas = [table(folder / "classification.tsv").auc_base for folder in (fair, results)]
+    # Volumes are larger at site B, which has most of AD, whose volumes are smaller.
+    assert (areas[0] > areas[1]).all()
