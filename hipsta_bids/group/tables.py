@@ -391,8 +391,9 @@ def _shifts(analysis: Analysis) -> Iterator[Columns]:
 
 
 def _sites(name: str, cohort: Cohort, analysis: Analysis) -> Iterator[Named]:
-    if analysis.harmonization is not None:
-        yield name, pd.DataFrame(list(_site_rows(analysis.harmonization, cohort.units)))
+    done = analysis.harmonization
+    if done is not None and (rows := list(_site_rows(done, cohort.units))):
+        yield name, pd.DataFrame(rows)
 
 
 def _site_rows(done: Harmonization, units: Mapping[str, str]) -> Iterator[Columns]:

@@ -354,6 +354,8 @@ def test_maps_of_other_programs(study, tmp_path, quick):
     name = "hemi-L_contrast-CNAD_desc-hipp_statmap.tsv"
     first = table(out / "group" / MODEL / name)
     assert first.estimate.mean() == pytest.approx(EFFECT, abs=0.02)
+    page = group_page(out / "group" / MODEL)
+    assert '<th scope="row">hipp' in page[page.index('id="group-harmonization"') :]
     saved = str(out / "group" / MODEL / "harmonization.json")
     assert main([*call, "--harmonize-model", saved, "--name", "again"]) == 0
     again = table(out / "group" / "again" / name)
