@@ -445,7 +445,7 @@ def draw_sites(cohort: Cohort, analysis: Analysis) -> "Figure":
     if done is None:
         raise ValueError("nothing was harmonized")
     shown_sites = [site for site in done.plan.sites if site in done.plan.counts]
-    height = 0.9 + 0.3 * len(shown_sites)
+    height = 0.9 + 0.24 * len(shown_sites)
     figure, axes = panels(2, len(done.maps), (2.9, height))
     for j, ((hemi, measure), (effects, moments)) in enumerate(done.maps.items()):
         states = {"before": moments, "after": moments.after(effects)}

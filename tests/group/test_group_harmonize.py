@@ -20,10 +20,13 @@ from small_cohorts import (
 from hipsta_bids.cli.main import main
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.group import write
+from hipsta_bids.group.comparison import Comparison
+from hipsta_bids.group.data import Cohort, Measures, SideMaps
 from hipsta_bids.group.figures import draw_sites, encode
-from hipsta_bids.group.formula import Contrast
+from hipsta_bids.group.formula import Contrast, model_from_shortcut, parse_model
 from hipsta_bids.group.glm import fit_points
-from hipsta_bids.group.settings import GlmSettings
+from hipsta_bids.group.harmonize import harmonize_cohort, plan_sites
+from hipsta_bids.group.settings import GlmSettings, GroupSettings
 from hipsta_bids.io import files
 from hipsta_bids.reports.group import group_page
 
@@ -330,6 +333,50 @@ def test_refuses_files_that_do_not_fit(case, results, tmp_path, quick, capsys):
     assert main([str(out.parent / "bids"), str(out), "group", *given, *quick]) == code
     (line,) = capsys.readouterr().err.splitlines()
     assert words in line
+
+
+def test_standard_deviations_of_measurements_follow_the_scale_of_their_site():
+    """As their maps do: weights by uncertainty would be those of other units else."""
+    random = np.random.default_rng(4)
+    n, shape = 60, (6, 5)
+    sites = np.repeat(["A", "B"], n // 2)
+    ages = random.normal(70, 5, n) + 30 * (sites == "B")
+    people = {"participant_id": [f"sub-{i}" for i in range(n)], "age": ages, "site": sites}
+    walls = 1.8 + np.where(sites == "B", SCALE, 1)[:, None, None] * random.normal(
+        0, 0.1, (n, *shape)
+    )
+    side = SideMaps(
+        rows=np.arange(n),
+        maps={"thickness": walls},
+        errors={"thickness": np.full((n, *shape), 0.05)},
+        subfield=np.zeros((n, *shape), np.int8),
+        names=("all",),
+        summary=pd.DataFrame(index=range(n)),
+    )
+    cohort = Cohort(
+        table=pd.DataFrame(people), sides={"L": side}, x=np.arange(6), y=np.arange(5), units={}
+    )
+    settings = GroupSettings().changed(harmonization={"column": "site"})
+    model = parse_model(model_from_shortcut("age + site", [], "test"))
+    plan = plan_sites(
+        cohort,
+        model,
+        settings,
+        references={},
+        comparison=Comparison(),
+        icv=None,
+        saved=None,
+    )
+    done = harmonize_cohort(cohort, plan, settings, Measures(maps=("thickness",)), {})
+    changed, (effects, _) = done.cohort.sides["L"], done.maps["L", "thickness"]
+    for number, site in enumerate("AB"):
+        np.testing.assert_allclose(
+            changed.errors["thickness"][sites == site].reshape(n // 2, -1),
+            np.tile(0.05 / effects.scale[number], (n // 2, 1)),
+        )
+    # Ages of the sites are 30 years apart, and vary by 5.
+    assert plan.explained == {"age": pytest.approx(0.9, abs=0.03)}
+    assert any("site explains 9" in note and "of age" in note for note in done.notes)
 
 
 def test_maps_of_other_programs(study, tmp_path, quick):
