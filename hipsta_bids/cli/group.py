@@ -115,6 +115,11 @@ def _add_sheets(parser: Parser) -> None:
         "FILE.tsv",
         "leave out: columns participant_id, perhaps session_id, hemi, protocol, region, reason",
     )
+    add(
+        "--ratings",
+        "FILE.tsv",
+        "ratings saved from report.html: leaves out what is rated exclude, and counts the others",
+    )
 
 
 def _add_model(parser: Parser) -> None:
@@ -346,8 +351,9 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
 
 
 def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOptions":
-    from hipsta_bids.group.collect import GroupRequest, QualityCondition  # noqa: PLC0415  (heavy)
+    from hipsta_bids.group.collect import GroupRequest  # noqa: PLC0415  (heavy)
     from hipsta_bids.group.comparison import Comparison  # noqa: PLC0415  (heavy)
+    from hipsta_bids.group.exclusions import QualityCondition  # noqa: PLC0415  (heavy)
     from hipsta_bids.group.model import ModelRequest  # noqa: PLC0415  (heavy)
     from hipsta_bids.group.run import GroupOptions  # noqa: PLC0415  (heavy)
 

@@ -23,6 +23,7 @@ from hipsta_bids.group.glm import FittedMaps, PointTest, RowModel, fit_maps, wit
 from hipsta_bids.group.grammar import closed_formula
 from hipsta_bids.group.harmonize import (
     Harmonization,
+    SitePlan,
     check_in_model,
     harmonize_cohort,
     plan_sites,
@@ -40,10 +41,12 @@ from hipsta_bids.group.normative import Scores, score_cohort
 from hipsta_bids.group.registration import (
     GroupShift,
     Registration,
+    ShiftDifference,
     mean_profiles,
     register,
     register_to,
     shift_by_group,
+    shift_difference,
 )
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.site_effects import SavedEffects
@@ -65,6 +68,8 @@ class SideResult:
     """Maps of all visits that were chosen."""
     shifts: Mapping[str, GroupShift]
     """Shifts by group; empty without groups."""
+    difference: ShiftDifference | None
+    """Between the groups, if there are groups."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -88,6 +93,9 @@ class Analysis:
     fitted: Mapping[str, FittedMaps]
     """Fitted maps by hemisphere; ``LR`` is left minus right."""
     found: Mapping[MapKey, Discoveries]
+    unregistered: Mapping[MapKey, Discoveries]
+    """The same of maps that were not registered; empty without registration, with permutations,
+    which are too slow to do twice, and with harmonization from a file."""
     scores: Scores | None
     """Scores of participants against a reference group, if there is one."""
     measures: Sequence[MeasureFit]
@@ -185,6 +193,13 @@ def analyze_cohort(
     compared = compare_sessions(measured if done is None else done.cohort, comparison)
     fitted = _fit_sides(compared, measures.maps, rows, comparison, settings)
     found = correct(fitted, rows, table, settings)
+    unregistered: Mapping[MapKey, Discoveries] = {}
+    if settings.registration.align != "none" and settings.multiplicity.method not in PERMUTATIONS:
+        plain = _as_measured(cohort, plan, settings, measures)
+        if plain is not None:
+            again = compare_sessions(plain, comparison)
+            refitted = _fit_sides(again, measures.maps, rows, comparison, settings)
+            unregistered = correct(refitted, rows, table, settings)
     scores = None
     if comparison.normative is not None:
         scores = score_cohort(
@@ -222,11 +237,23 @@ def analyze_cohort(
         row_model=rows,
         fitted=fitted,
         found=found,
+        unregistered=unregistered,
         scores=scores,
         measures=summaries,
         pairs=pairs,
         skipped=[*(done.notes if done else ()), *notes, *more],
     )
+
+
+def _as_measured(
+    cohort: Cohort, plan: SitePlan | None, settings: GroupSettings, measures: Measures
+) -> Cohort | None:
+    """Harmonize maps without registration; a file's effects are those of registered nodes."""
+    if plan is None:
+        return cohort
+    if plan.saved is not None:
+        return None
+    return harmonize_cohort(cohort, plan, settings, measures, {}).cohort
 
 
 def analyze_points(cohort: Cohort, analysis: Analysis, settings: GroupSettings) -> Analysis:
@@ -255,6 +282,7 @@ def analyze_points(cohort: Cohort, analysis: Analysis, settings: GroupSettings) 
         compared=compared,
         fitted=fitted,
         found=correct(fitted, analysis.row_model, compared.table, settings),
+        unregistered={},
         measures=(),
         pairs=(),
         scores=scores,
@@ -325,18 +353,27 @@ def _register_side(
     else:
         registration = register_to(profiles, templates[hemi], settings.registration)
     shifts: Mapping[str, GroupShift] = {}
+    difference = None
     if groups is not None:
         names = cohort.table[groups.column].iloc[side.rows]
         known = names.notna().to_numpy()
-        shifts = shift_by_group(
-            replace(registration, warps=registration.warps[known]),
-            names[known].astype(str).to_numpy(dtype=np.str_),
-        )
+        grouped = replace(registration, warps=registration.warps[known])
+        members = names[known].astype(str).to_numpy(dtype=np.str_)
+        shifts = shift_by_group(grouped, members)
+        if registration.template is not None:
+            difference = shift_difference(
+                grouped,
+                members,
+                cohort.table[PARTICIPANT].iloc[side.rows][known].to_numpy(),
+                permutations=settings.registration.group_permutations,
+                seed=settings.multiplicity.seed,
+            )
     return SideResult(
         profiles=profiles,
         registration=registration,
         registered=_register_maps(side, registration.warps),
         shifts=shifts,
+        difference=difference,
     )
 
 

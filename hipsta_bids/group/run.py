@@ -193,7 +193,16 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
     shapes = average_shapes(inputs.found.records, cohort, analysis, settings)
     _describe(options)
     with write.model_folder(options.out_dir, name) as folder:
-        write_results(folder, cohort, analysis, settings, exclusions, others=others, region=region)
+        write_results(
+            folder,
+            cohort,
+            analysis,
+            settings,
+            exclusions,
+            others=others,
+            region=region,
+            ratings=inputs.found.ratings,
+        )
         files.write_json(folder / "model.json", document)
         write_shapes(folder, shapes)
         if analysis.sides and inputs.found.records and not shapes:
@@ -395,6 +404,7 @@ def _record(
         "groups": None if analysis.groups is None else asdict(analysis.groups),
         "participants": analysis.n_participants,
         "rows": len(analysis.design.rows),
+        "ratings": found.ratings,
         "hemispheres": {hemi: len(one.used) for hemi, one in analysis.fitted.items()},
         "notes": notes,
         "settings": resolve(settings),

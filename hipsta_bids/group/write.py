@@ -89,6 +89,7 @@ def write_results(
     *,
     others: Mapping[str, tuple[Cohort, Analysis]],
     region: str = "body",
+    ratings: Mapping[str, int] | None = None,
 ) -> None:
     """Write tables, maps and text."""
     for name, table in result_tables(cohort, analysis, settings):
@@ -125,7 +126,13 @@ def write_results(
         _write_gifti(folder, *one)
         _write_scores(folder, *one)
     text = methods_text(
-        cohort, analysis, settings, len(exclusions), others=tuple(others), region=region
+        cohort,
+        analysis,
+        settings,
+        len(exclusions),
+        others=tuple(others),
+        region=region,
+        ratings=ratings,
     )
     files.write_text(folder / "methods.md", text)
 

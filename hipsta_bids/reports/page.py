@@ -1,4 +1,4 @@
-"""What pages say and how they are made: reasons, verdicts, usual ranges, and templates.
+"""What pages say and how they are made: reasons, usual ranges, and templates.
 
 A page is one file that asks for nothing from outside.
 """
@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 from hipsta_bids import __version__
 from hipsta_bids.reports.display import ORIENTATION
 from hipsta_bids.settings import Settings
-from hipsta_bids.types import Status
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -123,33 +122,6 @@ def reason_sections() -> tuple[ReasonSection, ...]:
         )
         for section in tomllib.loads(text)["section"]
     )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Verdict:
-    """How a hemisphere ended, for a reader who decides about its use."""
-
-    title: str
-    advice: str
-
-
-VERDICTS: Mapping[Status, Verdict] = {
-    Status.OK: Verdict(title="Measured", advice="Nothing stood out. It can be used as it is."),
-    Status.REPAIRED: Verdict(
-        title="Measured after repair",
-        advice="Small defects of the labels were repaired. Look at the points below; if the repair"
-        " fits, it can be used.",
-    ),
-    Status.FLAGGED: Verdict(
-        title="Look before use",
-        advice="It was measured, but something is doubtful. Look at the points below, then use it,"
-        " correct it, or leave it out.",
-    ),
-    Status.FAILED: Verdict(
-        title="Not measured",
-        advice="There are no maps. The cause and what to try are below.",
-    ),
-}
 
 
 @dataclass(frozen=True, kw_only=True)

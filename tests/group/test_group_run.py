@@ -98,6 +98,7 @@ def test_tables_say_what_their_columns_are(results):
         "warps",
         "descriptives",
         "shifts",
+        "alignment",
         "classification",
         "excluded",
         "means",
@@ -113,6 +114,21 @@ def test_tables_say_what_their_columns_are(results):
         assert list(described) == columns, path.name
         unknown = [c for c in columns if c not in COLUMNS and not c.startswith("node_")]
         assert not unknown, path.name
+
+
+def test_findings_are_counted_with_and_without_registration(results):
+    with_it = pd.read_table(results / "alignment.tsv")
+    maps = pd.read_table(results / "maps.tsv")
+    columns = ["measure", "contrast", "hemi", "n_tests", "n_significant"]
+    pd.testing.assert_frame_equal(with_it[columns], maps[columns])
+    assert (with_it.n_both <= with_it[["n_significant", "n_unregistered"]].min(axis=1)).all()
+    # The cohort's groups are apart, so that the maps differ.
+    assert (with_it.n_unregistered != with_it.n_significant).any()
+    moved = pd.read_table(results / "registration.tsv")
+    assert (moved.difference_p < 0.05).all()
+    assert "largest difference of mean displacement between groups" in (
+        (results / "methods.md").read_text()
+    )
 
 
 def test_maps_file_is_typed_and_has_units(results):
