@@ -194,6 +194,18 @@ def _add_methods(parser: Parser) -> None:
     )
     add("--template", "FILE", "register to the template.json of another analysis")
     add(
+        "--harmonize",
+        "COLUMN",
+        "take shifts and scales of sites or scanners out of maps and summary measures (ComBat);"
+        " effects of the model are kept, and the model has the sites too",
+    )
+    add(
+        "--harmonize-model",
+        "FILE",
+        "do it with the harmonization.json of another analysis, for its sites and for new ones of"
+        " enough participants; with its --template",
+    )
+    add(
         "--weights",
         "",
         "how much each map counts at a point: the same (none, the default), or by its SD as"
@@ -346,6 +358,7 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
         },
         "model": {"age": parsed.age_model},
         "longitudinal": {"random": parsed.longitudinal},
+        "harmonization": {"column": parsed.harmonize},
         "glm": {"weights": parsed.weights},
         "classification": {
             "base": tuple(parsed.base) or None,
@@ -356,6 +369,11 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
     for section, options in chosen.items():
         given = {name: value for name, value in options.items() if value is not None}
         settings = settings.changed(**{section: given})
+    if parsed.harmonize:
+        # The default model has what is harmonized instead of other names of the same.
+        same = {"site", "scanner", "center"}
+        names = [name for name in settings.model.covariates if name.casefold() not in same]
+        settings = settings.changed(model={"covariates": (*names, parsed.harmonize)})
     return settings
 
 

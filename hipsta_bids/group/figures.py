@@ -291,6 +291,50 @@ def _mark_subfields(axis: "Axes", layers: Float, one: FittedMaps, node: int) -> 
             axis.text(x, y, name, fontsize=SMALL, ha="center", va="center", bbox=box)
 
 
+def draw_sites(cohort: Cohort, analysis: Analysis) -> "list[Figure]":
+    """Draw means and SDs of the residuals of sites over points, before and after harmonization."""
+    done = analysis.harmonization
+    if done is None:
+        raise ValueError("nothing was harmonized")
+    shown_sites = [site for site in done.plan.sites if site in done.plan.counts]
+    height = 2 * (20 + 5 * len(shown_sites))
+    figure, axes = _panels(2, len(done.maps), (TWO_COLUMNS, height))
+    for j, ((hemi, measure), (effects, moments)) in enumerate(done.maps.items()):
+        states = {"before": moments, "after": moments.after(effects)}
+        unit = cohort.units.get(measure, "1")
+        for number, (name, one) in enumerate(states.items()):
+            for axis, values in ((axes[0, j], one.mean * effects.sd), (axes[1, j], one.sd)):
+                for row, site in enumerate(shown_sites):
+                    _spread(axis, values[done.plan.sites.index(site)], row, number, name)
+        for axis, label, ideal in (
+            (axes[0, j], f"mean, {display_name(measure)} [{unit}]", 0.0),
+            (axes[1, j], "SD, over that of all", 1.0),
+        ):
+            axis.axvline(ideal, color="black", linewidth=0.5)
+            axis.set_yticks(
+                range(len(shown_sites)), shown_sites if j == 0 else [""] * len(shown_sites)
+            )
+            axis.invert_yaxis()
+            axis.locator_params(axis="x", nbins=4)
+            axis.set_xlabel(label)
+        axes[0, j].set_title(f"{display_name(measure)}, {SIDES[hemi]}")
+    handles = dict(zip(*axes[0, 0].get_legend_handles_labels()[::-1], strict=True))
+    figure.legend(handles.values(), handles, loc="outside lower center", ncols=2)
+    return [figure]
+
+
+def _spread(axis: "Axes", values: Float, row: int, number: int, name: str) -> None:
+    """Draw the 5th to the 95th percentile, the quartiles and the median of points as lines."""
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return
+    low, first, middle, third, high = np.percentile(known, [5, 25, 50, 75, 95])
+    y, color = row - 0.16 + 0.32 * number, ("0.6", COLORS[0])[number]
+    axis.plot([low, high], [y, y], color=color, linewidth=1.0)
+    axis.plot([first, third], [y, y], color=color, linewidth=4.5, label=name, solid_capstyle="butt")
+    axis.plot([middle], [y], "|", color="white", markersize=4.5)
+
+
 def draw_figures(
     cohort: Cohort, analysis: Analysis, shapes: Mapping[str, AverageShape]
 ) -> Iterator[tuple[str, Drawing]]:
@@ -298,6 +342,9 @@ def draw_figures(
     views: Views = {}
     for measure in dict.fromkeys(m for one in analysis.fitted.values() for m in one.fits):
         yield f"{measure}_maps", partial(draw_measure, cohort, analysis, shapes, views, measure)
+    if analysis.harmonization is not None and analysis.harmonization.maps:
+        name = "sites" if analysis.sides else f"{next(iter(analysis.measured.maps))}_sites"
+        yield name, partial(draw_sites, cohort, analysis)
     if analysis.sides and all(
         side.registration.template is not None for side in analysis.sides.values()
     ):

@@ -52,6 +52,18 @@ REFERENCES: Mapping[str, str] = {
     "normative": "Jack CR, Petersen RC, Xu YC, et al. Medial temporal atrophy on MRI in normal"
     " aging and very mild Alzheimer's disease. Neurology 1997;49(3):786-794."
     " doi:10.1212/WNL.49.3.786",
+    "combat": "Fortin JP, Cullen N, Sheline YI, et al. Harmonization of cortical thickness"
+    " measurements across scanners and sites. NeuroImage 2018;167:104-120."
+    " doi:10.1016/j.neuroimage.2017.11.024",
+    "johnson": "Johnson WE, Li C, Rabinovic A. Adjusting batch effects in microarray expression"
+    " data using empirical Bayes methods. Biostatistics 2007;8(1):118-127."
+    " doi:10.1093/biostatistics/kxj037",
+    "beer": "Beer JC, Tustison NJ, Cook PA, et al. Longitudinal ComBat: a method for harmonizing"
+    " longitudinal multi-scanner imaging data. NeuroImage 2020;220:117129."
+    " doi:10.1016/j.neuroimage.2020.117129",
+    "nygaard": "Nygaard V, Rødland EA, Hovig E. Methods that remove batch effects while retaining"
+    " group differences may lead to exaggerated confidence in downstream analyses. Biostatistics"
+    " 2016;17(1):29-39. doi:10.1093/biostatistics/kxv027",
     "delong": "DeLong ER, DeLong DM, Clarke-Pearson DL. Comparing the areas under two or more"
     " correlated receiver operating characteristic curves: a nonparametric approach. Biometrics"
     " 1988;44(3):837-845.",
@@ -90,6 +102,7 @@ def methods_text(
     paragraphs[0] += _rated(ratings)
     if analysis.sides or others:
         paragraphs.append(_alignment(analysis, settings, cite, others))
+    paragraphs += _harmonization(analysis, cite)
     paragraphs.append(_models(analysis, settings, cite))
     if analysis.comparison.asymmetry:
         paragraphs.append(_asymmetry(settings, cite("asymmetry")))
@@ -191,6 +204,48 @@ def _registration(analysis: Analysis, settings: GroupSettings, cite: Callable[[s
         f" variance of the profiles that their mean explains went from {shares}.{moved}"
         f" Warps out of line with the others: {extreme}."
     )
+
+
+def _harmonization(analysis: Analysis, cite: Callable[[str], str]) -> list[str]:
+    done = analysis.harmonization
+    if done is None:
+        return []
+    plan = done.plan
+    counts = ", ".join(f"{site} {n}" for site, n in plan.counts.items())
+    sources = f"{cite('johnson')}, {cite('combat')}"
+    kept = f"`{plan.formula}`" if plan.columns else "no variable"
+    if plan.icv is not None:
+        kept += f", for volumes also {plan.icv}"
+    text = (
+        f"Effects of {plan.column} ({counts} participants) were taken out of"
+        f"{' the registered' if analysis.sides else ''} maps and summary measures by ComBat"
+        f" {sources}: at each point, a shift and a scale of the residuals of a linear model that"
+        f" keeps {kept}. The two were pooled over the points of a map by empirical Bayes, and"
+        " estimated for each summary measure by itself; missing values were left out point by"
+        " point."
+    )
+    if plan.visits.participant is not None:
+        text += (
+            " Participants had random intercepts, which were kept, so that the scale is that of"
+            f" differences within participants {cite('beer')}."
+        )
+    if plan.saved is not None:
+        known = sum(site in plan.saved.sites for site in plan.counts)
+        text += f" Parameters of {known} of these were those of an earlier analysis"
+        text += f"; those of {', '.join(plan.estimated)} were new." if plan.estimated else "."
+    if plan.estimated and not analysis.comparison.pair:
+        lost = len(plan.counts) - 1
+        text += (
+            f" As the shifts were estimated from the same participants, {plan.column} is also a"
+            f" factor of the model, which has {lost} degree{'s' if lost > 1 else ''} of freedom"
+            f" less: without, tests would reject too often {cite('nygaard')}."
+        )
+    if analysis.pairs and analysis.groups and done.leaks(analysis.groups.column):
+        text += (
+            " Classifiers were given the measures before harmonization, since parameters that"
+            " were estimated with the groups known would tell something about who is left out."
+        )
+    return [text]
 
 
 def _models(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], str]) -> str:

@@ -269,6 +269,8 @@ class Design:
     contrasts: tuple[Contrast, ...]
     notes: Mapping[str, str] = field(default_factory=dict)
     """What to know about the coding of variables, by their names."""
+    levels: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    """Levels of each factor, the reference first."""
 
 
 def build_design(
@@ -309,6 +311,7 @@ def build_design(
         references={name: levels[0] for name, levels in chosen.items()},
         contrasts=tuple(terms.contrast(spec) for spec in specs),
         notes={name: note for name, note in notes.items() if note},
+        levels=chosen,
     )
 
 

@@ -25,6 +25,7 @@ from hipsta_bids.group.comparison import Comparison, choose_visits
 from hipsta_bids.group.covariates import VisitTime, add_time, read_covariates, read_icv
 from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Measures
 from hipsta_bids.group.formula import parse_model, with_factors
+from hipsta_bids.group.harmonize import harmonization_record
 from hipsta_bids.group.model import (
     ModelRequest,
     choose_references,
@@ -42,6 +43,7 @@ from hipsta_bids.group.read import (
 )
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.shapes import average_shapes, write_shapes
+from hipsta_bids.group.site_effects import SavedEffects, load_effects
 from hipsta_bids.group.surfaces import (
     ExternalCohorts,
     MapPattern,
@@ -82,6 +84,8 @@ class GroupOptions:
     measures: tuple[str, ...] = ()
     """What to fit the model to; empty for the default or the formula's left-hand side."""
     template: Path | None = None
+    harmonize_model: Path | None = None
+    """Parameters of the harmonization of another analysis."""
     comparison: Comparison = field(default_factory=Comparison)
     reports: bool = True
     """Whether a page is made."""
@@ -177,6 +181,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         time=inputs.time.column if inputs.time else None,
         icv=inputs.icv,
         templates=templates,
+        site_effects=_site_effects(options),
     )
     others = {
         name: (other, analyze_points(other, analysis, settings))
@@ -225,6 +230,11 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         notes=tuple(notes),
         warnings=inputs.found.warnings,
     )
+
+
+def _site_effects(options: GroupOptions) -> SavedEffects | None:
+    path = options.harmonize_model
+    return None if path is None else load_effects(path)
 
 
 def _read(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
@@ -418,7 +428,13 @@ def _record(
             "volumes": dict(options.volumes),
             "covariates": [str(path) for path in options.covariates],
             "template": None if options.template is None else str(options.template),
+            "harmonization": None
+            if options.harmonize_model is None
+            else str(options.harmonize_model),
         },
+        "harmonization": None
+        if analysis.harmonization is None
+        else harmonization_record(analysis.harmonization, analysis.groups),
         "measures": {"maps": analysis.measured.maps, "summaries": analysis.measured.summaries},
         "formula": analysis.model.formula,
         "columns": analysis.design.columns,

@@ -222,6 +222,24 @@ class MultiplicitySettings(SettingsTable):
     """Neighbors of a point on the sheet, 4 or 8."""
 
 
+class HarmonizationSettings(SettingsTable):
+    """ComBat: effects of sites or scanners, taken out of maps and summary measures."""
+
+    column: str = ""
+    """Column whose levels are harmonized, as ``site``; empty is none."""
+    least_participants: Annotated[int, Field(ge=3)] = 10
+    """Sites with fewer participants are refused: the mean of ten is known to a third of an SD."""
+    explained: OpenFraction = 0.8
+    """A note names columns of the model of whose variance sites explain more than this."""
+    pooling: bool = True
+    """Points of a map inform each other about a site (empirical Bayes); summary measures never
+    do."""
+    iterations: PositiveInt = 200
+    """Most steps of the posterior of shift and scale."""
+    tolerance: PositiveFloat = 1e-6
+    """They end when no shift, in SD, and no variance, as a fraction, changes by more."""
+
+
 class AsymmetrySettings(SettingsTable):
     """Differences between left and right."""
 
@@ -288,6 +306,7 @@ class GroupSettings(SettingsTable):
     design: DesignSettings = DesignSettings()
     glm: GlmSettings = GlmSettings()
     longitudinal: LongitudinalSettings = LongitudinalSettings()
+    harmonization: HarmonizationSettings = HarmonizationSettings()
     asymmetry: AsymmetrySettings = AsymmetrySettings()
     multiplicity: MultiplicitySettings = MultiplicitySettings()
     shapes: ShapeSettings = ShapeSettings()

@@ -17,7 +17,8 @@ from hipsta_bids.group.analysis import (
 )
 from hipsta_bids.group.classify import ClassifierResult, roc_curve
 from hipsta_bids.group.clusters import edges_of, frame_of, peak_table
-from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort
+from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float
+from hipsta_bids.group.harmonize import Harmonization
 from hipsta_bids.group.inference import control_fdr
 from hipsta_bids.group.registration import ShiftDifference
 from hipsta_bids.group.settings import GroupSettings
@@ -125,6 +126,16 @@ COLUMNS: Mapping[str, str] = {
     "w": "observed minus expected from the reference group, in its residual standard deviations",
     "low": "share of points with a two-sided p below the level, and w below zero",
     "high": "the same, and w above zero",
+    "kind": "map, or summary measure",
+    "site": "level of the column that was harmonized",
+    "estimated": "true if its effects were estimated from these participants, not read from a file",
+    "site_shift": "added by the site and taken out: mean over points, unit of the measure",
+    "site_shift_rms": "the same, root mean square over points",
+    "site_scale": "factor of the site on residuals, divided out: mean over points",
+    "offset_before": "mean of the site's residuals, in SD of all: root mean square over points",
+    "offset_after": "the same after harmonization",
+    "spread_before": "SD of the site's residuals, in SD of all: mean over points",
+    "spread_after": "the same after harmonization",
     "participant_id": "participant",
     "session_id": "session",
     "reason": "why",
@@ -142,6 +153,7 @@ def result_tables(cohort: Cohort, analysis: Analysis, settings: GroupSettings) -
         yield "maps", _overview(analysis)
     if analysis.sides:
         yield from _registration_tables(cohort, analysis)
+    yield from _sites("sites", cohort, analysis)
     if analysis.measures:
         yield "measures", _with_fdr(_stacked(_measures(cohort, analysis)), settings)
         if grouped:
@@ -163,6 +175,7 @@ def point_tables(
     yield f"{name}_peaks", _stacked(_peaks(cohort, analysis, settings))
     if analysis.scores is not None:
         yield f"{name}_wscores", analysis.scores.table
+    yield from _sites(f"{name}_sites", cohort, analysis)
     yield f"{name}_means", _stacked(_means(cohort, analysis))
     yield from _statistics(cohort, analysis)
 
@@ -435,6 +448,45 @@ def _shifts(analysis: Analysis) -> Iterator[Columns]:
                 "shift": shift.mean,
                 "shift_se": shift.se,
             }
+
+
+def _sites(name: str, cohort: Cohort, analysis: Analysis) -> Iterator[Named]:
+    done = analysis.harmonization
+    if done is not None and (rows := list(_site_rows(done, cohort.units))):
+        yield name, pd.DataFrame(rows)
+
+
+def _site_rows(done: Harmonization, units: Mapping[str, str]) -> Iterator[Columns]:
+    """List shifts and scales of sites: means over the points of a map, or of a summary measure."""
+    for kind, part in (("map", done.maps), ("summary", done.summaries)):
+        for (hemi, measure), (effects, moments) in part.items():
+            shift, after = effects.shift * effects.sd, moments.after(effects)
+            for number, site in enumerate(done.plan.sites):
+                if moments.n[number].any():
+                    yield {
+                        "measure": measure,
+                        "unit": units.get(measure, "1"),
+                        "kind": kind,
+                        "hemi": hemi,
+                        "site": site,
+                        "estimated": site in done.plan.estimated,
+                        "n": int(moments.n[number].max()),
+                        "site_shift": _mean_known(shift[number]),
+                        "site_shift_rms": _root_mean_square(shift[number]),
+                        "site_scale": _mean_known(effects.scale[number]),
+                        "offset_before": _root_mean_square(moments.mean[number]),
+                        "offset_after": _root_mean_square(after.mean[number]),
+                        "spread_before": _mean_known(moments.sd[number]),
+                        "spread_after": _mean_known(after.sd[number]),
+                    }
+
+
+def _mean_known(values: Float) -> float:
+    return float(mean_of_known(values, 0))
+
+
+def _root_mean_square(values: Float) -> float:
+    return float(np.sqrt(mean_of_known(values**2, 0)))
 
 
 def _curves(analysis: Analysis, curve: CurveOf) -> Iterator[Columns]:

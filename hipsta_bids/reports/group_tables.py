@@ -37,7 +37,7 @@ _SUBFIELD = re.compile(
 _TEXT = (
     *("measure", "unit", "contrast", "hemi", "group", "subfield", "shares", "test", "effect"),
     *("file", "model", "control", "case", "base", "added", "classifier", "region"),
-    *("participant_id", "session_id", "reason", "message"),
+    *("participant_id", "session_id", "reason", "message", "site", "kind"),
 )
 
 
