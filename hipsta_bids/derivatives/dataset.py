@@ -168,6 +168,12 @@ def _maker() -> dict[str, Any]:
     }
     if url := _code_url():
         maker["CodeURL"] = url
+    container = container_of_process()
+    return maker | ({"Container": container} if container else {})
+
+
+def container_of_process() -> dict[str, str]:
+    """Say which container this process is in: an entry of ``GeneratedBy``, empty outside."""
     container = {
         key: os.environ[variable]
         for key, variable in CONTAINER_VARIABLES.items()
@@ -175,7 +181,7 @@ def _maker() -> dict[str, Any]:
     }
     if any(os.environ.get(variable) for variable in _APPTAINER_VARIABLES):
         container["Type"] = "apptainer"
-    return maker | ({"Container": container} if container else {})
+    return container
 
 
 def _code_url() -> str | None:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from hipsta_bids.derivatives.dataset import container_of_process
 from hipsta_bids.derivatives.names import output_name, participant_report
 from hipsta_bids.reports.cohort import Cohort, title_of
 from hipsta_bids.reports.results import SURFACES, Hemisphere, input_path
@@ -53,12 +54,18 @@ def _link(hemisphere: Hemisphere | None, cohort: Cohort) -> tuple[str, str] | No
 
 
 def open_commands(hemisphere: Hemisphere) -> list[tuple[str, str]]:
-    """Write commands, by program, that open the files of a hemisphere from the output folder."""
+    """Write commands, by program, that open the files of a hemisphere from the output folder.
+
+    In a container the folder with the labels is ``LABELS_DIR``, to be replaced.
+    """
     place = hemisphere.place
     labels, mask = input_path(hemisphere), place.path("body_mask")
     volumes = []
     if labels is not None and labels.exists():
-        volumes.append((_from(place.root, labels), ":colormap=lut:opacity=0.5"))
+        # Docker's own paths mean nothing outside; Apptainer's are those of the machine.
+        hidden = container_of_process().get("Type") == "docker"
+        own = f"LABELS_DIR/{labels.name}" if hidden else _from(place.root, labels)
+        volumes.append((own, ":colormap=lut:opacity=0.5"))
     if mask.exists():
         volumes.append((_from(place.root, mask), ":colormap=heat:opacity=0.3"))
     if not volumes:

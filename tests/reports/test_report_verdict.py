@@ -186,6 +186,17 @@ def test_commands_open_the_files_from_the_output_folder(out):
     assert snap == (f"mri_convert {labels} labels.nii.gz && itksnap -g labels.nii.gz -s {mask}")
 
 
+def test_commands_of_a_container_name_no_folder_of_it(out, monkeypatch):
+    from hipsta_bids.reports.review import open_commands  # noqa: PLC0415
+
+    monkeypatch.setenv("HIPSTA_BIDS_CONTAINER_TYPE", "docker")
+    (_, freeview), (_, snap) = open_commands(hemisphere(out, "01", "R"))
+    assert freeview.startswith("freeview -v LABELS_DIR/")
+    assert snap.startswith("mri_convert LABELS_DIR/")
+    monkeypatch.setenv("APPTAINER_CONTAINER", "image.sif")  # which sees the folders of the machine
+    assert "LABELS_DIR" not in open_commands(hemisphere(out, "01", "R"))[0][1]
+
+
 def test_of_several_repairs_the_largest_is_named(out):
     repairs = [
         "filled a cavity of 4 grid nodes at RAS 1 2 3 mm (CA1); it concerns 1.0% of the columns",
