@@ -4,7 +4,8 @@ How values become colors, and how maps lie, is that of the pages (``reports.disp
 """
 
 import io
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
@@ -437,6 +438,48 @@ def _borders(axis: "Axes", cohort: Cohort, one: FittedMaps) -> None:
                 ha="center",
                 bbox={"facecolor": "white", "alpha": 0.6, "edgecolor": "none", "pad": 0.5},
             )
+
+
+TrialMaps = Mapping[str, tuple[FittedMaps, Float]]
+"""By hemisphere, where the points of a map are, and their values."""
+
+
+@dataclass(frozen=True)
+class TrialRow:
+    """One statistic of a map, for a row of panels with one per side."""
+
+    title: str
+    unit: str
+    """In brackets, or empty."""
+    maps: TrialMaps
+    colors: str
+    limits: tuple[float, float] | None = None
+    """At the ends of the colors; else the 1st and 99th percentiles."""
+    log: bool = False
+    """Whether colors go by the logarithm."""
+
+    @property
+    def scale(self) -> Scale:
+        """Colors and the values at their ends."""
+        from matplotlib.colors import LogNorm  # noqa: PLC0415  (optional, slow to load)
+
+        every = [values for _, values in self.maps.values()]
+        low, high = self.limits or display.scale_of(display.THICKNESS, every)
+        if self.log:
+            return {"cmap": self.colors, "norm": LogNorm(low, max(high, 1.1 * low))}
+        return scale_of(self.colors, low, high)
+
+
+def draw_trial(cohort: Cohort, rows: Sequence[TrialRow]) -> "Figure":
+    """Draw statistics of one map, a row each, both sides beside each other."""
+    figure, axes = panels(len(rows), max(len(row.maps) for row in rows), _MAP_PANEL)
+    for i, row in enumerate(rows):
+        scale, image = row.scale, None
+        for axis, (hemi, (one, values)) in zip(axes[i], row.maps.items(), strict=False):
+            image = _draw(axis, cohort, one, values.reshape(one.maps.shape), scale)
+            axis.set_title(f"{row.title}, {SIDES[hemi]}", fontsize=TITLE)
+        _bar(figure, image, axes[i], f"{row.title} {row.unit}".strip(), extend="both")
+    return figure
 
 
 def draw_figures(

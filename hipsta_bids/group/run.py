@@ -50,7 +50,7 @@ from hipsta_bids.group.surfaces import (
     taken_names,
 )
 from hipsta_bids.group.volumes import add_volumes, check_volumes
-from hipsta_bids.group.warps import templates_from_json
+from hipsta_bids.group.warps import Template, templates_from_json
 from hipsta_bids.group.write import draw, write_results
 from hipsta_bids.io import files
 from hipsta_bids.protocols.toml import resolve
@@ -143,7 +143,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         If inputs, model or output folder do not allow it.
     """
     dataset.check_own_dataset(options.out_dir)
-    inputs = _read(options, settings)
+    inputs = read_inputs(options, settings)
     cohort = inputs.cohort
     references, groups = choose_references(options.model, cohort.table, settings)
     document = model_document(
@@ -155,10 +155,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         visits=inputs.time,
     )
     model = parse_model(document)
-    templates = None
-    if options.template is not None:
-        templates = templates_from_json(files.read_json(options.template), str(options.template))
-        _check_templates(templates, cohort, options.template)
+    templates = read_templates(options.template, cohort)
     analysis = analyze_cohort(
         cohort,
         model,
@@ -186,7 +183,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
     name = options.model.name or (name if region == "body" else f"{name}_{region}")
     notes = [*inputs.notes, *_notes(inputs, analysis)]
     shapes = average_shapes(inputs.found.records, cohort, analysis, settings)
-    _describe(options)
+    describe_dataset(options)
     with write.model_folder(options.out_dir, name) as folder:
         write_results(folder, cohort, analysis, settings, exclusions, others=others, region=region)
         files.write_json(folder / "model.json", document)
@@ -196,7 +193,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         draw(folder, cohort, analysis, shapes, others=others)
         record = _record(options, inputs.found, settings, analysis, notes)
         files.write_json(folder / "analysis.json", record)
-    page, problem = _report(options, name)
+    page, problem = make_page(options, name)
     return GroupResult(
         folder=options.out_dir / write.GROUP_FOLDER / name,
         page=page,
@@ -207,7 +204,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
     )
 
 
-def _read(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
+def read_inputs(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
     """Find and read sheets, other maps, volumes and covariates."""
     check_volumes(options.volumes)
     found = collect_sheets(options.sheets, may_lack=bool(options.maps))
@@ -359,17 +356,7 @@ def _record(
     return {
         "command": list(options.command),
         "version": __version__,
-        "inputs": {
-            "datasets": [str(root.resolve()) for root in options.sheets.roots],
-            "settings_hash": found.settings_hash,
-            "versions": found.versions,
-            "seg": found.records[0].place.name.seg if found.records else None,
-            "region": options.sheets.region,
-            "maps": dict(options.maps),
-            "volumes": dict(options.volumes),
-            "covariates": [str(path) for path in options.covariates],
-            "template": None if options.template is None else str(options.template),
-        },
+        "inputs": record_inputs(options, found),
         "measures": {"maps": analysis.measured.maps, "summaries": analysis.measured.summaries},
         "formula": analysis.model.formula,
         "columns": analysis.design.columns,
@@ -385,7 +372,22 @@ def _record(
     }
 
 
-def _report(options: GroupOptions, name: str) -> tuple[Path | None, str | None]:
+def record_inputs(options: GroupOptions, found: Collection) -> dict[str, Any]:
+    """Record what was read."""
+    return {
+        "datasets": [str(root.resolve()) for root in options.sheets.roots],
+        "settings_hash": found.settings_hash,
+        "versions": found.versions,
+        "seg": found.records[0].place.name.seg if found.records else None,
+        "region": options.sheets.region,
+        "maps": dict(options.maps),
+        "volumes": dict(options.volumes),
+        "covariates": [str(path) for path in options.covariates],
+        "template": None if options.template is None else str(options.template),
+    }
+
+
+def make_page(options: GroupOptions, name: str) -> tuple[Path | None, str | None]:
     """Make the page, and say why if it is not there."""
     path = options.out_dir / group_report(name)
     if not options.reports:
@@ -395,7 +397,7 @@ def _report(options: GroupOptions, name: str) -> tuple[Path | None, str | None]:
     return (path if problem is None else None), problem
 
 
-def _describe(options: GroupOptions) -> None:
+def describe_dataset(options: GroupOptions) -> None:
     """Describe the output dataset, if the participant level has not."""
     files.make_folder(options.out_dir)
     if not (options.out_dir / "dataset_description.json").exists():
@@ -406,11 +408,16 @@ def _describe(options: GroupOptions) -> None:
     dataset.write_notes(options.out_dir)
 
 
-def _check_templates(templates: Mapping[str, Any], cohort: Cohort, path: Path) -> None:
+def read_templates(path: Path | None, cohort: Cohort) -> Mapping[str, Template] | None:
+    """Read the templates of an earlier analysis, if one is named."""
+    if path is None:
+        return None
+    templates = templates_from_json(files.read_json(path), str(path))
     if missing := sorted(set(cohort.sides) - set(templates)):
         raise ModelError(
             f"{path}: has no template of hemisphere {', '.join(missing)}", reason="template-file"
         )
+    return templates
 
 
 def _incomplete(analysis: Analysis) -> list[Exclusion]:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from hipsta_bids.group.analysis import (
     Analysis,
+    SideResult,
     mean_of_known,
     members_of,
     rows_of,
@@ -115,6 +116,25 @@ COLUMNS: Mapping[str, str] = {
     "w": "observed minus expected from the reference group, in its residual standard deviations",
     "low": "share of points with a two-sided p below the level, and w below zero",
     "high": "the same, and w above zero",
+    "sd_between": "SD between participants, of their true values",
+    "sd_within": "SD within participants, between sessions",
+    "sd_within_low": "lower confidence limit",
+    "sd_within_high": "upper confidence limit",
+    "icc": "intraclass correlation ICC(2,1), absolute agreement of single measurements",
+    "icc_low": "lower confidence limit",
+    "icc_high": "upper confidence limit",
+    "detectable_change": "minimal detectable change in one participant, 1.96 sqrt(2) sd_within",
+    "p_sessions": "p-value of the F test that all sessions have the same mean",
+    "change_per_year": "mean change in the reference, unit of the measure per year",
+    "difference": "between the arms, unit of the measure; with several visits, per year",
+    "sd_endpoint": "SD of a participant's value; with several visits, of the slope per year",
+    "alpha": "two-sided level of the test",
+    "per_arm": "participants per arm who complete the trial; n/a above ``power.most``",
+    "per_arm_low": "the same at the better confidence limit, of the mean change for slowing, else"
+    " of the SD",
+    "per_arm_high": "at the worse one; n/a if no number is enough",
+    "enrolled_per_arm": "participants per arm to enroll, as some drop out",
+    "power": "with this number per arm",
     "participant_id": "participant",
     "session_id": "session",
     "reason": "why",
@@ -131,8 +151,7 @@ def result_tables(cohort: Cohort, analysis: Analysis, settings: GroupSettings) -
     if analysis.found:
         yield "maps", _overview(analysis)
     if analysis.sides:
-        yield "registration", _registration(analysis)
-        yield "warps", _stacked(_warps(cohort, analysis))
+        yield from registration_tables(cohort, analysis.sides)
         yield "profiles", _stacked(_profiles(cohort, analysis))
         if grouped:
             yield "shifts", _stacked(_shifts(analysis))
@@ -334,24 +353,27 @@ def _descriptives(analysis: Analysis) -> Iterator[Columns]:
             }
 
 
-def _registration(analysis: Analysis) -> pd.DataFrame:
-    return pd.DataFrame(
-        [
-            {
-                "hemi": hemi,
-                "n": len(side.registration.warps),
-                "explained_before": side.registration.explained_before,
-                "explained_after": side.registration.explained_after,
-                "iterations": side.registration.iterations,
-                "converged": side.registration.converged,
-            }
-            for hemi, side in analysis.sides.items()
-        ]
-    )
+def registration_tables(cohort: Cohort, sides: Mapping[str, SideResult]) -> Iterator[Named]:
+    """Make the tables of registration and of its warps."""
+    if not sides:
+        return
+    rows = [
+        {
+            "hemi": hemi,
+            "n": len(side.registration.warps),
+            "explained_before": side.registration.explained_before,
+            "explained_after": side.registration.explained_after,
+            "iterations": side.registration.iterations,
+            "converged": side.registration.converged,
+        }
+        for hemi, side in sides.items()
+    ]
+    yield "registration", pd.DataFrame(rows)
+    yield "warps", _stacked(_warps(cohort, sides))
 
 
-def _warps(cohort: Cohort, analysis: Analysis) -> Iterator[Columns]:
-    for hemi, side in analysis.sides.items():
+def _warps(cohort: Cohort, sides: Mapping[str, SideResult]) -> Iterator[Columns]:
+    for hemi, side in sides.items():
         visits = cohort.table.iloc[side.registered.rows]
         warps = side.registration.warps
         yield {

@@ -86,16 +86,14 @@ def write_results(
 ) -> None:
     """Write tables, maps and text."""
     for name, table in result_tables(cohort, analysis, settings):
-        _write_table(folder, name, table)
+        write_table(folder, name, table)
     for name, other in others.items():
         for title, table in point_tables(name, *other, settings):
-            _write_table(folder, title, table)
-    columns = {"participant": PARTICIPANT, "session": SESSION}
-    excluded = pd.DataFrame(exclusions, columns=[*columns, "hemi", "reason", "message"])
-    _write_table(folder, "excluded", excluded.rename(columns=columns))
+            write_table(folder, title, table)
+    write_exclusions(folder, exclusions)
     rows_of_model = analysis.compared.table.iloc[analysis.design.rows]
-    _write_table(folder, "covariates", rows_of_model, described=False)
-    _write_table(folder, "design", design_table(analysis), described=False)
+    write_table(folder, "covariates", rows_of_model, described=False)
+    write_table(folder, "design", design_table(analysis), described=False)
     registered = {hemi: side.registered for hemi, side in analysis.sides.items()}
     if registered or others:
         points = {name: other for name, (other, _) in others.items()}
@@ -116,6 +114,13 @@ def write_results(
     files.write_text(folder / "methods.md", text)
 
 
+def write_exclusions(folder: Path, exclusions: Sequence[Exclusion]) -> None:
+    """Write who is not in the analysis, and why."""
+    columns = {"participant": PARTICIPANT, "session": SESSION}
+    excluded = pd.DataFrame(exclusions, columns=[*columns, "hemi", "reason", "message"])
+    write_table(folder, "excluded", excluded.rename(columns=columns))
+
+
 def draw(
     folder: Path,
     cohort: Cohort,
@@ -130,7 +135,7 @@ def draw(
             files.write_bytes(folder / "figures" / name, content)
 
 
-def _write_table(folder: Path, name: str, table: pd.DataFrame, *, described: bool = True) -> None:
+def write_table(folder: Path, name: str, table: pd.DataFrame, *, described: bool = True) -> None:
     """Write a table, with a sidecar unless the columns are the user's or the model's."""
     columns = [str(column) for column in table.columns]
     cells = [[_cell(value) for value in table[column].tolist()] for column in table.columns]
@@ -270,7 +275,7 @@ def _write_gifti(folder: Path, cohort: Cohort, analysis: Analysis) -> None:
     """Write statistics, effect sizes and corrected p-values, and the surfaces to draw them on."""
     for hemi, one in analysis.fitted.items():
         if hemi in cohort.sides:
-            _write_surface(folder, cohort, one, hemi)
+            write_surface(folder, cohort, one, hemi)
     for key, test, found in tested_maps(analysis):
         for stat, values in (
             (test.kind, test.statistic),
@@ -284,10 +289,10 @@ def _write_gifti(folder: Path, cohort: Cohort, analysis: Analysis) -> None:
             files.write_bytes(folder / f"{stem}.shape.gii", content)
 
 
-def _write_surface(folder: Path, cohort: Cohort, one: FittedMaps, hemi: str) -> None:
+def write_surface(folder: Path, cohort: Cohort, one: FittedMaps, hemi: str) -> None:
     """Write the unfolded sheet, or the surface of other programs' maps."""
     if one.maps.mesh is not None:
-        space, secondary = next(iter(one.fits)), None
+        space, secondary = next(iter(one.maps.maps)), None
         points, triangles = one.maps.mesh.points, one.maps.mesh.triangles.astype(np.int32)
     else:
         space, secondary = "unfold", "MidThickness"

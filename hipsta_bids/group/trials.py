@@ -1,0 +1,397 @@
+"""Agreement of repeated sessions and sample sizes of trials, from files to files."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from hipsta_bids import __version__
+from hipsta_bids.derivatives import dataset
+from hipsta_bids.derivatives.names import TRIAL_MAPS, TRIAL_TABLES
+from hipsta_bids.errors import ModelError
+from hipsta_bids.group import write
+from hipsta_bids.group.analysis import register_side
+from hipsta_bids.group.clusters import frame_of
+from hipsta_bids.group.collect import Exclusion
+from hipsta_bids.group.comparison import Comparison
+from hipsta_bids.group.data import PARTICIPANT, SESSION, Bool, Cohort
+from hipsta_bids.group.figures import TrialMaps, TrialRow, draw_trial, encode
+from hipsta_bids.group.formula import (
+    check_names,
+    listed,
+)
+from hipsta_bids.group.glm import FittedMaps
+from hipsta_bids.group.methods import REFERENCES
+from hipsta_bids.group.power import (
+    THINNING,
+    TrialEffect,
+    point_level,
+    power_columns,
+    power_text,
+    sample_size,
+)
+from hipsta_bids.group.reference import Modeled, Retested, Source, Tables
+from hipsta_bids.group.retest import (
+    retest_cohort,
+    retest_text,
+)
+from hipsta_bids.group.run import (
+    GroupInputs,
+    GroupOptions,
+    GroupResult,
+    describe_dataset,
+    make_page,
+    read_inputs,
+    read_templates,
+    record_inputs,
+)
+from hipsta_bids.group.settings import GroupSettings
+from hipsta_bids.group.tables import entity_label, registration_tables
+from hipsta_bids.group.warps import templates_to_json
+from hipsta_bids.io import files, gifti
+from hipsta_bids.protocols.toml import resolve
+
+_NOT_ASKED = "another level than --among"
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialRequest:
+    """What is asked of repeated sessions, or of a reference cohort."""
+
+    retest: bool = False
+    effect: TrialEffect | None = None
+    """Of a trial whose size is asked for."""
+    among: tuple[str, str] | None = None
+    """Column and level of the participants; all without."""
+
+    @property
+    def name(self) -> str:
+        """Folder of the results."""
+        parts = ["retest"] if self.retest else []
+        if self.effect is not None:
+            share = f"{100 * self.effect.share:g}".replace(".", "p")
+            parts.append(f"power-{self.effect.kind}-{share}")
+        parts += [self.among[1]] if self.among else []
+        return "_".join("".join(c if c.isalnum() else "-" for c in part) for part in parts)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Found:
+    """What was found for some summary measures."""
+
+    hemi: str
+    measures: tuple[str, ...]
+    tables: Tables
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MapFound(Found):
+    """What was found at the points of one map."""
+
+    place: FittedMaps
+    """Where the points are."""
+
+
+def run_trial(options: GroupOptions, request: TrialRequest, settings: GroupSettings) -> GroupResult:
+    """Measure the agreement of sessions, or sample sizes, and write all results or none.
+
+    Raises
+    ------
+    HipstaError
+        If inputs, sessions or output folder do not allow it.
+    """
+    dataset.check_own_dataset(options.out_dir)
+    effect = request.effect
+    if effect is not None:
+        point_level(settings)  # refuses before anything is read
+    repeated = request.retest or bool(effect and effect.visits)
+    options = replace(options, comparison=Comparison(longitudinal=repeated))
+    inputs = read_inputs(options, settings)
+    table = inputs.cohort.table
+    keep = _members(table, request)
+    left_out = dict.fromkeys(table.index[~keep].astype(str), _NOT_ASKED)
+    cohort, retest = inputs.cohort.take(keep), None
+    if request.retest:
+        retest = retest_cohort(cohort, settings.retest.min_participants)
+        cohort, left_out = retest.cohort, left_out | dict(retest.left_out)
+    kept = table.index.isin(cohort.table.index)
+    templates = read_templates(options.template, cohort)
+    sides = {
+        hemi: register_side(cohort, hemi, groups=None, settings=settings, templates=templates)
+        for hemi in (cohort.sides if inputs.measures.maps else ())
+    }
+    registered = {hemi: side.registered for hemi, side in sides.items()} or cohort.sides
+    cohorts = {"": replace(cohort, sides=registered)}
+    cohorts |= {name: other.take(kept) for name, other in inputs.others.items()}
+    source: Source
+    if retest is not None:
+        source = Retested(retest, settings, repeated=bool(effect and effect.visits))
+    else:
+        source = Modeled(cohort, options.model, settings, inputs.time)
+    maps = {
+        name: list(
+            _of_maps(one, (name,) if name else inputs.measures.maps, source, effect, settings)
+        )
+        for name, one in cohorts.items()
+    }
+    measures = list(_of_measures(cohorts[""], inputs.measures.summaries, source, effect, settings))
+    notes = [*inputs.notes, *_notes(maps, inputs, source, effect)]
+    exclusions = [*inputs.exclusions, *_excluded(table, left_out)]
+    region = options.sheets.region
+    name = options.model.name or request.name + ("" if region == "body" else f"_{region}")
+    people = int(cohort.table[PARTICIPANT].nunique())
+    describe_dataset(options)
+    with write.model_folder(options.out_dir, name) as folder:
+        _write_measures(folder, cohort, measures)
+        for surface, found in maps.items():
+            _write_maps(folder, surface, cohorts[surface], found)
+        for title, content in registration_tables(cohort, sides):
+            write.write_table(folder, title, content)
+        made = {hemi: side.registration.template for hemi, side in sides.items()}
+        if own := {hemi: template for hemi, template in made.items() if template is not None}:
+            files.write_json(folder / "template.json", templates_to_json(own))
+        write.write_exclusions(folder, exclusions)
+        write.write_table(folder, "covariates", cohort.table, described=False)
+        text = _methods(source, request, cohort, settings)
+        files.write_text(folder / "methods.md", text)
+        record = {
+            "command": list(options.command),
+            "version": __version__,
+            "inputs": record_inputs(options, inputs.found),
+            "formula": source.spec.formula if isinstance(source, Modeled) else None,
+            "participants": people,
+            "rows": len(cohort.table),
+            "hemispheres": {hemi: len(side.rows) for hemi, side in cohort.sides.items()},
+            "retest": retest and {"participants": people, "sessions": retest.sessions},
+            "power": effect and asdict(effect) | {"alpha_point": point_level(settings)},
+            "among": request.among,
+            "notes": notes,
+            "settings": resolve(settings),
+        }
+        files.write_json(folder / "analysis.json", record)
+    page, problem = make_page(options, name)
+    return GroupResult(
+        folder=options.out_dir / write.GROUP_FOLDER / name,
+        page=page,
+        problem=problem,
+        n_participants=people,
+        n_excluded=len(exclusions),
+        notes=tuple(notes),
+    )
+
+
+def _members(table: pd.DataFrame, request: TrialRequest) -> Bool:
+    """Tell whose visits are asked for."""
+    if request.among is None:
+        return np.ones(len(table), dtype=bool)
+    column, level = request.among
+    check_names([column], table.columns)
+    values = table[column].map(lambda value: None if value is None else str(value))
+    keep = (values == level).to_numpy()
+    if not keep.any():
+        raise ModelError(
+            f"--among {column}={level}: no participant has it; there are"
+            f" {listed(sorted(values.dropna().unique()))}",
+            reason="unknown-level",
+        )
+    return np.asarray(keep, dtype=bool)
+
+
+def _of_maps(
+    cohort: Cohort,
+    names: Sequence[str],
+    source: Source,
+    effect: TrialEffect | None,
+    settings: GroupSettings,
+) -> Iterator[MapFound]:
+    """Results at each point of the maps of a cohort."""
+    for hemi, side in cohort.sides.items() if names else ():
+        place = source.place(hemi, side.only([name for name in names if name in side.maps]))
+        for measure in place.maps.maps:
+            tables, reference = source.of_map(place, measure)
+            signed = effect is not None and effect.kind == THINNING
+            # A share of a mean has no meaning where values have both signs.
+            if effect is not None and not (signed and np.nanmin(place.values(measure)) <= 0):
+                size = sample_size(effect, reference, settings, alpha=point_level(settings))
+                tables = {**tables, "power": power_columns(effect, size, reference)}
+            yield MapFound(hemi=hemi, measures=(measure,), tables=tables, place=place)
+
+
+def _of_measures(
+    cohort: Cohort,
+    only: Sequence[str] | None,
+    source: Source,
+    effect: TrialEffect | None,
+    settings: GroupSettings,
+) -> Iterator[Found]:
+    """Results of the summary measures of each hemisphere and of the mean of both."""
+    for hemi, names, values, tables, known in source.of_summaries(cohort, only):
+        own, reference = tables, known
+        if effect is not None:
+            if effect.kind == THINNING:
+                signed = np.where(np.isfinite(values), values, 1.0).min(axis=0) <= 0
+                reference = replace(known, mean=np.where(signed, np.nan, known.mean))
+            size = sample_size(effect, reference, settings, alpha=settings.power.alpha, limits=True)
+            own = {**tables, "power": power_columns(effect, size, reference)}
+        yield Found(hemi=hemi, measures=names, tables=own)
+
+
+def _notes(
+    maps: Mapping[str, Sequence[MapFound]],
+    inputs: GroupInputs,
+    source: Source,
+    effect: TrialEffect | None,
+) -> Iterator[str]:
+    if isinstance(source, Retested) and (n := len(source.retest.left_out)):
+        yield f"{n} visits of participants who lack a session are left out, see excluded.tsv"
+    if effect is None:
+        return
+    every = [one for own in maps.values() for one in own]
+    if lost := dict.fromkeys(one.measures[0] for one in every if "power" not in one.tables):
+        yield (
+            f"{', '.join(lost)}: no sample sizes, since it has values of both signs, whose share"
+            " means nothing"
+        )
+    if isinstance(source, Modeled) and effect.duration > source.follow_up:
+        yield (
+            f"the trial lasts {effect.duration:g} months, the reference {source.follow_up:.3g};"
+            " that change goes on alike is an assumption"
+        )
+    if isinstance(source, Retested) and effect.visits:
+        yield (
+            "sample sizes rest on the variance of measurement alone; trials need more, as people"
+            " differ in how they change"
+        )
+    if later := sum(one.reason == "later-session" for one in inputs.exclusions):
+        yield f"{later} later sessions are not in it; --visits takes all"
+
+
+def _excluded(table: pd.DataFrame, left_out: Mapping[str, str]) -> Iterator[Exclusion]:
+    for row in table.loc[list(left_out), [PARTICIPANT, SESSION]].itertuples():
+        message = left_out[str(row.Index)]
+        yield Exclusion(
+            participant=str(row[1]),
+            session=row[2],
+            hemi=files.MISSING,
+            reason="not-asked" if message == _NOT_ASKED else "incomplete-sessions",
+            message=message,
+        )
+
+
+def _methods(source: Source, request: TrialRequest, cohort: Cohort, settings: GroupSettings) -> str:
+    """Word what was done, with the works it rests on."""
+    cited: list[str] = []
+
+    def cite(key: str) -> str:
+        if key not in cited:
+            cited.append(key)
+        return f"[{cited.index(key) + 1}]"
+
+    people = int(cohort.table[PARTICIPANT].nunique())
+    among = f" ({' '.join(request.among)})" if request.among else ""
+    first = (
+        f"Measures of the hippocampus {cite('method')} of {people} participants{among} with"
+        f" {len(cohort.table)} visits were analyzed with hipsta_bids {__version__}. "
+    )
+    if settings.registration.align == "none":
+        first += "Maps were not registered to each other."
+    else:
+        first += (
+            f"Sheets were registered by their curvature profiles {cite('registr')}, each session by"
+            " itself, as for comparisons of groups."
+        )
+    paragraphs = [first]
+    if isinstance(source, Retested):
+        paragraphs.append(retest_text(source.retest, settings.retest, cite))
+    if request.effect is not None:
+        paragraphs.append(power_text(request.effect, settings, source.words, cite))
+    lines = ["# Methods and findings", "", "This text may be used freely, as it stands or changed."]
+    for paragraph in paragraphs:
+        lines += ["", paragraph]
+    lines += ["", "# References", ""]
+    lines += [f"{i}. {REFERENCES[key]}" for i, key in enumerate(cited, start=1)]
+    return "\n".join(lines) + "\n"
+
+
+def _write_measures(folder: Path, cohort: Cohort, found: Sequence[Found]) -> None:
+    """Write what was found for summary measures, those first that need fewest participants."""
+    for question, (title, _) in TRIAL_TABLES.items():
+        blocks = [
+            pd.DataFrame(
+                {
+                    "hemi": one.hemi,
+                    "measure": one.measures,
+                    "unit": [cohort.units.get(name, "1") for name in one.measures],
+                    **one.tables[question],
+                }
+            )
+            for one in found
+            if question in one.tables
+        ]
+        if blocks:
+            table = pd.concat(blocks, ignore_index=True)
+            if "per_arm" in table:
+                table = table.sort_values("per_arm", kind="stable", ignore_index=True)
+            write.write_table(folder, title, table)
+
+
+def _write_maps(folder: Path, surface: str, cohort: Cohort, found: Sequence[MapFound]) -> None:
+    """Write the points of maps as a table, as GIFTI and as figures."""
+    for question, (_, title) in TRIAL_TABLES.items():
+        blocks = []
+        for one in found:
+            if question in one.tables:
+                frame = frame_of(cohort, one.place)
+                columns = {
+                    "hemi": one.hemi,
+                    "measure": one.measures[0],
+                    "unit": cohort.units.get(one.measures[0], "1"),
+                    **frame.number,
+                    **frame.position,
+                    "subfield": frame.subfield,
+                    **one.tables[question],
+                }
+                blocks.append(pd.DataFrame(columns))
+        if blocks:
+            table = pd.concat(blocks, ignore_index=True)
+            write.write_table(folder, "_".join(filter(None, (surface, title))), table)
+    for one in found:
+        write.write_surface(folder, cohort, one.place, one.hemi)
+        units = {"1": "1", "": cohort.units.get(one.measures[0], "1")}
+        for stat, (question, column, unit) in TRIAL_MAPS.items():
+            if question in one.tables:
+                stem = f"hemi-{one.hemi}_stat-{stat}_desc-{entity_label(one.measures[0])}_statmap"
+                values = np.asarray(one.tables[question][column], dtype=np.float64)
+                content = gifti.shape_bytes(values, hemi=one.hemi, name=stem, unit=units[unit])
+                files.write_bytes(folder / f"{stem}.shape.gii", content)
+    for title, rows in _figures(cohort, found):
+        for file, content in encode(title, draw_trial(cohort, rows)):
+            files.write_bytes(folder / "figures" / file, content)
+
+
+def _figures(cohort: Cohort, found: Sequence[MapFound]) -> Iterator[tuple[str, list[TrialRow]]]:
+    """Name the figures of each map, and say what their rows of panels are."""
+    for measure in dict.fromkeys(one.measures[0] for one in found):
+
+        def maps(question: str, column: str, name: str = measure) -> TrialMaps:
+            return {
+                one.hemi: (one.place, np.asarray(one.tables[question][column], dtype=np.float64))
+                for one in found
+                if one.measures[0] == name and question in one.tables
+            }
+
+        if within := maps("retest", "sd_within"):
+            unit = f"[{cohort.units.get(measure, '1')}]"
+            yield (
+                f"{measure}_retest",
+                [
+                    TrialRow("within-subject SD", unit, within, "magma"),
+                    TrialRow("ICC(2,1)", "", maps("retest", "icc"), "viridis", limits=(0.0, 1.0)),
+                ],
+            )
+        sizes = maps("power", "per_arm")
+        if any(np.isfinite(values).any() for _, values in sizes.values()):
+            row = TrialRow("participants per arm", "", sizes, "viridis_r", log=True)
+            yield f"{measure}_power", [row]
