@@ -37,6 +37,8 @@ _EPILOG = """\
 without --model and --formula: group + age + sex (+ site), each group against its reference level
 (CN, CU, HC, control ..., else the most frequent), from BIDS_DIR/participants.tsv
 
+--retest and --power answer questions of their own, in OUT_DIR/group/retest/ or power-.../
+
 results: OUT_DIR/group/MODEL/; begin with OUT_DIR/group/MODEL.html
 
 exit codes: 0 done; 64 wrong use; 65 the data do not allow it; 66 no hemispheres; 73 cannot write

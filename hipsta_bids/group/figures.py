@@ -40,6 +40,9 @@ _WIDTHS = (1.2, 0.7, 1.2)  # of the lines of interior, middle and exterior, poin
 _STYLES = ("-", ":", "-")
 
 
+#: Ticks of numbers of participants.
+_COUNTS = tuple(n * 10**power for power in range(5) for n in (1, 2, 3, 5))
+
 Scale = Mapping[str, Any]
 """Color map and the values at its ends, as matplotlib's arguments."""
 
@@ -478,7 +481,12 @@ def draw_trial(cohort: Cohort, rows: Sequence[TrialRow]) -> "Figure":
         for axis, (hemi, (one, values)) in zip(axes[i], row.maps.items(), strict=False):
             image = _draw(axis, cohort, one, values.reshape(one.maps.shape), scale)
             axis.set_title(f"{row.title}, {SIDES[hemi]}", fontsize=TITLE)
-        _bar(figure, image, axes[i], f"{row.title} {row.unit}".strip(), extend="both")
+        bar = _bar(figure, image, axes[i], f"{row.title} {row.unit}".strip(), extend="both")
+        if row.log:
+            low, high = bar.norm.vmin, bar.norm.vmax
+            bar.minorticks_off()
+            ticks = [tick for tick in _COUNTS if low <= tick <= high]
+            bar.set_ticks(ticks, labels=[f"{tick:,}" for tick in ticks])
     return figure
 
 

@@ -333,7 +333,9 @@ def _write_measures(folder: Path, cohort: Cohort, found: Sequence[Found]) -> Non
         if blocks:
             table = pd.concat(blocks, ignore_index=True)
             if "per_arm" in table:
-                table = table.sort_values("per_arm", kind="stable", ignore_index=True)
+                table = table.sort_values(
+                    ["per_arm", "cohen_d"], ascending=[True, False], ignore_index=True
+                )
             write.write_table(folder, title, table)
 
 

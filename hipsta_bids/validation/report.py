@@ -34,6 +34,7 @@ SUITES: Mapping[str, str] = MappingProxyType(
         "defects": "defects:run",
         "population": "population:run",
         "group": "group:run",
+        "trials": "trials:run",
         "surrogate": "surrogate:run",
         "hippunfold": "hippunfold:run",
     }
