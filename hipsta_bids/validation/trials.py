@@ -33,7 +33,7 @@ MAX_DIFFERENCE = 0.03
 
 _MEAN, _BETWEEN, _WITHIN = 1.6, 0.16, 0.04  # mm
 _SLOPE, _SLOPE_SD = -0.004, 0.003  # mm per month
-_COHORT, _MAP_COHORT = 2000, 400  # participants of the reference
+_COHORT, _MAP_COHORT = 5000, 400  # participants of the reference
 _FOLLOWED = (0.0, 12.0, 24.0)  # months of the reference's visits
 _PROCEDURES = {"bh": "fdr_bh", "fdr2": "fdr_tsbky"}
 
