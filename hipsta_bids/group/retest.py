@@ -138,7 +138,7 @@ def retest_cohort(cohort: Cohort, least: int) -> RetestCohort:
     own = table[PARTICIPANT].map(table.groupby(PARTICIPANT)[SESSION].nunique())
     complete = (own == len(sessions)).to_numpy()
     n = int(table.loc[complete, PARTICIPANT].nunique())
-    found = listed([f"{name} ({count})" for name, count in counts.items()])
+    found = listed([f"{name or 'without a name'} ({count})" for name, count in counts.items()])
     if len(sessions) < 2:  # noqa: PLR2004 -- two sessions
         raise ModelError(
             f"--retest: there is no second session, only {found}; measure repeated sessions first",
@@ -183,7 +183,7 @@ def retest_text(one: RetestCohort, settings: RetestSettings, cite: Callable[[str
     """Word how agreement was measured."""
     return (
         f"Agreement between {len(one.sessions)} sessions of {len(one.participants)} participants"
-        " was estimated at each point of the registered sheets and for each summary measure. The"
+        " was estimated at each point of the maps and for each summary measure. The"
         " within-subject standard deviation is the root of the mean variance of a participant's"
         f" values {cite('bland')}; a change beyond 1.96 √2 times this is unlikely to be measurement"
         f" alone (minimal detectable change {cite('weir')}). The intraclass correlation is"

@@ -154,7 +154,7 @@ def run_trial(options: GroupOptions, request: TrialRequest, settings: GroupSetti
             files.write_json(folder / "template.json", templates_to_json(own))
         write.write_exclusions(folder, exclusions)
         write.write_table(folder, "covariates", cohort.table, described=False)
-        text = _methods(source, request, cohort, settings)
+        text = _methods(source, request, cohort, maps, settings)
         files.write_text(folder / "methods.md", text)
         record = {
             "command": list(options.command),
@@ -280,7 +280,13 @@ def _excluded(table: pd.DataFrame, left_out: Mapping[str, str]) -> Iterator[Excl
         )
 
 
-def _methods(source: Source, request: TrialRequest, cohort: Cohort, settings: GroupSettings) -> str:
+def _methods(
+    source: Source,
+    request: TrialRequest,
+    cohort: Cohort,
+    maps: Mapping[str, Sequence[MapFound]],
+    settings: GroupSettings,
+) -> str:
     """Word what was done, with the works it rests on."""
     cited: list[str] = []
 
@@ -293,14 +299,20 @@ def _methods(source: Source, request: TrialRequest, cohort: Cohort, settings: Gr
     among = f" ({' '.join(request.among)})" if request.among else ""
     first = (
         f"Measures of the hippocampus {cite('method')} of {people} participants{among} with"
-        f" {len(cohort.table)} visits were analyzed with hipsta_bids {__version__}. "
+        f" {len(cohort.table)} visits were analyzed with hipsta_bids {__version__}."
     )
-    if settings.registration.align == "none":
-        first += "Maps were not registered to each other."
-    else:
+    others = [name for name in maps if name]
+    if maps[""] and settings.registration.align != "none":
         first += (
-            f"Sheets were registered by their curvature profiles {cite('registr')}, each session by"
-            " itself, as for comparisons of groups."
+            f" Sheets were registered by their curvature profiles {cite('registr')}, each session"
+            " by itself, as for comparisons of groups."
+        )
+    elif maps[""]:
+        first += " Sheets were not registered to each other."
+    if others:
+        first += (
+            f" Maps of other programs ({', '.join(others)}) were taken as they are, without"
+            " registration."
         )
     paragraphs = [first]
     if isinstance(source, Retested):

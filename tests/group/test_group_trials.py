@@ -6,13 +6,8 @@ import nibabel as nib
 import numpy as np
 import pandas as pd
 import pytest
-from small_cohorts import (
-    NODES,
-    SETTINGS,
-    place_of,
-    write_hemisphere,
-    write_participants,
-)
+from hippunfold_like import flat_surface, names, write_map, write_surface
+from small_cohorts import NODES, SETTINGS, place_of, write_hemisphere, write_participants
 from statsmodels.api import OLS
 from statsmodels.stats.power import TTestIndPower
 
@@ -203,6 +198,31 @@ def test_retest_feeds_sample_sizes(dataset):
     np.testing.assert_allclose(sizes.difference, 0.05 * agreed["mean"], rtol=1e-8)
     record = json.loads((folder / "analysis.json").read_text())
     assert any("variance of measurement alone" in note for note in record["notes"])
+
+
+def test_maps_of_other_programs_lie_on_their_surface(tmp_path):
+    data, out, random = tmp_path / "bids", tmp_path / "out", np.random.default_rng(0)
+    surface = flat_surface(60)
+    values = 1.5 + random.normal(0, 0.1, (6, 1, 60)) + random.normal(0, 0.04, (6, 2, 60))
+    for i, of_participant in enumerate(values):
+        for session, one in zip("12", of_participant, strict=True):
+            path, flat = names(data / "hippunfold", f"{i}", "L", version=2, session=session)
+            write_map(path, one)
+            write_surface(flat, *surface)
+    pattern = "hippunfold/sub-{subject}/ses-{session}/metric/*_hemi-{hemi}_*_thickness.shape.gii"
+    asked = ["--retest", "--power", "thinning=5%", "--maps", f"hipp={pattern}"]
+    folder = run((data, out), *asked)
+    expected = repeatability(values)
+    found = table(folder / "hipp_retest_points.tsv")
+    np.testing.assert_allclose(found.icc, expected.icc, rtol=1e-5)  # maps are in single precision
+    assert found.surface_x.to_numpy() == pytest.approx(surface[0][:, 0], abs=1e-4)
+    sizes = table(folder / "hipp_power_points.tsv")
+    total = np.sqrt(expected.within**2 + expected.between**2)
+    np.testing.assert_allclose(sizes.sd_endpoint, total, rtol=1e-5)
+    assert (folder / "hemi-L_space-hipp_midthickness.surf.gii").is_file()
+    text = (folder / "methods.md").read_text()
+    assert "(hipp) were taken as they are" in text
+    assert "could not be made" not in group_page(folder)
 
 
 @pytest.mark.parametrize(
