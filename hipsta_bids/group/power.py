@@ -209,7 +209,7 @@ def power_columns(
         "n": reference.n,
         "mean": reference.mean,
         "change_per_year": np.nan if reference.slope is None else reference.slope * _YEAR,
-        "difference": found.difference * per_year,
+        "arm_difference": found.difference * per_year,
         "sd_endpoint": found.sd * per_year,
         "cohen_d": found.cohen_d,
         "alpha": found.alpha,

@@ -12,7 +12,7 @@ from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.names import TRIAL_MAPS, TRIAL_TABLES
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group import write
-from hipsta_bids.group.analysis import register_side
+from hipsta_bids.group.analysis import SideResult, register_side
 from hipsta_bids.group.clusters import frame_of
 from hipsta_bids.group.collect import Exclusion
 from hipsta_bids.group.comparison import Comparison
@@ -49,8 +49,9 @@ from hipsta_bids.group.run import (
 )
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.tables import entity_label, registration_tables
-from hipsta_bids.group.warps import templates_to_json
+from hipsta_bids.group.warps import Template, templates_to_json
 from hipsta_bids.io import files, gifti
+from hipsta_bids.progress import each, tell
 from hipsta_bids.protocols.toml import resolve
 
 _NOT_ASKED = "another level than --among"
@@ -108,6 +109,7 @@ def run_trial(options: GroupOptions, request: TrialRequest, settings: GroupSetti
         point_level(settings)  # refuses before anything is read
     repeated = request.retest or bool(effect and effect.visits)
     options = replace(options, comparison=Comparison(longitudinal=repeated))
+    tell("reading")
     inputs = read_inputs(options, settings)
     table = inputs.cohort.table
     keep = _members(table, request)
@@ -120,11 +122,12 @@ def run_trial(options: GroupOptions, request: TrialRequest, settings: GroupSetti
     templates = read_templates(options.template, cohort)
     sides = {
         hemi: register_side(cohort, hemi, groups=None, settings=settings, templates=templates)
-        for hemi in (cohort.sides if inputs.measures.maps else ())
+        for hemi in each("registration", list(cohort.sides) if inputs.measures.maps else [])
     }
     registered = {hemi: side.registered for hemi, side in sides.items()} or cohort.sides
     cohorts = {"": replace(cohort, sides=registered)}
     cohorts |= {name: other.take(kept) for name, other in inputs.others.items()}
+    tell("points and measures")
     source: Source
     if retest is not None:
         source = Retested(retest, settings, repeated=bool(effect and effect.visits))
@@ -144,14 +147,14 @@ def run_trial(options: GroupOptions, request: TrialRequest, settings: GroupSetti
     people = int(cohort.table[PARTICIPANT].nunique())
     describe_dataset(options)
     with write.model_folder(options.out_dir, name) as folder:
+        tell("tables, maps and figures")
         _write_measures(folder, cohort, measures)
         for surface, found in maps.items():
             _write_maps(folder, surface, cohorts[surface], found)
         for title, content in registration_tables(cohort, sides):
             write.write_table(folder, title, content)
-        made = {hemi: side.registration.template for hemi, side in sides.items()}
-        if own := {hemi: template for hemi, template in made.items() if template is not None}:
-            files.write_json(folder / "template.json", templates_to_json(own))
+        if templates := _templates(sides):
+            files.write_json(folder / "template.json", templates_to_json(templates))
         write.write_exclusions(folder, exclusions)
         write.write_table(folder, "covariates", cohort.table, described=False)
         text = _methods(source, request, cohort, maps, settings)
@@ -180,6 +183,12 @@ def run_trial(options: GroupOptions, request: TrialRequest, settings: GroupSetti
         n_excluded=len(exclusions),
         notes=tuple(notes),
     )
+
+
+def _templates(sides: Mapping[str, SideResult]) -> dict[str, Template]:
+    """Templates of registration by hemisphere, where it made or used one."""
+    found = {hemi: side.registration.template for hemi, side in sides.items()}
+    return {hemi: template for hemi, template in found.items() if template is not None}
 
 
 def _members(table: pd.DataFrame, request: TrialRequest) -> Bool:

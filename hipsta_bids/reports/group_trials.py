@@ -79,7 +79,7 @@ def power(results: GroupResults) -> Mapping[str, Any] | None:
             "n": int(row["n"]),
             "mean": number_text(row["mean"]),
             "change": number_text(row["change_per_year"]),
-            "difference": number_text(row["difference"]),
+            "difference": number_text(row["arm_difference"]),
             "sd": number_text(row["sd_endpoint"]),
             "d": number_text(row["cohen_d"]),
             "per_arm": _count(row["per_arm"]),

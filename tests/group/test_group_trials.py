@@ -174,7 +174,7 @@ def test_sample_size_of_slowing_among_patients_draws_a_map(dataset):
     thin = summary.loc["thickness_mean"]
     # The planted change, with the SD .01 of own changes over seven patients.
     assert thin.change_per_year.to_numpy() == pytest.approx([-0.06] * 3, abs=0.012)
-    np.testing.assert_allclose(thin.difference, -0.25 * thin.change_per_year, rtol=1e-8)
+    np.testing.assert_allclose(thin.arm_difference, -0.25 * thin.change_per_year, rtol=1e-8)
     assert summary.loc[("volume", "LR")].change_per_year == pytest.approx(-5, abs=0.6)
     assert (summary.power >= 0.9).all()
     reasons = table(folder / "excluded.tsv").reason
@@ -195,7 +195,7 @@ def test_retest_feeds_sample_sizes(dataset):
     sizes = table(folder / "power.tsv").set_index(["measure", "hemi"]).loc[agreed.index]
     # The slope of two visits is their difference.
     np.testing.assert_allclose(sizes.sd_endpoint, np.sqrt(2) * agreed.sd_within, rtol=1e-8)
-    np.testing.assert_allclose(sizes.difference, 0.05 * agreed["mean"], rtol=1e-8)
+    np.testing.assert_allclose(sizes.arm_difference, 0.05 * agreed["mean"], rtol=1e-8)
     record = json.loads((folder / "analysis.json").read_text())
     assert any("variance of measurement alone" in note for note in record["notes"])
 
