@@ -33,10 +33,7 @@ from hipsta_bids.group.power import (
     sample_size,
 )
 from hipsta_bids.group.reference import Modeled, Retested, Source, Tables
-from hipsta_bids.group.retest import (
-    retest_cohort,
-    retest_text,
-)
+from hipsta_bids.group.retest import RetestCohort, retest_cohort, retest_text
 from hipsta_bids.group.run import (
     GroupInputs,
     GroupOptions,
@@ -53,8 +50,6 @@ from hipsta_bids.group.warps import Template, templates_to_json
 from hipsta_bids.io import files, gifti
 from hipsta_bids.progress import each, tell
 from hipsta_bids.protocols.toml import resolve
-
-_NOT_ASKED = "another level than --among"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,12 +107,7 @@ def run_trial(options: GroupOptions, request: TrialRequest, settings: GroupSetti
     tell("reading")
     inputs = read_inputs(options, settings)
     table = inputs.cohort.table
-    keep = _members(table, request)
-    left_out = dict.fromkeys(table.index[~keep].astype(str), _NOT_ASKED)
-    cohort, retest = inputs.cohort.take(keep), None
-    if request.retest:
-        retest = retest_cohort(cohort, settings.retest.min_participants)
-        cohort, left_out = retest.cohort, left_out | dict(retest.left_out)
+    cohort, retest, left_out = _choose(inputs.cohort, request, settings)
     kept = table.index.isin(cohort.table.index)
     templates = read_templates(options.template, cohort)
     sides = {
@@ -133,6 +123,11 @@ def run_trial(options: GroupOptions, request: TrialRequest, settings: GroupSetti
         source = Retested(retest, settings, repeated=bool(effect and effect.visits))
     else:
         source = Modeled(cohort, options.model, settings, inputs.time)
+        left_out |= {
+            visit: ("incomplete", f"{variable} is missing")
+            for variable, visits in source.model.design.dropped.items()
+            for visit in visits
+        }
     maps = {
         name: list(
             _of_maps(one, (name,) if name else inputs.measures.maps, source, effect, settings)
@@ -144,7 +139,10 @@ def run_trial(options: GroupOptions, request: TrialRequest, settings: GroupSetti
     exclusions = [*inputs.exclusions, *_excluded(table, left_out)]
     region = options.sheets.region
     name = options.model.name or request.name + ("" if region == "body" else f"_{region}")
-    people = int(cohort.table[PARTICIPANT].nunique())
+    modeled = cohort.table
+    if isinstance(source, Modeled):
+        modeled = modeled.iloc[source.model.design.rows]
+    people = int(modeled[PARTICIPANT].nunique())
     describe_dataset(options)
     with write.model_folder(options.out_dir, name) as folder:
         tell("tables, maps and figures")
@@ -156,8 +154,8 @@ def run_trial(options: GroupOptions, request: TrialRequest, settings: GroupSetti
         if templates := _templates(sides):
             files.write_json(folder / "template.json", templates_to_json(templates))
         write.write_exclusions(folder, exclusions)
-        write.write_table(folder, "covariates", cohort.table, described=False)
-        text = _methods(source, request, cohort, maps, settings)
+        write.write_table(folder, "covariates", modeled, described=False)
+        text = _methods(source, request, modeled, maps, settings)
         files.write_text(folder / "methods.md", text)
         record = {
             "command": list(options.command),
@@ -165,7 +163,7 @@ def run_trial(options: GroupOptions, request: TrialRequest, settings: GroupSetti
             "inputs": record_inputs(options, inputs.found),
             "formula": source.spec.formula if isinstance(source, Modeled) else None,
             "participants": people,
-            "rows": len(cohort.table),
+            "rows": len(modeled),
             "hemispheres": {hemi: len(side.rows) for hemi, side in cohort.sides.items()},
             "retest": retest and {"participants": people, "sessions": retest.sessions},
             "power": effect and asdict(effect) | {"alpha_point": point_level(settings)},
@@ -189,6 +187,21 @@ def _templates(sides: Mapping[str, SideResult]) -> dict[str, Template]:
     """Templates of registration by hemisphere, where it made or used one."""
     found = {hemi: side.registration.template for hemi, side in sides.items()}
     return {hemi: template for hemi, template in found.items() if template is not None}
+
+
+def _choose(
+    cohort: Cohort, request: TrialRequest, settings: GroupSettings
+) -> tuple[Cohort, RetestCohort | None, dict[str, tuple[str, str]]]:
+    """Keep the visits that are asked for; of others reason and message."""
+    keep = _members(cohort.table, request)
+    message = "another level than --among"
+    left_out = dict.fromkeys(cohort.table.index[~keep].astype(str), ("not-asked", message))
+    cohort = cohort.take(keep)
+    if not request.retest:
+        return cohort, None, left_out
+    retest = retest_cohort(cohort, settings.retest.min_participants)
+    left_out |= {v: ("incomplete-sessions", why) for v, why in retest.left_out.items()}
+    return retest.cohort, retest, left_out
 
 
 def _members(table: pd.DataFrame, request: TrialRequest) -> Bool:
@@ -277,14 +290,15 @@ def _notes(
         yield f"{later} later sessions are not in it; --visits takes all"
 
 
-def _excluded(table: pd.DataFrame, left_out: Mapping[str, str]) -> Iterator[Exclusion]:
+def _excluded(table: pd.DataFrame, left_out: Mapping[str, tuple[str, str]]) -> Iterator[Exclusion]:
+    """List visits that are left out, with reason and message."""
     for row in table.loc[list(left_out), [PARTICIPANT, SESSION]].itertuples():
-        message = left_out[str(row.Index)]
+        reason, message = left_out[str(row.Index)]
         yield Exclusion(
             participant=str(row[1]),
             session=row[2],
             hemi=files.MISSING,
-            reason="not-asked" if message == _NOT_ASKED else "incomplete-sessions",
+            reason=reason,
             message=message,
         )
 
@@ -292,7 +306,7 @@ def _excluded(table: pd.DataFrame, left_out: Mapping[str, str]) -> Iterator[Excl
 def _methods(
     source: Source,
     request: TrialRequest,
-    cohort: Cohort,
+    visits: pd.DataFrame,
     maps: Mapping[str, Sequence[MapFound]],
     settings: GroupSettings,
 ) -> str:
@@ -304,11 +318,11 @@ def _methods(
             cited.append(key)
         return f"[{cited.index(key) + 1}]"
 
-    people = int(cohort.table[PARTICIPANT].nunique())
+    people = int(visits[PARTICIPANT].nunique())
     among = f" ({' '.join(request.among)})" if request.among else ""
     first = (
         f"Measures of the hippocampus {cite('method')} of {people} participants{among} with"
-        f" {len(cohort.table)} visits were analyzed with hipsta_bids {__version__}."
+        f" {len(visits)} visits were analyzed with hipsta_bids {__version__}."
     )
     others = [name for name in maps if name]
     if maps[""] and settings.registration.align != "none":

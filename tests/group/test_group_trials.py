@@ -225,6 +225,22 @@ def test_maps_of_other_programs_lie_on_their_surface(tmp_path):
     assert "could not be made" not in group_page(folder)
 
 
+def test_who_lacks_a_covariate_is_not_in_the_reference(dataset, tmp_path):
+    score = tmp_path / "score.tsv"
+    score.write_text(
+        "participant_id\tscore\n"
+        + "".join(f"sub-{i + 1:02d}\t{i or 'n/a'}\n" for i in range(PEOPLE))
+    )
+    options = ["--power", "thinning=5%", "--measures", "volume", "--formula", "score"]
+    folder = run(dataset, *options, "--covariates", str(score))
+    assert (table(folder / "power.tsv").n == PEOPLE - 1).all()
+    excluded = table(folder / "excluded.tsv").query("reason == 'incomplete'")
+    assert excluded[["participant_id", "message"]].to_numpy().tolist() == [
+        ["sub-01", "score is missing"]
+    ]
+    assert f"{PEOPLE - 1} participants" in (folder / "methods.md").read_text()
+
+
 @pytest.mark.parametrize(
     ("options", "code", "message"),
     [
