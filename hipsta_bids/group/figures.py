@@ -466,8 +466,8 @@ class TrialRow:
         """Colors and the values at their ends."""
         from matplotlib.colors import LogNorm  # noqa: PLC0415  (optional, slow to load)
 
-        every = [values for _, values in self.maps.values()]
-        low, high = self.limits or display.scale_of(display.THICKNESS, every)
+        every = display.known([values for _, values in self.maps.values()])
+        low, high = self.limits or (np.percentile(every, (1, 99)) if len(every) else (1.0, 2.0))
         if self.log:
             return {"cmap": self.colors, "norm": LogNorm(low, max(high, 1.1 * low))}
         return scale_of(self.colors, low, high)
