@@ -2,7 +2,9 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -16,14 +18,12 @@ from hipsta_bids.group.analysis import SideResult, register_side
 from hipsta_bids.group.clusters import frame_of
 from hipsta_bids.group.collect import Exclusion
 from hipsta_bids.group.comparison import Comparison
-from hipsta_bids.group.data import PARTICIPANT, SESSION, Bool, Cohort
-from hipsta_bids.group.figures import TrialMaps, TrialRow, draw_trial, encode
-from hipsta_bids.group.formula import (
-    check_names,
-    listed,
-)
+from hipsta_bids.group.data import PARTICIPANT, SESSION, Bool, Cohort, Float
+from hipsta_bids.group.figures import Drawing
+from hipsta_bids.group.formula import check_names, listed
 from hipsta_bids.group.glm import FittedMaps
 from hipsta_bids.group.methods import REFERENCES
+from hipsta_bids.group.panels import Row, Scale, draw_rows
 from hipsta_bids.group.power import (
     THINNING,
     TrialEffect,
@@ -50,6 +50,14 @@ from hipsta_bids.group.warps import Template, templates_to_json
 from hipsta_bids.io import files, gifti
 from hipsta_bids.progress import each, tell
 from hipsta_bids.protocols.toml import resolve
+from hipsta_bids.reports.display import known
+from hipsta_bids.reports.group_tables import display_name, with_brackets
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: Ticks of numbers of participants.
+_COUNTS = tuple(n * 10**power for power in range(5) for n in (1, 2, 3, 5))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,18 +153,19 @@ def run_trial(options: GroupOptions, request: TrialRequest, settings: GroupSetti
     people = int(modeled[PARTICIPANT].nunique())
     describe_dataset(options)
     with write.model_folder(options.out_dir, name) as folder:
-        tell("tables, maps and figures")
+        tell("tables and maps")
         _write_measures(folder, cohort, measures)
         for surface, found in maps.items():
             _write_maps(folder, surface, cohorts[surface], found)
-        for title, content in registration_tables(cohort, sides):
+        for title, content in registration_tables(cohort, sides) if sides else ():
             write.write_table(folder, title, content)
         if templates := _templates(sides):
             files.write_json(folder / "template.json", templates_to_json(templates))
         write.write_exclusions(folder, exclusions)
         write.write_table(folder, "covariates", modeled, described=False)
-        text = _methods(source, request, modeled, maps, settings)
-        files.write_text(folder / "methods.md", text)
+        files.write_text(folder / "methods.md", _methods(source, request, modeled, maps, settings))
+        figures = (figure for key, own in maps.items() for figure in _figures(cohorts[key], own))
+        notes += write.write_figures(folder, figures)
         record = {
             "command": list(options.command),
             "version": __version__,
@@ -168,7 +177,7 @@ def run_trial(options: GroupOptions, request: TrialRequest, settings: GroupSetti
             "retest": retest and {"participants": people, "sessions": retest.sessions},
             "power": effect and asdict(effect) | {"alpha_point": point_level(settings)},
             "among": request.among,
-            "notes": notes,
+            "notes": [*inputs.found.warnings, *notes],
             "settings": resolve(settings),
         }
         files.write_json(folder / "analysis.json", record)
@@ -180,6 +189,7 @@ def run_trial(options: GroupOptions, request: TrialRequest, settings: GroupSetti
         n_participants=people,
         n_excluded=len(exclusions),
         notes=tuple(notes),
+        warnings=inputs.found.warnings,
     )
 
 
@@ -249,12 +259,12 @@ def _of_measures(
     settings: GroupSettings,
 ) -> Iterator[Found]:
     """Results of the summary measures of each hemisphere and of the mean of both."""
-    for hemi, names, values, tables, known in source.of_summaries(cohort, only):
-        own, reference = tables, known
+    for hemi, names, values, tables, described in source.of_summaries(cohort, only):
+        own, reference = tables, described
         if effect is not None:
             if effect.kind == THINNING:
                 signed = np.where(np.isfinite(values), values, 1.0).min(axis=0) <= 0
-                reference = replace(known, mean=np.where(signed, np.nan, known.mean))
+                reference = replace(described, mean=np.where(signed, np.nan, described.mean))
             size = sample_size(effect, reference, settings, alpha=settings.power.alpha, limits=True)
             own = {**tables, "power": power_columns(effect, size, reference)}
         yield Found(hemi=hemi, measures=names, tables=own)
@@ -375,7 +385,7 @@ def _write_measures(folder: Path, cohort: Cohort, found: Sequence[Found]) -> Non
 
 
 def _write_maps(folder: Path, surface: str, cohort: Cohort, found: Sequence[MapFound]) -> None:
-    """Write the points of maps as a table, as GIFTI and as figures."""
+    """Write the points of maps as a table and as GIFTI."""
     for question, (_, title) in TRIAL_TABLES.items():
         blocks = []
         for one in found:
@@ -403,32 +413,66 @@ def _write_maps(folder: Path, surface: str, cohort: Cohort, found: Sequence[MapF
                 values = np.asarray(one.tables[question][column], dtype=np.float64)
                 content = gifti.shape_bytes(values, hemi=one.hemi, name=stem, unit=units[unit])
                 files.write_bytes(folder / f"{stem}.shape.gii", content)
-    for title, rows in _figures(cohort, found):
-        for file, content in encode(title, draw_trial(cohort, rows)):
-            files.write_bytes(folder / "figures" / file, content)
 
 
-def _figures(cohort: Cohort, found: Sequence[MapFound]) -> Iterator[tuple[str, list[TrialRow]]]:
-    """Name the figures of each map, and say what their rows of panels are."""
+def _figures(cohort: Cohort, found: Sequence[MapFound]) -> Iterator[tuple[str, Drawing]]:
+    """List the figures of each map by name."""
     for measure in dict.fromkeys(one.measures[0] for one in found):
-
-        def maps(question: str, column: str, name: str = measure) -> TrialMaps:
-            return {
-                one.hemi: (one.place, np.asarray(one.tables[question][column], dtype=np.float64))
+        for question, make in (("retest", _agreement), ("power", _sizes)):
+            own = {
+                one.hemi: one
                 for one in found
-                if one.measures[0] == name and question in one.tables
+                if one.measures[0] == measure and question in one.tables
             }
+            unit = cohort.units.get(measure, "1")
+            if rows := list(make(own, with_brackets(display_name(measure), unit))):
+                places = {hemi: one.place for hemi, one in own.items()}
+                yield f"{measure}_{question}", partial(_draw, cohort, places, rows)
 
-        if within := maps("retest", "sd_within"):
-            unit = f"[{cohort.units.get(measure, '1')}]"
-            yield (
-                f"{measure}_retest",
-                [
-                    TrialRow("within-subject SD", unit, within, "magma"),
-                    TrialRow("ICC(2,1)", "", maps("retest", "icc"), "viridis", limits=(0.0, 1.0)),
-                ],
-            )
-        sizes = maps("power", "per_arm")
-        if any(np.isfinite(values).any() for _, values in sizes.values()):
-            row = TrialRow("participants per arm", "", sizes, "viridis_r", log=True)
-            yield f"{measure}_power", [row]
+
+def _draw(cohort: Cohort, places: Mapping[str, FittedMaps], rows: Sequence[Row]) -> "list[Figure]":
+    return [draw_rows(cohort, places, {}, rows, {})]
+
+
+def _agreement(found: Mapping[str, MapFound], measure: str) -> Iterator[Row]:
+    """Show agreement between sessions."""
+    if found:
+        within, icc = (_values(found, "retest", name) for name in ("sd_within", "icc"))
+        title = "Within-subject SD"
+        label = f"{title},\n{measure}"
+        scale = _scale("magma", within)
+        yield Row(kind="error", index=0, title=title, label=label, scale=scale, values=within)
+        title = "ICC(2,1)"
+        scale = {"cmap": "viridis", "vmin": 0.0, "vmax": 1.0}
+        yield Row(kind="agreement", index=0, title=title, label=title, scale=scale, values=icc)
+
+
+def _sizes(found: Mapping[str, MapFound], measure: str) -> Iterator[Row]:
+    """Show participants per arm, by their logarithm."""
+    values = {hemi: np.log10(own) for hemi, own in _values(found, "power", "per_arm").items()}
+    if any(np.isfinite(own).any() for own in values.values()):
+        scale = _scale("viridis_r", values)
+        ticks = [n for n in _COUNTS if scale["vmin"] <= np.log10(n) <= scale["vmax"]]
+        yield Row(
+            kind="size",
+            index=0,
+            title="Participants per arm",
+            label=f"participants per arm,\n{measure}",
+            scale=scale,
+            values=values,
+            ticks={float(np.log10(n)): f"{n:,}" for n in ticks},
+        )
+
+
+def _values(found: Mapping[str, MapFound], question: str, column: str) -> dict[str, Float]:
+    return {
+        hemi: np.asarray(one.tables[question][column], dtype=np.float64)
+        for hemi, one in found.items()
+    }
+
+
+def _scale(colors: str, values: Mapping[str, Float]) -> Scale:
+    """Colors from the 1st to the 99th percentile."""
+    every = known(list(values.values()))
+    low, high = np.percentile(every, (1, 99)) if len(every) else (0.0, 1.0)
+    return {"cmap": colors, "vmin": float(low), "vmax": float(high if high > low else low + 1)}

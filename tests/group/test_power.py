@@ -6,7 +6,6 @@ from scipy import stats
 from statsmodels.stats.power import TTestIndPower
 
 from hipsta_bids.errors import ModelError, UsageError
-from hipsta_bids.group.figures import TrialRow
 from hipsta_bids.group.power import (
     Reference,
     TrialEffect,
@@ -86,13 +85,6 @@ def test_slowing_needs_change_and_visits():
     plain = Reference(**vars(REFERENCE) | {"slope": None})
     with pytest.raises(ModelError, match="was followed"):
         sample_size(effect, plain, SETTINGS, alpha=0.05)
-
-
-def test_colors_span_the_numbers_that_are_shown():
-    numbers = np.append(np.linspace(100, 900, 99), np.nan)
-    row = TrialRow("per arm", "", {"L": (None, numbers)}, "viridis_r", log=True)
-    assert row.scale["norm"].vmin == pytest.approx(108, abs=1)
-    assert row.scale["norm"].vmax == pytest.approx(892, abs=1)
 
 
 @pytest.mark.parametrize("method", ["bh", "fdr2"])
