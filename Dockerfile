@@ -45,6 +45,8 @@ RUN command -v strip || { apt-get update; apt-get install --yes --no-install-rec
     rm -r fontTools/t1Lib fontTools/diff fontTools/svgLib fontTools/mtiLib fontTools/merge \
         fontTools/voltLib fontTools/ufoLib fontTools/cu2qu fontTools/qu2cu fontTools/varLib/instancer; \
     find fontTools -name '*.so' -delete; \
+    # Axes that nothing draws on, pictures of buttons, and helpers of matplotlib's own tests.
+    rm -r mpl_toolkits/axes_grid1 mpl_toolkits/axisartist matplotlib/mpl-data/images matplotlib/testing; \
     rm -r PIL/_avif.* PIL/_imagingft.* pillow.libs/libavif-* pillow.libs/libfreetype-* pillow.libs/libharfbuzz-*; \
     # Compilers, other databases, graphs of regions, time series.
     rm -r numpy/distutils skimage/graph skimage/segmentation statsmodels/tsa \

@@ -314,7 +314,7 @@ def draw_sites(cohort: Cohort, analysis: Analysis) -> "list[Figure]":
             axis.set_yticks(
                 range(len(shown_sites)), shown_sites if j == 0 else [""] * len(shown_sites)
             )
-            axis.invert_yaxis()
+            axis.set_ylim(len(shown_sites) - 0.5, -0.5)
             axis.locator_params(axis="x", nbins=4)
             axis.set_xlabel(label)
         axes[0, j].set_title(f"{display_name(measure)}, {SIDES[hemi]}")

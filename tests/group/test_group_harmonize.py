@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -22,7 +23,7 @@ from hipsta_bids.derivatives import dataset
 from hipsta_bids.group import write
 from hipsta_bids.group.comparison import Comparison
 from hipsta_bids.group.data import Cohort, Measures, SideMaps
-from hipsta_bids.group.figures import draw_sites, encode
+from hipsta_bids.group.figures import draw_sites
 from hipsta_bids.group.formula import Contrast, model_from_shortcut, parse_model
 from hipsta_bids.group.glm import fit_points
 from hipsta_bids.group.harmonize import harmonize_cohort, plan_sites
@@ -77,8 +78,11 @@ def results(study, quick):
     """With the figure of sites alone, since figures take longer than all else."""
     data, out = study
     with pytest.MonkeyPatch.context() as patch:
-        draw = lambda cohort, analysis, _: encode("sites", draw_sites(cohort, analysis))  # noqa: E731
-        patch.setattr(write, "draw_figures", draw)
+        patch.setattr(
+            write,
+            "draw_figures",
+            lambda cohort, analysis, _: [("sites", partial(draw_sites, cohort, analysis))],
+        )
         assert main([str(data), str(out), "group", "--harmonize", "site", *quick]) == 0
     return out / "group" / MODEL
 
