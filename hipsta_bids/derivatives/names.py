@@ -244,6 +244,22 @@ DATASET_FILES: dict[str, str] = {
     "report": "report.html",
 }
 
+#: Tables of the group level about repeated sessions and sample sizes: of summary measures, and of
+#: the points of maps.
+TRIAL_TABLES: dict[str, tuple[str, str]] = {
+    "retest": ("retest", "retest_points"),
+    "power": ("power", "power_points"),
+}
+
+#: Their maps, by the value of ``stat-``: the tables that have them, the column, and the unit; none
+#: is that of the map.
+TRIAL_MAPS: dict[str, tuple[str, str, str]] = {
+    "icc": ("retest", "icc", "1"),
+    "sdwithin": ("retest", "sd_within", ""),
+    "mdc": ("retest", "detectable_change", ""),
+    "n": ("power", "per_arm", "1"),
+}
+
 #: Lines of ``.bidsignore``, and why BIDS has no name for what each hides. The validator (3.0)
 #: passes over what is in a folder with a final slash, but not over the folder; and a wildcard
 #: before another one ends at the first character that follows it in the pattern. So folders have

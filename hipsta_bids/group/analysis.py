@@ -182,7 +182,7 @@ def analyze_cohort(
     check_permutations(rows, settings)
     _check_weights(comparison, settings)
     sides = {
-        hemi: _register_side(cohort, hemi, groups=groups, settings=settings, templates=templates)
+        hemi: register_side(cohort, hemi, groups=groups, settings=settings, templates=templates)
         for hemi in each("registration", list(cohort.sides) if measures.maps else [])
     }
     registered = {hemi: side.registered for hemi, side in sides.items()} or cohort.sides
@@ -341,7 +341,7 @@ def _references(
     return chosen
 
 
-def _register_side(
+def register_side(
     cohort: Cohort,
     hemi: str,
     *,
@@ -349,6 +349,7 @@ def _register_side(
     settings: GroupSettings,
     templates: Mapping[str, Template] | None,
 ) -> SideResult:
+    """Register the sheets of one hemisphere, to a template or to each other."""
     side = cohort.sides[hemi]
     profiles = mean_profiles(side.maps["curvature"], settings.registration)
     if templates is None:

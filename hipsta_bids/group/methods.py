@@ -67,6 +67,22 @@ REFERENCES: Mapping[str, str] = {
     "delong": "DeLong ER, DeLong DM, Clarke-Pearson DL. Comparing the areas under two or more"
     " correlated receiver operating characteristic curves: a nonparametric approach. Biometrics"
     " 1988;44(3):837-845.",
+    "shrout": "Shrout PE, Fleiss JL. Intraclass correlations: uses in assessing rater reliability."
+    " Psychological Bulletin 1979;86(2):420-428. doi:10.1037/0033-2909.86.2.420",
+    "mcgraw": "McGraw KO, Wong SP. Forming inferences about some intraclass correlation"
+    " coefficients. Psychological Methods 1996;1(1):30-46. doi:10.1037/1082-989X.1.1.30",
+    "bland": "Bland JM, Altman DG. Measurement error. BMJ 1996;313(7059):744."
+    " doi:10.1136/bmj.313.7059.744",
+    "weir": "Weir JP. Quantifying test-retest reliability using the intraclass correlation"
+    " coefficient and the SEM. Journal of Strength and Conditioning Research 2005;19(1):231-240."
+    " doi:10.1519/15184.1",
+    "ard": "Ard MC, Edland SD. Power calculations for clinical trials in Alzheimer's disease."
+    " Journal of Alzheimer's Disease 2011;26(s3):369-377. doi:10.3233/JAD-2011-0062",
+    "jung": "Jung SH. Sample size for FDR-control in microarray data analysis. Bioinformatics"
+    " 2005;21(14):3097-3104. doi:10.1093/bioinformatics/bti456",
+    "liu": "Liu P, Hwang JTG. Quick calculation for sample size while controlling false discovery"
+    " rate with application to microarray analysis. Bioinformatics 2007;23(6):739-746."
+    " doi:10.1093/bioinformatics/btl664",
     "firth": "Heinze G, Schemper M. A solution to the problem of separation in logistic"
     " regression. Statistics in Medicine 2002;21(16):2409-2419. doi:10.1002/sim.1047",
 }

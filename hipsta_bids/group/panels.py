@@ -55,6 +55,7 @@ _FLAT = 1e-3  # a surface is flat if it is thinner than this share of its length
 _HALF = 0.5
 _HEAD_PIXELS = round(_HEAD * MM)
 _FAR_APART = 0.35  # of the most extreme ticks of p
+_EXTEND = {"significance": "neither", "agreement": "min"}  # color bars, where 1 is most
 
 
 Scale = Mapping[str, Any]
@@ -68,20 +69,21 @@ class Row:
     """One quantity on all sides."""
 
     kind: str
-    """``mean``, ``effect`` or ``significance``."""
+    """``mean``, ``effect``, ``significance``; of trials ``error``, ``agreement``, ``size``."""
     index: int
     """Of the group, or of the contrast."""
     title: str
     label: str
     """Of the color bar."""
     scale: Scale
-    """Color map and the values at its ends, as matplotlib's arguments."""
     values: Mapping[str, Float]
     """(points,) by side."""
     survive: Mapping[str, Bool] = field(default_factory=dict)
-    """(points,) by side; empty for means."""
+    """(points,) by side; empty where nothing is tested."""
     level: float | None = None
     """Of significance, on maps of it."""
+    ticks: Mapping[float, str] = field(default_factory=dict)
+    """Positions and texts on the color bar, where it is not to choose them."""
 
 
 def draw_measure(
@@ -103,7 +105,7 @@ def draw_measure(
         if len(pages[-1]) + len(block) > _MOST_ROWS:
             pages.append([])
         pages[-1] += block
-    return [_draw(cohort, sides, shapes, rows, views) for rows in pages]
+    return [draw_rows(cohort, sides, shapes, rows, views) for rows in pages]
 
 
 def _means(
@@ -307,7 +309,7 @@ class _Paper:
         return axes
 
 
-def _draw(
+def draw_rows(
     cohort: Cohort,
     sides: Mapping[str, FittedMaps],
     shapes: Mapping[str, AverageShape],
@@ -402,9 +404,8 @@ def _draw_row(
     top, height, letter = place
     paper.text(1.0 * MM, top - 3.2 * MM, letter, fontsize=LETTER, weight="bold", ha="left")
     room = int((paper.width / MM - _LEFT) / (_LETTER_WIDTH * TITLE * 25.4 / 72))
-    title = (
-        row.title if len(row.title) <= room else row.title[: room - 1] + "\N{HORIZONTAL ELLIPSIS}"
-    )
+    long = len(row.title) > room
+    title = row.title[: room - 1] + "\N{HORIZONTAL ELLIPSIS}" if long else row.title
     paper.text(_LEFT * MM, top - 3.2 * MM, title, fontsize=TITLE, ha="left")
     if columns[0].seen is not None or columns[0].one.maps.mesh is None:
         for word, y, va in ((Y_ENDS[0], top + height, "bottom"), (Y_ENDS[1], top, "top")):
@@ -451,9 +452,7 @@ def _draw_sheet(
         room = own[:, : len(y) // 3].sum() / (len(y) // 3) / len(x) * width
         upright = len(name) * _LETTER_WIDTH * SMALL > room
         axes.text(
-            at,
-            y[0],
-            name, fontsize=SMALL, ha="center", va="bottom", rotation=90 * upright,
+            at, y[0], name, fontsize=SMALL, ha="center", va="bottom", rotation=90 * upright,
             bbox={"facecolor": "white", "alpha": 0.6, "edgecolor": "none", "pad": 0.6},
         )  # fmt: skip
 
@@ -525,12 +524,14 @@ def _draw_bar(axes: "Axes", row: Row) -> None:
     low, high = row.scale["vmin"], row.scale["vmax"]
     signs = (-1, 1) if low else (1,)
     colors = ScalarMappable(Normalize(low, high), row.scale["cmap"])
-    extend = "neither" if row.kind == "significance" else "both" if low else "max"
+    extend = _EXTEND.get(row.kind, "both" if low else "max")
     bar = axes.figure.colorbar(colors, cax=axes, extend=extend, extendfrac=0.06)
     if bar.solids is not None:
         bar.solids.set_rasterized(True)
     bar.set_label(row.label, fontsize=SMALL, labelpad=2)
     axes.tick_params(labelsize=SMALL, length=2, pad=1.5)
+    if row.ticks:
+        bar.set_ticks(list(row.ticks), labels=list(row.ticks.values()))
     if row.level is not None:
         ticks = {sign * at: text for at, text in _p_ticks(row.level, high) for sign in signs}
         bar.set_ticks(list(ticks), labels=list(ticks.values()))

@@ -53,7 +53,7 @@ from hipsta_bids.group.surfaces import (
     taken_names,
 )
 from hipsta_bids.group.volumes import add_volumes, check_volumes
-from hipsta_bids.group.warps import templates_from_json
+from hipsta_bids.group.warps import Template, templates_from_json
 from hipsta_bids.group.write import draw, write_results
 from hipsta_bids.io import files
 from hipsta_bids.progress import tell
@@ -154,7 +154,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
     """
     dataset.check_own_dataset(options.out_dir)
     tell("reading")
-    inputs = _read(options, settings)
+    inputs = read_inputs(options, settings)
     cohort = inputs.cohort
     references, groups = choose_references(options.model, cohort.table, settings)
     document = model_document(
@@ -166,10 +166,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         visits=inputs.time,
     )
     model = parse_model(document)
-    templates = None
-    if options.template is not None:
-        templates = templates_from_json(files.read_json(options.template), str(options.template))
-        _check_templates(templates, cohort, options.template)
+    templates = read_templates(options.template, cohort)
     analysis = analyze_cohort(
         cohort,
         model,
@@ -199,7 +196,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
     notes = [*inputs.notes, *_notes(options, inputs, analysis, settings)]
     tell("average surfaces")
     shapes = average_shapes(inputs.found.records, cohort, analysis, settings)
-    _describe(options)
+    describe_dataset(options)
     with write.model_folder(options.out_dir, name) as folder:
         tell("tables and maps")
         write_results(
@@ -220,7 +217,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         told = [*inputs.found.warnings, *notes]
         record = _record(options, inputs.found, settings, analysis, told)
         files.write_json(folder / "analysis.json", record)
-    page, problem = _report(options, name)
+    page, problem = make_page(options, name)
     return GroupResult(
         folder=options.out_dir / write.GROUP_FOLDER / name,
         page=page,
@@ -237,7 +234,7 @@ def _site_effects(options: GroupOptions) -> SavedEffects | None:
     return None if path is None else load_effects(path)
 
 
-def _read(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
+def read_inputs(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
     """Find and read sheets, other maps, volumes and covariates."""
     check_volumes(options.volumes)
     found = collect_sheets(options.sheets, may_lack=bool(options.maps))
@@ -418,20 +415,7 @@ def _record(
     return {
         "command": list(options.command),
         "version": __version__,
-        "inputs": {
-            "datasets": [str(root.resolve()) for root in options.sheets.roots],
-            "settings_hash": found.settings_hash,
-            "versions": found.versions,
-            "seg": found.records[0].place.name.seg if found.records else None,
-            "region": options.sheets.region,
-            "maps": dict(options.maps),
-            "volumes": dict(options.volumes),
-            "covariates": [str(path) for path in options.covariates],
-            "template": None if options.template is None else str(options.template),
-            "harmonization": None
-            if options.harmonize_model is None
-            else str(options.harmonize_model),
-        },
+        "inputs": record_inputs(options, found),
         "harmonization": None
         if analysis.harmonization is None
         else harmonization_record(analysis.harmonization, analysis.groups),
@@ -451,7 +435,23 @@ def _record(
     }
 
 
-def _report(options: GroupOptions, name: str) -> tuple[Path | None, str | None]:
+def record_inputs(options: GroupOptions, found: Collection) -> dict[str, Any]:
+    """Record what was read."""
+    return {
+        "datasets": [str(root.resolve()) for root in options.sheets.roots],
+        "settings_hash": found.settings_hash,
+        "versions": found.versions,
+        "seg": found.records[0].place.name.seg if found.records else None,
+        "region": options.sheets.region,
+        "maps": dict(options.maps),
+        "volumes": dict(options.volumes),
+        "covariates": [str(path) for path in options.covariates],
+        "template": None if options.template is None else str(options.template),
+        "harmonization": None if options.harmonize_model is None else str(options.harmonize_model),
+    }
+
+
+def make_page(options: GroupOptions, name: str) -> tuple[Path | None, str | None]:
     """Make the page, and say why if it is not there."""
     path = options.out_dir / group_report(name)
     if not options.reports:
@@ -462,7 +462,7 @@ def _report(options: GroupOptions, name: str) -> tuple[Path | None, str | None]:
     return (path if problem is None else None), problem
 
 
-def _describe(options: GroupOptions) -> None:
+def describe_dataset(options: GroupOptions) -> None:
     """Describe the output dataset, if the participant level has not."""
     files.make_folder(options.out_dir)
     if not (options.out_dir / "dataset_description.json").exists():
@@ -473,11 +473,16 @@ def _describe(options: GroupOptions) -> None:
     dataset.write_notes(options.out_dir)
 
 
-def _check_templates(templates: Mapping[str, Any], cohort: Cohort, path: Path) -> None:
+def read_templates(path: Path | None, cohort: Cohort) -> Mapping[str, Template] | None:
+    """Read the templates of an earlier analysis, if one is named."""
+    if path is None:
+        return None
+    templates = templates_from_json(files.read_json(path), str(path))
     if missing := sorted(set(cohort.sides) - set(templates)):
         raise ModelError(
             f"{path}: has no template of hemisphere {', '.join(missing)}", reason="template-file"
         )
+    return templates
 
 
 def _incomplete(analysis: Analysis) -> list[Exclusion]:

@@ -298,6 +298,33 @@ class ClassificationSettings(SettingsTable):
     """Steps end when they promise to raise the log likelihood by less than this."""
 
 
+class RetestSettings(SettingsTable):
+    """Agreement of repeated sessions."""
+
+    confidence: OpenFraction = 0.95
+    """Coverage of two-sided confidence limits, fraction."""
+    min_participants: Annotated[int, Field(ge=3)] = 5
+    """Fewer participants with all sessions are too few, also at a point."""
+
+
+class PowerSettings(SettingsTable):
+    """Participants that a trial of two arms of equal size needs."""
+
+    power: OpenFraction = 0.8
+    """Chance to find the effect."""
+    dropout: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    """Share of those enrolled that does not complete the trial, and is not in its analysis."""
+    alpha: OpenFraction = 0.05
+    """Two-sided level of the test of a summary measure, one of which is the end point. Maps hold
+    the false discovery rate ``multiplicity.alpha``."""
+    affected: OpenFraction = 0.1
+    """Share of the points of a map that differ, as it decides on the level at each of them."""
+    most: Annotated[int, Field(ge=10)] = 10_000
+    """More participants per arm are not looked for."""
+    months_per_time: PositiveFloat = 12.0
+    """Months per unit of a column of time that is not called years, months or days."""
+
+
 class GroupSettings(SettingsTable):
     """All settings of the group level."""
 
@@ -311,6 +338,8 @@ class GroupSettings(SettingsTable):
     multiplicity: MultiplicitySettings = MultiplicitySettings()
     shapes: ShapeSettings = ShapeSettings()
     classification: ClassificationSettings = ClassificationSettings()
+    retest: RetestSettings = RetestSettings()
+    power: PowerSettings = PowerSettings()
 
 
 def load_group_settings(path: Path | None) -> GroupSettings:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from hipsta_bids.group.analysis import (
     Analysis,
+    SideResult,
     mean_of_known,
     members_of,
     rows_of,
@@ -20,6 +21,7 @@ from hipsta_bids.group.clusters import edges_of, frame_of, peak_table
 from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float
 from hipsta_bids.group.harmonize import Harmonization
 from hipsta_bids.group.inference import control_fdr
+from hipsta_bids.group.reference import TRIAL_COLUMNS
 from hipsta_bids.group.registration import ShiftDifference
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.summaries import hemispheres, participants_with, summary_values
@@ -126,6 +128,7 @@ COLUMNS: Mapping[str, str] = {
     "w": "observed minus expected from the reference group, in its residual standard deviations",
     "low": "share of points with a two-sided p below the level, and w below zero",
     "high": "the same, and w above zero",
+    **TRIAL_COLUMNS,
     "kind": "map, or summary measure",
     "site": "level of the column that was harmonized",
     "estimated": "true if its effects were estimated from these participants, not read from a file",
@@ -371,30 +374,30 @@ def _descriptives(analysis: Analysis) -> Iterator[Columns]:
 
 
 def _registration_tables(cohort: Cohort, analysis: Analysis) -> Iterator[Named]:
-    yield "registration", _registration(analysis)
+    yield from registration_tables(cohort, analysis.sides)
     if analysis.unregistered:
         yield "alignment", _alignment(analysis)
-    yield "warps", _stacked(_warps(cohort, analysis))
     yield "profiles", _stacked(_profiles(cohort, analysis))
     if analysis.groups is not None:
         yield "shifts", _stacked(_shifts(analysis))
 
 
-def _registration(analysis: Analysis) -> pd.DataFrame:
-    return pd.DataFrame(
-        [
-            {
-                "hemi": hemi,
-                "n": len(side.registration.warps),
-                "explained_before": side.registration.explained_before,
-                "explained_after": side.registration.explained_after,
-                "iterations": side.registration.iterations,
-                "converged": side.registration.converged,
-                **_difference(side.difference),
-            }
-            for hemi, side in analysis.sides.items()
-        ]
-    )
+def registration_tables(cohort: Cohort, sides: Mapping[str, SideResult]) -> Iterator[Named]:
+    """Make the tables of registration and of its warps."""
+    rows = [
+        {
+            "hemi": hemi,
+            "n": len(side.registration.warps),
+            "explained_before": side.registration.explained_before,
+            "explained_after": side.registration.explained_after,
+            "iterations": side.registration.iterations,
+            "converged": side.registration.converged,
+            **_difference(side.difference),
+        }
+        for hemi, side in sides.items()
+    ]
+    yield "registration", pd.DataFrame(rows)
+    yield "warps", _stacked(_warps(cohort, sides))
 
 
 def _difference(found: ShiftDifference | None) -> Columns:
@@ -423,8 +426,8 @@ def _alignment(analysis: Analysis) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _warps(cohort: Cohort, analysis: Analysis) -> Iterator[Columns]:
-    for hemi, side in analysis.sides.items():
+def _warps(cohort: Cohort, sides: Mapping[str, SideResult]) -> Iterator[Columns]:
+    for hemi, side in sides.items():
         visits = cohort.table.iloc[side.registered.rows]
         warps = side.registration.warps
         yield {

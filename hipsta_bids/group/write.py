@@ -18,7 +18,7 @@ from hipsta_bids.derivatives.names import DATASET_FILES
 from hipsta_bids.group.analysis import Analysis, tested_maps
 from hipsta_bids.group.collect import Exclusion
 from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float, Int, SideMaps
-from hipsta_bids.group.figures import draw_figures, encode
+from hipsta_bids.group.figures import Drawing, draw_figures, encode
 from hipsta_bids.group.glm import FittedMaps
 from hipsta_bids.group.harmonize import digests, effects_of
 from hipsta_bids.group.methods import methods_text
@@ -99,16 +99,14 @@ def write_results(
 ) -> None:
     """Write tables, maps and text."""
     for name, table in result_tables(cohort, analysis, settings):
-        _write_table(folder, name, table)
+        write_table(folder, name, table)
     for name, other in others.items():
         for title, table in point_tables(name, *other, settings):
-            _write_table(folder, title, table)
-    columns = {"participant": PARTICIPANT, "session": SESSION}
-    excluded = pd.DataFrame(exclusions, columns=[*columns, "hemi", "reason", "message"])
-    _write_table(folder, "excluded", excluded.rename(columns=columns))
+            write_table(folder, title, table)
+    write_exclusions(folder, exclusions)
     rows_of_model = analysis.compared.table.iloc[analysis.design.rows]
-    _write_table(folder, "covariates", rows_of_model, described=False)
-    _write_table(folder, "design", design_table(analysis), described=False)
+    write_table(folder, "covariates", rows_of_model, described=False)
+    write_table(folder, "design", design_table(analysis), described=False)
     registered = {hemi: side.registered for hemi, side in analysis.sides.items()}
     if registered or others:
         points = {name: other for name, (other, _) in others.items()}
@@ -143,6 +141,13 @@ def write_results(
     files.write_text(folder / "methods.md", text)
 
 
+def write_exclusions(folder: Path, exclusions: Sequence[Exclusion]) -> None:
+    """Write who is not in the analysis, and why."""
+    columns = {"participant": PARTICIPANT, "session": SESSION}
+    excluded = pd.DataFrame(exclusions, columns=[*columns, "hemi", "reason", "message"])
+    write_table(folder, "excluded", excluded.rename(columns=columns))
+
+
 def draw(
     folder: Path,
     cohort: Cohort,
@@ -151,32 +156,36 @@ def draw(
     *,
     others: Mapping[str, tuple[Cohort, Analysis]],
 ) -> list[str]:
-    """Draw the figures, and say which are missing or lack letters; one line each."""
+    """Draw the figures of all models, and say what is wrong with them."""
+    every = ((cohort, analysis, shapes), *((*one, {}) for one in others.values()))
+    return write_figures(folder, (figure for one in every for figure in draw_figures(*one)))
+
+
+def write_figures(folder: Path, drawings: Iterable[tuple[str, Drawing]]) -> list[str]:
+    """Draw figures by name, and say which are missing or lack letters; one line each."""
     tell("figures")
-    problems, missing, number = [], set(), 0
-    for one in ((cohort, analysis, shapes), *((*one, {}) for one in others.values())):
-        for name, drawing in draw_figures(*one):
-            number += 1
-            tell("figures", number)
-            try:
-                with warnings.catch_warnings(record=True) as warned:
-                    warnings.simplefilter("always")
-                    encoded = encode(name, drawing)
-            except Exception as error:  # results are worth more than figures
-                _LOGGER.exception("figure %s", name)
-                problems.append(f"figure {name}: not drawn ({type(error).__name__}: {error})")
-                continue
-            for warning in warned:
-                missing |= set(re.findall(r"^Glyph (\d+) ", str(warning.message)))
-            for title, content in encoded:
-                files.write_bytes(folder / "figures" / title, content)
+    problems, missing = [], set()
+    for number, (name, drawing) in enumerate(drawings, start=1):
+        tell("figures", number)
+        try:
+            with warnings.catch_warnings(record=True) as warned:
+                warnings.simplefilter("always")
+                encoded = encode(name, drawing)
+        except Exception as error:  # results are worth more than figures
+            _LOGGER.exception("figure %s", name)
+            problems.append(f"figure {name}: not drawn ({type(error).__name__}: {error})")
+            continue
+        for warning in warned:
+            missing |= set(re.findall(r"^Glyph (\d+) ", str(warning.message)))
+        for title, content in encoded:
+            files.write_bytes(folder / "figures" / title, content)
     if missing:
         letters = "".join(sorted(chr(int(number)) for number in missing))
         problems.append(f"figures: PDF and PNG show boxes for {letters}; SVG has them as text")
     return problems
 
 
-def _write_table(folder: Path, name: str, table: pd.DataFrame, *, described: bool = True) -> None:
+def write_table(folder: Path, name: str, table: pd.DataFrame, *, described: bool = True) -> None:
     """Write a table, with a sidecar unless the columns are the user's or the model's."""
     columns = [str(column) for column in table.columns]
     cells = [[_cell(value) for value in table[column].tolist()] for column in table.columns]
@@ -323,7 +332,7 @@ def _write_gifti(folder: Path, cohort: Cohort, analysis: Analysis) -> None:
     """Write statistics, effect sizes and corrected p-values, and the surfaces to draw them on."""
     for hemi, one in analysis.fitted.items():
         if hemi in cohort.sides:
-            _write_surface(folder, cohort, one, hemi)
+            write_surface(folder, cohort, one, hemi)
     for key, test, found in tested_maps(analysis):
         for stat, values in (
             (test.kind, test.statistic),
@@ -337,10 +346,10 @@ def _write_gifti(folder: Path, cohort: Cohort, analysis: Analysis) -> None:
             files.write_bytes(folder / f"{stem}.shape.gii", content)
 
 
-def _write_surface(folder: Path, cohort: Cohort, one: FittedMaps, hemi: str) -> None:
+def write_surface(folder: Path, cohort: Cohort, one: FittedMaps, hemi: str) -> None:
     """Write the unfolded sheet, or the surface of other programs' maps."""
     if one.maps.mesh is not None:
-        space, secondary = next(iter(one.fits)), None
+        space, secondary = next(iter(one.maps.maps)), None
         points, triangles = one.maps.mesh.points, one.maps.mesh.triangles.astype(np.int32)
     else:
         space, secondary = "unfold", "MidThickness"

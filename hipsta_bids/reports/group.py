@@ -36,6 +36,7 @@ from hipsta_bids.reports.group_tables import (
     visit_of,
     with_brackets,
 )
+from hipsta_bids.reports.group_trials import power, retest
 from hipsta_bids.reports.page import Section, build_sections, render
 
 _LOGGER = logging.getLogger(__name__)
@@ -44,9 +45,11 @@ _ROW_HEIGHT, _LOWEST, _TALLEST = 6, 60, 360  # of the picture of a design matrix
 _SHADES = 64
 
 
-def design(results: GroupResults) -> Mapping[str, Any]:
+def design(results: GroupResults) -> Mapping[str, Any] | None:
     """Describe the model in words, by its contrasts, and as a picture of its design matrix."""
     record = results.record
+    if "contrasts" not in record:
+        return None
     table = results.table("design")
     columns = [str(name) for name in record.get("columns") or ()]
     measures = results.table("maps")
@@ -318,6 +321,8 @@ def _runs(text: str) -> list[tuple[bool, str]]:
 
 #: Sections of the page, from top to bottom.
 SECTIONS: tuple[Section[GroupResults], ...] = (
+    Section(key="power", title="Sample size", template="group/power.html", build=power),
+    Section(key="retest", title="Test-retest", template="group/retest.html", build=retest),
     Section(key="found", title="What was found", template="group/found.html", build=findings),
     Section(key="maps", title="Maps", template="group/maps.html", build=map_scenes),
     Section(key="peaks", title="Clusters and peaks", template="group/peaks.html", build=peaks),

@@ -159,6 +159,8 @@ def direction(results: GroupResults, contrast: str, hemi: str, sign: float) -> s
 def findings(results: GroupResults) -> Mapping[str, Any] | None:
     """Describe what survived, by measure and contrast."""
     maps = results.table("maps")
+    if "contrasts" not in results.record:
+        return None  # nothing was compared
     cards = []
     if len(maps):
         for (measure, contrast), rows in maps.groupby(["measure", "contrast"], sort=False):

@@ -159,7 +159,7 @@ def simulate_cohort(plan: SimulationPlan, seed: int) -> SimulatedCohort:
     bend = np.where(group[:, None], _bumps(warps, _scaled_bend(plan)), _bumps(warps, _BEND))
     bend *= 1 + plan.amplitude_sd * random.standard_normal((n, 1))
     curvature = bend[:, :, None] + plan.curvature_sd * random.standard_normal((n, x_nodes, y_nodes))
-    field = plan.thickness_sd * _smooth_noise(random, (n, x_nodes, y_nodes), plan.correlation)
+    field = plan.thickness_sd * smooth_noise(random, (n, x_nodes, y_nodes), plan.correlation)
     field += plan.age_slope * (age - age.mean())[:, None, None]
     field -= plan.effect * plan.thickness_sd * group[:, None, None] * affected
     # A subject shows the values of a registered point where that point lies in the subject.
@@ -194,7 +194,7 @@ def _bumps(at: Float, shape: tuple[float, tuple[tuple[float, float, float], ...]
     return total
 
 
-def _smooth_noise(random: np.random.Generator, shape: tuple[int, int, int], width: float) -> Float:
+def smooth_noise(random: np.random.Generator, shape: tuple[int, int, int], width: float) -> Float:
     """Gaussian noise of variance one, smooth along the sheet."""
     pad = int(np.ceil(4 * width))
     large = (shape[0], shape[1] + 2 * pad, shape[2] + 2 * pad)

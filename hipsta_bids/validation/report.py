@@ -35,6 +35,7 @@ SUITES: Mapping[str, str] = MappingProxyType(
         "defects": "defects:run",
         "population": "population:run",
         "group": "group:run",
+        "trials": "trials:run",
         "harmonization": "harmonization:run",
         "surrogate": "surrogate:run",
         "hippunfold": "hippunfold:run",
@@ -69,6 +70,8 @@ QUESTIONS: Mapping[str, str] = MappingProxyType(
         "defects": "Damage is repaired rightly, flagged or refused",
         "population": "Flags spare sound hemispheres, and find damaged ones, of other brains",
         "group": "Tests of the group level hold their level, and find a planted effect",
+        "trials": "Trials of the sample size that was found have the power that was asked for",
+        "harmonization": "Harmonization removes sites, and leaves effects as they are",
         "surrogate": "Thickness without a mesh agrees with that of the mesh",
         "hippunfold": "Thickness agrees with HippUnfold's own",
     }

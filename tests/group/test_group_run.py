@@ -225,7 +225,7 @@ def test_the_page_is_named_unless_it_could_not_be_made(tmp_path, monkeypatch, pr
         bids_dir=tmp_path, out_dir=tmp_path, sheets=sheets, model=ModelRequest()
     )
     page = tmp_path / "group" / "kept.html"
-    assert run._report(given, "kept") == (None if problem else page, problem)
+    assert run.make_page(given, "kept") == (None if problem else page, problem)
 
 
 def test_flagged_hemispheres_are_told(dataset, quick, capsys):

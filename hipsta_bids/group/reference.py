@@ -1,0 +1,259 @@
+"""What a reference cohort says about measures: means, changes over time, and variances."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy import stats
+
+from hipsta_bids.errors import ModelError
+from hipsta_bids.group.analysis import mean_of_known
+from hipsta_bids.group.covariates import VisitTime
+from hipsta_bids.group.data import PARTICIPANT, Cohort, Float, Int, SideMaps
+from hipsta_bids.group.formula import model_from_shortcut, parse_model
+from hipsta_bids.group.glm import FittedMaps, PointwiseFit, RowModel, fit_maps, most_frequent
+from hipsta_bids.group.mixed import longitudinal_model
+from hipsta_bids.group.model import ModelRequest, build_design, default_formula
+from hipsta_bids.group.retest import RetestCohort, repeatability, retest_columns
+from hipsta_bids.group.settings import GroupSettings
+from hipsta_bids.group.summaries import fit_summaries, hemispheres, summary_values
+
+#: Months per unit of columns of time with these names.
+_MONTHS = {"years": 12.0, "months": 1.0, "days": 12 / 365.25}
+#: Sessions that tell a participant's change from noise.
+_SLOPE_SESSIONS = 3
+
+Tables = Mapping[str, Mapping[str, Any]]
+"""Columns of the tables of each question, ``retest`` and ``power``."""
+
+#: Meaning of these columns; the unit is that of the measure unless said.
+TRIAL_COLUMNS: Mapping[str, str] = {
+    "sd_between": "SD between participants, of their true values",
+    "sd_within": "SD within participants, between sessions",
+    "sd_within_low": "lower confidence limit",
+    "sd_within_high": "upper confidence limit",
+    "icc": "intraclass correlation ICC(2,1), absolute agreement of single measurements",
+    "icc_low": "lower confidence limit",
+    "icc_high": "upper confidence limit",
+    "detectable_change": "minimal detectable change in one participant, 1.96 sqrt(2) sd_within",
+    "p_sessions": "p-value of the F test that all sessions have the same mean",
+    "change_per_year": "mean change in the reference, unit of the measure per year",
+    "arm_difference": "between the arms, unit of the measure; with several visits, per year",
+    "sd_endpoint": "SD of a participant's value; with several visits, of the slope per year",
+    "alpha": "two-sided level of the test",
+    "per_arm": "participants per arm who complete the trial; n/a above ``power.most``",
+    "per_arm_low": "the same at the better confidence limit, of the mean change for slowing, else"
+    " of the SD",
+    "per_arm_high": "at the worse one; n/a if no number is enough",
+    "enrolled_per_arm": "participants per arm to enroll, as some drop out",
+    "power": "with this number per arm",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reference:
+    """What a reference cohort says about some measures or points."""
+
+    n: NDArray[np.int64]
+    """Participants with a value."""
+    mean: Float
+    """In units of the measure."""
+    variance: Float
+    """Between participants at one visit, or with several visits within participants."""
+    freedom: Float
+    """Degrees of freedom of the variance, about."""
+    slope: Float | None = None
+    """Change per month."""
+    slope_limits: Float | None = None
+    """(2, points)"""
+    slope_variance: Float | None = None
+    """Of true changes per month between participants; None if they are taken to change alike."""
+
+
+class Retested:
+    """Means and variances of repeated sessions."""
+
+    time: str | None = None
+
+    def __init__(
+        self, retest: RetestCohort, settings: GroupSettings, *, repeated: bool = False
+    ) -> None:
+        self.retest = retest
+        self._repeated, self._how = repeated, settings.retest
+
+    def place(self, _: str, side: SideMaps) -> FittedMaps:
+        """Locate the points of maps of one hemisphere."""
+        every = np.arange(len(side.rows))
+        subfield = most_frequent(side.subfield, len(side.names))
+        return FittedMaps(maps=side, used=every, rows=every, subfield=subfield, fits={})
+
+    def of_map(self, one: FittedMaps, measure: str) -> tuple[Tables, Reference]:
+        """Describe the points of one map."""
+        return self._describe(one.maps.rows, one.values(measure))
+
+    def of_summaries(
+        self, cohort: Cohort, only: Sequence[str] | None
+    ) -> Iterator[tuple[str, tuple[str, ...], Float, Tables, Reference]]:
+        """Describe summary measures of each hemisphere, and of the mean of both."""
+        for hemi in hemispheres(cohort):
+            values = summary_values(cohort, hemi, only)
+            values = values.loc[:, (values.max() > values.min()).to_numpy()]
+            numbers = values.to_numpy(dtype=np.float64)
+            if numbers.size:
+                found = self._describe(np.arange(len(numbers)), numbers)
+                yield hemi, tuple(map(str, values.columns)), numbers, *found
+
+    def _describe(self, rows: Int, values: Float) -> tuple[Tables, Reference]:
+        agreed = repeatability(
+            self.retest.arrange(values, rows),
+            confidence=self._how.confidence,
+            least=self._how.min_participants,
+        )
+        # Of one visit, the variance between and within; of several, that within.
+        freedom = agreed.n * (len(self.retest.sessions) - 1) if self._repeated else agreed.n - 1
+        reference = Reference(
+            n=agreed.n,
+            mean=agreed.mean,
+            variance=agreed.within**2 + (0.0 if self._repeated else agreed.between**2),
+            freedom=np.maximum(freedom, 1.0),
+        )
+        return {"retest": retest_columns(agreed)}, reference
+
+    def words(self, cite: Callable[[str], str]) -> str:
+        """Name what means and variances rest on."""
+        text = f"these repeated sessions {cite('bland')}"
+        if self._repeated:
+            text += (
+                "; true changes were taken to be the same in all participants, so that the numbers"
+                " are lower limits"
+            )
+        return text
+
+
+class Modeled:
+    """Means, changes and variances of a cohort, by a model of its visits."""
+
+    def __init__(
+        self,
+        cohort: Cohort,
+        request: ModelRequest,
+        settings: GroupSettings,
+        visits: VisitTime | None = None,
+    ) -> None:
+        table, covariates = cohort.table, None
+        self.time: str | None = None
+        if visits is not None:
+            self.time, covariates = visits.column, visits.covariates
+            _check_times(table, self.time, settings)
+        formula = request.formula or default_formula(
+            table, None, settings, covariates=covariates, time=self.time
+        )
+        contrasts = [self.time] if self.time else []
+        self.spec = parse_model(model_from_shortcut(formula, contrasts, "reference"))
+        design = build_design(table, self.spec, settings.design, dict(request.references))
+        self._table, self._settings = table, settings
+        self.model = RowModel(replace(design, contrasts=()))
+        if self.time is not None:
+            slopes = settings.changed(longitudinal={"random": "slope"})
+            self.model = longitudinal_model(design, table, self.time, slopes)
+
+    @property
+    def months(self) -> float:
+        """Months per unit of time."""
+        return _MONTHS.get(str(self.time).casefold(), self._settings.power.months_per_time)
+
+    @property
+    def follow_up(self) -> float:
+        """Months from the earliest to the latest visit."""
+        if self.time is None:
+            return 0.0
+        times = self._table[self.time].to_numpy(dtype=np.float64)
+        return float(np.ptp(times[np.isfinite(times)])) * self.months
+
+    def place(self, hemi: str, side: SideMaps) -> FittedMaps:
+        """Fit the model at the points of maps of one hemisphere."""
+        return fit_maps(hemi, side, self.model, self._settings)
+
+    def of_map(self, one: FittedMaps, measure: str) -> tuple[Tables, Reference]:
+        """Describe the points of one map."""
+        rows = one.maps.rows[one.used]
+        return {}, self._reference(rows, one.values(measure), one.fits[measure])
+
+    def of_summaries(
+        self, cohort: Cohort, only: Sequence[str] | None
+    ) -> Iterator[tuple[str, tuple[str, ...], Float, Tables, Reference]]:
+        """Describe summary measures of each hemisphere, and of the mean of both."""
+        fits, _ = fit_summaries(
+            cohort,
+            self.spec,
+            self.model.design,
+            self._settings,
+            only=only,
+            references={},
+            icv=None,
+            rows_of=lambda _: self.model,
+        )
+        rows = self.model.design.rows
+        for one in fits:
+            values = summary_values(cohort, one.hemi, one.measures)[list(one.measures)]
+            numbers = values.to_numpy(dtype=np.float64)[rows]
+            reference = self._reference(rows, numbers, one.fit)
+            yield one.hemi, one.measures, numbers, {}, reference
+
+    def _reference(self, rows: Int, values: Float, fit: PointwiseFit) -> Reference:
+        """At one visit with the residual variance; over time with changes and both variances."""
+        numbers, names = pd.factorize(self._table[PARTICIPANT].iloc[rows])
+        seen = np.zeros((len(names), values.shape[1]), dtype=bool)
+        np.logical_or.at(seen, numbers, np.isfinite(values))
+        n = seen.sum(axis=0)
+        plain = Reference(
+            n=n,
+            mean=mean_of_known(values, 0),
+            variance=fit.sigma**2,
+            freedom=np.maximum(n - float(len(self.model.design.columns)), 1.0),
+        )
+        if self.time is None:
+            return plain
+        (test,) = (one for one in fit.tests if one.contrast.name == self.time)
+        slope, se = test.estimate[0] / self.months, test.se[0] / self.months
+        reach = stats.t.ppf((1 + self._settings.glm.confidence) / 2, test.df) * se
+        return replace(
+            plain,
+            variance=fit.variances["residual"],
+            slope=slope,
+            slope_limits=np.stack([slope - reach, slope + reach]),
+            slope_variance=fit.variances["slope"] / self.months**2,
+        )
+
+    def words(self, cite: Callable[[str], str]) -> str:
+        """Name what means, changes and variances rest on."""
+        model = f"`{self.spec.formula}`"
+        if self.time is None:
+            return f"these participants, after a linear model {model}"
+        unit = "a month" if self.months == 1 else f"{self.months:.3g} months"
+        return (
+            f"these participants, by a linear mixed model {model} with intercepts and"
+            f" slopes of participants {cite('mixed')}; a unit of {self.time} is {unit}"
+        )
+
+
+Source = Retested | Modeled
+
+
+def _check_times(table: pd.DataFrame, time: str | None, settings: GroupSettings) -> None:
+    """Refuse a reference in which change cannot be told from noise."""
+    if time is None:
+        raise ModelError(
+            "--power with --visits needs the time of each session of the reference: a column"
+            f" {', '.join(settings.longitudinal.time_columns)}, acq_time or age in sessions.tsv",
+            reason="no-time",
+        )
+    if table[PARTICIPANT].value_counts().max() < _SLOPE_SESSIONS:
+        raise ModelError(
+            "--power with --visits: no participant of the reference has three sessions, so that"
+            " changes cannot be told from noise; leave --visits out, or give --retest",
+            reason="few-sessions",
+        )

@@ -1,0 +1,478 @@
+"""Agreement of repeated sessions and sample sizes of trials, from files to files."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+
+from hipsta_bids import __version__
+from hipsta_bids.derivatives import dataset
+from hipsta_bids.derivatives.names import TRIAL_MAPS, TRIAL_TABLES
+from hipsta_bids.errors import ModelError
+from hipsta_bids.group import write
+from hipsta_bids.group.analysis import SideResult, register_side
+from hipsta_bids.group.clusters import frame_of
+from hipsta_bids.group.collect import Exclusion
+from hipsta_bids.group.comparison import Comparison
+from hipsta_bids.group.data import PARTICIPANT, SESSION, Bool, Cohort, Float
+from hipsta_bids.group.figures import Drawing
+from hipsta_bids.group.formula import check_names, listed
+from hipsta_bids.group.glm import FittedMaps
+from hipsta_bids.group.methods import REFERENCES
+from hipsta_bids.group.panels import Row, Scale, draw_rows
+from hipsta_bids.group.power import (
+    THINNING,
+    TrialEffect,
+    point_level,
+    power_columns,
+    power_text,
+    sample_size,
+)
+from hipsta_bids.group.reference import Modeled, Retested, Source, Tables
+from hipsta_bids.group.retest import RetestCohort, retest_cohort, retest_text
+from hipsta_bids.group.run import (
+    GroupInputs,
+    GroupOptions,
+    GroupResult,
+    describe_dataset,
+    make_page,
+    read_inputs,
+    read_templates,
+    record_inputs,
+)
+from hipsta_bids.group.settings import GroupSettings
+from hipsta_bids.group.tables import entity_label, registration_tables
+from hipsta_bids.group.warps import Template, templates_to_json
+from hipsta_bids.io import files, gifti
+from hipsta_bids.progress import each, tell
+from hipsta_bids.protocols.toml import resolve
+from hipsta_bids.reports.display import known
+from hipsta_bids.reports.group_tables import display_name, with_brackets
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: Ticks of numbers of participants.
+_COUNTS = tuple(n * 10**power for power in range(5) for n in (1, 2, 3, 5))
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialRequest:
+    """What is asked of repeated sessions, or of a reference cohort."""
+
+    retest: bool = False
+    effect: TrialEffect | None = None
+    """Of a trial whose size is asked for."""
+    among: tuple[str, str] | None = None
+    """Column and level of the participants; all without."""
+
+    @property
+    def name(self) -> str:
+        """Folder of the results."""
+        parts = ["retest"] if self.retest else []
+        if self.effect is not None:
+            share = f"{100 * self.effect.share:g}".replace(".", "p")
+            parts.append(f"power-{self.effect.kind}-{share}")
+        parts += [self.among[1]] if self.among else []
+        return "_".join("".join(c if c.isalnum() else "-" for c in part) for part in parts)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Found:
+    """What was found for some summary measures."""
+
+    hemi: str
+    measures: tuple[str, ...]
+    tables: Tables
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MapFound(Found):
+    """What was found at the points of one map."""
+
+    place: FittedMaps
+    """Where the points are."""
+
+
+def run_trial(options: GroupOptions, request: TrialRequest, settings: GroupSettings) -> GroupResult:
+    """Measure the agreement of sessions, or sample sizes, and write all results or none.
+
+    Raises
+    ------
+    HipstaError
+        If inputs, sessions or output folder do not allow it.
+    """
+    dataset.check_own_dataset(options.out_dir)
+    effect = request.effect
+    if effect is not None:
+        point_level(settings)  # refuses before anything is read
+    repeated = request.retest or bool(effect and effect.visits)
+    options = replace(options, comparison=Comparison(longitudinal=repeated))
+    tell("reading")
+    inputs = read_inputs(options, settings)
+    table = inputs.cohort.table
+    cohort, retest, left_out = _choose(inputs.cohort, request, settings)
+    kept = table.index.isin(cohort.table.index)
+    templates = read_templates(options.template, cohort)
+    sides = {
+        hemi: register_side(cohort, hemi, groups=None, settings=settings, templates=templates)
+        for hemi in each("registration", list(cohort.sides) if inputs.measures.maps else [])
+    }
+    registered = {hemi: side.registered for hemi, side in sides.items()} or cohort.sides
+    cohorts = {"": replace(cohort, sides=registered)}
+    cohorts |= {name: other.take(kept) for name, other in inputs.others.items()}
+    tell("points and measures")
+    source: Source
+    if retest is not None:
+        source = Retested(retest, settings, repeated=bool(effect and effect.visits))
+    else:
+        source = Modeled(cohort, options.model, settings, inputs.time)
+        left_out |= {
+            visit: ("incomplete", f"{variable} is missing")
+            for variable, visits in source.model.design.dropped.items()
+            for visit in visits
+        }
+    maps = {
+        name: list(
+            _of_maps(one, (name,) if name else inputs.measures.maps, source, effect, settings)
+        )
+        for name, one in cohorts.items()
+    }
+    measures = list(_of_measures(cohorts[""], inputs.measures.summaries, source, effect, settings))
+    notes = [*inputs.notes, *_notes(maps, inputs, source, effect)]
+    exclusions = [*inputs.exclusions, *_excluded(table, left_out)]
+    region = options.sheets.region
+    name = options.model.name or request.name + ("" if region == "body" else f"_{region}")
+    modeled = cohort.table
+    if isinstance(source, Modeled):
+        modeled = modeled.iloc[source.model.design.rows]
+    people = int(modeled[PARTICIPANT].nunique())
+    describe_dataset(options)
+    with write.model_folder(options.out_dir, name) as folder:
+        tell("tables and maps")
+        _write_measures(folder, cohort, measures)
+        for surface, found in maps.items():
+            _write_maps(folder, surface, cohorts[surface], found)
+        for title, content in registration_tables(cohort, sides) if sides else ():
+            write.write_table(folder, title, content)
+        if templates := _templates(sides):
+            files.write_json(folder / "template.json", templates_to_json(templates))
+        write.write_exclusions(folder, exclusions)
+        write.write_table(folder, "covariates", modeled, described=False)
+        files.write_text(folder / "methods.md", _methods(source, request, modeled, maps, settings))
+        figures = (figure for key, own in maps.items() for figure in _figures(cohorts[key], own))
+        notes += write.write_figures(folder, figures)
+        record = {
+            "command": list(options.command),
+            "version": __version__,
+            "inputs": record_inputs(options, inputs.found),
+            "formula": source.spec.formula if isinstance(source, Modeled) else None,
+            "participants": people,
+            "rows": len(modeled),
+            "hemispheres": {hemi: len(side.rows) for hemi, side in cohort.sides.items()},
+            "retest": retest and {"participants": people, "sessions": retest.sessions},
+            "power": effect and asdict(effect) | {"alpha_point": point_level(settings)},
+            "among": request.among,
+            "notes": [*inputs.found.warnings, *notes],
+            "settings": resolve(settings),
+        }
+        files.write_json(folder / "analysis.json", record)
+    page, problem = make_page(options, name)
+    return GroupResult(
+        folder=options.out_dir / write.GROUP_FOLDER / name,
+        page=page,
+        problem=problem,
+        n_participants=people,
+        n_excluded=len(exclusions),
+        notes=tuple(notes),
+        warnings=inputs.found.warnings,
+    )
+
+
+def _templates(sides: Mapping[str, SideResult]) -> dict[str, Template]:
+    """Templates of registration by hemisphere, where it made or used one."""
+    found = {hemi: side.registration.template for hemi, side in sides.items()}
+    return {hemi: template for hemi, template in found.items() if template is not None}
+
+
+def _choose(
+    cohort: Cohort, request: TrialRequest, settings: GroupSettings
+) -> tuple[Cohort, RetestCohort | None, dict[str, tuple[str, str]]]:
+    """Keep the visits that are asked for; of others reason and message."""
+    keep = _members(cohort.table, request)
+    message = "another level than --among"
+    left_out = dict.fromkeys(cohort.table.index[~keep].astype(str), ("not-asked", message))
+    cohort = cohort.take(keep)
+    if not request.retest:
+        return cohort, None, left_out
+    retest = retest_cohort(cohort, settings.retest.min_participants)
+    left_out |= {v: ("incomplete-sessions", why) for v, why in retest.left_out.items()}
+    return retest.cohort, retest, left_out
+
+
+def _members(table: pd.DataFrame, request: TrialRequest) -> Bool:
+    """Tell whose visits are asked for."""
+    if request.among is None:
+        return np.ones(len(table), dtype=bool)
+    column, level = request.among
+    check_names([column], table.columns)
+    values = table[column].map(lambda value: None if value is None else str(value))
+    keep = (values == level).to_numpy()
+    if not keep.any():
+        raise ModelError(
+            f"--among {column}={level}: no participant has it; there are"
+            f" {listed(sorted(values.dropna().unique()))}",
+            reason="unknown-level",
+        )
+    return np.asarray(keep, dtype=bool)
+
+
+def _of_maps(
+    cohort: Cohort,
+    names: Sequence[str],
+    source: Source,
+    effect: TrialEffect | None,
+    settings: GroupSettings,
+) -> Iterator[MapFound]:
+    """Results at each point of the maps of a cohort."""
+    for hemi, side in cohort.sides.items() if names else ():
+        place = source.place(hemi, side.only([name for name in names if name in side.maps]))
+        for measure in place.maps.maps:
+            tables, reference = source.of_map(place, measure)
+            signed = effect is not None and effect.kind == THINNING
+            # A share of a mean has no meaning where values have both signs.
+            if effect is not None and not (signed and np.nanmin(place.values(measure)) <= 0):
+                size = sample_size(effect, reference, settings, alpha=point_level(settings))
+                tables = {**tables, "power": power_columns(effect, size, reference)}
+            yield MapFound(hemi=hemi, measures=(measure,), tables=tables, place=place)
+
+
+def _of_measures(
+    cohort: Cohort,
+    only: Sequence[str] | None,
+    source: Source,
+    effect: TrialEffect | None,
+    settings: GroupSettings,
+) -> Iterator[Found]:
+    """Results of the summary measures of each hemisphere and of the mean of both."""
+    for hemi, names, values, tables, described in source.of_summaries(cohort, only):
+        own, reference = tables, described
+        if effect is not None:
+            if effect.kind == THINNING:
+                signed = np.where(np.isfinite(values), values, 1.0).min(axis=0) <= 0
+                reference = replace(described, mean=np.where(signed, np.nan, described.mean))
+            size = sample_size(effect, reference, settings, alpha=settings.power.alpha, limits=True)
+            own = {**tables, "power": power_columns(effect, size, reference)}
+        yield Found(hemi=hemi, measures=names, tables=own)
+
+
+def _notes(
+    maps: Mapping[str, Sequence[MapFound]],
+    inputs: GroupInputs,
+    source: Source,
+    effect: TrialEffect | None,
+) -> Iterator[str]:
+    if isinstance(source, Retested) and (n := len(source.retest.left_out)):
+        yield f"{n} visits of participants who lack a session are left out, see excluded.tsv"
+    if effect is None:
+        return
+    every = [one for own in maps.values() for one in own]
+    if lost := dict.fromkeys(one.measures[0] for one in every if "power" not in one.tables):
+        yield (
+            f"{', '.join(lost)}: no sample sizes, since it has values of both signs, whose share"
+            " means nothing"
+        )
+    if isinstance(source, Modeled) and effect.duration > source.follow_up:
+        yield (
+            f"the trial lasts {effect.duration:g} months, the reference {source.follow_up:.3g};"
+            " that change goes on alike is an assumption"
+        )
+    if isinstance(source, Retested) and effect.visits:
+        yield (
+            "sample sizes rest on the variance of measurement alone; trials need more, as people"
+            " differ in how they change"
+        )
+    if later := sum(one.reason == "later-session" for one in inputs.exclusions):
+        yield f"{later} later sessions are not in it; --visits takes all"
+
+
+def _excluded(table: pd.DataFrame, left_out: Mapping[str, tuple[str, str]]) -> Iterator[Exclusion]:
+    """List visits that are left out, with reason and message."""
+    for row in table.loc[list(left_out), [PARTICIPANT, SESSION]].itertuples():
+        reason, message = left_out[str(row.Index)]
+        yield Exclusion(
+            participant=str(row[1]),
+            session=row[2],
+            hemi=files.MISSING,
+            reason=reason,
+            message=message,
+        )
+
+
+def _methods(
+    source: Source,
+    request: TrialRequest,
+    visits: pd.DataFrame,
+    maps: Mapping[str, Sequence[MapFound]],
+    settings: GroupSettings,
+) -> str:
+    """Word what was done, with the works it rests on."""
+    cited: list[str] = []
+
+    def cite(key: str) -> str:
+        if key not in cited:
+            cited.append(key)
+        return f"[{cited.index(key) + 1}]"
+
+    people = int(visits[PARTICIPANT].nunique())
+    among = f" ({' '.join(request.among)})" if request.among else ""
+    first = (
+        f"Measures of the hippocampus {cite('method')} of {people} participants{among} with"
+        f" {len(visits)} visits were analyzed with hipsta_bids {__version__}."
+    )
+    others = [name for name in maps if name]
+    if maps[""] and settings.registration.align != "none":
+        first += (
+            f" Sheets were registered by their curvature profiles {cite('registr')}, each session"
+            " by itself, as for comparisons of groups."
+        )
+    elif maps[""]:
+        first += " Sheets were not registered to each other."
+    if others:
+        first += (
+            f" Maps of other programs ({', '.join(others)}) were taken as they are, without"
+            " registration."
+        )
+    paragraphs = [first]
+    if isinstance(source, Retested):
+        paragraphs.append(retest_text(source.retest, settings.retest, cite))
+    if request.effect is not None:
+        paragraphs.append(power_text(request.effect, settings, source.words, cite))
+    lines = ["# Methods and findings", "", "This text may be used freely, as it stands or changed."]
+    for paragraph in paragraphs:
+        lines += ["", paragraph]
+    lines += ["", "# References", ""]
+    lines += [f"{i}. {REFERENCES[key]}" for i, key in enumerate(cited, start=1)]
+    return "\n".join(lines) + "\n"
+
+
+def _write_measures(folder: Path, cohort: Cohort, found: Sequence[Found]) -> None:
+    """Write what was found for summary measures, those first that need fewest participants."""
+    for question, (title, _) in TRIAL_TABLES.items():
+        blocks = [
+            pd.DataFrame(
+                {
+                    "hemi": one.hemi,
+                    "measure": one.measures,
+                    "unit": [cohort.units.get(name, "1") for name in one.measures],
+                    **one.tables[question],
+                }
+            )
+            for one in found
+            if question in one.tables
+        ]
+        if blocks:
+            table = pd.concat(blocks, ignore_index=True)
+            if "per_arm" in table:
+                table = table.sort_values(
+                    ["per_arm", "cohen_d"], ascending=[True, False], ignore_index=True
+                )
+            write.write_table(folder, title, table)
+
+
+def _write_maps(folder: Path, surface: str, cohort: Cohort, found: Sequence[MapFound]) -> None:
+    """Write the points of maps as a table and as GIFTI."""
+    for question, (_, title) in TRIAL_TABLES.items():
+        blocks = []
+        for one in found:
+            if question in one.tables:
+                frame = frame_of(cohort, one.place)
+                columns = {
+                    "hemi": one.hemi,
+                    "measure": one.measures[0],
+                    "unit": cohort.units.get(one.measures[0], "1"),
+                    **frame.number,
+                    **frame.position,
+                    "subfield": frame.subfield,
+                    **one.tables[question],
+                }
+                blocks.append(pd.DataFrame(columns))
+        if blocks:
+            table = pd.concat(blocks, ignore_index=True)
+            write.write_table(folder, "_".join(filter(None, (surface, title))), table)
+    for one in found:
+        write.write_surface(folder, cohort, one.place, one.hemi)
+        units = {"1": "1", "": cohort.units.get(one.measures[0], "1")}
+        for stat, (question, column, unit) in TRIAL_MAPS.items():
+            if question in one.tables:
+                stem = f"hemi-{one.hemi}_stat-{stat}_desc-{entity_label(one.measures[0])}_statmap"
+                values = np.asarray(one.tables[question][column], dtype=np.float64)
+                content = gifti.shape_bytes(values, hemi=one.hemi, name=stem, unit=units[unit])
+                files.write_bytes(folder / f"{stem}.shape.gii", content)
+
+
+def _figures(cohort: Cohort, found: Sequence[MapFound]) -> Iterator[tuple[str, Drawing]]:
+    """List the figures of each map by name."""
+    for measure in dict.fromkeys(one.measures[0] for one in found):
+        for question, make in (("retest", _agreement), ("power", _sizes)):
+            own = {
+                one.hemi: one
+                for one in found
+                if one.measures[0] == measure and question in one.tables
+            }
+            unit = cohort.units.get(measure, "1")
+            if rows := list(make(own, with_brackets(display_name(measure), unit))):
+                places = {hemi: one.place for hemi, one in own.items()}
+                yield f"{measure}_{question}", partial(_draw, cohort, places, rows)
+
+
+def _draw(cohort: Cohort, places: Mapping[str, FittedMaps], rows: Sequence[Row]) -> "list[Figure]":
+    return [draw_rows(cohort, places, {}, rows, {})]
+
+
+def _agreement(found: Mapping[str, MapFound], measure: str) -> Iterator[Row]:
+    """Show agreement between sessions."""
+    if found:
+        within, icc = (_values(found, "retest", name) for name in ("sd_within", "icc"))
+        title = "Within-subject SD"
+        label = f"{title},\n{measure}"
+        scale = _scale("magma", within)
+        yield Row(kind="error", index=0, title=title, label=label, scale=scale, values=within)
+        title = "ICC(2,1)"
+        scale = {"cmap": "viridis", "vmin": 0.0, "vmax": 1.0}
+        yield Row(kind="agreement", index=0, title=title, label=title, scale=scale, values=icc)
+
+
+def _sizes(found: Mapping[str, MapFound], measure: str) -> Iterator[Row]:
+    """Show participants per arm, by their logarithm."""
+    values = {hemi: np.log10(own) for hemi, own in _values(found, "power", "per_arm").items()}
+    if any(np.isfinite(own).any() for own in values.values()):
+        scale = _scale("viridis_r", values)
+        ticks = [n for n in _COUNTS if scale["vmin"] <= np.log10(n) <= scale["vmax"]]
+        yield Row(
+            kind="size",
+            index=0,
+            title="Participants per arm",
+            label=f"participants per arm,\n{measure}",
+            scale=scale,
+            values=values,
+            ticks={float(np.log10(n)): f"{n:,}" for n in ticks},
+        )
+
+
+def _values(found: Mapping[str, MapFound], question: str, column: str) -> dict[str, Float]:
+    return {
+        hemi: np.asarray(one.tables[question][column], dtype=np.float64)
+        for hemi, one in found.items()
+    }
+
+
+def _scale(colors: str, values: Mapping[str, Float]) -> Scale:
+    """Colors from the 1st to the 99th percentile."""
+    every = known(list(values.values()))
+    low, high = np.percentile(every, (1, 99)) if len(every) else (0.0, 1.0)
+    return {"cmap": colors, "vmin": float(low), "vmax": float(high if high > low else low + 1)}

@@ -1,0 +1,256 @@
+"""Sample sizes against simulated trials: power as it was stated, and as it comes out."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+from statsmodels.stats.multitest import multipletests
+
+from hipsta_bids.group.covariates import VisitTime
+from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, SideMaps
+from hipsta_bids.group.model import ModelRequest
+from hipsta_bids.group.power import (
+    SLOWING,
+    THINNING,
+    TrialEffect,
+    point_level,
+    power_of,
+    sample_size,
+)
+from hipsta_bids.group.reference import Modeled, Reference, Retested
+from hipsta_bids.group.retest import retest_cohort
+from hipsta_bids.group.settings import GroupSettings
+from hipsta_bids.types import Bool, Float
+from hipsta_bids.validation.group import smooth_noise
+from hipsta_bids.validation.report import Cells, Suite, Table
+
+TRIALS, MAP_TRIALS, FEW_MAP_TRIALS = 4000, 400, 150
+#: Target: stated and observed power differ by at most this.
+MAX_DIFFERENCE = 0.03
+
+_MEAN, _BETWEEN, _WITHIN = 1.6, 0.16, 0.04  # mm
+_SLOPE, _SLOPE_SD = -0.004, 0.003  # mm per month
+_COHORT, _MAP_COHORT = 5000, 400  # participants of the reference
+_FOLLOWED = (0.0, 12.0, 24.0)  # months of the reference's visits
+_PROCEDURES = {"bh": "fdr_bh", "fdr2": "fdr_tsbky"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialDesign:
+    """One question, and the reference that answers it."""
+
+    title: str
+    effect: TrialEffect
+    retest: bool = False
+    nodes: tuple[int, int] = (1, 1)
+    """Of the sheet; one for a summary measure."""
+    power: Mapping[str, Any] = field(default_factory=dict)
+    """Settings."""
+    correction: str = "fdr2"
+    smoothness: float = 2.0
+    """Of maps, standard deviation of a Gaussian, nodes."""
+
+    @property
+    def settings(self) -> GroupSettings:
+        """Settings of the group level."""
+        return GroupSettings().changed(power=self.power, multiplicity={"method": self.correction})
+
+    @property
+    def is_map(self) -> bool:
+        """Whether it is about a map."""
+        return self.nodes != (1, 1)
+
+
+DESIGNS = (
+    TrialDesign(
+        title="measure, one visit, 5 % thinner",
+        effect=TrialEffect(kind=THINNING, share=0.05),
+    ),
+    TrialDesign(
+        title="measure, months 0, 12, 24, 30 % slower",
+        effect=TrialEffect(kind=SLOWING, share=0.3, visits=(0, 12, 24)),
+    ),
+    TrialDesign(
+        title="measure, months 0 to 24 by 6, 25 % slower, 20 % drop out",
+        effect=TrialEffect(kind=SLOWING, share=0.25, visits=(0, 6, 12, 18, 24)),
+        power={"power": 0.9, "dropout": 0.2},
+    ),
+    TrialDesign(
+        title="measure, test-retest, months 0, 12, 2 % thinner",
+        effect=TrialEffect(kind=THINNING, share=0.02, visits=(0, 12)),
+        retest=True,
+    ),
+    TrialDesign(
+        title="map, one visit, 5 % thinner at 10 % of the points, bh",
+        effect=TrialEffect(kind=THINNING, share=0.05),
+        nodes=(40, 21),
+        power={"affected": 0.1},
+        correction="bh",
+    ),
+    TrialDesign(
+        title="map, one visit, 5 % thinner at 30 % of the points, fdr2",
+        effect=TrialEffect(kind=THINNING, share=0.05),
+        nodes=(40, 21),
+        power={"affected": 0.3, "power": 0.9},
+    ),
+)
+
+
+@dataclass(frozen=True)
+class TrialOutcome:
+    """A sample size and what became of it."""
+
+    per_arm: int
+    enrolled: int
+    stated: float
+    """Power of the test, with those who complete the trial."""
+    observed: float
+    """Share of trials that find the effect; of maps mean share of the affected points found."""
+    se: float
+    """Standard error of this share."""
+
+
+def simulate_design(design: TrialDesign, trials: int, seed: int = 0) -> TrialOutcome:
+    """Find the sample size from a simulated reference cohort, and run trials of that size."""
+    random = np.random.default_rng(seed)
+    reference = _reference(design, random)
+    settings = design.settings
+    alpha = point_level(settings) if design.is_map else settings.power.alpha
+    found = sample_size(design.effect, reference, settings, alpha=alpha)
+    per_arm, enrolled = int(np.median(found.per_arm)), int(np.median(found.enrolled))
+    if design.is_map:
+        shares = [_map_trial(design, per_arm, random) for _ in range(trials)]
+    else:
+        shares = [_trial(design, enrolled, random) for _ in range(trials)]
+    return TrialOutcome(
+        per_arm=per_arm,
+        enrolled=enrolled,
+        stated=float(np.mean(power_of(found.cohen_d, np.full(found.sd.shape, per_arm), alpha))),
+        observed=float(np.mean(shares)),
+        se=float(np.std(shares) / np.sqrt(trials)),
+    )
+
+
+def _reference(design: TrialDesign, random: np.random.Generator) -> Reference:
+    """Let the group level describe a cohort, as the command does."""
+    n_visits = 2 if design.retest else len(_FOLLOWED)
+    visits = _FOLLOWED[:n_visits] if design.effect.visits else (0.0,)
+    people = _MAP_COHORT if design.is_map else _COHORT
+    slopes = 0.0 if design.retest else _SLOPE + _SLOPE_SD * random.standard_normal(people)
+    values = _values(design, people, random)[:, None] + np.zeros((len(visits), *design.nodes))
+    values += (np.multiply.outer(slopes * np.ones(people), visits))[..., None, None]
+    if design.effect.visits:
+        values += _WITHIN * random.standard_normal(values.shape)
+    rows = people * len(visits)
+    names = [f"sub-{i:05d}" for i in range(people)]
+    table = pd.DataFrame(
+        {
+            PARTICIPANT: np.repeat(names, len(visits)),
+            SESSION: [f"ses-{j}" for j in range(len(visits))] * people,
+            "months": np.tile(visits, people),
+        }
+    )
+    side = SideMaps(
+        rows=np.arange(rows),
+        maps={"thickness": values.reshape(rows, *design.nodes)},
+        subfield=np.zeros((rows, *design.nodes), dtype=np.int8),
+        names=("all",),
+        summary=pd.DataFrame(index=range(rows)),
+    )
+    axes = [np.linspace(-1, 1, n) for n in design.nodes]
+    cohort = Cohort(table=table, sides={"L": side}, x=axes[0], y=axes[1], units={})
+    source: Modeled | Retested
+    if design.retest:
+        source = Retested(retest_cohort(cohort, 3), design.settings, repeated=True)
+    else:
+        time = VisitTime(table, "months", ()) if design.effect.visits else None
+        source = Modeled(cohort, ModelRequest(), design.settings, time)
+    return source.of_map(source.place("L", side), "thickness")[1]
+
+
+def _values(design: TrialDesign, people: int, random: np.random.Generator) -> Float:
+    """(people, x, y) mm at the first visit, without the error of single visits."""
+    if design.is_map:
+        noise = smooth_noise(random, (people, *design.nodes), design.smoothness)
+    else:
+        noise = random.standard_normal((people, 1, 1))
+    return _MEAN + _BETWEEN * noise
+
+
+def _trial(design: TrialDesign, enrolled: int, random: np.random.Generator) -> bool:
+    """Run one trial of a summary measure, and tell whether it finds the effect."""
+    effect = design.effect
+    arms = []
+    for treated in (False, True):
+        stays = random.random(enrolled) >= design.settings.power.dropout
+        first = _MEAN + _BETWEEN * random.standard_normal(int(stays.sum()))
+        if not effect.visits:
+            arms.append(first - (effect.share * _MEAN if treated else 0.0))
+            continue
+        times = np.array(effect.visits)
+        slopes = np.zeros(len(first))
+        if not design.retest:
+            slopes += _SLOPE + _SLOPE_SD * random.standard_normal(len(first))
+        if treated and effect.kind == SLOWING:
+            slopes -= effect.share * _SLOPE
+        elif treated:
+            slopes -= effect.share * _MEAN / effect.duration
+        values = first[:, None] + slopes[:, None] * times
+        values += _WITHIN * random.standard_normal(values.shape)
+        centered = times - times.mean()
+        arms.append(values @ centered / (centered @ centered))
+    return bool(stats.ttest_ind(*arms).pvalue <= design.settings.power.alpha)
+
+
+def _map_trial(design: TrialDesign, per_arm: int, random: np.random.Generator) -> float:
+    """Run one trial of a map, and return the share of the affected points that it finds."""
+    affected: Bool = np.zeros(design.nodes, dtype=bool)
+    affected[: round(design.settings.power.affected * design.nodes[0])] = True
+    values = _values(design, 2 * per_arm, random)
+    values[per_arm:, affected] -= design.effect.share * _MEAN
+    flat = values.reshape(2 * per_arm, -1)
+    p = stats.ttest_ind(flat[:per_arm], flat[per_arm:]).pvalue
+    level = design.settings.multiplicity.alpha
+    rejected = multipletests(p, level, method=_PROCEDURES[design.correction])[0]
+    return float(rejected[affected.ravel()].mean())
+
+
+def run(full: bool) -> Suite:
+    """Simulate the trials of all designs."""
+    rows: list[Cells] = []
+    for design in DESIGNS:
+        trials = (MAP_TRIALS if full else FEW_MAP_TRIALS) if design.is_map else TRIALS
+        found = simulate_design(design, trials)
+        rows.append(
+            {
+                "design": design.title,
+                "per arm": found.per_arm,
+                "enrolled": found.enrolled,
+                "stated power": found.stated,
+                "observed power": found.observed,
+                "SE": found.se,
+                "trials": trials,
+                "met": abs(found.observed - found.stated) <= MAX_DIFFERENCE,
+            }
+        )
+    return Suite(
+        name="trials",
+        title="Sample sizes of trials",
+        text="A reference cohort is simulated, described by the group level, and asked how many"
+        " participants a trial needs. Trials of that size are then simulated and analyzed.",
+        tables=(
+            Table(
+                title="Simulated trials",
+                rows=rows,
+                notes=f"Values between participants have an SD of {_BETWEEN:g} mm around"
+                f" {_MEAN:g} mm; with several visits, slopes one of {1000 * _SLOPE_SD:g} µm around"
+                f" {1000 * _SLOPE:g} µm per month, and single visits one of {_WITHIN:g} mm."
+                f" References have {_COHORT} participants, of maps {_MAP_COHORT}. Of maps, power is"
+                " the mean share of the affected points that are found. Target: it differs from"
+                f" what was stated by at most {MAX_DIFFERENCE:g}.",
+            ),
+        ),
+    )

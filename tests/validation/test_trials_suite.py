@@ -1,0 +1,39 @@
+"""Simulated trials have the power that their sample size was to give."""
+
+from dataclasses import replace
+
+import pytest
+
+from hipsta_bids.validation import trials
+from hipsta_bids.validation.trials import DESIGNS, simulate_design
+
+
+def test_six_designs_are_simulated():
+    assert len(DESIGNS) == 6
+    assert len({design.title for design in DESIGNS}) == 6
+
+
+@pytest.mark.parametrize("design", [DESIGNS[2], DESIGNS[3]], ids=["slowing", "retest"])
+def test_stated_power_is_observed(design):
+    found = simulate_design(design, 600)
+    # Four standard errors of 600 trials, and the reference's own error.
+    assert found.observed == pytest.approx(found.stated, abs=4 * found.se + 0.02)
+    assert found.enrolled > found.per_arm or design.retest
+
+
+def test_stated_power_of_maps_is_observed():
+    # Coarse and rough maps: fast, and many points tell the share that is found.
+    found = simulate_design(replace(DESIGNS[4], nodes=(20, 10), smoothness=0.5), 60)
+    assert found.observed == pytest.approx(found.stated, abs=0.05)
+
+
+def test_a_wrong_size_is_noticed(monkeypatch):
+    real = trials.sample_size
+
+    def half(*args, **options):
+        found = real(*args, **options)
+        return replace(found, enrolled=found.enrolled // 2)
+
+    monkeypatch.setattr(trials, "sample_size", half)
+    found = simulate_design(DESIGNS[0], 300)
+    assert found.stated - found.observed > 2 * trials.MAX_DIFFERENCE
