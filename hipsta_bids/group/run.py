@@ -24,6 +24,7 @@ from hipsta_bids.group.collect import (
 from hipsta_bids.group.comparison import Comparison, choose_visits
 from hipsta_bids.group.covariates import VisitTime, add_time, read_covariates, read_icv
 from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Measures
+from hipsta_bids.group.exchange import SUMMARY, summarize, write_summary
 from hipsta_bids.group.formula import parse_model
 from hipsta_bids.group.model import (
     ModelRequest,
@@ -79,6 +80,9 @@ class GroupOptions:
     """What to fit the model to; empty for the default or the formula's left-hand side."""
     template: Path | None = None
     comparison: Comparison = field(default_factory=Comparison)
+    export_summary: str | None = None
+    """Name of this site in a summary for others, empty for that of the folder; ``None`` for no
+    summary."""
     reports: bool = True
     """Whether a page is made."""
     command: tuple[str, ...] = ()
@@ -157,7 +161,9 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
     model = parse_model(document)
     templates = None
     if options.template is not None:
-        templates = templates_from_json(files.read_json(options.template), str(options.template))
+        content = files.read_json(options.template)
+        content = content.get("template") or content  # in the summary of another site
+        templates = templates_from_json(content, str(options.template))
         _check_templates(templates, cohort, options.template)
     analysis = analyze_cohort(
         cohort,
@@ -185,11 +191,14 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
     name = folder_name(model.formula, wanted) + options.comparison.suffix
     name = options.model.name or (name if region == "body" else f"{name}_{region}")
     notes = [*inputs.notes, *_notes(inputs, analysis)]
+    summary = _summary(options, inputs, analysis, settings, notes)
     shapes = average_shapes(inputs.found.records, cohort, analysis, settings)
     _describe(options)
     with write.model_folder(options.out_dir, name) as folder:
         write_results(folder, cohort, analysis, settings, exclusions, others=others, region=region)
         files.write_json(folder / "model.json", document)
+        if summary is not None:
+            write_summary(folder / SUMMARY, summary)
         write_shapes(folder, shapes)
         if analysis.sides and inputs.found.records and not shapes:
             notes.append("no average surfaces: those of the participant level are missing")
@@ -205,6 +214,33 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         n_excluded=len(exclusions),
         notes=tuple(notes),
     )
+
+
+def _summary(
+    options: GroupOptions,
+    inputs: GroupInputs,
+    analysis: Analysis,
+    settings: GroupSettings,
+    notes: list[str],
+) -> dict[str, Any] | None:
+    """Make the summary for other sites, if it is asked for."""
+    if options.export_summary is None:
+        return None
+    found = inputs.found
+    summary, more = summarize(
+        inputs.cohort,
+        analysis,
+        settings,
+        site=options.export_summary or options.bids_dir.resolve().name,
+        inputs={
+            "versions": list(found.versions),
+            "seg": found.records[0].place.name.seg if found.records else "none",
+            "region": options.sheets.region,
+            "settings_hash": found.settings_hash,
+        },
+    )
+    notes += more
+    return summary
 
 
 def _read(options: GroupOptions, settings: GroupSettings) -> GroupInputs:

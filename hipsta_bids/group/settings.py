@@ -237,6 +237,33 @@ class ClassificationSettings(SettingsTable):
     """Steps end when they promise to raise the log likelihood by less than this."""
 
 
+class ExchangeSettings(SettingsTable):
+    """What a summary for other sites may say."""
+
+    min_cell: Annotated[int, Field(ge=3)] = 5
+    """Fewest participants in a group, a level of a factor, or a cell of two factors."""
+    min_residual_df: PositiveInt = 10
+    """Fewest participants beyond the columns of the model."""
+    max_leverage: OpenFraction = 0.5
+    """Largest share of a fitted value that comes from one participant's own value."""
+
+
+class MetaSettings(SettingsTable):
+    """Summaries of several sites become one result."""
+
+    fixed: Literal["joint", "inverse-variance"] = "joint"
+    """Fixed effect: ``joint`` (the model of all participants with a constant per site, from the
+    sites' coefficients and their covariances; Becker and Wu 2007), or the mean of the sites'
+    estimates by ``inverse-variance``."""
+    random: Literal["reml", "dl"] = "reml"
+    """Variance between sites: ``reml`` (restricted maximum likelihood, with tests of Knapp and
+    Hartung 2003) or ``dl`` (DerSimonian and Laird 1986, with normal tests)."""
+    min_sites: Annotated[int, Field(ge=2)] = 2
+    """Fewest sites with an estimate at a point."""
+    confidence: OpenFraction = 0.95
+    """Coverage of two-sided confidence and prediction limits, fraction."""
+
+
 class GroupSettings(SettingsTable):
     """All settings of the group level."""
 
@@ -249,6 +276,8 @@ class GroupSettings(SettingsTable):
     multiplicity: MultiplicitySettings = MultiplicitySettings()
     shapes: ShapeSettings = ShapeSettings()
     classification: ClassificationSettings = ClassificationSettings()
+    exchange: ExchangeSettings = ExchangeSettings()
+    meta: MetaSettings = MetaSettings()
 
 
 def load_group_settings(path: Path | None) -> GroupSettings:
