@@ -44,17 +44,22 @@ _SUFFIXES = {"": "as measured", "_registered": "after registration"}
 Columns = dict[str, pa.Array]
 
 
+def model_folder(root: Path, name: str) -> contextlib.AbstractContextManager[Path]:
+    """Make the folder of a model, whole or not at all."""
+    return whole_folder(root / GROUP_FOLDER / name)
+
+
 @contextlib.contextmanager
-def model_folder(root: Path, name: str) -> Iterator[Path]:
+def whole_folder(path: Path) -> Iterator[Path]:
     """Make a folder to write into, which is renamed to its final name if all went well."""
-    parent = root / GROUP_FOLDER
+    parent, name = path.parent, path.name
     aside = parent / f".{name}.{os.getpid()}.tmp"
     files.make_folder(parent)
     try:
         aside.mkdir()
         try:
             yield aside
-            _replace(aside, parent / name)
+            _replace(aside, path)
         except BaseException:
             shutil.rmtree(aside, ignore_errors=True)
             raise
@@ -62,7 +67,7 @@ def model_folder(root: Path, name: str) -> Iterator[Path]:
         for left in parent.glob(f".{name}.*.tmp"):
             shutil.rmtree(left, ignore_errors=True)
     except OSError as error:
-        raise files.output_error(parent / name, error) from error
+        raise files.output_error(path, error) from error
 
 
 def _replace(aside: Path, final: Path) -> None:
@@ -86,16 +91,16 @@ def write_results(
 ) -> None:
     """Write tables, maps and text."""
     for name, table in result_tables(cohort, analysis, settings):
-        _write_table(folder, name, table)
+        write_table(folder, name, table)
     for name, other in others.items():
         for title, table in point_tables(name, *other, settings):
-            _write_table(folder, title, table)
+            write_table(folder, title, table)
     columns = {"participant": PARTICIPANT, "session": SESSION}
     excluded = pd.DataFrame(exclusions, columns=[*columns, "hemi", "reason", "message"])
-    _write_table(folder, "excluded", excluded.rename(columns=columns))
+    write_table(folder, "excluded", excluded.rename(columns=columns))
     rows_of_model = analysis.compared.table.iloc[analysis.design.rows]
-    _write_table(folder, "covariates", rows_of_model, described=False)
-    _write_table(folder, "design", design_table(analysis), described=False)
+    write_table(folder, "covariates", rows_of_model, described=False)
+    write_table(folder, "design", design_table(analysis), described=False)
     registered = {hemi: side.registered for hemi, side in analysis.sides.items()}
     if registered or others:
         points = {name: other for name, (other, _) in others.items()}
@@ -130,7 +135,7 @@ def draw(
             files.write_bytes(folder / "figures" / name, content)
 
 
-def _write_table(folder: Path, name: str, table: pd.DataFrame, *, described: bool = True) -> None:
+def write_table(folder: Path, name: str, table: pd.DataFrame, *, described: bool = True) -> None:
     """Write a table, with a sidecar unless the columns are the user's or the model's."""
     columns = [str(column) for column in table.columns]
     cells = [[_cell(value) for value in table[column].tolist()] for column in table.columns]

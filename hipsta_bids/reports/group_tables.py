@@ -37,7 +37,7 @@ _SUBFIELD = re.compile(
 _TEXT = (
     *("measure", "unit", "contrast", "hemi", "group", "subfield", "shares", "test", "effect"),
     *("file", "model", "control", "case", "base", "added", "classifier", "region"),
-    *("participant_id", "session_id", "reason", "message"),
+    *("participant_id", "session_id", "reason", "message", "site", "kind", "version", "template"),
 )
 
 
@@ -148,7 +148,8 @@ def direction(results: GroupResults, contrast: str, hemi: str, sign: float) -> s
     if contrast == "mean" and comparison.get("pair"):
         return "with an increase" if sign > 0 else "with a decrease"
     # Contrasts as users write them, and as the default model names them: of change in time, too.
-    short = re.sub(r"\w+\[([^\]]*)\]", r"\1", contrast).replace(" - ", "-")
+    short = re.sub(r" \((fixed|random) effects?\)$", "", contrast)
+    short = re.sub(r"\w+\[([^\]]*)\]", r"\1", short).replace(" - ", "-")
     for first in results.levels:
         for second in results.levels:
             if re.fullmatch(rf"(?:.* in )?{re.escape(first)}-{re.escape(second)}", short):

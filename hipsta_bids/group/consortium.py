@@ -1,0 +1,223 @@
+"""The meta-analysis from files to files: summaries of sites become tables, maps and a page."""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hipsta_bids import __version__
+from hipsta_bids.derivatives.names import META, META_REPORT
+from hipsta_bids.errors import OutputError, UsageError
+from hipsta_bids.group.exchange import SiteSummary, check_agreement, read_summary
+from hipsta_bids.group.figures import LABEL, TITLE, encode, panels
+from hipsta_bids.group.inference import PERMUTATIONS
+from hipsta_bids.group.methods import REFERENCES
+from hipsta_bids.group.settings import GroupSettings
+from hipsta_bids.group.sites import Meta, analyze_sites, meta_tables
+from hipsta_bids.group.write import whole_folder, write_table
+from hipsta_bids.io import files
+from hipsta_bids.protocols.toml import resolve
+from hipsta_bids.reports.display import X_ENDS, Y_ENDS
+from hipsta_bids.reports.group_tables import SIDES, display_name
+from hipsta_bids.reports.meta import write_meta_report
+
+
+@dataclass(frozen=True, kw_only=True)
+class MetaOptions:
+    """What the user asked for."""
+
+    sites: tuple[tuple[str | None, Path], ...]
+    """Summaries, perhaps with other names than those in them."""
+    out_dir: Path
+    command: tuple[str, ...] = ()
+
+
+def run_meta(options: MetaOptions, settings: GroupSettings) -> tuple[Path, list[str]]:
+    """Combine the summaries of sites; returns the page and what should be known.
+
+    Raises
+    ------
+    HipstaError
+        If a summary cannot be read, or sites do not agree.
+    """
+    if settings.multiplicity.method in PERMUTATIONS:
+        raise UsageError(
+            "meta: there is nobody to permute in summaries; use --correction fdr2 or bh",
+            reason="usage",
+        )
+    sites = _read(options.sites)
+    notes = check_agreement(sites)
+    meta = analyze_sites(sites, settings)
+    folder = options.out_dir / META
+    if folder.exists() and not (folder / "meta.json").exists():
+        raise OutputError(
+            f"{folder}: is no earlier meta-analysis; choose another output folder",
+            reason="not-writable",
+        )
+    with whole_folder(folder) as aside:
+        for name, table in meta_tables(meta):
+            write_table(aside, name, table, described=name != "sites")
+        for name, content in _heterogeneity(meta):
+            files.write_bytes(aside / "figures" / name, content)
+        files.write_text(aside / "methods.md", _methods(meta))
+        files.write_json(aside / "meta.json", _record(meta, options, notes))
+    write_meta_report(options.out_dir)
+    return options.out_dir / META_REPORT, notes
+
+
+def _read(given: Sequence[tuple[str | None, Path]]) -> list[SiteSummary]:
+    """Read summaries, and refuse any that would count twice."""
+    sites: list[SiteSummary] = []
+    seen: dict[str, str] = {}
+    for name, path in given:
+        site = read_summary(path)
+        content = site.model_dump_json(exclude={"site"})
+        site = site if name is None else site.model_copy(update={"site": name})
+        if content in seen:
+            raise UsageError(
+                f"meta: {site.site} and {seen[content]} are the same summary; give each site once",
+                reason="same-site",
+            )
+        if site.site in seen.values():
+            raise UsageError(
+                f"meta: two sites are called {site.site}; name them, as a={path} b=...",
+                reason="same-site",
+            )
+        seen[content] = site.site
+        sites.append(site)
+    if len(sites) < 2:  # noqa: PLR2004 -- sites
+        raise UsageError("meta: give the summaries of two sites or more", reason="usage")
+    return sites
+
+
+def _heterogeneity(meta: Meta) -> Iterator[tuple[str, bytes]]:
+    """Draw maps of I squared, a row per measure and contrast."""
+    maps = list(meta.of("map"))
+    if not maps:
+        return
+    rows = list(dict.fromkeys((item.model.measures[0], item.contrast) for item in maps))
+    hemis = list(dict.fromkeys(item.model.hemi for item in maps))
+    figure, axes = panels(len(rows), len(hemis), (2.6, 3.0))
+    x, y = np.array(meta.sites[0].x), np.array(meta.sites[0].y)
+    for axis in axes.ravel():
+        axis.set_axis_off()
+    for item in maps:
+        measure = item.model.measures[0]
+        axis = axes[rows.index((measure, item.contrast)), hemis.index(item.model.hemi)]
+        axis.set_axis_on()
+        values = 100 * item.result.random.i2.reshape(len(x), len(y)).T
+        image = axis.pcolormesh(x, y, values, vmin=0, vmax=100, cmap="cividis", rasterized=True)
+        axis.set_facecolor("0.92")
+        axis.set_xticks([x[0], x[-1]], X_ENDS, fontsize=LABEL)
+        axis.set_yticks([y[0], y[-1]], Y_ENDS, fontsize=LABEL, rotation=90)
+        title = f"{display_name(measure)}, {item.contrast}\n{SIDES[item.model.hemi]}"
+        axis.set_title(title, fontsize=TITLE)
+    figure.colorbar(image, ax=axes, label="I² [%]", shrink=min(1.0, 1.6 / len(rows)))
+    yield from encode("heterogeneity", figure)
+
+
+def _record(meta: Meta, options: MetaOptions, notes: Sequence[str]) -> dict[str, Any]:
+    """Record what was combined, and how."""
+    first = meta.sites[0]
+    return {
+        "command": list(options.command),
+        "version": __version__,
+        "inputs": {
+            "datasets": [str(path.resolve()) for _, path in options.sites],
+            "settings_hash": first.settings_hash,
+            "versions": sorted({version for site in meta.sites for version in site.versions}),
+            "seg": first.seg,
+            "region": first.region,
+            "template_hash": first.template_hash,
+        },
+        "formula": first.models[0].formula,
+        "columns": first.models[0].columns,
+        "groups": {"levels": list(first.groups)},
+        "comparison": {},
+        "participants": meta.people,
+        "sites": [site.site for site in meta.sites],
+        "notes": notes,
+        "settings": {
+            name: values
+            for name, values in resolve(meta.settings).items()
+            if name in {"meta", "multiplicity"}
+        },
+    }
+
+
+def _methods(meta: Meta) -> str:
+    """Word what was done and what came out."""
+    how, sites = meta.settings.meta, meta.sites
+    cited: list[str] = []
+
+    def cite(key: str) -> str:
+        if key not in cited:
+            cited.append(key)
+        return f"[{cited.index(key) + 1}]"
+
+    counts = Counter[str]()
+    for site in sites:
+        counts.update(site.groups)
+    groups = f" ({', '.join(f'{n} {name}' for name, n in counts.items())})" if counts else ""
+    aligned = (
+        "Maps were not registered to each other."
+        if sites[0].template is None
+        else "All sites registered their maps to one template of curvature profiles (hash"
+        f" {sites[0].template_hash})."
+    )
+    fixed = "The fixed effect is the mean of the sites' estimates, weighted by inverse variances."
+    if how.fixed == "joint":
+        fixed = (
+            "The fixed effect is that of the model of all participants with a constant per site,"
+            f" from the sites' coefficients and their covariances {cite('join')}; contrasts that"
+            " include the constant are combined by inverse variances."
+        )
+    random = (
+        f"restricted maximum likelihood {cite('reml')}, tests and limits are those of Knapp and"
+        f" Hartung {cite('knapp-hartung')}"
+        if how.random == "reml"
+        else f"the moments of DerSimonian and Laird {cite('dl')}, tests are normal"
+    )
+    correction = meta.settings.multiplicity
+    kind = (
+        "the procedure of Benjamini and Hochberg"
+        if correction.method == "bh"
+        else "the two-stage procedure of Benjamini, Krieger and Yekutieli"
+    )
+    family = "each map" if correction.scope == "map" else "both hemispheres together"
+    what = (
+        f"Measures of the hippocampus {cite('method')} of {meta.people} participants{groups} at"
+        f" {len(sites)} sites were combined with hipsta_bids {__version__}; no values of"
+        f" participants left a site. Each site fitted the linear model"
+        f" `{sites[0].models[0].formula}` at each point of the sheet and to each summary measure."
+    )
+    effects = (
+        f"{fixed} In the random-effects model, true effects differ between sites; their variance"
+        f" (tau²) was estimated by {random}. Heterogeneity is described by Cochran's Q and I²"
+        f" {cite('i2')}, and by limits of the effect at a further site {cite('prediction')}."
+    )
+    if meta.items[0].result.without:
+        effects += " All was repeated without each of the sites."
+    errors = (
+        f"The false discovery rate was held at {correction.alpha:g} by {kind}"
+        f" {cite(correction.method)}, for {family}, and for all summary measures of a contrast"
+        " together. Effect sizes are Cohen's d: the estimate over the residual standard deviation"
+        f" within sites, with {how.confidence:.0%} confidence limits."
+    )
+    paragraphs = [f"{what} {aligned}", effects, errors]
+    survivors = [
+        f"{key.measure}, {key.contrast}, {key.hemi}: {int(found.rejected.sum())} of"
+        f" {found.n_tests} points"
+        for key, found in meta.found.items()
+    ]
+    if survivors:
+        paragraphs.append(f"Points that survive: {'; '.join(survivors)}.")
+    lines = ["# Methods and findings", "", "This text may be used freely, as it stands or changed."]
+    for paragraph in paragraphs:
+        lines += ["", paragraph]
+    lines += ["", "# References", ""]
+    lines += [f"{i}. {REFERENCES[key]}" for i, key in enumerate(cited, start=1)]
+    return "\n".join(lines) + "\n"
