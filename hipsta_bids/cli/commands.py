@@ -309,7 +309,7 @@ def run_surrogate(arguments: Sequence[str]) -> ExitCode:
 
 def run_meta_analysis(arguments: Sequence[str]) -> ExitCode:
     """Combine summaries of sites."""
-    options = meta_parser().parse_args(arguments)
+    options = meta_parser().parse_intermixed_args(arguments)
     from hipsta_bids.group.consortium import MetaOptions, run_meta  # noqa: PLC0415  (heavy)
     from hipsta_bids.group.settings import load_group_settings  # noqa: PLC0415  (start-up time)
 

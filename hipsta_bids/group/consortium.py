@@ -113,6 +113,10 @@ def _heterogeneity(meta: Meta) -> Iterator[tuple[str, bytes]]:
         axis.set_facecolor("0.92")
         axis.set_xticks([x[0], x[-1]], X_ENDS, fontsize=LABEL)
         axis.set_yticks([y[0], y[-1]], Y_ENDS, fontsize=LABEL, rotation=90)
+        for labels, place in ((axis.get_xticklabels(), "ha"), (axis.get_yticklabels(), "va")):
+            ends = ("left", "right") if place == "ha" else ("bottom", "top")
+            for label, end in zip(labels, ends, strict=True):
+                label.set(**{place: end})
         title = f"{display_name(measure)}, {item.contrast}\n{SIDES[item.model.hemi]}"
         axis.set_title(title, fontsize=TITLE)
     figure.colorbar(image, ax=axes, label="I² [%]", shrink=min(1.0, 1.6 / len(rows)))
@@ -175,9 +179,14 @@ def _methods(meta: Meta) -> str:
             f" from the sites' coefficients and their covariances {cite('join')}; contrasts that"
             " include the constant are combined by inverse variances."
         )
+    modified = (
+        f", with standard errors not smaller than without their correction {cite('modified')}"
+        if how.random == "reml" and how.knapp_hartung == "modified"
+        else ""
+    )
     random = (
         f"restricted maximum likelihood {cite('reml')}, tests and limits are those of Knapp and"
-        f" Hartung {cite('knapp-hartung')}"
+        f" Hartung {cite('knapp-hartung')}{modified}"
         if how.random == "reml"
         else f"the moments of DerSimonian and Laird {cite('dl')}, tests are normal"
     )

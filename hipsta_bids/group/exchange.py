@@ -480,7 +480,7 @@ def check_agreement(sites: Sequence[SiteSummary]) -> list[str]:
         "region": lambda site: site.region,
         "hash of the participant level's settings": lambda site: site.settings_hash,
         "direction of the axes": lambda site: site.axes,
-        "grid of the sheet": lambda site: (_few(site.x), _few(site.y)),
+        "grid of the sheet": lambda site: f"{_few(site.x)} by {_few(site.y)}",
         "what a row of the model is": lambda site: "a change" if site.change else "a visit",
         "registration": lambda site: site.align,
         "hash of the template of registration": lambda site: site.template_hash,

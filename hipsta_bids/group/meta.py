@@ -78,7 +78,12 @@ class RandomEffects(Combined):
 
 
 def combine(
-    estimates: Float, variances: Float, method: str, *, knapp_hartung: bool = False, least: int = 2
+    estimates: Float,
+    variances: Float,
+    method: str,
+    *,
+    test: str = "normal",
+    least: int = 2,
 ) -> RandomEffects:
     """Combine independent estimates with known variances, at each point.
 
@@ -90,9 +95,10 @@ def combine(
         How the variance between sites is estimated: ``fixed`` (it is zero, so that weights are
         inverse variances), ``dl`` (DerSimonian and Laird 1986) or ``reml`` (restricted maximum
         likelihood by Fisher scoring, Viechtbauer 2005).
-    knapp_hartung : bool
-        Standard errors from the spread of the sites' estimates, and t with ``sites - 1`` degrees of
-        freedom (Knapp and Hartung 2003); else the normal distribution.
+    test : str
+        ``normal``; ``plain``: standard errors from the spread of the sites' estimates, and t with
+        ``sites - 1`` degrees of freedom (Knapp and Hartung 2003); or ``modified``: the same, but no
+        standard error smaller than that of ``normal`` (Roever, Knapp and Friede 2015).
     least : int
         Sites below which a point has no result.
 
@@ -124,9 +130,10 @@ def combine(
     share = weights / np.where(usable, weights.sum(axis=0), 1.0)
     se = np.sqrt(1 / np.where(usable, weights.sum(axis=0), 1.0))
     df = np.full_like(se, np.inf)
-    if knapp_hartung:
+    if test != "normal":
         df = np.where(usable, sites - 1, 1.0)
-        se = se * np.sqrt(np.sum(weights * (values - estimate) ** 2, axis=0) / df)
+        factor = np.sum(weights * (values - estimate) ** 2, axis=0) / df
+        se = se * np.sqrt(np.maximum(factor, 1.0) if test == "modified" else factor)
     values_of = {"estimate": estimate, "se": se, "df": df, "tau2": tau2, "q": q, "i2": i2}
     found = {name: np.where(usable, value, np.nan) for name, value in values_of.items()}
     return RandomEffects(**found, sites=sites, weights=np.where(usable, share, 0.0))
@@ -276,7 +283,7 @@ def meta_analyze(
         estimates,
         ses**2,
         settings.random,
-        knapp_hartung=settings.random == "reml",
+        test=settings.knapp_hartung if settings.random == "reml" else "normal",
         least=settings.min_sites,
     )
     own_constant = intercept is not None and abs(weights[0][intercept]) > _ZERO

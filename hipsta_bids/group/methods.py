@@ -50,6 +50,9 @@ REFERENCES: Mapping[str, str] = {
     " 1986;7(3):177-188. doi:10.1016/0197-2456(86)90046-2",
     "knapp-hartung": "Knapp G, Hartung J. Improved tests for a random effects meta-regression with"
     " a single covariate. Statistics in Medicine 2003;22(17):2693-2710. doi:10.1002/sim.1482",
+    "modified": "Röver C, Knapp G, Friede T. Hartung-Knapp-Sidik-Jonkman approach and its"
+    " modification for random-effects meta-analysis with few studies. BMC Medical Research"
+    " Methodology 2015;15:99. doi:10.1186/s12874-015-0091-1",
     "i2": "Higgins JPT, Thompson SG. Quantifying heterogeneity in a meta-analysis. Statistics in"
     " Medicine 2002;21(11):1539-1558. doi:10.1002/sim.1186",
     "prediction": "Higgins JPT, Thompson SG, Spiegelhalter DJ. A re-evaluation of random-effects"

@@ -24,6 +24,7 @@ from hipsta_bids.reports.group_tables import (
     SIDES,
     GroupResults,
     display_name,
+    map_unit,
     number_text,
     records,
     unit_of,
@@ -90,8 +91,7 @@ def _block(
     every: Sequence[Mapping[str, Any]],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Everything about one measure, beside the tests of all: for the template and the script."""
-    means = _means(results, measure)
-    unit = str(means["unit"].iloc[0]) if len(means) else "1"
+    unit = map_unit(results, measure)
     scene = {
         "unit": unit_of(unit),
         "scales": _scales(results, measure, sides, every, unit),

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from scipy import stats
 
 from hipsta_bids.derivatives.names import META, META_REPORT
 from hipsta_bids.io import files
@@ -34,7 +35,7 @@ _PREFIX = "meta"
 _MOST_FORESTS = 60
 _SITE, _PREDICTION, _RANDOM = "site", "prediction", "random effects"
 #: Layout of a forest plot, pixels.
-_NAMES, _PLOT, _TEXTS, _ROW, _TOP = 138, 270, 172, 21, 10
+_NAMES, _PLOT, _TEXTS, _ROW, _TOP = 156, 250, 204, 21, 10
 _LARGEST = 12.0  # side of the square of a site with all of the weight
 _TICKS = 4
 
@@ -99,6 +100,8 @@ def _drawing(rows: Sequence[Mapping[str, Any]], unit: str) -> dict[str, Any]:
     values = "; ".join(f"{mark['name']} {mark['text']}" for mark in marks)
     return {
         "marks": marks,
+        "names": _NAMES,
+        "plot": _PLOT,
         "width": _NAMES + _PLOT + _TEXTS,
         "height": height + 34,
         "bottom": height,
@@ -134,16 +137,18 @@ def _ticks(low: float, high: float) -> list[float]:
 
 def _explained(results: GroupResults) -> Mapping[str, Any]:
     settings = (results.record.get("settings") or {}).get("meta") or {}
+    sites = len(results.record.get("sites") or ())
     return {
         "joint": settings.get("fixed") == "joint",
         "reml": settings.get("random") == "reml",
-        "sites": len(results.record.get("sites") or ()),
+        "sites": sites,
+        "needed": number_text(float(stats.t.isf(0.0005, max(1, sites - 1)))),
         "confidence": f"{settings.get('confidence', 0.95):.0%}",
     }
 
 
 def _peak_forests(results: GroupResults) -> Mapping[str, Any] | None:
-    plots = list(_forests(results, maps=True))
+    plots = sorted(_forests(results, maps=True), key=lambda plot: plot["measure"] != "thickness")
     return {"plots": plots, "more": 0, "what": "peak"} if plots else None
 
 
