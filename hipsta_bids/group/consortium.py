@@ -11,12 +11,12 @@ import numpy as np
 from hipsta_bids import __version__
 from hipsta_bids.derivatives.names import META, META_REPORT
 from hipsta_bids.errors import OutputError, UsageError
-from hipsta_bids.group.exchange import SiteSummary, check_agreement, read_summary
+from hipsta_bids.group.exchange import SiteSummary, read_summary
 from hipsta_bids.group.figures import LABEL, TITLE, encode, panels
 from hipsta_bids.group.inference import PERMUTATIONS
 from hipsta_bids.group.methods import REFERENCES
 from hipsta_bids.group.settings import GroupSettings
-from hipsta_bids.group.sites import Meta, analyze_sites, meta_tables
+from hipsta_bids.group.sites import Meta, analyze_sites, check_agreement, meta_tables
 from hipsta_bids.group.write import whole_folder, write_table
 from hipsta_bids.io import files
 from hipsta_bids.protocols.toml import resolve

@@ -7,11 +7,11 @@ difference of two of them is about one person.
 import hashlib
 import json
 import re
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from textwrap import shorten
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -23,7 +23,7 @@ from hipsta_bids.errors import InputError, ModelError
 from hipsta_bids.group.analysis import Analysis
 from hipsta_bids.group.data import Cohort, Float, Int
 from hipsta_bids.group.formula import typed
-from hipsta_bids.group.glm import MEAN, FittedMaps, fit_points, with_mean
+from hipsta_bids.group.glm import FittedMaps, fit_points, with_mean
 from hipsta_bids.group.grammar import closed_formula
 from hipsta_bids.group.meta import SiteFit
 from hipsta_bids.group.model import Design, build_design
@@ -39,9 +39,10 @@ SUMMARY = "summary.json"
 _FORMAT = 1
 _AXES = "x from medial to lateral, y from posterior to anterior, on both sides"
 #: Digits written; summaries larger than this many bytes are not read.
-_DIGITS, _MOST_BYTES = 9, 200_000_000
+_DIGITS, _MOST_BYTES = 9, 50_000_000
 #: Sums in another order, and rounding to these digits, differ by less.
 _ROUNDING = 1e-5
+_LEAST = 1e-15  # eigenvalue of a covariance, relative to the largest
 _LONGEST = 300  # characters of a mistake
 #: Functions whose columns depend on who is in the table.
 _OF_THE_SAMPLE = re.compile(r"(?<![\w.])(bs|center|cr|poly|scale)\s*\(")
@@ -55,6 +56,7 @@ def _printable(text: str) -> str:
 
 Text = Annotated[str, Field(max_length=500), AfterValidator(_printable)]
 Word = Annotated[str, Field(min_length=1, max_length=60, pattern=r"^[\w][\w .+-]*$")]
+Name = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^\w[\w .:+-]*$")]
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Numbers = list[Number]
 Known = list[Number | None]
@@ -66,7 +68,7 @@ class ModelSummary(TomlTable):
     kind: Literal["map", "summary"]
     """What the points are: those of the sheet, or summary measures."""
     hemi: Literal["L", "R", "LR"]
-    measures: Annotated[list[Text], Field(min_length=1)]
+    measures: Annotated[list[Name], Field(min_length=1)]
     units: list[Text]
     formula: Text
     columns: Annotated[list[Text], Field(min_length=1, max_length=200)]
@@ -74,7 +76,7 @@ class ModelSummary(TomlTable):
     """Residual degrees of freedom."""
     covariance: list[Numbers]
     """(columns, columns) of the coefficients, over the residual variance."""
-    contrasts: dict[Text, Numbers]
+    contrasts: Annotated[dict[Text, Numbers], Field(min_length=1)]
     """Weights of the columns."""
     coefficients: list[Known]
     """(columns, points); null where a participant lacks a value."""
@@ -108,7 +110,7 @@ class ModelSummary(TomlTable):
             df=self.df,
         )
 
-    def check(self, points: int) -> str | None:
+    def check(self, points: int, participants: int) -> str | None:
         """Say what does not fit together, if anything."""
         count = len(self.columns)
         points = points if self.kind == "map" else len(self.measures)
@@ -121,20 +123,24 @@ class ModelSummary(TomlTable):
         square += self.contrasts.values()
         if any(len(row) != count for row in square) or len(self.units) != len(self.measures):
             return f"numbers of columns that are not {count}"
+        if self.df != participants - count:
+            return "other degrees of freedom than participants"
         if not self.contrasts.keys() == self.estimate.keys() == self.se.keys():
             return "contrasts without estimates"
         fit = self.fit
-        if not np.allclose(fit.covariance, fit.covariance.T) or (
-            np.linalg.eigvalsh(fit.covariance).min() <= 0
-        ):
+        sizes = np.linalg.eigvalsh(fit.covariance)
+        if not (np.allclose(fit.covariance, fit.covariance.T) and sizes[0] > _LEAST * sizes[-1]):
             return "a covariance of coefficients that is none"
+        return self._wrong_contrast(fit)
+
+    def _wrong_contrast(self, fit: SiteFit) -> str | None:
         for name, row in self.contrasts.items():
             weights = np.array(row, dtype=np.float64)
             for kept, made in (
                 (self.estimate[name], fit.estimate(weights)),
                 (self.se[name], fit.se(weights)),
             ):
-                size = _ROUNDING * max(1e-300, float(np.nanmax(np.abs(made), initial=0.0)))
+                size = _ROUNDING * float(np.abs(np.nan_to_num(made)).max(initial=0.0))
                 known = np.array(kept, dtype=np.float64)
                 if not np.allclose(known, made, rtol=_ROUNDING, atol=size, equal_nan=True):
                     return f"estimates of {name} that are not those of its coefficients"
@@ -156,9 +162,9 @@ class SiteSummary(TomlTable):
     settings_hash: Text
     """Of the settings of the participant level."""
     axes: Text
-    x: Numbers
+    x: Annotated[Numbers, Field(min_length=2, max_length=2000)]
     """Coordinates of the nodes of the sheet, medial to lateral."""
-    y: Numbers
+    y: Annotated[Numbers, Field(min_length=2, max_length=2000)]
     """Posterior to anterior."""
     asymmetry: list[Text]
     """Measures whose left minus right is relative."""
@@ -174,7 +180,7 @@ class SiteSummary(TomlTable):
     """Participants by level of each factor of the model, the reference level first."""
     covariates: dict[Text, dict[Literal["mean", "sd"], Number]]
     """Of the numbers of the model."""
-    models: Annotated[list[ModelSummary], Field(max_length=500)]
+    models: Annotated[list[ModelSummary], Field(min_length=1, max_length=500)]
 
     @property
     def template_hash(self) -> str:
@@ -217,13 +223,14 @@ def read_summary(path: Path) -> SiteSummary:
         ) from error
     except ValidationError as error:
         said = first_mistake(error, SiteSummary)[1]
-        said = _short(said.encode("unicode_escape").decode())
+        said = shorten(said.encode("unicode_escape").decode(), _LONGEST)
         raise InputError(
             f"{path}: not a summary: {said}; ask the site for it again",
             reason="bad-summary",
         ) from error
     for model in summary.models:
-        if problem := model.check(len(summary.x) * len(summary.y)):
+        points = len(summary.x) * len(summary.y)
+        if problem := model.check(points, summary.participants):
             raise InputError(
                 f"{path}: {model.title} has {problem}; ask the site for it again",
                 reason="bad-summary",
@@ -465,78 +472,3 @@ def _model(
 
 def _round(value: float) -> float:
     return float(f"{value:.{_DIGITS}g}")
-
-
-def check_agreement(sites: Sequence[SiteSummary]) -> list[str]:
-    """Refuse summaries that are not about the same; note what may differ but should be known.
-
-    Raises
-    ------
-    ModelError
-        One line that names the site that differs from most, and the item.
-    """
-    items: dict[str, Callable[[SiteSummary], object]] = {
-        "segmentation protocol": lambda site: site.seg,
-        "region": lambda site: site.region,
-        "hash of the participant level's settings": lambda site: site.settings_hash,
-        "direction of the axes": lambda site: site.axes,
-        "grid of the sheet": lambda site: f"{_few(site.x)} by {_few(site.y)}",
-        "what a row of the model is": lambda site: "a change" if site.change else "a visit",
-        "registration": lambda site: site.align,
-        "hash of the template of registration": lambda site: site.template_hash,
-        "measures with a relative asymmetry": lambda site: ", ".join(site.asymmetry),
-        "maps": lambda site: _listed(site, "map"),
-        "models of summary measures": lambda site: _listed(site, "summary"),
-        "terms of the model": lambda site: " + ".join(site.models[0].columns),
-        "reference levels": lambda site: ", ".join(
-            f"{name} {next(iter(levels), '')}" for name, levels in site.factors.items()
-        ),
-        "contrasts": lambda site: ", ".join(site.models[0].contrasts),
-    }
-    empty = [site.site for site in sites if not site.models]
-    if empty:
-        raise ModelError(f"site {empty[0]}: its summary has no results", reason="sites-differ")
-    for item, value in items.items():
-        _agree(sites, item, [str(value(site)) for site in sites])
-    for number, model in enumerate(sites[0].models):
-        title = model.title
-        _agree(sites, f"{title}: columns", [", ".join(s.models[number].columns) for s in sites])
-        _agree(sites, f"{title}: contrasts", [", ".join(s.models[number].contrasts) for s in sites])
-        for name in model.contrasts:
-            # The mean is that of a site's own participants, whatever their age.
-            rows = [site.models[number].contrasts[name] for site in sites if name != MEAN]
-            if rows:
-                words = [", ".join(f"{weight:.6g}" for weight in row) for row in rows]
-                _agree(sites, f"{title}: weights of {name} on {', '.join(model.columns)}", words)
-    notes = []
-    if len({site.version for site in sites}) > 1:
-        notes.append("sites used several versions of hipsta_bids, see sites.tsv")
-    return notes
-
-
-def _agree(sites: Sequence[SiteSummary], item: str, values: Sequence[str]) -> None:
-    usual = Counter(values).most_common(1)[0][0]
-    for site, own in zip(sites, values, strict=True):
-        if own != usual:
-            other = sites[values.index(usual)].site
-            raise ModelError(
-                f"site {site.site}: {item}: {_short(own)}, but at {other} {_short(usual)}; all"
-                " sites need the same",
-                reason="sites-differ",
-            )
-
-
-def _short(text: str) -> str:
-    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
-
-
-def _few(values: Sequence[float]) -> str:
-    return f"{len(values)} nodes from {values[0]:.4g} to {values[-1]:.4g}" if values else "none"
-
-
-def _listed(site: SiteSummary, kind: str) -> str:
-    return "; ".join(
-        model.title if kind == "map" else f"{model.title}: {', '.join(model.measures)}"
-        for model in site.models
-        if model.kind == kind
-    )

@@ -1,18 +1,20 @@
 """The results of several sites together: what survives, tables, and forest plots as numbers."""
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from textwrap import shorten
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from hipsta_bids.errors import ModelError
 from hipsta_bids.group.clusters import Frame, peak_table, sheet_edges
 from hipsta_bids.group.data import Float
 from hipsta_bids.group.exchange import ModelSummary, SiteSummary
-from hipsta_bids.group.formula import Contrast
-from hipsta_bids.group.glm import PointTest
+from hipsta_bids.group.formula import Contrast, listed
+from hipsta_bids.group.glm import MEAN, PointTest
 from hipsta_bids.group.inference import Discoveries, MapKey, control_fdr, discover
 from hipsta_bids.group.meta import FIXED, RANDOM, Combined, MetaResult, combine, meta_analyze
 from hipsta_bids.group.settings import GroupSettings
@@ -22,6 +24,7 @@ from hipsta_bids.io import files
 #: Peaks of a map that get a forest plot.
 _MOST_PEAKS = 6
 _PREDICTION = "prediction"
+_LONGEST = 200  # characters of what two sites have
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -70,6 +73,86 @@ class Meta:
         return np.asarray(np.sum(np.isfinite(item.result.estimates) * sizes, axis=0))
 
 
+def check_agreement(sites: Sequence[SiteSummary]) -> list[str]:
+    """Refuse summaries that are not about the same; note what may differ but should be known.
+
+    Raises
+    ------
+    ModelError
+        One line that names the site that differs from most, and the item.
+    """
+    items: dict[str, Callable[[SiteSummary], object]] = {
+        "segmentation protocol": lambda site: site.seg,
+        "region": lambda site: site.region,
+        "hash of the participant level's settings": lambda site: site.settings_hash,
+        "direction of the axes": lambda site: site.axes,
+        "grid of the sheet": lambda site: f"{_few(site.x)} by {_few(site.y)}",
+        "what a row of the model is": lambda site: "a change" if site.change else "a visit",
+        "registration": lambda site: site.align,
+        "hash of the template of registration": lambda site: site.template_hash,
+        "measures with a relative asymmetry": lambda site: ", ".join(site.asymmetry),
+        "terms of the model": lambda site: " + ".join(site.models[0].columns),
+        "reference levels": lambda site: ", ".join(
+            f"{name} {next(iter(levels), '')}" for name, levels in site.factors.items()
+        ),
+        "contrasts": lambda site: ", ".join(site.models[0].contrasts),
+    }
+    for item, value in items.items():
+        _agree(sites, item, [str(value(site)) for site in sites])
+    _agree_on_measures(sites)
+    for number, model in enumerate(sites[0].models):
+        title = model.title
+        _agree(sites, f"{title}: columns", [", ".join(s.models[number].columns) for s in sites])
+        _agree(sites, f"{title}: contrasts", [", ".join(s.models[number].contrasts) for s in sites])
+        for name in model.contrasts:
+            # The mean is that of a site's own participants, whatever their age.
+            rows = [site.models[number].contrasts[name] for site in sites if name != MEAN]
+            if rows:
+                words = [", ".join(f"{weight:.6g}" for weight in row) for row in rows]
+                _agree(sites, f"{title}: weights of {name} on {', '.join(model.columns)}", words)
+    notes = []
+    if len({site.version for site in sites}) > 1:
+        notes.append("sites used several versions of hipsta_bids, see sites.tsv")
+    return notes
+
+
+def _agree(sites: Sequence[SiteSummary], item: str, values: Sequence[str]) -> None:
+    usual = Counter(values).most_common(1)[0][0]
+    for site, own in zip(sites, values, strict=True):
+        if own != usual:
+            other = sites[values.index(usual)].site
+            raise ModelError(
+                f"site {site.site}: {item}: {shorten(own, _LONGEST)}, but at {other}"
+                f" {shorten(usual, _LONGEST)}; all sites need the same",
+                reason="sites-differ",
+            )
+
+
+def _agree_on_measures(sites: Sequence[SiteSummary]) -> None:
+    """Refuse sites that lack a map or summary measure of others."""
+    own = [
+        [
+            f"{name}, {model.hemi} ({'map' if model.kind == 'map' else model.formula})"
+            for model in site.models
+            for name in model.measures
+        ]
+        for site in sites
+    ]
+    every = list(dict.fromkeys(name for names in own for name in names))
+    for site, names in zip(sites, own, strict=True):
+        if lacking := [name for name in every if name not in names]:
+            raise ModelError(
+                f"site {site.site}: lacks {listed(lacking)}; give all sites the same --measures",
+                reason="sites-differ",
+            )
+    titles = ["; ".join(model.title for model in site.models) for site in sites]
+    _agree(sites, "order of results", titles)
+
+
+def _few(values: Sequence[float]) -> str:
+    return f"{len(values)} nodes from {values[0]:.4g} to {values[-1]:.4g}" if values else "none"
+
+
 def analyze_sites(sites: list[SiteSummary], settings: GroupSettings) -> Meta:
     """Combine each contrast of each model, and tell which points survive."""
     items = [
@@ -77,12 +160,7 @@ def analyze_sites(sites: list[SiteSummary], settings: GroupSettings) -> Meta:
             number=number,
             model=model,
             contrast=contrast,
-            result=meta_analyze(
-                [site.models[number].fit for site in sites],
-                [np.array(site.models[number].contrasts[contrast]) for site in sites],
-                model.intercept,
-                settings.meta,
-            ),
+            result=_combined(sites, number, contrast, settings),
         )
         for number, model in enumerate(sites[0].models)
         for contrast in model.contrasts
@@ -96,6 +174,19 @@ def analyze_sites(sites: list[SiteSummary], settings: GroupSettings) -> Meta:
         item.model.hemi: _frame(sites, item.number) for item in reversed(maps)
     }
     return Meta(sites=sites, items=items, found=found, frame=frames, settings=settings)
+
+
+@np.errstate(over="ignore", divide="ignore", invalid="ignore")  # of numbers as others sent them
+def _combined(
+    sites: Sequence[SiteSummary], number: int, contrast: str, settings: GroupSettings
+) -> MetaResult:
+    models = [site.models[number] for site in sites]
+    return meta_analyze(
+        [model.fit for model in models],
+        [np.array(model.contrasts[contrast]) for model in models],
+        models[0].intercept,
+        settings.meta,
+    )
 
 
 def _frame(sites: Sequence[SiteSummary], number: int) -> Frame:
@@ -395,5 +486,5 @@ def _left_out(meta: Meta) -> Iterator[dict[str, Any]]:
                     "site": site.site,
                     "n_significant": int(found[key].rejected.sum()),
                     "n_kept": int(both.sum()),
-                    "largest_change": float(np.nanmax(moved, initial=0.0)),
+                    "largest_change": float(np.nan_to_num(moved).max(initial=0.0)),
                 }

@@ -128,6 +128,24 @@ def test_a_summary_has_no_value_of_a_participant(cohort, plain):
     assert not numbers & {row["thickness"] for row in sheet}
 
 
+def test_a_point_that_nobody_may_know_of_is_left_out(plain, tmp_path):
+    """Where one site has nothing, the other alone is no meta-analysis."""
+
+    def empty(models):
+        for model in models:
+            if model["hemi"] == "L" and model["measures"] == ["thickness"]:
+                none = [None] * len(model["sd"])
+                model |= {"sd": none, "coefficients": [none] * len(model["columns"])}
+                model |= {"estimate": {"CN-AD": none}, "se": {"CN-AD": none}}
+        return models
+
+    other = edited(plain[1], tmp_path / "other.json", models=empty)
+    assert main(["meta", str(plain[0]), str(other), str(tmp_path / "out")]) == 0
+    assert statmap(tmp_path / "out" / "meta", "FixedEffect").estimate.isna().all()
+    assert statmap(tmp_path / "out" / "meta", "FixedEffect", "R").estimate.notna().all()
+    assert "could not be" not in (tmp_path / "out" / "meta.html").read_text()
+
+
 def test_every_number_is_about_the_same_participants(cohort, tmp_path, capsys):
     """Who lacks a hemisphere is in neither, and a point that one lacks is in none."""
     excluded = tmp_path / "exclude.tsv"
@@ -197,7 +215,7 @@ def test_other_sites_register_to_the_template_in_a_summary(registered, plain, tm
         ({"settings_hash": "1234"}, "hash of the participant level's settings"),
         ({"axes": "x from lateral to medial"}, "direction of the axes"),
         ({"x": lambda x: [*x[:-1], 0.95]}, "grid of the sheet: 21 nodes from -0.9 to 0.95"),
-        ({"models": lambda m: m[1:]}, "site b: maps: "),
+        ({"models": lambda m: m[1:]}, "site b: lacks thickness, L (map); give all sites the same"),
         (
             {"models": lambda m: json.loads(json.dumps(m).replace('"sex[T.M]"', '"sex[T.F]"'))},
             "terms of the model",
@@ -235,6 +253,9 @@ def spoiled(change):
         (spoiled(lambda m: m["sd"].append(1.0)), "numbers of points that are not 147"),
         (spoiled(lambda m: m["sd"].__setitem__(0, "1")), "has to be a number"),
         (spoiled(lambda m: m["estimate"]["CN-AD"].__setitem__(0, 9.0)), "estimates of CN-AD"),
+        (spoiled(lambda m: m["contrasts"].clear()), "contrasts"),
+        (spoiled(lambda m: m["measures"].__setitem__(0, "../x")), "measures"),
+        (spoiled(lambda m: m.__setitem__("df", 400)), "other degrees of freedom"),
         (spoiled(lambda m: m["covariance"][0].__setitem__(0, -1.0)), "a covariance"),
     ],
 )
