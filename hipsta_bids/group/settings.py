@@ -259,9 +259,9 @@ class MetaSettings(SettingsTable):
     """Variance between sites: ``reml`` (restricted maximum likelihood, with tests of Knapp and
     Hartung 2003) or ``dl`` (DerSimonian and Laird 1986, with normal tests)."""
     knapp_hartung: Literal["modified", "plain"] = "modified"
-    """``modified``: no standard error is smaller than without this correction, since among many
-    points sites agree somewhere by chance (Roever, Knapp and Friede 2015); ``plain`` lets them
-    shrink."""
+    """``modified``: no standard error is smaller than without this correction, so that peaks are
+    not where sites agree by chance (Roever, Knapp and Friede 2015); ``plain`` lets them shrink,
+    which holds the level more exactly."""
     min_sites: Annotated[int, Field(ge=2)] = 2
     """Fewest sites with an estimate at a point."""
     confidence: OpenFraction = 0.95

@@ -23,6 +23,7 @@ from hipsta_bids.io import files
 
 #: Peaks of a map that get a forest plot.
 _MOST_PEAKS = 6
+_SAME_PEAK = 2  # nodes
 _PREDICTION = "prediction"
 _LONGEST = 200  # characters of what two sites have
 
@@ -344,8 +345,14 @@ def _points(peaks: Sequence[pd.DataFrame], frame: Frame) -> list[int]:
             zip(frame.position["x"].tolist(), frame.position["y"].tolist(), strict=True)
         )
     }
-    places = zip(own["x"].tolist(), own["y"].tolist(), strict=True)
-    return list(dict.fromkeys(at[place] for place in places))[:_MOST_PEAKS]
+    nodes = np.stack([frame.number["node_x"], frame.number["node_y"]])
+    kept: list[int] = []
+    for place in zip(own["x"].tolist(), own["y"].tolist(), strict=True):
+        away = np.abs(nodes[:, kept] - nodes[:, [at[place]]]).max(axis=0)
+        # Both models have the same cluster's peak there, or nearly.
+        if (away > _SAME_PEAK).all():
+            kept.append(at[place])
+    return kept[:_MOST_PEAKS]
 
 
 def _forest(meta: Meta, item: Item, point: int) -> pd.DataFrame:

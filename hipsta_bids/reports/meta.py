@@ -35,7 +35,7 @@ _PREFIX = "meta"
 _MOST_FORESTS = 60
 _SITE, _PREDICTION, _RANDOM = "site", "prediction", "random effects"
 #: Layout of a forest plot, pixels.
-_NAMES, _PLOT, _TEXTS, _ROW, _TOP = 156, 250, 204, 21, 10
+_NAMES, _PLOT, _TEXTS, _ROW, _TOP = 156, 236, 222, 21, 10
 _LARGEST = 12.0  # side of the square of a site with all of the weight
 _TICKS = 4
 

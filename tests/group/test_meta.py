@@ -176,3 +176,21 @@ def test_contrasts_with_the_constant_are_combined_by_inverse_variances(people):
     found = meta_analyze(fits, weights, 0, MetaSettings())
     variances = found.ses**2
     assert found.fixed.se == pytest.approx(1 / np.sqrt(np.sum(1 / variances, axis=0)))
+
+
+def test_levels_hold_where_the_model_does():
+    """Shares of p below 0.05 among tests of nothing; the fixed effect fails where sites differ."""
+    random = np.random.default_rng(0)
+    contrast = np.array([0.0, 1.0, 0.0])
+    for tau in (0.0, 0.3):
+        fits = []
+        for _ in range(5):
+            matrix = np.column_stack([np.ones(40), np.arange(40) % 2, random.normal(size=40)])
+            effect = tau * random.normal(size=3000)
+            fits.append(fit_of(matrix, random.normal(size=(40, 3000)) + matrix[:, [1]] * effect))
+        found = meta_analyze(fits, [contrast] * 5, 0, MetaSettings(), leave_out=False)
+        plain = combine(found.estimates, found.ses**2, "reml", test="plain")
+        assert np.mean(plain.p < 0.05) == pytest.approx(0.05, abs=0.015)
+        assert np.mean(found.random.p < 0.05) < 0.035
+        share = np.mean(found.fixed.p < 0.05)
+        assert share > 0.12 if tau else share == pytest.approx(0.05, abs=0.015)
