@@ -25,6 +25,8 @@ from hipsta_bids.io import files
 _MOST_PEAKS = 6
 _SAME_PEAK = 2  # nodes
 _PREDICTION = "prediction"
+#: What to do where a mean of the sample is in a contrast, as age is in those of an interaction.
+_BY_COLUMNS = "write the contrast by columns, as -1*group[T.AD]"
 _LONGEST = 200  # characters of what two sites have
 
 
@@ -110,21 +112,27 @@ def check_agreement(sites: Sequence[SiteSummary]) -> list[str]:
             rows = [site.models[number].contrasts[name] for site in sites if name != MEAN]
             if rows:
                 words = [", ".join(f"{weight:.6g}" for weight in row) for row in rows]
-                _agree(sites, f"{title}: weights of {name} on {', '.join(model.columns)}", words)
+                item = f"{title}: weights of {name} on {', '.join(model.columns)}"
+                _agree(sites, item, words, _BY_COLUMNS)
     notes = []
     if len({site.version for site in sites}) > 1:
         notes.append("sites used several versions of hipsta_bids, see sites.tsv")
     return notes
 
 
-def _agree(sites: Sequence[SiteSummary], item: str, values: Sequence[str]) -> None:
+def _agree(
+    sites: Sequence[SiteSummary],
+    item: str,
+    values: Sequence[str],
+    remedy: str = "all sites need the same",
+) -> None:
     usual = Counter(values).most_common(1)[0][0]
     for site, own in zip(sites, values, strict=True):
         if own != usual:
             other = sites[values.index(usual)].site
             raise ModelError(
                 f"site {site.site}: {item}: {shorten(own, _LONGEST)}, but at {other}"
-                f" {shorten(usual, _LONGEST)}; all sites need the same",
+                f" {shorten(usual, _LONGEST)}; {remedy}",
                 reason="sites-differ",
             )
 

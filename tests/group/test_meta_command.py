@@ -235,6 +235,22 @@ def test_sites_that_differ_are_refused_by_name(plain, tmp_path, capsys, change, 
     assert not (tmp_path / "out").exists()
 
 
+def test_contrasts_that_mean_something_else_are_refused(plain, tmp_path, capsys):
+    """As those of an interaction do, where they hold the mean age of a site."""
+
+    def doubled(models):
+        for model in models:
+            for name in ("contrasts", "estimate", "se"):
+                model[name]["CN-AD"] = [v and 2 * v for v in model[name]["CN-AD"]]
+        return models
+
+    other = edited(plain[1], tmp_path / "other.json", models=doubled)
+    assert main(["meta", str(plain[0]), str(other), str(tmp_path / "out")]) == 65
+    error = capsys.readouterr().err
+    assert "thickness, L: weights of CN-AD on Intercept, group[T.AD], age, sex[T.M]: 0, -2" in error
+    assert "write the contrast by columns" in error
+
+
 def spoiled(change):
     def make(models):
         change(models[0])
