@@ -4,6 +4,8 @@ A message says what is wrong, where, and what to try, on one line. Any exception
 :class:`HipstaError` is a bug in this package and shows its traceback.
 """
 
+import difflib
+from collections.abc import Iterable
 from enum import IntEnum
 from signal import SIGINT, SIGTERM
 
@@ -88,3 +90,10 @@ class GeometryError(HipstaError):
 
 class ModelError(HipstaError):
     """A statistical model cannot be fitted to these data; the reason names the obstacle."""
+
+
+def did_you_mean(words: Iterable[str], known: Iterable[str]) -> str:
+    """Name the nearest known words as the end of a message; empty if none is near."""
+    names = list(known)
+    near = [match for word in words for match in difflib.get_close_matches(word, names, n=1)]
+    return f"; did you mean {' '.join(near)}?" if near else ""

@@ -1,6 +1,7 @@
 """Guards for what no single module owns: locks, documents, and their agreement with the code."""
 
 import ast
+import json
 import re
 import shutil
 import subprocess
@@ -130,6 +131,15 @@ def test_no_segmentations_or_other_large_files_are_tracked():
     images = [path.name for path in tracked_files() if path.name.endswith((".mgz", ".nii.gz"))]
     assert not large
     assert not images
+
+
+@pytest.mark.parametrize("path", sorted(ROOT.glob("docs/notebooks/*.ipynb")), ids=lambda p: p.stem)
+def test_notebooks_hold_no_results(path):
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    code = [cell for cell in cells if cell["cell_type"] == "code"]
+    assert code
+    assert all(cell["outputs"] == [] and cell["execution_count"] is None for cell in code)
+    assert f"notebooks/{path.stem}.md" in (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
 
 
 def test_license_is_whole():

@@ -24,7 +24,7 @@ from hipsta_bids.errors import EXIT_MEANINGS
 from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY, Column
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.tables import COLUMNS
-from hipsta_bids.reports.page import reason_sections
+from hipsta_bids.reports.page import reason_actions, reason_sections
 from hipsta_bids.settings import Settings
 
 NOTE = "<!-- Written by `tools/make-docs`; do not edit, run it again. -->"
@@ -80,7 +80,7 @@ Where a meaning begins with an ellipsis (...), it goes on from the row above."""
 REASONS_TEXT = """\
 Every reason has a short name that programs can read: in the column `reason` of `status.tsv`, in
 `desc-qc_metrics.json`, and in the group level's `excluded.tsv`. The message beside it says where,
-with the numbers. Here is what the names mean, and what to do."""
+with the numbers. Here is what the names mean, in the order of what to do."""
 
 OPTIONS_TEXT = """\
 `hipsta-bids BIDS_DIR OUTPUT_DIR participant` measures, `... group` compares. Other commands:
@@ -202,15 +202,21 @@ def _words(text: str | None) -> str:
 
 def reasons_page() -> str:
     """Write the page of flags, refusals and what to do about them."""
+    sections = reason_sections()
+    where = ((section.title, " ".join(section.text.split())) for section in sections)
     parts = [
         "# Flags and refusals",
         REASONS_TEXT,
+        _table(("where a reason is given", "what it says"), where),
     ]
-    for section in reason_sections():
-        parts += [f"## {section.title}", section.text]
-        # A heading for each, so that it can be searched for and linked to.
-        for name, reason in sorted(section.reasons.items()):
-            parts += [f"#### `{name}`", f"{reason.meaning}\n**Try:** {reason.remedy}"]
+    for action, title in reason_actions().items():
+        parts.append(f"## {title}")
+        for section in sections:
+            own = {name: row for name, row in section.reasons.items() if row.action == action}
+            parts += [f"**{section.title}**"] if own else []
+            # A heading for each, so that it can be searched for and linked to.
+            for name, reason in sorted(own.items()):
+                parts += [f"#### `{name}`", f"{reason.meaning}\n**Try:** {reason.remedy}"]
     codes = ((str(int(code)), words) for code, words in EXIT_MEANINGS.items())
     return _page([*parts, "## Exit codes", _table(("code", "meaning"), codes)])
 

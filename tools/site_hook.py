@@ -1,7 +1,9 @@
-"""Hook of MkDocs: files beside docs/ that its pages link to become part of the site."""
+"""Hook of MkDocs: notebooks are run, and files that pages link to beside docs/ become pages."""
 
 import re
+import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 from mkdocs.config.defaults import MkDocsConfig
@@ -9,6 +11,12 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "tools")]
+
+from notebooks import run_notebook  # noqa: E402
+
+#: Folder of notebooks, below docs/.
+NOTEBOOKS = "notebooks"
 
 #: Pages of the site that lie beside docs/.
 BESIDE = ("CONTRIBUTING.md", "CHANGELOG.md")
@@ -30,6 +38,19 @@ def on_files(files: Files, *, config: MkDocsConfig) -> None:
     linked = {path for text in pages for path in _beyond(text)}
     for name in sorted({*BESIDE, *linked} - {"README.md"}):
         files.append(File.generated(config, name, abs_src_path=str(ROOT / name)))
+    for path in sorted((Path(config.docs_dir) / NOTEBOOKS).glob("*.ipynb")):
+        text, figures = _run(path, path.stat().st_mtime_ns)
+        link = f"[This notebook as a file]({path.name}), for Jupyter.\n"
+        page = f"{NOTEBOOKS}/{path.stem}.md"
+        files.append(File.generated(config, page, content=f"{text}\n{link}"))
+        for name, content in figures.items():
+            files.append(File.generated(config, f"{NOTEBOOKS}/{name}", content=content))
+
+
+@cache
+def _run(path: Path, _changed: int) -> tuple[str, dict[str, bytes]]:
+    """Run a notebook once for each time that it was changed, while a server goes on."""
+    return run_notebook(path)
 
 
 def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
@@ -37,6 +58,8 @@ def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: 
     del config, files
     if page.file.src_uri in BESIDE:
         return _LINK.sub(lambda found: found["path"].removeprefix("docs/"), markdown)
+    if page.file.src_uri.startswith(f"{NOTEBOOKS}/"):
+        return markdown
     if page.file.src_uri.count("/"):  # a page from a folder beside docs/: its links stay there
         return _LINK.sub(r"#", markdown)
     return _LINK.sub(lambda found: _inside(found["path"]), markdown)
@@ -51,4 +74,6 @@ def _beyond(text: str) -> Iterator[str]:
 
 
 def _inside(path: str) -> str:
+    if path.endswith(".ipynb"):
+        return f"{path.removesuffix('.ipynb')}.md"
     return "index.md" if path == "../README.md" else path.removeprefix("../")

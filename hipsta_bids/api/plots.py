@@ -49,8 +49,8 @@ def plot_sheet(
 ) -> "Axes":
     """Draw a map on the unfolded sheet, with borders and names of subfields.
 
-    Sheets are seen from above, anterior up: the medial side of a left one is on the right. Columns
-    that were repaired are hatched, those that were filled from their neighbors crossed.
+    Maps of both sides lie alike: medial left, lateral right, anterior up. Columns that were
+    repaired are hatched, those that were filled from their neighbors crossed.
 
     Parameters
     ----------
@@ -61,8 +61,8 @@ def plot_sheet(
     ax : Axes, optional
         Where to draw; else the current axes of pyplot.
     limits : tuple of float, optional
-        Values at both ends of the colors; else percentiles of this map. Give the same to maps
-        that are compared.
+        Values at both ends of the colors; else those of the pages for thickness and mean
+        curvature, and percentiles of this map for others. Give the same to maps that are compared.
     colorbar : bool
         Whether to add one.
 
@@ -262,7 +262,6 @@ def plot_group(
         colors=EFFECT_COLORS,
         centered=True,
         digits=2,
-        percentiles=(1, 99),
     )
     sheet = SheetTable(
         columns={"effect": effect},

@@ -1,11 +1,19 @@
 """What a run prints on the terminal."""
 
+import os
+import re
+import shutil
 import sys
-from collections.abc import Mapping, Sequence
+import textwrap
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, redirect_stdout
+from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TextIO
 
 from hipsta_bids import __version__
+from hipsta_bids.progress import listening
 
 if TYPE_CHECKING:
     from hipsta_bids.participant.job import Outcome
@@ -15,17 +23,55 @@ if TYPE_CHECKING:
 #: How many warnings of a kind are printed.
 _SHOWN = 3
 
+#: Escape codes by what they mark: statuses, and the beginnings of lines.
+_COLORS = {
+    "ok": "32",
+    "repaired": "36",
+    "flagged": "33",
+    "failed": "1;31",
+    "hipsta-bids:": "1;31",
+    "warning:": "33",
+    "note:": "36",
+}
+_WORD = re.compile(
+    r"^(hipsta-bids:|warning:|note:)|(?<![^\s(])(ok|repaired|flagged|failed)(?=[,\s)]|$)"
+)
+
+#: Bars of stages with parts, and of those without.
+_PARTS = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]"
+_WHOLE = "{desc} [{elapsed}]"
+
+#: Narrowest that a column of a table is made, and the space between two.
+_NARROWEST, _GAP = 16, 2
+
+
+def has_color(stream: TextIO) -> bool:
+    """Tell whether a stream shows colors: a terminal, unless the environment says otherwise.
+
+    ``NO_COLOR`` and ``FORCE_COLOR`` count if they are not empty, in this order, then ``TERM=dumb``.
+    """
+    if os.environ.get("NO_COLOR"):
+        return False
+    return bool(os.environ.get("FORCE_COLOR")) or (
+        os.environ.get("TERM") != "dumb" and stream.isatty()
+    )
+
+
+def _print(text: str, stream: TextIO) -> None:
+    if has_color(stream):
+        text = _WORD.sub(lambda word: f"\033[{_COLORS[word[0]]}m{word[0]}\033[0m", text)
+    stream.write(f"{text}\n")
+    stream.flush()
+
 
 def echo(text: str) -> None:
     """Print a line of results."""
-    sys.stdout.write(f"{text}\n")
-    sys.stdout.flush()
+    _print(text, sys.stdout)
 
 
 def warn(text: str) -> None:
     """Print one line about what went wrong, to the standard error."""
-    sys.stderr.write(" ".join(text.split()) + "\n")
-    sys.stderr.flush()
+    _print(" ".join(text.split()), sys.stderr)
 
 
 def echo_start(level: str, bids_dir: Path) -> None:
@@ -33,24 +79,42 @@ def echo_start(level: str, bids_dir: Path) -> None:
     echo(f"hipsta_bids {__version__}, {level} level of {bids_dir}")
 
 
+@contextmanager
+def quiet(wanted: bool) -> Iterator[None]:
+    """Print nothing but what went wrong, if that is wanted."""
+    if not wanted:
+        yield
+        return
+    with Path(os.devnull).open("w", encoding="utf-8") as nowhere, redirect_stdout(nowhere):
+        yield
+
+
 class Progress:
-    """One line per hemisphere, and a bar below them where there is a terminal."""
+    """One line per hemisphere or stage, and a bar with the time left where there is a terminal."""
 
-    def __init__(self, total: int, verbosity: int) -> None:
+    def __init__(self, verbosity: int) -> None:
         self._verbosity = verbosity
+        self._stage, self._start = "", 0.0
         self._bar: Any = None
-        if verbosity >= 0 and sys.stderr.isatty():
-            from tqdm import tqdm  # noqa: PLC0415  (not needed elsewhere)
-
-            tqdm.monitor_interval = 0  # its thread would keep workers from being forked
-            self._bar = tqdm(total=total, unit="hemisphere", file=sys.stderr, leave=False)
+        self._listening = ExitStack()
 
     def __enter__(self) -> Self:
+        self._listening.enter_context(listening(self.show))
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self._listening.close()
+        self._close(said=kind is None)
+
+    def show(self, stage: str, done: int = 0, total: int = 0) -> None:
+        """Show what is being done; a stage ends with a line that has its time."""
+        if stage != self._stage:
+            self._close(said=True)
+            self._stage, self._start = stage, time.monotonic()
+            if self._verbosity >= 0 and sys.stderr.isatty():
+                self._bar = _bar(stage, total)
         if self._bar is not None:
-            self._bar.close()
+            self._bar.update(done - self._bar.n)
 
     def report(self, outcome: "Outcome") -> None:
         """Show one outcome."""
@@ -64,6 +128,22 @@ class Progress:
             echo(summary_line(outcome))
         if self._bar is not None:
             self._bar.update()
+
+    def _close(self, *, said: bool) -> None:
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
+        # Hemispheres have a line each.
+        if said and self._stage not in {"", "hemispheres"}:
+            echo(f"  {self._stage:<18}{time.monotonic() - self._start:6.1f} s")
+
+
+def _bar(stage: str, total: int) -> Any:  # noqa: ANN401  (tqdm's)
+    from tqdm import tqdm  # noqa: PLC0415  (not needed elsewhere)
+
+    tqdm.monitor_interval = 0  # its thread would keep workers from being forked
+    style = _PARTS if total else _WHOLE
+    return tqdm(total=total or None, desc=stage, file=sys.stderr, leave=False, bar_format=style)
 
 
 def summary_line(outcome: "Outcome") -> str:
@@ -108,10 +188,47 @@ def echo_result(result: "RunResult", out_dir: Path) -> None:
 
 
 def echo_table(rows: Sequence[Mapping[str, str]]) -> None:
-    """Print rows as aligned columns; empty columns are left out, and tables without rows."""
+    """Print rows as aligned columns; empty columns are left out, and tables without rows.
+
+    On a terminal wide columns are wrapped and long words, as paths, lose their middle, so that a
+    row fits; where that takes narrow columns, each cell has a line. Elsewhere all is there.
+    """
     if not rows:
         return
     columns = [c for c in rows[0] if any(row[c] for row in rows)]
     widths = {c: max(len(c), *(len(row[c]) for row in rows)) for c in columns}
+    room = shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
+    while sum(widths.values()) + _GAP * (len(columns) - 1) > room:
+        widest = max(columns, key=lambda c: widths[c])
+        widths[widest] -= 1
+        if widths[widest] < _NARROWEST:
+            _echo_records(rows, columns, room)
+            return
     for row in [{c: c for c in columns}, *rows]:
-        echo("  ".join(row[c].ljust(widths[c]) for c in columns).rstrip())
+        cells = [_fitted(row[c], widths[c]) for c in columns]
+        for line in zip_longest(*cells, fillvalue=""):
+            texts = (text.ljust(widths[c]) for c, text in zip(columns, line, strict=True))
+            echo((" " * _GAP).join(texts).rstrip())
+
+
+def _echo_records(rows: Sequence[Mapping[str, str]], columns: Sequence[str], room: int) -> None:
+    """Print each row as lines of its own, one per cell that has something."""
+    indent = " " * (2 * _GAP)
+    for row in rows:
+        head, *cells = (f"{c}: {row[c]}" for c in columns if row[c])
+        for i, cell in enumerate((head, *cells)):
+            first, *more = _fitted(cell, max(room - len(indent), _NARROWEST))
+            for line in (f"{indent[:_GAP] if i else ''}{first}", *(indent + text for text in more)):
+                echo(line)
+
+
+def _fitted(text: str, width: int) -> list[str]:
+    """Break a text into lines of a width; longer words lose their middle."""
+    if len(text) <= width:
+        return [text]
+    end = (width - 3) // 2
+    words = [
+        word if len(word) <= width else f"{word[: width - 3 - end]}...{word[-end:]}"
+        for word in text.split()
+    ]
+    return textwrap.wrap(" ".join(words), width, break_on_hyphens=False)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hipsta_bids import __version__
-from hipsta_bids.cli.console import echo, echo_start, warn
+from hipsta_bids.cli.console import Progress, echo, echo_start, quiet, warn
 from hipsta_bids.cli.parser import (
     Parser,
     adder,
@@ -123,6 +123,11 @@ def _add_sheets(parser: Parser) -> None:
         "FILE.tsv",
         "leave out: columns participant_id, perhaps session_id, hemi, protocol, region, reason",
     )
+    add(
+        "--ratings",
+        "FILE.tsv",
+        "ratings saved from report.html: leaves out what is rated exclude, and counts the others",
+    )
 
 
 def _add_model(parser: Parser) -> None:
@@ -235,6 +240,7 @@ def _add_reports(parser: Parser) -> None:
         "make these pages again from the results that are there, of all analyses or that of"
         " --name, and end",
     )
+    adder(group)("-q --quiet", "", "say only what went wrong")
 
 
 def _folder(text: str) -> Path:
@@ -268,6 +274,11 @@ def is_group_level(arguments: Sequence[str]) -> bool:
 def run_group_level(arguments: Sequence[str]) -> ExitCode:
     """Run the group level."""
     parsed = group_parser().parse_args(arguments)
+    with quiet(parsed.quiet):
+        return _run(parsed, arguments)
+
+
+def _run(parsed: argparse.Namespace, arguments: Sequence[str]) -> ExitCode:
     if parsed.model is not None and (parsed.formula or parsed.contrast):
         raise UsageError("give --model, or --formula and --contrast", reason="usage")
     if parsed.reports_only:
@@ -281,7 +292,8 @@ def run_group_level(arguments: Sequence[str]) -> ExitCode:
 
     check_scratch()
     settings = _settings(parsed)
-    result = run_group(_options(parsed, arguments), settings)
+    with Progress(-1 if parsed.quiet else 0):
+        result = run_group(_options(parsed, arguments), settings)
     for note in result.notes:
         echo(f"note: {note}")
     echo(f"{result.n_participants} participants in the model, {result.n_excluded} left out")
@@ -340,8 +352,9 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
 
 
 def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOptions":
-    from hipsta_bids.group.collect import GroupRequest, QualityCondition  # noqa: PLC0415  (heavy)
+    from hipsta_bids.group.collect import GroupRequest  # noqa: PLC0415  (heavy)
     from hipsta_bids.group.comparison import Comparison  # noqa: PLC0415  (heavy)
+    from hipsta_bids.group.exclusions import QualityCondition  # noqa: PLC0415  (heavy)
     from hipsta_bids.group.model import ModelRequest  # noqa: PLC0415  (heavy)
     from hipsta_bids.group.run import GroupOptions  # noqa: PLC0415  (heavy)
 

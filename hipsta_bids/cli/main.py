@@ -8,12 +8,13 @@ import traceback
 from collections.abc import Iterator, Sequence
 from importlib import import_module
 from importlib.resources import files
+from pathlib import Path
 from types import FrameType
 
 from hipsta_bids.cli.console import echo, warn
 from hipsta_bids.cli.group import LEVEL, is_group_level, run_group_level
 from hipsta_bids.cli.participant import LEVELS, build_parser, run_participant_level
-from hipsta_bids.errors import EXIT_MEANINGS, ExitCode, HipstaError
+from hipsta_bids.errors import EXIT_MEANINGS, ExitCode, HipstaError, UsageError, did_you_mean
 
 _SIGNALED = 128  # shells report death by signal n as 128 + n
 
@@ -107,6 +108,9 @@ def _dispatch(arguments: list[str]) -> ExitCode:
         function = COMMANDS[arguments[0]][0]
         code: ExitCode = getattr(import_module("hipsta_bids.cli.commands"), function)(arguments[1:])
         return code
+    near = did_you_mean(arguments[:1], COMMANDS)
+    if near and not is_app and not Path(arguments[0]).exists():
+        raise UsageError(f"{arguments[0]!r} is no command and no dataset{near}", reason="usage")
     if is_group_level(arguments):
         return run_group_level(arguments)
     return run_participant_level(build_parser(EPILOG).parse_args(arguments), arguments)

@@ -1,13 +1,13 @@
 """The parser of every command, and the way from its options to a dataclass."""
 
 import argparse
-import difflib
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
-from hipsta_bids.errors import UsageError
+from hipsta_bids.errors import UsageError, did_you_mean
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 #: Values that are paths, by what they are called in the help.
 _PATHS = ("DIR", "FILE", "FILE.tsv", "FILE.toml", "FILE.json")
+#: argparse's message about a word that is none of some.
+_CHOICE = re.compile(r"invalid choice: '(?P<word>.*)' \(choose from (?P<known>.*)\)")
 
 
 class Parser(argparse.ArgumentParser):
@@ -31,7 +33,10 @@ class Parser(argparse.ArgumentParser):
         )
 
     def parse_known_args(self, args: Sequence[str], namespace: Any = None) -> Any:  # type: ignore[override]  # noqa: ANN401  (as in argparse, but without its overloads)
-        """Parse options in either spelling; the value of ``--slurm`` may begin with a dash."""
+        """Parse options in either spelling; the value of ``--slurm`` may begin with a dash.
+
+        Unknown options are told first: what follows one would be taken for something else.
+        """
         spelled: list[str] = []
         for text in args:
             name, equals, value = text.partition("=")
@@ -41,20 +46,28 @@ class Parser(argparse.ArgumentParser):
                 spelled.append(name.replace("_", "-") + equals + value)
             else:
                 spelled.append(text)
+        unknown = [
+            text
+            for text in spelled
+            if text[2:]
+            and text.startswith("--")
+            and " " not in text.partition("=")[0]
+            and text.partition("=")[0] not in self._option_string_actions
+        ]
+        if unknown:
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
         return super().parse_known_args(spelled, namespace)
 
     def error(self, message: str) -> NoReturn:
-        """Turn argparse's message into the package's own error; name options like unknown ones."""
+        """Turn argparse's message into the package's own error; name what is like unknown words."""
+        hint = ""
         unknown = message.removeprefix("unrecognized arguments: ")
-        near = [
-            match
-            for text in (unknown.split() if unknown != message else ())
-            for match in difflib.get_close_matches(
-                text.partition("=")[0], self._option_string_actions, n=1
-            )
-            if text.startswith("-")
-        ]
-        hint = f"; did you mean {' '.join(near)}?" if near else ""
+        if unknown != message:
+            words = [text.partition("=")[0] for text in unknown.split() if text.startswith("-")]
+            hint = did_you_mean(words, self._option_string_actions)
+        elif choice := _CHOICE.search(message):
+            known = [name.strip("'\"") for name in choice["known"].split(", ")]
+            hint = did_you_mean([choice["word"]], known)
         raise UsageError(f"{message}{hint} (see {self.prog} --help)", reason="usage")
 
 

@@ -5,13 +5,20 @@ import os
 import re
 import shlex
 from collections.abc import Callable, Sequence
-from contextlib import redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hipsta_bids import __version__
-from hipsta_bids.cli.console import Progress, echo, echo_result, echo_start, echo_table, warn
+from hipsta_bids.cli.console import (
+    Progress,
+    echo,
+    echo_result,
+    echo_start,
+    echo_table,
+    quiet,
+    warn,
+)
 from hipsta_bids.cli.parser import (
     Parser,
     accept,
@@ -24,7 +31,7 @@ from hipsta_bids.cli.parser import (
     positive_int,
     subject_label,
 )
-from hipsta_bids.errors import ExitCode, NothingToDoError, UsageError
+from hipsta_bids.errors import ExitCode, NothingToDoError, UsageError, did_you_mean
 from hipsta_bids.participant.cluster import Cluster, Shard, check_cluster, parse_shard
 from hipsta_bids.participant.pool import pin_threads, processors
 
@@ -264,6 +271,7 @@ def _level(text: str) -> str:
     if text not in LEVELS:
         raise argparse.ArgumentTypeError(
             f"{text!r} does not exist; there are participant, collect and group"
+            f"{did_you_mean([text], [*LEVELS, 'group'])}"
         )
     return text
 
@@ -310,10 +318,8 @@ def _gigabytes(text: str) -> float:
 
 def run_participant_level(options: "Namespace", arguments: Sequence[str] = ()) -> ExitCode:
     """Measure, collect or list hemispheres, as a parsed command line says."""
-    if options.quiet:
-        with Path(os.devnull).open("w", encoding="utf-8") as nowhere, redirect_stdout(nowhere):
-            return _run(options, arguments)
-    return _run(options, arguments)
+    with quiet(options.quiet):
+        return _run(options, arguments)
 
 
 def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
@@ -358,11 +364,11 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
 
     notes += tuple(f"not used: {entry.path}: {entry.reason}" for entry in found.ignored)
     out, run_options = options.output_dir, _run_options(options, arguments, notes)
-    if collects:
-        result = collect(items, out, settings, run_options)
-    else:
-        verbosity = -1 if options.quiet else options.verbose
-        with Progress(len(items), verbosity) as progress:
+    with Progress(-1 if options.quiet else options.verbose) as progress:
+        if collects:
+            result = collect(items, out, settings, run_options)
+        else:
+            progress.show("hemispheres", 0, len(items))
             result = run_participants(items, out, settings, run_options, progress.report)
     echo_result(result, out)
     return result.exit_code
@@ -416,7 +422,8 @@ def _rebuild_reports(options: "Namespace") -> ExitCode:
             reason="nothing-to-report",
         )
     check_writable(root)
-    with log_file(root, options.verbose) as log:
+    progress = Progress(-1 if options.quiet else options.verbose)
+    with log_file(root, options.verbose) as log, progress:
         problems = list(
             write_reports(PagePlan(root=root, n_workers=options.n_procs, log=log), visits)
         )

@@ -34,14 +34,17 @@ from hipsta_bids.group.normative import Scores, score_cohort
 from hipsta_bids.group.registration import (
     GroupShift,
     Registration,
+    ShiftDifference,
     mean_profiles,
     register,
     register_to,
     shift_by_group,
+    shift_difference,
 )
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.summaries import MeasureFit, classify_groups, fit_summaries
 from hipsta_bids.group.warps import Template, warp_labels, warp_values
+from hipsta_bids.progress import each, tell
 
 #: Group of all, where there are no groups.
 ALL = "all"
@@ -58,6 +61,8 @@ class SideResult:
     """Maps of all visits that were chosen."""
     shifts: Mapping[str, GroupShift]
     """Shifts by group; empty without groups."""
+    difference: ShiftDifference | None
+    """Between the groups, if there are groups."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -79,6 +84,9 @@ class Analysis:
     fitted: Mapping[str, FittedMaps]
     """Fitted maps by hemisphere; ``LR`` is left minus right."""
     found: Mapping[MapKey, Discoveries]
+    unregistered: Mapping[MapKey, Discoveries]
+    """The same of maps that were not registered; empty without registration, and with
+    permutations, which are too slow to do twice."""
     scores: Scores | None
     """Scores of participants against a reference group, if there is one."""
     measures: Sequence[MeasureFit]
@@ -151,14 +159,20 @@ def analyze_cohort(
     _check_weights(comparison, settings)
     sides = {
         hemi: _register_side(cohort, hemi, groups=groups, settings=settings, templates=templates)
-        for hemi in (cohort.sides if measures.maps else ())
+        for hemi in each("registration", list(cohort.sides) if measures.maps else [])
     }
     registered = {hemi: side.registered for hemi, side in sides.items()} or cohort.sides
     compared = compare_sessions(replace(cohort, sides=registered), comparison)
     fitted = _fit_sides(compared, measures.maps, rows, comparison, settings)
     found = correct(fitted, rows, table, settings)
+    unregistered: Mapping[MapKey, Discoveries] = {}
+    if settings.registration.align != "none" and settings.multiplicity.method not in PERMUTATIONS:
+        plain = compare_sessions(cohort, comparison)
+        refitted = _fit_sides(plain, measures.maps, rows, comparison, settings)
+        unregistered = correct(refitted, rows, table, settings)
     scores = None
     if comparison.normative is not None:
+        tell("w-scores")
         scores = score_cohort(
             compared,
             model,
@@ -167,6 +181,7 @@ def analyze_cohort(
             measures=measures,
             references=references,
         )
+    tell("summary measures")
     summaries, notes = fit_summaries(
         compared,
         model,
@@ -190,6 +205,7 @@ def analyze_cohort(
         row_model=rows,
         fitted=fitted,
         found=found,
+        unregistered=unregistered,
         scores=scores,
         measures=summaries,
         pairs=pairs,
@@ -205,6 +221,7 @@ def analyze_points(cohort: Cohort, analysis: Analysis, settings: GroupSettings) 
     measured = Measures(maps=maps, summaries=())
     scores = None
     if analysis.comparison.normative is not None:
+        tell("w-scores")
         scores = score_cohort(
             compared,
             analysis.model,
@@ -220,6 +237,7 @@ def analyze_points(cohort: Cohort, analysis: Analysis, settings: GroupSettings) 
         compared=compared,
         fitted=fitted,
         found=correct(fitted, analysis.row_model, compared.table, settings),
+        unregistered={},
         measures=(),
         pairs=(),
         scores=scores,
@@ -255,8 +273,7 @@ def _fit_sides(
     """Fit each hemisphere, and left minus right if that is asked for."""
     fitted = {
         hemi: fit_maps(hemi, side.only(maps), rows, settings)
-        for hemi, side in compared.sides.items()
-        if maps
+        for hemi, side in each("models", list(compared.sides.items()) if maps else [])
     }
     if comparison.asymmetry and maps:
         both = asymmetry_maps(compared, maps, settings.asymmetry.relative)
@@ -290,18 +307,27 @@ def _register_side(
     else:
         registration = register_to(profiles, templates[hemi], settings.registration)
     shifts: Mapping[str, GroupShift] = {}
+    difference = None
     if groups is not None:
         names = cohort.table[groups.column].iloc[side.rows]
         known = names.notna().to_numpy()
-        shifts = shift_by_group(
-            replace(registration, warps=registration.warps[known]),
-            names[known].astype(str).to_numpy(dtype=np.str_),
-        )
+        grouped = replace(registration, warps=registration.warps[known])
+        members = names[known].astype(str).to_numpy(dtype=np.str_)
+        shifts = shift_by_group(grouped, members)
+        if registration.template is not None:
+            difference = shift_difference(
+                grouped,
+                members,
+                cohort.table[PARTICIPANT].iloc[side.rows][known].to_numpy(),
+                permutations=settings.registration.group_permutations,
+                seed=settings.multiplicity.seed,
+            )
     return SideResult(
         profiles=profiles,
         registration=registration,
         registered=_register_maps(side, registration.warps),
         shifts=shifts,
+        difference=difference,
     )
 
 

@@ -1,12 +1,8 @@
 """Which hemispheres of the participant level enter the group level, and which are left out, why."""
 
-import ast
-import difflib
-import operator
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,142 +13,13 @@ from hipsta_bids.derivatives.hemisphere import (
     read_record,
 )
 from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName
-from hipsta_bids.errors import InputError, NothingToDoError, UsageError
+from hipsta_bids.errors import InputError, NothingToDoError
 from hipsta_bids.group.covariates import relocate
+from hipsta_bids.group.exclusions import SHOWN, Choices, QualityCondition, read_choices
 from hipsta_bids.io import files
 from hipsta_bids.protocols.toml import resolve, settings_hash
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Status
-
-#: Number of names that a note lists.
-_SHOWN = 4
-_ALLOWED = "may hold comparisons, and, or, not, + - * / only"
-_LONGEST = 500  # characters of a condition
-_OPERATORS: Mapping[type[ast.AST], Callable[[Any, Any], Any]] = {
-    ast.Lt: operator.lt,
-    ast.LtE: operator.le,
-    ast.Gt: operator.gt,
-    ast.GtE: operator.ge,
-    ast.Eq: operator.eq,
-    ast.NotEq: operator.ne,
-    ast.Add: operator.add,
-    ast.Sub: operator.sub,
-    ast.Mult: operator.mul,
-    ast.Div: operator.truediv,
-}
-
-
-def read_exclusions(path: Path | None) -> list[dict[str, str]]:
-    """Read the user's table of participants, or single sessions and hemispheres, to leave out."""
-    if path is None:
-        return []
-    rows = files.read_tsv(path)
-    if rows and "participant_id" not in rows[0]:
-        raise InputError(
-            f"{path}: no column participant_id; it may have session_id, hemi, protocol, region and"
-            " reason besides",
-            reason="bad-table",
-        )
-    return rows
-
-
-def lost_exclusions(
-    path: Path | None, rows: Sequence[Mapping[str, str]], found: Sequence[HemisphereName]
-) -> tuple[str, ...]:
-    """Note rows of the user's table that match no hemisphere: labels may be misspelled.
-
-    Those ``found`` are of all protocols and regions, as rows of a saved list may be.
-    """
-    if path is None:
-        return ()
-    if not rows:
-        return (f"{path}: has no rows; nothing is excluded",)
-    lost = [
-        row["participant_id"] for row in rows if not any(is_listed(name, row) for name in found)
-    ]
-    if not lost:
-        return ()
-    more = f" and {len(lost) - _SHOWN} more" if len(lost) > _SHOWN else ""
-    return (f"{path}: matches no hemisphere here: {', '.join(lost[:_SHOWN])}{more}",)
-
-
-def is_listed(name: HemisphereName, row: Mapping[str, str]) -> bool:
-    """Whether a row of the user's table means this hemisphere; empty cells mean any.
-
-    One without a protocol, of other programs' maps, is meant by rows of any protocol and region.
-    """
-    own = {"participant_id": name.subject, "session_id": name.session or "", "hemi": name.hemi}
-    own |= {"protocol": name.seg, "region": name.region} if name.seg else {}
-    for key, value in own.items():
-        cell = row.get(key, files.MISSING).removeprefix("sub-").removeprefix("ses-")
-        if cell not in {files.MISSING, "", value}:
-            return False
-    return True
-
-
-class QualityCondition:
-    """A condition on quality metrics, such as ``filled_fraction > 0.01 or voxels_across < 3``."""
-
-    def __init__(self, text: str) -> None:
-        self.text = text[:_LONGEST]
-        if len(text) > _LONGEST:
-            raise self._refusal(f"... is too long; {_LONGEST} characters are the limit")
-        try:
-            self._tree = ast.parse(text.strip(), mode="eval").body
-        except (SyntaxError, ValueError) as error:  # ValueError: a null byte
-            raise self._refusal("cannot be read; write it as filled_fraction > 0.01") from error
-
-    def holds(self, metrics: Mapping[str, Any]) -> bool:
-        """Evaluate the condition; comparisons with missing metrics do not hold."""
-        return bool(self._value(self._tree, metrics))
-
-    def _value(self, node: ast.expr, metrics: Mapping[str, Any]) -> Any:  # noqa: ANN401 -- of the metric
-        value: Any = None
-        match node:
-            case ast.Constant():
-                value = node.value
-            case ast.Name(id=name):
-                value = self._metric(name, metrics)
-            case ast.Compare():
-                values = [self._value(part, metrics) for part in (node.left, *node.comparators)]
-                pairs = zip(node.ops, pairwise(values), strict=True)
-                value = all(self._act(sign, a, b) for sign, (a, b) in pairs)
-            case ast.BoolOp(op=ast.And()):
-                value = all(self._value(part, metrics) for part in node.values)
-            case ast.BoolOp():
-                value = any(self._value(part, metrics) for part in node.values)
-            case ast.UnaryOp(op=ast.Not()):
-                value = not self._value(node.operand, metrics)
-            case ast.UnaryOp(op=ast.USub()):
-                value = self._act(ast.Sub(), 0, self._value(node.operand, metrics))
-            case ast.BinOp():
-                a, b = self._value(node.left, metrics), self._value(node.right, metrics)
-                value = self._act(node.op, a, b)
-            case _:
-                raise self._refusal(_ALLOWED)
-        return value
-
-    def _act(self, sign: ast.AST, a: Any, b: Any) -> Any:  # noqa: ANN401 -- as above
-        if type(sign) not in _OPERATORS:
-            raise self._refusal(_ALLOWED)
-        if a is None or b is None:
-            return None
-        if isinstance(sign, ast.operator) and (isinstance(a, str) or isinstance(b, str)):
-            raise self._refusal(f"cannot combine {a!r} and {b!r}")
-        try:
-            return _OPERATORS[type(sign)](a, b)
-        except (TypeError, ZeroDivisionError) as error:
-            raise self._refusal(f"cannot combine {a!r} and {b!r}") from error
-
-    def _metric(self, name: str, metrics: Mapping[str, Any]) -> Any:  # noqa: ANN401 -- as above
-        if name not in metrics:
-            near = difflib.get_close_matches(name, metrics, n=1)
-            hint = f"did you mean {near[0]}?" if near else "see the desc-qc_metrics.json files"
-            raise self._refusal(f"has {name!r}, which is no quality metric; {hint}")
-        return metrics[name]
-
-    def _refusal(self, what: str) -> UsageError:
-        return UsageError(f"--exclude-qc {self.text!r} {what}", reason="quality-condition")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,6 +42,8 @@ class GroupRequest:
     exclude_quality: QualityCondition | None = None
     exclude_table: Path | None = None
     """Participants, or single sessions and hemispheres, to leave out."""
+    ratings: Path | None = None
+    """Ratings of hemispheres, saved from the report."""
     segmentations: tuple[Path, ...] = ()
     """Where segmentations are now, if they have moved since they were measured."""
 
@@ -222,6 +91,8 @@ class Collection:
     """Sorted by subject, session, hemisphere."""
     exclusions: tuple[Exclusion, ...] = ()
     versions: tuple[str, ...] = ()
+    ratings: Mapping[str, int] | None = None
+    """Numbers of hemispheres by rating, if there is a table of these."""
     notes: tuple[str, ...] = ()
     """What to know, one line each."""
 
@@ -242,16 +113,16 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
     seg = _one_protocol(found, everything, request)
     found = [place for place in found if place.name.seg == seg]
     _refuse_twice(found)
-    unwanted = read_exclusions(request.exclude_table)
+    choices = read_choices(request.exclude_table, request.ratings)
     kept: list[SheetRecord] = []
     left_out: list[Exclusion] = []
     for place in sorted(found, key=_key):
-        entry = _judge(place, request, unwanted)
+        entry = _judge(place, request, choices)
         if isinstance(entry, Exclusion):
             left_out.append(entry)
         else:
             kept.append(entry)
-    _refuse_unfinished(request, seg, unwanted)
+    _refuse_unfinished(request, seg, choices)
     if not kept:
         reasons = ", ".join(f"{n} {why}" for why, n in Counter(e.reason for e in left_out).items())
         raise NothingToDoError(
@@ -265,20 +136,28 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
         settings=settings_of(kept[0].place.root),
         settings_hash=digest,
         versions=tuple(sorted({record.version for record in kept})),
+        ratings=choices.counts((place.name, _digest(place)) for place in found),
         notes=(
             *notes,
-            *lost_exclusions(request.exclude_table, unwanted, [place.name for place in everything]),
+            *choices.excluded.notes((place.name, _digest(place)) for place in everything),
+            *choices.rated.notes((place.name, _digest(place)) for place in everything),
         ),
     )
 
 
+def _digest(place: ResultPlace) -> str | None:
+    """Hash of a hemisphere's input and settings, if its record has one."""
+    digest = read_record(place).get("input_hash")
+    return None if digest is None else str(digest)
+
+
 def wanted_by(request: GroupRequest) -> Callable[[str, str | None, str], bool]:
-    """Tell whether a hemisphere is asked for, and not in the table of exclusions."""
-    unwanted = read_exclusions(request.exclude_table)
+    """Tell whether a hemisphere is asked for, and not in a table of those to leave out."""
+    choices = read_choices(request.exclude_table, request.ratings)
 
     def is_wanted(subject: str, session: str | None, hemi: str) -> bool:
         name = HemisphereName(subject=subject, session=session, hemi=hemi, seg="")
-        return request.wants(subject, session) and not any(is_listed(name, row) for row in unwanted)
+        return request.wants(subject, session) and not choices.reason_to_leave_out(name, None)
 
     return is_wanted
 
@@ -346,15 +225,13 @@ def _refuse_twice(found: Sequence[ResultPlace]) -> None:
             )
 
 
-def _judge(
-    place: ResultPlace, request: GroupRequest, unwanted: Sequence[Mapping[str, str]]
-) -> SheetRecord | Exclusion:
+def _judge(place: ResultPlace, request: GroupRequest, choices: Choices) -> SheetRecord | Exclusion:
     record = read_record(place)
     status = record.get("status")
     reason, message = record.get("reason") or str(status), record.get("message") or ""
-    listed = next((row for row in unwanted if is_listed(place.name, row)), None)
-    if listed is not None:
-        reason, message = "listed", listed.get("reason", "in the table of --exclude")
+    unwanted = choices.reason_to_leave_out(place.name, record.get("input_hash"))
+    if unwanted is not None:
+        reason, message = unwanted
     elif status == Status.FAILED:
         reason = f"failed: {reason}"
     elif request.exclude_flagged and status == Status.FLAGGED:
@@ -387,21 +264,19 @@ def _metrics(record: Mapping[str, Any]) -> dict[str, Any]:
     return {k: v for k, v in both.items() if not isinstance(v, (list, dict))}
 
 
-def _refuse_unfinished(
-    request: GroupRequest, seg: str, unwanted: Sequence[Mapping[str, str]]
-) -> None:
+def _refuse_unfinished(request: GroupRequest, seg: str, choices: Choices) -> None:
     """Refuse a run of the participant level that was interrupted: the rest might differ."""
     pending = []
     for root in request.roots:
         for row in read_status(root):
             name = name_of(row)
             asked = request.wants(name.subject, name.session)
-            listed = any(is_listed(name, one) for one in unwanted)
+            listed = choices.reason_to_leave_out(name, None) is not None
             same = (name.seg, name.region) == (seg, request.region)
             if row.get("reason") == NOT_FINISHED and same and asked and not listed:
                 pending.append(name.stem)
     if pending:
-        shown = ", ".join(pending[:_SHOWN]) + (" ..." if len(pending) > _SHOWN else "")
+        shown = ", ".join(pending[:SHOWN]) + (" ..." if len(pending) > SHOWN else "")
         raise InputError(
             f"{request.roots[0]}: the participant level has not finished {len(pending)} hemispheres"
             f" ({shown}); complete it by the same command, or list them in --exclude",

@@ -15,6 +15,7 @@ from hipsta_bids.group.data import Bool, Float, Int
 from hipsta_bids.group.formula import Contrast, check_names, listed
 from hipsta_bids.group.glm import FittedMaps, RowModel, fit_points
 from hipsta_bids.group.settings import GlmSettings, GroupSettings, MultiplicitySettings
+from hipsta_bids.progress import tell
 
 #: Share of the smallest p that serves as cut-off when nothing is rejected.
 BELOW_ALL = 0.1
@@ -65,6 +66,7 @@ def permute(
     *,
     settings: MultiplicitySettings,
     blocks: Int | None = None,
+    family: tuple[int, int] = (0, 1),
 ) -> list[PermutationTest]:
     """Permutation test of one contrast at all points (Freedman and Lane 1983).
 
@@ -73,13 +75,16 @@ def permute(
     all subjects have in common (an intercept), signs are flipped instead of subjects shuffled.
 
     Missing values count as what the covariates predict, which shrinks an effect; degrees of
-    freedom are those of the subjects present.
+    freedom are those of the subjects present. ``family`` is the number of this one, from 0, and of
+    how many, to tell how far all are.
     """
     runs = [_Run.build(part, contrast, settings, blocks) for part in parts]
     random = np.random.default_rng(settings.seed)
     n_subjects = 1 + max(int(part.subjects.max()) for part in parts)
     for start in range(1, settings.permutations, _BATCH):
         count = min(_BATCH, settings.permutations - start)
+        done = family[0] * settings.permutations + start - 1
+        tell("permutations", done, family[1] * settings.permutations)
         keys = random.random((count, n_subjects))
         maps = [run.shuffled(keys) for run in runs]
         highest = np.max([_maximum(t) for t, _ in maps], axis=0)
@@ -330,7 +335,8 @@ def correct(
     check_permutations(model, settings)
     blocks = _blocks(model, table, how)
     found: dict[MapKey, Discoveries] = {}
-    for keys in families(tests, how.scope):
+    together = families(tests, how.scope)
+    for number, keys in enumerate(together):
         parts = [
             PermutationPart(
                 maps=one.values(key.measure),
@@ -341,7 +347,13 @@ def correct(
             for key in keys
             for one in [fitted[key.hemi]]
         ]
-        results = permute(parts, tests[keys[0]].contrast, settings=how, blocks=blocks)
+        results = permute(
+            parts,
+            tests[keys[0]].contrast,
+            settings=how,
+            blocks=blocks,
+            family=(number, len(together)),
+        )
         raw = [tests[key].p for key in keys]
         found |= dict(zip(keys, _permuted_discoveries(results, raw, how), strict=True))
     return {key: found[key] for key in tests}

@@ -90,6 +90,7 @@ def methods_text(
     *,
     others: Sequence[str] = (),
     region: str = "body",
+    ratings: Mapping[str, int] | None = None,
 ) -> str:
     """Word what was done and what came out."""
     cited: list[str] = []
@@ -101,6 +102,7 @@ def methods_text(
 
     paragraphs = [_sample(cohort, analysis, n_out, cite("method"), others)]
     paragraphs[0] = paragraphs[0].replace("the hippocampus", _MEASURED[region], 1)
+    paragraphs[0] += _rated(ratings)
     if analysis.sides or others:
         paragraphs.append(_alignment(analysis, settings, cite, others))
     paragraphs.append(_models(analysis, settings, cite))
@@ -146,6 +148,16 @@ def _sample(
     return f"{text}. {n_out} hemispheres or visits were left out; the table of exclusions says why."
 
 
+def _rated(ratings: Mapping[str, int] | None) -> str:
+    if ratings is None:
+        return ""
+    counts = ", ".join(f"{n} {rating}" for rating, n in ratings.items())
+    return (
+        f" Hemispheres were rated on their report pages ({counts}); those rated exclude were left"
+        " out."
+    )
+
+
 def _words(names: Sequence[str]) -> str:
     return ", ".join(f"map of {name.replace('_', ' ')}" for name in names)
 
@@ -175,10 +187,23 @@ def _registration(analysis: Analysis, settings: GroupSettings, cite: Callable[[s
         for hemi, side in analysis.sides.items()
     )
     extreme = sum(int(side.registration.extreme.sum()) for side in analysis.sides.values())
+    own = ", each less its mean and over its standard deviation," if how.standardize else ""
+    groups = "; ".join(
+        f"{hemi}: {side.difference.largest:.2f} nodes, p = {side.difference.p:.2g}"
+        for hemi, side in analysis.sides.items()
+        if side.difference is not None
+    )
+    moved = (
+        " The largest difference of mean displacement between groups, with its p-value corrected"
+        f" for all positions by {how.group_permutations} permutations of participants, was"
+        f" {groups}."
+        if groups
+        else ""
+    )
     return (
-        "Curvature profiles from medial to lateral (means from posterior to anterior) were"
+        f"Curvature profiles from medial to lateral (means from posterior to anterior){own} were"
         f" registered by {method}, and the warps were applied to all maps. The share of the"
-        f" variance of the profiles that their mean explains went from {shares}."
+        f" variance of the profiles that their mean explains went from {shares}.{moved}"
         f" Warps out of line with the others: {extreme}."
     )
 

@@ -54,16 +54,17 @@ def register(profiles: Float, settings: RegistrationSettings) -> Registration:
 
     ``registr`` takes turns: each profile is warped onto its own approximation by the mean and
     the principal components; these are estimated again from the warped profiles (Wrobel et al.
-    2018, as in version 2.1.1 of the R package of that name). Profiles are divided by their
-    standard deviation, since the algorithm is not free of scale. Unlike R, the mean warp is
-    kept at identity (setting ``center``). ``penalized`` has finer warps with a normal prior on
-    the logarithms of local stretch, whose variance is estimated along with the rest.
+    2018, as in version 2.1.1 of the R package of that name). Unlike R, each profile is first
+    standardized (setting ``standardize``; else all are divided by one standard deviation, since
+    the algorithm is not free of scale), and the mean warp is kept at identity (``center``).
+    ``penalized`` has finer warps with a normal prior on the logarithms of local stretch, whose
+    variance is estimated along with the rest.
     """
     if settings.align == "none":
         return _finish(profiles, _identity(profiles), None, settings, 0, converged=True)
     scale = _check(profiles, settings)
     chosen = _numbers(settings)
-    scaled = profiles / scale
+    scaled = _scaled(profiles, scale)
     basis = WarpBasis.make(profiles.shape[1], chosen["warp_splines"])
     warps = _identity(profiles)
     knots = inner_knots(warps, chosen["template_splines"])
@@ -113,8 +114,14 @@ def register_to(
             f" {settings.align}; use the same",
             reason="template-mismatch",
         )
-    _check_finite(profiles)
-    fitted = _fit_to(profiles / template.scale, template, settings)
+    if (template.scale is None) != settings.standardize:
+        raise ModelError(
+            "registration: the template was made with another setting of"
+            f" standardize, not {str(settings.standardize).lower()}; use the same",
+            reason="template-mismatch",
+        )
+    _check_profiles(profiles, settings)
+    fitted = _fit_to(_scaled(profiles, template.scale), template, settings)
     warps = _after_inverse(fitted, template.center)
     return _finish(profiles, warps, template, settings, template.turns, converged=True)
 
@@ -146,18 +153,34 @@ def _after_inverse(warps: Float, common: Float) -> Float:
     return np.asarray(back.reshape(warps.shape), dtype=np.float64)
 
 
-def _check_finite(profiles: Float) -> None:
+def _scaled(profiles: Float, scale: float | None) -> Float:
+    """Profiles over one standard deviation, or each less its mean over its own."""
+    if scale is not None:
+        return profiles / scale
+    centered = profiles - profiles.mean(axis=1, keepdims=True)
+    return np.asarray(centered / profiles.std(axis=1, keepdims=True), dtype=np.float64)
+
+
+def _check_profiles(profiles: Float, settings: RegistrationSettings) -> None:
+    """Refuse single profiles that cannot be registered."""
     rows = np.flatnonzero(~np.isfinite(profiles).all(axis=1))
     if len(rows):
         raise ModelError(
             f"registration: profiles {', '.join(map(str, rows[:10]))} have missing values",
             reason="profile-missing",
         )
+    constant = profiles.std(axis=1) <= np.finfo(np.float64).eps * np.abs(profiles).max(axis=1)
+    if settings.standardize and constant.any() and not constant.all():
+        raise ModelError(
+            f"registration: profiles {', '.join(map(str, np.flatnonzero(constant)[:10]))} are"
+            " constant; leave them out",
+            reason="profile-constant",
+        )
 
 
-def _check(profiles: Float, settings: RegistrationSettings) -> float:
-    """Refuse what makes no template; else return the profiles' standard deviation."""
-    _check_finite(profiles)
+def _check(profiles: Float, settings: RegistrationSettings) -> float | None:
+    """Refuse what makes no template; else return what to divide all profiles by, if anything."""
+    _check_profiles(profiles, settings)
     if len(profiles) < settings.min_subjects:
         raise ModelError(
             f"registration: {len(profiles)} profiles are too few for a template (least"
@@ -170,7 +193,7 @@ def _check(profiles: Float, settings: RegistrationSettings) -> float:
             "registration: all profiles are the same constant; use align none",
             reason="profile-constant",
         )
-    return scale
+    return None if settings.standardize else scale
 
 
 def _finish(
@@ -233,6 +256,71 @@ def mean_profiles(maps: Float, settings: RegistrationSettings) -> Float:
         gaps = empty[row]
         profiles[row, gaps] = np.interp(nodes[gaps], nodes[~gaps], profiles[row, ~gaps])
     return np.asarray(profiles, dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class ShiftDifference:
+    """Whether groups are displaced by different amounts."""
+
+    largest: float
+    """Largest difference between the mean displacements of two groups, grid nodes."""
+    node: int
+    """Where along x, from 0."""
+    p: float
+    """That the largest F over the nodes is by chance; NaN if a group has fewer than two members."""
+
+
+def shift_difference(
+    registration: Registration,
+    groups: Sequence[str] | NDArray[np.str_],
+    people: NDArray[np.generic],
+    *,
+    permutations: int,
+    seed: int,
+) -> ShiftDifference:
+    """Compare displacements between groups, at all nodes along x at once.
+
+    Warps of one person are averaged first. F of a one-way analysis of variance at each node; the
+    largest is compared with those after permuting people over the groups, so that the error rate
+    is that of the whole sheet (Westfall and Young 1993).
+
+    Parameters
+    ----------
+    registration : Registration
+        Warps (sheets, nodes).
+    groups : sequence of str
+        Group of each sheet.
+    people : ndarray
+        (sheets,) person of each sheet; the group is the same in all of one person's.
+    permutations : int
+    seed : int
+    """
+    persons, first, index = np.unique(people, return_index=True, return_inverse=True)
+    nodes = registration.warps.shape[1]
+    moved = (registration.warps - np.linspace(0, 1, nodes)) * (nodes - 1)
+    own = np.zeros((len(persons), nodes))
+    np.add.at(own, index, moved)
+    own /= np.bincount(index)[:, None]
+    names, member = np.unique(np.asarray(groups)[first], return_inverse=True)
+    counts = np.bincount(member)
+    total = np.sum((own - own.mean(axis=0)) ** 2, axis=0)
+
+    def f_of(order: NDArray[np.intp]) -> Float:
+        sums = np.zeros((len(names), nodes))
+        np.add.at(sums, member, own[order])
+        between = np.sum(sums**2 / counts[:, None], axis=0) - len(own) * own.mean(axis=0) ** 2
+        within = np.maximum(total - between, 1e-12 * total.max() + 1e-300)
+        return np.asarray(between / within, dtype=np.float64)
+
+    means = np.stack([own[member == i].mean(axis=0) for i in range(len(names))])
+    spread = np.ptp(means, axis=0)
+    node = int(np.argmax(spread))
+    if len(names) < 2 or counts.min() < 2 or not total.any():  # noqa: PLR2004 -- a difference
+        return ShiftDifference(float(spread[node]), node, float("nan"))
+    random = np.random.default_rng(seed)
+    observed = f_of(np.arange(len(own))).max() * (1 - 1e-9)
+    above = sum(f_of(random.permutation(len(own))).max() >= observed for _ in range(permutations))
+    return ShiftDifference(float(spread[node]), node, (1 + above) / (1 + permutations))
 
 
 def shift_by_group(

@@ -54,6 +54,7 @@ from hipsta_bids.group.volumes import add_volumes, check_volumes
 from hipsta_bids.group.warps import templates_from_json
 from hipsta_bids.group.write import draw, write_results
 from hipsta_bids.io import files
+from hipsta_bids.progress import tell
 from hipsta_bids.protocols.toml import resolve
 from hipsta_bids.reports.group import write_group_report
 
@@ -147,6 +148,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         If inputs, model or output folder do not allow it.
     """
     dataset.check_own_dataset(options.out_dir)
+    tell("reading")
     inputs = _read(options, settings)
     cohort = inputs.cohort
     references, groups = choose_references(options.model, cohort.table, settings)
@@ -192,10 +194,21 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
     name = options.model.name or (name if region == "body" else f"{name}_{region}")
     notes = [*inputs.notes, *_notes(inputs, analysis)]
     summary = _summary(options, inputs, analysis, settings, notes)
+    tell("average surfaces")
     shapes = average_shapes(inputs.found.records, cohort, analysis, settings)
     _describe(options)
     with write.model_folder(options.out_dir, name) as folder:
-        write_results(folder, cohort, analysis, settings, exclusions, others=others, region=region)
+        tell("tables and maps")
+        write_results(
+            folder,
+            cohort,
+            analysis,
+            settings,
+            exclusions,
+            others=others,
+            region=region,
+            ratings=inputs.found.ratings,
+        )
         files.write_json(folder / "model.json", document)
         if summary is not None:
             write_summary(folder / SUMMARY, summary)
@@ -415,6 +428,7 @@ def _record(
         "groups": None if analysis.groups is None else asdict(analysis.groups),
         "participants": analysis.n_participants,
         "rows": len(analysis.design.rows),
+        "ratings": found.ratings,
         "hemispheres": {hemi: len(one.used) for hemi, one in analysis.fitted.items()},
         "notes": notes,
         "settings": resolve(settings),
@@ -427,6 +441,7 @@ def _report(options: GroupOptions, name: str) -> tuple[Path | None, str | None]:
     if not options.reports:
         files.remove([path])  # it would be that of an earlier analysis of this name
         return None, None
+    tell("page")
     problem = write_group_report(options.out_dir, name)
     return (path if problem is None else None), problem
 

@@ -31,6 +31,9 @@ class RegistrationSettings(SettingsTable):
     align: Literal["registr", "penalized", "none"] = "registr"
     """``registr`` (Wrobel et al. 2018), ``penalized`` (finer warps, held back by a penalty that is
     estimated) or ``none``."""
+    standardize: bool = True
+    """Subtract each profile's mean and divide it by its own standard deviation, so that curvature
+    that is larger everywhere is not taken for a displacement; R's ``registr`` does not."""
     template_splines: Splines = 8
     """Cubic B-splines of the template (Kt)."""
     warp_splines: Splines = 4
@@ -72,6 +75,8 @@ class RegistrationSettings(SettingsTable):
     extreme: NonNegativeFloat = 4.0
     """Flag warps whose mean displacement is above the median by more than this many robust
     SDs."""
+    group_permutations: PositiveInt = 1999
+    """Permutations of participants for the difference of displacements between groups."""
 
 
 class DesignSettings(SettingsTable):

@@ -15,6 +15,7 @@ from hipsta_bids.group.glm import MEAN, PointwiseFit, RowModel, with_mean
 from hipsta_bids.group.grammar import closed_formula
 from hipsta_bids.group.model import Design, Groups, build_design
 from hipsta_bids.group.settings import GroupSettings
+from hipsta_bids.progress import tell
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -118,13 +119,15 @@ def classify_groups(
     labels = names.where(names.notna(), "").astype(str).to_numpy(dtype=np.str_)
     results: list[tuple[str, str, PairComparison]] = []
     notes: list[str] = []
-    for hemi in hemispheres(cohort):
+    hemis, added = hemispheres(cohort), settings.classification.added
+    for part, hemi in enumerate(hemis):
         values = summary_values(cohort, hemi)
         if values.columns.empty:
             continue  # other programs' maps have no summaries
         base = _base(cohort, values, settings)
         measured = values.columns[values.notna().any().to_numpy()]
-        for measure in settings.classification.added:
+        for number, measure in enumerate(added, start=part * len(added)):
+            tell("classification", number, len(hemis) * len(added))
             if measure not in measured or measure in settings.classification.base:
                 continue
             try:

@@ -18,6 +18,7 @@ from hipsta_bids.group.analysis import (
 from hipsta_bids.group.classify import ClassifierResult, roc_curve
 from hipsta_bids.group.clusters import edges_of, frame_of, peak_table
 from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort
+from hipsta_bids.group.registration import ShiftDifference
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.summaries import hemispheres, summary_values
 
@@ -68,6 +69,8 @@ COLUMNS: Mapping[str, str] = {
     "file": "name of the files with this map, without suffix",
     "n_tests": "points tested in the family",
     "n_significant": "points of the map that survive",
+    "n_unregistered": "points that survive if the maps are not registered",
+    "n_both": "points that survive either way",
     "p_cutoff": "largest p-value that survives; below all if none does; n/a if clusters decide",
     "lenient": "true where p-values above the level survive, as they may with widespread effects",
     "group": "group",
@@ -81,6 +84,9 @@ COLUMNS: Mapping[str, str] = {
     "explained_after": "the same after registration",
     "iterations": "turns of template and warps",
     "converged": "whether warps had settled",
+    "difference": "largest difference of mean displacement between two groups, grid nodes",
+    "difference_node": "node along x where it is",
+    "difference_p": "p-value of the difference, corrected for all nodes by permutations of people",
     "displacement": "root mean square of warp minus identity, grid nodes",
     "extreme": "true where the displacement is out of line with the others",
     "control": "first group of the pair",
@@ -153,11 +159,7 @@ def result_tables(cohort: Cohort, analysis: Analysis, settings: GroupSettings) -
     if analysis.found:
         yield "maps", _overview(analysis)
     if analysis.sides:
-        yield "registration", _registration(analysis)
-        yield "warps", _stacked(_warps(cohort, analysis))
-        yield "profiles", _stacked(_profiles(cohort, analysis))
-        if grouped:
-            yield "shifts", _stacked(_shifts(analysis))
+        yield from _registration_tables(cohort, analysis)
     if analysis.measures:
         yield "measures", _stacked(_measures(cohort, analysis))
         if grouped:
@@ -356,6 +358,16 @@ def _descriptives(analysis: Analysis) -> Iterator[Columns]:
             }
 
 
+def _registration_tables(cohort: Cohort, analysis: Analysis) -> Iterator[Named]:
+    yield "registration", _registration(analysis)
+    if analysis.unregistered:
+        yield "alignment", _alignment(analysis)
+    yield "warps", _stacked(_warps(cohort, analysis))
+    yield "profiles", _stacked(_profiles(cohort, analysis))
+    if analysis.groups is not None:
+        yield "shifts", _stacked(_shifts(analysis))
+
+
 def _registration(analysis: Analysis) -> pd.DataFrame:
     return pd.DataFrame(
         [
@@ -366,10 +378,37 @@ def _registration(analysis: Analysis) -> pd.DataFrame:
                 "explained_after": side.registration.explained_after,
                 "iterations": side.registration.iterations,
                 "converged": side.registration.converged,
+                **_difference(side.difference),
             }
             for hemi, side in analysis.sides.items()
         ]
     )
+
+
+def _difference(found: ShiftDifference | None) -> Columns:
+    if found is None:
+        return {}
+    return {"difference": found.largest, "difference_node": found.node + 1, "difference_p": found.p}
+
+
+def _alignment(analysis: Analysis) -> pd.DataFrame:
+    """One row per map: points that survive with and without registration."""
+    rows = []
+    for key, found in analysis.found.items():
+        other = analysis.unregistered.get(key)
+        if other is not None:
+            rows.append(
+                {
+                    "measure": key.measure,
+                    "contrast": key.contrast,
+                    "hemi": key.hemi,
+                    "n_tests": found.n_tests,
+                    "n_significant": int(found.rejected.sum()),
+                    "n_unregistered": int(other.rejected.sum()),
+                    "n_both": int((found.rejected & other.rejected).sum()),
+                }
+            )
+    return pd.DataFrame(rows)
 
 
 def _warps(cohort: Cohort, analysis: Analysis) -> Iterator[Columns]:

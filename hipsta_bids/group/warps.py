@@ -48,13 +48,14 @@ class Template:
     knots: Float
     """Inner knots on 0..1, medial to lateral."""
     mean: Float
-    """(splines,) coefficients, in units of ``scale``."""
+    """(splines,) coefficients, in units of ``scale`` or of each profile's standard deviation."""
     components: Float
     """(splines, components), times scores of variance 1."""
     noise: float
-    """Variance of what is left, in squares of ``scale``."""
-    scale: float
-    """Standard deviation of the profiles that made it, in their unit."""
+    """Variance of what is left, in squares of the same."""
+    scale: float | None
+    """Standard deviation of the profiles that made it, in their unit; None where each profile
+    was standardized by its own mean and standard deviation."""
     align: str
     """How it was made."""
     warp_variance: float
@@ -64,10 +65,6 @@ class Template:
     center: Float
     """(nodes,) mean warp of the subjects that made it, when they are registered to it as new ones
     are; warps are followed by its inverse."""
-
-    def curves(self, at: Float) -> Float:
-        """Mean profile at coordinates 0..1, in the profiles' unit."""
-        return np.asarray(make_basis(self.knots)(at) @ self.mean, dtype=np.float64) * self.scale
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ from hipsta_bids.group.tables import (
 )
 from hipsta_bids.group.warps import templates_to_json
 from hipsta_bids.io import files, gifti
+from hipsta_bids.progress import tell
 
 #: Folder of all models, in the output dataset.
 GROUP_FOLDER = DATASET_FILES["group"]
@@ -88,6 +89,7 @@ def write_results(
     *,
     others: Mapping[str, tuple[Cohort, Analysis]],
     region: str = "body",
+    ratings: Mapping[str, int] | None = None,
 ) -> None:
     """Write tables, maps and text."""
     for name, table in result_tables(cohort, analysis, settings):
@@ -116,7 +118,13 @@ def write_results(
         _write_gifti(folder, *one)
         _write_scores(folder, *one)
     text = methods_text(
-        cohort, analysis, settings, len(exclusions), others=tuple(others), region=region
+        cohort,
+        analysis,
+        settings,
+        len(exclusions),
+        others=tuple(others),
+        region=region,
+        ratings=ratings,
     )
     files.write_text(folder / "methods.md", text)
 
@@ -130,8 +138,10 @@ def draw(
     others: Mapping[str, tuple[Cohort, Analysis]],
 ) -> None:
     """Draw the figures."""
+    tell("figures")
     for one in ((cohort, analysis, shapes), *((*one, {}) for one in others.values())):
-        for name, content in draw_figures(*one):
+        for number, (name, content) in enumerate(draw_figures(*one), start=1):
+            tell("figures", number)
             files.write_bytes(folder / "figures" / name, content)
 
 

@@ -17,6 +17,7 @@ from hipsta_bids.errors import HipstaError, OutputError
 from hipsta_bids.io import files
 from hipsta_bids.participant.cluster import Cluster, run_on_cluster
 from hipsta_bids.participant.pool import WorkerLost, WorkerPlan, run_jobs
+from hipsta_bids.progress import tell
 from hipsta_bids.reports.cohort import Cohort, read_cohort
 from hipsta_bids.types import VisitKey
 
@@ -98,8 +99,10 @@ def write_reports(plan: PagePlan, visits: Iterable[VisitKey]) -> Iterator[Proble
         found = run_jobs(workers, jobs)
     else:
         found = run_on_cluster(plan.cluster, workers, jobs)
+    tell("pages", 0, len(jobs))
     with contextlib.closing(found) as pages:
-        for job, answer in pages:
+        for done, (job, answer) in enumerate(pages, start=1):
+            tell("pages", done, len(jobs))
             problem = answer
             if isinstance(answer, WorkerLost):
                 cause = "took too long" if answer.timed_out else f"process died: {answer.cause}"

@@ -8,7 +8,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from hipsta_bids.errors import UsageError
+from hipsta_bids.errors import UsageError, did_you_mean
 from hipsta_bids.io import files
 from hipsta_bids.phantom.dataset import (
     Hemisphere,
@@ -104,7 +104,8 @@ class CohortPlan:
         for name, value, known in (("region", self.region, REGIONS), ("kind", self.kind, KINDS)):
             if value not in known:
                 raise UsageError(
-                    f"phantom: {name} {value!r} is unknown; choose from {', '.join(known)}",
+                    f"phantom: {name} {value!r} is unknown; choose from {', '.join(known)}"
+                    f"{did_you_mean([value], known)}",
                     reason="phantom-region" if name == "region" else "phantom-setting",
                 )
         problem = None

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hipsta_bids import __version__
-from hipsta_bids.errors import SettingsError, UsageError
+from hipsta_bids.errors import SettingsError, UsageError, did_you_mean
 from hipsta_bids.io import files
 from hipsta_bids.phantom.labels import encode
 from hipsta_bids.phantom.phantom import Phantom
@@ -118,7 +118,8 @@ def write_dataset(
     unknown = [name for name in layouts if name not in LAYOUTS]
     if unknown:
         raise SettingsError(
-            f"phantom: layout {unknown[0]!r} is unknown; choose from {', '.join(LAYOUTS)}",
+            f"phantom: layout {unknown[0]!r} is unknown; choose from {', '.join(LAYOUTS)}"
+            f"{did_you_mean(unknown, LAYOUTS)}",
             reason="phantom-setting",
         )
     if any(item.spec.cortex for item in hemispheres):

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 from scipy.special import erf
 
-from hipsta_bids.errors import SettingsError
+from hipsta_bids.errors import SettingsError, did_you_mean
 from hipsta_bids.types import Float
 
 #: rad, direction in which the curve leaves its medial end, against the lateral direction. The
@@ -178,7 +178,8 @@ class PhantomSpec:
 def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
     if value not in choices:
         raise SettingsError(
-            f"phantom: {name} {value!r} is unknown; choose one of {', '.join(choices)}",
+            f"phantom: {name} {value!r} is unknown; choose one of {', '.join(choices)}"
+            f"{did_you_mean([value], choices)}",
             reason="phantom-setting",
         )
 

@@ -2,8 +2,9 @@
 
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ from hipsta_bids.io import files
 from hipsta_bids.reports.maps import make_sprites, read_maps
 from hipsta_bids.reports.page import number, render
 from hipsta_bids.reports.results import Hemisphere, find_results
+from hipsta_bids.reports.verdict import RATINGS, Verdict, verdict_of
+from hipsta_bids.settings import Settings
 from hipsta_bids.types import Float, Status
 
 #: Least number of hemispheres whose range is shown.
@@ -104,6 +107,20 @@ class Cohort:
     def origin(self, hemisphere: Hemisphere) -> Origin | None:
         """Find the run that measured a hemisphere, if its log is there."""
         return self.origins.get(title_of(hemisphere.place.name))
+
+    @cached_property
+    def verdicts(self) -> Mapping[str, Verdict]:
+        """What each hemisphere's page says first, by title of the hemisphere."""
+        checks = Settings().checks.model_dump() | dict(self.settings.get("checks") or {})
+        return {
+            title_of(h.place.name): verdict_of(h, checks["flag_reach"]) for h in self.hemispheres
+        }
+
+    @cached_property
+    def ranking(self) -> list[Hemisphere]:
+        """All hemispheres, the most severe first; of equal ones by name."""
+        severity = {title: verdict.severity for title, verdict in self.verdicts.items()}
+        return sorted(self.hemispheres, key=lambda h: -severity[title_of(h.place.name)])
 
     def profiles(self, name: HemisphereName, column: str) -> Float:
         """(N, Nx) means over y of a map, of all hemispheres of the same kind."""
@@ -219,7 +236,7 @@ def _departure(maps: Float) -> Float:
 
 def cohort_page(cohort: Cohort) -> str | None:
     """Make the page about all hemispheres of an output dataset."""
-    hemispheres = cohort.hemispheres
+    hemispheres = cohort.ranking
     if not hemispheres:
         return None
     maps = [read_maps(h) if h.measured else {} for h in hemispheres]
@@ -229,11 +246,12 @@ def cohort_page(cohort: Cohort) -> str | None:
         if found
     }
     apart = distances(cohort, thickness)
-    sprites, grid = make_sprites(hemispheres, maps)
+    sprites, grid = make_sprites(maps)
     counts = Counter(str(h.status) for h in hemispheres)
     rows = [
-        _row(h, apart.get(title_of(h.place.name)), grid.tiles.get(n))
+        _row(h, cohort.verdicts[title], apart.get(title), grid.tiles.get(n))
         for n, h in enumerate(hemispheres)
+        for title in [title_of(h.place.name)]
     ]
     return render(
         "cohort.html",
@@ -250,10 +268,12 @@ def cohort_page(cohort: Cohort) -> str | None:
         smallest=SMALLEST_COMPARED,
         compared=bool(apart),
         sprites=sprites,
+        ratings=RATINGS,
         data={
             "columns": _columns(hemispheres),
             "rows": rows,
             "apart": OUTLIER,
+            "ratings": RATINGS,
             "grid": {
                 "columns": grid.columns,
                 "rows": grid.rows,
@@ -263,7 +283,7 @@ def cohort_page(cohort: Cohort) -> str | None:
     )
 
 
-def _columns(hemispheres: tuple[Hemisphere, ...]) -> list[Mapping[str, Any]]:
+def _columns(hemispheres: Sequence[Hemisphere]) -> list[Mapping[str, Any]]:
     """Columns of the table; those of one value throughout are left out."""
     names = [h.place.name for h in hemispheres]
     measures = {measure.name: measure for measure in MEASURES}
@@ -276,6 +296,15 @@ def _columns(hemispheres: tuple[Hemisphere, ...]) -> list[Mapping[str, Any]]:
     if len({name.region for name in names}) > 1:
         columns.append({"key": "region", "title": "Region"})
     columns += [
+        {
+            "key": "severity",
+            "title": "Severity",
+            "digits": 1,
+            "help": "mm by which the mean thickness could be off times % of the map that could be"
+            " wrong; from 1 on look before use; 100 is not measured",
+        },
+        {"key": "verdict", "title": "Verdict"},
+        {"key": "rating", "title": "Rating"},
         {"key": "status", "title": "Status"},
         {"key": "reason", "title": "Reason"},
         {
@@ -295,17 +324,25 @@ def _columns(hemispheres: tuple[Hemisphere, ...]) -> list[Mapping[str, Any]]:
     return columns
 
 
-def _row(hemisphere: Hemisphere, distance: Distance | None, tile: int | None) -> dict[str, Any]:
+def _row(
+    hemisphere: Hemisphere, verdict: Verdict, distance: Distance | None, tile: int | None
+) -> dict[str, Any]:
     name, record = hemisphere.place.name, hemisphere.record
     numbers = {key: hemisphere.summary.get(key, np.nan) for key in _SHOWN}
     numbers |= {key: number(hemisphere.metrics, key) for key in _QUALITY}
     return {
+        "key": title_of(name),
         "page": participant_report(name.subject, name.session),
+        "hash": record.get("input_hash") or "",
         "participant": f"sub-{name.subject}",
         "session": f"ses-{name.session}" if name.session else None,
         "hemi": name.hemi,
         "seg": name.seg,
         "region": name.region,
+        "severity": verdict.severity,
+        "verdict": verdict.title,
+        "kind": verdict.kind,
+        "because": f"{verdict.reason} {verdict.consequence}",
         "status": str(hemisphere.status),
         "reason": record.get("reason") or "",
         "message": hemisphere.message,
@@ -316,7 +353,7 @@ def _row(hemisphere: Hemisphere, distance: Distance | None, tile: int | None) ->
     }
 
 
-def _aspect(hemispheres: tuple[Hemisphere, ...]) -> float:
+def _aspect(hemispheres: Sequence[Hemisphere]) -> float:
     """Median length over width of the sheets."""
     ratios = [
         h.summary["extent_y"] / h.summary["extent_x"]

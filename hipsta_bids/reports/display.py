@@ -1,7 +1,7 @@
 """How values look, the same on all pages and figures: color scales, palettes, and orientation."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,10 +48,18 @@ class MapKind:
     centered: bool
     """Whether zero means something, and has the middle of the colors."""
     digits: int
-    percentiles: tuple[float, float]
-    """Values at the ends of the colors, so that a few points at the edges may saturate."""
+    limits: tuple[float, float] | None = None
+    """Values at the ends of the colors, the same on all pages and figures; beyond them colors
+    stay as they are there. ``None`` where a measure has no usual range."""
+    percentiles: tuple[float, float] = (1, 99)
+    """Of the values that are shown, at the ends of the colors of kinds without limits."""
 
 
+#: Limits are fixed, not taken from the hemispheres at hand: a page may be written before the others
+#: are measured, and a color has to mean the same on all. Protocols share them, since they differ
+#: little: in the three brains of Winterburn et al. (2013, doi:10.1016/j.neuroimage.2013.02.003),
+#: drawn by hand, given as FreeSurfer and ASHS write labels, 98 % of the points lie between 0.6 and
+#: 3.0 mm.
 THICKNESS = MapKind(
     column="thickness",
     title="Thickness",
@@ -59,9 +67,10 @@ THICKNESS = MapKind(
     colors="viridis",
     centered=False,
     digits=2,
-    percentiles=(1, 99),
+    limits=(0.5, 3.0),
 )
-#: Zero is flat; the sign tells which way the sheet curls.
+#: Zero is flat; the sign tells which way the sheet curls. In the same brains 98 % of the points of
+#: the mid-surface lie within 0.4 1/mm; the walls, which share the limits, reach farther.
 CURVATURE = MapKind(
     column="curvature",
     title="Mean curvature",
@@ -69,10 +78,11 @@ CURVATURE = MapKind(
     colors="RdBu_r",
     centered=True,
     digits=3,
+    limits=(-0.5, 0.5),
     percentiles=(4, 96),
 )
 MAP_KINDS = (THICKNESS, CURVATURE)
-#: Drawn where it was estimated (``--uncertainty``).
+#: Drawn where it was estimated (``--uncertainty``); in phantoms it is about 0.1 mm.
 UNCERTAINTY = MapKind(
     column="thickness_sd",
     title="SD of thickness",
@@ -80,7 +90,7 @@ UNCERTAINTY = MapKind(
     colors="magma",
     centered=False,
     digits=2,
-    percentiles=(1, 99),
+    limits=(0.0, 0.3),
 )
 #: Of any measure, between two visits or sides.
 _CHANGE = MapKind(
@@ -89,10 +99,17 @@ _CHANGE = MapKind(
 
 
 def kind_of(measure: str, *, change: bool = False) -> MapKind:
-    """Choose how a measure of the group level is shown: as on the pages of participants."""
+    """Choose how a measure of the group level is shown: as on the pages of participants.
+
+    Limits are those of thickness and of mean curvature; other measures have other units.
+    """
     if change:
         return _CHANGE
-    return CURVATURE if "curvature" in measure else THICKNESS
+    if measure == THICKNESS.column:
+        return THICKNESS
+    if "curvature" in measure:
+        return replace(CURVATURE, limits=None) if "gaussian" in measure else CURVATURE
+    return replace(THICKNESS, limits=None)
 
 
 def known(values: Sequence[Float]) -> Float:
@@ -102,7 +119,9 @@ def known(values: Sequence[Float]) -> Float:
 
 
 def scale_of(kind: MapKind, values: Sequence[Float]) -> tuple[float, float]:
-    """Choose the values at both ends of the colors; any where nothing is known."""
+    """Return the values at both ends of the colors: fixed ones, or from the values shown."""
+    if kind.limits is not None:
+        return kind.limits
     every = known(values)
     low, high = np.percentile(every, kind.percentiles).tolist() if len(every) else (-1.0, 1.0)
     if kind.centered:

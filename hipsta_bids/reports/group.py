@@ -20,17 +20,20 @@ from hipsta_bids.io.files import hide_home
 from hipsta_bids.reports.display import DESIGN_COLORS, colors_of
 from hipsta_bids.reports.group_maps import embedded, map_scenes
 from hipsta_bids.reports.group_tables import (
+    SIDES,
     GroupResults,
     classification,
     display_name,
     findings,
     number_text,
+    p_text,
     participants,
     peaks,
     read_group,
-    registration,
+    records,
     scores,
     summaries,
+    visit_of,
 )
 from hipsta_bids.reports.page import Section, build_sections, render
 
@@ -169,9 +172,61 @@ def _classification(results: GroupResults) -> Mapping[str, Any] | None:
     }
 
 
+def _registered(results: GroupResults) -> dict[str, Any] | None:
+    """List what registration explains, and sheets whose warps are outliers."""
+    table = results.table("registration")
+    if not len(table):
+        return None
+    warps = results.table("warps")
+    extreme = warps[warps["extreme"] == True] if len(warps) else warps  # noqa: E712  (may be text)
+    if len(extreme):
+        extreme = extreme.sort_values("displacement", ascending=False)
+    settings = (results.record.get("settings") or {}).get("registration") or {}
+    return {
+        "align": settings.get("align"),
+        "rows": [
+            {
+                "side": SIDES[row["hemi"]],
+                "n": row["n"],
+                "before": f"{row['explained_before']:.0%}",
+                "after": f"{row['explained_after']:.0%}",
+                "converged": bool(row["converged"]),
+                "difference": _moved(row),
+            }
+            for row in records(table)
+        ],
+        "alignment": [
+            {
+                "map": f"{display_name(row['measure'])}, {SIDES[row['hemi']]}: {row['contrast']}",
+                "with": row["n_significant"],
+                "without": row["n_unregistered"],
+                "both": row["n_both"],
+                "of": row["n_tests"],
+            }
+            for row in records(results.table("alignment"))
+        ],
+        "extreme": [
+            {
+                "who": visit_of(row),
+                "side": SIDES[row["hemi"]],
+                "displacement": f"{row['displacement']:.1f}",
+            }
+            for row in records(extreme)
+        ],
+    }
+
+
+def _moved(row: Mapping[str, Any]) -> str:
+    """Say by how much groups are displaced differently, where that was tested."""
+    value = row.get("difference")
+    if value is None or not np.isfinite(value):
+        return ""
+    return f"{value:.2f} nodes (p {p_text(row['difference_p'])})"
+
+
 def _registration(results: GroupResults) -> Mapping[str, Any] | None:
     """Describe what registration has done, with the profiles before and after it, and warps."""
-    values = registration(results)
+    values = _registered(results)
     if values is None:
         return None
     profiles = "Means of groups from medial to lateral, before and after registration"

@@ -375,6 +375,7 @@ def participants(results: GroupResults) -> Mapping[str, Any]:
             {"title": name, "cells": [_described(part[name], people[name]) for part in members]}
             for name in _variables(results, people, column)
         ],
+        "ratings": list((results.record.get("ratings") or {}).items()),
         "reasons": [(str(reason).replace("-", " "), n) for reason, n in reasons],
         "excluded": records(excluded.fillna("").head(_MOST_ROWS)),
         "more": max(0, len(excluded) - _MOST_ROWS),
@@ -463,40 +464,7 @@ def classification(results: GroupResults) -> list[dict[str, Any]]:
     ]
 
 
-def registration(results: GroupResults) -> dict[str, Any] | None:
-    """List what registration explains, and sheets whose warps are outliers."""
-    table = results.table("registration")
-    if not len(table):
-        return None
-    warps = results.table("warps")
-    extreme = warps[warps["extreme"] == True] if len(warps) else warps  # noqa: E712  (may be text)
-    if len(extreme):
-        extreme = extreme.sort_values("displacement", ascending=False)
-    settings = (results.record.get("settings") or {}).get("registration") or {}
-    return {
-        "align": settings.get("align"),
-        "rows": [
-            {
-                "side": SIDES[row["hemi"]],
-                "n": row["n"],
-                "before": f"{row['explained_before']:.0%}",
-                "after": f"{row['explained_after']:.0%}",
-                "converged": bool(row["converged"]),
-            }
-            for row in records(table)
-        ],
-        "extreme": [
-            {
-                "who": _visit(row),
-                "side": SIDES[row["hemi"]],
-                "displacement": f"{row['displacement']:.1f}",
-            }
-            for row in records(extreme)
-        ],
-    }
-
-
-def _visit(row: Mapping[str, Any]) -> str:
+def visit_of(row: Mapping[str, Any]) -> str:
     """Name a participant, and the session if there is one."""
     return " ".join(row[name] for name in _IDS if isinstance(row[name], str))
 
@@ -537,7 +505,7 @@ def _far(table: pd.DataFrame) -> Iterator[dict[str, str]]:
     far = far.reindex(far["w"].abs().sort_values(ascending=False, kind="stable").index)
     for row in records(far.head(_MOST_ROWS)):
         yield {
-            "who": _visit(row),
+            "who": visit_of(row),
             "measure": display_name(row["measure"]),
             "side": summary_side(row["hemi"], row["measure"]),
             "w": number_text(row["w"]),

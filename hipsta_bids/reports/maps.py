@@ -31,7 +31,7 @@ from hipsta_bids.reports.display import (
     scale_of,
 )
 from hipsta_bids.reports.results import SIDES, Hemisphere, SheetTable
-from hipsta_bids.types import Float, Status
+from hipsta_bids.types import Float
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -324,10 +324,8 @@ def read_maps(hemisphere: Hemisphere) -> dict[str, Float]:
         return {}
 
 
-def make_sprites(
-    hemispheres: Sequence[Hemisphere], maps: Sequence[Mapping[str, Float]]
-) -> tuple[list[Sprites], Grid]:
-    """Draw the maps of all hemispheres."""
+def make_sprites(maps: Sequence[Mapping[str, Float]]) -> tuple[list[Sprites], Grid]:
+    """Draw the maps of all hemispheres; those that have none are empty."""
     shapes = [found[MAP_KINDS[0].column].shape for found in maps if found]
     usual = max(set(shapes), key=shapes.count) if shapes else (0, 0)
     shown = [
@@ -339,11 +337,9 @@ def make_sprites(
         tiles={row: tile for tile, row in enumerate(shown)},
     )
     step = 1 if len(shown) <= _FULL_SIZE else 2
-    trusted = [row for row in shown if hemispheres[row].status != Status.FLAGGED] or shown
     sprites = []
     for kind in MAP_KINDS if shown else ():
-        # Flagged hemispheres may be far off; they must not stretch the colors of all others.
-        scale = scale_of(kind, [maps[row][kind.column] for row in trusted])
+        scale = scale_of(kind, [maps[row][kind.column] for row in shown])
         tiles = [maps[row][kind.column][::step, ::step] for row in shown]
         sprites.append(_sprites(kind, tiles, grid, scale))
     return sprites, grid

@@ -1,4 +1,4 @@
-"""What pages say and how they are made: reasons, verdicts, usual ranges, and templates.
+"""What pages say and how they are made: reasons, usual ranges, and templates.
 
 A page is one file that asks for nothing from outside.
 """
@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 from hipsta_bids import __version__
 from hipsta_bids.reports.display import ORIENTATION
 from hipsta_bids.settings import Settings
-from hipsta_bids.types import Status
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -97,6 +96,8 @@ def _environment() -> "Environment":
 class Reason:
     """What a machine-readable reason means, and what to do about it."""
 
+    action: str
+    """What kind of thing to do, a key of :func:`reason_actions`."""
     meaning: str
     remedy: str
 
@@ -114,42 +115,26 @@ class ReasonSection:
 @cache
 def reason_sections() -> tuple[ReasonSection, ...]:
     """Read the table of all reasons, in the order of the reference page."""
-    text = (files("hipsta_bids.reports") / "reasons.toml").read_text(encoding="utf-8")
     return tuple(
         ReasonSection(
             title=section["title"],
             text=section["text"],
             reasons={name: Reason(**row) for name, row in section["reasons"].items()},
         )
-        for section in tomllib.loads(text)["section"]
+        for section in _reason_table()["section"]
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Verdict:
-    """How a hemisphere ended, for a reader who decides about its use."""
-
-    title: str
-    advice: str
+def reason_actions() -> Mapping[str, str]:
+    """Titles of what to do, in the order of the reference page, by the keys that reasons name."""
+    actions: Mapping[str, str] = _reason_table()["actions"]
+    return actions
 
 
-VERDICTS: Mapping[Status, Verdict] = {
-    Status.OK: Verdict(title="Measured", advice="Nothing stood out. It can be used as it is."),
-    Status.REPAIRED: Verdict(
-        title="Measured after repair",
-        advice="Small defects of the labels were repaired. Look at the points below; if the repair"
-        " fits, it can be used.",
-    ),
-    Status.FLAGGED: Verdict(
-        title="Look before use",
-        advice="It was measured, but something is doubtful. Look at the points below, then use it,"
-        " correct it, or leave it out.",
-    ),
-    Status.FAILED: Verdict(
-        title="Not measured",
-        advice="There are no maps. The cause and what to try are below.",
-    ),
-}
+@cache
+def _reason_table() -> dict[str, Any]:
+    text = (files("hipsta_bids.reports") / "reasons.toml").read_text(encoding="utf-8")
+    return tomllib.loads(text)
 
 
 @dataclass(frozen=True, kw_only=True)

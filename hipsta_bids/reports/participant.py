@@ -1,6 +1,5 @@
 """The page about one visit: is this hemisphere usable, and what went wrong."""
 
-import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -11,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hipsta_bids.derivatives.names import output_name
 from hipsta_bids.reports.cohort import MEASURES, SMALLEST_COHORT, Cohort, Measure
 from hipsta_bids.reports.display import (
     MAP_KINDS,
@@ -24,7 +22,7 @@ from hipsta_bids.reports.display import (
     subfield_title,
 )
 from hipsta_bids.reports.maps import draw_map, draw_profiles
-from hipsta_bids.reports.page import VERDICTS, Section, build_sections, number, render, usual_ranges
+from hipsta_bids.reports.page import Section, build_sections, number, render, usual_ranges
 from hipsta_bids.reports.results import (
     SURFACES,
     Finding,
@@ -34,7 +32,9 @@ from hipsta_bids.reports.results import (
     input_path,
     read_views,
 )
+from hipsta_bids.reports.review import card_of, correction_of
 from hipsta_bids.reports.slices import point_panels, section_panels, slice_panels
+from hipsta_bids.reports.verdict import RATINGS
 from hipsta_bids.types import Float, Status
 
 # Data of the three-dimensional view of a page.
@@ -315,20 +315,7 @@ def _time_of(hemisphere: Hemisphere, cohort: Cohort) -> str:
 
 
 def _status(series: Series) -> Mapping[str, Any]:
-    return {
-        "cards": [
-            {
-                "side": h.side,
-                "status": str(h.status),
-                "verdict": VERDICTS[h.status],
-                "findings": h.findings,
-                "reason": h.record.get("reason"),
-                "notes": h.record.get("notes") or [],
-                "edited": [str(e.get("what")) for e in h.record.get("edited") or []],
-            }
-            for h in series.hemispheres
-        ]
-    }
+    return {"cards": [card_of(h, series.cohort) for h in series.hemispheres], "ratings": RATINGS}
 
 
 def _points(series: Series) -> Mapping[str, Any] | None:
@@ -459,28 +446,7 @@ def _cohort_profiles(series: Series, column: str) -> dict[str, Float]:
 def _correct(series: Series) -> Mapping[str, Any] | None:
     """How to correct what was measured; nothing if all is well."""
     wanted = [h for h in series.hemispheres if h.status != Status.OK]
-    if not wanted:
-        return None
-    first = wanted[0].place.name
-    choices = []
-    for hemisphere in wanted:
-        name = hemisphere.place.name
-        mask = hemisphere.place.path("body_mask")
-        path = input_path(hemisphere)
-        suffix = f"{name.stem}_{name.protocol}_desc-edited"
-        choices.append(
-            {
-                "side": hemisphere.side,
-                "labels": path.name if path else None,
-                "edited_labels": f"{suffix}_dseg.nii.gz",
-                "mask": output_name(name, "body_mask") if mask.exists() else None,
-                "edited_mask": f"{suffix}_mask.nii.gz",
-            }
-        )
-    command = ["hipsta-bids", "BIDS_DIR", "OUT_DIR", "participant", "--edited-dir", "EDITS"]
-    command += ["--participant-label", first.subject]
-    folder = f"EDITS/{first.folder}"
-    return {"choices": choices, "folder": folder, "command": shlex.join(command)}
+    return correction_of(wanted) if wanted else None
 
 
 def _origin(series: Series) -> Mapping[str, Any]:
@@ -507,7 +473,7 @@ def _origin(series: Series) -> Mapping[str, Any]:
 SECTIONS: tuple[Section[Series], ...] = tuple(
     Section(key=key, title=title, template=f"sections/{key}.html", build=build)
     for key, title, build in (
-        ("status", "Status", _status),
+        ("status", "Verdict", _status),
         ("points", "Where to look", _points),
         ("numbers", "Key numbers", _key_numbers),
         ("input", "Labels and body", _input),

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from hipsta_bids.io.volumes import LabelImage, read_labels
 from hipsta_bids.protocols.load import load_protocol, protocol_names
 from hipsta_bids.protocols.protocol import Protocol
 from hipsta_bids.reports.display import palette
+from hipsta_bids.reports.page import number
 from hipsta_bids.types import Bool, Float, Status
 
 SURFACES = ("interior", "midthickness", "exterior")
@@ -49,6 +50,12 @@ class Finding:
     message: str
     point: tuple[float, float, float] | None
     """RAS mm, where the message names a point."""
+    reason: str = ""
+    """Of a flag."""
+    share: float = float("nan")
+    """Share of the columns concerned, as far as the record of a flag says."""
+    change: float = float("nan")
+    """By how much they raise the mean thickness, mm, likewise."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -119,7 +126,15 @@ class Hemisphere:
         """What stopped it, or what is doubtful about it, and what was repaired."""
         if not self.measured:
             return (_finding("failure", self.message or "no message"),)
-        flags = [_finding("flag", str(f["message"])) for f in self.record.get("flags") or []]
+        flags = [
+            replace(
+                _finding("flag", str(flag["message"])),
+                reason=str(flag.get("reason")),
+                share=number(flag, "columns_share"),
+                change=number(flag, "mean_change_mm"),
+            )
+            for flag in self.record.get("flags") or []
+        ]
         repairs = [_finding("repair", str(r)) for r in self.record.get("repairs") or []]
         # A large repair is also a flag.
         said = tuple(finding.message for finding in flags)

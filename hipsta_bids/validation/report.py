@@ -1,6 +1,7 @@
 """Validation suites: their tables with targets, their figures, and the page ``validation.md``."""
 
 import platform
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
@@ -11,7 +12,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from hipsta_bids import __version__
-from hipsta_bids.errors import UsageError
+from hipsta_bids.errors import UsageError, did_you_mean
 from hipsta_bids.io import files
 from hipsta_bids.reports.maps import new_figure
 from hipsta_bids.types import Float
@@ -53,11 +54,33 @@ WITH_LABELS = frozenset(
     }
 )
 
+#: What each suite asks, as the sentence that would hold if all its targets were met.
+QUESTIONS: Mapping[str, str] = MappingProxyType(
+    {
+        "accuracy": "Drawn shapes get the thickness, curvature, volume and areas that they have",
+        "limits": "Sheets too thin for their voxels are measured, or refused with the reason",
+        "slices": "Thick slices give the maps of full resolution",
+        "ends": "The ends of the body are found without labels of head and tail",
+        "convergence": "The error falls with the voxel size",
+        "invariance": "Position, axis order and mirroring leave a map as it is",
+        "uncertainty": "The SD from perturbed copies is that over positions",
+        "mending": "Labels that were mended are measured as undamaged ones",
+        "defects": "Damage is repaired rightly, flagged or refused",
+        "population": "Flags spare sound hemispheres, and find damaged ones, of other brains",
+        "group": "Tests of the group level hold their level, and find a planted effect",
+        "surrogate": "Thickness without a mesh agrees with that of the mesh",
+        "hippunfold": "Thickness agrees with HippUnfold's own",
+    }
+)
+
 #: What is written, below the output folder.
 PAGE = "validation.md"
 IMAGES = "images"
 
 _DPI = 100
+#: Missed targets of a table that are named; of more the number is said.
+_NAMED = 3
+_MET, _MISSED = "#0072b2", "#e69f00"  # told apart also by those who see no red or no green
 _LIBRARIES = ("numpy", "scipy", "scikit-image", "lapy", "tetgen")
 
 #: A float is shown with the table's number of digits, a bool as met or missed, None as n/a.
@@ -99,6 +122,24 @@ class Table:
         """Number of targets: cells that are True or False."""
         return sum(isinstance(cell, bool) for row in self.rows for cell in row.values())
 
+    @property
+    def misses(self) -> list[str]:
+        """Name the rows with missed targets, by as many first cells as tell rows apart."""
+        cells = [[show(row.get(name), self.digits) for name in self.columns] for row in self.rows]
+        size = next(
+            (
+                n
+                for n in range(1, len(self.columns))
+                if len({*(tuple(c[:n]) for c in cells)}) == len(cells)
+            ),
+            1,
+        )
+        return [
+            ", ".join(c[:size])
+            for c, row in zip(cells, self.rows, strict=True)
+            if False in (cell for cell in row.values() if isinstance(cell, bool))
+        ]
+
 
 @dataclass(frozen=True, kw_only=True)
 class Picture:
@@ -131,6 +172,16 @@ class Suite:
     tables: tuple[Table, ...] = ()
     pictures: tuple[Picture, ...] = ()
 
+    @property
+    def targets(self) -> int:
+        """Number of targets of all tables."""
+        return sum(table.targets for table in self.tables)
+
+    @property
+    def missed(self) -> int:
+        """Number of targets that were missed."""
+        return sum(table.missed for table in self.tables)
+
 
 def run_suite(name: str, *, full: bool, labels: Path | None = None) -> Suite:
     """Run one suite."""
@@ -151,7 +202,8 @@ def validate(
     unknown = [name for name in names if name not in SUITES]
     if unknown:
         raise UsageError(
-            f"validate: suite {unknown[0]!r} is unknown; choose from {', '.join(SUITES)}",
+            f"validate: suite {unknown[0]!r} is unknown; choose from {', '.join(SUITES)}"
+            f"{did_you_mean(unknown, SUITES)}",
             reason="unknown-suite",
         )
     files.check_writable(out)
@@ -159,13 +211,10 @@ def validate(
     for name in names or SUITES:
         suite = run_suite(name, full=full, labels=labels)
         suites.append(suite)
-        targets = sum(table.targets for table in suite.tables)
-        missing = sum(table.missed for table in suite.tables)
-        missed += missing
-        report(f"{suite.title}: {targets - missing} of {targets} targets met")
-    for suite in suites:
-        for picture in suite.pictures:
-            files.write_bytes(out / IMAGES / picture.file, render(picture))
+        missed += suite.missed
+        report(f"{suite.title}: {suite.targets - suite.missed} of {suite.targets} targets met")
+    for picture in (overview(suites), *(p for suite in suites for p in suite.pictures)):
+        files.write_bytes(out / IMAGES / picture.file, render(picture))
     files.write_text(out / PAGE, page(suites, full=full, labels=labels is not None))
     return missed
 
@@ -182,7 +231,7 @@ def page(suites: Sequence[Suite], *, full: bool, labels: bool = False) -> str:
     )
     python = f"Python {platform.python_version()}"
     libraries = ", ".join([python, *(f"{name} {version(name)}" for name in _LIBRARIES)])
-    overview: list[Cells] = [
+    counts: list[Cells] = [
         {
             "suite": suite.title,
             "table": table.title,
@@ -199,11 +248,77 @@ def page(suites: Sequence[Suite], *, full: bool, labels: bool = False) -> str:
     parts = [
         f"<!-- Written by `{command}`; do not edit, run it again. -->",
         "# Validation",
+        opening(suites),
         intro,
-        markdown(Table(title="Overview", rows=overview)),
+        markdown(Table(title="Overview", rows=counts)),
         *(_section(suite) for suite in suites),
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def opening(suites: Sequence[Suite]) -> str:
+    """Say from the tables alone what was asked, what holds, and what does not."""
+    targets, missed = (sum(getattr(s, name) for s in suites) for name in ("targets", "missed"))
+    judged = [suite for suite in suites if suite.targets]
+    holds = [f"{_asked(suite)} ({suite.targets})" for suite in judged if not suite.missed]
+    short = [_shortfall(suite) for suite in judged if suite.missed]
+    total = (
+        f"**{targets - missed} of {targets} targets are met.** Each line is what was asked, with"
+        " its number of targets, and leads to the tables."
+    )
+    parts = [
+        total,
+        *(["What holds:", _bullets(holds)] if holds else []),
+        *(["What does not hold everywhere:", _bullets(short)] if short else []),
+        _figure(overview(suites)),
+    ]
+    return "\n\n".join(parts)
+
+
+def _bullets(lines: Sequence[str]) -> str:
+    return "\n".join(f"- {line}" for line in lines)
+
+
+def _asked(suite: Suite) -> str:
+    anchor = re.sub(r"[^a-z0-9]+", "-", suite.title.lower())
+    return f"[{QUESTIONS.get(suite.name, suite.title)}](#{anchor})"
+
+
+def _shortfall(suite: Suite) -> str:
+    parts = []
+    for table in suite.tables:
+        if table.missed:
+            title = table.title.split(",")[0].split(":")[0]
+            names = table.misses
+            which = f": {'; '.join(names)}" if len(names) <= _NAMED else ""
+            parts.append(f"{title} ({table.missed} of {table.targets}{which})")
+    met = f"{suite.targets - suite.missed} of {suite.targets}"
+    return f"{_asked(suite)}: {met}. Missed: {', '.join(parts)}."
+
+
+def overview(suites: Sequence[Suite]) -> Picture:
+    """Draw the share of targets that each suite meets."""
+    judged = [suite for suite in suites if suite.targets]
+
+    def draw(figure: "Figure") -> None:
+        axis = figure.subplots()
+        for place, suite in enumerate(judged):
+            share = 100 * (1 - suite.missed / suite.targets)
+            axis.barh(place, share, color=_MET)
+            axis.barh(place, 100 - share, left=share, color=_MISSED)
+            axis.text(101, place, f"{suite.targets - suite.missed} of {suite.targets}", va="center")
+        axis.set_yticks(range(len(judged)), [suite.title for suite in judged])
+        axis.invert_yaxis()
+        axis.set_xlim(0, 100)
+        axis.set_xlabel("targets met, percent")
+        axis.spines[["top", "right"]].set_visible(False)
+
+    caption = "Share of targets that are met (blue) and missed (orange), with their numbers."
+    return Picture(name="overview", caption=caption, draw=draw, size=(8.0, 0.6 + 0.3 * len(judged)))
+
+
+def _figure(picture: Picture) -> str:
+    return f"![{picture.caption}]({IMAGES}/{picture.file})\n\n*{picture.caption}*"
 
 
 def _section(suite: Suite) -> str:
@@ -211,10 +326,7 @@ def _section(suite: Suite) -> str:
     if suite.text:
         parts.append(suite.text.strip())
     parts += [markdown(table) for table in suite.tables]
-    parts += [
-        f"![{picture.caption}]({IMAGES}/{picture.file})\n\n*{picture.caption}*"
-        for picture in suite.pictures
-    ]
+    parts += [_figure(picture) for picture in suite.pictures]
     return "\n\n".join(parts)
 
 

@@ -19,7 +19,7 @@ from small_cohorts import (
 from hipsta_bids.cli.main import main
 from hipsta_bids.derivatives.dataset import identity, update_status
 from hipsta_bids.derivatives.names import HemisphereName
-from hipsta_bids.group.collect import is_listed
+from hipsta_bids.group.exclusions import is_listed
 from hipsta_bids.io import files
 
 

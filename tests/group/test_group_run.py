@@ -1,6 +1,7 @@
 """The group level from files to files, on sheets with a planted effect."""
 
 import json
+import re
 import shutil
 
 import numpy as np
@@ -98,6 +99,7 @@ def test_tables_say_what_their_columns_are(results):
         "warps",
         "descriptives",
         "shifts",
+        "alignment",
         "classification",
         "excluded",
         "means",
@@ -113,6 +115,21 @@ def test_tables_say_what_their_columns_are(results):
         assert list(described) == columns, path.name
         unknown = [c for c in columns if c not in COLUMNS and not c.startswith("node_")]
         assert not unknown, path.name
+
+
+def test_findings_are_counted_with_and_without_registration(results):
+    with_it = pd.read_table(results / "alignment.tsv")
+    maps = pd.read_table(results / "maps.tsv")
+    columns = ["measure", "contrast", "hemi", "n_tests", "n_significant"]
+    pd.testing.assert_frame_equal(with_it[columns], maps[columns])
+    assert (with_it.n_both <= with_it[["n_significant", "n_unregistered"]].min(axis=1)).all()
+    # The cohort's groups are apart, so that the maps differ.
+    assert (with_it.n_unregistered != with_it.n_significant).any()
+    moved = pd.read_table(results / "registration.tsv")
+    assert (moved.difference_p < 0.05).all()
+    assert "largest difference of mean displacement between groups" in (
+        (results / "methods.md").read_text()
+    )
 
 
 def test_maps_file_is_typed_and_has_units(results):
@@ -219,7 +236,20 @@ def test_flagged_hemispheres_are_told(dataset, quick, capsys):
     said = capsys.readouterr().out
     assert "note: 1 flagged hemispheres are in it" in said
     assert f"what was done and found: {out / 'group' / 'flagged.html'}\n" in said
+    # The time of each stage, as it ends.
+    timed = re.findall(r"^  ([\w -]+?) +\d+\.\d s$", said, re.MULTILINE)
+    assert timed[:3] == ["reading", "registration", "models"]
+    assert timed[-3:] == ["tables and maps", "figures", "page"]
+    assert len(timed) <= 12
     path.write_bytes(before)
+
+
+def test_a_quiet_run_prints_nothing(dataset, quick, capsys):
+    data, out = dataset
+    options = ["--measures", "thickness_mean", "--no-reports", "--name", "quiet", "-q"]
+    assert main([str(data), str(out), "group", *quick, *options]) == 0
+    assert capsys.readouterr() == ("", "")
+    assert (out / "group" / "quiet" / "measures.tsv").exists()
 
 
 def test_left_out_hemispheres_are_listed_with_the_reason(tmp_path, quick):

@@ -7,7 +7,13 @@ import pytest
 from scipy.optimize import minimize
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.registration import mean_profiles, register, register_to, shift_by_group
+from hipsta_bids.group.registration import (
+    mean_profiles,
+    register,
+    register_to,
+    shift_by_group,
+    shift_difference,
+)
 from hipsta_bids.group.settings import RegistrationSettings
 from hipsta_bids.group.warps import (
     WarpBasis,
@@ -21,8 +27,9 @@ from hipsta_bids.group.warps import (
 
 NODES = 41
 GRID = np.linspace(0, 1, NODES)
-SETTINGS = RegistrationSettings()
-PENALIZED = RegistrationSettings(align="penalized")
+DEFAULT = RegistrationSettings()
+SETTINGS = RegistrationSettings(align="registr", standardize=False)  # as R's
+PENALIZED = RegistrationSettings(align="penalized", standardize=False)
 
 
 def root_mean_square(values):
@@ -169,6 +176,45 @@ def test_shift_between_groups_is_reported():
     assert (shifts["a"].se[8:34] < 0.2).all()
 
 
+def test_curvature_that_is_larger_everywhere_moves_nobody():
+    profiles, warps, group = simulated(100, seed=5)
+    larger = profiles * np.where(group, 1.3, 1.0)[:, None] + 0.05 * group[:, None]
+    truth = warps[group == 1].mean(axis=0) - warps[group == 0].mean(axis=0)
+
+    def bias(settings):
+        found = register(larger, settings).warps
+        moved = found[group == 1].mean(axis=0) - found[group == 0].mean(axis=0)
+        return np.abs(moved - truth).max() * (NODES - 1)
+
+    assert bias(DEFAULT) < 0.1
+    assert bias(SETTINGS) > 0.3  # what the default cures
+    same = register(profiles, DEFAULT)
+    np.testing.assert_allclose(register(larger, DEFAULT).warps, same.warps, atol=1e-6)
+    new = register_to(larger, same.template, DEFAULT)
+    assert root_mean_square(new.warps - same.warps) < 0.2 / (NODES - 1)
+
+
+def test_groups_that_are_moved_apart_are_told_from_those_that_are_not():
+    def tested(shift, seed, people=None, groups=("a", "b")):
+        profiles, _, group = simulated(60, seed=seed, shift=shift)
+        found = register(profiles, DEFAULT)
+        names = np.array(groups)[group]
+        people = np.arange(60) if people is None else people
+        return shift_difference(found, names, people, permutations=199, seed=0)
+
+    apart = tested(2.0, 6)
+    assert apart.p == 1 / 200
+    assert apart.largest == pytest.approx(2.0, abs=0.5)
+    assert 8 < apart.node < 34
+    together = [tested(0.0, seed).p for seed in range(12)]
+    assert sum(p <= 0.05 for p in together) <= 3  # of 12 at .05: more by chance in .2 %
+    assert np.mean(together) > 0.25
+    assert np.isnan(tested(0.0, 6, groups=("a", "a")).p)
+    # Visits are not people: thirty of each group who come ten times are three of each.
+    visits = np.arange(60) % 6
+    assert tested(2.0, 6, people=visits).p > 1 / 200
+
+
 def test_extreme_warp_is_flagged():
     profiles, _, _ = simulated(80, seed=3, spread=0.5)
     profiles[7] = shape(GRID + 6 / (NODES - 1) * np.sin(np.pi * GRID))
@@ -237,6 +283,12 @@ def test_refuses_what_gives_no_template():
     template = register(profiles, SETTINGS).template
     with pytest.raises(ModelError, match="align registr"):
         register_to(profiles, template, PENALIZED)
+    with pytest.raises(ModelError, match="setting of standardize, not true"):
+        register_to(profiles, template, SETTINGS.changed(standardize=True))
+    flat = profiles.copy()
+    flat[4] = 0.1
+    with pytest.raises(ModelError, match="profiles 4 are constant"):
+        register(flat, DEFAULT)
     profiles[3, 3] = np.nan
     for call in (register, lambda p, s: register_to(p, template, s)):
         with pytest.raises(ModelError, match="profiles 3 have"):

@@ -9,11 +9,12 @@ from collections import Counter
 from importlib.resources import files
 
 import pytest
+from reference_pages import reasons_page
 
 from hipsta_bids.cli.group import group_parser
 from hipsta_bids.cli.participant import build_parser
 from hipsta_bids.errors import HipstaError
-from hipsta_bids.reports.page import reason_sections
+from hipsta_bids.reports.page import reason_actions, reason_sections
 from hipsta_bids.types import Flag
 
 ROWS = [(name, row) for section in reason_sections() for name, row in section.reasons.items()]
@@ -31,6 +32,20 @@ def test_an_unknown_reason_is_noticed(kind):
     code = compile(line, str(files("hipsta_bids") / "made_up.py"), "eval")
     with pytest.raises(AssertionError, match="nobody-knows"):
         eval(code, {"HipstaError": HipstaError, "Flag": Flag})  # noqa: S307
+
+
+def test_each_reason_says_what_kind_of_thing_to_do():
+    assert {row.action for _, row in ROWS} == set(reason_actions())
+
+
+def test_the_page_has_each_reason_under_what_to_do():
+    page = reasons_page()
+    for (action, title), following in zip(
+        reason_actions().items(), [*list(reason_actions().values())[1:], "Exit codes"], strict=True
+    ):
+        part = page.split(f"\n## {title}\n")[1].split(f"\n## {following}\n")[0]
+        names = re.findall(r"^#### `(.+)`$", part, re.MULTILINE)
+        assert sorted(names) == sorted(name for name, row in ROWS if row.action == action)
 
 
 def test_the_table_has_no_leftovers():

@@ -1,5 +1,8 @@
 """How pages behave in a real browser; see :mod:`browsing`."""
 
+import json
+import re
+
 import numpy as np
 import pytest
 from browsing import colored, fits, one, open_browser, open_page, pixels, texts, until, watched
@@ -131,15 +134,21 @@ def test_layers_of_the_slices_can_be_hidden(visit):
 
 
 def rows(browser):
-    return texts(browser, "#table tbody tr td:nth-child(2)")
+    return texts(browser, "#table tbody tr td:first-child")
 
 
 def test_the_table_is_filtered_and_sorted_with_the_maps(visit):
     browser = visit("report.html")
-    assert rows(browser) == ["sub-01", "sub-01", "sub-02", "sub-02"]
+    # At first by severity, and equal ones by name.
+    assert rows(browser) == ["sub-02", "sub-02", "sub-01", "sub-01"]
+    assert one(browser, "[data-key=severity]").get_attribute("aria-sort") == "descending"
+    assert texts(browser, "#table .badge.refuse, #table .badge.look, #table .badge.use") == [
+        *("Do not use", "Look before use", "Use", "Use")
+    ]
     assert len(texts(browser, "#tiles li")) == 4
     one(browser, "[name=status][value=failed]").click()
-    assert texts(browser, "#table .badge") == ["ok", "repaired", "flagged"]
+    status = "#table .badge:is(.ok, .repaired, .flagged, .failed)"
+    assert texts(browser, status) == ["flagged", "repaired", "ok"]
     one(browser, "#search").send_keys("large-repair")
     assert rows(browser) == ["sub-02"]
     assert texts(browser, "#tiles li") == ["02 L"]
@@ -157,32 +166,202 @@ def test_the_table_is_filtered_and_sorted_with_the_maps(visit):
 
 def test_maps_are_drawn_and_lead_to_their_page(visit):
     browser = visit("report.html")
-    tile = one(browser, "#tiles .tile")
+    tile = one(browser, "#tiles .tile:not(.none)")
     browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", tile)
     assert colored(pixels(tile)) > 0.9
     before = pixels(tile)
     one(browser, "[name=map][value=curvature]").click()
     assert (pixels(tile) != before).any()
-    one(browser, "#tiles a").click()
+    one(browser, "#tiles li:last-child a").click()
     assert texts(browser, "h1") == ["sub-01"]
     one(browser, ".crumbs a").click()
     assert texts(browser, "h1") == ["All hemispheres"]
 
 
-def test_the_selection_is_a_list_that_the_group_level_takes(visit, out):
+@pytest.fixture
+def review(visit, browser):
+    """Open a page where nothing is kept yet."""
+
+    def opened(name, width=1280):
+        visit("report.html", width)
+        browser.execute_script("localStorage.clear()")
+        browser.get("about:blank")
+        return visit(name, width)
+
+    return opened
+
+
+def press(browser, *keys):
+    webdriver.ActionChains(browser).send_keys(*keys).perform()
+
+
+def card(browser):
+    """Which hemisphere keys are about."""
+    return one(browser, ".card.current").get_attribute("id")
+
+
+def rate(browser, row, rating):
+    one(browser, f"#table tbody tr:nth-child({row}) .rate").click()
+    one(browser, f"#table option[value={rating}]").click()
+    one(browser, "#search").click()
+
+
+def ratings(browser):
+    """Participant, side, rating and note of the rows that are shown."""
+    return browser.execute_script(
+        "return [...document.querySelectorAll('#table tbody tr')].map(row => [...row.cells])"
+        ".map(([who, side, , , rating]) => [who.textContent, side.textContent,"
+        " rating.querySelector('.rate').textContent.replace('none', ''),"
+        " rating.querySelector('.remark').textContent])"
+    )
+
+
+def test_keys_lead_by_severity_and_rate(review, visit):
+    browser = review("sub-02.html")
+    # The table was left in its first order, so links are the same with it and without.
+    one(browser, "a.badge.refuse").click()
+    until(lambda: card(browser) == "sub-02_hemi-R_seg-freesurfer")
+    assert not one(browser, ".card.current .previous").is_displayed()
+    press(browser, "3", "n")
+    until(lambda: card(browser) == "sub-02_hemi-L_seg-freesurfer")
+    press(browser, "2", "n")
+    until(lambda: texts(browser, "h1") == ["sub-01"])
+    assert card(browser) == "sub-01_hemi-R_seg-freesurfer"
+    press(browser, "1", "0", "n")
+    until(lambda: card(browser) == "sub-01_hemi-L_seg-freesurfer")
+    assert not one(browser, ".card.current .next").is_displayed()
+    press(browser, "1", "p")
+    until(lambda: card(browser) == "sub-01_hemi-R_seg-freesurfer")
+    assert browser.find_elements(By.CSS_SELECTOR, ".card.current .rating :checked") == []
+    # Digits in a note are words.
+    remark = one(browser, ".card.current .remark")
+    remark.send_keys("bridge 1 of 2", Keys.TAB)
+    visit("report.html")
+    assert ratings(browser) == [
+        ["sub-02", "R", "exclude", ""],
+        ["sub-02", "L", "unsure", ""],
+        ["sub-01", "R", "", "bridge 1 of 2"],
+        ["sub-01", "L", "use", ""],
+    ]
+    one(browser, "#rating option[value=unsure]").click()
+    assert rows(browser) == ["sub-02"]
+    one(browser, "#rating option[value=none]").click()
+    assert texts(browser, "#tiles li") == ["01 R"]
+    assert "1 of 4 shown, 3 rated" in one(browser, "#shown").text
+
+
+def test_links_follow_the_table_as_it_was_left_or_severity_without_it(review, visit, browser):
+    review("report.html")
+    one(browser, "[data-key=volume] button").click()
+    order = browser.execute_script(
+        "return JSON.parse(Object.entries(localStorage).find(([k]) => k.endsWith(' order'))[1])"
+    )
+    page, key = order[1]["page"], order[1]["key"]
+    visit(page)
+    own = f"[data-key={key}]"
+    for name, n in (("previous", 0), ("next", 2)):
+        link = one(browser, f"{own} .{name}")
+        assert link.get_attribute("href").endswith(f"{order[n]['page']}#{order[n]['key']}")
+        assert order[n]["words"] in link.text
+    # Without an order, or with one that leads elsewhere, links go by severity.
+    browser.execute_script(
+        "const [key] = Object.keys(localStorage).filter((key) => key.endsWith(' order'));"
+        "const order = JSON.parse(localStorage[key]);"
+        "order.forEach((row) => { row.page = 'javascript:alert(1)//'; });"
+        "localStorage[key] = JSON.stringify(order)"
+    )
+    visit("sub-02.html")
+    next_one = one(browser, "[data-key=sub-02_hemi-L_seg-freesurfer] .next")
+    assert next_one.get_attribute("href").endswith("sub-01.html#sub-01_hemi-R_seg-freesurfer")
+    browser.execute_script("localStorage.clear()")
+    visit("sub-02.html")
+    link = one(browser, "[data-key=sub-02_hemi-L_seg-freesurfer] .next")
+    assert link.text == "next: sub-01 right: use →"
+    assert link.get_attribute("href").endswith("sub-01.html#sub-01_hemi-R_seg-freesurfer")
+
+
+def test_ratings_are_saved_loaded_and_taken_by_the_group_level(review, browser, out):
     from hipsta_bids.group.collect import GroupRequest, collect_sheets  # noqa: PLC0415
 
-    browser = visit("report.html")
+    review("report.html")
     assert not one(browser, "#save").is_enabled()
-    one(browser, "#table tbody tr:nth-child(3) input").click()
-    assert "1 selected" in one(browser, "#shown").text
+    rate(browser, 2, "exclude")
+    assert "1 rated" in one(browser, "#shown").text
+    one(browser, "#hemi option[value=L]").click()
+    one(browser, "#rate-shown option[value=use]").click()
+    before = ratings(browser)
+    assert [row[2] for row in before] == ["exclude", "use"]
     one(browser, "#save").click()
-    path = browser.downloads / "exclude.tsv"
+    path = browser.downloads / "ratings.tsv"
     until(path.exists)
-    header, line = (row.split("\t") for row in path.read_text().splitlines())
-    assert header == ["participant_id", "session_id", "hemi", "protocol", "region", "reason"]
-    assert line[:5] == ["sub-02", "n/a", "L", "freesurfer", "body"]
-    found = collect_sheets(GroupRequest(roots=(out,), exclude_table=path))
-    left_out = {(e.participant, e.hemi): e.reason for e in found.exclusions}
-    assert left_out["sub-02", "L"] == "listed"
+    header, *lines = (row.split("\t") for row in path.read_text().splitlines())
+    assert header == [
+        *("participant_id", "session_id", "hemi", "protocol", "region", "rating", "note"),
+        "input_hash",
+    ]
+    assert [line[:7] for line in lines] == [
+        ["sub-02", "n/a", "L", "freesurfer", "body", "exclude", "n/a"],
+        ["sub-01", "n/a", "L", "freesurfer", "body", "use", "n/a"],
+    ]
+    found = collect_sheets(GroupRequest(roots=(out,), ratings=path))
+    assert found.ratings == {"use": 1, "unsure": 0, "exclude": 1, "unrated": 2}
+    assert {(e.participant, e.hemi): e.reason for e in found.exclusions}["sub-02", "L"] == "rated"
     assert [r.place.name.subject for r in found.records] == ["01", "01"]
+    # Loaded where they are not known; one line is of nobody here.
+    with path.open("a") as file:
+        file.write("sub-99\tn/a\tL\tfreesurfer\tbody\tuse\tn/a\tn/a\n")
+    review("report.html")
+    one(browser, "#load").send_keys(str(path))
+    until(lambda: "2 ratings loaded; 1 lines" in one(browser, "#told").text)
+    one(browser, "#hemi option[value=L]").click()
+    assert ratings(browser) == before
+
+
+def test_ratings_of_other_labels_are_marked(review, visit, browser):
+    review("report.html")
+    rate(browser, 4, "use")
+    browser.execute_script(
+        "const [k, v] = Object.entries(localStorage).find(([k]) => k.includes('hemi-L'));"
+        "localStorage.setItem(k, JSON.stringify({...JSON.parse(v), input_hash: 'other'}))"
+    )
+    visit("sub-01.html")
+    assert "its labels were others" in one(browser, ".card.current .earlier").text
+    assert browser.find_elements(By.CSS_SELECTOR, ".rating :checked") == []
+    visit("report.html")
+    one(browser, "#rating option[value=earlier]").click()
+    assert ratings(browser) == [["sub-01", "L", "", "(use, of earlier labels)"]]
+    visit("sub-01.html")
+    press(browser, "1")
+    assert one(browser, ".card.current .rating :checked").get_attribute("value") == "use"
+    assert one(browser, ".card.current .earlier").text == ""
+
+
+def test_the_command_that_opens_the_files_is_copied(visit):
+    browser = visit("sub-01.html")
+    one(browser, ".open summary").click()
+    one(browser, ".open .copy").click()
+    assert one(browser, ".open .copy").text == "Copied"
+    remark = one(browser, ".remark")
+    remark.send_keys(Keys.CONTROL, "v")
+    assert remark.get_attribute("value").startswith("freeview -v ")
+    remark.clear()
+
+
+def test_all_of_hundreds_of_rows_are_shown_and_sorted(visit, out, tmp_path):
+    text = (out / "report.html").read_text()
+    found = re.search(r'id="data">(.*?)</script>', text, re.DOTALL)
+    data = json.loads(found[1])
+    data["rows"] = [
+        {**data["rows"][n % 4], "key": f"k{n}", "participant": f"sub-{n:03d}", "volume": n}
+        for n in range(200)
+    ]
+    page = tmp_path / "report.html"
+    page.write_text(text.replace(found[1], json.dumps(data)))
+    browser = visit(page)
+    until(lambda: len(rows(browser)) == 200)
+    one(browser, "[data-key=volume] button").click()
+    assert rows(browser)[0] == "sub-199"
+    one(browser, "[data-key=volume] button").click()
+    until(lambda: rows(browser) == [f"sub-{n:03d}" for n in range(200)])
+    one(browser, "#search").send_keys("sub-19")
+    until(lambda: len(texts(browser, "#tiles li")) == 10)

@@ -102,7 +102,7 @@ def test_maps_of_both_hemispheres_lie_alike(out, monkeypatch):
     values = np.arange(12.0).reshape(4, 3)
     pictures = []
     monkeypatch.setattr(maps_module, "_palette_png", lambda picture, _: pictures.append(picture))
-    maps_module.make_sprites([left, right], [dict.fromkeys(("thickness", "curvature"), values)] * 2)
+    maps_module.make_sprites([dict.fromkeys(("thickness", "curvature"), values)] * 2)
     tile = pictures[0][:, :4]
     np.testing.assert_array_equal(tile, pictures[0][:, 4:])
     assert tile[-1].tolist() == sorted(tile[-1].tolist())  # posterior below, medial left
@@ -132,15 +132,37 @@ def test_no_two_numbers_of_a_page_have_one_name(out):
     assert "Length of the body" not in titles
 
 
-def test_curvatures_have_one_scale_with_zero_in_the_middle():
-    for measure in ("curvature", "gaussian_curvature_exterior"):
-        assert kind_of(measure) is CURVATURE
+def test_thickness_and_mean_curvature_have_fixed_scales_and_others_those_of_their_values():
     assert kind_of("thickness") is THICKNESS
-    assert kind_of("thickness", change=True).centered
-    low, high = scale_of(CURVATURE, [np.linspace(0.0, 0.2, 101)])
-    assert low == -high
-    assert scale_of(THICKNESS, [np.linspace(1.0, 2.0, 101)]) == pytest.approx((1.01, 1.99))
-    assert scale_of(CURVATURE, []) == (-1.0, 1.0)
+    assert kind_of("curvature") is kind_of("curvature_interior") is CURVATURE
+    assert scale_of(THICKNESS, [np.array([9.0])]) == scale_of(THICKNESS, []) == (0.5, 3.0)
+    assert scale_of(CURVATURE, [np.linspace(0.0, 0.2, 101)]) == (-0.5, 0.5)
+    # Other units: per square millimeter, differences, and maps of other programs.
+    low, high = scale_of(kind_of("gaussian_curvature_exterior"), [np.linspace(0.0, 0.02, 101)])
+    assert -low == high == pytest.approx(0.0192)
+    assert scale_of(kind_of("t1t2"), [np.linspace(1.0, 2.0, 101)]) == pytest.approx((1.01, 1.99))
+    assert scale_of(kind_of("t1t2"), []) == (-1.0, 1.0)
+    change = scale_of(kind_of("thickness", change=True), [np.linspace(0.0, 0.2, 101)])
+    assert change == pytest.approx((-0.196, 0.196))
+
+
+def test_a_color_means_the_same_on_every_page(out):
+    first, second = (
+        json.loads(
+            re.search(
+                r'<div class="viewer".*?application/json">(.*?)</script>',
+                (out / f"sub-0{n}.html").read_text(),
+                re.DOTALL,
+            )[1]
+        )["scales"]
+        for n in (1, 2)
+    )
+    assert first == second
+    ends = (first["thickness"]["low"], first["thickness"]["high"])
+    bar = r'<p class="colorbar[^>]*><span>≤ ([-\d.]+)</span>.*?<span>≥ ([-\d.]+) mm</span>'
+    for name in ("sub-01.html", "sub-02.html", "report.html"):
+        found = re.search(bar, (out / name).read_text())
+        assert (float(found[1]), float(found[2])) == ends
 
 
 def effects_of_noise(kind="t", n=24, points=861):

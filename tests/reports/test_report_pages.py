@@ -47,10 +47,16 @@ def test_a_page_is_made_for_all_readers(page):
 
 def test_statuses_are_said_with_what_to_do(out):
     first, second = ((out / f"sub-0{n}.html").read_text() for n in (1, 2))
-    assert "Nothing stood out" in first
-    assert "Measured after repair" in first
-    assert "Look before use" in second
-    assert "Not measured" in second
+    verdicts = [
+        re.findall(r'<p class="verdict">(.*?)</p>\n<p><b>(.*?)</b></p>', text)
+        for text in (first, second)
+    ]
+    assert [title for page in verdicts for title, _ in page] == [
+        *("Use", "Use", "Look before use", "Do not use")
+    ]
+    assert verdicts[0][0][1] == "Nothing stood out."
+    assert verdicts[0][1][1].startswith("Cut a bridge of")
+    assert verdicts[1][1][1].startswith("The body is interrupted at RAS")
     assert "the body is interrupted at RAS" in second
     assert "fill in missing slices" in second
     assert "sub-02_hemi-R_seg-freesurfer_desc-edited_mask.nii.gz" in second
@@ -97,12 +103,15 @@ def cohort_data(text):
 def test_the_table_has_every_hemisphere(out):
     data = cohort_data((out / "report.html").read_text())
     assert [(r["participant"], r["hemi"], r["status"]) for r in data["rows"]] == [
-        ("sub-01", "L", "ok"),
-        ("sub-01", "R", "repaired"),
-        ("sub-02", "L", "flagged"),
         ("sub-02", "R", "failed"),
+        ("sub-02", "L", "flagged"),
+        ("sub-01", "R", "repaired"),
+        ("sub-01", "L", "ok"),
     ]
-    assert [r["tile"] for r in data["rows"]] == [0, 1, 2, None]
+    assert [r["tile"] for r in data["rows"]] == [None, 0, 1, 2]
+    severity = [r["severity"] for r in data["rows"]]
+    assert severity == sorted(severity, reverse=True)
+    assert (severity[0], severity[-1]) == (100, 0)
     assert all((out / row["page"]).exists() for row in data["rows"])
 
 
@@ -189,7 +198,8 @@ def test_reports_only_makes_the_pages_anew(copy, capsys):
     options = ["--reports-only", "--participant-label", "02", "--n-procs", "1"]
     assert main.main(["gone", str(copy), "participant", *options]) == 0
     assert sorted(path.name for path in copy.glob("*.html")) == ["report.html", "sub-02.html"]
-    assert "reports of 1 visits" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert re.match(r"  pages +\d+\.\d s\nreports of 1 visits", said)
 
 
 def test_reports_only_of_nothing_says_so(tmp_path, capsys):

@@ -1,4 +1,4 @@
-"""The documentation site: a build without warnings or network."""
+"""The documentation site: a build without warnings or network, read from its folder."""
 
 import os
 import re
@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from browsing import fits, one, open_browser, open_page, texts, until, watched
 
 ROOT = Path(__file__).parents[2]
 
@@ -55,3 +56,42 @@ def test_docstrings_are_on_the_python_page(site):
 def test_pages_show_every_reason_and_setting(site):
     assert 'id="topology"' in (site / "settings.html").read_text(encoding="utf-8")
     assert 'id="body-split"' in (site / "reasons.html").read_text(encoding="utf-8")
+
+
+def test_notebooks_are_run(site):
+    texts_of = {
+        path.stem: path.read_text(encoding="utf-8") for path in site.glob("notebooks/*.html")
+    }
+    assert texts_of.keys() == {path.stem for path in (ROOT / "docs").glob("notebooks/*.ipynb")}
+    assert "voxel size, mm: [0.4 0.4 0.4]" in texts_of["measure"]
+    assert re.search(r"t differs by at most \de-0[5-9] at 861 vertices", texts_of["group"])
+    for name, text in texts_of.items():
+        assert f'href="{name}.ipynb"' in text
+        assert (site / "notebooks" / f"{name}.ipynb").exists()
+        assert f'src="{name}-1.png"' in text
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    with open_browser(tmp_path_factory.mktemp("browser")) as session:
+        yield session
+
+
+def test_a_word_is_found_without_a_server(site, browser):
+    with watched(browser):
+        open_page(browser, site / "index.html")
+        field = one(browser, ".md-search__input")
+        field.click()
+        field.send_keys("wide-cavity")
+        until(lambda: "matching document" in one(browser, ".md-search-result__meta").text)
+        until(lambda: "Flags and refusals" in texts(browser, ".md-search-result h1"))
+        one(browser, ".md-search-result__link").click()
+        until(lambda: browser.current_url.partition("#")[0].endswith("/reasons.html"))
+
+
+@pytest.mark.parametrize(("name", "figures"), [("measure", 1), ("group", 3)])
+def test_notebooks_show_their_figures(site, browser, name, figures):
+    with watched(browser):
+        open_page(browser, site / "notebooks" / f"{name}.html")
+        assert fits(browser, 1280)
+    assert len(texts(browser, "article img")) == figures

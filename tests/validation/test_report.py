@@ -1,8 +1,10 @@
 """From suites to the page, with suites that take no time."""
 
+import re
 import struct
 import sys
 from inspect import signature
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -10,12 +12,15 @@ import pytest
 from hipsta_bids.cli import main
 from hipsta_bids.errors import ExitCode
 from hipsta_bids.validation.report import (
+    QUESTIONS,
     SUITES,
     WITH_LABELS,
     Picture,
     Suite,
     Table,
     markdown,
+    opening,
+    overview,
     page,
     render,
     run_suite,
@@ -34,6 +39,26 @@ TABLE = Table(
 
 def line(figure):
     figure.subplots().plot([0, 1], [1, 0])
+
+
+PAGE = (Path(__file__).parents[2] / "docs" / "validation.md").read_text(encoding="utf-8")
+WORDS = {"yes": True, r"**no**": False, "n/a": None}
+
+
+def suites_of(text):
+    """The suites that a page shows, as far as their tables."""
+    for name, section in zip(SUITES, text.split("\n## ")[1:], strict=True):
+        title, _, content = section.partition("\n")
+        found = re.findall(r"^\*\*(.+)\*\*\n\n((?:\|.*\n)+)", content + "\n", re.MULTILINE)
+        tables = tuple(table_of(heading, lines.splitlines()) for heading, lines in found)
+        yield Suite(name=name, title=title, tables=tables)
+
+
+def table_of(title, lines):
+    cells = [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines]
+    headings, _, *rows = cells
+    own = [{h: WORDS.get(c, c) for h, c in zip(headings, row, strict=True)} for row in rows]
+    return Table(title=title, rows=own)
 
 
 PICTURE = Picture(name="line", caption="A falling line.", draw=line, size=(3.0, 2.0))
@@ -91,6 +116,50 @@ def test_page_says_that_it_is_generated_and_shows_all():
     assert "| Toys | Bias | 2 | 1 |" in text
     assert "![A falling line.](images/validation-line.png)" in text
     assert text.count("**Bias**") == 1
+
+
+def test_a_page_opens_with_what_was_asked_and_what_was_missed():
+    good = Table(title="Good", rows=[{"case": "x", "met": True}])
+    many = Table(title="Many, mm", rows=[{"case": str(i), "met": i > 3} for i in range(6)])
+    suites = [
+        Suite(name="toy", title="Toys", tables=(TABLE, many)),
+        Suite(name="limits", title="Fine things", tables=(good,)),
+        Suite(name="none", title="Not judged"),
+    ]
+    holds, misses = opening(suites).split("What does not hold everywhere:")
+    assert holds.startswith("**4 of 9 targets are met.**")
+    assert f"- [{QUESTIONS['limits']}](#fine-things) (1)" in holds
+    assert "- [Toys](#toys): 3 of 8. Missed: Bias (1 of 2: c), Many (4 of 6)." in misses
+    assert "Not judged" not in holds + misses
+    assert render(overview(suites))[:4] == b"\x89PNG"
+
+
+def test_misses_are_named_by_what_tells_rows_apart():
+    rows = [
+        {"a": "x", "b": 1.0, "c": "u", "met": False},
+        {"a": "x", "b": 2.0, "c": "u", "met": True},
+    ]
+    assert Table(title="t", rows=rows, digits=1).misses == ["x, 1.0"]
+    both = [{"a": "x", "one": False, "two": False}, {"a": "y", "one": True, "two": True}]
+    assert Table(title="t", rows=both).misses == ["x"]
+
+
+def test_every_suite_asks_something():
+    assert QUESTIONS.keys() == SUITES.keys()
+
+
+def test_the_page_in_the_documentation_opens_with_the_counts_of_its_tables():
+    suites = list(suites_of(PAGE))
+    assert [suite.name for suite in suites] == list(SUITES)
+    assert opening(suites) in PAGE
+    counted = re.findall(
+        r"^\| (.+) \| (.+) \| (\d+) \| (\d+) \|$", PAGE.split("\n## ")[0], re.MULTILINE
+    )
+    assert [
+        (one.title, table.title, str(table.targets), str(table.missed))
+        for one in suites
+        for table in one.tables
+    ] == counted
 
 
 def test_figures_are_png_and_the_same_each_time():

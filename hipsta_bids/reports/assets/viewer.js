@@ -430,7 +430,7 @@
         return;
       }
       const colors = (scale || this.scales.thickness).colors;
-      const words = scale ? [scale.low.toFixed(scale.digits), `${scale.title.toLowerCase()} [${scale.unit}]`, scale.high.toFixed(scale.digits)]
+      const words = scale ? [`≤ ${scale.low.toFixed(scale.digits)}`, `${scale.title.toLowerCase()} [${scale.unit}]`, `≥ ${scale.high.toFixed(scale.digits)}`]
         : kind === "x" ? ["medial", "", "lateral"] : ["posterior", "", "anterior"];
       const gradient = make("div", { className: "gradient" });
       gradient.style.background = `linear-gradient(to right,${colors.join(",")})`;

@@ -1,0 +1,41 @@
+"""What a long run is at: its stages and how much of one is done, told to whoever listens.
+
+Without a listener, as in the Python interface, nothing is told. The command line listens.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import TypeVar
+
+Item = TypeVar("Item")
+
+#: Takes the stage, how many of its parts are done, and how many there are; 0 if it has none.
+Listener = Callable[[str, int, int], None]
+
+_LISTENER: ContextVar[Listener | None] = ContextVar("listener", default=None)
+
+
+@contextmanager
+def listening(listener: Listener) -> Iterator[None]:
+    """Have a listener told what is done inside the block."""
+    token = _LISTENER.set(listener)
+    try:
+        yield
+    finally:
+        _LISTENER.reset(token)
+
+
+def tell(stage: str, done: int = 0, total: int = 0) -> None:
+    """Say what is being done. A stage ends when another begins."""
+    listener = _LISTENER.get()
+    if listener is not None:
+        listener(stage, done, total)
+
+
+def each(stage: str, items: Sequence[Item]) -> Iterator[Item]:
+    """Yield items, and tell how many are done."""
+    tell(stage, 0, len(items))
+    for done, item in enumerate(items, start=1):
+        yield item
+        tell(stage, done, len(items))

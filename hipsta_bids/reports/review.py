@@ -1,0 +1,110 @@
+"""What a person does about a hemisphere: read the verdict, rate it, open its files, correct it."""
+
+import os
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from hipsta_bids.derivatives.names import output_name, participant_report
+from hipsta_bids.reports.cohort import Cohort, title_of
+from hipsta_bids.reports.results import SURFACES, Hemisphere, input_path
+from hipsta_bids.reports.verdict import verdict_of
+
+#: Colors of the edges of surfaces where FreeView cuts them, as in the slices of a page.
+_EDGES = dict(zip(SURFACES, ("green", "white", "magenta"), strict=True))
+
+
+def card_of(hemisphere: Hemisphere, cohort: Cohort) -> Mapping[str, Any]:
+    """Collect what the page says first about a hemisphere, and what leads on from there."""
+    key, record = title_of(hemisphere.place.name), hemisphere.record
+    order = [title_of(other.place.name) for other in cohort.ranking]
+    n = order.index(key) if key in order else None
+    before = cohort.ranking[n - 1] if n else None
+    after = cohort.ranking[n + 1] if n is not None and n + 1 < len(order) else None
+    return {
+        "key": key,
+        "hash": record.get("input_hash") or "",
+        "side": hemisphere.side,
+        "status": str(hemisphere.status),
+        "verdict": cohort.verdicts.get(key) or verdict_of(hemisphere),
+        "findings": hemisphere.findings,
+        "notes": record.get("notes") or [],
+        "edited": [str(e.get("what")) for e in record.get("edited") or []],
+        "neighbors": [
+            ("previous", _link(before, cohort)),
+            ("next", _link(after, cohort)),
+        ],
+        "commands": open_commands(hemisphere),
+    }
+
+
+def _link(hemisphere: Hemisphere | None, cohort: Cohort) -> tuple[str, str] | None:
+    """Address and words of a link to a hemisphere's part of its page."""
+    if hemisphere is None:
+        return None
+    name = hemisphere.place.name
+    title = title_of(name)
+    verdict = cohort.verdicts[title].title.lower()
+    words = f"sub-{name.subject}{f' ses-{name.session}' if name.session else ''} {hemisphere.side}"
+    if len({other.place.name.protocol for other in cohort.hemispheres}) > 1:
+        words += f" {name.seg}" + ("" if name.region == "body" else f" {name.region}")
+    return f"{participant_report(name.subject, name.session)}#{title}", f"{words}: {verdict}"
+
+
+def open_commands(hemisphere: Hemisphere) -> list[tuple[str, str]]:
+    """Write commands, by program, that open the files of a hemisphere from the output folder."""
+    place = hemisphere.place
+    labels, mask = input_path(hemisphere), place.path("body_mask")
+    volumes = []
+    if labels is not None and labels.exists():
+        volumes.append((_from(place.root, labels), ":colormap=lut:opacity=0.5"))
+    if mask.exists():
+        volumes.append((_from(place.root, mask), ":colormap=heat:opacity=0.3"))
+    if not volumes:
+        return []
+    freeview = ["freeview", "-v", *(path + look for path, look in volumes)]
+    surfaces = {name: place.path(f"{name}_surface") for name in SURFACES}
+    if all(path.exists() for path in surfaces.values()):
+        freeview.append("-f")
+        freeview += [
+            f"{_from(place.root, path)}:edgecolor={_EDGES[name]}" for name, path in surfaces.items()
+        ]
+    point = next((f.point for f in hemisphere.findings if f.point is not None), None)
+    if point is not None:
+        freeview += ["-ras", *(f"{value:g}" for value in point)]
+    first, before = volumes[0][0], ""
+    if not first.endswith((".nii", ".nii.gz")):
+        before, first = f"mri_convert {shlex.quote(first)} labels.nii.gz && ", "labels.nii.gz"
+    snap = ["itksnap", "-g", first]
+    if len(volumes) > 1:
+        snap += ["-s", volumes[1][0]]
+    return [("FreeView", shlex.join(freeview)), ("ITK-SNAP", before + shlex.join(snap))]
+
+
+def _from(root: Path, path: Path) -> str:
+    return Path(os.path.relpath(path, root)).as_posix()
+
+
+def correction_of(hemispheres: Sequence[Hemisphere]) -> Mapping[str, Any]:
+    """Name the files to correct, where they go, and the command that measures them again."""
+    first = hemispheres[0].place.name
+    choices = []
+    for hemisphere in hemispheres:
+        name = hemisphere.place.name
+        mask = hemisphere.place.path("body_mask")
+        path = input_path(hemisphere)
+        suffix = f"{name.stem}_{name.protocol}_desc-edited"
+        choices.append(
+            {
+                "side": hemisphere.side,
+                "labels": path.name if path else None,
+                "edited_labels": f"{suffix}_dseg.nii.gz",
+                "mask": output_name(name, "body_mask") if mask.exists() else None,
+                "edited_mask": f"{suffix}_mask.nii.gz",
+            }
+        )
+    command = ["hipsta-bids", "BIDS_DIR", "OUT_DIR", "participant", "--edited-dir", "EDITS"]
+    command += ["--participant-label", first.subject]
+    folder = f"EDITS/{first.folder}"
+    return {"choices": choices, "folder": folder, "command": shlex.join(command)}
