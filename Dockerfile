@@ -32,15 +32,19 @@ RUN command -v strip || { apt-get update; apt-get install --yes --no-install-rec
     find . -type f \( -name '*.[achx]' -o -name '*.[ch]pp' -o -name '*.px[di]' -o -name '*.pyx' \) -delete; \
     # Stubs are for type checkers, but for one package that finds its functions by them.
     find . -path ./skimage -prune -o -type f -name '*.pyi' -exec rm {} +; \
-    # Data to try things on, and fonts for PDF and PostScript.
+    # Data to try things on, fonts that readers of PDF have, and those of styles that no figure has.
     find matplotlib/mpl-data/sample_data skimage/data sklearn/datasets statsmodels/datasets \
         -type f ! -name '*.py' ! -name '*.pyi' -delete; \
     rm -r matplotlib/mpl-data/fonts/afm matplotlib/mpl-data/fonts/pdfcorefonts; \
+    rm matplotlib/mpl-data/fonts/ttf/cm* matplotlib/mpl-data/fonts/ttf/DejaVuSansMono* \
+        matplotlib/mpl-data/fonts/ttf/DejaVuSerif*; \
     # Network protocols, cloud storage, and two more names of one library, which have become copies of it.
     rm pyarrow/_flight.* pyarrow/_s3fs.* pyarrow/lib*_flight.* pyarrow/libarrow_s3.*; \
     find pyarrow \( -name 'libarrow_python*.so' -o -name 'libarrow_python*.so.*.*' \) -delete; \
-    # Of fontTools matplotlib loads a table of glyphs, unless it writes PDF or PostScript.
-    find fontTools -mindepth 1 -maxdepth 1 -type d ! -name misc -exec rm -r {} +; \
+    # Of fontTools matplotlib takes what puts the letters of a text into PDF; it works uncompiled.
+    rm -r fontTools/t1Lib fontTools/diff fontTools/svgLib fontTools/mtiLib fontTools/merge \
+        fontTools/voltLib fontTools/ufoLib fontTools/cu2qu fontTools/qu2cu fontTools/varLib/instancer; \
+    find fontTools -name '*.so' -delete; \
     rm -r PIL/_avif.* PIL/_imagingft.* pillow.libs/libavif-* pillow.libs/libfreetype-* pillow.libs/libharfbuzz-*; \
     # Compilers, other databases, graphs of regions, time series.
     rm -r numpy/distutils skimage/graph skimage/segmentation statsmodels/tsa \

@@ -86,6 +86,52 @@ def fits(browser, width):
     return wide <= width and browser.execute_script(broken) == 0
 
 
+def use_theme(browser, theme, media=""):
+    """Let a page believe that its reader prefers ``light`` or ``dark``, on ``screen`` or paper."""
+    feature = {"name": "prefers-color-scheme", "value": theme}
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": media, "features": [feature]})
+
+
+#: Contrast as in WCAG 2.1 of the visible texts with what is behind them.
+_FAINT = """
+const number = (text) => {
+  const [r, g, b, a = 1] = text.match(/[\\d.]+/g).map(Number);
+  return [r, g, b, a];
+};
+const over = ([r, g, b, a], back) => [r, g, b].map((v, k) => a * v + (1 - a) * back[k]);
+const behind = (element) => {
+  const layers = [];
+  for (let up = element; up; up = up.parentElement) {
+    layers.push(number(getComputedStyle(up).backgroundColor));
+  }
+  return layers.reverse().reduce((back, layer) => over(layer, back), [255, 255, 255]);
+};
+const light = (color) => {
+  const [r, g, b] = color.map((v) => v / 255).map(
+    (v) => (v <= 0.03928 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4));
+  return 0.2126 * r + 0.7152 * g + 0.0722 * b;
+};
+const found = [], walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+let seen = 0;
+while (walker.nextNode()) {
+  const element = walker.currentNode.parentElement, text = walker.currentNode.textContent.trim();
+  if (!text || !element.checkVisibility() || element.closest("script, style, :disabled")) continue;
+  seen += 1;
+  const style = getComputedStyle(element), back = behind(element);
+  const front = over(number(element instanceof SVGElement ? style.fill : style.color), back);
+  const [low, high] = [light(front), light(back)].sort((a, b) => a - b);
+  const ratio = (high + 0.05) / (low + 0.05);
+  if (ratio < 4.5) found.push([text.slice(0, 40), ratio.toFixed(2), front.join(), back.join()]);
+}
+return [seen, found];
+"""
+
+
+def faint(browser):
+    """Count the visible texts of a page, and list those that are hard to read."""
+    return browser.execute_script(_FAINT)
+
+
 def one(browser, selector):
     return browser.find_element(By.CSS_SELECTOR, selector)
 

@@ -213,7 +213,7 @@ _MODEL = {
     "template": ("template.json", "the template of registration", False),
     "model_file": ("model.json", "the model, in the form of BIDS Stats Models", True),
     "record": ("analysis.json", "command, settings, seeds, versions", True),
-    "figures": ("figures/*", "figures (PNG, SVG), where matplotlib is installed", False),
+    "figures": ("figures/*", "figures as papers print them (PDF, PNG, SVG)", False),
 }
 
 

@@ -153,6 +153,13 @@ def _add_model(parser: Parser) -> None:
         "TEXT...",
         'such as "group[CU]-group[DAT]"; rows of an F test are separated by commas',
     )
+    add(
+        "--age-model",
+        "",
+        "how age stands in the default model (default: linear); quadratic and spline (natural,"
+        " cubic) come with a test for nonlinearity",
+        choices=["linear", "quadratic", "spline"],
+    )
     add("--reference", "FACTOR=LEVEL...", "reference levels", type=factor_level)
     add(
         "--measures",
@@ -169,11 +176,11 @@ def _add_comparison(parser: Parser) -> None:
     add(
         "--longitudinal",
         "",
-        "all sessions, by a mixed model in which participants have an intercept (default) or"
-        " also a slope of their own",
+        "all sessions, by a mixed model in which participants have an intercept or also a slope of"
+        " their own (default: auto, slopes where 10 participants have three visits)",
         nargs="?",
-        const="intercept",
-        choices=["intercept", "slope"],
+        const="auto",
+        choices=["auto", "intercept", "slope"],
     )
     add("--paired", "SES1 SES2", "the second session minus the first", type=bids_label("ses-"))
     add("--asymmetry", "", "also maps of left minus right")
@@ -197,6 +204,18 @@ def _add_methods(parser: Parser) -> None:
         "--template",
         "FILE",
         "register to the template.json of another analysis, or that in a summary.json",
+    )
+    add(
+        "--harmonize",
+        "COLUMN",
+        "take shifts and scales of sites or scanners out of maps and summary measures (ComBat);"
+        " effects of the model are kept, and the model has the sites too",
+    )
+    add(
+        "--harmonize-model",
+        "FILE",
+        "do it with the harmonization.json of another analysis, for its sites and for new ones of"
+        " enough participants; with its --template",
     )
     add(
         "--weights",
@@ -225,6 +244,7 @@ def _add_methods(parser: Parser) -> None:
         "MEASURE...",
         "measures and covariates of the base model of classification (default: volume)",
     )
+    add("--no-classification", "", "do not tell groups apart by logistic models")
     add(
         "--settings", "FILE.toml", "settings that change results (see `hipsta-bids settings group`)"
     )
@@ -281,6 +301,12 @@ def run_group_level(arguments: Sequence[str]) -> ExitCode:
 def _run(parsed: argparse.Namespace, arguments: Sequence[str]) -> ExitCode:
     if parsed.model is not None and (parsed.formula or parsed.contrast):
         raise UsageError("give --model, or --formula and --contrast", reason="usage")
+    if parsed.age_model is not None and (parsed.model or parsed.formula):
+        raise UsageError(
+            "--age-model is of the default model; write poly(age, 2) in the formula, and --contrast"
+            ' "nonlinear(age)"',
+            reason="usage",
+        )
     if parsed.reports_only:
         return _rebuild_reports(parsed.output_dir, parsed.name)
     # Thousands of tiny fits: threads of the linear algebra would only get in each other's way.
@@ -294,6 +320,8 @@ def _run(parsed: argparse.Namespace, arguments: Sequence[str]) -> ExitCode:
     settings = _settings(parsed)
     with Progress(-1 if parsed.quiet else 0):
         result = run_group(_options(parsed, arguments), settings)
+    for warning in result.warnings:
+        warn(f"warning: {warning}")
     for note in result.notes:
         echo(f"note: {note}")
     echo(f"{result.n_participants} participants in the model, {result.n_excluded} left out")
@@ -340,14 +368,24 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
             "permutations": parsed.permutations,
             "blocks": parsed.blocks,
         },
+        "model": {"age": parsed.age_model},
         "longitudinal": {"random": parsed.longitudinal},
+        "harmonization": {"column": parsed.harmonize},
         "glm": {"weights": parsed.weights},
-        "classification": {"base": tuple(parsed.base) or None},
+        "classification": {
+            "base": tuple(parsed.base) or None,
+            "added": () if parsed.no_classification else None,
+        },
     }
     settings = load_group_settings(parsed.settings)
     for section, options in chosen.items():
         given = {name: value for name, value in options.items() if value is not None}
         settings = settings.changed(**{section: given})
+    if parsed.harmonize:
+        # The default model has what is harmonized instead of other names of the same.
+        same = {"site", "scanner", "center"}
+        names = [name for name in settings.model.covariates if name.casefold() not in same]
+        settings = settings.changed(model={"covariates": (*names, parsed.harmonize)})
     return settings
 
 

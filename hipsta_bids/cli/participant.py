@@ -221,6 +221,11 @@ def _add_processing(parser: Parser) -> None:
         "--reports-only", "", "make these pages again from the results that are there, and end"
     )
     add(
+        "--no-anatomy",
+        "",
+        "show no anatomical images on the pages (default: behind the labels, where there are some)",
+    )
+    add(
         "--n-procs --nprocs --n-cpus --nthreads",
         "N",
         "hemispheres at the same time, one processor each (default: all processors)",
@@ -425,7 +430,15 @@ def _rebuild_reports(options: "Namespace") -> ExitCode:
     progress = Progress(-1 if options.quiet else options.verbose)
     with log_file(root, options.verbose) as log, progress:
         problems = list(
-            write_reports(PagePlan(root=root, n_workers=options.n_procs, log=log), visits)
+            write_reports(
+                PagePlan(
+                    root=root,
+                    n_workers=options.n_procs,
+                    log=log,
+                    bids_dir=None if options.no_anatomy else options.bids_dir,
+                ),
+                visits,
+            )
         )
     for problem in problems:
         warn(f"report: {problem.message}")
@@ -514,6 +527,7 @@ def _run_options(
         verbosity=options.verbose,
         cluster=cluster,
         reports=not options.no_reports,
+        anatomy=None if options.no_anatomy else options.bids_dir,
         # The home folder names a person.
         command=hide_home(shlex.join(("hipsta-bids", *arguments))) if arguments else None,
         notes=tuple(map(hide_home, notes)),

@@ -21,6 +21,13 @@ from hipsta_bids.group.data import PARTICIPANT, Cohort, Float, Measures, SideMap
 from hipsta_bids.group.formula import ModelSpec
 from hipsta_bids.group.glm import FittedMaps, PointTest, RowModel, fit_maps, with_mean
 from hipsta_bids.group.grammar import closed_formula
+from hipsta_bids.group.harmonize import (
+    Harmonization,
+    SitePlan,
+    check_in_model,
+    harmonize_cohort,
+    plan_sites,
+)
 from hipsta_bids.group.inference import (
     PERMUTATIONS,
     Discoveries,
@@ -42,6 +49,7 @@ from hipsta_bids.group.registration import (
     shift_difference,
 )
 from hipsta_bids.group.settings import GroupSettings
+from hipsta_bids.group.site_effects import SavedEffects
 from hipsta_bids.group.summaries import MeasureFit, classify_groups, fit_summaries
 from hipsta_bids.group.warps import Template, warp_labels, warp_values
 from hipsta_bids.progress import each, tell
@@ -75,6 +83,8 @@ class Analysis:
     groups: Groups | None
     sides: Mapping[str, SideResult]
     """Registered sheets by hemisphere."""
+    harmonization: Harmonization | None
+    """Effects of sites that were taken out after registration, if this was asked for."""
     measured: Measures
     """What the model was fitted to."""
     compared: Cohort
@@ -85,8 +95,8 @@ class Analysis:
     """Fitted maps by hemisphere; ``LR`` is left minus right."""
     found: Mapping[MapKey, Discoveries]
     unregistered: Mapping[MapKey, Discoveries]
-    """The same of maps that were not registered; empty without registration, and with
-    permutations, which are too slow to do twice."""
+    """The same of maps that were not registered; empty without registration, with permutations,
+    which are too slow to do twice, and with harmonization from a file."""
     scores: Scores | None
     """Scores of participants against a reference group, if there is one."""
     measures: Sequence[MeasureFit]
@@ -113,6 +123,7 @@ def analyze_cohort(
     time: str | None = None,
     icv: str | None = None,
     templates: Mapping[str, Template] | None = None,
+    site_effects: SavedEffects | None = None,
 ) -> Analysis:
     """Register, fit a model at each point and to each summary measure, and classify.
 
@@ -138,6 +149,8 @@ def analyze_cohort(
         Column of intracranial volume, for volumes.
     templates : mapping of str to Template, optional
         By hemisphere; else they are made from this cohort.
+    site_effects : SavedEffects, optional
+        Parameters of harmonization of another cohort.
 
     Raises
     ------
@@ -147,7 +160,18 @@ def analyze_cohort(
     comparison = comparison or Comparison()
     references = _references(model, groups, references)
     table = modeled_table(cohort.table, comparison)
+    plan = plan_sites(
+        cohort,
+        model,
+        settings,
+        references=references,
+        comparison=comparison,
+        icv=icv,
+        saved=site_effects,
+    )
     design = build_design(table, model, settings.design, references)
+    if plan is not None:
+        check_in_model(plan, design, comparison)
     if comparison.pair or not design.contrasts:
         design = replace(design, contrasts=with_mean(design))
 
@@ -162,14 +186,21 @@ def analyze_cohort(
         for hemi in each("registration", list(cohort.sides) if measures.maps else [])
     }
     registered = {hemi: side.registered for hemi, side in sides.items()} or cohort.sides
-    compared = compare_sessions(replace(cohort, sides=registered), comparison)
+    measured = replace(cohort, sides=registered)
+    done = None
+    if plan is not None:
+        how = {hemi: side.registration for hemi, side in sides.items()}
+        done = harmonize_cohort(measured, plan, settings, measures, how)
+    compared = compare_sessions(measured if done is None else done.cohort, comparison)
     fitted = _fit_sides(compared, measures.maps, rows, comparison, settings)
     found = correct(fitted, rows, table, settings)
     unregistered: Mapping[MapKey, Discoveries] = {}
     if settings.registration.align != "none" and settings.multiplicity.method not in PERMUTATIONS:
-        plain = compare_sessions(cohort, comparison)
-        refitted = _fit_sides(plain, measures.maps, rows, comparison, settings)
-        unregistered = correct(refitted, rows, table, settings)
+        plain = _as_measured(cohort, plan, settings, measures)
+        if plain is not None:
+            again = compare_sessions(plain, comparison)
+            refitted = _fit_sides(again, measures.maps, rows, comparison, settings)
+            unregistered = correct(refitted, rows, table, settings)
     scores = None
     if comparison.normative is not None:
         tell("w-scores")
@@ -192,7 +223,10 @@ def analyze_cohort(
         icv=icv,
         rows_of=rows_of,
     )
-    once = compared.take(~table[PARTICIPANT].duplicated().to_numpy())
+    told = compared
+    if done is not None and groups is not None and done.leaks(groups.column):
+        told = compare_sessions(measured, comparison)
+    once = told.take(~table[PARTICIPANT].duplicated().to_numpy())
     pairs, more = classify_groups(once, groups, settings) if groups else ([], [])
     return Analysis(
         model=model,
@@ -200,6 +234,7 @@ def analyze_cohort(
         design=design,
         groups=groups,
         sides=sides,
+        harmonization=done,
         measured=measures,
         compared=compared,
         row_model=rows,
@@ -209,16 +244,29 @@ def analyze_cohort(
         scores=scores,
         measures=summaries,
         pairs=pairs,
-        skipped=[*notes, *more],
+        skipped=[*(done.notes if done else ()), *notes, *more],
     )
+
+
+def _as_measured(
+    cohort: Cohort, plan: SitePlan | None, settings: GroupSettings, measures: Measures
+) -> Cohort | None:
+    """Harmonize maps without registration; a file's effects are those of registered nodes."""
+    if plan is None:
+        return cohort
+    if plan.saved is not None:
+        return None
+    return harmonize_cohort(cohort, plan, settings, measures, {}).cohort
 
 
 def analyze_points(cohort: Cohort, analysis: Analysis, settings: GroupSettings) -> Analysis:
     """Fit the model of an analysis to further maps, which are not registered."""
     maps = tuple(dict.fromkeys(name for side in cohort.sides.values() for name in side.maps))
-    compared = compare_sessions(cohort, analysis.comparison)
+    done, measured = None, Measures(maps=maps, summaries=())
+    if analysis.harmonization is not None:
+        done = harmonize_cohort(cohort, analysis.harmonization.plan, settings, measured, {})
+    compared = compare_sessions(cohort if done is None else done.cohort, analysis.comparison)
     fitted = _fit_sides(compared, maps, analysis.row_model, analysis.comparison, settings)
-    measured = Measures(maps=maps, summaries=())
     scores = None
     if analysis.comparison.normative is not None:
         tell("w-scores")
@@ -233,6 +281,7 @@ def analyze_points(cohort: Cohort, analysis: Analysis, settings: GroupSettings) 
     return replace(
         analysis,
         sides={},
+        harmonization=done,
         measured=measured,
         compared=compared,
         fitted=fitted,

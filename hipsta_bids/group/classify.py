@@ -1,10 +1,5 @@
-"""How well measures tell two groups apart, beyond a base model: logistic models and their curves.
+"""How well measures tell two groups apart, beyond a base model: classifiers and their curves."""
 
-Logistic regression is by maximum likelihood (statsmodels), or by Firth's method where a model
-separates the groups.
-"""
-
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -13,195 +8,25 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize, special, stats
-from sklearn import config_context, metrics
+from sklearn import metrics
 from sklearn.model_selection import RepeatedStratifiedKFold
-from statsmodels.discrete.discrete_model import Logit
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.data import Bool, Float
+from hipsta_bids.group.data import Bool, Float, Int
+from hipsta_bids.group.logistic import (
+    RANK,
+    LogisticFit,
+    fit_logistic,
+    fit_overlapping_or_firth,
+    is_separated,
+    maxima,
+    orthonormal,
+    overlaps,
+)
 from hipsta_bids.group.settings import ClassificationSettings
 
-#: Largest sum of margins, per subject, that still counts as rounding of the linear program.
-_NO_MARGIN = 1e-7
-#: Where all fitted chances are farther from 0 and 1 than this, groups are not separated.
-_INSIDE = 1e-3
-#: Maximum likelihood has converged when coefficients of unit columns change by less.
-_CONVERGED = 1e-10
-#: Longest step of Firth's method, in standard deviations of a column, as in ``logistf``.
-_LONGEST_STEP = 5.0
-#: A step must gain at least this share of what the slope promises, or it is halved.
-_SHARE = 0.1
-#: Log likelihoods differ by rounding by no more than this, relatively.
-_ROUNDING = 1e-12
-#: Halvings of a step that does not gain.
-_HALVINGS = 30
-#: Directions of a training set with less than this share of the largest are no columns.
-_RANK = 1e-9
 #: Subjects in a group of the table of calibration, or there are fewer groups.
 _LEAST_IN_BIN = 5
-
-
-@dataclass(frozen=True)
-class LogisticFit:
-    """One logistic model."""
-
-    coefficients: Float
-    """Log odds per unit of each column."""
-    se: Float
-    """From the inverse of Fisher's information at the estimate."""
-    log_likelihood: float
-    """With Firth the penalized one: half the log determinant of the information comes on top."""
-    firth: bool
-    """Whether Firth's penalty was used."""
-
-
-def is_separated(matrix: Float, case: Bool) -> bool:
-    """Whether a combination of the columns tells the groups apart without overlap.
-
-    Then maximum-likelihood estimates are infinite (Albert and Anderson 1984). Found exactly, by
-    a linear program (Konis 2007): the largest sum of margins under which none is negative.
-    """
-    scale = np.abs(matrix).max(axis=0)
-    margins = np.where(case, 1.0, -1.0)[:, None] * matrix / np.where(scale > 0, scale, 1.0)
-    solution = optimize.linprog(
-        -margins.sum(axis=0), A_ub=-margins, b_ub=np.zeros(len(margins)), bounds=(-1, 1)
-    )
-    return bool(margins.sum(axis=0) @ solution.x > _NO_MARGIN * len(margins))
-
-
-def fit_logistic(
-    matrix: Float,
-    case: Bool,
-    settings: ClassificationSettings,
-    *,
-    firth: bool,
-    free: Bool | None = None,
-) -> LogisticFit:
-    """Fit a logistic regression by maximum likelihood, or by Firth's method.
-
-    Of Firth's, columns that are not ``free`` stay zero but count in the penalty, as the penalized
-    likelihood-ratio test needs it (Heinze and Schemper 2002).
-    """
-    if firth:
-        return _fit_firth(matrix, case, settings, free)
-    fit = _fit_maximum(matrix, case, settings)
-    if fit is None:
-        raise _no_convergence(settings.iterations)
-    return fit
-
-
-def fit_overlapping_or_firth(
-    matrix: Float, case: Bool, settings: ClassificationSettings
-) -> LogisticFit:
-    """Fit by maximum likelihood if the groups overlap, else by Firth's method."""
-    fit = _fit_maximum(matrix, case, settings)
-    if fit is not None:
-        # A maximum inside proves overlap; only near the edge must the linear program decide.
-        chance = special.expit(matrix @ fit.coefficients)
-        if min(chance.min(), 1 - chance.max()) > _INSIDE:
-            return fit
-    if is_separated(matrix, case):
-        return _fit_firth(matrix, case, settings)
-    if fit is None:
-        raise _no_convergence(settings.iterations)
-    return fit
-
-
-def _no_convergence(limit: int) -> ModelError:
-    return ModelError(
-        f"logistic model: no convergence in {limit} steps; the groups may be separated, or columns"
-        " nearly the same",
-        reason="logistic-convergence",
-    )
-
-
-def _scales(matrix: Float) -> Float:
-    """Take standard deviations of columns, and the size of those that are constant."""
-    spread = matrix.std(axis=0)
-    size = np.maximum(np.abs(matrix).max(axis=0), 1e-300)
-    return np.asarray(np.where(spread > 0, spread, size), dtype=np.float64)
-
-
-def _fit_maximum(matrix: Float, case: Bool, settings: ClassificationSettings) -> LogisticFit | None:
-    """Maximize the likelihood by statsmodels; None if that does not converge."""
-    scale = _scales(matrix)
-    model = Logit(case.astype(np.float64), matrix / scale, check_rank=False)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of separation, which the caller looks for
-        try:
-            found = model.fit(
-                method="newton",
-                maxiter=settings.iterations,
-                tol=_CONVERGED,
-                disp=False,
-                warn_convergence=False,
-            )
-        except np.linalg.LinAlgError:
-            return None
-    if not found.mle_retvals["converged"]:
-        return None
-    return LogisticFit(found.params / scale, found.bse / scale, float(found.llf), firth=False)
-
-
-def _fit_firth(
-    matrix: Float, case: Bool, settings: ClassificationSettings, free: Bool | None = None
-) -> LogisticFit:
-    """Penalize the likelihood by the root of the information's determinant (Firth 1993).
-
-    This is Jeffreys' prior: estimates are finite under separation, and less biased.
-    """
-    scale = _scales(matrix)
-    scaled = matrix / scale
-    kept = np.ones(matrix.shape[1], dtype=bool) if free is None else free
-    beta = np.zeros(matrix.shape[1])
-    value = _penalized(scaled, case, beta)
-    for _ in range(settings.firth_iterations):
-        step, promised = _firth_step(scaled, case, beta, kept)
-        for halving in range(_HALVINGS):
-            new = _penalized(scaled, case, beta + step)
-            least = _SHARE * promised / 2**halving - _ROUNDING * (1 + abs(value))
-            if new >= value + least:
-                break
-            step = step / 2
-        beta, value = beta + step, new
-        if promised < settings.tolerance:
-            break
-    else:
-        raise _no_convergence(settings.firth_iterations)
-    covariance = np.linalg.inv(_information(scaled, beta))
-    return LogisticFit(
-        coefficients=beta / scale,
-        se=np.sqrt(np.diagonal(covariance)) / scale,
-        # The penalty is that of the columns as given.
-        log_likelihood=value + float(np.log(scale).sum()),
-        firth=True,
-    )
-
-
-def _information(matrix: Float, beta: Float) -> Float:
-    chance = special.expit(matrix @ beta)
-    weighted: Float = matrix.T @ (matrix * (chance * (1 - chance))[:, None])
-    return weighted
-
-
-def _penalized(matrix: Float, case: Bool, beta: Float) -> float:
-    """Penalized log likelihood."""
-    margin = np.where(case, 1.0, -1.0) * (matrix @ beta)
-    penalty = 0.5 * float(np.linalg.slogdet(_information(matrix, beta))[1])
-    return float(special.log_expit(margin).sum()) + penalty
-
-
-def _firth_step(matrix: Float, case: Bool, beta: Float, kept: Bool) -> tuple[Float, float]:
-    """Newton's next step, and the gain that the slope promises."""
-    chance = special.expit(matrix @ beta)
-    information = _information(matrix, beta)
-    leverage = np.sum(matrix @ np.linalg.pinv(information) * matrix, axis=1)
-    residual = case - chance + chance * (1 - chance) * leverage * (0.5 - chance)
-    score = (matrix.T @ residual)[kept]
-    step = np.zeros(len(beta))
-    step[kept] = np.linalg.pinv(information[np.ix_(kept, kept)], hermitian=True) @ score
-    step *= min(1.0, _LONGEST_STEP / max(float(np.abs(step).max()), 1e-300))
-    return step, float(score @ step[kept])
 
 
 @dataclass(frozen=True)
@@ -311,7 +136,7 @@ def compare_models(
     """
     full = np.column_stack([base, added])
     _check(full, case)
-    separated = is_separated(full, case)
+    separated = not overlaps(full, case) and is_separated(full, case)
     whole = fit_logistic(full, case, settings, firth=separated)
     free = np.arange(full.shape[1]) < base.shape[1]
     if separated:
@@ -382,18 +207,37 @@ def _cross_validated(
     """Keep results: the base model is the same for each measure that is added."""
     matrix, case = np.frombuffer(values).reshape(-1, columns), np.frombuffer(cases, dtype=bool)
     folds = min(settings.folds, int(case.sum()), int((~case).sum()))
-    splits = RepeatedStratifiedKFold(
-        n_splits=folds, n_repeats=settings.repeats, random_state=settings.seed
-    )
-    total, areas = np.zeros(len(case)), []
-    with config_context(assume_finite=True, skip_parameter_validation=True):
-        for train, test in splits.split(matrix, case):
-            score = _predict(matrix[train], case[train], matrix[test], settings)
-            total[test] += score
-            areas.append(metrics.roc_auc_score(case[test], score))
-    means = np.reshape(areas, (settings.repeats, folds)).mean(axis=1)
-    spread = float(means.std(ddof=1)) if settings.repeats > 1 else float("nan")
-    return CrossValidation(float(means.mean()), spread, total / settings.repeats, folds)
+    basis = orthonormal(matrix)
+    total, means = np.zeros(len(case)), []
+    for fold_of in _folds(cases, folds, settings.repeats, settings.seed):
+        train = fold_of != np.arange(folds)[:, None]
+        beta, settled = maxima(basis, case, train.astype(np.float64))
+        score = np.einsum("sj,sj->s", basis, beta[fold_of])
+        for fold in np.flatnonzero(~settled):
+            test = ~train[fold]
+            score[test] = _predict(matrix[~test], case[~test], matrix[test], settings)
+        total += score
+        means.append(np.mean([_area(score[~own & case], score[~own & ~case]) for own in train]))
+    spread = float(np.std(means, ddof=1)) if settings.repeats > 1 else float("nan")
+    return CrossValidation(float(np.mean(means)), spread, total / settings.repeats, folds)
+
+
+@lru_cache(maxsize=16)
+def _folds(cases: bytes, folds: int, repeats: int, seed: int) -> Int:
+    """(repeats, subjects) fold of each subject, the same for all measures."""
+    case = np.frombuffer(cases, dtype=bool)
+    splits = RepeatedStratifiedKFold(n_splits=folds, n_repeats=repeats, random_state=seed)
+    numbers = np.empty((repeats, len(case)), dtype=np.int64)
+    for i, (_, test) in enumerate(splits.split(case, case)):
+        numbers[i // folds, test] = i % folds
+    return numbers
+
+
+def _area(cases: Float, controls: Float) -> float:
+    """Chance that a case scores higher than a control, ties counted half."""
+    ordered = np.sort(controls)
+    below = np.searchsorted(ordered, cases, "left") + np.searchsorted(ordered, cases, "right")
+    return float(below.mean()) / (2 * len(controls))
 
 
 def _predict(train: Float, case: Bool, test: Float, settings: ClassificationSettings) -> Float:
@@ -401,7 +245,7 @@ def _predict(train: Float, case: Bool, test: Float, settings: ClassificationSett
     scale = np.abs(train).max(axis=0)
     scale = np.where(scale > 0, scale, 1.0)
     _, size, axes = np.linalg.svd(train / scale, full_matrices=False)
-    axes = axes[size > _RANK * size[0]].T
+    axes = axes[size > RANK * size[0]].T
     fit = fit_overlapping_or_firth(train / scale @ axes, case, settings)
     score: Float = test / scale @ axes @ fit.coefficients
     return score

@@ -95,6 +95,8 @@ class Collection:
     """Numbers of hemispheres by rating, if there is a table of these."""
     notes: tuple[str, ...] = ()
     """What to know, one line each."""
+    warnings: tuple[str, ...] = ()
+    """What may make results wrong, one line each."""
 
 
 def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collection:
@@ -142,6 +144,7 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
             *choices.excluded.notes((place.name, _digest(place)) for place in everything),
             *choices.rated.notes((place.name, _digest(place)) for place in everything),
         ),
+        warnings=_several_versions(kept),
     )
 
 
@@ -149,6 +152,22 @@ def _digest(place: ResultPlace) -> str | None:
     """Hash of a hemisphere's input and settings, if its record has one."""
     digest = read_record(place).get("input_hash")
     return None if digest is None else str(digest)
+
+
+def _several_versions(kept: Sequence[SheetRecord]) -> tuple[str, ...]:
+    """Say which hemispheres another version has measured: versions may give other numbers."""
+    counts = Counter(record.version for record in kept)
+    if len(counts) < 2:  # noqa: PLR2004 -- one is as it should be
+        return ()
+    usual = counts.most_common(1)[0][0]
+    others = [record.place.name.stem for record in kept if record.version != usual]
+    more = f" and {len(others) - SHOWN} more" if len(others) > SHOWN else ""
+    found = ", ".join(f"{version} ({n})" for version, n in sorted(counts.items()))
+    text = (
+        f"hemispheres were measured by several versions, {found}; measure"
+        f" {', '.join(others[:SHOWN])}{more} with {usual}: a version may change numbers"
+    )
+    return (text,)
 
 
 def wanted_by(request: GroupRequest) -> Callable[[str, str | None, str], bool]:

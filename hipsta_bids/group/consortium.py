@@ -3,25 +3,36 @@
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from hipsta_bids import __version__
 from hipsta_bids.derivatives.names import META, META_REPORT
 from hipsta_bids.errors import OutputError, UsageError
+from hipsta_bids.group.data import Cohort, SideMaps
 from hipsta_bids.group.exchange import SiteSummary, read_summary
-from hipsta_bids.group.figures import LABEL, TITLE, encode, panels
+from hipsta_bids.group.figures import Drawing
+from hipsta_bids.group.glm import FittedMaps, PointTest, PointwiseFit
 from hipsta_bids.group.inference import PERMUTATIONS
+from hipsta_bids.group.meta import FIXED, RANDOM
 from hipsta_bids.group.methods import REFERENCES
+from hipsta_bids.group.panels import Row, contrasts, draw_rows
 from hipsta_bids.group.settings import GroupSettings
-from hipsta_bids.group.sites import Meta, analyze_sites, check_agreement, meta_tables
-from hipsta_bids.group.write import whole_folder, write_table
+from hipsta_bids.group.sites import (
+    COLUMNS,
+    Meta,
+    analyze_sites,
+    check_agreement,
+    meta_tables,
+    point_test,
+)
+from hipsta_bids.group.write import draw_all, whole_folder, write_table
 from hipsta_bids.io import files
 from hipsta_bids.protocols.toml import resolve
-from hipsta_bids.reports.display import X_ENDS, Y_ENDS
-from hipsta_bids.reports.group_tables import SIDES, display_name
 from hipsta_bids.reports.meta import write_meta_report
 
 
@@ -59,9 +70,8 @@ def run_meta(options: MetaOptions, settings: GroupSettings) -> tuple[Path, list[
         )
     with whole_folder(folder) as aside:
         for name, table in meta_tables(meta):
-            write_table(aside, name, table, described=name != "sites")
-        for name, content in _heterogeneity(meta):
-            files.write_bytes(aside / "figures" / name, content)
+            write_table(aside, name, table, described=name != "sites", meaning=COLUMNS)
+        notes += draw_all(aside, _figures(meta))
         files.write_text(aside / "methods.md", _methods(meta))
         files.write_json(aside / "meta.json", _record(meta, options, notes))
     write_meta_report(options.out_dir)
@@ -93,34 +103,64 @@ def _read(given: Sequence[tuple[str | None, Path]]) -> list[SiteSummary]:
     return sites
 
 
-def _heterogeneity(meta: Meta) -> Iterator[tuple[str, bytes]]:
-    """Draw maps of I squared, a row per measure and contrast."""
-    maps = list(meta.of("map"))
-    if not maps:
-        return
-    rows = list(dict.fromkeys((item.model.measures[0], item.contrast) for item in maps))
-    hemis = list(dict.fromkeys(item.model.hemi for item in maps))
-    figure, axes = panels(len(rows), len(hemis), (2.6, 3.0))
-    x, y = np.array(meta.sites[0].x), np.array(meta.sites[0].y)
-    for axis in axes.ravel():
-        axis.set_axis_off()
-    for item in maps:
-        measure = item.model.measures[0]
-        axis = axes[rows.index((measure, item.contrast)), hemis.index(item.model.hemi)]
-        axis.set_axis_on()
-        values = 100 * item.result.random.i2.reshape(len(x), len(y)).T
-        image = axis.pcolormesh(x, y, values, vmin=0, vmax=100, cmap="cividis", rasterized=True)
-        axis.set_facecolor("0.92")
-        axis.set_xticks([x[0], x[-1]], X_ENDS, fontsize=LABEL)
-        axis.set_yticks([y[0], y[-1]], Y_ENDS, fontsize=LABEL, rotation=90)
-        for labels, place in ((axis.get_xticklabels(), "ha"), (axis.get_yticklabels(), "va")):
-            ends = ("left", "right") if place == "ha" else ("bottom", "top")
-            for label, end in zip(labels, ends, strict=True):
-                label.set(**{place: end})
-        title = f"{display_name(measure)}, {item.contrast}\n{SIDES[item.model.hemi]}"
-        axis.set_title(title, fontsize=TITLE)
-    figure.colorbar(image, ax=axes, label="I² [%]", shrink=min(1.0, 1.6 / len(rows)))
-    yield from encode("heterogeneity", figure)
+def _figures(meta: Meta) -> Iterator[tuple[str, Drawing]]:
+    """List figures of maps, one per measure, for :func:`draw_all`."""
+    first, maps = meta.sites[0], list(meta.of("map"))
+    cohort = Cohort(
+        table=pd.DataFrame(), sides={}, x=np.array(first.x), y=np.array(first.y), units={}
+    )
+    hemis = dict.fromkeys(item.model.hemi for item in maps)
+    fitted = {hemi: _fitted(meta, hemi, cohort) for hemi in hemis}
+    like = {item.label(RANDOM): item.label(FIXED) for item in maps}
+    for measure in dict.fromkeys(item.model.measures[0] for item in maps):
+        sides = {hemi: one for hemi, one in fitted.items() if measure in one.fits}
+        blocks = list(contrasts(fitted, meta.found, measure, like))
+        own = [item for item in maps if item.model.measures[0] == measure]
+        for number, contrast in enumerate(dict.fromkeys(item.contrast for item in own)):
+            row = Row(
+                kind="heterogeneity",
+                index=number,
+                title=f"Heterogeneity, {contrast}",
+                label="I² [%]",
+                scale={"cmap": "cividis", "vmin": 0.0, "vmax": 100.0},
+                values={
+                    item.model.hemi: 100 * item.result.random.i2
+                    for item in own
+                    if item.contrast == contrast
+                },
+            )
+            blocks[2 * number + 1].append(row)
+        yield f"{measure}_maps", partial(draw_rows, cohort, sides, {}, {}, blocks)
+
+
+def _fitted(meta: Meta, hemi: str, cohort: Cohort) -> FittedMaps:
+    """Put the tests of a hemisphere into the form of a fit, to draw them; without any sheets."""
+    shape, nobody = (len(cohort.x), len(cohort.y)), np.zeros(0, dtype=np.int64)
+    words = meta.frame[hemi].subfield
+    names = tuple(name for name in dict.fromkeys(words) if name != files.MISSING)
+    subfield = np.array([names.index(word) if word in names else -1 for word in words])
+    maps = SideMaps(
+        rows=nobody,
+        maps={},
+        subfield=np.zeros((0, *shape), dtype=np.int8),
+        names=names,
+        summary=pd.DataFrame(),
+    )
+    tests: dict[str, list[PointTest]] = {}
+    for item in meta.of("map"):
+        if item.model.hemi == hemi:
+            tests.setdefault(item.model.measures[0], []).extend(
+                point_test(item, effects, meta.settings.meta.confidence)
+                for effects in item.result.models
+            )
+    none = np.zeros(0)
+    fits = {
+        measure: PointwiseFit(coefficients=none[None], sigma=none, n=nobody, tests=tuple(own))
+        for measure, own in tests.items()
+    }
+    return FittedMaps(
+        maps=maps, used=nobody, rows=nobody, subfield=subfield.reshape(shape), fits=fits
+    )
 
 
 def _record(meta: Meta, options: MetaOptions, notes: Sequence[str]) -> dict[str, Any]:

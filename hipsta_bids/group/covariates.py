@@ -1,5 +1,6 @@
 """Covariates of participants and sessions, from the tables of a BIDS dataset and from others."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -10,7 +11,7 @@ import pandas as pd
 from hipsta_bids.derivatives.dataset import linked_path, read_links
 from hipsta_bids.errors import InputError, ModelError
 from hipsta_bids.group.data import PARTICIPANT, SESSION
-from hipsta_bids.group.formula import typed
+from hipsta_bids.group.formula import as_factor, check_numbers, level_name, typed
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
 
@@ -19,6 +20,9 @@ _SHOWN = 6
 #: Column of BIDS' sessions.tsv with dates, and columns that are made here.
 _DATE, TIME, FIRST_AGE = "acq_time", "time", "age_first"
 _DAYS_PER_YEAR = 365.25
+#: Levels of factors that are numbers, and characters of a name for one.
+_CODE = re.compile(r"-?\d+(\.\d+)?")
+_LONGEST_NAME = 40
 
 
 @dataclass(frozen=True)
@@ -59,11 +63,13 @@ def read_covariates(visits: pd.DataFrame, bids_dir: Path, extra: Sequence[Path])
     """Join covariates to visits; cells stay text.
 
     In this order: ``participants.tsv``, ``sessions.tsv`` of the participants, ``phenotype/*.tsv``,
-    and the user's own tables. A later table fills or replaces columns of the same name.
+    and the user's own tables. A later table fills or replaces columns of the same name. Columns
+    whose ``Levels`` a sidecar lists are factors, with the names of the levels instead of numbers.
     """
     joined = visits.copy()
     main = bids_dir / "participants.tsv"
     tables = [main] if main.is_file() else []
+    described: dict[str, object] = {}
     if not bids_dir.is_dir():
         raise InputError(f"{bids_dir}: no such folder; check its name", reason="no-folder")
     for path in (*tables, *sorted((bids_dir / "phenotype").glob("*.tsv")), *extra):
@@ -71,9 +77,42 @@ def read_covariates(visits: pd.DataFrame, bids_dir: Path, extra: Sequence[Path])
         if path == main:
             _check_known(joined, table, path)
         joined = _join(joined, table, path)
+        described |= _sidecar(path.with_suffix(".json"))
         if path == main:
             joined = _join_sessions(joined, bids_dir)
+            described |= _sidecar(bids_dir / "sessions.json")
+    for column in described.keys() & set(joined.columns):
+        joined[column] = _with_levels(joined[column], described[column])
     return joined
+
+
+def _sidecar(path: Path) -> dict[str, object]:
+    return dict(files.read_json(path)) if path.is_file() else {}
+
+
+def _with_levels(values: pd.Series, description: object) -> pd.Series:
+    """Make a factor of a column all of whose values are ``Levels`` of its description."""
+    listed = description.get("Levels") if isinstance(description, Mapping) else None
+    if not isinstance(listed, Mapping):
+        return values
+    levels = {level_name(code): meaning for code, meaning in listed.items()}
+    factor = as_factor(values)
+    present = [str(code) for code in factor.cat.categories]
+    if not present or not set(present) <= set(levels):
+        return values
+    names = [_level_word(levels[code]) for code in present]
+    codes = all(_CODE.fullmatch(code) for code in present)
+    if codes and all(names) and len(set(names)) == len(names):
+        factor = factor.cat.rename_categories(names)
+    return factor
+
+
+def _level_word(meaning: object) -> str:
+    """Name a level by what its description says, if that is short and may stand in a contrast."""
+    if isinstance(meaning, Mapping):
+        meaning = meaning.get("LongName") or meaning.get("Description")
+    word = " ".join(str(meaning or "").split())
+    return word if len(word) <= _LONGEST_NAME and not set(word) & set("[]=,") else ""
 
 
 def _check_known(visits: pd.DataFrame, table: pd.DataFrame, path: Path) -> None:
@@ -103,7 +142,8 @@ def _read(path: Path) -> pd.DataFrame:
 
 
 def _cleaned(table: pd.DataFrame) -> pd.DataFrame:
-    """Add prefixes that labels lack, and mark missing cells."""
+    """Take off blanks round cells, add prefixes that labels lack, and mark missing cells."""
+    table = table.map(str.strip)
     for column, prefix in ((PARTICIPANT, "sub-"), (SESSION, "ses-")):
         if column in table.columns:
             table[column] = [_prefixed(cell, prefix) for cell in table[column]]
@@ -111,7 +151,6 @@ def _cleaned(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def _prefixed(cell: str, prefix: str) -> str:
-    cell = cell.strip()
     return cell if cell == files.MISSING or cell.startswith(prefix) else prefix + cell
 
 
@@ -203,6 +242,8 @@ def add_time(table: pd.DataFrame, settings: GroupSettings) -> VisitTime:
     ages = None
     if age is not None:
         ages = typed(table[age], settings.design)
+        if pd.api.types.is_numeric_dtype(ages):
+            check_numbers(ages, settings.design)
         if _varies(ages, table):
             first = ages.groupby(table[PARTICIPANT]).transform("first")
             result = result.assign(**{FIRST_AGE: first})

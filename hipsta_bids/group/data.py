@@ -62,10 +62,16 @@ class SideMaps:
 
     def take(self, keep: NDArray[np.bool_]) -> "SideMaps":
         """Keep some rows of the cohort's table, which are renumbered."""
-        own = keep[self.rows]
+        own = self.sheets(keep[self.rows])
+        return replace(own, rows=(np.cumsum(keep) - 1)[own.rows])
+
+    def sheets(self, own: NDArray[np.bool_]) -> "SideMaps":
+        """Keep some sheets; of all, no copy is made."""
+        if own.all():
+            return self
         return replace(
             self,
-            rows=(np.cumsum(keep) - 1)[self.rows[own]],
+            rows=self.rows[own],
             maps={name: values[own] for name, values in self.maps.items()},
             errors={name: values[own] for name, values in self.errors.items()},
             subfield=self.subfield[own],

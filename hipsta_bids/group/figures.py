@@ -1,270 +1,246 @@
-"""Figures: maps, profiles, warps, cross-sections, receiver operating characteristics, calibration.
+"""Figures of an analysis, as a paper prints them: sizes, type, files, and all that show curves.
 
-How values become colors, and how maps lie, is that of the pages (``reports.display``).
+Those of maps are in ``panels``. Colors are those of the pages (``reports.display``).
 """
 
 import io
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hipsta_bids.group.analysis import Analysis, mean_of_known, members_of, rows_of, spread_of_known
+from hipsta_bids.group.analysis import Analysis, mean_of_known, members_of, spread_of_known
 from hipsta_bids.group.classify import ClassifierResult, PairComparison, roc_curve
-from hipsta_bids.group.data import Cohort, Float, Int
+from hipsta_bids.group.data import Cohort, Float
 from hipsta_bids.group.glm import FittedMaps
-from hipsta_bids.group.inference import MapKey
+from hipsta_bids.group.panels import (
+    DOTS_PER_INCH,
+    LETTER,
+    ONE_COLUMN,
+    SMALL,
+    TITLE,
+    TWO_COLUMNS,
+    Views,
+    draw_measure,
+)
 from hipsta_bids.group.shapes import AverageShape
-from hipsta_bids.reports import display
-from hipsta_bids.reports.display import COLORS, X_ENDS, Y_ENDS
-from hipsta_bids.reports.group_maps import EFFECT_NAMES, signed_logarithm
-from hipsta_bids.reports.group_tables import BOTH, SIDES, display_name
+from hipsta_bids.reports.display import COLORS, X_ENDS
+from hipsta_bids.reports.group_tables import SIDES, display_name, with_brackets
 from hipsta_bids.reports.maps import new_figure
-from hipsta_bids.types import Mesh
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Font sizes in points: of titles, of axes, and inside.
-TITLE, LABEL, SMALL = 9, 7.5, 6.5
-_DOTS_PER_INCH = 150
-_MAP_PANEL, _SQUARE_PANEL = (2.6, 3.4), (3.1, 4.0)  # inches
-#: A surface is flat if it is thinner than this share of its length.
-_FLAT = 1e-3
+_STYLE: Any = {
+    "font.family": "sans-serif",
+    # The first is everywhere; the others are for readers of drawings who lack it.
+    # Chinese, Japanese and Korean characters come from the first of these that is installed.
+    "font.sans-serif": [
+        "DejaVu Sans",
+        "Verdana",
+        "Arial",
+        "Helvetica",
+        "Noto Sans CJK SC",
+        "Source Han Sans SC",
+        "Microsoft YaHei",
+        "PingFang SC",
+        "Malgun Gothic",
+    ],
+    "font.size": SMALL,
+    "axes.titlesize": TITLE,
+    "axes.labelsize": SMALL,
+    "xtick.labelsize": SMALL,
+    "ytick.labelsize": SMALL,
+    "legend.fontsize": SMALL,
+    "legend.title_fontsize": SMALL,
+    "legend.frameon": False,
+    "axes.linewidth": 0.6,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "xtick.major.size": 2.5,
+    "ytick.major.size": 2.5,
+    "text.parse_math": False,  # names of groups are no formulas
+    "pdf.fonttype": 42,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "hipsta_bids",
+}
+#: What of a file would change from day to day, or with the version of a library.
+_METADATA: Mapping[str, Any] = {
+    "png": {"Software": None},
+    "svg": {"Date": None, "Creator": None},
+    "pdf": {"CreationDate": None, "Producer": None, "Creator": None},
+}
+_INCH = 25.4  # mm
 #: Positions of cross-sections along the long axis, as a fraction from posterior to anterior.
 _SECTIONS = {0.1: "posterior", 0.5: "middle", 0.9: "anterior"}
 _WIDTHS = (1.2, 0.7, 1.2)  # of the lines of interior, middle and exterior, points
 _STYLES = ("-", ":", "-")
+_LETTERS = "abcdefghijklmnopqrstuvwxyz"
+
+Drawing = Callable[[], "list[Figure]"]
 
 
-Scale = Mapping[str, Any]
-"""Color map and the values at its ends, as matplotlib's arguments."""
+def encode(name: str, draw: Drawing) -> list[tuple[str, bytes]]:
+    """Draw figures and encode each as PDF, PNG and SVG; the same results give the same bytes."""
+    new_figure((1.0, 1.0), None)  # loads the library with settings of its own
+    from matplotlib import rc_context  # noqa: PLC0415  (slow to load)
+
+    encoded = []
+    with rc_context(_STYLE):
+        for number, figure in enumerate(draw(), start=1):
+            own = name if number == 1 else f"{name}_{number}"
+            for kind, metadata in _METADATA.items():
+                buffer = io.BytesIO()
+                figure.savefig(buffer, format=kind, dpi=DOTS_PER_INCH, metadata=metadata)
+                encoded.append((f"{own}.{kind}", buffer.getvalue()))
+    return encoded
 
 
-def scale_of(colors: str, low: float, high: float) -> Scale:
-    """Name the arguments of a color scale."""
-    return {"cmap": colors, "vmin": low, "vmax": high}
-
-
-def encode(name: str, figure: "Figure") -> Iterator[tuple[str, bytes]]:
-    """Encode a figure as PNG and SVG files; the same results give the same bytes."""
-    from matplotlib import rc_context  # noqa: PLC0415  (optional, slow to load)
-
-    with rc_context({"svg.hashsalt": "hipsta_bids", "svg.fonttype": "none"}):
-        for kind, metadata in (("png", {"Software": None}), ("svg", {"Date": None})):
-            buffer = io.BytesIO()
-            figure.savefig(buffer, format=kind, dpi=_DOTS_PER_INCH, metadata=metadata)
-            yield f"{name}.{kind}", buffer.getvalue()
-
-
-def panels(n_rows: int, n_columns: int, size: tuple[float, float]) -> tuple["Figure", Any]:
-    """Return an empty figure and its panels, of a size in inches."""
-    figure = new_figure((size[0] * n_columns + 0.8, size[1] * n_rows + 0.4), layout="constrained")
+def _panels(n_rows: int, n_columns: int, size: tuple[float, float]) -> tuple["Figure", Any]:
+    """Return an empty figure of a size in mm, and its panels."""
+    figure = new_figure((size[0] / _INCH, size[1] / _INCH), "constrained")
     return figure, figure.subplots(n_rows, n_columns, squeeze=False)
 
 
-def shown(analysis: Analysis, measure: str) -> Mapping[str, FittedMaps]:
-    """Fitted maps of the hemispheres, or of their difference, that have a measure."""
-    return {hemi: one for hemi, one in analysis.fitted.items() if measure in one.fits}
+def _name(axes: "Sequence[Axes]") -> None:
+    """Put letters on panels, beside their titles."""
+    for axis, letter in zip(axes, cycle(_LETTERS), strict=False):
+        axis.set_title(letter, loc="left", fontsize=LETTER, weight="bold")
 
 
 def mark_medial(axis: "Axes", cohort: Cohort) -> None:
     """Say on the x axis which end is medial."""
-    axis.set_xticks([cohort.x[0], cohort.x[-1]], X_ENDS, fontsize=LABEL)
+    axis.set_xticks([cohort.x[0], cohort.x[-1]], X_ENDS)
     left, right = axis.get_xticklabels()
     left.set_horizontalalignment("left")
     right.set_horizontalalignment("right")
 
 
-def draw_roc(analysis: Analysis) -> "Figure":
+def draw_roc(analysis: Analysis) -> "list[Figure]":
     """Draw the curves of the first added measure."""
-    figure, panels_of_pairs = _pair_panels(analysis)
-    for axis, measure, pair in panels_of_pairs:
-        for color, name, result in _models(measure, pair):
-            area, validation = result.auc, result.cross_validation
-            text = f"{name}: {area.area:.2f} ({area.low:.2f}-{area.high:.2f})"
-            text += f"\nleft out: {validation.auc:.2f}"
-            curve = roc_curve(result.score, pair.is_case)
-            axis.plot(*curve, color=color, label=text, linewidth=1.2)
-        title = "area, participants fitted and left out"
-        _finish(axis, ("1 - specificity", "sensitivity"), title)
-    return figure
+
+    def line(axis: "Axes", result: ClassifierResult, is_case: Any, color: str) -> str:  # noqa: ANN401
+        axis.plot(*roc_curve(result.score, is_case), color=color)
+        area, left_out = result.auc, result.cross_validation.auc
+        return f"{area.area:.2f} ({area.low:.2f} to {area.high:.2f}),\n   left out {left_out:.2f}"
+
+    labels = "1 - specificity", "sensitivity"
+    return _draw_pairs(analysis, labels, "area (95 % limits), participants fitted", line)
 
 
-def draw_calibration(analysis: Analysis) -> "Figure":
-    """Draw predicted chances, cross-validated, against what happened."""
-    figure, panels_of_pairs = _pair_panels(analysis)
-    for axis, measure, pair in panels_of_pairs:
-        if not pair.comparison.full.calibration.judged:
-            axis.set_axis_off()  # too few participants
-            continue
-        for color, name, result in _models(measure, pair):
-            found = result.calibration
-            text = f"{name}: {found.slope:.2f}, {found.brier:.2f}"
-            axis.plot(found.predicted, found.observed, "o-", color=color, label=text, markersize=3)
-        labels = ("predicted chance, cross-validated", "share of cases")
-        _finish(axis, labels, "slope, Brier score")
-    return figure
+def draw_calibration(analysis: Analysis) -> "list[Figure]":
+    """Draw predicted chances, cross-validated, against what happened; of large groups only."""
+
+    def line(axis: "Axes", result: ClassifierResult, _: Any, color: str) -> str:  # noqa: ANN401
+        found = result.calibration
+        axis.plot(found.predicted, found.observed, "o-", color=color, markersize=3)
+        return f"{found.slope:.2f}, {found.brier:.2f}"
+
+    judged = [one for one in analysis.pairs if one[2].comparison.full.calibration.judged]
+    labels = "predicted chance, cross-validated", "share of cases"
+    return _draw_pairs(replace(analysis, pairs=judged), labels, "slope, Brier score", line)
 
 
-def _pair_panels(
+def _draw_pairs(
     analysis: Analysis,
-) -> tuple["Figure", list[tuple["Axes", str, PairComparison]]]:
-    """Title a panel for each pair and hemisphere, with the measure that was added first."""
-    hemis = list(dict.fromkeys(hemi for hemi, _, _ in analysis.pairs))
-    groups = list(dict.fromkeys((pair.control, pair.case) for _, _, pair in analysis.pairs))
-    figure, axes = panels(len(groups), len(hemis), _SQUARE_PANEL)
-    first: dict[tuple[str, str, str], tuple[str, PairComparison]] = {}
+    labels: tuple[str, str],
+    what: str,
+    line: "Callable[[Axes, ClassifierResult, Any, str], str]",
+) -> "list[Figure]":
+    """Draw a row for each pair of groups, with its legend beside it: the first added measure."""
+    first: dict[tuple[str, str], dict[str, tuple[str, PairComparison]]] = {}
     for hemi, measure, pair in analysis.pairs:
-        first.setdefault((pair.control, pair.case, hemi), (measure, pair))
-    titled = []
-    for i, (control, case) in enumerate(groups):
-        for j, hemi in enumerate(hemis):
-            axis = axes[i, j]
-            if (control, case, hemi) not in first:
-                axis.set_axis_off()
-                continue
-            measure, pair = first[control, case, hemi]
-            how = "\n(separated: Firth's method)" if pair.comparison.separated else ""
-            side = {"L": "left", "R": "right"}.get(hemi, "both sides")
-            axis.set_title(f"{control} against {case}, {side}{how}", fontsize=TITLE)
+        first.setdefault((pair.control, pair.case), {}).setdefault(hemi, (measure, pair))
+    n = max(map(len, first.values()))
+    width = TWO_COLUMNS if n > 1 else ONE_COLUMN
+    side = (width - 6.0) / (n + 1)
+    figure, axes = _panels(len(first), n + 1, (width, len(first) * max(side + 13, 18 + 14 * n)))
+    for row, ((control, case), by_side) in zip(axes, first.items(), strict=True):
+        texts: dict[str, list[str]] = {}
+        for axis, (hemi, (measure, pair)) in zip(row, by_side.items(), strict=False):
+            where = {"L": "left", "R": "right"}.get(hemi, "both sides")
             axis.plot([0, 1], [0, 1], color="0.6", linewidth=0.5)
-            titled.append((axis, measure, pair))
-    return figure, titled
+            for color, name, result in _models(measure, pair):
+                text = line(axis, result, pair.is_case, color)
+                texts.setdefault(name, []).append(f"{where}: {text}")
+            axis.set_title(where)
+            axis.set(xlabel=labels[0], aspect="equal")
+            axis.set_xticks([0, 0.5, 1])
+            axis.set_yticks([0, 0.5, 1])
+        row[0].set_ylabel(labels[1])
+        for axis in row[len(by_side) :]:
+            axis.set_axis_off()
+        method = "\n(separated: Firth's method)" if pair.comparison.separated else ""
+        from matplotlib.lines import Line2D  # noqa: PLC0415  (slow to load)
+
+        nothing = Line2D([], [], linestyle="none")
+        row[-1].legend(
+            [
+                handle
+                for color, lines in zip(COLORS, texts.values(), strict=False)
+                for handle in (Line2D([], [], color=color), *[nothing] * len(lines))
+            ],
+            [text for name, lines in texts.items() for text in (name, *lines)],
+            title=f"{control} against {case}{method}\n{what}",
+            loc="upper left", borderaxespad=0, alignment="left", handlelength=1.2, labelspacing=0.2,
+        )  # fmt: skip
+    _name([axis for axis in axes.flat if axis.axison])
+    return [figure]
 
 
 def _models(measure: str, pair: PairComparison) -> Iterator[tuple[str, str, ClassifierResult]]:
-    yield COLORS[0], "base", pair.comparison.base
+    yield COLORS[0], "base model", pair.comparison.base
     yield COLORS[1], f"with {display_name(measure)}", pair.comparison.full
 
 
-def _finish(axis: "Axes", labels: tuple[str, str], title: str) -> None:
-    """Label the axes of a panel, about square, and put its legend below them, off the curves."""
-    axis.set_xlabel(labels[0], fontsize=LABEL)
-    axis.set_ylabel(labels[1], fontsize=LABEL)
-    axis.tick_params(labelsize=LABEL)
-    axis.legend(
-        fontsize=SMALL,
-        title=title,
-        title_fontsize=SMALL,
-        loc="upper center",
-        bbox_to_anchor=(0.5, -0.15),
-        frameon=False,
-    )
-
-
-def draw_profiles(cohort: Cohort, analysis: Analysis) -> "Figure":
-    """Draw means over y by group, before and after registration."""
-    measures = list(next(iter(cohort.sides.values())).maps)
-    figure, axes = panels(len(analysis.sides), 2 * len(measures), (3.0, 2.4))
-    for i, (hemi, side) in enumerate(analysis.sides.items()):
-        sources = {"before": cohort.sides[hemi], "after": side.registered}
-        for j, measure in enumerate(measures):
-            pair = axes[i, 2 * j : 2 * j + 2]
-            for axis, (when, source) in zip(pair, sources.items(), strict=True):
-                values = mean_of_known(source.maps[measure], 2)
-                members = members_of(analysis, cohort.table.iloc[source.rows])
-                for color, (group, own) in zip(cycle(COLORS), members.items(), strict=False):
-                    _band(axis, cohort.x, values[own], group, color)
-                axis.set_title(
-                    f"{display_name(measure)}, {SIDES[hemi]},\n{when} registration",
-                    fontsize=TITLE,
-                )
-                _finish_curve(
-                    axis, cohort, f"{display_name(measure)} [{cohort.units.get(measure, '1')}]"
-                )
-            pair[1].sharey(pair[0])
-    axes[0, 0].legend(fontsize=LABEL, title="mean, 2 SE", title_fontsize=LABEL)
-    return figure
-
-
-def draw_warps(cohort: Cohort, analysis: Analysis) -> "Figure":
-    """Draw displacements by group."""
-    figure, axes = panels(len(analysis.sides), 2, (3.6, 2.6))
-    for i, (hemi, side) in enumerate(analysis.sides.items()):
+def draw_registration(cohort: Cohort, analysis: Analysis) -> "list[Figure]":
+    """Draw curvature from medial to lateral before and after registration, and the warps."""
+    figure, axes = _panels(len(analysis.sides), 3, (TWO_COLUMNS, 48 * len(analysis.sides)))
+    label = with_brackets("curvature", cohort.units.get("curvature", "1"))
+    for (before, after, shifts), (hemi, side) in zip(axes, analysis.sides.items(), strict=True):
+        members = members_of(analysis, cohort.table.iloc[side.registered.rows])
+        for axis, source, when in (
+            (before, cohort.sides[hemi], "before"),
+            (after, side.registered, "after"),
+        ):
+            _curves(axis, cohort.x, mean_of_known(source.maps["curvature"], 2), members)
+            axis.set_title(f"{SIDES[hemi]}, {when} registration")
+            axis.set_ylabel(label)
+        after.sharey(before)
         nodes = side.registration.warps.shape[1]
         moved = (side.registration.warps - np.linspace(0, 1, nodes)) * (nodes - 1)
-        members = members_of(analysis, cohort.table.iloc[side.registered.rows])
-        for color, (group, own) in zip(cycle(COLORS), members.items(), strict=False):
-            axes[i, 0].plot(cohort.x, moved[own].T, color=color, alpha=0.4, linewidth=0.6)
-            _band(axes[i, 1], cohort.x, moved[own], group, color)
-        for axis, what in zip(axes[i], ("each participant", "means, 2 SE"), strict=True):
-            axis.axhline(0, color="black", linewidth=0.5)
-            axis.set_title(f"warps, {SIDES[hemi]}, {what}", fontsize=TITLE)
-            _finish_curve(axis, cohort, "shift to lateral [nodes]")
-    axes[0, 1].legend(fontsize=LABEL)
-    return figure
+        for color, own in zip(cycle(COLORS), members.values(), strict=False):
+            shifts.plot(cohort.x, moved[own].T, color=color, alpha=0.25, linewidth=0.4)
+        _curves(shifts, cohort.x, moved, members)
+        shifts.axhline(0, color="black", linewidth=0.5)
+        shifts.set_title(f"{SIDES[hemi]}, warps")
+        shifts.set_ylabel("shift to lateral [nodes]")
+        for axis in (before, after, shifts):
+            mark_medial(axis, cohort)
+    axes[0, 0].legend(title="mean, 2 standard errors")
+    _name(axes.flat)
+    return [figure]
 
 
-def _finish_curve(axis: "Axes", cohort: Cohort, label: str) -> None:
-    axis.set_ylabel(label, fontsize=LABEL)
-    mark_medial(axis, cohort)
-    axis.tick_params(labelsize=LABEL)
-
-
-def _band(axis: "Axes", x: Float, values: Float, name: str, color: str) -> None:
-    """Draw a mean and twice its standard error to both sides."""
-    count = np.isfinite(values).sum(axis=0)
-    mean = mean_of_known(values, 0)
-    error = spread_of_known(values) / np.sqrt(np.maximum(count, 1))
-    axis.plot(x, mean, color=color, label=f"{name} (n = {len(values)})", linewidth=1.2)
-    axis.fill_between(x, mean - 2 * error, mean + 2 * error, color=color, alpha=0.25, linewidth=0)
-
-
-def draw_mesh(axis: "Axes", mesh: Mesh, values: Float, scale: Scale) -> Any:  # noqa: ANN401  (what colorbars take)
-    """Draw one map, upright as sheets are.
-
-    A flat surface is drawn in its own coordinates. HippUnfold's runs from anterior to posterior
-    along x and from the subiculum to the dentate gyrus along y, so that x goes down and y to the
-    right, as on a sheet. A folded surface is seen along its thinnest direction.
-    """
-    plane, triangles, words = _laid_out(mesh)
-    flat = values.reshape(-1)
-    known = np.isfinite(flat[triangles]).all(axis=1)
-    axis.set_facecolor("0.92")
-    axis.set_aspect("equal")
-    axis.set_xlabel(words[0], fontsize=LABEL)
-    axis.set_ylabel(words[1], fontsize=LABEL)
-    axis.tick_params(labelsize=SMALL)
-    (left, bottom), (right, top) = plane.min(axis=0), plane.max(axis=0)
-    axis.set_xlim(left, right)
-    axis.set_ylim(*((top, bottom) if words[1].startswith("x") else (bottom, top)))
-    # One invisible triangle carries the colors if nothing is known.
-    some = triangles[known] if known.any() else triangles[:1]
-    return axis.tripcolor(
-        plane[:, 0],
-        plane[:, 1],
-        some,
-        facecolors=np.nan_to_num(flat[some].mean(axis=1)),
-        **scale,
-        edgecolors="none",
-        rasterized=True,
-        visible=bool(known.any()),
-    )
-
-
-def _laid_out(mesh: Mesh) -> tuple[Float, Int, tuple[str, str]]:
-    """Positions in the plane, triangles from back to front, and what the axes are."""
-    centered = mesh.points - mesh.points.mean(axis=0)
-    reach = np.ptp(mesh.points, axis=0)
-    if reach[2] <= _FLAT * reach.max():
-        names = ("x of the surface", "y of the surface")
-        if reach[0] > reach[1]:
-            return mesh.points[:, [1, 0]], mesh.triangles, (names[1], names[0])
-        return mesh.points[:, :2], mesh.triangles, names
-    axes = np.linalg.svd(centered, full_matrices=False)[2]
-    rotated = centered @ axes.T
-    order = np.argsort(rotated[mesh.triangles, 2].mean(axis=1))
-    return rotated[:, [1, 0]], mesh.triangles[order], ("second axis", "longest axis")
+def _curves(axis: "Axes", x: Float, values: Float, members: Mapping[str, Any]) -> None:
+    """Draw the mean of each group and twice its standard error to both sides."""
+    for color, (name, own) in zip(cycle(COLORS), members.items(), strict=False):
+        count = np.isfinite(values[own]).sum(axis=0)
+        mean = mean_of_known(values[own], 0)
+        error = 2 * spread_of_known(values[own]) / np.sqrt(np.maximum(count, 1))
+        axis.plot(x, mean, color=color, label=f"{name} (n = {len(values[own])})", linewidth=1.2)
+        axis.fill_between(x, mean - error, mean + error, color=color, alpha=0.25, linewidth=0)
 
 
 def draw_sections(
     cohort: Cohort, analysis: Analysis, shapes: Mapping[str, AverageShape]
-) -> "Figure":
+) -> "list[Figure]":
     """Draw the groups' mean walls at three places along the long axis, superior up."""
-    figure, axes = panels(len(shapes), len(_SECTIONS), (3.2, 2.8))
+    figure, axes = _panels(len(shapes), len(_SECTIONS), (TWO_COLUMNS, 55 * len(shapes)))
     for i, (hemi, shape) in enumerate(shapes.items()):
         for j, (share, name) in enumerate(_SECTIONS.items()):
             axis, node = axes[i, j], round(share * (len(cohort.y) - 1))
@@ -279,13 +255,13 @@ def draw_sections(
             if hemi in analysis.fitted:
                 middle = (shape.mean[:, :, node] - center) @ plane.T
                 _mark_subfields(axis, middle, analysis.fitted[hemi], node)
-            axis.set_title(f"{SIDES[hemi]}, y = {cohort.y[node]:.2g} ({name})", fontsize=TITLE)
-            axis.set_xlabel("to lateral [mm]", fontsize=LABEL)
-            axis.set_ylabel("to superior [mm]", fontsize=LABEL)
+            axis.set_title(f"{SIDES[hemi]}, {name} (y = {cohort.y[node]:.2g})")
+            axis.set_xlabel("to lateral [mm]")
+            axis.set_ylabel("to superior [mm]")
             axis.set_aspect("equal", adjustable="datalim")
-            axis.tick_params(labelsize=LABEL)
-    axes[0, 0].legend(fontsize=SMALL, title="walls, and dotted the middle", title_fontsize=SMALL)
-    return figure
+    axes[0, 0].legend(title="walls; dotted: middle")
+    _name(axes.flat)
+    return [figure]
 
 
 def _plane(middle: Float, node: int, *, left: bool) -> Float:
@@ -315,149 +291,67 @@ def _mark_subfields(axis: "Axes", layers: Float, one: FittedMaps, node: int) -> 
             axis.text(x, y, name, fontsize=SMALL, ha="center", va="center", bbox=box)
 
 
-def draw_means(cohort: Cohort, analysis: Analysis, measure: str) -> "Figure":
-    """Draw the mean map of each group."""
-    groups = analysis.groups.levels if analysis.groups else ("all",)
-    sides = shown(analysis, measure)
-    figure, axes = panels(len(sides), len(groups), _MAP_PANEL)
-    means, counts = {}, {}
-    for hemi, one in sides.items():
-        for group, own in members_of(analysis, rows_of(analysis, one)).items():
-            values = mean_of_known(one.values(measure)[own], 0)
-            means[hemi, group] = values.reshape(one.maps.shape)
-            counts[hemi, group] = int(own.sum())
-    kind = display.kind_of(measure, change=bool(analysis.comparison.pair) or set(sides) == {BOTH})
-    scale = scale_of(kind.colors, *display.scale_of(kind, list(means.values())))
-    images: list[Any] = []
-    for i, (hemi, one) in enumerate(sides.items()):
-        for j, group in enumerate(groups):
-            axis = axes[i, j]
-            images.append(_draw(axis, cohort, one, means[hemi, group], scale))
-            axis.set_title(f"{group}, {SIDES[hemi]} (n = {counts[hemi, group]})", fontsize=TITLE)
-    change = " change of" if analysis.comparison.pair else ""
-    unit = cohort.units.get(measure, "1")
-    _bar(figure, images[0], axes, f"mean{change} {display_name(measure)} [{unit}]")
-    return figure
-
-
-def draw_contrasts(cohort: Cohort, analysis: Analysis, measure: str) -> "Figure":
-    """Draw effect sizes and corrected p-values, one row per contrast."""
-    sides = shown(analysis, measure)
-    tests = next(iter(sides.values())).fits[measure].tests
-    figure, axes = panels(len(tests), 2 * len(sides), _MAP_PANEL)
-    reaches = _reaches(analysis)
-    signed = {}
-    for hemi, one in sides.items():
-        for i, test in enumerate(one.fits[measure].tests):
-            found = analysis.found[MapKey(measure, test.contrast.name, hemi)]
-            signed[hemi, i] = signed_logarithm(found.adjusted, found.rejected, test.statistic)
-    top = display.significance_reach(list(signed.values()))
-    p_scale = scale_of(display.P_COLORS, -top, top)
-    effects, significances = {}, []
-    for j, (hemi, one) in enumerate(sides.items()):
-        for i, test in enumerate(one.fits[measure].tests):
-            left, right = axes[i, 2 * j], axes[i, 2 * j + 1]
-            effect = test.effect.reshape(one.maps.shape)
-            p = signed[hemi, i].reshape(one.maps.shape)
-            reach = reaches[test.contrast.name]
-            scale = scale_of(display.EFFECT_COLORS, -reach, reach)
-            effects[i] = _draw(left, cohort, one, effect, scale)
-            significances.append(_draw(right, cohort, one, p, p_scale))
-            for axis, what in ((left, "effect size"), (right, "significance")):
-                axis.set_title(f"{test.contrast.name}\n{SIDES[hemi]}, {what}", fontsize=TITLE)
-    bar = _bar(figure, significances[0], axes, "-log10 of corrected p, with the sign of the effect")
-    alpha = next(iter(analysis.found.values())).alpha
-    for sign in (-1, 1):
-        bar.ax.axhline(-sign * np.log10(alpha), color="black", linewidth=1)
-        place = (-0.15, -sign * np.log10(alpha))
-        bar.ax.text(*place, f"p {alpha:g}", fontsize=SMALL, ha="right", va="center")
-    for i, test in enumerate(tests):
-        _bar(figure, effects[i], axes[i], EFFECT_NAMES[test.kind], extend="both")
-    return figure
-
-
-def _reaches(analysis: Analysis) -> dict[str, float]:
-    """Effect sizes at the ends of the colors by contrast, the same for all measures."""
-    maps: dict[str, list[display.Effects]] = {}
-    for one in analysis.fitted.values():
-        for test in (test for fit in one.fits.values() for test in fit.tests):
-            effects = display.Effects(test.kind, test.effect, test.statistic, test.df)
-            maps.setdefault(test.contrast.name, []).append(effects)
-    return {name: display.effect_reach(own) for name, own in maps.items()}
-
-
-def _bar(figure: "Figure", image: Any, axes: Any, label: str, extend: str = "neither") -> Any:  # noqa: ANN401  (of matplotlib)
-    bar = figure.colorbar(
-        image, ax=axes, shrink=min(1.0, 2 / len(axes)) if np.ndim(axes) > 1 else 1.0, extend=extend
-    )
-    bar.set_label(label, fontsize=TITLE)
-    bar.ax.tick_params(labelsize=LABEL)
-    return bar
-
-
-def _draw(
-    axis: "Axes",
-    cohort: Cohort,
-    one: FittedMaps,
-    values: Float,
-    scale: Scale,
-) -> Any:  # noqa: ANN401  (what colorbars take)
-    """Draw one map on the sheet with its subfields, or on the surface that it lies on."""
-    if one.maps.mesh is not None:
-        return draw_mesh(axis, one.maps.mesh, values, scale)
-    x, y = cohort.x, cohort.y
-    image = axis.pcolormesh(x, y, values.T, **scale, shading="nearest", rasterized=True)
-    axis.set_facecolor("0.92")
-    mark_medial(axis, cohort)
-    axis.set_yticks([y[0], y[-1]], Y_ENDS, fontsize=LABEL, rotation=90)
-    lower, upper = axis.get_yticklabels()
-    lower.set_verticalalignment("bottom")
-    upper.set_verticalalignment("top")
-    _borders(axis, cohort, one)
-    return image
-
-
-def _borders(axis: "Axes", cohort: Cohort, one: FittedMaps) -> None:
-    """Draw where the most frequent subfield changes, and name the subfields."""
-    fields = one.subfield
-    x, y = cohort.x, cohort.y
-    dx, dy = (x[1] - x[0]) / 2, (y[1] - y[0]) / 2
-    i, j = np.nonzero(fields[1:] != fields[:-1])
-    axis.vlines(x[i] + dx, y[j] - dy, y[j] + dy, colors="black", linewidth=0.8)
-    i, j = np.nonzero(fields[:, 1:] != fields[:, :-1])
-    axis.hlines(y[j] + dy, x[i] - dx, x[i] + dx, colors="black", linewidth=0.8)
-    for number, name in enumerate(one.maps.names):
-        nodes = np.nonzero(fields == number)[0]
-        if len(nodes):
-            axis.text(
-                float(x[nodes].mean()),
-                float(y[0]) + 2 * dy,
-                name,
-                fontsize=SMALL,
-                ha="center",
-                bbox={"facecolor": "white", "alpha": 0.6, "edgecolor": "none", "pad": 0.5},
+def draw_sites(cohort: Cohort, analysis: Analysis) -> "list[Figure]":
+    """Draw means and SDs of the residuals of sites over points, before and after harmonization."""
+    done = analysis.harmonization
+    if done is None:
+        raise ValueError("nothing was harmonized")
+    shown_sites = [site for site in done.plan.sites if site in done.plan.counts]
+    height = 2 * (20 + 5 * len(shown_sites))
+    figure, axes = _panels(2, len(done.maps), (TWO_COLUMNS, height))
+    for j, ((hemi, measure), (effects, moments)) in enumerate(done.maps.items()):
+        states = {"before": moments, "after": moments.after(effects)}
+        unit = cohort.units.get(measure, "1")
+        for number, (name, one) in enumerate(states.items()):
+            for axis, values in ((axes[0, j], one.mean * effects.sd), (axes[1, j], one.sd)):
+                for row, site in enumerate(shown_sites):
+                    _spread(axis, values[done.plan.sites.index(site)], row, number, name)
+        for axis, label, ideal in (
+            (axes[0, j], f"mean, {display_name(measure)} [{unit}]", 0.0),
+            (axes[1, j], "SD, over that of all", 1.0),
+        ):
+            axis.axvline(ideal, color="black", linewidth=0.5)
+            axis.set_yticks(
+                range(len(shown_sites)), shown_sites if j == 0 else [""] * len(shown_sites)
             )
+            axis.set_ylim(len(shown_sites) - 0.5, -0.5)
+            axis.locator_params(axis="x", nbins=4)
+            axis.set_xlabel(label)
+        axes[0, j].set_title(f"{display_name(measure)}, {SIDES[hemi]}")
+    handles = dict(zip(*axes[0, 0].get_legend_handles_labels()[::-1], strict=True))
+    figure.legend(handles.values(), handles, loc="outside lower center", ncols=2)
+    return [figure]
+
+
+def _spread(axis: "Axes", values: Float, row: int, number: int, name: str) -> None:
+    """Draw the 5th to the 95th percentile, the quartiles and the median of points as lines."""
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return
+    low, first, middle, third, high = np.percentile(known, [5, 25, 50, 75, 95])
+    y, color = row - 0.16 + 0.32 * number, ("0.6", COLORS[0])[number]
+    axis.plot([low, high], [y, y], color=color, linewidth=1.0)
+    axis.plot([first, third], [y, y], color=color, linewidth=4.5, label=name, solid_capstyle="butt")
+    axis.plot([middle], [y], "|", color="white", markersize=4.5)
 
 
 def draw_figures(
     cohort: Cohort, analysis: Analysis, shapes: Mapping[str, AverageShape]
-) -> Iterator[tuple[str, bytes]]:
-    """Draw all figures of one model, as files."""
+) -> Iterator[tuple[str, Drawing]]:
+    """List all figures of one model by name, for :func:`encode`."""
+    views: Views = {}
     for measure in dict.fromkeys(m for one in analysis.fitted.values() for m in one.fits):
-        yield from encode(f"{measure}_means", draw_means(cohort, analysis, measure))
-        if any(one.fits[measure].tests for one in analysis.fitted.values() if measure in one.fits):
-            yield from encode(f"{measure}_contrasts", draw_contrasts(cohort, analysis, measure))
-    if analysis.sides:
-        yield from encode("profiles", draw_profiles(cohort, analysis))
-    if (
-        analysis.groups is not None
-        and analysis.sides
-        and all(side.registration.template is not None for side in analysis.sides.values())
+        yield f"{measure}_maps", partial(draw_measure, cohort, analysis, shapes, views, measure)
+    if analysis.harmonization is not None and analysis.harmonization.maps:
+        name = "sites" if analysis.sides else f"{next(iter(analysis.measured.maps))}_sites"
+        yield name, partial(draw_sites, cohort, analysis)
+    if analysis.sides and all(
+        side.registration.template is not None for side in analysis.sides.values()
     ):
-        yield from encode("warps", draw_warps(cohort, analysis))
+        yield "registration", partial(draw_registration, cohort, analysis)
     if shapes:
-        yield from encode("sections", draw_sections(cohort, analysis, shapes))
+        yield "sections", partial(draw_sections, cohort, analysis, shapes)
     if analysis.pairs:
-        yield from encode("roc", draw_roc(analysis))
+        yield "roc", partial(draw_roc, analysis)
         if any(pair.comparison.full.calibration.judged for *_, pair in analysis.pairs):
-            yield from encode("calibration", draw_calibration(analysis))
+            yield "calibration", partial(draw_calibration, analysis)

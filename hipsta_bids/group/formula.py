@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.data import Float
-from hipsta_bids.group.settings import DesignSettings
+from hipsta_bids.group.settings import DesignSettings, GroupSettings
 
 _VERSION = "1.0.0"
 #: A weight and a name such as ``age``, ``group[CU]`` or ``group[T.CU]:age``.
@@ -28,6 +28,11 @@ _MISSING = ("n/a", "NA", "N/A", "nan", "NaN", "")
 _LARGEST = 1e100
 #: Rows that a message names.
 _NAMED = 8
+#: Two values are the same on a line and as a factor.
+_LEAST_LINE = 3
+#: Whole numbers as spreadsheets may write them, and dates.
+_WHOLE = re.compile(r"(-?\d+)\.0+")
+_DATE = re.compile(r"\d{4}-\d{1,2}-\d{1,2}\b.*|\d{1,2}[./]\d{1,2}[./]\d{2,4}")
 
 
 @dataclass(frozen=True)
@@ -231,8 +236,39 @@ def check_names(names: Iterable[str], columns: pd.Index) -> None:
             )
 
 
+def with_factors(table: pd.DataFrame, settings: GroupSettings) -> pd.DataFrame:
+    """Make factors, of pandas' type, of the columns that are some by their name."""
+    known = (*settings.design.factors, *settings.model.group_columns)
+    names = {name.casefold() for name in known}
+    chosen = [
+        column
+        for column in table.columns
+        if str(column).casefold() in names
+        and not isinstance(table[column].dtype, pd.CategoricalDtype)
+    ]
+    return table.assign(**{str(column): as_factor(table[column]) for column in chosen})
+
+
+def as_factor(values: pd.Series) -> pd.Series:
+    """Take values for names, whatever they look like; ``1.0`` is ``1``."""
+    if pd.api.types.is_bool_dtype(values):
+        return values.map({True: "yes", False: "no"}).astype("category")
+    text = values.astype(object).where(values.notna(), None)
+    text = text.map(lambda value: None if value is None else level_name(value))
+    return text.where(~text.isin(_MISSING), None).astype("category")
+
+
+def level_name(value: object) -> str:
+    """Write a level of a factor."""
+    text = str(value).strip()
+    whole = _WHOLE.fullmatch(text)
+    return whole[1] if whole else text
+
+
 def typed(values: pd.Series, settings: DesignSettings) -> pd.Series:
-    """Return numbers as floats, text as text, and what is missing as missing."""
+    """Return numbers as floats, text and factors as text, and what is missing as missing."""
+    if isinstance(values.dtype, pd.CategoricalDtype):
+        return values.astype(object).where(values.notna(), None)
     if pd.api.types.is_bool_dtype(values):
         return values.map({True: "yes", False: "no"}).astype(object)
     if pd.api.types.is_numeric_dtype(values):
@@ -255,11 +291,92 @@ def typed(values: pd.Series, settings: DesignSettings) -> pd.Series:
     if numbers[present].notna().mean() > settings.numeric_share:
         bad = present & numbers.isna()
         raise ModelError(
-            f"model: column {values.name!r} holds numbers but for rows"
-            f" {listed(values.index[bad])}; correct them, or mark them n/a",
+            f"model: column {values.name!r} holds numbers but for rows {_cells(text[bad])};"
+            " correct them, or mark them n/a",
             reason="not-numeric",
         )
+    _refuse_spellings(text[present], settings)
     return text
+
+
+def _refuse_spellings(text: pd.Series, settings: DesignSettings) -> None:
+    """Refuse what is meant for numbers but is not written so: decimal commas, and dates."""
+    points = pd.to_numeric(text.str.replace(",", ".", n=1, regex=False), errors="coerce")
+    for written, what, remedy in (
+        (points.notna(), "decimal commas", "write 70.5 for 70,5"),
+        (text.str.fullmatch(_DATE), "dates", "give years or days, as numbers"),
+    ):
+        if len(text) and written.mean() > settings.numeric_share:
+            raise ModelError(
+                f"model: column {text.name!r} holds {what}, as {_cells(text[written][:1])};"
+                f" {remedy}",
+                reason="not-numeric",
+            )
+
+
+def check_numbers(values: pd.Series, settings: DesignSettings) -> None:
+    """Refuse codes for missing values that are far from all others, and values out of all range."""
+    present = values[values.notna()]
+    codes = present.isin(settings.missing_codes)
+    rest = present[~codes]
+    if codes.any() and len(rest):
+        low, high = float(rest.min()), float(rest.max())
+        gap = np.maximum(low - present, present - high)
+        far = codes & (gap > high - low)
+        if far.any():
+            raise ModelError(
+                f"model: column {values.name!r} has {_cells(present[far])} where all others are"
+                f" {low:g} to {high:g}: a code for missing values? mark them n/a (or change the"
+                " setting design.missing_codes)",
+                reason="implausible-value",
+            )
+    if not len(present):
+        return
+    quartiles = np.quantile(present, [0.25, 0.5, 0.75])
+    reach = settings.farthest * (quartiles[2] - quartiles[0])
+    far = (present - quartiles[1]).abs() > reach
+    if reach > 0 and far.any():
+        raise ModelError(
+            f"model: column {values.name!r} has {_cells(present[far])} where half of the others are"
+            f" {quartiles[0]:.4g} to {quartiles[2]:.4g}; correct them, or mark them n/a",
+            reason="implausible-value",
+        )
+
+
+def _cells(values: pd.Series) -> str:
+    """List rows with what stands in them."""
+    shown = [f"{value:g}" if isinstance(value, float) else repr(value) for value in values]
+    return listed(f"{row} ({cell})" for row, cell in zip(values.index, shown, strict=True))
+
+
+def check_spelling(levels: Mapping[str, int], name: str) -> None:
+    """Refuse levels of a factor that differ in case or blanks only.
+
+    Which of them is meant is for a person to say: merged silently, a typing error would pass.
+    """
+    alike: dict[str, list[str]] = {}
+    for level in levels:
+        alike.setdefault("".join(level.split()).casefold(), []).append(level)
+    for found in alike.values():
+        if len(found) > 1:
+            words = ", ".join(f"{level!r} ({levels[level]})" for level in sorted(found))
+            raise ModelError(
+                f"model: levels of {name!r} differ in capitals or blanks only: {words}; write them"
+                " alike",
+                reason="level-spelling",
+            )
+
+
+def coding_note(values: pd.Series, settings: DesignSettings) -> str | None:
+    """Say that few different numbers are fitted as a line, as perhaps they should not."""
+    found = sorted(values.unique())
+    if not _LEAST_LINE <= len(found) <= settings.few_values:
+        return None
+    return (
+        f"{values.name} has {len(found)} different values ({', '.join(f'{x:g}' for x in found)})"
+        f" and is fitted as a line; if these are codes, write C({values.name}) in --formula, or"
+        " give their Levels in participants.json"
+    )
 
 
 def rows_by_lack(used: pd.DataFrame, complete: NDArray[np.bool_]) -> dict[str, tuple[str, ...]]:
@@ -288,6 +405,7 @@ def set_levels(
     for column in used.columns:
         name = str(column)
         if pd.api.types.is_numeric_dtype(used[name]):
+            check_numbers(used[name], settings)
             _check_varies(used[name], name)
         else:
             chosen[name] = _levels(used[name], name, references.get(name), settings)
@@ -314,7 +432,8 @@ def _levels(
 ) -> list[str]:
     """Levels of a factor, reference first."""
     counts = {str(level): int(count) for level, count in values.value_counts().items()}
-    levels = sorted(counts)
+    check_spelling(counts, name)
+    levels = sorted(counts, key=in_order)
     first = levels[0] if reference is None else reference
     if first not in levels:
         raise ModelError(
@@ -335,6 +454,14 @@ def _levels(
         )
     levels.remove(first)
     return [first, *levels]
+
+
+def in_order(level: str) -> tuple[float, str]:
+    """Sort levels as numbers where they are some, before names."""
+    try:
+        return float(level), level
+    except ValueError:
+        return np.inf, level
 
 
 def listed(items: Iterable[object]) -> str:

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -425,7 +424,11 @@ class RowModel:
     """A linear model of independent rows of a design."""
 
     design: Design
-    independent: ClassVar[bool] = True
+
+    @property
+    def people(self) -> Int | None:
+        """(rows,) number of each row's participant, where participants have several."""
+        return None
 
     def fit(
         self, values: Float, rows: Int, contrasts: tuple[Contrast, ...], settings: GroupSettings

@@ -59,6 +59,8 @@ class ClosedFormula:
     """The formula, put together from its checked parts."""
     names: tuple[str, ...]
     """Columns that it needs, without backticks, in the order of their first use."""
+    factors: frozenset[str] = frozenset()
+    """Those of them that stand in ``C`` only."""
 
 
 def closed_formula(text: str) -> ClosedFormula:
@@ -70,6 +72,7 @@ def closed_formula(text: str) -> ClosedFormula:
         The message names the first part that is not allowed, and what is.
     """
     names: dict[str, None] = {}
+    plain: set[str] = set()
     parts: list[str] = []
     tokens = _tokens(text)
     position, after_operand = 0, False
@@ -82,7 +85,9 @@ def closed_formula(text: str) -> ClosedFormula:
             _refuse(text, f"{tokens[position - 1].text} {token.text}")
         if is_call:
             end = _call_end(tokens, position)
-            names |= dict.fromkeys(_check_call(text, tokens[position:end]))
+            inside = _check_call(text, tokens[position:end])
+            names |= dict.fromkeys(inside)
+            plain |= set(inside) if token.text != "C" else set()
         elif token.kind == "number":
             is_power = position > 0 and tokens[position - 1].text == "**"
             powers = [str(power) for power in range(1, _HIGHEST_POWER + 1)]
@@ -90,12 +95,13 @@ def closed_formula(text: str) -> ClosedFormula:
                 _refuse(text, token.text)
         elif token.kind in {"name", "quoted"}:
             names[_column(text, token)] = None
+            plain.add(_column(text, token))
         elif token.text not in _OPERATORS | {"(", ")"}:
             _refuse(text, token.text)
         after_operand = is_operand or token.text == ")"
         parts.append("".join(part.text for part in tokens[position:end]))
         position = end
-    return ClosedFormula(" ".join(parts), tuple(names))
+    return ClosedFormula(" ".join(parts), tuple(names), frozenset(names) - plain)
 
 
 def _refuse(text: str, part: str) -> NoReturn:

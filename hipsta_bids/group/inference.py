@@ -58,6 +58,8 @@ class PermutationPart:
     same way in all parts."""
     edges: Int
     """(edges, 2) neighbors among the points."""
+    people: Int | None = None
+    """(subjects,) whose each is, if they are visits of which people have several."""
 
 
 def permute(
@@ -73,6 +75,8 @@ def permute(
     What the covariates explain is subtracted, the residuals are shuffled between subjects, and
     the whole model is fitted to them again (Winkler et al. 2014). If the contrast tests what
     all subjects have in common (an intercept), signs are flipped instead of subjects shuffled.
+    Of repeated visits the signs of all visits of a person are flipped together, whatever is tested:
+    that keeps their covariance, and asks only that errors are symmetric (Winkler et al. 2015).
 
     Missing values count as what the covariates predict, which shrinks an effect; degrees of
     freedom are those of the subjects present. ``family`` is the number of this one, from 0, and of
@@ -134,11 +138,10 @@ class _Run:
 
     def shuffled(self, keys: Float) -> tuple[Float, Float]:
         """Statistics, and enhanced ones, of the permutations that are given by keys of subjects."""
-        flip = self.model.tests_common_part()
-        bases = [
-            _shuffle(self.model.basis, self.blocks, key[self.part.subjects], flip=flip)
-            for key in keys
-        ]
+        people = self.part.people
+        flip = people is not None or self.model.tests_common_part()
+        own = self.part.subjects if people is None else people
+        bases = [_shuffle(self.model.basis, self.blocks, key[own], flip=flip) for key in keys]
         t = self.model.statistics(np.stack(bases))
         return t, _enhanced(t, self.part.edges, self.settings)
 
@@ -343,6 +346,7 @@ def correct(
                 matrix=model.design.matrix[one.rows],
                 subjects=one.rows,
                 edges=edges_of(one.maps, how.neighbors),
+                people=None if model.people is None else model.people[one.rows],
             )
             for key in keys
             for one in [fitted[key.hemi]]
@@ -363,10 +367,10 @@ def check_permutations(model: RowModel, settings: GroupSettings) -> None:
     """Refuse permutations where rows cannot be exchanged."""
     if settings.multiplicity.method not in PERMUTATIONS:
         return
-    if not model.independent:
+    if model.people is not None and settings.multiplicity.blocks:
         raise ModelError(
-            "permutations: visits of the same participant cannot be exchanged with those of"
-            " others; use --correction fdr2, or --paired",
+            "permutations: of repeated visits the signs of participants are flipped, which no"
+            " blocks restrict; leave --blocks out",
             reason="permutation-model",
         )
     if settings.glm.covariance != "ordinary":

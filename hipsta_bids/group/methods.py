@@ -8,7 +8,7 @@ import numpy as np
 from hipsta_bids import __version__
 from hipsta_bids.group.analysis import Analysis
 from hipsta_bids.group.data import PARTICIPANT, Cohort
-from hipsta_bids.group.inference import PERMUTATIONS
+from hipsta_bids.group.inference import PERMUTATIONS, control_fdr
 from hipsta_bids.group.normative import Scores
 from hipsta_bids.group.settings import GroupSettings, MultiplicitySettings
 
@@ -31,6 +31,8 @@ REFERENCES: Mapping[str, str] = {
     "permutation": "Winkler AM, Ridgway GR, Webster MA, Smith SM, Nichols TE. Permutation inference"
     " for the general linear model. NeuroImage 2014;92:381-397."
     " doi:10.1016/j.neuroimage.2014.01.060",
+    "repeated": "Winkler AM, Webster MA, Vidaurre D, Nichols TE, Smith SM. Multi-level block"
+    " permutation. NeuroImage 2015;123:253-268. doi:10.1016/j.neuroimage.2015.05.092",
     "tfce": "Smith SM, Nichols TE. Threshold-free cluster enhancement: addressing problems of"
     " smoothing, threshold dependence and localisation in cluster inference. NeuroImage"
     " 2009;44(1):83-98. doi:10.1016/j.neuroimage.2008.03.061",
@@ -67,6 +69,18 @@ REFERENCES: Mapping[str, str] = {
     "normative": "Jack CR, Petersen RC, Xu YC, et al. Medial temporal atrophy on MRI in normal"
     " aging and very mild Alzheimer's disease. Neurology 1997;49(3):786-794."
     " doi:10.1212/WNL.49.3.786",
+    "combat": "Fortin JP, Cullen N, Sheline YI, et al. Harmonization of cortical thickness"
+    " measurements across scanners and sites. NeuroImage 2018;167:104-120."
+    " doi:10.1016/j.neuroimage.2017.11.024",
+    "johnson": "Johnson WE, Li C, Rabinovic A. Adjusting batch effects in microarray expression"
+    " data using empirical Bayes methods. Biostatistics 2007;8(1):118-127."
+    " doi:10.1093/biostatistics/kxj037",
+    "beer": "Beer JC, Tustison NJ, Cook PA, et al. Longitudinal ComBat: a method for harmonizing"
+    " longitudinal multi-scanner imaging data. NeuroImage 2020;220:117129."
+    " doi:10.1016/j.neuroimage.2020.117129",
+    "nygaard": "Nygaard V, Rødland EA, Hovig E. Methods that remove batch effects while retaining"
+    " group differences may lead to exaggerated confidence in downstream analyses. Biostatistics"
+    " 2016;17(1):29-39. doi:10.1093/biostatistics/kxv027",
     "delong": "DeLong ER, DeLong DM, Clarke-Pearson DL. Comparing the areas under two or more"
     " correlated receiver operating characteristic curves: a nonparametric approach. Biometrics"
     " 1988;44(3):837-845.",
@@ -105,6 +119,7 @@ def methods_text(
     paragraphs[0] += _rated(ratings)
     if analysis.sides or others:
         paragraphs.append(_alignment(analysis, settings, cite, others))
+    paragraphs += _harmonization(analysis, cite)
     paragraphs.append(_models(analysis, settings, cite))
     if analysis.comparison.asymmetry:
         paragraphs.append(_asymmetry(settings, cite("asymmetry")))
@@ -208,6 +223,48 @@ def _registration(analysis: Analysis, settings: GroupSettings, cite: Callable[[s
     )
 
 
+def _harmonization(analysis: Analysis, cite: Callable[[str], str]) -> list[str]:
+    done = analysis.harmonization
+    if done is None:
+        return []
+    plan = done.plan
+    counts = ", ".join(f"{site} {n}" for site, n in plan.counts.items())
+    sources = f"{cite('johnson')}, {cite('combat')}"
+    kept = f"`{plan.formula}`" if plan.columns else "no variable"
+    if plan.icv is not None:
+        kept += f", for volumes also {plan.icv}"
+    text = (
+        f"Effects of {plan.column} ({counts} participants) were taken out of"
+        f"{' the registered' if analysis.sides else ''} maps and summary measures by ComBat"
+        f" {sources}: at each point, a shift and a scale of the residuals of a linear model that"
+        f" keeps {kept}. The two were pooled over the points of a map by empirical Bayes, and"
+        " estimated for each summary measure by itself; missing values were left out point by"
+        " point."
+    )
+    if plan.visits.participant is not None:
+        text += (
+            " Participants had random intercepts, which were kept, so that the scale is that of"
+            f" differences within participants {cite('beer')}."
+        )
+    if plan.saved is not None:
+        known = sum(site in plan.saved.sites for site in plan.counts)
+        text += f" Parameters of {known} of these were those of an earlier analysis"
+        text += f"; those of {', '.join(plan.estimated)} were new." if plan.estimated else "."
+    if plan.estimated and not analysis.comparison.pair:
+        lost = len(plan.counts) - 1
+        text += (
+            f" As the shifts were estimated from the same participants, {plan.column} is also a"
+            f" factor of the model, which has {lost} degree{'s' if lost > 1 else ''} of freedom"
+            f" less: without, tests would reject too often {cite('nygaard')}."
+        )
+    if analysis.pairs and analysis.groups and done.leaks(analysis.groups.column):
+        text += (
+            " Classifiers were given the measures before harmonization, since parameters that"
+            " were estimated with the groups known would tell something about who is left out."
+        )
+    return [text]
+
+
 def _models(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], str]) -> str:
     names = ", ".join(contrast.name for contrast in analysis.design.contrasts)
     levels = ", ".join(f"{name} {level}" for name, level in analysis.design.references.items())
@@ -223,24 +280,46 @@ def _models(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], s
         first, second = analysis.comparison.pair
         what = f" to the change from {first} to {second}, with the covariates of {first}"
     if analysis.comparison.longitudinal:
-        own = "intercepts and slopes" if settings.longitudinal.random == "slope" else "intercepts"
+        slopes = getattr(analysis.row_model, "times", None) is not None
+        own = "intercepts and slopes" if slopes else "intercepts"
         kind = f"linear mixed model with {own} of participants"
         errors = (
             " by restricted maximum likelihood, with Satterthwaite's degrees of freedom"
             f" {cite('mixed')}"
         )
         d = "estimate over the standard deviation of single visits"
+    repeated = analysis.comparison.longitudinal
+    corrected = _correction(settings.multiplicity, cite, repeated=repeated)
     return (
         f"At each point of the sheet a {kind} `{analysis.model.formula}` was fitted{what}{errors}"
         f" (reference levels: {levels or 'none'}); contrasts: {names}."
-        f" {_correction(settings.multiplicity, cite)} Effect sizes are"
+        f" {corrected} Effect sizes are"
         f" Cohen's d ({d}) or partial eta squared, with"
         f" {settings.glm.confidence:.0%} confidence limits from non-central distributions. Summary"
-        " measures were tested in the same model, volumes also with intracranial volume."
+        " measures were tested in the same model, volumes also with intracranial volume; their"
+        " false discovery rate was held over all measures, sides and models of a contrast."
+        f"{_nonlinear(analysis, settings)}"
     )
 
 
-def _correction(how: MultiplicitySettings, cite: Callable[[str], str]) -> str:
+def _nonlinear(analysis: Analysis, settings: GroupSettings) -> str:
+    """Say how age was modeled, and in how many summary measures it bends."""
+    names = [one.name for one in analysis.design.contrasts if one.name.endswith(" nonlinear")]
+    if not names or settings.model.age == "linear":
+        return ""
+    how = "its square" if settings.model.age == "quadratic" else "a natural cubic spline"
+    p = [
+        test.p for one in analysis.measures for test in one.fit.tests if test.contrast.name in names
+    ]
+    found = control_fdr(np.concatenate(p or [np.empty(0)]), settings.multiplicity.alpha)
+    return (
+        f" Age was in the model with {how}; the contrast {names[0]} tests whether that differs from"
+        f" a line, as it did in {int(found.rejected.sum())} of {found.n_tests} tests of summary"
+        " measures (false discovery rate)."
+    )
+
+
+def _correction(how: MultiplicitySettings, cite: Callable[[str], str], *, repeated: bool) -> str:
     family = "each map" if how.scope == "map" else "both hemispheres together"
     if how.method in PERMUTATIONS:
         statistic = "the largest absolute statistic"
@@ -250,10 +329,18 @@ def _correction(how: MultiplicitySettings, cite: Callable[[str], str]) -> str:
                 f" {how.tfce_extent:g}, height {how.tfce_height:g})"
             )
         inside = f" within levels of {how.blocks}" if how.blocks else ""
+        shuffled = (
+            "the residuals of the model without the contrast (Freedman and Lane's; of signs, where"
+            " a mean was tested"
+        )
+        if repeated:
+            shuffled = (
+                "the signs of each participant's residuals, of all visits together, of the linear"
+                f" model without the contrast {cite('repeated')} ("
+            )
         return (
             f"The family-wise error rate was held at {how.alpha:g} by {statistic} in"
-            f" {how.permutations} permutations{inside} of the residuals of the model without the"
-            " contrast (Freedman and Lane's; of signs, where a mean was tested; seed"
+            f" {how.permutations} permutations{inside} of {shuffled}{'' if repeated else '; '}seed"
             f" {how.seed}) {cite('permutation')}, for {family}."
         )
     kind = (

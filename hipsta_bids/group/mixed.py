@@ -1,21 +1,22 @@
 """Repeated sessions: mixed models at each point."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from scipy import special
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.data import PARTICIPANT, Bool, Float, Int
 from hipsta_bids.group.formula import Contrast
-from hipsta_bids.group.glm import PointwiseFit, RowModel, chunks, t_test
+from hipsta_bids.group.glm import PointTest, PointwiseFit, RowModel, chunks, t_test, with_effects
 from hipsta_bids.group.model import Design
 from hipsta_bids.group.random_slope import (
     best_triangles,
     collect_slope_sums,
+    forms,
     slope_freedom,
     solve_slopes,
 )
@@ -23,6 +24,8 @@ from hipsta_bids.group.settings import GroupSettings, LongitudinalSettings
 
 #: Sessions of one participant that tell a slope from noise.
 _SLOPE_SESSIONS = 3
+#: Degrees of freedom of t statistics that differ by less are the same.
+_SAME_DF = 1e-8
 
 
 @dataclass(frozen=True)
@@ -177,9 +180,11 @@ def fit_mixed(
     ratio of the two variances. It is found for all points at once. Degrees of freedom are
     Satterthwaite's, from the curvature of the likelihood at the optimum, as in R's ``lmerTest``
     (Kuznetsova et al. 2017); where no variance between participants is found they are those of
-    the linear model.
+    the linear model. Several rows are tested by F: the mean of the squared t of combinations that
+    are independent, with the degrees of freedom that give F its expectation (Fai and Cornelius
+    1996).
     """
-    numbers = _check(maps, matrix, participants, contrasts)
+    numbers = _check(maps, matrix, participants)
     if times is not None and np.bincount(numbers).max() < _SLOPE_SESSIONS:
         raise ModelError(
             "longitudinal model: no participant has three sessions, so that slopes cannot be"
@@ -188,7 +193,7 @@ def fit_mixed(
         )
     basis, triangle = np.linalg.qr(matrix)
     back = np.linalg.inv(triangle)
-    rotated = np.array([contrast.weights[0] @ back for contrast in contrasts])
+    rotated = tuple(contrast.weights @ back for contrast in contrasts)
     parts = []
     for points in chunks(maps.shape, matrix.shape[1]):
         values = np.asarray(maps[:, points], dtype=np.float64)
@@ -203,21 +208,59 @@ def fit_mixed(
         coefficients=back @ whole["scores"],
         sigma=sigma,
         n=whole["n"].astype(np.int64),
-        tests=tuple(
-            t_test(contrast, estimate, se, df=df, sigma=sigma, confidence=settings.confidence)
-            for contrast, estimate, se, df in zip(
-                contrasts, whole["estimate"], whole["se"], whole["df"], strict=True
-            )
-        ),
+        tests=tuple(_tests(contrasts, whole, sigma, settings.confidence)),
         variances={name: whole[name] for name in ("residual", "participant", "slope")},
     )
+
+
+def _tests(
+    contrasts: Sequence[Contrast], whole: Mapping[str, Float], sigma: Float, confidence: float
+) -> Iterator[PointTest]:
+    """Test contrasts, whose rows follow each other in what was fitted."""
+    start = 0
+    for contrast in contrasts:
+        rows = slice(start, start + contrast.n_rows)
+        start = rows.stop
+        estimate, se, t, df = (whole[name][rows] for name in ("estimate", "se", "t", "df"))
+        if contrast.n_rows == 1:
+            yield t_test(contrast, estimate[0], se[0], df=df[0], sigma=sigma, confidence=confidence)
+            continue
+        f = np.mean(t**2, axis=0)
+        freedom = _denominator(df)
+        p = np.asarray(special.fdtrc(float(contrast.n_rows), freedom, f), dtype=np.float64)
+        where = {"df": freedom, "estimate": estimate, "se": se, "sigma": sigma}
+        yield with_effects(contrast, f, p, **where, confidence=confidence)
+
+
+def _denominator(df: Float) -> Float:
+    """Denominator's degrees of freedom of F from those (rows, points) of its t statistics."""
+    rows, least = len(df), 2.0  # F has no expectation below
+    expected = np.sum(df / np.where(df > least, df - least, np.nan), axis=0)
+    found = np.asarray(2 * expected / (expected - rows), dtype=np.float64)
+    found = np.where(np.ptp(df, axis=0) < _SAME_DF, df.mean(axis=0), found)
+    return np.where(np.isfinite(df).all(axis=0) & np.isnan(found), least, found)
+
+
+def _independent(rotated: Sequence[Float], inverse: Float) -> tuple[Float, Float]:
+    """Rows of weights at each point, and those that make the rows of a contrast independent.
+
+    ``inverse`` is (points, columns, columns); both results are (rows, points, columns).
+    """
+    given, turned = [], []
+    for rows in rotated:
+        own = np.broadcast_to(rows[:, None], (len(rows), *inverse.shape[:2]))
+        given.append(own)
+        if len(rows) > 1:
+            axes = np.linalg.eigh(rows @ inverse @ rows.T)[1]
+            own = np.einsum("pjk,ji->kpi", axes, rows)
+        turned.append(own)
+    return np.concatenate(given), np.concatenate(turned)
 
 
 def _check(
     maps: Float,
     matrix: Float,
     participants: Sequence[str] | NDArray[np.str_],
-    contrasts: Sequence[Contrast],
 ) -> Int:
     """Refuse what cannot be fitted; participants as numbers otherwise."""
     if not len(maps) == len(matrix) == len(participants):
@@ -231,11 +274,6 @@ def _check(
             f"longitudinal model: the design's {matrix.shape[1]} columns are not independent;"
             " leave one out",
             reason="design-rank",
-        )
-    if several := [contrast.name for contrast in contrasts if contrast.n_rows > 1]:
-        raise ModelError(
-            f"longitudinal model: contrast {several[0]!r} has several rows; test each by itself",
-            reason="contrast-shape",
         )
     _, numbers, counts = np.unique(
         np.asarray(participants), return_inverse=True, return_counts=True
@@ -252,7 +290,7 @@ def _fit(
     maps: Float,
     basis: Float,
     participants: Int,
-    rotated: Float,
+    rotated: Sequence[Float],
     settings: LongitudinalSettings,
 ) -> dict[str, Float]:
     """Fit intercepts at some points; points last."""
@@ -265,9 +303,9 @@ def _fit(
     state = sums.at(ratio)
     freedom = sums.n - columns
     variance = state.residual[0] / freedom
-    form = np.einsum("ci,pij,cj->cp", rotated, state.inverse, rotated)
-    moved = state.inverse @ state.information_first @ state.inverse
-    slope = -np.einsum("ci,pij,cj->cp", rotated, moved, rotated)
+    given, turned = _independent(rotated, state.inverse)
+    form = forms(state.inverse, turned)
+    slope = -forms(state.inverse @ state.information_first @ state.inverse, turned)
     df = _satterthwaite(form, slope, freedom, ratio, state)
     blank = np.where(usable, 1.0, np.nan)
     return {
@@ -276,8 +314,9 @@ def _fit(
         "participant": variance * ratio * blank,
         "slope": np.full(len(blank), np.nan),
         "n": sums.n.astype(np.float64),
-        "estimate": np.einsum("cj,pj->cp", rotated, state.scores) * blank,
-        "se": np.sqrt(form * variance) * blank,
+        "estimate": np.einsum("cpj,pj->cp", given, state.scores) * blank,
+        "se": np.sqrt(forms(state.inverse, given) * variance) * blank,
+        "t": np.einsum("cpj,pj->cp", turned, state.scores) / np.sqrt(form * variance) * blank,
         "df": df * blank,
     }
 
@@ -286,7 +325,7 @@ def _fit_slopes(
     maps: Float,
     basis: Float,
     participants: Int,
-    rotated: Float,
+    rotated: Sequence[Float],
     settings: LongitudinalSettings,
     *,
     times: Float,
@@ -302,7 +341,8 @@ def _fit_slopes(
     triangles = best_triangles(kept, settings)
     state = solve_slopes(kept, triangles)
     variance = state.residual / (kept.n - basis.shape[1])
-    form = np.einsum("ci,pij,cj->cp", rotated, state.inverse, rotated)
+    given, turned = _independent(rotated, state.inverse)
+    se, root = (np.sqrt(forms(state.inverse, rows) * variance) for rows in (given, turned))
 
     def spread(values: Float) -> Float:
         full = np.full((*values.shape[:-1], len(usable)), np.nan)
@@ -315,9 +355,10 @@ def _fit_slopes(
         "participant": spread(variance * triangles[:, 0] ** 2),
         "slope": spread(variance * np.sum(triangles[:, 1:] ** 2, axis=1) / unit**2),
         "n": sums.n.astype(np.float64),
-        "estimate": spread(np.einsum("cj,pj->cp", rotated, state.scores)),
-        "se": spread(np.sqrt(form * variance)),
-        "df": spread(slope_freedom(kept, triangles, rotated)),
+        "estimate": spread(np.einsum("cpj,pj->cp", given, state.scores)),
+        "se": spread(se),
+        "t": spread(np.einsum("cpj,pj->cp", turned, state.scores) / root),
+        "df": spread(slope_freedom(kept, triangles, turned)),
     }
 
 
@@ -346,7 +387,11 @@ class RepeatedRows(RowModel):
     """(rows,)"""
     times: Float | None
     """(rows,) of each visit, for random slopes; else random intercepts."""
-    independent: ClassVar[bool] = False
+
+    @property
+    def people(self) -> Int | None:
+        """(rows,) number of each row's participant."""
+        return np.asarray(np.unique(self.participants, return_inverse=True)[1], dtype=np.int64)
 
     def fit(
         self, values: Float, rows: Int, contrasts: tuple[Contrast, ...], settings: GroupSettings
@@ -379,7 +424,11 @@ def longitudinal_model(
         )
     own = table.iloc[design.rows]
     times = None
-    if settings.longitudinal.random == "slope":
+    visits = own[PARTICIPANT].value_counts()
+    several = int((visits >= _SLOPE_SESSIONS).sum())
+    enough = time is not None and several >= settings.longitudinal.slope_participants
+    random = settings.longitudinal.random
+    if random == "slope" or (random == "auto" and enough):
         if time is None:
             raise ModelError(
                 "longitudinal model: random slopes need the time of each session; give a column"

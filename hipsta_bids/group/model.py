@@ -1,27 +1,34 @@
 """Which model is fitted, the user's or the paper's default, and its design matrix."""
 
 import difflib
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from formulaic import Formula
+from scipy.linalg import null_space
 
 from hipsta_bids.errors import ModelError, UsageError
 from hipsta_bids.group.comparison import Comparison
-from hipsta_bids.group.covariates import VisitTime
-from hipsta_bids.group.data import Float, Int
+from hipsta_bids.group.covariates import FIRST_AGE, VisitTime
+from hipsta_bids.group.data import PARTICIPANT, SESSION, Float, Int
 from hipsta_bids.group.formula import (
     Contrast,
     ContrastSpec,
     ModelSpec,
+    as_factor,
     check_left,
     check_names,
+    check_spelling,
+    coding_note,
+    in_order,
     left_side,
+    level_name,
     listed,
     model_from_shortcut,
     parse_model,
@@ -32,6 +39,12 @@ from hipsta_bids.group.formula import (
 from hipsta_bids.group.grammar import CONTEXT, closed_formula
 from hipsta_bids.group.settings import DefaultModelSettings, DesignSettings, GroupSettings
 from hipsta_bids.io import files
+
+#: How a contrast asks whether a variable bends, and the ages that the default model may bend.
+_NONLINEAR = "nonlinear"
+_AGES = ("age", FIRST_AGE)
+#: A line is in the span of columns if it is off by less, in standard deviations.
+_EXACT = 1e-6
 
 
 @dataclass(frozen=True)
@@ -66,13 +79,8 @@ def find_groups(
         values = typed(table[column], settings.design).dropna() if column else None
         if column is None or values is None or values.nunique() < 2:  # noqa: PLR2004 -- two groups
             continue
-        if pd.api.types.is_numeric_dtype(values):
-            raise ModelError(
-                f"model: column {column!r} holds numbers, which do not name groups; give names, or"
-                " a model by --formula",
-                reason="group-numeric",
-            )
-        counts = Counter(str(value) for value in values)
+        counts = Counter(level_name(value) for value in values)
+        check_spelling(counts, column)
         first = reference or _reference(counts, settings.model)
         if first not in counts:
             raise ModelError(
@@ -80,7 +88,8 @@ def find_groups(
                 f" {', '.join(sorted(counts))}",
                 reason="unknown-level",
             )
-        return Groups(column, (first, *sorted(level for level in counts if level != first)))
+        others = sorted((level for level in counts if level != first), key=in_order)
+        return Groups(column, (first, *others))
     return None
 
 
@@ -103,14 +112,28 @@ def default_formula(
     """Spell the right-hand side: the groups, and each covariate that varies."""
     first = " * ".join(name for name in (groups.column if groups else None, time) if name)
     names = settings.model.covariates if covariates is None else covariates
-    return " + ".join([first or "1", *_varying(table, names, settings)])
+    found = _varying(table, names, settings)
+    return " + ".join([first or "1", *(_shaped(name, settings) for name in found)])
 
 
-def default_contrasts(groups: Groups | None, time: str | None) -> list[str]:
-    """Contrasts of the default model: groups, changes over time in each, and their differences."""
+def _shaped(name: str, settings: GroupSettings) -> str:
+    """Write a covariate; age as the settings say."""
+    shape = settings.model.age if name.casefold() in _AGES else "linear"
+    forms = {"quadratic": f"poly({name}, 2)", "spline": f'cr({name}, df=3, constraints="center")'}
+    return forms.get(shape, name)
+
+
+def default_contrasts(
+    groups: Groups | None, time: str | None, nonlinear: Sequence[str] = ()
+) -> list[str]:
+    """Contrasts of the default model.
+
+    Groups, changes over time in each, their differences, and whether covariates bend.
+    """
+    bends = [f"{name} nonlinear = {_NONLINEAR}({name})" for name in nonlinear]
     if groups is None:
-        return [time] if time else []
-    found = groups.contrasts()
+        return [*([time] if time else []), *bends]
+    found = [*groups.contrasts(), *bends]
     if time is None:
         return found
     slopes = {level: f"{groups.column}[T.{level}]:{time}" for level in groups.levels[1:]}
@@ -119,6 +142,13 @@ def default_contrasts(groups: Groups | None, time: str | None) -> list[str]:
         found.append(f"{time} in {level} = {time} + {slope}")
         found.append(f"{time} in {groups.reference}-{level} = -1*{slope}")
     return found
+
+
+def empty_covariates(table: pd.DataFrame, settings: GroupSettings) -> list[str]:
+    """Name covariates of the default model whose column holds nothing."""
+    wanted = {name.casefold() for name in settings.model.covariates}
+    named = [str(name) for name in table.columns if str(name).casefold() in wanted]
+    return [name for name in named if typed(table[name], settings.design).isna().all()]
 
 
 def _varying(table: pd.DataFrame, names: Sequence[str], settings: GroupSettings) -> list[str]:
@@ -193,10 +223,11 @@ def model_document(
     comparison = comparison or Comparison()
     within = comparison.longitudinal or comparison.pair or comparison.asymmetry
     if groups is None and not within:
+        own = [str(name) for name in table.columns if name not in {PARTICIPANT, SESSION}]
+        there = f"there are {listed(own)}" if own else "BIDS_DIR has no participants.tsv"
         raise ModelError(
-            "participants.tsv has no column that tells groups"
-            f" ({', '.join(settings.model.group_columns)}) with two levels; give a model by"
-            ' --formula "age + sex" --contrast age',
+            f"no column tells groups ({', '.join(settings.model.group_columns)}) with two levels;"
+            f' {there}; or give a model by --formula "age + sex" --contrast age',
             reason="no-groups",
         )
     time = visits.column if visits else None
@@ -208,7 +239,9 @@ def model_document(
         )
     covariates = visits.covariates if visits else settings.model.covariates
     formula = default_formula(table, groups, settings, covariates=covariates, time=time)
-    contrasts = list(request.contrasts) or default_contrasts(groups, time)
+    bent = [name for name in closed_formula(formula).names if name.casefold() in _AGES]
+    bent = [] if settings.model.age == "linear" else bent
+    contrasts = list(request.contrasts) or default_contrasts(groups, time, bent)
     return model_from_shortcut(formula, contrasts, request.name or folder_name(formula))
 
 
@@ -234,6 +267,10 @@ class Design:
     references: Mapping[str, str]
     """Reference level of each factor."""
     contrasts: tuple[Contrast, ...]
+    notes: Mapping[str, str] = field(default_factory=dict)
+    """What to know about the coding of variables, by their names."""
+    levels: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    """Levels of each factor, the reference first."""
 
 
 def build_design(
@@ -246,11 +283,14 @@ def build_design(
     check_names(names, table.columns)
     used = table[names].copy()
     for name in names:
-        used[name] = typed(used[name], settings)
+        column = as_factor(used[name]) if name in closed.factors else used[name]
+        used[name] = typed(column, settings)
     complete = used.notna().all(axis=1).to_numpy()
     dropped = rows_by_lack(used, complete)
     used = used.loc[complete].copy()
     check_left(used, dropped)
+    numeric = used.select_dtypes("number")
+    notes = {name: coding_note(numeric[name], settings) for name in map(str, numeric.columns)}
     chosen = set_levels(used, references, settings)
     try:
         made = formula.get_model_matrix(used, na_action="raise", context=dict(CONTEXT))
@@ -261,7 +301,7 @@ def build_design(
     columns = tuple(str(column) for column in made.columns)
     matrix: Float = np.asarray(made, dtype=np.float64)
     _check_matrix(matrix, columns, used.index, settings)
-    terms = _Terms(columns, used, made.model_spec, chosen)
+    terms = _Terms(columns, used, made.model_spec, chosen, matrix)
     specs = (*model.contrasts, *_dummies(columns, model.dummy))
     return Design(
         matrix=matrix,
@@ -270,6 +310,8 @@ def build_design(
         dropped=dropped,
         references={name: levels[0] for name, levels in chosen.items()},
         contrasts=tuple(terms.contrast(spec) for spec in specs),
+        notes={name: note for name, note in notes.items() if note},
+        levels=chosen,
     )
 
 
@@ -281,11 +323,53 @@ class _Terms:
     table: pd.DataFrame
     spec: Any
     levels: Mapping[str, list[str]]
+    matrix: Float
 
     def contrast(self, spec: ContrastSpec) -> Contrast:
+        variable = re.fullmatch(rf"{_NONLINEAR}\(`?([^`]+)`?\)", spec.conditions[0])
+        if variable and len(spec.conditions) == 1:
+            return Contrast(spec.name, self._nonlinear(variable[1], spec.name))
         rows = np.array([self._row(name, spec.name) for name in spec.conditions])
         weights: Float = np.array(spec.weights) @ rows
         return Contrast(spec.name, weights)
+
+    def _nonlinear(self, variable: str, contrast: str) -> Float:
+        """Weights that are zero where the columns of a variable make a line of it.
+
+        If ``line`` are the coefficients that give the variable itself, these are the directions of
+        its coefficients at right angles to ``line``. A single one is scaled to the coefficient of
+        the square.
+        """
+        own = [
+            column
+            for structure in self.spec.structure
+            if closed_formula(str(structure.term)).names == (variable,)
+            for column in structure.columns
+        ]
+        places = [i for i, column in enumerate(self.columns) if column in own]
+        if variable not in self.table or len(places) < 2:  # noqa: PLR2004 -- a line is one
+            raise ModelError(
+                f"contrast {contrast!r}: {variable!r} is in the formula as a line at most; write it"
+                f" as poly({variable}, 2) or cr({variable}, df=3)",
+                reason="contrast-unknown",
+            )
+        values = self.table[variable].to_numpy(dtype=np.float64)
+        spread = float(values.std())
+        values = (values - values.mean()) / spread
+        powers = np.column_stack([values, values**2])
+        found = np.linalg.lstsq(self.matrix, powers, rcond=None)[0]
+        if np.abs(self.matrix @ found[:, 0] - values).max() > _EXACT:
+            raise ModelError(
+                f"contrast {contrast!r}: no line of {variable!r} is in the formula to compare with",
+                reason="contrast-unknown",
+            )
+        line, square = found[places].T
+        across = null_space(line[None]).T
+        if len(across) == 1:
+            across = across / float(across[0] @ square) / spread**2
+        weights = np.zeros((len(across), len(self.columns)))
+        weights[:, places] = across
+        return weights
 
     def _row(self, name: str, contrast: str) -> Float:
         if name in self.columns:

@@ -11,7 +11,7 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from hipsta_bids.group.data import PARTICIPANT, Bool, Float, SideMaps
-from hipsta_bids.group.formula import parse_model
+from hipsta_bids.group.formula import parse_model, with_factors
 from hipsta_bids.group.glm import FittedMaps, PointTest, RowModel, fit_maps
 from hipsta_bids.group.inference import Discoveries, MapKey, correct
 from hipsta_bids.group.model import (
@@ -246,6 +246,7 @@ def group(
         and any(values.ndim == _VERTICES for values in sides.values())
     ):
         raise ValueError("clusters of vertices need triangles, (faces, 3)")
+    table = with_factors(table, settings)
     levels, groups = choose_references(request, table, settings)
     document = model_document(request, table, groups, settings)
     design = build_design(table, parse_model(document), settings.design, levels)

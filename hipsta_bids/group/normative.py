@@ -149,7 +149,7 @@ def score_cohort(
 ) -> Scores:
     """Score all participants who have the covariates of a model, whatever their group."""
     factor, level = normative
-    formula = _without(model.formula, factor)
+    formula = without_variable(model.formula, factor)
     known = closed_formula(formula).names
     check_names([factor], cohort.table.columns)
     chosen = {name: text for name, text in references.items() if name in known}
@@ -195,7 +195,7 @@ def score_cohort(
     )
 
 
-def _without(formula: str, factor: str) -> str:
+def without_variable(formula: str, factor: str) -> str:
     """Leave out all terms in which a variable has a part."""
     terms = [
         str(term)

@@ -6,7 +6,7 @@ of V = I + Z L L' Z' takes W = L (I + L' A L)^-1 L' between the sums Z' x of its
 of squares.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
 
@@ -181,14 +181,13 @@ def best_triangles(sums: SlopeSums, settings: LongitudinalSettings) -> Float:
     return best
 
 
-def slope_freedom(sums: SlopeSums, triangles: Float, weights: Sequence[Float] | Float) -> Float:
-    """Satterthwaite's degrees of freedom of contrasts (contrasts, points).
+def slope_freedom(sums: SlopeSums, triangles: Float, rows: Float) -> Float:
+    """Satterthwaite's degrees of freedom of rows of weights, (rows, points, columns).
 
     From the Hessian of minus twice the restricted likelihood for the logarithm of the residual
     variance and the triangle; directions without curvature, as at a bound, are left out, as in
     R's ``lmerTest``.
     """
-    rows = np.asarray(weights)
     freedom = sums.n - sums.squares.shape[1]
     base = solve_slopes(sums, triangles)
     variance = base.residual / freedom
@@ -200,11 +199,11 @@ def slope_freedom(sums: SlopeSums, triangles: Float, weights: Sequence[Float] | 
         up, down = (solve_slopes(sums, triangles + sign * shifts[i]) for sign in (1, -1))
         hessian[:, 0, i + 1] = -(up.residual - down.residual) / (2 * _STEP) / variance
         hessian[:, i + 1, 0] = hessian[:, 0, i + 1]
-        slopes.append((_forms(up, rows) - _forms(down, rows)) / (2 * _STEP))
+        slopes.append((forms(up.inverse, rows) - forms(down.inverse, rows)) / (2 * _STEP))
     hessian[:, 1:, 1:] = _second(
         lambda at: _fixed_variance(solve_slopes(sums, at), variance), triangles
     )
-    form = _forms(base, rows)
+    form = forms(base.inverse, rows)
     gradient = np.stack([np.ones_like(form), *(slope / form for slope in slopes)], axis=-1)
     size, axes = np.linalg.eigh(hessian)
     valid = size > _BENT * size[:, -1:]
@@ -217,9 +216,9 @@ def _fixed_variance(state: SlopeState, variance: Float) -> Float:
     return np.asarray(state.penalty + state.residual / variance)
 
 
-def _forms(state: SlopeState, rows: Float) -> Float:
-    """Variances of contrasts over the residual variance."""
-    return np.asarray(np.einsum("ci,pij,cj->cp", rows, state.inverse, rows))
+def forms(inverse: Float, rows: Float) -> Float:
+    """Variances of rows of weights (rows, points, columns) over the residual variance."""
+    return np.asarray(np.einsum("cpi,pij,cpj->cp", rows, inverse, rows))
 
 
 def _loss(sums: SlopeSums, triangles: Float) -> Float:

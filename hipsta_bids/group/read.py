@@ -18,14 +18,16 @@ from hipsta_bids.derivatives.hemisphere import (
 )
 from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.catalog import MAPS
-from hipsta_bids.group.collect import SheetRecord
+from hipsta_bids.group.collect import Exclusion, SheetRecord
 from hipsta_bids.group.data import PARTICIPANT, SESSION, Float, Measures, SideMaps
+from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.types import VisitKey
 
 #: Map that registration rests on.
 CURVATURE = "curvature"
 #: Maps that are analyzed unless others are asked for.
-DEFAULT = ("thickness", CURVATURE)
+THICKNESS = "thickness"
+DEFAULT = (THICKNESS, CURVATURE)
 #: Names of all maps in the sheet tables.
 SHEET_MAPS = tuple(row.name for row in MAPS)
 #: Prefix of the names of volumes from other programs.
@@ -100,6 +102,8 @@ class Measured:
     units: Mapping[str, str]
     sources: Mapping[str, tuple[str, Path]]
     """Address of one segmentation, and the dataset whose record has it, of visits with sheets."""
+    damaged: tuple[Exclusion, ...] = ()
+    """Hemispheres left out because their maps are empty or impossible."""
 
 
 def read_sheets(
@@ -108,9 +112,13 @@ def read_sheets(
     maps: Sequence[str],
     visits: Sequence[VisitKey] | None = None,
     *,
+    rules: GroupSettings,
     error_window: int = 0,
 ) -> Measured:
-    """Read all sheets and summaries, and the SDs of the maps if they have a window."""
+    """Read all sheets and summaries, and the SDs of the maps if they have a window.
+
+    Hemispheres with empty or impossible maps are left out by ``rules``.
+    """
     if error_window:
         _check_errors(records, maps)
     grid = settings["sheet"]
@@ -119,11 +127,23 @@ def read_sheets(
     row_of = {visit: row for row, visit in enumerate(visits)}
     names = tuple(dict.fromkeys((*maps, CURVATURE)))
     sides = {}
+    damaged: list[Exclusion] = []
     for hemi in "LR":
         own = [record for record in records if record.place.name.hemi == hemi]
         rows = [row_of[r.place.name.subject, r.place.name.session] for r in own]
         if own:
-            sides[hemi] = _read_side(own, np.array(rows, dtype=np.int64), shape, names)
+            side = _read_side(own, np.array(rows, dtype=np.int64), shape, names)
+            why = [_damage(side, i, rules) for i in range(len(own))]
+            found = [_excluded(r, text) for r, text in zip(own, why, strict=True) if text]
+            if len(found) == len(own):
+                raise InputError(
+                    f"hemisphere {hemi}: no sheet can be used; {found[0].participant}:"
+                    f" {found[0].message}",
+                    reason="all-points-invalid",
+                )
+            damaged += found
+            sides[hemi] = side.sheets(np.array([not text for text in why]))
+            own = [r for r, text in zip(own, why, strict=True) if not text]
         if own and error_window:
             errors = _read_errors(own, shape, maps, error_window)
             sides[hemi] = replace(sides[hemi], errors=errors)
@@ -145,6 +165,36 @@ def read_sheets(
             visit_name(r.place.name.subject, r.place.name.session): (r.source, r.place.root)
             for r in reversed(records)
         },
+        damaged=tuple(damaged),
+    )
+
+
+def _damage(side: SideMaps, i: int, rules: GroupSettings) -> str | None:
+    """Say why a sheet cannot be used, if it cannot."""
+    curvature = side.maps[CURVATURE][i]
+    gap = float((~np.isfinite(curvature)).all(axis=1).mean())
+    if gap > rules.registration.max_gap:
+        return f"{gap:.0%} of the curvature profile has no value"
+    if THICKNESS in side.maps and not np.isfinite(side.maps[THICKNESS][i]).any():
+        return "no point of the thickness map has a value"
+    for name, most, unit in (
+        (CURVATURE, rules.design.largest_curvature, "1/mm"),
+        (THICKNESS, rules.design.largest_thickness, "mm"),
+    ):
+        worst = float(np.nanmax(np.abs(side.maps[name][i]))) if name in side.maps else 0.0
+        if worst > most:
+            return f"{name} reaches {worst:.3g} {unit}, which no sheet does"
+    return None
+
+
+def _excluded(record: SheetRecord, message: str) -> Exclusion:
+    name = record.place.name
+    return Exclusion(
+        participant=f"sub-{name.subject}",
+        session=name.session and f"ses-{name.session}",
+        hemi=name.hemi,
+        reason="damaged-map",
+        message=message,
     )
 
 

@@ -25,10 +25,12 @@ from hipsta_bids.group.comparison import Comparison, choose_visits
 from hipsta_bids.group.covariates import VisitTime, add_time, read_covariates, read_icv
 from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Measures
 from hipsta_bids.group.exchange import SUMMARY, summarize, write_summary
-from hipsta_bids.group.formula import parse_model
+from hipsta_bids.group.formula import parse_model, with_factors
+from hipsta_bids.group.harmonize import harmonization_record
 from hipsta_bids.group.model import (
     ModelRequest,
     choose_references,
+    empty_covariates,
     folder_name,
     model_document,
     wanted_measures,
@@ -42,6 +44,7 @@ from hipsta_bids.group.read import (
 )
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.shapes import average_shapes, write_shapes
+from hipsta_bids.group.site_effects import SavedEffects, load_effects
 from hipsta_bids.group.surfaces import (
     ExternalCohorts,
     MapPattern,
@@ -60,6 +63,8 @@ from hipsta_bids.reports.group import write_group_report
 
 #: Column that takes the intracranial volume estimated by the segmentation's program.
 _ICV = "icv"
+#: Hemispheres that notes name.
+_SHOWN = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,6 +85,8 @@ class GroupOptions:
     measures: tuple[str, ...] = ()
     """What to fit the model to; empty for the default or the formula's left-hand side."""
     template: Path | None = None
+    harmonize_model: Path | None = None
+    """Parameters of the harmonization of another analysis."""
     comparison: Comparison = field(default_factory=Comparison)
     export_summary: str | None = None
     """Name of this site in a summary for others, empty for that of the folder; ``None`` for no
@@ -122,6 +129,8 @@ class GroupResult:
     """Hemispheres and visits."""
     notes: tuple[str, ...]
     """What to know, one line each."""
+    warnings: tuple[str, ...]
+    """What may make results wrong, one line each."""
     page: Path | None
     """To look at; ``None`` if there is none."""
     problem: str | None = None
@@ -178,6 +187,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         time=inputs.time.column if inputs.time else None,
         icv=inputs.icv,
         templates=templates,
+        site_effects=_site_effects(options),
     )
     others = {
         name: (other, analyze_points(other, analysis, settings))
@@ -192,7 +202,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
     region = options.sheets.region
     name = folder_name(model.formula, wanted) + options.comparison.suffix
     name = options.model.name or (name if region == "body" else f"{name}_{region}")
-    notes = [*inputs.notes, *_notes(inputs, analysis)]
+    notes = [*inputs.notes, *_notes(options, inputs, analysis, settings)]
     summary = _summary(options, inputs, analysis, settings, notes)
     tell("average surfaces")
     shapes = average_shapes(inputs.found.records, cohort, analysis, settings)
@@ -215,8 +225,9 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         write_shapes(folder, shapes)
         if analysis.sides and inputs.found.records and not shapes:
             notes.append("no average surfaces: those of the participant level are missing")
-        draw(folder, cohort, analysis, shapes, others=others)
-        record = _record(options, inputs.found, settings, analysis, notes)
+        notes += draw(folder, cohort, analysis, shapes, others=others)
+        told = [*inputs.found.warnings, *notes]
+        record = _record(options, inputs.found, settings, analysis, told)
         files.write_json(folder / "analysis.json", record)
     page, problem = _report(options, name)
     return GroupResult(
@@ -226,6 +237,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         n_participants=analysis.n_participants,
         n_excluded=len(exclusions),
         notes=tuple(notes),
+        warnings=inputs.found.warnings,
     )
 
 
@@ -256,6 +268,11 @@ def _summary(
     return summary
 
 
+def _site_effects(options: GroupOptions) -> SavedEffects | None:
+    path = options.harmonize_model
+    return None if path is None else load_effects(path)
+
+
 def _read(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
     """Find and read sheets, other maps, volumes and covariates."""
     check_volumes(options.volumes)
@@ -264,20 +281,24 @@ def _read(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
     requests = map_patterns(options.maps, options.surfaces, taken)
     wanted = wanted_measures(options.model, options.measures)
     measures = choose_measures(wanted, found.records, [one.name for one in requests])
-    window = 0 if settings.glm.weights == "none" else settings.glm.error_window
-    external = _read_maps(options, found, requests, measures, window)
+    external = _read_maps(options, found, requests, measures, settings)
     measured, volume_notes = add_volumes(
         external.measured, found.records, options.volumes, options.bids_dir
     )
     check_summaries(measures, measured.sides)
     everybody = Cohort(
-        table=read_covariates(measured.visits, options.bids_dir, options.covariates),
+        table=with_factors(
+            read_covariates(measured.visits, options.bids_dir, options.covariates), settings
+        ),
         sides=measured.sides,
         x=measured.x,
         y=measured.y,
         units=measured.units,
     )
-    cohort, reasons = choose_visits(everybody, options.comparison)
+    # A visit may have lost both of its hemispheres.
+    sides = [side for one in (everybody, *external.others.values()) for side in one.sides.values()]
+    there = np.isin(np.arange(len(everybody.table)), np.concatenate([one.rows for one in sides]))
+    cohort, reasons = choose_visits(everybody.take(there), options.comparison)
     keep = everybody.table.index.isin(cohort.table.index)
     cohort, icv = _with_icv(cohort, measured, settings)
     time = None
@@ -295,8 +316,12 @@ def _read(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
         measures=replace(measures, maps=own),
         icv=icv,
         time=time,
-        exclusions=(*found.exclusions, *_other_visits(measured, reasons, options.comparison)),
-        notes=(*found.notes, *external.notes, *volume_notes),
+        exclusions=(
+            *found.exclusions,
+            *measured.damaged,
+            *_other_visits(measured, reasons, options.comparison),
+        ),
+        notes=(*found.notes, *external.notes, *volume_notes, *_damaged(measured)),
     )
 
 
@@ -305,9 +330,10 @@ def _read_maps(
     found: Collection,
     requests: Sequence[MapPattern],
     measures: Measures,
-    error_window: int,
+    rules: GroupSettings,
 ) -> ExternalCohorts:
     """Read the maps that are asked for, of the sheets and of other programs."""
+    error_window = 0 if rules.glm.weights == "none" else rules.glm.error_window
     asked = [one for one in requests if one.name in measures.maps]
     files_of, visits = find_all(
         asked, options.bids_dir, visits_of(found.records), wanted_by(options.sheets)
@@ -321,8 +347,20 @@ def _read_maps(
             " weights out",
             reason="no-uncertainty",
         )
-    measured = read_sheets(found.records, found.settings, own, visits, error_window=error_window)
+    measured = read_sheets(
+        found.records, found.settings, own, visits, rules=rules, error_window=error_window
+    )
     return add_external(measured, files_of, visits)
+
+
+def _damaged(measured: Measured) -> tuple[str, ...]:
+    shown = [
+        f"{one.participant}{f' {one.session}' if one.session else ''}, hemisphere {one.hemi}, is"
+        f" left out: {one.message}; measure it again"
+        for one in measured.damaged[:_SHOWN]
+    ]
+    more = len(measured.damaged) - _SHOWN
+    return (*shown, f"{more} more are left out alike, see excluded.tsv") if more > 0 else (*shown,)
 
 
 def _other_visits(
@@ -362,9 +400,19 @@ def _with_icv(
     return replace(cohort, table=table), _ICV
 
 
-def _notes(inputs: GroupInputs, analysis: Analysis) -> list[str]:
+def _notes(
+    options: GroupOptions, inputs: GroupInputs, analysis: Analysis, settings: GroupSettings
+) -> list[str]:
     """List what a reader of the results should know, one line each."""
     found, notes = inputs.found, list(analysis.skipped)
+    time = inputs.time.column if inputs.time else None
+    notes += [note for name, note in analysis.design.notes.items() if name != time]
+    if options.model.formula is None and options.model.file is None:
+        notes += [
+            f"{name} is n/a for all, and not in the model; fill it in, or do not read much into"
+            f" differences that {name} might explain"
+            for name in empty_covariates(inputs.cohort.table, settings)
+        ]
     if later := sum(one.reason == "later-session" for one in inputs.exclusions):
         notes.append(
             f"{later} later sessions are not in it; --longitudinal takes all, --paired two"
@@ -373,8 +421,6 @@ def _notes(inputs: GroupInputs, analysis: Analysis) -> list[str]:
         notes.append(
             f"{flagged} flagged hemispheres are in it; look at them, or use --exclude-flagged"
         )
-    if len(found.versions) > 1:
-        notes.append(f"hemispheres were measured by several versions, {', '.join(found.versions)}")
     if separated := sum(pair.comparison.separated for _, _, pair in analysis.pairs):
         notes.append(
             f"{separated} of {len(analysis.pairs)} comparisons of classifiers are separated, and"
@@ -418,7 +464,13 @@ def _record(
             "volumes": dict(options.volumes),
             "covariates": [str(path) for path in options.covariates],
             "template": None if options.template is None else str(options.template),
+            "harmonization": None
+            if options.harmonize_model is None
+            else str(options.harmonize_model),
         },
+        "harmonization": None
+        if analysis.harmonization is None
+        else harmonization_record(analysis.harmonization, analysis.groups),
         "measures": {"maps": analysis.measured.maps, "summaries": analysis.measured.summaries},
         "formula": analysis.model.formula,
         "columns": analysis.design.columns,

@@ -3,7 +3,14 @@
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import (
+    Field,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    Strict,
+)
 
 from hipsta_bids.protocols.toml import (
     Fraction,
@@ -14,6 +21,8 @@ from hipsta_bids.protocols.toml import (
     read_settings,
 )
 
+#: Numbers of either sign; TOML has lists.
+Codes = Annotated[tuple[float, ...], Strict(strict=False)]
 Splines = Annotated[int, Field(ge=4)]
 AtLeastTwo = Annotated[int, Field(ge=2)]
 #: How to allow for many tests, as the command line spells it.
@@ -90,6 +99,28 @@ class DesignSettings(SettingsTable):
     """A column is a combination of others if less than this fraction of its length is its own."""
     numeric_share: Fraction = 0.5
     """A column with text is taken for a damaged number if more of it than this is numbers."""
+    factors: Texts = (
+        *("group", "diagnosis", "dx", "diagnostic_group", "arm", "cohort", "study"),
+        *("sex", "gender", "ethnicity", "race"),
+        *("site", "site_id", "scanner", "scanner_id", "center", "center_id", "vendor"),
+    )
+    """Columns whose values are names, in any case of letters, even if they are written as numbers;
+    others are if the ``Levels`` of the table's sidecar have all their values."""
+    few_values: NonNegativeInt = 5
+    """A note names other columns of three to this many different numbers, fitted as a line."""
+    missing_codes: Codes = (
+        *(-9.0, -99.0, -999.0, -9999.0, -99999.0),
+        *(99.0, 999.0, 9999.0, 99999.0, 777.0, 7777.0, 888.0, 8888.0),
+    )
+    """Numbers that often stand for missing ones; refused where they are farther from all other
+    values than these are from each other."""
+    largest_thickness: PositiveFloat = 20.0
+    """Hemispheres with a thickness beyond this, mm, are left out: no wall of a hippocampus is a
+    third as thick, so that the file is damaged."""
+    largest_curvature: PositiveFloat = 100.0
+    """Likewise mean curvature, 1/mm, of either sign."""
+    farthest: PositiveFloat = 1e4
+    """Numbers farther than this from the median, in ranges between quartiles, are refused."""
 
 
 class DefaultModelSettings(SettingsTable):
@@ -102,6 +133,9 @@ class DefaultModelSettings(SettingsTable):
     groups; else the most frequent one is."""
     covariates: Texts = ("age", "sex", "site")
     """Further columns of the model, where the table has them and they vary."""
+    age: Literal["linear", "quadratic", "spline"] = "linear"
+    """How age stands in the model: as a line, with its square, or as a natural cubic spline of
+    three columns."""
     icv_columns: Texts = ("icv", "etiv", "tiv", "intracranial_volume")
     """The first of these columns is the covariate of volumes; else what FreeSurfer or ASHS
     estimated."""
@@ -135,8 +169,12 @@ class GlmSettings(SettingsTable):
 class LongitudinalSettings(SettingsTable):
     """Repeated sessions of the same participants."""
 
-    random: Literal["intercept", "slope"] = "intercept"
-    """What participants have of their own: an ``intercept``, or also a ``slope`` over time."""
+    random: Literal["auto", "intercept", "slope"] = "auto"
+    """What participants have of their own: an ``intercept``, or also a ``slope`` over time;
+    ``auto`` takes slopes where ``slope_participants`` have three visits. Without them tests of
+    changes take differences between participants for noise, and find too much."""
+    slope_participants: PositiveInt = 10
+    """Participants with three visits or more that ``auto`` wants for slopes."""
     time_columns: Texts = ("time", "years", "months", "days")
     """The first of these columns, in any case, that varies between sessions is the time; else it
     is made, in years since the first session, from ``acq_time`` or age."""
@@ -182,6 +220,24 @@ class MultiplicitySettings(SettingsTable):
     """Step of the height, in units of t (of the square root of F)."""
     neighbors: Literal[4, 8] = 8
     """Neighbors of a point on the sheet, 4 or 8."""
+
+
+class HarmonizationSettings(SettingsTable):
+    """ComBat: effects of sites or scanners, taken out of maps and summary measures."""
+
+    column: str = ""
+    """Column whose levels are harmonized, as ``site``; empty is none."""
+    least_participants: Annotated[int, Field(ge=3)] = 10
+    """Sites with fewer participants are refused: the mean of ten is known to a third of an SD."""
+    explained: OpenFraction = 0.8
+    """A note names columns of the model of whose variance sites explain more than this."""
+    pooling: bool = True
+    """Points of a map inform each other about a site (empirical Bayes); summary measures never
+    do."""
+    iterations: PositiveInt = 200
+    """Most steps of the posterior of shift and scale."""
+    tolerance: PositiveFloat = 1e-6
+    """They end when no shift, in SD, and no variance, as a fraction, changes by more."""
 
 
 class AsymmetrySettings(SettingsTable):
@@ -281,6 +337,7 @@ class GroupSettings(SettingsTable):
     design: DesignSettings = DesignSettings()
     glm: GlmSettings = GlmSettings()
     longitudinal: LongitudinalSettings = LongitudinalSettings()
+    harmonization: HarmonizationSettings = HarmonizationSettings()
     asymmetry: AsymmetrySettings = AsymmetrySettings()
     multiplicity: MultiplicitySettings = MultiplicitySettings()
     shapes: ShapeSettings = ShapeSettings()

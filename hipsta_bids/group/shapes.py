@@ -16,6 +16,7 @@ from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float
 from hipsta_bids.group.settings import GroupSettings, ShapeSettings
 from hipsta_bids.group.warps import warp_values
 from hipsta_bids.io import files, gifti
+from hipsta_bids.types import Mesh
 
 #: Surfaces of a sheet, in the order of the arrays here.
 LAYERS = ("interior", "midthickness", "exterior")
@@ -33,6 +34,14 @@ class AverageShape:
     """The same of each group, laid upon ``mean``."""
     counts: Mapping[str, int]
     """Sheets by group."""
+
+    @property
+    def middle(self) -> Mesh:
+        """Mean middle surface of all, closed where points are missing; y is the faster axis."""
+        points = fill_from_nearest(self.mean[_MIDDLE])
+        flip = is_left_handed(np.moveaxis(self.mean, 0, 2))
+        triangles = gifti.sheet_triangles(*points.shape[:2], flip=flip).astype(np.int64)
+        return Mesh(points=points.reshape(-1, 3), triangles=triangles)
 
 
 def average_shape(
@@ -142,11 +151,10 @@ def average_shapes(
 def write_shapes(folder: Path, shapes: Mapping[str, AverageShape]) -> None:
     """Write the average middle surfaces, on which maps of statistics can be drawn."""
     for hemi, shape in shapes.items():
-        points = fill_from_nearest(shape.mean[_MIDDLE])
-        flip = is_left_handed(np.moveaxis(shape.mean, 0, 2))
+        mesh = shape.middle
         content = gifti.surface_bytes(
-            points.reshape(-1, 3),
-            gifti.sheet_triangles(*points.shape[:2], flip=flip),
+            mesh.points,
+            mesh.triangles.astype(np.int32),
             hemi=hemi,
             secondary="MidThickness",
             unfolded=False,

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from hipsta_bids.errors import ModelError
+from hipsta_bids.group import tables
 from hipsta_bids.group.clusters import Frame, peak_table, sheet_edges
 from hipsta_bids.group.data import Float
 from hipsta_bids.group.exchange import ModelSummary, SiteSummary
@@ -18,7 +19,6 @@ from hipsta_bids.group.glm import MEAN, PointTest
 from hipsta_bids.group.inference import Discoveries, MapKey, control_fdr, discover
 from hipsta_bids.group.meta import FIXED, RANDOM, Combined, MetaResult, combine, meta_analyze
 from hipsta_bids.group.settings import GroupSettings
-from hipsta_bids.group.tables import map_name
 from hipsta_bids.io import files
 
 #: Peaks of a map that get a forest plot.
@@ -28,6 +28,33 @@ _PREDICTION = "prediction"
 #: What to do where a mean of the sample is in a contrast, as age is in those of an interaction.
 _BY_COLUMNS = "write the contrast by columns, as -1*group[T.AD]"
 _LONGEST = 200  # characters of what two sites have
+
+#: Meanings of columns of tables, beside those of the group level.
+COLUMNS: Mapping[str, str] = {
+    **tables.COLUMNS,
+    "site": "site; in forest.tsv also the combined estimates, and the limits of a further site",
+    "kind": "what the row is: site, fixed effect, random effects, or prediction",
+    "plot": "number of the forest plot",
+    "version": "version of hipsta_bids",
+    "template": "hash of the template of registration; none without registration",
+    "n_sites": "sites with an estimate",
+    "estimate_low": "lower confidence limit of the estimate; of prediction, of a further site's",
+    "estimate_high": "upper limit",
+    "weight": "share of the site in the random-effects estimate",
+    "without_estimate": "random-effects estimate without the site",
+    "without_low": "its lower confidence limit",
+    "without_high": "its upper confidence limit",
+    "without_p": "its p-value",
+    "tau2": "variance of the true effects between sites, unit of the measure squared",
+    "q": "Cochran's Q",
+    "q_p": "its p-value",
+    "i2": "I squared: share of the variance of the sites' estimates that is between sites",
+    "estimate_dl": "random-effects estimate with the variance of DerSimonian and Laird",
+    "se_dl": "its standard error",
+    "p_dl": "its p-value, from the normal distribution",
+    "n_kept": "points that survive with all sites, and without this one",
+    "largest_change": "largest change of the estimate without the site, in residual SDs",
+}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -210,7 +237,7 @@ def _frame(sites: Sequence[SiteSummary], number: int) -> Frame:
     return Frame.of_sheet(np.array(first.x), np.array(first.y), np.array(names).reshape(shape))
 
 
-def _test(item: Item, effects: str, confidence: float) -> PointTest:
+def point_test(item: Item, effects: str, confidence: float) -> PointTest:
     """Write a combined estimate as a test; Cohen's d is over the residual SD within sites."""
     one, sd = item.result.models[effects], item.result.sd
     none = np.full(len(sd), np.nan)
@@ -240,9 +267,9 @@ def meta_tables(meta: Meta) -> Iterator[tuple[str, pd.DataFrame]]:
         frame = meta.frame[item.model.hemi]
         own = []
         for effects in item.result.models:
-            key, test = item.key(effects), _test(item, effects, confidence)
+            key, test = item.key(effects), point_test(item, effects, confidence)
             found = meta.found[key]
-            stem = map_name(key.hemi, key.measure, key.contrast)
+            stem = tables.map_name(key.hemi, key.measure, key.contrast)
             rows.append(
                 {
                     "measure": key.measure,
@@ -433,7 +460,7 @@ def _summaries(meta: Meta) -> pd.DataFrame:
     parts = []
     for item in meta.of("summary"):
         for effects, one in item.result.models.items():
-            test = _test(item, effects, confidence)
+            test = point_test(item, effects, confidence)
             low, high = one.limits(confidence)
             parts.append(
                 pd.DataFrame(
@@ -445,6 +472,7 @@ def _summaries(meta: Meta) -> pd.DataFrame:
                         "contrast": item.label(effects),
                         "test": "t",
                         "n": meta.counts(item).astype(int),
+                        "visits": meta.counts(item).astype(int),
                         "n_sites": item.result.random.sites.astype(int),
                         "estimate": one.estimate,
                         "se": one.se,
@@ -470,7 +498,7 @@ def _summaries(meta: Meta) -> pd.DataFrame:
         for _, own in table.groupby("contrast", sort=False)["p"]
     ]
     corrected = pd.concat(adjusted) if adjusted else pd.Series(dtype=np.float64)
-    table.insert(int(np.flatnonzero(table.columns == "p")[0]) + 1, "p_corrected", corrected)
+    table.insert(int(np.flatnonzero(table.columns == "p")[0]) + 1, "p_fdr", corrected)
     return table
 
 

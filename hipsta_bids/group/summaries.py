@@ -5,11 +5,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.classify import PairComparison, compare_pairs
 from hipsta_bids.group.comparison import BOTH
-from hipsta_bids.group.data import Cohort, Float
+from hipsta_bids.group.data import PARTICIPANT, Cohort, Float, Int
 from hipsta_bids.group.formula import Contrast, ModelSpec, check_names, typed
 from hipsta_bids.group.glm import MEAN, PointwiseFit, RowModel, with_mean
 from hipsta_bids.group.grammar import closed_formula
@@ -27,6 +28,8 @@ class MeasureFit:
     measures: tuple[str, ...]
     formula: str
     fit: PointwiseFit
+    participants: Int
+    """(measures,) with a value; the fit counts visits."""
 
 
 def summary_values(cohort: Cohort, hemi: str, only: Sequence[str] | None = None) -> pd.DataFrame:
@@ -65,7 +68,7 @@ def fit_summaries(
     notes: list[str] = []
     for hemi in hemispheres(cohort):
         values = summary_values(cohort, hemi, only)
-        fits += _fit(values, hemi, model.formula, rows_of(design), settings)
+        fits += _fit(cohort, values, hemi, model.formula, rows_of(design), settings)
     if not fits:
         return fits, notes
     if icv is None:
@@ -83,11 +86,13 @@ def fit_summaries(
     for hemi in hemispheres(cohort):
         values = summary_values(cohort, hemi, only)
         volumes = [name for name in values.columns if name.startswith("volume")]
-        fits += _fit(values[volumes], hemi, adjusted.formula, rows_of(larger), settings)
+        own = values[volumes]
+        fits += _fit(cohort, own, hemi, adjusted.formula, rows_of(larger), settings)
     return fits, notes
 
 
-def _fit(
+def _fit(  # noqa: PLR0917
+    cohort: Cohort,
     values: pd.DataFrame,
     hemi: str,
     formula: str,
@@ -101,7 +106,20 @@ def _fit(
         return []
     maps: Float = own[list(varying)].to_numpy(dtype=np.float64)[present]
     fit = model.fit_measures(maps, present, model.design.contrasts, settings)
-    return [MeasureFit(hemi=hemi, measures=varying, formula=formula, fit=fit)]
+    who = cohort.table[PARTICIPANT].iloc[model.design.rows[present]].to_numpy()
+    people = participants_with(maps, who)
+    return [MeasureFit(hemi=hemi, measures=varying, formula=formula, fit=fit, participants=people)]
+
+
+def participants_with(values: Float, who: NDArray[np.object_]) -> Int:
+    """Count those (columns,) who have a value in any of their rows."""
+    _, numbers = np.unique(who.astype(str), return_inverse=True)
+    order = np.argsort(numbers, kind="stable")
+    starts = np.searchsorted(numbers[order], np.arange(numbers.max(initial=-1) + 1))
+    known = np.isfinite(values)[order]
+    if not len(starts):
+        return np.zeros(values.shape[1], dtype=np.int64)
+    return np.asarray(np.logical_or.reduceat(known, starts, axis=0).sum(axis=0), dtype=np.int64)
 
 
 def _same_names(larger: Design, design: Design) -> tuple[Contrast, ...]:

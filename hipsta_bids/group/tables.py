@@ -17,10 +17,12 @@ from hipsta_bids.group.analysis import (
 )
 from hipsta_bids.group.classify import ClassifierResult, roc_curve
 from hipsta_bids.group.clusters import edges_of, frame_of, peak_table
-from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort
+from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float
+from hipsta_bids.group.harmonize import Harmonization
+from hipsta_bids.group.inference import control_fdr
 from hipsta_bids.group.registration import ShiftDifference
 from hipsta_bids.group.settings import GroupSettings
-from hipsta_bids.group.summaries import hemispheres, summary_values
+from hipsta_bids.group.summaries import hemispheres, participants_with, summary_values
 
 Named = tuple[str, pd.DataFrame]
 """File name without extension, and table."""
@@ -44,7 +46,8 @@ COLUMNS: Mapping[str, str] = {
     "node_x": "node along x, 1 is most medial; coordinates are registered",
     "node_y": "node along y, 1 is most posterior",
     "subfield": "subfield, most frequent after registration",
-    "n": "participants with a value",
+    "n": "participants with a value; in maps of statistics, with --longitudinal, visits",
+    "visits": "visits with a value, as many as participants unless --longitudinal",
     "n_cases": "of these, in the second group",
     "n_incomplete": "participants of the two groups that lack a value",
     "estimate": "contrast of the model's coefficients, unit of the measure; n/a for F",
@@ -53,6 +56,8 @@ COLUMNS: Mapping[str, str] = {
     "df": "degrees of freedom; of F, the denominator's",
     "p": "two-sided p-value, not corrected",
     "p_corrected": "p-value corrected for the number of points, by the method of analysis.json",
+    "p_fdr": "p-value with the false discovery rate held over all tests of the contrast in the"
+    " table: all measures, sides and models",
     "significant": "true where the corrected p-value is at most the level",
     "effect": "kind of effect size",
     "effect_size": "Cohen's d (estimate over residual SD), or partial eta squared",
@@ -121,30 +126,18 @@ COLUMNS: Mapping[str, str] = {
     "w": "observed minus expected from the reference group, in its residual standard deviations",
     "low": "share of points with a two-sided p below the level, and w below zero",
     "high": "the same, and w above zero",
+    "kind": "map, or summary measure",
+    "site": "level of the column that was harmonized",
+    "estimated": "true if its effects were estimated from these participants, not read from a file",
+    "site_shift": "added by the site and taken out: mean over points, unit of the measure",
+    "site_shift_rms": "the same, root mean square over points",
+    "site_scale": "factor of the site on residuals, divided out: mean over points",
+    "offset_before": "mean of the site's residuals, in SD of all: root mean square over points",
+    "offset_after": "the same after harmonization",
+    "spread_before": "SD of the site's residuals, in SD of all: mean over points",
+    "spread_after": "the same after harmonization",
     "participant_id": "participant",
     "session_id": "session",
-    "site": "site; in forest.tsv also the combined estimates, and the limits of a further site",
-    "kind": "what the row is: site, fixed effect, random effects, or prediction",
-    "plot": "number of the forest plot",
-    "version": "version of hipsta_bids",
-    "template": "hash of the template of registration; none without registration",
-    "n_sites": "sites with an estimate",
-    "estimate_low": "lower confidence limit of the estimate; of prediction, of a further site's",
-    "estimate_high": "upper limit",
-    "weight": "share of the site in the random-effects estimate",
-    "without_estimate": "random-effects estimate without the site",
-    "without_low": "its lower confidence limit",
-    "without_high": "its upper confidence limit",
-    "without_p": "its p-value",
-    "tau2": "variance of the true effects between sites, unit of the measure squared",
-    "q": "Cochran's Q",
-    "q_p": "its p-value",
-    "i2": "I squared: share of the variance of the sites' estimates that is between sites",
-    "estimate_dl": "random-effects estimate with the variance of DerSimonian and Laird",
-    "se_dl": "its standard error",
-    "p_dl": "its p-value, from the normal distribution",
-    "n_kept": "points that survive with all sites, and without this one",
-    "largest_change": "largest change of the estimate without the site, in residual SDs",
     "reason": "why",
     "message": "what was said about it",
 }
@@ -160,8 +153,9 @@ def result_tables(cohort: Cohort, analysis: Analysis, settings: GroupSettings) -
         yield "maps", _overview(analysis)
     if analysis.sides:
         yield from _registration_tables(cohort, analysis)
+    yield from _sites("sites", cohort, analysis)
     if analysis.measures:
-        yield "measures", _stacked(_measures(cohort, analysis))
+        yield "measures", _with_fdr(_stacked(_measures(cohort, analysis)), settings)
         if grouped:
             yield "descriptives", _stacked(_descriptives(analysis))
     if analysis.scores is not None and len(analysis.scores.table):
@@ -181,6 +175,7 @@ def point_tables(
     yield f"{name}_peaks", _stacked(_peaks(cohort, analysis, settings))
     if analysis.scores is not None:
         yield f"{name}_wscores", analysis.scores.table
+    yield from _sites(f"{name}_sites", cohort, analysis)
     yield f"{name}_means", _stacked(_means(cohort, analysis))
     yield from _statistics(cohort, analysis)
 
@@ -257,7 +252,9 @@ def _means(cohort: Cohort, analysis: Analysis) -> Iterator[Columns]:
     """Means and standard deviations of groups at each point of the maps that were fitted."""
     for hemi, one in analysis.fitted.items():
         frame = frame_of(cohort, one)
-        members = members_of(analysis, rows_of(analysis, one))
+        rows = rows_of(analysis, one)
+        people = rows[PARTICIPANT].to_numpy()
+        members = members_of(analysis, rows)
         for measure in one.fits:
             values = one.values(measure)
             for group, own in members.items():
@@ -268,7 +265,7 @@ def _means(cohort: Cohort, analysis: Analysis) -> Iterator[Columns]:
                     "group": group,
                     **frame.number,
                     **frame.position,
-                    "n": np.isfinite(values[own]).sum(axis=0),
+                    "n": participants_with(values[own], people[own]),
                     "mean": mean_of_known(values[own], 0),
                     "sd": spread_of_known(values[own]),
                 }
@@ -326,12 +323,14 @@ def _measures(cohort: Cohort, analysis: Analysis) -> Iterator[Columns]:
                 "model": one.formula,
                 "contrast": test.contrast.name,
                 "test": test.kind,
-                "n": one.fit.n,
+                "n": one.participants,
+                "visits": one.fit.n,
                 "estimate": test.estimate[0] if single else np.nan,
                 "se": test.se[0] if single else np.nan,
                 "statistic": test.statistic,
                 "df": test.df,
                 "p": test.p,
+                "p_fdr": np.nan,
                 "effect": "cohen_d" if single else "partial_eta_squared",
                 "effect_size": test.effect,
                 "effect_low": limits[0],
@@ -339,12 +338,25 @@ def _measures(cohort: Cohort, analysis: Analysis) -> Iterator[Columns]:
             }
 
 
+def _with_fdr(table: pd.DataFrame, settings: GroupSettings) -> pd.DataFrame:
+    """Correct the tests of one contrast for the number of measures, sides and models."""
+    how = settings.multiplicity
+    method = "bh" if how.method == "bh" else "fdr2"
+    for _, rows in table.groupby("contrast", sort=False):
+        found = control_fdr(rows["p"].to_numpy(dtype=np.float64), how.alpha, method)
+        table.loc[rows.index, "p_fdr"] = found.adjusted
+    return table
+
+
 def _descriptives(analysis: Analysis) -> Iterator[Columns]:
+    """Describe the first visit of each participant in the model."""
     cohort = analysis.compared
-    members = members_of(analysis, cohort.table.iloc[analysis.design.rows])
+    in_model = analysis.design.rows
+    first = in_model[~cohort.table[PARTICIPANT].iloc[in_model].duplicated().to_numpy()]
+    members = members_of(analysis, cohort.table.iloc[first])
     for hemi in hemispheres(cohort):
         values = summary_values(cohort, hemi, analysis.measured.summaries)
-        values = values.iloc[analysis.design.rows]
+        values = values.iloc[first]
         for group, rows in members.items():
             own = values[rows]
             yield {
@@ -436,6 +448,45 @@ def _shifts(analysis: Analysis) -> Iterator[Columns]:
                 "shift": shift.mean,
                 "shift_se": shift.se,
             }
+
+
+def _sites(name: str, cohort: Cohort, analysis: Analysis) -> Iterator[Named]:
+    done = analysis.harmonization
+    if done is not None and (rows := list(_site_rows(done, cohort.units))):
+        yield name, pd.DataFrame(rows)
+
+
+def _site_rows(done: Harmonization, units: Mapping[str, str]) -> Iterator[Columns]:
+    """List shifts and scales of sites: means over the points of a map, or of a summary measure."""
+    for kind, part in (("map", done.maps), ("summary", done.summaries)):
+        for (hemi, measure), (effects, moments) in part.items():
+            shift, after = effects.shift * effects.sd, moments.after(effects)
+            for number, site in enumerate(done.plan.sites):
+                if moments.n[number].any():
+                    yield {
+                        "measure": measure,
+                        "unit": units.get(measure, "1"),
+                        "kind": kind,
+                        "hemi": hemi,
+                        "site": site,
+                        "estimated": site in done.plan.estimated,
+                        "n": int(moments.n[number].max()),
+                        "site_shift": _mean_known(shift[number]),
+                        "site_shift_rms": _root_mean_square(shift[number]),
+                        "site_scale": _mean_known(effects.scale[number]),
+                        "offset_before": _root_mean_square(moments.mean[number]),
+                        "offset_after": _root_mean_square(after.mean[number]),
+                        "spread_before": _mean_known(moments.sd[number]),
+                        "spread_after": _mean_known(after.sd[number]),
+                    }
+
+
+def _mean_known(values: Float) -> float:
+    return float(mean_of_known(values, 0))
+
+
+def _root_mean_square(values: Float) -> float:
+    return float(np.sqrt(mean_of_known(values**2, 0)))
 
 
 def _curves(analysis: Analysis, curve: CurveOf) -> Iterator[Columns]:

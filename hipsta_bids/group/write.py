@@ -1,8 +1,11 @@
 """Writes the results of one model, all or none: tables, maps, surfaces, figures and text."""
 
 import contextlib
+import logging
 import os
+import re
 import shutil
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -15,11 +18,13 @@ from hipsta_bids.derivatives.names import DATASET_FILES
 from hipsta_bids.group.analysis import Analysis, tested_maps
 from hipsta_bids.group.collect import Exclusion
 from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float, Int, SideMaps
-from hipsta_bids.group.figures import draw_figures
+from hipsta_bids.group.figures import Drawing, draw_figures, encode
 from hipsta_bids.group.glm import FittedMaps
+from hipsta_bids.group.harmonize import digests, effects_of
 from hipsta_bids.group.methods import methods_text
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.shapes import AverageShape
+from hipsta_bids.group.site_effects import save_effects
 from hipsta_bids.group.tables import (
     COLUMNS,
     design_table,
@@ -32,6 +37,8 @@ from hipsta_bids.group.warps import templates_to_json
 from hipsta_bids.io import files, gifti
 from hipsta_bids.progress import tell
 
+_LOGGER = logging.getLogger(__name__)
+
 #: Folder of all models, in the output dataset.
 GROUP_FOLDER = DATASET_FILES["group"]
 #: Name of the surface of the sheets.
@@ -40,7 +47,11 @@ SHEET = "sheet"
 _BLOCK, _ROWS_OF_SCORES = 500_000, 500
 
 _WORD = pa.dictionary(pa.int32(), pa.string())
-_SUFFIXES = {"": "as measured", "_registered": "after registration"}
+_SUFFIXES = {
+    "": "as measured",
+    "_registered": "after registration",
+    "_harmonized": "after registration and harmonization",
+}
 
 Columns = dict[str, pa.Array]
 
@@ -106,7 +117,10 @@ def write_results(
     registered = {hemi: side.registered for hemi, side in analysis.sides.items()}
     if registered or others:
         points = {name: other for name, (other, _) in others.items()}
-        _write_maps(folder / "maps.parquet", cohort, registered, points)
+        states = [cohort.sides, registered]
+        if analysis.harmonization is not None:
+            states.append(analysis.harmonization.cohort.sides)
+        _write_maps(folder / "maps.parquet", cohort, states if registered else [], points)
     templates = {
         hemi: side.registration.template
         for hemi, side in analysis.sides.items()
@@ -114,6 +128,11 @@ def write_results(
     }
     if templates:
         files.write_json(folder / "template.json", templates_to_json(templates))
+    if analysis.harmonization is not None:
+        done = [analysis.harmonization, *(other.harmonization for _, other in others.values())]
+        how = digests({hemi: side.registration for hemi, side in analysis.sides.items()})
+        if effects := effects_of([one for one in done if one is not None], how):
+            save_effects(folder / "harmonization.json", effects)
     for one in ((cohort, analysis), *others.values()):
         _write_gifti(folder, *one)
         _write_scores(folder, *one)
@@ -136,23 +155,51 @@ def draw(
     shapes: Mapping[str, AverageShape],
     *,
     others: Mapping[str, tuple[Cohort, Analysis]],
-) -> None:
-    """Draw the figures."""
+) -> list[str]:
+    """Draw the figures, and say which are missing or lack letters; one line each."""
     tell("figures")
-    for one in ((cohort, analysis, shapes), *((*one, {}) for one in others.values())):
-        for number, (name, content) in enumerate(draw_figures(*one), start=1):
-            tell("figures", number)
-            files.write_bytes(folder / "figures" / name, content)
+    every = ((cohort, analysis, shapes), *((*one, {}) for one in others.values()))
+    return draw_all(folder, (figure for one in every for figure in draw_figures(*one)))
 
 
-def write_table(folder: Path, name: str, table: pd.DataFrame, *, described: bool = True) -> None:
+def draw_all(folder: Path, figures: Iterable[tuple[str, Drawing]]) -> list[str]:
+    """Draw figures by name, and say which are missing or lack letters; one line each."""
+    problems, missing = [], set()
+    for number, (name, drawing) in enumerate(figures, start=1):
+        tell("figures", number)
+        try:
+            with warnings.catch_warnings(record=True) as warned:
+                warnings.simplefilter("always")
+                encoded = encode(name, drawing)
+        except Exception as error:  # results are worth more than figures
+            _LOGGER.exception("figure %s", name)
+            problems.append(f"figure {name}: not drawn ({type(error).__name__}: {error})")
+            continue
+        for warning in warned:
+            missing |= set(re.findall(r"^Glyph (\d+) ", str(warning.message)))
+        for title, content in encoded:
+            files.write_bytes(folder / "figures" / title, content)
+    if missing:
+        letters = "".join(sorted(chr(int(number)) for number in missing))
+        problems.append(f"figures: PDF and PNG show boxes for {letters}; SVG has them as text")
+    return problems
+
+
+def write_table(
+    folder: Path,
+    name: str,
+    table: pd.DataFrame,
+    *,
+    described: bool = True,
+    meaning: Mapping[str, str] = COLUMNS,
+) -> None:
     """Write a table, with a sidecar unless the columns are the user's or the model's."""
     columns = [str(column) for column in table.columns]
     cells = [[_cell(value) for value in table[column].tolist()] for column in table.columns]
     files.write_tsv(folder / f"{name}.tsv", columns, zip(*cells, strict=True))
     if described:
         meanings = {
-            column: COLUMNS.get(column)
+            column: meaning.get(column)
             or f"registered coordinate of node {column.removeprefix('node_')}, 0..1"
             for column in columns
         }
@@ -169,9 +216,15 @@ def _cell(value: object) -> str:
 
 
 def _write_maps(
-    path: Path, cohort: Cohort, registered: Mapping[str, SideMaps], others: Mapping[str, Cohort]
+    path: Path,
+    cohort: Cohort,
+    states: Sequence[Mapping[str, SideMaps]],
+    others: Mapping[str, Cohort],
 ) -> None:
-    """Write all analyzed maps as one Parquet file: a row per visit, hemisphere and point."""
+    """Write all analyzed maps as one Parquet file: a row per visit, hemisphere and point.
+
+    The states of the sheets are those before and after each step; none without sheets.
+    """
     fields = [pa.field(name, _WORD) for name in (PARTICIPANT, SESSION, "hemi")]
     about = {"description": f"{SHEET}, or the name of maps with points of their own"}
     fields.append(pa.field("surface", _WORD, metadata=about))
@@ -181,16 +234,17 @@ def _write_maps(
     fields += [pa.field(f"node_{axis}", pa.int16(), metadata=about) for axis in "xy"]
     about = {"description": "coordinate on the sheet, -1 to 1", "unit": "1"}
     fields += [pa.field(axis, pa.float32(), metadata=about) for axis in "xy"]
-    measures = list(next(iter(registered.values())).maps) if registered else []
-    for suffix, text in _SUFFIXES.items() if registered else ():
-        fields.append(pa.field(f"subfield{suffix}", _WORD, metadata={"description": text}))
+    measures = list(next(iter(states[0].values())).maps) if states else []
+    for suffix, text in list(_SUFFIXES.items())[: len(states)]:
+        if suffix != "_harmonized":
+            fields.append(pa.field(f"subfield{suffix}", _WORD, metadata={"description": text}))
         fields += [_number(f"{name}{suffix}", cohort, name, text) for name in measures]
     fields += [_number(name, other, name, "as given") for name, other in others.items()]
     about = {
         "description": "one row per visit, hemisphere and point; x from medial to lateral, y"
         " from posterior to anterior; a column is empty where the surface lacks the measure"
     }
-    blocks = _map_blocks(cohort, registered, others)
+    blocks = _map_blocks(cohort, states, others)
     _write_parquet(path, pa.schema(fields, metadata=about), blocks)
 
 
@@ -215,9 +269,9 @@ def _write_parquet(path: Path, schema: pa.Schema, blocks: Iterable[Columns]) -> 
 
 
 def _map_blocks(
-    cohort: Cohort, registered: Mapping[str, SideMaps], others: Mapping[str, Cohort]
+    cohort: Cohort, states: Sequence[Mapping[str, SideMaps]], others: Mapping[str, Cohort]
 ) -> Iterator[Columns]:
-    surfaces = [(SHEET, cohort, registered)]
+    surfaces = [(SHEET, cohort, sides) for sides in states[:1]]
     surfaces += [(name, other, other.sides) for name, other in others.items()]
     for surface, own, sides in surfaces:
         for hemi, side in sides.items():
@@ -229,10 +283,10 @@ def _map_blocks(
                 columns["vertex"] = pa.array(vertices)
                 if side.mesh is None:
                     columns |= _node_columns(own, side.shape, len(rows))
-                if sides is registered:
-                    for suffix, source in zip(_SUFFIXES, (own.sides[hemi], side), strict=True):
-                        columns[f"subfield{suffix}"] = _subfields(source, part)
-                        columns |= _value_columns(source.maps, part, suffix)
+                if surface == SHEET:
+                    for suffix, state in zip(_SUFFIXES, states, strict=False):
+                        columns[f"subfield{suffix}"] = _subfields(state[hemi], part)
+                        columns |= _value_columns(state[hemi].maps, part, suffix)
                 else:
                     columns |= _value_columns(side.maps, part)
                 yield columns

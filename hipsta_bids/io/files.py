@@ -221,6 +221,10 @@ def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON object."""
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise InputError(
+            f"{path}: no such file; check its name", reason="unreadable-json"
+        ) from error
     except (OSError, ValueError) as error:
         raise InputError(
             f"{path}: not readable as JSON ({error}); restore or delete it",

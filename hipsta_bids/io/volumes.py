@@ -184,15 +184,7 @@ def label_codes(path: Path) -> list[float]:
 
 def _label_shape(image: Any, path: Path) -> tuple[int, int, int]:  # noqa: ANN401 (untyped)
     """Shape of an image of labels, by its header; refuse what is none, or too large."""
-    shape = [int(n) for n in image.shape]
-    text = " x ".join(map(str, shape))
-    while len(shape) > _SPACE and shape[-1] == 1:
-        shape.pop()
-    if len(shape) != _SPACE:
-        raise InputError(
-            f"{path}: has shape {text}, but labels are one 3-D volume; extract the volume",
-            reason="not-3d",
-        )
+    shape = _three_axes(image, path, "labels are")
     if image.get_data_dtype().kind not in "iufb":
         raise InputError(
             f"{path}: labels are not whole numbers but colors or complex numbers; save them as "
@@ -200,12 +192,27 @@ def _label_shape(image: Any, path: Path) -> tuple[int, int, int]:  # noqa: ANN40
             reason="non-integer-labels",
         )
     if math.prod(shape) > MOST_VOXELS or shape[0] * shape[1] > _MOST_IN_SLICE:
+        text = " x ".join(map(str, image.shape))
         raise InputError(
             f"{path}: its header declares {text} voxels, {MOST_VOXELS / 1e9:.0f} billion are the "
             "limit; make the file again, or crop it to the hippocampus",
             reason="image-too-large",
         )
     _check_fits(image, path, shape[0] * shape[1], "one slice")
+    return shape
+
+
+def _three_axes(image: Any, path: Path, what: str) -> tuple[int, int, int]:  # noqa: ANN401 (untyped)
+    """Shape of an image without further axes of length one; refuse what has more than three."""
+    shape = [int(n) for n in image.shape]
+    while len(shape) > _SPACE and shape[-1] == 1:
+        shape.pop()
+    if len(shape) != _SPACE:
+        text = " x ".join(map(str, image.shape))
+        raise InputError(
+            f"{path}: has shape {text}, but {what} one 3-D volume; extract the volume",
+            reason="not-3d",
+        )
     return shape[0], shape[1], shape[2]
 
 
@@ -259,6 +266,16 @@ def box_with_margin(
         for found in [np.flatnonzero(hit)]
     )
     return first, second, third
+
+
+def read_grid(path: Path) -> tuple[tuple[int, int, int], Float]:
+    """Read shape and affine (voxel index to RAS mm) of a 3-D image from its header."""
+    with _opened(path) as image:
+        _check_scalar(image, path)
+        shape = _three_axes(image, path, "an anatomical image is")
+        affine: Float = np.asarray(image.affine, dtype=np.float64)
+        _check_affine(image, affine, path, VOXEL_SIZES)
+    return shape, affine
 
 
 def read_scalars(path: Path, points: Float) -> ScalarVolume:

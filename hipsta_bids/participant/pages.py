@@ -25,6 +25,9 @@ _TIMEOUT = 600.0  # s for one page
 _COHORT = DATASET_FILES["report"]
 _RECORD = "_desc-qc_metrics.json"
 _RECORDS = tuple(f"{folder}/*{_RECORD}" for folder in ("sub-*/anat", "sub-*/ses-*/anat"))
+_START = 2000  # characters
+#: In the head of pages with anatomical images.
+ANATOMY = '<meta name="anatomy"'
 _LOGGER = logging.getLogger(__name__)
 
 
@@ -46,6 +49,8 @@ class PageJob:
     """The output dataset."""
     visit: VisitKey | None
     """The visit that the page is about; ``None`` for that of the cohort."""
+    bids_dir: Path | None = None
+    """See :class:`PagePlan`."""
 
     @property
     def path(self) -> Path:
@@ -63,6 +68,8 @@ class PagePlan:
     """Pages at the same time."""
     log: Path
     """Receives tracebacks and what libraries print."""
+    bids_dir: Path | None = None
+    """The dataset with anatomical images, which are shown behind labels; ``None`` shows none."""
     cohort: bool = True
     """Whether the page of the cohort is made, too."""
     cluster: Cluster | None = None
@@ -87,7 +94,10 @@ def visits_of(root: Path) -> list[VisitKey]:
 def write_reports(plan: PagePlan, visits: Iterable[VisitKey]) -> Iterator[Problem]:
     """Make the pages of some visits, and that of the cohort."""
     jobs = [PageJob(root=plan.root, visit=None)] if plan.cohort else []
-    jobs += [PageJob(root=plan.root, visit=visit) for visit in dict.fromkeys(visits)]
+    jobs += [
+        PageJob(root=plan.root, visit=visit, bids_dir=plan.bids_dir)
+        for visit in dict.fromkeys(visits)
+    ]
     workers = WorkerPlan(
         work=make_page,
         n_workers=max(1, min(plan.n_workers, len(jobs))),
@@ -128,13 +138,14 @@ def reports_after(plan: PagePlan, visits: Sequence[VisitKey]) -> Generator[Pages
 
 
 def _try_all(plan: PagePlan, visits: Sequence[VisitKey], problems: list[str]) -> None:
-    """Make the pages that are older than the records they are about."""
+    """Make the pages that are older than their records, or show images that they must not."""
     root = plan.root
     stale = []
     for subject, session in dict.fromkeys(visits):
         folder = f"sub-{subject}/{f'ses-{session}/' if session else ''}anat"
         page = root / participant_report(subject, session)
-        if not _is_newer(page, root, f"{folder}/*{_RECORD}"):
+        shows = plan.bids_dir is None and ANATOMY in _start(page)
+        if shows or not _is_newer(page, root, f"{folder}/*{_RECORD}"):
             stale.append((subject, session))
     if not stale and (not plan.cohort or _is_newer(root / _COHORT, root, *_RECORDS)):
         return
@@ -155,6 +166,15 @@ def _is_newer(page: Path, root: Path, *patterns: str) -> bool:
         return False
 
 
+def _start(page: Path) -> str:
+    """Read the first lines of a page, which say whether it shows anatomical images."""
+    try:
+        with page.open(encoding="utf-8") as stream:
+            return stream.read(_START)
+    except OSError:
+        return ""
+
+
 def warm_up() -> None:
     """Load the libraries, so that no page's time includes it."""
     import hipsta_bids.reports.participant  # noqa: F401, PLC0415  (loaded in workers only)
@@ -170,7 +190,11 @@ def make_page(job: PageJob) -> Problem | None:
 
     try:
         cohort = _cohort(job.root)
-        page = participant_page(job.root, *job.visit, cohort) if job.visit else cohort_page(cohort)
+        page = (
+            participant_page(job.root, *job.visit, cohort, job.bids_dir)
+            if job.visit
+            else cohort_page(cohort)
+        )
         if page is not None:
             files.write_text(job.path, page)
     except OutputError as error:

@@ -216,6 +216,8 @@ class RunOptions:
     """Workers elsewhere; ``None`` is this machine."""
     reports: bool = False
     """Make pages to look at afterwards."""
+    anatomy: Path | None = None
+    """The BIDS dataset whose anatomical images the pages show; ``None`` shows none."""
     command: str | None = None
     """The command line, for the log."""
     notes: tuple[str, ...] = ()
@@ -430,6 +432,7 @@ def _pages_after(
         root=out_dir,
         n_workers=n_workers(options, len(visits)),
         log=log,
+        bids_dir=options.anatomy,
         cohort=options.shard is None,
         cluster=options.cluster,
     )

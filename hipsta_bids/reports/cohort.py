@@ -270,7 +270,7 @@ def cohort_page(cohort: Cohort) -> str | None:
         sprites=sprites,
         ratings=RATINGS,
         data={
-            "columns": _columns(hemispheres),
+            "columns": _columns(hemispheres, compared=bool(apart)),
             "rows": rows,
             "apart": OUTLIER,
             "ratings": RATINGS,
@@ -283,7 +283,7 @@ def cohort_page(cohort: Cohort) -> str | None:
     )
 
 
-def _columns(hemispheres: Sequence[Hemisphere]) -> list[Mapping[str, Any]]:
+def _columns(hemispheres: Sequence[Hemisphere], *, compared: bool) -> list[Mapping[str, Any]]:
     """Columns of the table; those of one value throughout are left out."""
     names = [h.place.name for h in hemispheres]
     measures = {measure.name: measure for measure in MEASURES}
@@ -307,14 +307,11 @@ def _columns(hemispheres: Sequence[Hemisphere]) -> list[Mapping[str, Any]]:
         {"key": "rating", "title": "Rating"},
         {"key": "status", "title": "Status"},
         {"key": "reason", "title": "Reason"},
-        {
-            "key": "distance",
-            "title": "Outlier score",
-            "digits": 1,
-            "help": "largest robust z-score",
-        },
-        {"key": "farthest", "title": "Outlier measure"},
     ]
+    if compared:
+        score = {"title": "Outlier score", "digits": 1, "help": "largest robust z-score"}
+        columns.append({"key": "distance", **score})
+        columns.append({"key": "farthest", "title": "Outlier measure"})
     for key, title in _SHOWN.items():
         unit, digits = measures[key].unit, measures[key].digits
         columns.append({"key": key, "title": title, "unit": unit, "digits": digits})

@@ -28,6 +28,8 @@ HEMISPHERE_COLORS = {"L": COLORS[0], "R": COLORS[1]}
 
 #: Color maps of effect sizes, of significance and of design matrices.
 EFFECT_COLORS, P_COLORS, DESIGN_COLORS = "RdBu_r", "PuOr_r", "cividis"
+#: Of effects and significance that have no sign.
+_UNSIGNED = "Reds", "Oranges"
 
 _EFFECTS = 99.0  # percentile of sizes that the colors of effects span
 _LEVEL = 0.05
@@ -165,6 +167,14 @@ def effect_reach(maps: Sequence[Effects]) -> float:
     sizes = np.abs(known([effects.sizes for effects in maps]))
     usual = float(np.percentile(sizes, _EFFECTS)) if len(sizes) else 0.0
     return max(usual, *(effects.certain for effects in maps), _SMALLEST)
+
+
+def effect_colors(kind: str) -> tuple[float, str, str]:
+    """Where colors begin, as a share of their reach, and those of effects and of significance.
+
+    Differences (``t``) may be negative, shares of the variance (``F``) may not.
+    """
+    return (-1.0, EFFECT_COLORS, P_COLORS) if kind == "t" else (0.0, *_UNSIGNED)
 
 
 def significance_reach(values: Sequence[Float]) -> float:

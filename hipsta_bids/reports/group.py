@@ -34,6 +34,7 @@ from hipsta_bids.reports.group_tables import (
     scores,
     summaries,
     visit_of,
+    with_brackets,
 )
 from hipsta_bids.reports.page import Section, build_sections, render
 
@@ -73,7 +74,8 @@ def _what(comparison: Mapping[str, Any]) -> str:
     """Describe what a row of the model is."""
     if comparison.get("longitudinal"):
         return (
-            "A row is a visit; a mixed model gives each participant an intercept, or a slope too."
+            "A row is a visit; a mixed model gives each participant an intercept, or a slope too"
+            " (see the methods paragraph)."
         )
     if comparison.get("pair"):
         first, second = comparison["pair"]
@@ -225,14 +227,57 @@ def _moved(row: Mapping[str, Any]) -> str:
 
 
 def _registration(results: GroupResults) -> Mapping[str, Any] | None:
-    """Describe what registration has done, with the profiles before and after it, and warps."""
+    """Describe what registration has done, with curvature before and after it, and warps."""
     values = _registered(results)
     if values is None:
         return None
-    profiles = "Means of groups from medial to lateral, before and after registration"
-    warps = "How far sheets were moved to lateral: each sheet, and means of groups"
-    pictures = embedded(results, "profiles", "Profiles before and after", profiles)
-    return {**values, "pictures": pictures + embedded(results, "warps", "Warps", warps)}
+    alt = "Curvature from medial to lateral before and after registration, and warps, by group"
+    return {**values, "pictures": embedded(results, "registration", "Registration", alt)}
+
+
+def _harmonization(results: GroupResults) -> Mapping[str, Any] | None:
+    """Describe which effects of sites were taken out, and what is left of them."""
+    record = results.record.get("harmonization")
+    if not record:
+        return None
+    alt = "Means and SDs of the residuals of sites over points, before and after harmonization"
+    others = (results.record.get("inputs") or {}).get("maps") or {}
+    pictures = embedded(results, "sites", "Sites before and after harmonization", alt)
+    for name in others:
+        caption = f"Sites before and after harmonization, {display_name(name)}"
+        pictures += embedded(results, f"{name}_sites", caption, alt)
+    settings = (results.record.get("settings") or {}).get("harmonization") or {}
+    limit = float(settings.get("explained", 1.0))
+    shares = (record.get("explained") or {}).items()
+    return {
+        **record,
+        "rows": _site_rows(results),
+        "pictures": pictures,
+        "registered": bool(len(results.table("registration"))),
+        "compared": bool(len(results.table("classification"))),
+        "doubtful": [(name, f"{share:.0%}") for name, share in shares if share > limit],
+    }
+
+
+def _site_rows(results: GroupResults) -> list[dict[str, Any]]:
+    """List effects of sites on maps, and what is left of them."""
+    table = results.everywhere("sites")
+    return [
+        {
+            "measure": with_brackets(display_name(row["measure"]), row["unit"]),
+            "side": SIDES[row["hemi"]],
+            "site": row["site"],
+            "n": row["n"],
+            "shift": number_text(row["site_shift"]),
+            "scale": f"{row['site_scale']:.2f}",
+            "cells": [
+                f"{row[f'{what}_{when}']:.2f}"
+                for what in ("offset", "spread")
+                for when in ("before", "after")
+            ],
+        }
+        for row in records(table[table["kind"] == "map"])
+    ]
 
 
 def _sections_of_groups(results: GroupResults) -> Mapping[str, Any] | None:
@@ -294,6 +339,12 @@ SECTIONS: tuple[Section[GroupResults], ...] = (
         title="Registration",
         template="group/registration.html",
         build=_registration,
+    ),
+    Section(
+        key="harmonization",
+        title="Harmonization",
+        template="group/harmonization.html",
+        build=_harmonization,
     ),
     Section(
         key="sections",

@@ -1,26 +1,14 @@
-"""Maps of an analysis as the page draws them: means of groups, effects and significance."""
+"""Maps of an analysis on its page: figures, and the values at each point of the sheet."""
 
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
-from hipsta_bids.reports.display import (
-    EFFECT_COLORS,
-    P_COLORS,
-    Effects,
-    colors_of,
-    effect_reach,
-    kind_of,
-    known,
-    scale_of,
-    significance_reach,
-)
+from hipsta_bids.reports.display import known
 from hipsta_bids.reports.group_tables import (
-    BOTH,
-    MINUS,
     SIDES,
     GroupResults,
     display_name,
@@ -28,85 +16,135 @@ from hipsta_bids.reports.group_tables import (
     number_text,
     records,
     unit_of,
-    with_brackets,
-    with_unit,
 )
 from hipsta_bids.reports.maps import Picture, picture_of_file
 from hipsta_bids.types import Float
 
 #: Kinds of effect sizes, by the test.
 EFFECT_NAMES = {"t": "Cohen's d", "F": "partial eta squared"}
+#: Kinds of maps.
+KINDS = ("mean", "effect", "significance")
 _SMALLEST_P = 1e-10
+#: Measures whose figures are shown at once, and at all; the folder has them all.
+_OPEN, _MOST_FIGURES = 2, 9
+_HALF = 0.5  # of a cell, to its middle
 
 
-def signed_logarithm(adjusted: Float, significant: NDArray[np.bool_], statistic: Float) -> Float:
-    """Minus log10 of corrected p with the sign of the statistic; NaN where it does not survive."""
-    size = -np.log10(np.clip(adjusted, _SMALLEST_P, 1))
-    return np.where(significant, size * np.sign(statistic), np.nan)
+def signed_logarithm(adjusted: Float, statistic: Float) -> Float:
+    """Minus log10 of corrected p with the sign of the statistic; NaN without a test."""
+    return np.asarray(-np.log10(np.clip(adjusted, _SMALLEST_P, 1)) * np.sign(statistic))
+
+
+def map_id(kind: str, index: int | str, hemi: str) -> str:
+    """Name an unfolded map inside a drawing: a mean of a group, or a contrast's effect or p."""
+    return f"map-{kind}-{index}-{hemi}"
 
 
 def map_scenes(results: GroupResults) -> Mapping[str, Any] | None:
-    """Collect the maps of all measures: scenes on regular grids, and figures of other surfaces."""
+    """Collect the figures of all measures, and the values to read at each point of the sheet."""
     maps = results.table("maps")
     if not len(maps):
         return None
-    sides, pictures = {}, []
-    for measure in maps["measure"].unique().tolist():
+    blocks, data = [], list[dict[str, Any]]()
+    for measure in maps["measure"].unique().tolist()[:_MOST_FIGURES]:
         own = maps[maps["measure"] == measure]
+        means = results.table("means")
+        means = means[means["measure"] == measure] if len(means) else means
+        scene: dict[str, Any] | None = None
         if "node_x" in results.table(str(own["file"].iloc[0])):
-            sides[measure] = [
-                _side(results, str(hemi), _means(results, measure), rows)
+            unit = unit_of(map_unit(results, measure))
+            sides = [
+                _side(results, str(hemi), means, rows)
                 for hemi, rows in own.groupby("hemi", sort=False)
             ]
-        else:
-            title = display_name(measure).capitalize()
-            pictures += embedded(results, f"{measure}_means", f"{title}: means")
-            pictures += embedded(
-                results, f"{measure}_contrasts", f"{title}: effects and significance"
-            )
-    every = [test for own in sides.values() for side in own for test in side["tests"]]
-    blocks = [_block(results, measure, own, every) for measure, own in sides.items()]
-    return {
-        "blocks": [block for block, _ in blocks],
-        "data": [scene for _, scene in blocks],
-        "pictures": pictures,
-    }
+            scene = {"unit": unit, "sides": sides}
+        title = display_name(measure).capitalize()
+        plates = [
+            {"picture": picture, "spots": _spots(picture, scene, len(data)) if scene else []}
+            for number in range(1, _MOST_FIGURES)
+            for name in [f"{measure}_maps" if number == 1 else f"{measure}_maps_{number}"]
+            for picture in embedded(results, name, f"{title}, maps", _alternative(title, own))
+        ]
+        blocks.append({"title": title, "plates": plates})
+        if scene and plates:
+            data.append({**scene, "sides": list(map(_rounded, scene["sides"]))})
+    return {"blocks": blocks[:_OPEN], "more": blocks[_OPEN:], "data": data}
 
 
 def embedded(results: GroupResults, name: str, caption: str, alt: str = "") -> list[Picture]:
-    """Embed a figure of the analysis; none if figures were not made."""
+    """Embed a figure of the analysis; none if it was not made."""
     path = results.folder / "figures" / f"{name}.svg"
     return [picture_of_file(path, alt=alt or caption, caption=caption)] if path.exists() else []
 
 
-def _means(results: GroupResults, measure: str) -> pd.DataFrame:
-    means = results.table("means")
-    return means[means["measure"] == measure] if len(means) else means
+def _alternative(title: str, maps: pd.DataFrame) -> str:
+    """Write what the maps of a measure show."""
+    found = "; ".join(
+        f"{row['contrast']}, {SIDES[row['hemi']]}: {row['n_significant']} of {row['n_tests']}"
+        for row in records(maps)
+    )
+    return f"{title}: means, effects and significance. Points that survive: {found}"
 
 
-def _block(
-    results: GroupResults,
-    measure: str,
-    sides: Sequence[Mapping[str, Any]],
-    every: Sequence[Mapping[str, Any]],
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Everything about one measure, beside the tests of all: for the template and the script."""
-    unit = map_unit(results, measure)
-    scene = {
-        "unit": unit_of(unit),
-        "scales": _scales(results, measure, sides, every, unit),
-        "sides": [_rounded(side) for side in sides],
-    }
-    block = {
-        "title": display_name(measure).capitalize(),
-        "means": list(_mean_panels(measure, unit, sides)),
-        "contrasts": [
-            {"name": name, "panels": list(_contrast_panels(measure, name, sides))}
-            for name in dict.fromkeys(t["contrast"] for side in sides for t in side["tests"])
-        ],
-        "scales": scene["scales"],
-    }
-    return block, scene
+def _spots(picture: Picture, scene: Mapping[str, Any], block: int) -> list[dict[str, Any]]:
+    """Find where the unfolded maps lie in a figure, in percent of it, and what they show."""
+    number = r"([-\d.]+)"
+    content = picture.content.decode()
+    size = re.search(rf'viewBox="0 0 {number} {number}"', content)
+    spots: list[dict[str, Any]] = []
+    if size is None:
+        return spots
+    width, height = (float(length) / 100 for length in size.groups())
+    corner = rf"M {number} {number}\s+L {number} {number}\s+L {number} {number}"
+    sides = {side["hemi"]: (n, side) for n, side in enumerate(scene["sides"])}
+    for kind in KINDS:
+        name = map_id(kind, r"(\d+)", r"(\w+)")
+        pattern = rf'<g id="{name}">\s*<g id="\w+">\s*<path d="{corner}'
+        for index, hemi, *places in re.findall(pattern, content):
+            left, bottom, right, _, _, top = map(float, places)
+            at, side = sides[hemi]
+            spots.append(
+                {
+                    "block": block,
+                    "side": at,
+                    "kind": kind,
+                    "index": int(index),
+                    "box": [
+                        left / width,
+                        top / height,
+                        (right - left) / width,
+                        (bottom - top) / height,
+                    ],
+                    "alt": _alt(side, kind, int(index)),
+                    "numbers": _numbers(side, int(index)) if kind == "effect" else [],
+                }
+            )
+    return spots
+
+
+def _alt(side: Mapping[str, Any], kind: str, index: int) -> str:
+    """Write what an unfolded map shows."""
+    if kind == "mean":
+        group = side["means"][index]
+        return f"Mean of {group['group']}, {side['title']}: {_span(group['values'])}"
+    test = side["tests"][index]
+    said = f"{test['n_significant']} of {test['n_tests']} points survive"
+    if kind == "effect":
+        said = f"{EFFECT_NAMES[test['kind']]} {_span(test['effect'])}"
+    return f"{kind.capitalize()} of {test['contrast']}, {side['title']}: {said}"
+
+
+def _numbers(side: Mapping[str, Any], index: int) -> list[tuple[float, float]]:
+    """Places of clusters on a map, in percent from its left and upper edge."""
+    nx, ny = side["shape"]
+    x, y = side["x"][::ny], side["y"][:ny]
+    return [
+        (
+            100 * (int(np.abs(x - at[0]).argmin()) + _HALF) / nx,
+            100 - 100 * (int(np.abs(y - at[1]).argmin()) + _HALF) / ny,
+        )
+        for at in side["tests"][index]["peaks"]
+    ]
 
 
 def _side(
@@ -149,74 +187,9 @@ def _test(results: GroupResults, row: Mapping[str, Any]) -> dict[str, Any]:
         "n_tests": int(row["n_tests"]),
         "n_significant": int(row["n_significant"]),
         "effect": rows["cohen_d" if kind == "t" else "eta_squared"].to_numpy(dtype=np.float64),
-        "significance": signed_logarithm(numbers["p_corrected"], significant, numbers["statistic"]),
         "significant": significant.astype(int).tolist(),
         "values": numbers,
         "peaks": peaks.loc[same, ["x", "y"]].round(6).to_numpy().tolist(),
-    }
-
-
-def _scales(
-    results: GroupResults,
-    measure: str,
-    sides: Sequence[Mapping[str, Any]],
-    every: Sequence[Mapping[str, Any]],
-    unit: str,
-) -> dict[str, Any]:
-    """Choose ends, colors and words of the color bars; sides share them."""
-    pair = (results.record.get("comparison") or {}).get("pair")
-    change = bool(pair) or {side["hemi"] for side in sides} == {BOTH}
-    kind = kind_of(measure, change=change)
-    means = scale_of(kind, [g["values"] for side in sides for g in side["means"]])
-    tests = [test for side in sides for test in side["tests"]]
-    top = significance_reach([test["significance"] for test in tests])
-    mean_label = "mean change" if pair else "mean"
-    effects = {}
-    # Each contrast has its own ends, the same for all measures: effects per year and of groups
-    # differ by far.
-    for test in tests:
-        same = [one for one in every if one["contrast"] == test["contrast"]]
-        reach = effect_reach([_effects(one) for one in same])
-        label = f"effect size, {EFFECT_NAMES[test['kind']]}"
-        effects[test["contrast"]] = _scale(EFFECT_COLORS, (-reach, reach), label)
-    return {
-        "mean": _scale(
-            kind.colors,
-            means,
-            with_brackets(mean_label, unit),
-        ),
-        "effect": effects,
-        "significance": _scale(
-            P_COLORS,
-            (-top, top),
-            f"{MINUS}log₁₀ of corrected p, with the sign of the effect",
-            _level_marks(results, top),
-        ),
-    }
-
-
-def _effects(test: Mapping[str, Any]) -> Effects:
-    values = test["values"]
-    return Effects(test["kind"], test["effect"], values["statistic"], values["df"])
-
-
-def _level_marks(results: GroupResults, top: float) -> list[tuple[float, str]]:
-    """Positions on the bar of significance, in percent, of the level on both sides of zero."""
-    alpha = ((results.record.get("settings") or {}).get("multiplicity") or {}).get("alpha", 0.05)
-    share = -50 * np.log10(alpha) / top
-    return [(round(50 + sign * share, 2), f"p {number_text(alpha)}") for sign in (-1, 1)]
-
-
-def _scale(
-    colors: str, ends: tuple[float, float], label: str, marks: Sequence[tuple[float, str]] = ()
-) -> dict[str, Any]:
-    return {
-        "marks": marks,
-        "low": ends[0],
-        "high": ends[1],
-        "words": [number_text(value) for value in (ends[0], sum(ends) / 2, ends[1])],
-        "label": label,
-        "colors": colors_of(colors).tolist(),
     }
 
 
@@ -237,43 +210,3 @@ def _rounded(side: Mapping[str, Any]) -> dict[str, Any]:
         return [plain(part) for part in value] if isinstance(value, list) else value
 
     return {key: plain(value) for key, value in side.items()}
-
-
-def _mean_panels(
-    measure: str, unit: str, sides: Sequence[Mapping[str, Any]]
-) -> Iterator[dict[str, Any]]:
-    for i, side in enumerate(sides):
-        for j, group in enumerate(side["means"]):
-            span = with_unit(_span(group["values"]), unit)
-            yield {
-                "side": i,
-                "kind": "mean",
-                "index": j,
-                "title": f"{group['group']}, {side['title']}",
-                "note": f"n = {group['n']}",
-                "alt": f"Mean {display_name(measure)} of {group['group']}, {side['title']}: {span}",
-            }
-
-
-def _contrast_panels(
-    measure: str, contrast: str, sides: Sequence[Mapping[str, Any]]
-) -> Iterator[dict[str, Any]]:
-    for i, side in enumerate(sides):
-        for j, test in enumerate(side["tests"]):
-            if test["contrast"] != contrast:
-                continue
-            count = f"{test['n_significant']} of {test['n_tests']} points survive"
-            words = {
-                "effect": ("effect size", f"{EFFECT_NAMES[test['kind']]} {_span(test['effect'])}"),
-                "significance": ("significance", count),
-            }
-            for kind, (what, said) in words.items():
-                yield {
-                    "side": i,
-                    "kind": kind,
-                    "index": j,
-                    "title": f"{side['title'].capitalize()}, {what}",
-                    "note": count if kind == "significance" else "",
-                    "alt": f"{what.capitalize()} of {contrast} on {display_name(measure)},"
-                    f" {side['title']}: {said}",
-                }

@@ -22,7 +22,7 @@ BOTH = "LR"
 MINUS = "\N{MINUS SIGN}"
 
 _THIRD = 1 / 3
-_ALPHA = 0.05  # of tests that are not corrected, for a word only
+_ALPHA = 0.05  # of tests of summary measures and of models, for a word only
 _MOST_ROWS = 200  # of lists, so that pages stay small
 _IDS = ("participant_id", "session_id")
 _CHANCE = 0.5  # area under the curve of guesses
@@ -278,19 +278,19 @@ def effect_name(effect: str) -> str:
 
 
 def _summaries(results: GroupResults) -> Iterator[str]:
-    """List summary measures that differ, uncorrected."""
+    """List summary measures that differ, corrected for their number."""
     table = results.table("measures")
     if not len(table):
         return
     several = len(table["model"].unique()) > 1
     by = ["contrast", "measure", "model"]
     for (contrast, measure, model), rows in table.groupby(by, sort=False):
-        own = rows[rows["p"] < _ALPHA]
+        own = rows[rows["p_fdr"] < _ALPHA]
         if len(own):
             said = f", model {model}" if several else ""
             yield f"{display_name(str(measure))}, {contrast}{said}: " + "; ".join(
                 f"{summary_side(row['hemi'], str(measure))} {effect_name(row['effect'])}"
-                f" {number_text(row['effect_size'])}, p {p_text(row['p'])}"
+                f" {number_text(row['effect_size'])}, p {p_text(row['p_fdr'])}"
                 for row in records(own)
             )
 
@@ -418,6 +418,7 @@ def summaries(results: GroupResults) -> Mapping[str, Any] | None:
                 "contrast": row["contrast"],
                 "model": row["model"],
                 "n": int(row["n"]),
+                "visits": int(row["visits"]),
                 "means": [
                     f"{number_text(one['mean'])} ({number_text(one['sd'])})" if one else ""
                     for one in known
@@ -425,7 +426,8 @@ def summaries(results: GroupResults) -> Mapping[str, Any] | None:
                 "estimate": number_text(row["estimate"]),
                 "statistic": statistic_text(row),
                 "p": p_text(row["p"]),
-                "low": bool(row["p"] < _ALPHA),
+                "adjusted": p_text(row["p_fdr"]),
+                "low": bool(row["p_fdr"] < _ALPHA),
                 "effect": effect_text(row),
             }
         )
@@ -433,7 +435,12 @@ def summaries(results: GroupResults) -> Mapping[str, Any] | None:
     for row in rows:
         row["letter"] = letters[row["model"]]
     models = [(letter, model) for model, letter in letters.items()]
-    return {"groups": groups, "rows": rows, "models": models if len(models) > 1 else []}
+    return {
+        "groups": groups,
+        "rows": rows,
+        "models": models if len(models) > 1 else [],
+        "repeated": any(row["visits"] > row["n"] for row in rows),
+    }
 
 
 def classification(results: GroupResults) -> list[dict[str, Any]]:

@@ -58,7 +58,9 @@ _MISSING = (217, 217, 217)
 _FULL_SIZE = 1500  # tiles; of more, each has a quarter of the pixels, so that pages stay small
 
 
-def new_figure(size: tuple[float, float], layout: Literal["constrained", "compressed"]) -> "Figure":
+def new_figure(
+    size: tuple[float, float], layout: Literal["constrained", "compressed"] | None
+) -> "Figure":
     """Return an empty figure; it needs no screen and no home folder."""
     with contextlib.nullcontext() if "matplotlib" in sys.modules else _own_settings():
         from matplotlib.figure import Figure  # noqa: PLC0415  (slow to load)
@@ -94,6 +96,8 @@ class Picture:
     caption: str
     width: int
     """CSS pixels at which its letters have their size."""
+    content: bytes = b""
+    """The drawing, where it was made before."""
 
 
 def draw_map(kind: MapKind, hemispheres: Sequence[Hemisphere]) -> Picture:
@@ -169,6 +173,7 @@ def picture_of_file(path: Path, *, alt: str, caption: str) -> Picture:
         alt=alt,
         caption=caption,
         width=round(float(width[1]) / 0.75) if width else 800,
+        content=content,
     )
 
 

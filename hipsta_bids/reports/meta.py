@@ -11,7 +11,7 @@ from scipy import stats
 from hipsta_bids.derivatives.names import META, META_REPORT
 from hipsta_bids.io import files
 from hipsta_bids.reports.group import methods, origin
-from hipsta_bids.reports.group_maps import embedded, map_scenes
+from hipsta_bids.reports.group_maps import map_scenes
 from hipsta_bids.reports.group_tables import (
     SIDES,
     GroupResults,
@@ -147,6 +147,11 @@ def _explained(results: GroupResults) -> Mapping[str, Any]:
     }
 
 
+def _maps(results: GroupResults) -> Mapping[str, Any] | None:
+    scenes = map_scenes(results)
+    return None if scenes is None else {**scenes, "flat": True}
+
+
 def _peak_forests(results: GroupResults) -> Mapping[str, Any] | None:
     plots = sorted(_forests(results, maps=True), key=lambda plot: plot["measure"] != "thickness")
     return {"plots": plots, "more": 0, "what": "peak"} if plots else None
@@ -183,8 +188,7 @@ def _heterogeneity(results: GroupResults) -> Mapping[str, Any] | None:
                 "share": _percent(float((own["q_p"] < 0.05).mean())),  # noqa: PLR2004 -- in words
             }
         )
-    alt = "Maps of I squared, percent"
-    return {"rows": rows, "pictures": embedded(results, "heterogeneity", "Maps of I²", alt)}
+    return {"rows": rows} if rows else None
 
 
 def _left_out(results: GroupResults) -> Mapping[str, Any] | None:
@@ -237,7 +241,7 @@ SECTIONS: tuple[Section[GroupResults], ...] = (
         template="meta/forests.html",
         build=_summary_forests,
     ),
-    Section(key="maps", title="Maps", template="group/maps.html", build=map_scenes),
+    Section(key="maps", title="Maps", template="group/maps.html", build=_maps),
     Section(
         key="between",
         title="Heterogeneity",

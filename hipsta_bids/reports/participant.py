@@ -33,7 +33,7 @@ from hipsta_bids.reports.results import (
     read_views,
 )
 from hipsta_bids.reports.review import card_of, correction_of
-from hipsta_bids.reports.slices import point_panels, section_panels, slice_panels
+from hipsta_bids.reports.slices import point_panels, section_panels, slice_panels, stack_of
 from hipsta_bids.reports.verdict import RATINGS
 from hipsta_bids.types import Float, Status
 
@@ -50,9 +50,13 @@ def scene_of(hemisphere: Hemisphere, views: Views | None, names: Sequence[str]) 
         "side": hemisphere.side,
         "hemi": hemisphere.place.name.hemi,
         "findings": [
-            {"kind": f.kind, "message": f.message, "point": f.point}
-            for f in hemisphere.findings
-            if f.point is not None
+            {
+                "kind": min(f.kind for f in found),  # failure, flag, repair
+                "message": "; ".join(f.message for f in found),
+                "point": point,
+                "number": number,
+            }
+            for number, (point, found) in enumerate(_points_of(hemisphere).items(), start=1)
         ],
     }
     if hemisphere.measured:
@@ -61,6 +65,15 @@ def scene_of(hemisphere: Hemisphere, views: Views | None, names: Sequence[str]) 
         vertices, triangles = _body(views.mask, views)
         scene["body"] = {"vertices": _flat(vertices, 2), "triangles": triangles.ravel().tolist()}
     return scene
+
+
+def _points_of(hemisphere: Hemisphere) -> dict[tuple[float, float, float], list[Finding]]:
+    """Collect what is said about each point that messages name."""
+    points: dict[tuple[float, float, float], list[Finding]] = {}
+    for finding in hemisphere.findings:
+        if finding.point is not None:
+            points.setdefault(finding.point, []).append(finding)
+    return points
 
 
 def scales_of(hemispheres: Sequence[Hemisphere]) -> dict[str, Any]:
@@ -82,7 +95,7 @@ def scales_of(hemispheres: Sequence[Hemisphere]) -> dict[str, Any]:
 def _sheet_scene(hemisphere: Hemisphere, names: Sequence[str]) -> dict[str, Any]:
     sheet = hemisphere.sheet
     index = {name: n for n, name in enumerate(names)}
-    ends = (hemisphere.metrics.get(f"{end}_plane") for end in ("posterior", "anterior"))
+    ends = [hemisphere.metrics.get(f"{end}_plane") for end in ("posterior", "anterior")]
     return {
         "shape": sheet.shape,
         "extent": [hemisphere.summary.get(f"extent_{axis}", 1.0) for axis in "xy"],
@@ -96,8 +109,8 @@ def _sheet_scene(hemisphere: Hemisphere, names: Sequence[str]) -> dict[str, Any]
         "valid": sheet.valid.astype(int).ravel().tolist(),
         "repaired": sheet.repaired.astype(int).ravel().tolist(),
         "planes": [
-            {"point": plane["point_ras_mm"], "normal": plane["normal_ras"]}
-            for plane in ends
+            {"point": plane["point_ras_mm"], "normal": plane["normal_ras"], "end": end}
+            for end, plane in enumerate(ends)
             if isinstance(plane, Mapping)
         ],
     }
@@ -149,6 +162,8 @@ class Series:
     hemispheres: tuple[Hemisphere, ...]
     """Left before right; one may be missing."""
     cohort: Cohort
+    bids_dir: Path | None = None
+    """The dataset with anatomical images; ``None`` shows none."""
 
     @property
     def measured(self) -> list[Hemisphere]:
@@ -165,7 +180,7 @@ class Series:
     @cached_property
     def views(self) -> Mapping[str, Views | None]:
         """Labels and mask by hemisphere."""
-        return {h.place.name.hemi: read_views(h) for h in self.hemispheres}
+        return {h.place.name.hemi: read_views(h, self.bids_dir) for h in self.hemispheres}
 
     def view(self, hemisphere: Hemisphere) -> Views | None:
         """Labels and mask of one hemisphere."""
@@ -274,15 +289,17 @@ def _quality_numbers(series: Series) -> Mapping[str, Any] | None:
     return {"sides": [h.side for h in measured], "rows": rows, "facts": facts}
 
 
-def participant_page(root: Path, subject: str, session: str | None, cohort: Cohort) -> str | None:
-    """Make the page about one visit."""
+def participant_page(
+    root: Path, subject: str, session: str | None, cohort: Cohort, bids_dir: Path | None = None
+) -> str | None:
+    """Make the page about one visit; without ``bids_dir`` it shows no anatomical images."""
     kinds: dict[tuple[str, str], list[Hemisphere]] = {}
     for hemisphere in find_results(root, subject, session):
         name = hemisphere.place.name
         kinds.setdefault((name.seg, name.region), []).append(hemisphere)
     if not kinds:
         return None
-    series = [Series(tuple(found), cohort) for found in kinds.values()]
+    series = [Series(tuple(found), cohort, bids_dir) for found in kinds.values()]
     parts = [
         {
             "title": one.title,
@@ -300,6 +317,7 @@ def participant_page(root: Path, subject: str, session: str | None, cohort: Coho
         "participant.html",
         title=visit,
         parts=parts,
+        anatomy=any(view and view.anatomy for one in series for view in one.views.values()),
         versions=versions,
         hashes=hashes,
         measured=max((_time_of(h, cohort) for h in every), default=""),
@@ -323,10 +341,7 @@ def _points(series: Series) -> Mapping[str, Any] | None:
     groups = []
     for hemisphere in series.hemispheres:
         view = series.view(hemisphere)
-        points: dict[tuple[float, float, float], list[Finding]] = {}
-        for finding in hemisphere.findings:
-            if finding.point is not None:
-                points.setdefault(finding.point, []).append(finding)
+        points = _points_of(hemisphere)
         if view is None or not points:
             continue
         shown = [
@@ -337,7 +352,8 @@ def _points(series: Series) -> Mapping[str, Any] | None:
             }
             for point, findings in list(points.items())[:_POINTS_SHOWN]
         ]
-        groups.append({"side": hemisphere.side, "points": shown, "more": len(points) - len(shown)})
+        more = list(points.values())[_POINTS_SHOWN:]
+        groups.append({"side": hemisphere.side, "points": shown, "more": more})
     return {"groups": groups, "legend": _legend(series)} if groups else None
 
 
@@ -356,7 +372,9 @@ def _input(series: Series) -> Mapping[str, Any]:
                 "missing": view.missing if view else "neither labels nor mask are available",
                 "empty": view is not None and not panels,
                 "panels": panels,
-                "measured": hemisphere.measured,
+                "anatomy": view.anatomy.name if view and view.anatomy else None,
+                "unused": view.unused if view else None,
+                "stack": stack_of(view) if panels and view else None,
             }
         )
     return {"groups": groups, "legend": _legend(series)}

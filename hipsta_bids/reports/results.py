@@ -1,15 +1,17 @@
 """What the output dataset holds of one hemisphere, as the pages need it: numbers and images."""
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from nibabel.affines import apply_affine
 from nibabel.orientations import apply_orientation, inv_ornt_aff, io_orientation
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from hipsta_bids.derivatives.dataset import linked_path, read_links
 from hipsta_bids.derivatives.hemisphere import (
@@ -20,8 +22,10 @@ from hipsta_bids.derivatives.hemisphere import (
     read_summary,
 )
 from hipsta_bids.errors import HipstaError, InputError
+from hipsta_bids.geometry.sampling import ScalarVolume
+from hipsta_bids.inputs.anatomy import Candidate, find_anatomy
 from hipsta_bids.io import files, gifti
-from hipsta_bids.io.volumes import LabelImage, read_labels
+from hipsta_bids.io.volumes import LabelImage, read_grid, read_labels, read_scalars
 from hipsta_bids.protocols.load import load_protocol, protocol_names
 from hipsta_bids.protocols.protocol import Protocol
 from hipsta_bids.reports.display import palette
@@ -37,8 +41,18 @@ _PLACE = re.compile(rf"RAS {_NUMBER} {_NUMBER} {_NUMBER} mm")
 #: Folders before a file's name, which may tell more about a person than BIDS labels do.
 _FOLDERS = re.compile(r"(?:[^\s:;,()/]*/){2,}(?=[^\s:;,()/])")
 
-#: mm of the image that are kept round the body.
-_MARGIN = 5.0
+#: mm of the image that are kept round the body, and more of the anatomical image.
+_MARGIN, _BEYOND = 5.0, 8.0
+
+#: Share of the body's voxels that an anatomical image has to cover.
+_COVERED = 0.99
+#: mm by which corners of two images may differ if they have the same grid: headers are rounded.
+_SAME = 0.05
+#: Percentiles of the anatomical image that are black and white.
+_GRAYS = (1.0, 99.5)
+#: Most voxels of an anatomical image that are read: those round a long hippocampus at 0.24 mm take
+#: some 500 MB meanwhile.
+_MOST_VOXELS = 25_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,6 +239,41 @@ class LabelName:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class Anatomy:
+    """The part of an anatomical image round the body."""
+
+    name: str
+    """Of the file."""
+    shares: NDArray[np.float32]
+    """(I, J, K) from 0, black, to 1, white."""
+    affine: Float
+    """(4, 4), index to RAS mm."""
+
+    @property
+    def voxel(self) -> Float:
+        """(3,) spacing, mm, along the axes of the scanner."""
+        spacing: Float = 1 / np.linalg.norm(np.linalg.inv(self.affine[:3, :3]), axis=0)
+        return spacing
+
+    def grays(self, points: Float) -> NDArray[np.uint8]:
+        """Interpolate at (..., 3) points, RAS mm; 0 is black, 255 white, also outside."""
+        index = np.moveaxis(apply_affine(np.linalg.inv(self.affine), points), -1, 0)
+        shares = map_coordinates(self.shares, index, order=1, cval=1.0)
+        return np.round(255 * shares).astype(np.uint8)
+
+
+def anatomy_of(name: str, volume: ScalarVolume) -> Anatomy | None:
+    """Scale an image between its percentiles; ``None`` where it has one value."""
+    values = volume.values[..., 0]
+    known = values[np.isfinite(values)]
+    low, high = np.percentile(known, _GRAYS).tolist() if known.size else (0.0, 0.0)
+    if not low < high:
+        return None
+    shares = np.interp(np.nan_to_num(values, nan=low), (low, high), (0, 1)).astype(np.float32)
+    return Anatomy(name=name, shares=shares, affine=volume.affine)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Views:
     """Labels and mask of one hemisphere, cropped to what is of interest."""
 
@@ -238,6 +287,10 @@ class Views:
     """By code."""
     missing: str | None
     """Why there are no labels, in one phrase."""
+    anatomy: Anatomy | None = None
+    """The image that lies behind the labels."""
+    unused: str | None = None
+    """Which anatomical image is not shown and why, in one phrase."""
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -259,8 +312,8 @@ class Views:
         return index
 
 
-def read_views(hemisphere: Hemisphere) -> Views | None:
-    """Read what slices are drawn from."""
+def read_views(hemisphere: Hemisphere, bids_dir: Path | None = None) -> Views | None:
+    """Read what slices are drawn from; without ``bids_dir`` no anatomical images."""
     mask = _read_mask(hemisphere)
     labels, missing = _read_labels(hemisphere, mask)
     if mask is not None and labels is not None and mask.shape != labels.shape:
@@ -274,20 +327,75 @@ def read_views(hemisphere: Hemisphere) -> Views | None:
     names = _names(hemisphere, data)
     interest = inside if inside is not None else np.isin(data, list(names))  # type: ignore[arg-type]  # one is there
     box = _box(interest, np.linalg.norm(affine[:3, :3], axis=0))
+    anatomy, unused = None, None
+    if bids_dir is not None and interest.any():
+        points = apply_affine(affine, np.argwhere(interest)[::7])
+        anatomy, unused = _read_anatomy(hemisphere, bids_dir, first, points)
     return Views(
         labels=None if data is None else data[box].astype(np.int32),
         mask=None if inside is None else inside[box],
         affine=_cropped(affine, box),
         names=names,
         missing=missing,
+        anatomy=anatomy,
+        unused=unused,
     )
+
+
+def _read_anatomy(
+    hemisphere: Hemisphere, bids_dir: Path, labels: LabelImage, points: Float
+) -> tuple[Anatomy | None, str | None]:
+    """Read the image that lies behind the labels, or why one is not shown.
+
+    ``points``, RAS mm, are those of the body.
+    """
+    path = _linked(hemisphere, hemisphere.record.get("inputs") or [])
+    if path is None:
+        return None, None
+    unused = None
+    for candidate in find_anatomy(path, hemisphere.place.name, bids_dir):
+        try:
+            problem = _unfit(candidate, labels, points)
+            if problem is None:
+                beyond = _MARGIN + _BEYOND
+                corners = np.stack([points.min(axis=0) - beyond, points.max(axis=0) + beyond])
+                box = np.stack(np.meshgrid(*corners.T), axis=-1)
+                anatomy = anatomy_of(candidate.path.name, read_scalars(candidate.path, box))
+                if anatomy is not None:
+                    return anatomy, None
+                problem = "has one value everywhere round the body"
+        except InputError as error:
+            problem = f"is unusable: {error.reason}"
+        unused = unused or f"{candidate.path.name} {problem}"
+    return None, unused
+
+
+def _unfit(candidate: Candidate, labels: LabelImage, points: Float) -> str | None:
+    """Say why an image cannot lie behind the labels, by its header."""
+    shape, affine = read_grid(candidate.path)
+    ends = np.array([[0, 0, 0], labels.shape]) - 0.5
+    corners = np.stack(np.meshgrid(*ends.T), axis=-1)
+    apart = apply_affine(affine, corners) - apply_affine(labels.affine, corners)
+    if not candidate.proven and (shape != labels.shape or np.abs(apart).max() > _SAME):
+        return "has another grid than the labels, so its space may be another"
+    index = np.round(apply_affine(np.linalg.inv(affine), points))
+    if np.mean(((index >= 0) & (index < shape)).all(axis=-1)) < _COVERED:
+        return "does not cover the body"
+    size = np.prod(np.ptp(points, axis=0) + 2 * (_MARGIN + _BEYOND))
+    if size / abs(np.linalg.det(affine[:3, :3])) > _MOST_VOXELS:
+        return "has too many voxels round the body"
+    return None
 
 
 def input_path(hemisphere: Hemisphere) -> Path | None:
     """Find the file with the labels that were measured."""
     record = hemisphere.record
     edited = [e for e in record.get("edited") or [] if e.get("what") == "labels"]
-    entries = edited or record.get("inputs") or []
+    return _linked(hemisphere, edited or record.get("inputs") or [])
+
+
+def _linked(hemisphere: Hemisphere, entries: Sequence[Mapping[str, Any]]) -> Path | None:
+    """Find the first file of a list in the quality record."""
     address = str(entries[0].get("file", "")) if entries else ""
     root = hemisphere.place.root
     return linked_path(address, root, read_links(root))

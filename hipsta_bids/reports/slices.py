@@ -2,10 +2,14 @@
 
 import base64
 import io
+import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
+from nibabel.affines import apply_affine
 from numpy.typing import NDArray
 
 from hipsta_bids.io.gifti import sheet_triangles
@@ -19,10 +23,14 @@ _LETTERS = (("L", "R"), ("P", "A"), ("I", "S"))
 #: Where along the body slices and cross-sections are shown.
 POSITIONS = (0.1, 0.3, 0.5, 0.7, 0.9)
 
-_PALE = 0.45  # share of the label's color; the rest is white, so that lines show on it
+_PALE = 0.45  # opacity of labels, so that lines and the anatomical image show through
 _MARGIN = 3.0  # mm round the body that are shown
 _NEAR = 22.0  # mm across, of a window about a point that a message names
 _REACH = 7.0  # mm, how far the line of an end plane extends up and down
+_PIXEL = 0.4  # mm, finest pixels of the anatomical image
+_QUALITY = 80  # of its compression as JPEG
+_MOST_VOXELS = 250_000  # of the anatomical image in the viewer of slices
+_LEVELS = 64  # grays in that viewer
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,6 +45,10 @@ class Panel:
     """Data address of the labels' picture."""
     size: tuple[float, float] = (0.0, 0.0)
     """Width and height of the labels' picture, whose corner is (0, 0)."""
+    anatomy: str | None = None
+    """Data address of the anatomical image, which fills the window."""
+    at: Mapping[str, Any] = field(default_factory=dict)
+    """Where the viewer of slices opens: ``across`` (an axis), ``level`` and, marked, ``point``."""
     paths: Mapping[str, str] = field(default_factory=dict)
     """SVG path data by CSS class."""
     lines: tuple[tuple[str, str], ...] = ()
@@ -81,21 +93,54 @@ def outline(inside: NDArray[np.bool_]) -> Float:
 
 
 def path_data(lines: Float | Iterable[Float]) -> str:
-    """Write lines of points (N, 2) each as the data of an SVG path, to a hundredth of a mm."""
-    return " ".join(
-        "M" + "L".join(f"{x:.2f} {y:.2f}" for x, y in line)
+    """Write lines of points (N, 2) each as the data of an SVG path, to a hundredth of a mm.
+
+    Lines that end where others begin are joined, so that pages stay small.
+    """
+    left = [
+        [(round(100 * x), round(100 * y)) for x, y in line.tolist()]
         for line in lines
         if np.isfinite(line).all()
-    )
+    ]
+    ends: dict[tuple[int, int], list[int]] = {}
+    for n, line in enumerate(left):
+        for end in (line[0], line[-1]):
+            ends.setdefault(end, []).append(n)
+    used: set[int] = set()
+    paths = []
+    for n, line in enumerate(left):
+        if n in used:
+            continue
+        used.add(n)
+        path = list(line)
+        for _ in range(2):  # at its end, and then at its other end
+            while more := next((m for m in ends[path[-1]] if m not in used), None):
+                used.add(more)
+                path += (left[more] if left[more][0] == path[-1] else left[more][::-1])[1:]
+            path.reverse()
+        paths.append(path)
+    return "".join(map(_relative, paths))
+
+
+def _relative(path: Sequence[tuple[int, int]]) -> str:
+    """Write one line as SVG path data with relative steps; hundredths of a mm."""
+    steps = [(c - a, d - b) for (a, b), (c, d) in pairwise(path)]
+    moves = [(dx, dy) for dx, dy in steps if dx or dy]
+    start = f"M{path[0][0] / 100:g} {path[0][1] / 100:g}"
+    return start + "l" + " ".join(f"{dx / 100:g} {dy / 100:g}" for dx, dy in moves or [(0, 0)])
 
 
 def png_address(pixels: NDArray[np.uint8]) -> str:
     """Encode (rows, columns, 3 or 4) pixels as a data address."""
+    return _address(pixels, "png")
+
+
+def _address(pixels: NDArray[np.uint8], kind: str, **options: int) -> str:
     from PIL import Image  # noqa: PLC0415  (slow to load)
 
     buffer = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, format="png")
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
+    Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, format=kind, **options)
+    return f"data:image/{kind};base64," + base64.b64encode(buffer.getvalue()).decode()
 
 
 def slice_panels(hemisphere: Hemisphere, views: Views) -> list[Panel]:
@@ -108,16 +153,68 @@ def slice_panels(hemisphere: Hemisphere, views: Views) -> list[Panel]:
         _slice(hemisphere, views, "coronal", center, words=f"{share:.0%} from posterior")
         for share, center in zip(POSITIONS, centers, strict=True)
     ]
-    return [
-        *_same_windows(across),
-        _slice(hemisphere, views, "sagittal", middle, words="along the body"),
-    ]
+    along = _slice(hemisphere, views, "sagittal", middle, words="along the body")
+    return [_with_anatomy(panel, views) for panel in (*_same_windows(across), along)]
 
 
 def point_panels(hemisphere: Hemisphere, views: Views, point: Sequence[float]) -> list[Panel]:
     """Draw the three slices through a point that a message names."""
     index = views.to_index(np.asarray(point, dtype=np.float64))
-    return [_slice(hemisphere, views, name, index, mark=True) for name in _AXES]
+    panels = [_slice(hemisphere, views, name, index, mark=True) for name in _AXES]
+    return [_with_anatomy(panel, views) for panel in panels]
+
+
+def stack_of(views: Views) -> dict[str, Any]:
+    """Collect what the viewer of slices shows: labels, body and anatomical image, compressed.
+
+    A byte per voxel holds the number of its label in the list, from 1, plus 128 in the body.
+    """
+    stack = np.zeros(views.shape, dtype=np.uint8)
+    for n, code in enumerate(views.names, start=1):
+        stack[views.labels == code] = n
+    if views.mask is not None:
+        stack[views.mask] += 128
+    scene = {
+        "shape": views.shape,
+        "affine": np.round(views.affine[:3], 4).tolist(),
+        "colors": [label.color for label in views.names.values()],
+        "body": views.mask is not None,
+        "stack": _packed(stack),
+        "pale": _PALE,
+    }
+    if views.anatomy is None:
+        return scene
+    extent = np.array(views.shape) * views.voxel
+    count = extent / np.maximum(views.voxel, views.anatomy.voxel.min())
+    count *= min(1.0, (_MOST_VOXELS / np.prod(count)) ** (1 / 3))
+    grid = np.maximum(2, np.round(count)).astype(int)
+    centers = (np.indices(grid) + 0.5).T / grid * np.array(views.shape) - 0.5
+    grays = views.anatomy.grays(apply_affine(views.affine, centers)).T // (256 // _LEVELS)
+    anatomy = {"name": views.anatomy.name, "shape": grid.tolist(), "stack": _packed(grays)}
+    return scene | {"anatomy": anatomy, "levels": _LEVELS}
+
+
+def _packed(values: NDArray[np.uint8]) -> str:
+    """Compress bytes (zlib) as text."""
+    return base64.b64encode(zlib.compress(values.tobytes(), 9)).decode()
+
+
+def _with_anatomy(panel: Panel, views: Views) -> Panel:
+    """Put the anatomical image behind a slice."""
+    if views.anatomy is None:
+        return panel
+    right, up, across = next(axes for axes in _AXES.values() if axes[2] == panel.at["across"])
+    left, top, width, height = panel.window
+    count = np.ceil(np.array([width, height]) / max(_PIXEL, views.anatomy.voxel.min() / 2))
+    columns, rows = np.maximum(count, 2).astype(int).tolist()
+    index = np.zeros((rows, columns, 3))
+    x = left + (np.arange(columns) + 0.5) * width / columns
+    y = top + (np.arange(rows) + 0.5) * height / rows
+    index[..., right] = x / views.voxel[right] - 0.5
+    index[..., up] = views.shape[up] - 0.5 - y[:, None] / views.voxel[up]
+    index[..., across] = panel.at["level"]
+    grays = views.anatomy.grays(apply_affine(views.affine, index))
+    return replace(panel, anatomy=_address(grays, "jpeg", quality=_QUALITY))
 
 
 def section_panels(
@@ -235,6 +332,8 @@ def _slice(
         size=(round(float(width), 2), round(float(height), 2)),
         paths=paths,
         marks=((round(float(point[0]), 2), round(float(point[1]), 2)),) if mark else (),
+        at={"across": across, "level": level}
+        | ({"point": " ".join(f"{n:.2f}" for n in center)} if mark else {}),
         letters=(*_LETTERS[right], *_LETTERS[up]),
         note="empty" if empty and not mark else "",
     )
@@ -271,9 +370,10 @@ def _label_image(views: Views, across: int, level: int, right: int, up: int) -> 
     plane = _picture(views.labels, across, level, right, up)
     pixels = np.zeros((*plane.shape, 4), dtype=np.uint8)
     for code, name in views.names.items():
-        color = np.array([int(name.color[i : i + 2], 16) for i in (1, 3, 5)])
-        pale = np.round(_PALE * color + (1 - _PALE) * 255).astype(np.uint8)
-        pixels[plane == code] = (*pale.tolist(), 255)
+        pixels[plane == code] = (
+            *(int(name.color[i : i + 2], 16) for i in (1, 3, 5)),
+            round(255 * _PALE),
+        )
     return png_address(pixels.transpose(1, 0, 2)[::-1])
 
 

@@ -35,6 +35,7 @@ SUITES: Mapping[str, str] = MappingProxyType(
         "defects": "defects:run",
         "population": "population:run",
         "group": "group:run",
+        "harmonization": "harmonization:run",
         "surrogate": "surrogate:run",
         "hippunfold": "hippunfold:run",
     }

@@ -124,7 +124,9 @@ def test_defaults(seen, tmp_path):
     assert seen["settings"] == Settings()
     n_procs = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     command = f"hipsta-bids in {tmp_path} participant"
-    assert seen["options"] == RunOptions(n_procs=n_procs, reports=True, command=command)
+    assert seen["options"] == RunOptions(
+        n_procs=n_procs, reports=True, anatomy=Path("in"), command=command
+    )
     assert seen["out"] == tmp_path
 
 
@@ -139,7 +141,7 @@ def test_everything_reaches_its_place(seen, tmp_path):
         f" --bids-database-dir db --skip-bids-validation --settings {tmp_path}/s.toml"
         " --write-meshes"
         f" --force --n-procs 3 --mem 4G --timeout 9 -w {tmp_path}/work --stop-on-first-crash -vv"
-        " --no-reports"
+        " --no-reports --no-anatomy"
     )
     assert main.main(text.split()) == 0
     assert seen["request"] == InputRequest(

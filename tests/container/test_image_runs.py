@@ -45,7 +45,8 @@ def test_participant_level(participants):
 def test_group_level(both_levels):
     out, done = both_levels
     assert ended(done), done
-    assert list(out.glob("group/*/figures/*.png"))
+    kinds = {path.suffix for path in out.glob("group/*/figures/thickness_maps.*")}
+    assert kinds == {".pdf", ".png", ".svg"}
 
 
 def test_files_are_those_of_a_run_outside(both_levels, phantoms, reference):

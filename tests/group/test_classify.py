@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy import optimize, special, stats
 from sklearn.calibration import calibration_curve
+from sklearn.model_selection import RepeatedStratifiedKFold
 from statsmodels.discrete.discrete_model import Logit
 
 from hipsta_bids.errors import ModelError
@@ -13,11 +14,9 @@ from hipsta_bids.group.classify import (
     compare_pairs,
     cross_validate,
     delong,
-    fit_logistic,
-    fit_overlapping_or_firth,
-    is_separated,
     roc_curve,
 )
+from hipsta_bids.group.logistic import fit_logistic, fit_overlapping_or_firth, is_separated
 from hipsta_bids.group.settings import ClassificationSettings
 
 SETTINGS = ClassificationSettings(repeats=2, folds=5)
@@ -326,3 +325,28 @@ def test_names_the_pair_that_cannot_be_compared():
         compare_pairs(groups, volume, thickness, PAIRS, order=ORDER)
     with pytest.raises(ModelError, match="no participant is in group SCD"):
         compare_pairs(groups, volume, thickness, PAIRS, order=["CU", "SCD"])
+
+
+def test_firth_converges_where_groups_hardly_do_not_overlap():
+    """Steps by the information alone take more than 2000 in some of these training sets."""
+    controls = (8.75, 8.76, 9.3, 9.34, 9.44, 9.71, 9.72, 9.73, 10.06, 10.11, 10.14, 10.25)
+    cases = (10.29, 10.41, 10.57, 11.17, 11.27, 11.31, 11.41, 11.53, 11.55, 11.56, 11.84, 11.93)
+    values = np.array([*controls, 10.64, 11.2, *cases, 11.97])
+    case = np.arange(len(values)) >= len(controls) + 2
+    matrix = np.column_stack([np.ones(len(values)), values])
+    found = cross_validate(matrix, case, ClassificationSettings())
+    assert found.auc == pytest.approx(0.96, abs=0.02)
+
+
+def test_folds_fitted_at_once_are_those_fitted_one_by_one():
+    random = np.random.default_rng(4)
+    case = np.arange(60) % 2 == 0
+    matrix = np.column_stack([np.ones(60), random.normal(0, 1, (60, 2)) + 0.5 * case[:, None]])
+    settings = ClassificationSettings(repeats=2, folds=5)
+    score = np.zeros(60)
+    splits = RepeatedStratifiedKFold(n_splits=5, n_repeats=2, random_state=settings.seed)
+    for train, test in splits.split(matrix, case):
+        fit = fit_logistic(matrix[train], case[train], settings, firth=False)
+        score[test] += matrix[test] @ fit.coefficients / 2
+    found = cross_validate(matrix, case, settings)
+    np.testing.assert_allclose(found.score, score, atol=1e-9)

@@ -1,62 +1,117 @@
-"""Where figures put what they show: surfaces in the plane, borders and names of subfields."""
+"""Where figures put what they show, and that letters, lines and colors are those of the values."""
 
+import contextlib
+import io
+import re
+import zlib
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
+from matplotlib.contour import ContourSet
+from matplotlib.text import Text
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from hipsta_bids.group.analysis import Analysis
 from hipsta_bids.group.classify import Area, calibrate
-from hipsta_bids.group.figures import (
-    draw_calibration,
-    draw_mesh,
-    draw_roc,
-    draw_sections,
-    panels,
-    scale_of,
-)
+from hipsta_bids.group.figures import draw_calibration, draw_roc, draw_sections, encode
+from hipsta_bids.group.inference import Discoveries, MapKey
+from hipsta_bids.group.panels import Seen, draw_measure
 from hipsta_bids.group.settings import ClassificationSettings
 from hipsta_bids.group.shapes import AverageShape
+from hipsta_bids.group.views import across, draw_mesh, laid_out, look
 from hipsta_bids.io.gifti import sheet_triangles
+from hipsta_bids.reports.maps import new_figure
 from hipsta_bids.types import Mesh
 
-GRID = (11, 6)
-SCALE = scale_of("viridis", 0.0, 1.0)
+GRID = (21, 7)
+GRAY = {"cmap": "gray", "vmin": 0.0, "vmax": 1.0}
+ABOVE = np.eye(3)
 
 
-def surface(length, width, height):
+def surface(length, width, height, grid=(11, 6)):
     """A grid bent upward along its length; heights of its points are the second answer."""
-    u, v = np.meshgrid(*(np.linspace(-1, 1, n) for n in GRID), indexing="ij")
+    u, v = np.meshgrid(*(np.linspace(-1, 1, n) for n in grid), indexing="ij")
     points = np.stack([length * u, width * v, height * u**2], axis=-1).reshape(-1, 3) / 2
-    return Mesh(points=points, triangles=sheet_triangles(*GRID).astype(np.int64)), points[:, 2]
+    return Mesh(points=points, triangles=sheet_triangles(*grid).astype(np.int64)), points[:, 2]
 
 
-def drawn(mesh, values):
-    _, axes = panels(1, 1, (3.0, 3.0))
-    return axes[0, 0], draw_mesh(axes[0, 0], mesh, values, SCALE)
+def no_lines(view):
+    return np.zeros(view.triangle.shape, dtype=bool)
 
 
-def test_a_folded_surface_is_seen_along_its_thinnest_direction():
-    """Wherever in the scanner it lies, and however it is turned; what is in front covers the rest.
+def test_half_of_a_flat_sheet_has_the_color_of_its_values():
+    """Seen from above, right is right, up is up, and both sides of a surface are as bright."""
+    mesh, _ = surface(20.0, 10.0, 0.0)
+    for triangles in (mesh.triangles, mesh.triangles[:, ::-1]):
+        view = look(Mesh(points=mesh.points, triangles=triangles), ABOVE, 4.0, (60, 100))
+        right_and_up = (mesh.points[:, 0] > 0) & (mesh.points[:, 1] > 0)
+        shown = Seen(view, no_lines(view)).picture(right_and_up.astype(float), GRAY, None)
+        assert shown.shape == (60, 100, 3)
+        bright = (shown[..., 0] > 150) & (shown[..., 0] < 255)
+        rows, columns = np.nonzero(bright)
+        # 80 by 40 pixels are in the middle: a quarter of them is bright, the last nodes aside.
+        assert (rows.min(), columns.max()) == (11, 88)
+        assert rows.max() < 32
+        assert columns.min() > 48
+        assert view.triangle[::2, ::2][10:50, 10:90].min() >= 0
+        assert (view.triangle >= 0).mean() == pytest.approx(80 * 40 / 6000, rel=0.03)
+        assert len(np.unique(view.light.round(6))) == 1
 
-    The mean of its heights is not zero, and all axes are those of its points about their mean.
-    """
-    mesh, height = surface(20.0, 8.0, 3.0)
-    turned = Rotation.from_euler("xyz", [50, -30, 70], degrees=True).apply(mesh.points)
-    placed = Mesh(points=turned + np.array([30.0, -25.0, -12.0]), triangles=mesh.triangles)
-    axis, colors = drawn(placed, height)
-    assert (axis.get_xlabel(), axis.get_ylabel()) == ("second axis", "longest axis")
-    assert np.ptp(axis.get_xlim()) == pytest.approx(8.0)
-    assert np.ptp(axis.get_ylim()) == pytest.approx(20.0)
-    steps = np.diff(colors.get_array())
-    assert (steps >= -1e-12).all() or (steps <= 1e-12).all()  # rounding
+
+def test_what_is_nearer_hides_what_is_farther():
+    """In any order of triangles, also where two sheets pass through each other."""
+    low, _ = surface(10.0, 10.0, 0.0)
+    tilt = Rotation.from_euler("y", 30, degrees=True).apply(low.points)
+    points = np.concatenate([low.points, tilt])
+    triangles = np.concatenate([low.triangles, low.triangles + len(low.points)])
+    order = np.random.default_rng(0).permutation(len(triangles))
+    view = look(Mesh(points=points, triangles=triangles[order]), ABOVE, 5.0, (60, 60))
+    tilted = triangles[order][view.triangle[30]][:, 0] >= len(low.points)
+    inside = np.flatnonzero(view.triangle[30] >= 0)
+    half = (inside[0] + inside[-1]) / 2
+    # Turned about y, its left half rises toward the viewer, and its right half sinks.
+    heights = tilt[tilt[:, 0] < 0, 2].mean()
+    nearer = inside < half - 2 if heights > 0 else inside > half + 2
+    farther = inside > half + 2 if heights > 0 else inside < half - 2
+    overlap = np.abs(inside - half) < 0.8 * np.cos(np.radians(30)) * (inside[-1] - half)
+    assert tilted[inside[nearer & overlap]].all()
+    assert not tilted[inside[farther & overlap]].any()
+
+
+@pytest.mark.parametrize("below", [False, True])
+def test_views_face_the_viewer_with_anterior_up(below):
+    along = np.array([0.1, 0.9, -0.4])
+    axes = across(along, np.array([1.0, 0, 0]), below=below)
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(axes) == pytest.approx(1)  # nothing is mirrored
+    assert axes[1] @ along > 0.99 * np.linalg.norm(along)
+    assert np.sign(axes[2, 2]) == (-1 if below else 1)
+    assert np.sign(axes[0, 0]) == (-1 if below else 1)
+    assert axes[2, 0] > 0  # the lateral wall is seen
+    assert np.isfinite(across(np.array([0, 0, 1.0]), np.array([1.0, 0, 0]), below=below)).all()
+
+
+def test_lines_enclose_regions_and_not_the_silhouette():
+    mesh, _ = surface(20.0, 10.0, 0.0, grid=(41, 21))
+    view = look(mesh, ABOVE, 4.0, (60, 100))
+    region = (np.abs(mesh.points[:, 0]) < 3.9).astype(int)
+    line = view.border(view.region(region, 1), 1.0)
+    columns = np.flatnonzero(line[60])
+    at = (columns / 2 - 50) / 4  # mm
+    assert set(np.sign(at)) == {-1, 1}
+    np.testing.assert_allclose(np.abs(at), 3.75, atol=0.4)  # half a cell from the last node
+    assert not view.border(view.seen, 1.0).any()
 
 
 @pytest.mark.parametrize(("size", "words"), [((20.0, 8.0), "yx"), ((8.0, 20.0), "xy")])
 def test_a_flat_surface_is_drawn_upright_in_its_own_coordinates(size, words):
-    mesh, _ = surface(*size, 0.015)  # thinner than a thousandth of its length
-    axis, _ = drawn(mesh, np.zeros(len(mesh.points)))
-    assert axis.get_xlabel() == f"{words[0]} of the surface"
+    mesh, _ = surface(*size, 0.0)
+    axis = new_figure((3.0, 3.0), None).subplots()
+    draw_mesh(axis, mesh, np.zeros(len(mesh.points)), GRAY)
+    assert laid_out(mesh)[2][0] == f"{words[0]} of the surface"
     assert axis.get_ylabel() == f"{words[1]} of the surface"
     assert axis.get_xlim() == (-4.0, 4.0)
     # Its x, from anterior to posterior, goes down where it is the longer one.
@@ -67,10 +122,217 @@ def test_triangles_without_a_value_are_left_out():
     mesh, _ = surface(20.0, 8.0, 0.0)
     values = np.full(len(mesh.points), 0.5)
     values[0] = np.nan
-    _, colors = drawn(mesh, values)
+    axis = new_figure((3.0, 3.0), None).subplots()
+    draw_mesh(axis, mesh, values, GRAY)
+    (colors,) = axis.collections
     assert len(colors.get_array()) == len(mesh.triangles) - (mesh.triangles == 0).any(axis=1).sum()
-    _, colors = drawn(mesh, np.full(len(mesh.points), np.nan))
-    assert not colors.get_visible()
+
+
+def measured(survive, sides="LR", *, kind="t", mesh=None, groups=("CN", "AD"), contrasts=1):
+    """An analysis of thickness in which some points survive on the left side."""
+    shape = GRID if mesh is None else (len(mesh.points), 1)
+    points = shape[0] * shape[1]
+    random = np.random.default_rng(0)
+    tests = [
+        SimpleNamespace(
+            contrast=SimpleNamespace(name=f"{groups[0]}-{groups[-1]} {n}" if n else "CN-AD"),
+            kind=kind,
+            statistic=np.abs(random.normal(0, 1, points)),
+            effect=random.uniform(0, 0.5, points),
+            df=np.full(points, 20.0),
+        )
+        for n in range(contrasts)
+    ]
+    fields = (
+        np.repeat([0] * 7 + [1] * 14, GRID[1]).reshape(GRID) if mesh is None else -np.ones(shape)
+    )
+    names = ("Sub", "CA1") if mesh is None else ()
+    one = SimpleNamespace(
+        fits={"thickness": SimpleNamespace(tests=tests)},
+        maps=SimpleNamespace(shape=shape, mesh=mesh, names=names, rows=np.arange(4)),
+        used=np.arange(4),
+        subfield=fields.astype(np.int64),
+        values=lambda _: random.normal(2, 0.1, (4, points)),
+    )
+    found = {
+        MapKey("thickness", test.contrast.name, hemi): Discoveries(
+            adjusted=np.where(flags, 0.001, 0.5),
+            rejected=flags,
+            cutoff=0.01,
+            n_tests=points,
+            alpha=0.05,
+        )
+        for test in tests
+        for hemi in sides
+        for flags in [np.asarray(survive) if hemi == "L" else np.zeros(points, dtype=bool)]
+    }
+    table = pd.DataFrame({"group": [groups[n % len(groups)] for n in range(4)]})
+    analysis = SimpleNamespace(
+        fitted=dict.fromkeys(sides, one),
+        found=found,
+        compared=SimpleNamespace(table=table),
+        groups=SimpleNamespace(column="group", levels=groups),
+        comparison=SimpleNamespace(pair=None, longitudinal=False),
+    )
+    cohort = SimpleNamespace(
+        x=np.linspace(-0.9, 0.9, GRID[0]),
+        y=np.linspace(-0.9, 0.9, GRID[1]),
+        units={"thickness": "mm"},
+    )
+    return cohort, analysis
+
+
+def shapes_of(sides="LR"):
+    """A bent wall on each side."""
+    u, y = np.meshgrid(np.linspace(0, np.pi, GRID[0]), np.linspace(-15, 15, GRID[1]), indexing="ij")
+    shapes = {}
+    for hemi in sides:
+        lateral = 1 if hemi == "R" else -1
+        layers = [
+            np.stack([lateral * r * np.sin(u), y, -r * np.cos(u)], axis=-1) for r in (4.0, 5.0, 6.0)
+        ]
+        shapes[hemi] = AverageShape(mean=np.array(layers), by_group={}, counts={})
+    return shapes
+
+
+def drawn(case, shapes=None):
+    files = encode("maps", lambda: draw_measure(*case, shapes or {}, {}, "thickness"))
+    return dict(files)
+
+
+def maps_of(figure):
+    """Unfolded maps by their identifiers."""
+    return {axes.get_gid(): axes for axes in figure.axes if axes.get_gid()}
+
+
+def bold_lines(axes):
+    return [c for c in axes.collections if isinstance(c, ContourSet) and c.get_linewidths()[0] > 1]
+
+
+NONE = np.zeros(GRID[0] * GRID[1], dtype=bool)
+SOME = np.arange(GRID[0] * GRID[1]) < 40
+
+
+def test_the_threshold_is_drawn_exactly_where_something_survives():
+    cohort, analysis = measured(SOME)
+    (figure,) = draw_measure(cohort, analysis, shapes_of(), {}, "thickness")
+    maps = maps_of(figure)
+    assert set(maps) == {
+        f"map-{kind}-{n}-{hemi}"
+        for hemi in "LR"
+        for kind, n in (("mean", 0), ("mean", 1), ("effect", 0), ("significance", 0))
+    }
+    enclosed = {name for name, axes in maps.items() if bold_lines(axes)}
+    assert enclosed == {"map-effect-0-L", "map-significance-0-L"}
+    (line,) = bold_lines(maps["map-effect-0-L"])
+    inside = [path.contains_points(grid_of(cohort)) for path in line.get_paths()]
+    np.testing.assert_array_equal(np.any(inside, axis=0), SOME)
+    titles = [text.get_text() for text in figure.texts]
+    assert "Significant: 40 left, 0 right of 147 points" in titles
+    words = {"Left", "Right", "unfolded", "superior", "inferior", "a", "b", "c", "d"}
+    assert words | {"medial", "lateral", "med.", "lat.", "anterior", "posterior"} <= set(titles)
+    names = [text.get_text() for text in maps["map-mean-0-R"].texts]
+    assert names == ["Sub", "CA1"]
+    cohort, analysis = measured(NONE)
+    (figure,) = draw_measure(cohort, analysis, {}, {}, "thickness")
+    assert not any(bold_lines(axes) for axes in maps_of(figure).values())
+
+
+def grid_of(cohort):
+    return np.stack(np.meshgrid(cohort.x, cohort.y, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def test_sizes_and_type_are_those_of_journals():
+    """Both sides with surfaces take two columns of a page, all else takes one."""
+    for sides, shapes, width in (
+        ("LR", shapes_of(), 180),
+        ("LR", {}, 85),
+        ("L", shapes_of("L"), 85),
+    ):
+        cohort, analysis = measured(SOME, sides)
+        (figure,) = draw_measure(cohort, analysis, shapes, {}, "thickness")
+        inches = figure.get_size_inches()
+        assert inches[0] * 25.4 == pytest.approx(width, abs=0.05)
+        assert inches[1] * 25.4 <= 235.5
+        letters = [text for text in figure.texts if text.get_text() in "abcd"]
+        assert {text.get_weight() for text in letters} == {"bold"}
+        figure.draw_without_rendering()
+        texts = [text for text in figure.findobj(Text) if text.get_text()]
+        assert {text.get_fontsize() for text in texts} == {7.0, 8.0, 9.0}
+
+
+def test_files_are_the_same_each_time_and_small(monkeypatch):
+    first = drawn(measured(SOME, "L"), shapes_of("L"))
+    assert [name.rpartition(".")[2] for name in first] == ["png", "svg", "pdf"]
+    monkeypatch.setattr("time.time", lambda: 1e9)
+    assert drawn(measured(SOME, "L"), shapes_of("L")) == first
+    picture = Image.open(io.BytesIO(first["maps.png"]))
+    assert picture.width == 1004  # 85 mm
+    assert max(map(len, first.values())) < 1e6
+    svg = first["maps.svg"].decode()
+    assert ">Mean, CN (n = 2)<" in svg
+    assert {"Sub", "CA1", "Left"} <= words_of(first["maps.pdf"])
+    assert b"/FontFile2" in first["maps.pdf"]
+    assert b"/Type3" not in first["maps.pdf"]
+
+
+def words_of(printed):
+    """Texts of a PDF whose fonts keep the letters' codes, as its tables of letters say."""
+    streams = []
+    for found in re.finditer(rb">>\s*stream\r?\n", printed):
+        with contextlib.suppress(zlib.error):
+            streams.append(zlib.decompressobj().decompress(printed[found.end() :]))
+    assert any(b"begincmap" in stream for stream in streams)
+    (page,) = (stream for stream in streams if b" Tf" in stream)
+    lines = re.findall(rb"\[(.*?)\] TJ", page)
+    return {b"".join(re.findall(rb"\x00([^\x00()])", line)).decode() for line in lines}
+
+
+def test_both_sides_and_both_views_are_seen():
+    """Each view is a picture of its own, colored, and not clipped by its box."""
+    cohort, analysis = measured(SOME)
+    (figure,) = draw_measure(cohort, analysis, shapes_of(), {}, "thickness")
+    pictures = [image.get_array() for axes in figure.axes for image in axes.images]
+    assert len(pictures) == 4 * 4
+    for picture in pictures:
+        inked = (picture < 250).any(axis=2)
+        assert 0.2 < inked.mean() < 0.95
+        edges = [inked[0], inked[-1], inked[:, 0], inked[:, -1]]
+        assert not np.concatenate(edges).any()
+    assert len({picture.tobytes() for picture in pictures[:4]}) == 4
+
+
+def test_many_contrasts_are_split_into_pages():
+    cohort, analysis = measured(SOME, groups=("CN", "MCI", "AD"), contrasts=3)
+    figures = draw_measure(cohort, analysis, {}, {}, "thickness")
+    kinds = [[name.split("-")[1] for name in maps_of(f) if name.endswith("L")] for f in figures]
+    assert kinds == [["mean"] * 3 + ["effect", "significance"], ["effect", "significance"] * 2]
+    assert all(figure.get_figheight() * 25.4 < 236 for figure in figures)
+
+
+def test_effects_without_sign_begin_at_zero():
+    cohort, analysis = measured(SOME, kind="F")
+    (figure,) = draw_measure(cohort, analysis, {}, {}, "thickness")
+    labels = {axes.get_ylabel(): axes.get_ylim() for axes in figure.axes if axes.get_ylabel()}
+    assert labels["partial eta squared"][0] == 0.0
+    assert labels["corrected p"][0] == 0.0
+
+
+def test_the_threshold_is_drawn_on_other_programs_flat_surfaces():
+    flat, _ = surface(20.0, 8.0, 0.0)
+    cohort, analysis = measured(flat.points[:, 0] > 2, "L", mesh=flat)
+    (figure,) = draw_measure(cohort, analysis, {}, {}, "thickness")
+    enclosed = {name for name, axes in maps_of(figure).items() if bold_lines(axes)}
+    assert enclosed == {"map-effect-0-L", "map-significance-0-L"}
+
+
+def test_a_folded_surface_of_other_programs_is_seen_from_above_and_below():
+    shape = shapes_of("L")["L"].middle
+    survive = np.arange(len(shape.points)) < 40
+    cohort, analysis = measured(survive, "L", mesh=shape)
+    (figure,) = draw_measure(cohort, analysis, {}, {}, "thickness")
+    assert maps_of(figure) == {}
+    assert sum(len(axes.images) for axes in figure.axes) == 4 * 2
 
 
 def test_legends_of_curves_are_beside_them_and_small_groups_have_no_calibration():
@@ -82,19 +344,25 @@ def test_legends_of_curves_are_beside_them_and_small_groups_have_no_calibration(
         score=score,
         calibration=calibration,
     )
-    model = SimpleNamespace(base=one, full=one, separated=False)
-    pair = SimpleNamespace(control="CN", case="AD", comparison=model, is_case=score > 0)
-    analysis = SimpleNamespace(pairs=[("L", "thickness_mean", pair)])
+    small = SimpleNamespace(calibration=calibrate(score, score > 0, ClassificationSettings()))
+    cases = []
+    for hemi, full in (("L", one), ("R", one), ("LR", small)):
+        model = SimpleNamespace(base=one, full=full, separated=False)
+        pair = SimpleNamespace(control="CN", case="AD", comparison=model, is_case=score > 0)
+        cases.append((hemi, "thickness_mean", pair))
+    fields = dict.fromkeys(Analysis.__dataclass_fields__)
+    analysis = Analysis(**{**fields, "pairs": cases[:2]})
     for draw in (draw_roc, draw_calibration):
-        figure = draw(analysis)
+        (figure,) = draw(analysis)
         figure.draw_without_rendering()
-        (axis,) = figure.axes
-        legend = axis.get_legend().get_window_extent()
-        assert not legend.overlaps(axis.get_window_extent())
+        first, second, beside = figure.axes
+        legend = beside.get_legend().get_window_extent()
+        assert not legend.overlaps(first.get_window_extent())
+        assert not legend.overlaps(second.get_window_extent())
         assert legend.y0 >= 0  # not cut off
-        assert legend.x0 >= 0
-    one.calibration = calibrate(score, score > 0, ClassificationSettings())
-    assert not draw_calibration(analysis).axes[0].axison
+        assert legend.x1 <= figure.bbox.width
+    (figure,) = draw_calibration(Analysis(**{**fields, "pairs": cases}))
+    assert [axis.get_title() for axis in figure.axes] == ["left", "right", ""]
 
 
 def test_subfields_are_named_inside_them_and_end_at_lines_across_the_wall():
@@ -104,7 +372,7 @@ def test_subfields_are_named_inside_them_and_end_at_lines_across_the_wall():
     fields = np.repeat([-1, 0, 0, 0, 1, 1, 1, 1, 1], 7).reshape(9, 7)
     left = SimpleNamespace(subfield=fields, maps=SimpleNamespace(names=("Sub", "CA1", "CA2")))
     cohort = SimpleNamespace(y=0.3 * np.arange(-3, 4))
-    figure = draw_sections(cohort, SimpleNamespace(fitted={"L": left}), {"L": shape, "R": shape})
+    (figure,) = draw_sections(cohort, SimpleNamespace(fitted={"L": left}), {"L": shape, "R": shape})
     axes = np.reshape(figure.axes, (2, 3))
     for axis in axes[0]:
         # The left side's lateral is against x; the center is at 4 and 1 mm.
@@ -117,4 +385,4 @@ def test_subfields_are_named_inside_them_and_end_at_lines_across_the_wall():
         np.testing.assert_allclose(middle, np.stack([sign * (x[:, 0, 0] - 4), 0 * x[:, 0, 0]], 1))
     assert not any(axis.texts for axis in axes[1])  # nothing was fitted there
     places = [axis.get_title().partition(", ")[2] for axis in axes[0]]
-    assert places == ["y = -0.6 (posterior)", "y = 0 (middle)", "y = 0.6 (anterior)"]
+    assert places == ["posterior (y = -0.6)", "middle (y = 0)", "anterior (y = 0.6)"]

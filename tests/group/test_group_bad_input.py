@@ -19,8 +19,12 @@ from small_cohorts import (
 from hipsta_bids.cli.main import main
 from hipsta_bids.derivatives.dataset import identity, update_status
 from hipsta_bids.derivatives.names import HemisphereName
+from hipsta_bids.group import write
 from hipsta_bids.group.exclusions import is_listed
 from hipsta_bids.io import files
+
+#: What keeps runs short that look at the model only.
+FAST = ("--align", "none", "--measures", "thickness", "--no-classification", "--no-reports")
 
 
 class Study(NamedTuple):
@@ -40,6 +44,12 @@ def study(written, tmp_path):
     """A copy that may be spoiled."""
     shutil.copytree(written, tmp_path / "study")
     return Study(tmp_path / "study" / "bids", tmp_path / "study" / "out")
+
+
+@pytest.fixture
+def without_figures(monkeypatch):
+    """Leave out what takes longer than all else."""
+    monkeypatch.setattr(write, "draw_figures", lambda *_: iter(()))
 
 
 def edit_record(place, **changes):
@@ -101,6 +111,37 @@ def no_dataset(study):
     shutil.rmtree(study.data)
 
 
+def ages(study, function):
+    rows = [[*row[:2], function(row[2]), row[3]] for row in read_participants(study.data)]
+    write_participants(study.data, rows)
+
+
+def impossible_age(study):
+    rows = read_participants(study.data)
+    rows[3][2] = "1e50"
+    write_participants(study.data, rows)
+
+
+def coded_age(study):
+    rows = read_participants(study.data)
+    rows[3][2] = rows[7][2] = "-9999"
+    write_participants(study.data, rows)
+
+
+def comma_age(study):
+    ages(study, lambda age: age.replace(".", ","))
+
+
+def date_age(study):
+    ages(study, lambda age: f"19{age[:2]}-01-01")
+
+
+def two_spellings(study):
+    rows = read_participants(study.data)
+    rows[3][1] = rows[3][1].lower()
+    write_participants(study.data, rows)
+
+
 def text_age(study):
     rows = read_participants(study.data)
     rows[3][2] = "old"
@@ -153,8 +194,13 @@ def no_values(study):
 @pytest.mark.parametrize(
     ("spoil", "options", "code", "words"),
     [
-        (no_groups, [], 65, "no column that tells groups"),
-        (no_table, [], 65, "no column that tells groups"),
+        (no_groups, [], 65, "no column tells groups"),
+        (no_table, [], 65, "BIDS_DIR has no participants.tsv"),
+        (impossible_age, [], 65, "has sub-04 (1e+50) where half of the others are"),
+        (coded_age, [], 65, "has sub-04 (-9999), sub-08 (-9999) where all others are 5"),
+        (comma_age, [], 65, "'age' holds decimal commas, as sub-01 ('74,1')"),
+        (date_age, [], 65, "'age' holds dates, as sub-01 ('1974-01-01')"),
+        (two_spellings, [], 65, "capitals or blanks only: 'CN' (15), 'cn' (1)"),
         (twice, [], 65, "sub-01 occur more than once"),
         (text_age, [], 65, "sub-04"),
         (huge_age, [], 65, "too large for rows sub-04"),
@@ -178,7 +224,7 @@ def no_values(study):
         (unfinished, [], 65, "sub-99_hemi-L"),
         (second_protocol, [], 65, "choose one by --seg"),
         (all_failed, [], 66, "60 failed: too-thin"),
-        (no_values, [], 65, "no point of the thickness maps"),
+        (no_values, [], 65, "sub-01: no point of the thickness map has a value"),
         (None, ["--seg", "nope"], 66, "there is demo"),
         (None, ["--participant-label", "77"], 66, "no hemisphere as asked for"),
         (None, ["--participant-label", "01", "02", "20", "21"], 65, "too few"),
@@ -193,7 +239,7 @@ def no_values(study):
         (None, ["--exclude-qc", "x\0"], 64, "cannot be read"),
         (None, ["--exclude-qc", "1" + "+1" * 100_000], 64, "too long"),
         (None, ["--exclude-qc", "open('x')"], 64, "may hold comparisons"),
-        (None, ["--model", "nowhere.json"], 65, "nowhere.json"),
+        (None, ["--model", "nowhere.json"], 65, "nowhere.json: no such file"),
         (None, ["--template", "nowhere.json"], 65, "nowhere.json"),
         (None, ["-d", "hipsta=/nowhere"], 65, "/nowhere"),
         (None, ["--align", "fancy"], 64, "fancy"),
@@ -229,6 +275,7 @@ def test_same_subject_in_two_datasets_is_refused(written, study, tmp_path, capsy
     assert not (tmp_path / "o").exists()
 
 
+@pytest.mark.usefixtures("without_figures")
 def test_table_of_a_spreadsheet_is_read(study, quick):
     """With a byte order mark, line ends of Windows, and blanks round the labels."""
     path = study.data / "participants.tsv"
@@ -252,9 +299,73 @@ def test_exclusions_name_one_protocol_and_region():
     assert is_listed(replace(name, seg=""), row | {"protocol": "other", "region": "body"})
 
 
+@pytest.mark.usefixtures("without_figures")
 def test_exclusions_of_nobody_are_told(study, quick, tmp_path, capsys):
     listed = tmp_path / "listed.tsv"
     listed.write_text("participant_id\themi\nsub-77\tn/a\nsub-01\tL\n")
     options = [*quick, "--align", "none", "--measures", "thickness", "--exclude", str(listed)]
     assert main([str(study.data), str(study.out), "group", *options]) == 0
     assert "matches no hemisphere here: sub-77" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_damaged_hemispheres_are_left_out_by_name_and_other_versions_told(study, capsys):
+    path = place_of(study.out, "05", "L").path("sheet")
+    lines = [line.split("\t") for line in path.read_text().splitlines()]
+    lines[9][2] = "1e30"
+    path.write_text("\n".join("\t".join(line) for line in lines) + "\n")
+    for hemi in "LR":  # a participant without any hemisphere is not in the model at all
+        path = place_of(study.out, "06", hemi).path("sheet")
+        rows = [line.split("\t") for line in path.read_text().splitlines()]
+        rows[1:] = [[*row[:2], "n/a", "n/a", row[4]] for row in rows[1:]]
+        path.write_text("\n".join("\t".join(row) for row in rows) + "\n")
+    edit_record(place_of(study.out, "07", "R"), version="0.0.9")
+    assert main([str(study.data), str(study.out), "group", *FAST]) == 0
+    said = capsys.readouterr()
+    assert "29 participants in the model, 3 left out" in said.out
+    assert "sub-05, hemisphere L, is left out: thickness reaches 1e+30 mm" in said.out
+    assert "sub-06, hemisphere R, is left out: 100% of the curvature profile" in said.out
+    assert said.err.startswith("warning: hemispheres were measured by several versions, 0.0.9 (1),")
+    assert "measure sub-07_hemi-R with 0.1.0" in said.err
+    (path,) = study.out.glob("group/*/excluded.tsv")
+    excluded = files.read_tsv(path)
+    assert [(row["participant_id"], row["hemi"], row["reason"]) for row in excluded] == [
+        ("sub-05", "L", "damaged-map"),
+        ("sub-06", "L", "damaged-map"),
+        ("sub-06", "R", "damaged-map"),
+    ]
+
+
+def with_column(study, name, values):
+    rows = [
+        [*row, str(value)] for row, value in zip(read_participants(study.data), values, strict=True)
+    ]
+    write_participants(study.data, rows, ("participant_id", "group", "age", "sex", name))
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_sites_are_factors_however_they_are_coded_and_empty_covariates_told(study, capsys):
+    no_age(study)
+    with_column(study, "site", [k % 3 + 1 for k in range(30)])
+    assert main([str(study.data), str(study.out), "group", *FAST]) == 0
+    (design,) = study.out.glob("group/*/design.tsv")
+    columns = ["Intercept", "group[T.AD]", "sex[T.M]", "site[T.2]", "site[T.3]"]
+    assert list(files.read_tsv(design)[0])[2:] == columns
+    assert "note: age is n/a for all, and not in the model" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_sidecar_makes_factors_and_names_their_levels(study, capsys):
+    with_column(study, "stage", [k % 3 for k in range(30)])
+    options = [*FAST, "--formula", "group + stage"]
+    assert main([str(study.data), str(study.out), "group", *options]) == 0
+    assert (
+        "stage has 3 different values (0, 1, 2) and is fitted as a line" in capsys.readouterr().out
+    )
+    levels = {"0": "none", "1": {"Description": "some"}, "2": "much"}
+    files.write_json(study.data / "participants.json", {"stage": {"Levels": levels}})
+    options += ["--contrast", "stage[none]-stage[much]"]
+    assert main([str(study.data), str(study.out), "group", *options]) == 0
+    assert "as a line" not in capsys.readouterr().out
+    (design,) = study.out.glob("group/*/design.tsv")
+    assert list(files.read_tsv(design)[0])[-2:] == ["stage[T.none]", "stage[T.some]"]

@@ -13,6 +13,7 @@ from small_cohorts import NODES, PLAN, SETTINGS, place_of, write_dataset, write_
 from hipsta_bids.cli.main import main
 from hipsta_bids.derivatives import dataset as derivative
 from hipsta_bids.group import write
+from hipsta_bids.group.inference import control_fdr
 from hipsta_bids.io import files
 from hipsta_bids.reports.group import group_page
 from hipsta_bids.validation.group import simulate_cohort
@@ -170,9 +171,9 @@ def test_changes_of_groups_are_compared_between_two_sessions(sessions, quick):
     assert "points with a decrease" in page
 
 
-@pytest.mark.parametrize("random", ["intercept", "slope"])
+@pytest.mark.parametrize("random", ["intercept", ""])
 def test_longitudinal_model_finds_the_slopes(sessions, quick, random):
-    folder = run(sessions, *quick, *ALIGNED, "--longitudinal", random)
+    folder = run(sessions, *quick, *ALIGNED, "--longitudinal", *random.split())
     record = json.loads((folder / "analysis.json").read_text())
     assert record["formula"] == "group * time + age + sex"
     assert (record["participants"], record["rows"]) == (30, 90)
@@ -185,15 +186,52 @@ def test_longitudinal_model_finds_the_slopes(sessions, quick, random):
         # Sessions of a participant do not count as participants.
         assert (found.df < 90).all()
     text = (folder / "methods.md").read_text()
-    own = "intercepts and slopes" if random == "slope" else "intercepts"
+    own = "intercepts" if random else "intercepts and slopes"  # three visits of 30
     assert f"a linear mixed model with {own} of participants `" in text
     assert "30 participants (90 visits)" in text
+    # Visits do not count as people.
+    measures = table(folder / "measures.tsv")
+    assert set(measures.n) == {30}
+    assert set(measures.visits) == {90}
+    assert table(folder / "means.tsv").n.max() == 16
+    assert table(folder / "descriptives.tsv").n.max() == 16
+    for _, own in measures.groupby("contrast"):
+        expected = control_fdr(own.p.to_numpy(), 0.05).adjusted
+        np.testing.assert_allclose(own.p_fdr, expected, rtol=1e-6)
     # Classification wants independent rows.
     assert set(table(folder / "classification.tsv").n) == {30}
     page = group_page(folder)
     assert "could not be made" not in page
+    assert "n counts participants" in page
     assert "30 participants with 90 visits" in page
     assert "points larger in CN" in page
+
+
+def test_default_model_with_a_curve_of_age_tests_it(sessions, quick):
+    """Also in a mixed model, where the spline's part beyond a line takes an F test."""
+    options = ("--longitudinal", "--age-model", "spline", "--measures", "thickness")
+    folder = run(sessions, *quick, *ALIGNED, "--no-classification", *options)
+    formula = json.loads((folder / "analysis.json").read_text())["formula"]
+    assert formula == 'group * time + cr(age, df=3, constraints="center") + sex'
+    found = table(folder / "hemi-L_contrast-AgeNonlinear_desc-thickness_statmap.tsv")
+    assert found.cohen_d.isna().all()
+    # Nothing bends; F of two rows, of 30 participants, is one on average, with 24 or so below.
+    assert 0.2 < found.statistic.mean() < 3
+    assert (found.df < 90).all()
+    assert set(table(folder / "peaks.tsv").query("contrast == 'age nonlinear'").test) == {"F"}
+    text = (folder / "methods.md").read_text()
+    assert "Age was in the model with a natural cubic spline; the contrast age nonlinear" in text
+    assert not (folder / "classification.tsv").exists()
+
+
+def test_permutations_of_repeated_visits_flip_signs_of_participants(sessions, quick):
+    options = ("--correction", "permutation-max", "--permutations", "20", "--no-classification")
+    folder = run(sessions, *quick, *ALIGNED, *options, "--longitudinal", "--measures", "thickness")
+    found = table(folder / "hemi-L_contrast-TimeInAD_desc-thickness_statmap.tsv")
+    # The loss of .1 mm per session is in all: none of the other signs gives as much.
+    np.testing.assert_allclose(found.p_corrected * 20, (found.p_corrected * 20).round(), atol=1e-6)
+    assert found.significant.mean() > 0.9
+    assert "signs of each participant's residuals" in (folder / "methods.md").read_text()
 
 
 def test_first_session_is_the_default_and_says_so(sessions, quick, capsys):
@@ -230,9 +268,15 @@ def test_asymmetry_is_left_minus_right_in_the_same_model(dataset, quick):
     [
         (["--paired", "1", "9"], 65, "there is no session ses-9"),
         (["--paired", "1", "2", "--longitudinal"], 64, "not both"),
-        (["--longitudinal", "--correction", "permutation-tfce"], 65, "cannot be exchanged"),
+        (
+            ["--longitudinal", "--correction", "permutation-tfce", "--blocks", "sex"],
+            65,
+            "leave --blocks out",
+        ),
         (["--correction", "permutation-max", "--permutations", "1"], 64, "at least 2"),
         (["--longitudinal", "--formula", "age", "--contrast", "age,age"], 65, "rows"),
+        (["--formula", "group + age", "--age-model", "spline"], 64, "of the default model"),
+        (["--formula", "group + age", "--contrast", "nonlinear(age)"], 65, "poly(age, 2)"),
     ],
 )
 def test_refusals(sessions, capsys, options, code, message):

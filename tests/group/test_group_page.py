@@ -9,19 +9,32 @@ import time
 import numpy as np
 import pandas as pd
 import pytest
-from browsing import colored, fits, one, open_browser, open_page, pixels, texts, until, watched
+from browsing import (
+    colored,
+    faint,
+    fits,
+    one,
+    open_browser,
+    open_page,
+    pixels,
+    texts,
+    until,
+    use_theme,
+    watched,
+)
 from page_outline import Outline
 from selenium import webdriver
 from selenium.webdriver.common.keys import Keys
 from small_cohorts import NODES, write_dataset
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.group import write
+from hipsta_bids.group import figures, write
 from hipsta_bids.io import files
 from hipsta_bids.reports import group as page_module
-from hipsta_bids.reports.display import ORIENTATION, colors_of
+from hipsta_bids.reports.display import ORIENTATION
 from hipsta_bids.reports.group import group_page, write_group_report
 from hipsta_bids.reports.group_tables import display_name
+from hipsta_bids.reports.maps import new_figure
 from hipsta_bids.reports.page import Section
 
 MODEL = "group-age-sex"
@@ -46,10 +59,15 @@ def dataset(tmp_path_factory):
     given = ["--settings", str(folder / "group.toml"), "--exclude", str(excluded)]
     given += ["--asymmetry", "--normative", "group=CN", "--name", MODEL]
     with pytest.MonkeyPatch.context() as patch:
-        # Figures take longer than all else, and the page works without them.
-        patch.setattr(write, "draw_figures", lambda *_: iter(()))
+        # Figures take longer than all else: those of maps alone, and as the page shows them.
+        patch.setattr(figures, "_METADATA", {"svg": {"Date": None, "Creator": None}})
+        patch.setattr(write, "draw_figures", only_maps)
         assert main([str(data), str(out), "group", *given]) == 0
     return data, out, given
+
+
+def only_maps(*given):
+    return ((name, draw) for name, draw in figures.draw_figures(*given) if name.endswith("_maps"))
 
 
 @pytest.fixture(scope="module")
@@ -91,8 +109,8 @@ def test_the_page_is_whole_and_made_for_all_readers(page):
 
 @pytest.mark.parametrize("key", [section.key for section in page_module.SECTIONS])
 def test_every_part_is_there(page, key):
-    # Average cross-sections need surfaces, which these sheets lack.
-    assert (f'id="group-{key}"' in page) == (key != "sections")
+    # Average cross-sections need surfaces, which these sheets lack; harmonization is an option.
+    assert (f'id="group-{key}"' in page) == (key not in {"sections", "harmonization"})
 
 
 def test_findings_are_those_of_the_tables(out, page):
@@ -123,7 +141,8 @@ def test_maps_are_those_of_the_tables(out, page):
 
 def test_figures_are_embedded_with_text_alternatives(copy, page):
     folder = copy / "group" / MODEL
-    names = {"roc", "calibration", "profiles", "warps", "sections"}
+    shutil.rmtree(folder / "figures")
+    names = {"roc", "calibration", "registration", "sections"}
     for name in names:
         svg = f'<svg xmlns="http://www.w3.org/2000/svg" width="90pt"><title>{name}</title></svg>'
         files.write_text(folder / "figures" / f"{name}.svg", svg)
@@ -138,7 +157,8 @@ def test_figures_are_embedded_with_text_alternatives(copy, page):
     outline = Outline(text)
     assert outline.open == outline.unlabeled == []
     assert max(np.diff(outline.headings)) <= 1
-    assert "image/svg" not in page  # it was made without figures
+    assert text.count("No figure of ") == 4  # they were taken away
+    assert "No figure of " not in page
 
 
 def test_who_is_left_out_is_said_with_the_reason(page):
@@ -211,7 +231,7 @@ def test_effects_of_two_models_name_their_model(copy):
     path = copy / "group" / MODEL / "measures.tsv"
     models = ["a + b", "a + b + icv"]
     change_table(path, "model", lambda content: [models[n % 2] for n in range(len(content))])
-    change_table(path, "p", lambda content: ["0.01"] * len(content))
+    change_table(path, "p_fdr", lambda content: ["0.01"] * len(content))
     text = group_page(copy / "group" / MODEL)
     found = re.findall(r"<li>[^<]*, model (a \+ b[^:]*): [^<]*</li>", text)
     assert set(found) == set(models)
@@ -227,21 +247,21 @@ def test_measures_of_subfields_are_spelled():
     assert display_name("extent_x") == "extent x"
 
 
-def test_scales_are_those_of_all_pages_and_mark_the_level(page):
-    thickness, curvature = (block["scales"] for block in scenes(page)[:2])
-    assert thickness["mean"]["colors"] == colors_of("viridis").tolist()
-    assert curvature["mean"]["colors"] == colors_of("RdBu_r").tolist()
-    assert curvature["mean"]["low"] == -curvature["mean"]["high"]
-    # Where nothing survives, colors are not those of large effects.
-    (name,) = thickness["effect"]
-    assert curvature["effect"][name]["high"] == thickness["effect"][name]["high"]
-    marks = thickness["significance"]["marks"]
-    reach = thickness["significance"]["high"]
-    assert [at for at, _ in marks] == pytest.approx(
-        [50 + s * 65.05 / reach for s in (-1, 1)], abs=0.01
-    )
-    assert ">p 0.05</span>" in page
+def test_values_are_read_where_the_maps_lie(page):
+    """Places come from the drawings: each unfolded map has one, with what it shows."""
     assert ORIENTATION in page
+    found = [
+        dict(re.findall(r'([\w-]+)="([^"]*)"', tag))
+        for tag in re.findall(r'<div class="map".*?>', page)
+    ]
+    own = [spot for spot in found if spot["data-block"] == "0"]
+    assert len(own) == 8  # two means, effect and significance on both sides
+    assert sum(spot["aria-label"].startswith("Effect of CN-AD") for spot in own) == 2
+    boxes = [[float(n) for n in re.findall(r"[\d.]+", spot["style"])] for spot in own]
+    for left, top, width, height in boxes:
+        assert 0 < left < left + width < 100
+        assert 0 < top < top + height < 100
+    assert len({(box[0], box[1]) for box in boxes}) == 8
 
 
 def test_users_text_is_escaped(copy):
@@ -275,6 +295,32 @@ def test_a_page_that_fails_costs_a_line_and_no_results(copy):
     assert (copy / "group" / MODEL / "peaks.tsv").exists()
 
 
+def test_a_figure_that_fails_costs_a_line_and_no_results(dataset, copy, monkeypatch, capsys):
+    data, _, given = dataset
+
+    def fail():
+        raise ZeroDivisionError("nothing there")
+
+    def one_fails(*_):
+        yield "broken", fail
+        yield "boxes", lambda: [labeled("\N{CJK UNIFIED IDEOGRAPH-60A3}")]
+
+    monkeypatch.setattr(write, "draw_figures", one_fails)
+    assert main([str(data), str(copy), "group", *given]) == 0
+    told = capsys.readouterr().out
+    assert "note: figure broken: not drawn (ZeroDivisionError: nothing there)\n" in told
+    assert "show boxes for \N{CJK UNIFIED IDEOGRAPH-60A3}; SVG has them as text" in told
+    folder = copy / "group" / MODEL
+    assert (folder / "peaks.tsv").exists()
+    assert "\N{CJK UNIFIED IDEOGRAPH-60A3}" in (folder / "figures" / "boxes.svg").read_text()
+
+
+def labeled(text):
+    figure = new_figure((1.0, 1.0), None)
+    figure.text(0.5, 0.5, text)
+    return figure
+
+
 def test_no_page_is_made_or_left_if_none_is_wanted(dataset, copy, monkeypatch, capsys):
     data, _, given = dataset
     monkeypatch.setattr(write, "draw_figures", lambda *_: iter(()))
@@ -302,27 +348,42 @@ def test_the_page_fits_its_window(visit, width):
     assert fits(visit(width), width)
 
 
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_texts_can_be_read_in_both_themes(visit, theme):
+    browser = visit()
+    use_theme(browser, theme)
+    seen, found = faint(browser)
+    use_theme(browser, "light")
+    assert seen > 100
+    assert found == []
+
+
 @pytest.mark.parametrize("label", ["Clusters and peaks", "Summary measures", "Classification"])
 def test_no_column_is_cut_off(visit, label):
     table_of = one(visit(), f"[aria-label='{label}']")
     assert int(table_of.get_property("scrollWidth")) <= int(table_of.get_property("clientWidth"))
 
 
-def test_maps_are_drawn(visit):
+def test_figures_are_few_and_the_page_is_short(visit):
+    """Of four measures here; the figure of curves is missing, of about 300 pixels."""
     browser = visit()
-    canvas = one(browser, "canvas.map")
-    browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", canvas)
-    assert colored(pixels(canvas)) > 0.8
+    assert len(texts(browser, "figure")) <= 15
+    assert browser.execute_script("return document.documentElement.scrollHeight") < 6000
+    shown = [e for e in browser.find_elements("css selector", ".plate") if e.is_displayed()]
+    assert len(shown) == 2  # more measures are folded
+    for picture in shown:
+        browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", picture)
+        assert colored(pixels(picture)) > 0.1
 
 
 def test_pointing_at_a_map_tells_its_values(visit, out):
     browser = visit()
-    canvas = one(browser, "canvas[data-kind=effect]")
-    browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", canvas)
+    spot = one(browser, ".map[data-kind=effect]")
+    browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", spot)
     assert not one(browser, "#tip").is_displayed()
-    size = canvas.size
+    size = spot.size
     corner = (size["width"] // 2 - 3, -(size["height"] // 2 - 3))
-    webdriver.ActionChains(browser).move_to_element_with_offset(canvas, *corner).perform()
+    webdriver.ActionChains(browser).move_to_element_with_offset(spot, *corner).perform()
     until(lambda: one(browser, "#tip").is_displayed())
     told = dict(zip(texts(browser, "#tip dt"), texts(browser, "#tip dd"), strict=True))
     points = table(out / "group" / MODEL / "hemi-L_contrast-CNAD_desc-thickness_statmap.tsv")
@@ -337,14 +398,14 @@ def test_pointing_at_a_map_tells_its_values(visit, out):
 
 def test_arrow_keys_move_from_point_to_point(visit):
     browser = visit()
-    canvas = one(browser, "canvas[data-kind=significance]")
-    browser.execute_script("arguments[0].focus()", canvas)
+    spot = one(browser, ".map[data-kind=significance]")
+    browser.execute_script("arguments[0].focus()", spot)
     middle = [n // 2 + 1 for n in NODES]
     for key, step in ((Keys.ARROW_UP, (0, 0)), (Keys.ARROW_RIGHT, (1, 0)), (Keys.ARROW_UP, (1, 1))):
-        canvas.send_keys(key)
+        spot.send_keys(key)
         node = ", ".join(str(n + move) for n, move in zip(middle, step, strict=True))
         assert texts(browser, "#tip b") == [f"Left, node {node}"]
-    canvas.send_keys(Keys.ESCAPE)
+    spot.send_keys(Keys.ESCAPE)
     assert not one(browser, "#tip").is_displayed()
 
 

@@ -18,7 +18,7 @@ EXTENDED = ["--region", "extended"]
 @pytest.fixture
 def study(tmp_path, monkeypatch):
     """All participants, measured with the neighboring cortex."""
-    monkeypatch.setattr("hipsta_bids.group.run.draw", lambda *_, **__: None)
+    monkeypatch.setattr("hipsta_bids.group.run.draw", lambda *_, **__: ())
     data, out = write_dataset(tmp_path, region="extended")
     return [str(data), str(out)], out
 

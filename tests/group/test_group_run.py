@@ -7,6 +7,7 @@ import shutil
 import numpy as np
 import pandas as pd
 import pytest
+from PIL import Image
 from pyarrow import parquet
 from small_cohorts import GROUPS, NODES, PLAN, place_of, write_dataset
 
@@ -294,22 +295,26 @@ def test_left_out_hemispheres_are_listed_with_the_reason(tmp_path, quick):
 
 def test_figures_are_drawn_as_pictures_and_drawings(results):
     names = {path.stem for path in (results / "figures").glob("*.png")}
-    assert names == {
-        *(
-            f"{measure}_{what}"
-            for measure in ("thickness", "curvature")
-            for what in ("means", "contrasts")
-        ),
-        *("profiles", "warps", "roc"),
-    }
+    assert names == {"thickness_maps", "curvature_maps", "registration", "roc"}
     for name in names:
         drawing = (results / "figures" / f"{name}.svg").read_text()
         # Words stay words, so that they can be searched and edited.
         assert ">medial<" in drawing or name == "roc"
-    contrasts = (results / "figures" / "thickness_contrasts.svg").read_text()
-    assert "CN-AD" in contrasts
-    assert contrasts.count(">p 0.05<") == 2  # on the bar of significance, on both sides of zero
-    assert ">CA1<" in contrasts
+        assert not re.search(r"font-size: (?![789](\.0)?px)", drawing)
+        with Image.open(results / "figures" / f"{name}.png") as picture:
+            assert picture.info["dpi"] == pytest.approx((300, 300), rel=1e-3)
+            widths = pytest.approx(85, abs=0.1), pytest.approx(180, abs=0.1)
+            assert picture.width / 300 * 25.4 in widths
+        printed = (results / "figures" / f"{name}.pdf").read_bytes()
+        assert b"/FontFile2" in printed  # TrueType, whole letters
+        assert b"/Type3" not in printed
+        assert b"CreationDate" not in printed
+        assert len(printed) < 2e6
+    maps = (results / "figures" / "thickness_maps.svg").read_text()
+    assert ">Effect, CN-AD<" in maps
+    assert maps.count(">0.05<") == 2  # on the bar of significance, on both sides of zero
+    assert ">CA1<" in maps
+    assert maps.count(">Left<") == maps.count(">Right<") == 1
 
 
 @pytest.mark.usefixtures("with_figures")

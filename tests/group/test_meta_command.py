@@ -10,7 +10,7 @@ from page_outline import Outline
 from small_cohorts import place_of, write_dataset
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.group import analysis, write
+from hipsta_bids.group import analysis, consortium, write
 from hipsta_bids.io import files
 
 SITES = {
@@ -25,6 +25,7 @@ def _only_what_counts():
     """Figures and classifiers take longer than all else."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(write, "draw_figures", lambda *_: iter(()))
+        patch.setattr(consortium, "draw_all", lambda *_: [])
         patch.setattr(analysis, "classify_groups", lambda *_: ([], []))
         yield
 
@@ -66,8 +67,11 @@ def registered(cohort):
 
 @pytest.fixture(scope="module")
 def combined(plain, tmp_path_factory):
+    """Results of both, with figures."""
     out = tmp_path_factory.mktemp("meta")
-    assert main(["meta", *map(str, plain), str(out)]) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(consortium, "draw_all", write.draw_all)
+        assert main(["meta", *map(str, plain), str(out)]) == 0
     return out
 
 
@@ -175,6 +179,18 @@ def test_what_could_be_traced_or_not_combined_is_refused(cohort, tmp_path, capsy
     error = capsys.readouterr().err.strip()
     assert said in error
     assert "\n" not in error
+    assert not folder.exists()
+
+
+def test_harmonized_values_are_refused(cohort, tmp_path, capsys):
+    loose = tmp_path / "loose.toml"
+    loose.write_text("[harmonization]\nleast_participants = 5\n")
+    options = ["--covariates", str(cohort[0].parent / "site.tsv"), "--align", "none"]
+    options += ["--harmonize", "site", "--settings", str(loose)]
+    code, folder = run(cohort, "harmonized", *options, "--export-summary", "all")
+    assert code == 65
+    error = capsys.readouterr().err.strip()
+    assert error.splitlines()[-1].endswith("cannot be combined; leave --harmonize out")
     assert not folder.exists()
 
 
@@ -347,6 +363,15 @@ def test_the_page_is_whole_and_escapes_what_sites_send(plain, tmp_path):
     assert "&lt;script&gt;document" in page
     assert page.count('<figure class="forest">') > 4
     assert "DerSimonian" in page
+
+
+def test_the_page_has_the_maps_of_both_models_and_of_heterogeneity(combined):
+    drawing = (combined / "meta" / "figures" / "thickness_maps.svg").read_text(encoding="utf-8")
+    for title in ("CN-AD (fixed effect)", "CN-AD (random effects)", "Heterogeneity, CN-AD"):
+        assert title in drawing
+    page = (combined / "meta.html").read_text(encoding="utf-8")
+    assert page.count('data-kind="effect"') == page.count('data-kind="significance"') > 0
+    assert "not drawn" not in page
 
 
 def test_tables_say_what_their_columns_are(combined):

@@ -200,12 +200,10 @@ def test_asymmetry():
 
 def test_refusals():
     who, matrix, maps = case(9)
-    both = [Contrast("both", np.eye(3)[1:])]
     cases = {
         "one-session": (maps[::3], matrix[::3, :2], who[::3], single(2)),
         "design-shape": (maps, matrix[1:], who, single(3)),
         "design-rank": (maps, matrix[:, [0, 1, 1]], who, single(3)),
-        "contrast-shape": (maps, matrix, who, both),
     }
     for reason, arguments in cases.items():
         with pytest.raises(ModelError) as caught:
@@ -281,3 +279,57 @@ def test_slopes_without_enough_sessions():
     np.testing.assert_array_equal(np.isnan(found.p), [False, True, True, False])
     none = np.full_like(maps, np.nan)
     assert np.isnan(fit_mixed(none, matrix, who, single(4), SETTINGS, times=time).tests[0].p).all()
+
+
+@pytest.mark.parametrize("slopes", [False, True])
+def test_f_of_groups_in_a_balanced_design_is_analysis_of_variance(slopes):
+    """Of participants' means with random intercepts, and of their slopes with random slopes."""
+    random = np.random.default_rng(5)
+    people, visits, points = 24, 4, 30
+    group, who = np.repeat(np.arange(people) % 3, visits), np.repeat(np.arange(people), visits)
+    times = np.tile(np.arange(visits, dtype=float) - 1.5, people)
+    own = random.normal(0, 1.0, (2, people, points))
+    maps = own[0][who] + own[1][who] * times[:, None]
+    maps += random.normal(0, 0.2, maps.shape)
+    if not slopes:
+        maps -= own[1][who] * times[:, None]
+    levels = np.column_stack([group == level for level in range(3)]).astype(float)
+    matrix = np.hstack([levels, levels * times[:, None]])
+    weights = np.zeros((2, 6))
+    weights[:, 3 * slopes : 3 * slopes + 3] = [[1, -1, 0], [1, 0, -1]]
+    (test,) = fit_mixed(
+        maps,
+        matrix,
+        who.astype(str),
+        [Contrast("any", weights)],
+        LongitudinalSettings(),
+        times=times if slopes else None,
+    ).tests
+    shape = maps.reshape(people, visits, points)
+    line = times[:visits, None] / np.sum(times[:visits] ** 2)
+    values = (shape * line).sum(axis=1) if slopes else shape.mean(axis=1)
+    expected = stats.f_oneway(*(values[np.arange(people) % 3 == level] for level in range(3)))
+    np.testing.assert_allclose(test.statistic, expected.statistic, rtol=1e-4)
+    np.testing.assert_allclose(test.df, people - 3, rtol=1e-3)
+    np.testing.assert_allclose(test.p, expected.pvalue, rtol=2e-3)
+
+
+def test_slopes_of_participants_keep_the_level_that_intercepts_exceed():
+    random = np.random.default_rng(0)
+    people, visits, points = 40, 4, 400
+    who = np.repeat(np.arange(people), visits)
+    times, group = np.tile(np.arange(visits, dtype=float), people), who % 2
+    maps = random.normal(0, 1, (people, points))[who] + random.normal(0, 0.5, (len(who), points))
+    maps += random.normal(0, 0.2, (people, points))[who] * times[:, None]
+    matrix = np.column_stack([np.ones(len(who)), group, times, group * times])
+    contrast = Contrast("difference of changes", np.array([0.0, 0, 0, 1]))
+    shares = [
+        float(np.mean(fit.tests[0].p < 0.05))
+        for own in (None, times)
+        for fit in [
+            fit_mixed(maps, matrix, who.astype(str), [contrast], LongitudinalSettings(), times=own)
+        ]
+    ]
+    # Of 400 tests of nothing, 20 with an SD of 4.4 are expected.
+    assert shares[0] > 0.08
+    assert shares[1] == pytest.approx(0.05, abs=0.025)

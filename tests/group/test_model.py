@@ -270,12 +270,11 @@ def test_covariates_that_do_not_vary_or_are_missing_are_left_out():
     assert default_formula(table, groups, DEFAULTS) == "group + Age"
 
 
-def test_one_level_is_no_group_and_numbers_are_no_names():
+def test_one_level_is_no_group_and_numbers_name_groups_in_their_order():
     assert find_groups(pd.DataFrame({"group": ["a", "a", None]}), DEFAULTS) is None
     assert find_groups(pd.DataFrame({"age": ["1", "2"]}), DEFAULTS) is None
-    with pytest.raises(ModelError) as caught:
-        find_groups(pd.DataFrame({"group": ["0", "1"]}), DEFAULTS)
-    assert caught.value.reason == "group-numeric"
+    table = pd.DataFrame({"group": ["10", "2", "0", "0"]})
+    assert find_groups(table, DEFAULTS).levels == ("0", "2", "10")
 
 
 def test_different_models_have_different_folders():
@@ -312,3 +311,11 @@ def test_contrasts_of_a_request_come_before_those_of_the_groups():
 def test_long_lists_are_cut_in_messages():
     assert listed(range(8)) == "0, 1, 2, 3, 4, 5, 6, 7"
     assert listed(range(11)) == "0, 1, 2, 3, 4, 5, 6, 7 and 3 more"
+
+
+def test_numbers_in_brackets_of_c_are_levels():
+    table = participants().assign(dose=[str(k % 4 * 5) for k in range(60)])
+    found = design("group + C(dose)", ["dose[0]-dose[10]"], table)
+    assert found.columns[3:] == ("C(dose)[T.5]", "C(dose)[T.10]", "C(dose)[T.15]")
+    assert not found.notes
+    assert list(design("group + dose", table=table).notes) == ["dose"]

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import shutil
 from pathlib import Path
 
 import nibabel as nib
@@ -72,6 +73,38 @@ def dataset(tmp_path_factory):
             edit(path, change)
         assert main.main([str(source), str(folder / "out"), "participant", "--n-procs", "1"]) == 1
     return folder
+
+
+def make_anatomy(folder, name="norm.mgz", dtype=np.uint8):
+    """Write an image of 1 mm beside FreeSurfer's labels: dark in them, noise on a slope outside."""
+    paths = sorted(folder.glob("?h.hippo*.mgz"))
+    images = [nib.load(path) for path in paths]
+    corners = np.stack(np.meshgrid(*[[0, 1]] * 3), axis=-1).reshape(-1, 3)
+    ends = [nib.affines.apply_affine(i.affine, corners * i.shape) for i in images]
+    low, high = np.min(ends, axis=(0, 1)) - 12, np.max(ends, axis=(0, 1)) + 12
+    shape = np.ceil(high - low).astype(int)
+    affine = np.diag([1.0, 1.0, 1.0, 1.0])
+    affine[:3, 3] = low
+    points = nib.affines.apply_affine(affine, np.moveaxis(np.indices(shape), 0, -1))
+    values = 120 + (points[..., 1] - low[1]) + np.random.default_rng(3).normal(0, 6, shape)
+    for image in images:
+        index = nib.affines.apply_affine(np.linalg.inv(image.affine), points).round().astype(int)
+        inside = ((index >= 0) & (index < image.shape)).all(axis=-1)
+        codes = np.asarray(image.dataobj)[tuple(index[inside].T)]
+        values[inside] = np.where(codes > 0, 40 + codes % 7, values[inside])
+    nib.save(nib.MGHImage(values.clip(0, 255).astype(dtype), affine), folder / name)
+    return folder / name
+
+
+@pytest.fixture(scope="session")
+def shown(dataset, tmp_path_factory):
+    """Output dataset of which the page of 01 shows an anatomical image behind the labels."""
+    folder = shutil.copytree(dataset, tmp_path_factory.mktemp("anatomy") / "data")
+    make_anatomy(folder / "in/derivatives/freesurfer/sub-01/mri")
+    again = [str(folder / "in"), str(folder / "out"), "participant", "--reports-only"]
+    with contextlib.redirect_stdout(io.StringIO()):
+        assert main.main([*again, "--participant-label", "01", "--n-procs", "1"]) == 0
+    return folder / "out"
 
 
 @pytest.fixture(scope="session")

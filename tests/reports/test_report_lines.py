@@ -43,7 +43,17 @@ def test_the_outline_reaches_the_border_of_the_picture():
 
 def test_lines_with_missing_points_are_left_out():
     lines = np.array([[[0, 0], [1, 2.5]], [[np.nan, 0], [1, 1]]])
-    assert path_data(lines) == "M0.00 0.00L1.00 2.50"
+    assert path_data(lines) == "M0 0l1 2.5"
+
+
+def test_lines_that_meet_are_joined_whichever_way_they_run():
+    lines = np.array([[[1, 0], [2, 0.5]], [[1, 0], [0, 0]], [[2, 0.5], [2, 3]], [[5, 5], [6, 6]]])
+    joined, alone = path_data(lines).split("M")[1:]
+    start, *steps = (np.fromstring(part, sep=" ") for part in joined.replace("l", "M").split("M"))
+    points = np.vstack([start, start + np.cumsum(steps[0].reshape(-1, 2), axis=0)])
+    expected = [[0, 0], [1, 0], [2, 0.5], [2, 3]]
+    assert points.tolist() in (expected, expected[::-1])
+    assert alone == "5 5l1 1"
 
 
 def test_pictures_come_back_as_they_were():

@@ -12,6 +12,7 @@
       vNormal = normalMatrix * normal; vColor = color; vView = -at.xyz;
       gl_Position = projectionMatrix * at;
     }`;
+  // Where the sheet faces the eye its color is that of the legend; elsewhere it is darker, of the same hue.
   const FRAGMENT = `
     precision highp float;
     uniform float opacity, flatness;
@@ -19,10 +20,11 @@
     void main() {
       vec3 n = normalize(vNormal), v = normalize(vView);
       if (dot(n, v) < 0.0) n = -n;
-      float light = 0.55 + 0.35 * max(dot(n, normalize(v + vec3(0.35, 0.55, 0.2))), 0.0) + 0.2 * dot(n, v);
+      float light = 0.6 + 0.4 * clamp(dot(n, normalize(v + vec3(0.2, 0.35, 0.1))), 0.0, 1.0);
       float edge = opacity < 1.0 ? mix(opacity, min(1.0, opacity * 2.6), pow(1.0 - abs(dot(n, v)), 2.0)) : 1.0;
       gl_FragColor = vec4(vColor * mix(light, 1.0, flatness), edge);
     }`;
+  const EDGES = ["medial edge", "lateral edge"], ENDS = ["posterior end plane", "anterior end plane"];
 
   const rgb = (hex) => [1, 3, 5].map((i) => parseInt(hex.slice(i, i + 2), 16) / 255);
   const toScene = ([r, a, s]) => [r, s, -a];
@@ -119,6 +121,7 @@
       }
       this.gl = this.renderer.gl;
       this.gl.clearColor(0.961, 0.969, 0.976, 1);
+      this.pins = this.root.querySelector(".pins");
       this.camera = new OGL.Camera(this.gl, { fov: 28, near: 1, far: 500 });
       // The wheel scrolls the page until the view has been clicked.
       this.solid.addEventListener("wheel", (event) => {
@@ -150,6 +153,7 @@
         this.pick(Math.max(0, Math.min(nx - 1, i + step[0])), Math.max(0, Math.min(ny - 1, j + step[1])));
       });
       if (!this.renderer) return;
+      window.addEventListener("beforeprint", () => this.still());
       let down = null;
       this.solid.addEventListener("pointerdown", (event) => { down = [event.clientX, event.clientY]; this.solid.focus({ preventScroll: true }); });
       this.solid.addEventListener("pointerup", (event) => {
@@ -260,15 +264,20 @@
       const scene = this.scene;
       this.world = new OGL.Transform();
       this.middle = null;
+      this.labels = [];
+      this.balls = [];
+      this.pins.replaceChildren();
       if (scene.surfaces) {
         this.middle = this.mesh(this.points.midthickness, this.index, this.colors());
-        if (this.shows("interior")) this.mesh(this.points.interior, this.index, [0.0, 0.47, 0.35], { opacity: 0.28 });
-        if (this.shows("exterior")) this.mesh(this.points.exterior, this.index, [0.69, 0.27, 0.54], { opacity: 0.28 });
+        if (this.shows("interior")) this.drawLattice("interior", [0.0, 0.47, 0.35]);
+        if (this.shows("exterior")) this.drawLattice("exterior", [0.69, 0.27, 0.54]);
         if (this.shows("boundaries")) {
-          for (const i of [0, scene.shape[0] - 1]) {
-            const { points, index } = tube(this.row("midthickness", i), 0.16);
-            this.mesh(points, index, i ? [0.84, 0.37, 0.0] : [0.1, 0.12, 0.15]);
-          }
+          EDGES.forEach((text, n) => {
+            const line = this.row("midthickness", n ? scene.shape[0] - 1 : 0);
+            const { points, index } = tube(line, 0.16);
+            this.mesh(points, index, n ? [0.84, 0.37, 0.0] : [0.1, 0.12, 0.15]);
+            this.label(line[Math.floor(line.length / 2)], text);
+          });
         }
         if (this.shows("planes")) scene.planes.forEach((plane) => this.drawPlane(plane));
       } else this.mesh(this.body, scene.body.triangles, GRAY, { opacity: 0.62 });
@@ -277,20 +286,57 @@
           const { points, index } = ball(toScene(finding.point), 0.55);
           // Inside a body it is drawn over what covers it.
           const over = scene.surfaces ? {} : { depthTest: false, order: 1 };
-          this.mesh(points, index, KINDS[finding.kind], { flatness: 0.3, ...over });
+          const drawn = this.mesh(points, index, KINDS[finding.kind], { flatness: 0.3, ...over });
+          this.balls.push(Object.assign(drawn, { finding }));
+          const pin = this.label(toScene(finding.point), String(finding.number), "button");
+          pin.className = finding.kind;
+          pin.title = finding.message;
+          pin.setAttribute("aria-label", `Point ${finding.number}, ${finding.kind}: ${finding.message}`);
+          pin.addEventListener("click", () => this.open(finding));
         }
       }
       this.markNode();
     }
 
-    drawPlane({ point, normal }) {
+    // Lines leave the colors between them as they are, which a veil would not.
+    drawLattice(name, color) {
+      const [nx, ny] = this.scene.shape, from = this.points[name], known = (p) => p.every(Number.isFinite);
+      const at = (i, j) => Array.from(from.slice(3 * (i * ny + j), 3 * (i * ny + j) + 3));
+      const every = (n) => Array.from({ length: n }, (_, k) => k);
+      const lines = every(nx).filter((i) => i % 5 === 0).map((i) => every(ny).map((j) => at(i, j)));
+      lines.push(...every(ny).filter((j) => j % 4 === 0).map((j) => every(nx).map((i) => at(i, j))));
+      for (const line of lines) {
+        const { points, index } = tube(line.filter(known), 0.05, 5);
+        this.mesh(points, index, color, { flatness: 0.7 });
+      }
+    }
+
+    drawPlane({ point, normal, end }) {
       const c = new OGL.Vec3(...toScene(point)), n = new OGL.Vec3(...toScene(normal)).normalize();
       const u = new OGL.Vec3(1, 0, 0).cross(n).normalize(), v = new OGL.Vec3().cross(n, u), reach = 0.55 * this.radius;
       const corners = [[-1, -1], [1, -1], [1, 1], [-1, 1]].map(([p, q]) => [
         c.x + reach * (p * u.x + q * v.x), c.y + reach * (p * u.y + q * v.y), c.z + reach * (p * u.z + q * v.z)]);
-      this.mesh(corners.flat(), [0, 1, 2, 0, 2, 3], [0.63, 0.07, 0.09], { opacity: 0.13, flatness: 1 });
-      const { points, index } = tube([...corners, corners[0]], 0.06);
+      const { points, index } = tube([...corners, corners[0]], 0.09);
       this.mesh(points, index, [0.63, 0.07, 0.09], { flatness: 1 });
+      this.label(corners.reduce((high, corner) => (corner[1] > high[1] ? corner : high)), ENDS[end]);
+    }
+
+    // A name beside a point of the scene.
+    label(point, textContent, tag = "span") {
+      const element = Object.assign(document.createElement(tag), { textContent });
+      if (tag === "button") element.type = "button";
+      this.pins.append(element);
+      this.labels.push({ point, element });
+      return element;
+    }
+
+    // The list says what is wrong at a point.
+    open({ number }) {
+      const entry = document.getElementById(`${this.root.dataset.key.replace(/view$/, "points")}-${this.scene.side}-${number}`);
+      if (!entry) return;
+      for (let up = entry; up; up = up.parentElement) if (up.tagName === "DETAILS") up.open = true;
+      entry.scrollIntoView({ block: "start" });
+      (entry.querySelector("summary") || entry).focus({ preventScroll: true });
     }
 
     markNode() {
@@ -313,12 +359,33 @@
       this.camera.perspective({ aspect: width / height });
     }
 
-    frame() {
+    frame(always = false) {
       const box = this.root.getBoundingClientRect();
-      if (!this.world || box.bottom < 0 || box.top > window.innerHeight) return;
+      if (!this.world || (!always && (box.bottom < 0 || box.top > window.innerHeight))) return;
       this.orbit.update();
       this.renderer.render({ scene: this.world, camera: this.camera });
       this.placeLetters();
+      for (const { point, element } of this.labels) {
+        const v = new OGL.Vec3(...point);
+        this.camera.project(v);
+        element.style.left = `${50 * (v.x + 1)}%`;
+        element.style.top = `${50 * (1 - v.y)}%`;
+      }
+    }
+
+    // Paper has the view as it is now: browsers do not print WebGL.
+    still() {
+      this.frame(true);
+      const picture = this.root.querySelector(".still"), { width, height } = this.solid, context = picture.getContext("2d");
+      Object.assign(picture, { width, height });
+      context.drawImage(this.solid, 0, 0);
+      const dpr = width / Math.max(1, this.root.querySelector(".scene").clientWidth);
+      Object.assign(context, { font: `600 ${13 * dpr}px system-ui, sans-serif`, textAlign: "center", textBaseline: "middle", lineWidth: 3 * dpr, strokeStyle: "#fff", fillStyle: "#1d2329" });
+      for (const element of this.root.querySelectorAll(".compass span, .pins *")) {
+        const [x, y] = [element.style.left, element.style.top].map((share) => parseFloat(share) / 100);
+        context.strokeText(element.textContent, x * width, y * height);
+        context.fillText(element.textContent, x * width, y * height);
+      }
     }
 
     placeLetters() {
@@ -336,11 +403,12 @@
     }
 
     pickAt(event) {
-      if (!this.middle) return;
       const box = this.solid.getBoundingClientRect();
       this.raycast.castMouse(this.camera, [2 * ((event.clientX - box.left) / box.width) - 1, 1 - 2 * ((event.clientY - box.top) / box.height)]);
-      const [hit] = this.raycast.intersectMeshes([this.middle], { cullFace: false, includeUV: false, includeNormal: false });
+      const seen = this.middle ? [this.middle, ...this.balls] : this.balls;
+      const [hit] = this.raycast.intersectMeshes(seen, { cullFace: false, includeUV: false, includeNormal: false });
       if (!hit) return;
+      if (hit.finding) { this.open(hit.finding); return; }
       const p = hit.hit.point, points = this.points.midthickness;
       let best = 0, least = Infinity;
       for (let n = 0; n < points.length; n += 3) {

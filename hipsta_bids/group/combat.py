@@ -1,0 +1,319 @@
+"""ComBat: shifts and scales of sites at each point of a map, estimated and taken out.
+
+The method of Johnson, Li and Rabinovic (2007, doi:10.1093/biostatistics/kxj037) as Fortin et al.
+(2018, doi:10.1016/j.neuroimage.2017.11.024) use it for thickness, and with repeated sessions that
+of Beer et al. (2020, doi:10.1016/j.neuroimage.2020.117129). Values may be missing anywhere, and all
+points are done at once.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hipsta_bids.group.data import Bool, Float, Int
+from hipsta_bids.group.formula import Contrast
+from hipsta_bids.group.glm import chunks
+from hipsta_bids.group.mixed import fit_mixed
+from hipsta_bids.group.settings import GroupSettings, HarmonizationSettings
+
+#: Values of a site at a point, below which its variance says nothing about that of other points.
+_FEW = 3
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Visits:
+    """Rows of maps: their sites, and the columns whose effects are kept."""
+
+    site: Int
+    """(visits,) position in the sites; -1 for visits that cannot be harmonized."""
+    columns: Float
+    """(visits, columns) without an intercept; NaN where the site is -1."""
+    participant: Int | None
+    """(visits,) participants as numbers where some have several visits; else ``None``."""
+
+    def take(self, rows: Int) -> "Visits":
+        """Choose rows."""
+        person = None if self.participant is None else self.participant[rows]
+        return Visits(site=self.site[rows], columns=self.columns[rows], participant=person)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SiteEffects:
+    """Parameters of ComBat; sites, columns and points as they are numbered elsewhere."""
+
+    mean: Float
+    """(points,) mean over sites by their size, at zero of all columns; unit of the map."""
+    sd: Float
+    """(points,) residual SD; with repeated sessions that within participants."""
+    slopes: Float
+    """(columns, points) effects that are kept, unit of the map per unit of the column."""
+    ratio: Float
+    """(points,) variance between participants over that within; 0 without repeated sessions."""
+    fixed: Float
+    """(sites, points) shifts of the model, before they are pooled over points, in ``sd``."""
+    shift: Float
+    """(sites, points) what is taken out, in ``sd``."""
+    scale: Float
+    """(sites, points) what residuals are divided by."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SiteMoments:
+    """Residuals of sites at each point, in the SD of all; NaN where there are too few."""
+
+    n: Int
+    """(sites, points)"""
+    mean: Float
+    """(sites, points)"""
+    sd: Float
+    """(sites, points)"""
+
+    def after(self, effects: SiteEffects) -> "SiteMoments":
+        """Moments after harmonization."""
+        mean = (self.mean - effects.shift) / effects.scale
+        return SiteMoments(n=self.n, mean=mean, sd=self.sd / effects.scale)
+
+
+def fit_effects(
+    values: Float, visits: Visits, n_sites: int, settings: GroupSettings, *, pooled: bool
+) -> tuple[SiteEffects, SiteMoments]:
+    """Estimate the effects of sites.
+
+    Parameters
+    ----------
+    values : array
+        (visits, points), NaN where missing.
+    visits : Visits
+        Participants with several of them get random intercepts, and the residual SD is the root
+        mean square of the conditional residuals, as the variant MSR of Beer et al. (2020): without
+        effects of sites it leaves the values as they are.
+    n_sites : int
+        Every site has visits.
+    settings : GroupSettings
+        ``harmonization``, and ``longitudinal`` for random intercepts.
+    pooled : bool
+        Whether points inform each other (empirical Bayes), as those of one map do. Otherwise each
+        site's own mean and variance are taken out.
+
+    Returns
+    -------
+    SiteEffects, SiteMoments
+        Parameters, NaN at points where missing values leave sites and columns inseparable; and the
+        residuals of sites before harmonization.
+    """
+    used = np.flatnonzero(visits.site >= 0)
+    values, visits = values[used], visits.take(used)
+    member = np.eye(n_sites)[visits.site]
+    # Of unit spread around zero, so that the equations are well conditioned.
+    center = visits.columns.mean(axis=0)
+    spread = visits.columns.std(axis=0)
+    spread = np.where(spread > 0, spread, 1.0)
+    design = np.hstack([member, (visits.columns - center) / spread])
+    found = np.full((design.shape[1], values.shape[1]), np.nan)
+    ratio = np.zeros(values.shape[1])
+    varies = np.flatnonzero(_varies(values))
+    if visits.participant is None:
+        for part in chunks((len(values), len(varies)), design.shape[1]):
+            points = varies[part]
+            found[:, points] = _least_squares(values[:, points], design)
+    elif len(varies):
+        there = np.flatnonzero(design.any(axis=0))
+        any_contrast = Contrast("", np.eye(len(there))[:1])
+        names = visits.participant.astype(np.str_)
+        own, matrix = values[:, varies], design[:, there]
+        fit = fit_mixed(own, matrix, names, [any_contrast], settings.longitudinal)
+        found[:, varies] = 0.0
+        found[np.ix_(there, varies)] = fit.coefficients
+        ratio[varies] = fit.variances["participant"] / fit.variances["residual"]
+    sites, slopes = found[:n_sites], found[n_sites:] / spread[:, None]
+    counts = member.T @ np.isfinite(values)
+    middle = np.einsum("sp,sp->p", counts, sites) / np.maximum(counts.sum(axis=0), 1)
+    effects = SiteEffects(
+        mean=middle - center @ slopes,
+        sd=np.ones(values.shape[1]),
+        slopes=slopes,
+        ratio=ratio,
+        fixed=sites - middle,
+        shift=np.zeros_like(sites),
+        scale=np.ones_like(sites),
+    )
+    square, count = np.zeros((2, values.shape[1]))
+    for part, rest in _residuals(effects, values, visits):
+        rest -= effects.fixed[visits.site, part]  # noqa: PLW2901 -- ours
+        square[part], count[part] = np.nansum(rest**2, axis=0), np.isfinite(rest).sum(axis=0)
+    sd = np.sqrt(square / np.maximum(count, 1))
+    effects = replace(effects, sd=np.where(sd > 0, sd, np.nan), fixed=effects.fixed / sd)
+    return _with_shifts(effects, values, visits, settings.harmonization, pooled=pooled)
+
+
+def extend_effects(
+    effects: SiteEffects,
+    values: Float,
+    visits: Visits,
+    settings: GroupSettings,
+    *,
+    pooled: bool,
+) -> tuple[SiteEffects, SiteMoments]:
+    """Estimate the effects of further sites, with all else as it was estimated before.
+
+    Sites beyond those of the effects are new. The moments are those of the given values.
+    """
+    known = len(effects.fixed)
+    used = np.flatnonzero(visits.site >= 0)
+    values, visits = values[used], visits.take(used)
+    total = max(int(visits.site.max(initial=-1)) + 1, known)
+    wider = np.zeros((total, values.shape[1]))
+    flat = replace(effects, ratio=np.zeros_like(effects.ratio), fixed=wider)
+    wider = np.vstack([effects.fixed, _moments(flat, values, visits)[1][known:]])
+    wide = replace(effects, fixed=wider)
+    fitted, moments = _with_shifts(wide, values, visits, settings.harmonization, pooled=pooled)
+    shift, scale = fitted.shift.copy(), fitted.scale.copy()
+    shift[:known], scale[:known] = effects.shift, effects.scale
+    return replace(fitted, shift=shift, scale=scale), moments
+
+
+def harmonize(values: Float, visits: Visits, effects: SiteEffects) -> Float:
+    """Take shifts and scales of sites out of values (visits, points).
+
+    What the columns explain stays, and with repeated sessions what participants have of their own.
+    Visits without a site or column are NaN.
+    """
+    used = np.flatnonzero(visits.site >= 0)
+    own = visits.take(used)
+    result = np.full(values.shape, np.nan)
+    for part, rest in _residuals(effects, values[used], own):
+        sd, shift, scale = effects.sd[part], effects.shift[own.site, part], effects.scale
+        kept = (rest / sd - shift) / scale[own.site, part]
+        result[used, part] = values[used, part] - rest + sd * kept
+    return result
+
+
+def _varies(values: Float) -> Bool:
+    """Tell points that have different values."""
+    known = np.isfinite(values)
+    low = np.where(known, values, np.inf).min(axis=0)
+    high = np.where(known, values, -np.inf).max(axis=0)
+    return np.asarray(low < high)
+
+
+def _least_squares(values: Float, design: Float) -> Float:
+    """(columns, points) coefficients with values missing anywhere; NaN where none are unique.
+
+    A site without values at a point has the coefficient 0 there.
+    """
+    present = np.isfinite(values)
+    grams = np.repeat((design.T @ design)[None], values.shape[1], axis=0)
+    for point in np.flatnonzero(~present.all(axis=0)):
+        lost = design[~present[:, point]]
+        grams[point] -= lost.T @ lost
+    right = (design.T @ np.where(present, values, 0.0)).T
+    diagonal = np.arange(design.shape[1])
+    size = grams[:, diagonal, diagonal]
+    absent = size < 0.5  # noqa: PLR2004 -- a number of values, but for rounding
+    grams[:, diagonal, diagonal] = np.where(absent, 1.0, size)
+    size = np.sqrt(grams[:, diagonal, diagonal])
+    unit = grams / (size[:, :, None] * size[:, None, :])
+    unique = np.linalg.eigvalsh(unit)[:, 0] > np.sqrt(np.finfo(np.float64).eps)
+    grams[~unique] = np.eye(design.shape[1])
+    found = np.linalg.solve(grams, right[:, :, None])[:, :, 0]
+    return np.where(unique[:, None], found, np.nan).T
+
+
+def _residuals(
+    effects: SiteEffects, values: Float, visits: Visits
+) -> Iterator[tuple[slice, Float]]:
+    """Take what columns and participants explain out of values, at some points after others.
+
+    A participant's own part is the mean of what the model leaves, shrunk as the best linear
+    unbiased prediction is.
+    """
+    for part in chunks(values.shape, 4):
+        rest = values[:, part] - effects.mean[part] - visits.columns @ effects.slopes[:, part]
+        if visits.participant is not None:
+            without = rest - effects.sd[part] * effects.fixed[visits.site, part]
+            rest -= _intercepts(without, visits.participant, effects.ratio[part])
+        yield part, rest
+
+
+def _intercepts(rest: Float, participant: Int, ratio: Float) -> Float:
+    """(visits, points) predicted random intercepts."""
+    _, numbers = np.unique(participant, return_inverse=True)
+    order = np.argsort(numbers, kind="stable")
+    starts = np.searchsorted(numbers[order], np.arange(numbers.max() + 1))
+    known = np.isfinite(rest)
+    total = np.add.reduceat(np.where(known, rest, 0.0)[order], starts, axis=0)
+    count = np.add.reduceat(known[order].astype(np.float64), starts, axis=0)
+    return np.asarray((total * ratio / (1 + count * ratio))[numbers])
+
+
+def _moments(effects: SiteEffects, values: Float, visits: Visits) -> tuple[Float, Float, Float]:
+    """Count, mean and sum of squares around it of residuals, in SD, by site and point."""
+    sites = len(effects.fixed)
+    member = np.eye(sites)[visits.site]
+    n, total, square = np.zeros((3, sites, values.shape[1]))
+    for part, rest in _residuals(effects, values, visits):
+        unit = rest / effects.sd[part]
+        known = np.isfinite(unit)
+        unit = np.where(known, unit, 0.0)
+        n[:, part], total[:, part] = member.T @ known, member.T @ unit
+        square[:, part] = member.T @ unit**2
+    mean = total / np.where(n > 0, n, np.nan)
+    return n, mean, np.maximum(square - n * np.where(n > 0, mean, 0.0) ** 2, 0.0)
+
+
+def _with_shifts(
+    effects: SiteEffects,
+    values: Float,
+    visits: Visits,
+    settings: HarmonizationSettings,
+    *,
+    pooled: bool,
+) -> tuple[SiteEffects, SiteMoments]:
+    """Complete effects by the shifts and scales that standardized residuals show."""
+    n, mean, around = _moments(effects, values, visits)
+    variance = np.where(n > 1, around / np.where(n > 1, n - 1, 1), np.nan)
+    shift, square = mean.copy(), variance.copy()
+    # Without pooling, a few values give no variance, and equal ones none to divide by.
+    square[~(n >= _FEW)] = np.nan
+    square[square == 0] = 1.0
+    shift[~(n >= _FEW)] = np.nan
+    for site in range(len(n)) if pooled else ():
+        told = (n[site] >= _FEW) & np.isfinite(variance[site])
+        if told.sum() > 1:
+            shift[site], square[site] = _pool(n[site], mean[site], around[site], told, settings)
+    where = np.isfinite(effects.sd)
+    done = replace(
+        effects,
+        shift=np.where(where, shift, np.nan),
+        scale=np.where(where, np.sqrt(square), np.nan),
+    )
+    return done, SiteMoments(n=n.astype(np.int64), mean=mean, sd=np.sqrt(variance))
+
+
+def _pool(
+    n: Float, mean: Float, around: Float, told: Bool, settings: HarmonizationSettings
+) -> tuple[Float, Float]:
+    """Posterior shift and variance of one site at each point (Johnson et al. 2007, section 3).
+
+    Over points, shifts are normal and variances inverse gamma; their parameters are moments of the
+    points that are ``told`` by enough values. Others take what these say.
+    """
+    variance = around[told] / (n[told] - 1)
+    prior, spread = mean[told].mean(), mean[told].var(ddof=1)
+    middle, width = variance.mean(), variance.var(ddof=1)
+    if not (width > 0 and middle > 0):
+        return np.where(n > 0, mean, prior), np.full_like(mean, middle if middle > 0 else 1.0)
+    shape, rate = 2 + middle**2 / width, middle * (1 + middle**2 / width)
+    own = np.where(n > 0, mean, 0.0)
+    square = np.where(told, around / np.maximum(n - 1, 1), middle)
+    shift = np.where(n > 0, mean, prior)
+    for _ in range(settings.iterations):
+        next_shift = (spread * n * own + square * prior) / (spread * n + square)
+        next_square = (rate + (around + n * (own - next_shift) ** 2) / 2) / (n / 2 + shape - 1)
+        change = np.max(np.abs(next_square / square - 1))
+        change = max(change, np.max(np.abs(next_shift - shift)))
+        shift, square = next_shift, next_square
+        if change < settings.tolerance:
+            break
+    return shift, square

@@ -1,0 +1,198 @@
+"""The anatomical image behind the labels: the right one, in its place, or none."""
+
+import base64
+import gzip
+import io
+import json
+import re
+import shutil
+import zlib
+
+import nibabel as nib
+import numpy as np
+import pytest
+from PIL import Image
+
+from hipsta_bids.cli import main
+from hipsta_bids.inputs.anatomy import Candidate
+from hipsta_bids.io.volumes import read_scalars
+from hipsta_bids.reports import results
+from hipsta_bids.reports.cohort import read_cohort
+from hipsta_bids.reports.participant import participant_page
+from hipsta_bids.reports.results import anatomy_of, find_results, read_views
+from hipsta_bids.reports.slices import slice_panels, stack_of
+
+MRI = "derivatives/freesurfer/sub-01/mri"
+
+
+@pytest.fixture
+def copy(shown, tmp_path):
+    """A copy of input and output, to do harm to."""
+    return shutil.copytree(shown.parent, tmp_path / "data")
+
+
+def views_of(folder, hemi="L"):
+    found = find_results(folder / "out", "01")
+    hemisphere = next(h for h in found if h.place.name.hemi == hemi)
+    return hemisphere, read_views(hemisphere, folder / "in")
+
+
+def test_the_page_shows_it_and_says_which_file(shown):
+    text = (shown / "sub-01.html").read_text()
+    assert text.count("Behind the labels: <code>norm.mgz</code>") == 2
+    assert len(re.findall(r'<image class="anatomy" href="data:image/jpeg;base64,', text)) >= 12
+    assert len(text) < 2_500_000
+    assert "Behind the labels" not in (shown / "sub-02.html").read_text()
+
+
+def test_values_are_those_of_the_image_at_the_same_points(tmp_path):
+    affine = np.array([[0, -1.2, 0.3, 5], [0.9, 0, 0, -8], [0, 0.2, 1.1, 3], [0, 0, 0, 1]])
+    indices = np.indices((20, 24, 22))
+    image = np.einsum("i,i...->...", [2.0, 3.0, 5.0], indices)
+    nib.save(nib.Nifti1Image(image.astype(np.float32), affine), tmp_path / "a.nii.gz")
+    index = np.random.default_rng(0).uniform(4, 15, (50, 3))
+    points = nib.affines.apply_affine(affine, index)
+    anatomy = anatomy_of("a.nii.gz", read_scalars(tmp_path / "a.nii.gz", points))
+    read = anatomy.grays(points).astype(float)
+    assert 0 < read.min() < read.max() < 255
+    # Gray is linear in the value between black and white, and the image linear in the index.
+    slope, offset = np.polyfit(index @ [2, 3, 5], read, 1)
+    assert slope > 0
+    assert np.abs(slope * (index @ [2, 3, 5]) + offset - read).max() < 1
+    assert anatomy.grays(points + 1000).tolist() == [255] * 50
+
+
+def test_it_lies_where_the_labels_are(shown):
+    for hemi in "LR":
+        hemisphere, views = views_of(shown.parent, hemi)
+        for panel in slice_panels(hemisphere, views):
+            data = panel.anatomy.removeprefix("data:image/jpeg;base64,")
+            gray = np.asarray(Image.open(io.BytesIO(base64.b64decode(data)))).astype(float)
+            # The same pixels of the labels, by the position in the window.
+            left, top, width, height = panel.window
+            across, level = panel.at["across"], panel.at["level"]
+            right, up = (axis for axis in range(3) if axis != across)
+            rows, columns = np.indices(gray.shape)
+            x = left + (columns + 0.5) * width / gray.shape[1]
+            y = top + (rows + 0.5) * height / gray.shape[0]
+            i = np.floor(x / views.voxel[right]).astype(int)
+            j = views.shape[up] - 1 - np.floor(y / views.voxel[up]).astype(int)
+            inside = (i >= 0) & (i < views.shape[right]) & (j >= 0) & (j < views.shape[up])
+            plane = np.moveaxis(views.labels, across, 0)[level]
+            labeled = np.zeros(gray.shape, dtype=bool)
+            labeled[inside] = plane[i[inside], j[inside]] > 0
+            assert gray[labeled].mean() < gray[~labeled].mean() - 60
+
+
+def unpacked(stack):
+    values = np.frombuffer(zlib.decompress(base64.b64decode(stack["stack"])), dtype=np.uint8)
+    return values.reshape(stack["shape"])
+
+
+def test_the_stack_of_slices_has_labels_body_and_image(shown):
+    _, views = views_of(shown.parent)
+    stack = json.loads(json.dumps(stack_of(views)))
+    values = unpacked(stack)
+    np.testing.assert_array_equal(values >= 128, views.mask)
+    codes = np.array([0, *views.names])
+    known = np.where(np.isin(views.labels, list(views.names)), views.labels, 0)
+    np.testing.assert_array_equal(codes[values % 128], known)
+    grays = unpacked(stack["anatomy"])
+    assert grays.max() < stack["levels"]
+    # At 1 mm, not at the finer voxels of the labels.
+    assert np.abs(np.array(grays.shape) - np.array(views.shape) * views.voxel).max() <= 1
+    # Both volumes fill the same box: dark is where the labels are.
+    index = [np.round((np.arange(n) + 0.5) * m / n - 0.5).astype(int) for n, m in
+             zip(grays.shape, values.shape, strict=True)]  # fmt: skip
+    labeled = (values % 128 > 0)[np.ix_(*index)]
+    assert grays[labeled].mean() < grays[~labeled].mean() - 15
+
+
+def shift(path):
+    image = nib.load(path)
+    affine = image.affine.copy()
+    affine[:3, 3] += 200
+    nib.save(nib.MGHImage(np.asarray(image.dataobj), affine), path)
+
+
+def flatten(path):
+    image = nib.load(path)
+    nib.save(nib.MGHImage(np.full(image.shape, 7, np.uint8), image.affine), path)
+
+
+def stretch(path):
+    image = nib.load(path)
+    data = np.stack([np.asarray(image.dataobj)] * 2, axis=-1)
+    nib.save(nib.MGHImage(data, image.affine), path)
+
+
+def cut_off(path):
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def bomb(path):
+    """A header that declares more than there is."""
+    header = nib.load(path).header.copy()
+    header.set_data_shape((2000, 2000, 2000))
+    path.write_bytes(gzip.compress(header.binaryblock))
+
+
+@pytest.mark.parametrize(
+    ("harm", "said"),
+    [
+        (shift, "does not cover the body"),
+        (flatten, "has one value everywhere round the body"),
+        (stretch, "is unusable: not-3d"),
+        (cut_off, "is unusable: unreadable-image"),
+        (lambda path: path.write_text("x"), "is unusable: unreadable-image"),
+        (bomb, "is unusable: unreadable-image"),
+    ],
+    ids=["elsewhere", "uniform", "two volumes", "cut off", "text", "declared"],
+)
+def test_an_image_that_does_not_fit_costs_the_image_only(copy, harm, said):
+    harm(copy / "in" / MRI / "norm.mgz")
+    _, views = views_of(copy)
+    assert views.anatomy is None
+    assert views.unused == f"norm.mgz {said}"
+    assert views.labels is not None
+
+
+def test_the_page_says_that_an_image_is_not_shown(copy):
+    shift(copy / "in" / MRI / "norm.mgz")
+    text = participant_page(copy / "out", "01", None, read_cohort(copy / "out"), copy / "in")
+    assert text.count("No anatomical image is shown: norm.mgz does not cover the body.") == 2
+    assert 'class="labels"' in text
+    assert 'class="anatomy"' not in text
+
+
+def test_an_image_of_unknown_space_has_to_have_the_grid_of_the_labels(copy, monkeypatch):
+    (labels,) = (copy / "in" / MRI).glob("lh.hippo*.mgz")
+    image = nib.load(labels)
+    noise = np.random.default_rng(0).uniform(0, 99, image.shape).astype(np.float32)
+    same, other = copy / "same_T1w.nii.gz", copy / "other_T1w.nii.gz"
+    nib.save(nib.Nifti1Image(noise, image.affine), same)
+    moved = image.affine.copy()
+    moved[0, 3] += 0.3
+    nib.save(nib.Nifti1Image(noise, moved), other)
+
+    def shown_of(*candidates):
+        monkeypatch.setattr(results, "find_anatomy", lambda *_: iter(candidates))
+        views = views_of(copy)[1]
+        return views.anatomy and views.anatomy.name, views.unused
+
+    unknown = [Candidate(path=path, proven=False) for path in (other, same)]
+    assert shown_of(*unknown) == ("same_T1w.nii.gz", None)
+    why = "has another grid than the labels, so its space may be another"
+    assert shown_of(unknown[0]) == (None, f"other_T1w.nii.gz {why}")
+    assert shown_of(Candidate(path=other, proven=True)) == ("other_T1w.nii.gz", None)
+
+
+def test_without_anatomy_no_trace_of_it_is_in_the_page(copy, out, capsys):
+    page = copy / "out/sub-01.html"
+    assert "data:image/jpeg" in page.read_text()
+    command = [str(copy / "in"), str(copy / "out"), "participant", "--participant-label", "01"]
+    # Nothing is measured, but the page is made again, as if there were no such image.
+    assert main.main([*command, "--no-anatomy", "--n-procs", "1"]) == 0
+    assert "2 unchanged" in capsys.readouterr().out
+    assert page.read_text() == (out / "sub-01.html").read_text()
+    assert "jpeg" not in page.read_text()
