@@ -112,6 +112,47 @@ def surrogate_parser() -> Parser:
     return parser
 
 
+def meta_parser() -> Parser:
+    """Describe ``hipsta-bids meta``."""
+    parser = Parser(
+        prog="hipsta-bids meta",
+        description="combine the summaries of several sites, which `group --export-summary` writes:"
+        "\nfixed and random effects at each point and of summary measures",
+        epilog="results: OUT/meta/; begin with OUT/meta.html\n\nexit codes: 0 done; 64 wrong use;"
+        " 65 a summary cannot be read, or sites do not agree; 73 cannot write",
+    )
+    parser.add_argument(
+        "sites", nargs="+", metavar="SITE", help="summary.json of a site, or NAME=summary.json"
+    )
+    parser.add_argument("out", type=Path, metavar="OUT", help="folder for the results")
+    add = adder(parser)
+    add(
+        "--random",
+        "",
+        "variance between sites: restricted maximum likelihood with tests of Knapp and Hartung"
+        " (reml, the default), or DerSimonian and Laird (dl)",
+        choices=["reml", "dl"],
+    )
+    add(
+        "--correction",
+        "",
+        "false discovery rate over points (default: fdr2)",
+        choices=["fdr2", "bh"],
+    )
+    add(
+        "--fdr-scope",
+        "",
+        "what is one family of tests (default: map)",
+        choices=["map", "hemispheres"],
+    )
+    add(
+        "--settings",
+        "FILE.toml",
+        "settings of the group level, of which meta and multiplicity count",
+    )
+    return parser
+
+
 def validate_parser() -> Parser:
     """Describe ``hipsta-bids validate``."""
     parser = Parser(
@@ -264,6 +305,41 @@ def run_surrogate(arguments: Sequence[str]) -> ExitCode:
         return ExitCode.OK
     check_output_is_no_input(options.output_dir, found.items)
     return crosscheck(found.items, options.output_dir, settings, echo, warn)
+
+
+def run_meta_analysis(arguments: Sequence[str]) -> ExitCode:
+    """Combine summaries of sites."""
+    options = meta_parser().parse_intermixed_args(arguments)
+    from hipsta_bids.group.consortium import MetaOptions, run_meta  # noqa: PLC0415  (heavy)
+    from hipsta_bids.group.settings import load_group_settings  # noqa: PLC0415  (start-up time)
+
+    chosen = {
+        "meta": {"random": options.random},
+        "multiplicity": {"method": options.correction, "scope": options.fdr_scope},
+    }
+    settings = load_group_settings(options.settings)
+    for section, values in chosen.items():
+        given = {name: value for name, value in values.items() if value is not None}
+        settings = settings.changed(**{section: given})
+    request = MetaOptions(
+        sites=tuple(_site(text) for text in options.sites),
+        out_dir=options.out,
+        command=("hipsta-bids", "meta", *arguments),
+    )
+    page, notes = run_meta(request, settings)
+    for note in notes:
+        echo(f"note: {note}")
+    echo(f"results: {options.out / 'meta'}")
+    echo(f"what was done and found: {page}")
+    return ExitCode.OK
+
+
+def _site(text: str) -> tuple[str | None, Path]:
+    """Read ``NAME=PATH``, or a path."""
+    name, equals, path = text.partition("=")
+    if equals and name and "/" not in name:
+        return name, Path(path)
+    return None, Path(text)
 
 
 def run_validation(arguments: Sequence[str]) -> ExitCode:

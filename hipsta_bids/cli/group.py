@@ -63,6 +63,14 @@ def group_parser() -> Parser:
     _add_comparison(parser)
     _add_methods(parser)
     _add_trials(parser)
+    adder(parser.add_argument_group("other sites"))(
+        "--export-summary",
+        "SITE",
+        "also write summary.json, estimates without values of participants, for `hipsta-bids"
+        " meta`; SITE is this site's name (default: that of the folder BIDS_DIR)",
+        nargs="?",
+        const="",
+    )
     _add_reports(parser)
     return parser
 
@@ -204,7 +212,11 @@ def _add_methods(parser: Parser) -> None:
         "registration of curvature profiles (default: registr)",
         choices=["registr", "penalized", "penalised", "none"],
     )
-    add("--template", "FILE", "register to the template.json of another analysis")
+    add(
+        "--template",
+        "FILE",
+        "register to the template.json of another analysis, or that in a summary.json",
+    )
     add(
         "--harmonize",
         "COLUMN",

@@ -28,6 +28,7 @@ COMMANDS = {
     "demo": ("run_demo", "DIR", "write it, run on it, and compare with the truth"),
     "phantom": ("write_phantoms", "DIR", "write a synthetic cohort with a known effect"),
     "surrogate": ("run_surrogate", "IN OUT", "measure thickness in single slices to check maps"),
+    "meta": ("run_meta_analysis", "SITE... OUT", "combine summaries of sites (group level)"),
     "validate": ("run_validation", "", "measure accuracy on phantoms, write a report"),
 }
 

@@ -260,6 +260,9 @@ TRIAL_MAPS: dict[str, tuple[str, str, str]] = {
     "n": ("power", "per_arm", "1"),
 }
 
+#: Folder and page of a meta-analysis, in an output folder of its own.
+META, META_REPORT = "meta", "meta.html"
+
 #: Lines of ``.bidsignore``, and why BIDS has no name for what each hides. The validator (3.0)
 #: passes over what is in a folder with a final slash, but not over the folder; and a wildcard
 #: before another one ends at the first character that follows it in the pattern. So folders have

@@ -43,6 +43,23 @@ REFERENCES: Mapping[str, str] = {
     "mixed": "Kuznetsova A, Brockhoff PB, Christensen RHB. lmerTest package: tests in linear mixed"
     " effects models. Journal of Statistical Software 2017;82(13):1-26."
     " doi:10.18637/jss.v082.i13",
+    "join": "Becker BJ, Wu MJ. The synthesis of regression slopes in meta-analysis. Statistical"
+    " Science 2007;22(3):414-429. doi:10.1214/07-STS243",
+    "reml": "Viechtbauer W. Bias and efficiency of meta-analytic variance estimators in the"
+    " random-effects model. Journal of Educational and Behavioral Statistics 2005;30(3):261-293."
+    " doi:10.3102/10769986030003261",
+    "dl": "DerSimonian R, Laird N. Meta-analysis in clinical trials. Controlled Clinical Trials"
+    " 1986;7(3):177-188. doi:10.1016/0197-2456(86)90046-2",
+    "knapp-hartung": "Knapp G, Hartung J. Improved tests for a random effects meta-regression with"
+    " a single covariate. Statistics in Medicine 2003;22(17):2693-2710. doi:10.1002/sim.1482",
+    "modified": "Röver C, Knapp G, Friede T. Hartung-Knapp-Sidik-Jonkman approach and its"
+    " modification for random-effects meta-analysis with few studies. BMC Medical Research"
+    " Methodology 2015;15:99. doi:10.1186/s12874-015-0091-1",
+    "i2": "Higgins JPT, Thompson SG. Quantifying heterogeneity in a meta-analysis. Statistics in"
+    " Medicine 2002;21(11):1539-1558. doi:10.1002/sim.1186",
+    "prediction": "Higgins JPT, Thompson SG, Spiegelhalter DJ. A re-evaluation of random-effects"
+    " meta-analysis. Journal of the Royal Statistical Society A 2009;172(1):137-159."
+    " doi:10.1111/j.1467-985X.2008.00552.x",
     "moments": "Raudenbush SW. Analyzing effect sizes: random-effects models. In: Cooper H, Hedges"
     " LV, Valentine JC, eds. The Handbook of Research Synthesis and Meta-Analysis. 2nd ed. Russell"
     " Sage Foundation; 2009:295-315.",

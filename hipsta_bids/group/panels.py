@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hipsta_bids.group.analysis import Analysis, mean_of_known, members_of, rows_of
-from hipsta_bids.group.data import Bool, Cohort, Float, Int
+from hipsta_bids.group.data import Bool, Cohort, Float
 from hipsta_bids.group.glm import FittedMaps
-from hipsta_bids.group.inference import MapKey
+from hipsta_bids.group.inference import Discoveries, MapKey
 from hipsta_bids.group.shapes import AverageShape
-from hipsta_bids.group.views import View, across, look
+from hipsta_bids.group.views import View, across, draw_mesh, laid_out, look
 from hipsta_bids.reports import display
 from hipsta_bids.reports.display import X_ENDS, Y_ENDS
 from hipsta_bids.reports.group_maps import EFFECT_NAMES, map_id, signed_logarithm
@@ -55,7 +55,7 @@ _FLAT = 1e-3  # a surface is flat if it is thinner than this share of its length
 _HALF = 0.5
 _HEAD_PIXELS = round(_HEAD * MM)
 _FAR_APART = 0.35  # of the most extreme ticks of p
-_EXTEND = {"significance": "neither", "agreement": "min"}  # color bars, where 1 is most
+_EXTEND = {"significance": "neither", "heterogeneity": "neither", "agreement": "min"}  # color bars
 
 
 Scale = Mapping[str, Any]
@@ -69,7 +69,7 @@ class Row:
     """One quantity on all sides."""
 
     kind: str
-    """``mean``, ``effect``, ``significance``; of trials ``error``, ``agreement``, ``size``."""
+    """``mean``, ``effect``, ``significance``, or another that has no place in the page's data."""
     index: int
     """Of the group, or of the contrast."""
     title: str
@@ -99,7 +99,18 @@ def draw_measure(
     """
     sides = {hemi: one for hemi, one in analysis.fitted.items() if measure in one.fits}
     blocks = [[row] for row in _means(cohort, analysis, sides, measure)]
-    blocks += _contrasts(analysis, sides, measure)
+    blocks += contrasts(analysis.fitted, analysis.found, measure)
+    return draw_pages(cohort, sides, shapes, views, blocks)
+
+
+def draw_pages(
+    cohort: Cohort,
+    sides: Mapping[str, FittedMaps],
+    shapes: Mapping[str, AverageShape],
+    views: Views,
+    blocks: Sequence[list[Row]],
+) -> "list[Figure]":
+    """Draw rows, of which those of a block are on the same figure."""
     pages: list[list[Row]] = [[]]
     for block in blocks:
         if len(pages[-1]) + len(block) > _MOST_ROWS:
@@ -140,13 +151,20 @@ def _means(
         )
 
 
-def _contrasts(
-    analysis: Analysis, sides: Mapping[str, FittedMaps], measure: str
+def contrasts(
+    fitted: Mapping[str, FittedMaps],
+    discoveries: Mapping[MapKey, Discoveries],
+    measure: str,
+    like: Mapping[str, str] | None = None,
 ) -> Iterator[list[Row]]:
-    """Effect sizes and corrected p-values of each contrast."""
-    tests = {hemi: one.fits[measure].tests for hemi, one in sides.items()}
+    """Effect sizes and corrected p-values of each contrast.
+
+    ``like`` names contrasts of which others take the colors.
+    """
+    sides = [hemi for hemi, one in fitted.items() if measure in one.fits]
+    tests = {hemi: fitted[hemi].fits[measure].tests for hemi in sides}
     found = {
-        (test.contrast.name, hemi): analysis.found[MapKey(measure, test.contrast.name, hemi)]
+        (test.contrast.name, hemi): discoveries[MapKey(measure, test.contrast.name, hemi)]
         for hemi, own in tests.items()
         for test in own
     }
@@ -162,10 +180,10 @@ def _contrasts(
         name = test.contrast.name
         every = [
             display.Effects(other.kind, other.effect, other.statistic, other.df)
-            for one in analysis.fitted.values()
+            for one in fitted.values()
             for fit in one.fits.values()
             for other in fit.tests
-            if other.contrast.name == name
+            if other.contrast.name == (like or {}).get(name, name)
         ]
         reach = display.effect_reach(every)
         low, colors, p_colors = display.effect_colors(test.kind)
@@ -195,7 +213,7 @@ def _contrasts(
                 scale={"cmap": p_colors, "vmin": low * top, "vmax": top},
                 values={hemi: signed[name, hemi] for hemi in sides},
                 survive=survive,
-                level=found[name, next(iter(sides))].alpha,
+                level=found[name, sides[0]].alpha,
             ),
         ]
 
@@ -478,42 +496,6 @@ def _beyond(nodes: Float) -> Float:
     """Add the outer edges of the first and of the last cell to the nodes."""
     half = (nodes[1] - nodes[0]) / 2
     return np.concatenate([[nodes[0] - half], nodes, [nodes[-1] + half]])
-
-
-def draw_mesh(axes: "Axes", mesh: Mesh, values: Float, scale: Mapping[str, Any]) -> None:
-    """Draw a map on a flat surface, in its own coordinates."""
-    plane, triangles, words = laid_out(mesh)
-    known = np.isfinite(values.ravel()[triangles]).all(axis=1)
-    axes.set_aspect("equal")
-    axes.set_ylabel(words[1], labelpad=2)
-    (left, bottom), (right, top) = plane.min(axis=0), plane.max(axis=0)
-    if known.any():
-        some = triangles[known]
-        colors = values.ravel()[some].mean(axis=1)
-        axes.tripcolor(
-            plane[:, 0],
-            plane[:, 1],
-            triangles=some,
-            facecolors=colors,
-            **scale,
-            edgecolors="none",
-            rasterized=True,
-        )
-    axes.set_xlim(left, right)
-    axes.set_ylim(*((top, bottom) if words[1].startswith("x") else (bottom, top)))
-
-
-def laid_out(mesh: Mesh) -> tuple[Float, Int, tuple[str, str]]:
-    """Positions of a flat surface in the plane, triangles, and what the axes are.
-
-    HippUnfold's runs from anterior to posterior along x and from the subiculum to the dentate
-    gyrus along y, so that x goes down and y to the right, as on a sheet.
-    """
-    reach = np.ptp(mesh.points, axis=0)
-    names = ("x of the surface", "y of the surface")
-    if reach[0] > reach[1]:
-        return mesh.points[:, [1, 0]], mesh.triangles, (names[1], names[0])
-    return mesh.points[:, :2], mesh.triangles, names
 
 
 def _draw_bar(axes: "Axes", row: Row) -> None:

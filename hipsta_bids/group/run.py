@@ -24,6 +24,7 @@ from hipsta_bids.group.collect import (
 from hipsta_bids.group.comparison import Comparison, choose_visits
 from hipsta_bids.group.covariates import VisitTime, add_time, read_covariates, read_icv
 from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Measures
+from hipsta_bids.group.exchange import SUMMARY, summarize, write_summary
 from hipsta_bids.group.formula import parse_model, with_factors
 from hipsta_bids.group.harmonize import harmonization_record
 from hipsta_bids.group.model import (
@@ -87,6 +88,9 @@ class GroupOptions:
     harmonize_model: Path | None = None
     """Parameters of the harmonization of another analysis."""
     comparison: Comparison = field(default_factory=Comparison)
+    export_summary: str | None = None
+    """Name of this site in a summary for others, empty for that of the folder; ``None`` for no
+    summary."""
     reports: bool = True
     """Whether a page is made."""
     command: tuple[str, ...] = ()
@@ -194,6 +198,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
     name = folder_name(model.formula, wanted) + options.comparison.suffix
     name = options.model.name or (name if region == "body" else f"{name}_{region}")
     notes = [*inputs.notes, *_notes(options, inputs, analysis, settings)]
+    summary = _summary(options, inputs, analysis, settings, notes)
     tell("average surfaces")
     shapes = average_shapes(inputs.found.records, cohort, analysis, settings)
     describe_dataset(options)
@@ -210,6 +215,8 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
             ratings=inputs.found.ratings,
         )
         files.write_json(folder / "model.json", document)
+        if summary is not None:
+            write_summary(folder / SUMMARY, summary)
         write_shapes(folder, shapes)
         if analysis.sides and inputs.found.records and not shapes:
             notes.append("no average surfaces: those of the participant level are missing")
@@ -227,6 +234,33 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         notes=tuple(notes),
         warnings=inputs.found.warnings,
     )
+
+
+def _summary(
+    options: GroupOptions,
+    inputs: GroupInputs,
+    analysis: Analysis,
+    settings: GroupSettings,
+    notes: list[str],
+) -> dict[str, Any] | None:
+    """Make the summary for other sites, if it is asked for."""
+    if options.export_summary is None:
+        return None
+    found = inputs.found
+    summary, more = summarize(
+        inputs.cohort,
+        analysis,
+        settings,
+        site=options.export_summary or options.bids_dir.resolve().name,
+        inputs={
+            "versions": list(found.versions),
+            "seg": found.records[0].place.name.seg if found.records else "none",
+            "region": options.sheets.region,
+            "settings_hash": found.settings_hash,
+        },
+    )
+    notes += more
+    return summary
 
 
 def _site_effects(options: GroupOptions) -> SavedEffects | None:
@@ -477,7 +511,9 @@ def read_templates(path: Path | None, cohort: Cohort) -> Mapping[str, Template] 
     """Read the templates of an earlier analysis, if one is named."""
     if path is None:
         return None
-    templates = templates_from_json(files.read_json(path), str(path))
+    content = files.read_json(path)
+    content = content.get("template") or content  # in the summary of another site
+    templates = templates_from_json(content, str(path))
     if missing := sorted(set(cohort.sides) - set(templates)):
         raise ModelError(
             f"{path}: has no template of hemisphere {', '.join(missing)}", reason="template-file"

@@ -325,6 +325,37 @@ class PowerSettings(SettingsTable):
     """Months per unit of a column of time that is not called years, months or days."""
 
 
+class ExchangeSettings(SettingsTable):
+    """What a summary for other sites may say."""
+
+    min_cell: Annotated[int, Field(ge=3)] = 5
+    """Fewest participants in a group, a level of a factor, or a cell of two factors."""
+    min_residual_df: PositiveInt = 10
+    """Fewest participants beyond the columns of the model."""
+    max_leverage: OpenFraction = 0.5
+    """Largest share of a fitted value that comes from one participant's own value."""
+
+
+class MetaSettings(SettingsTable):
+    """Summaries of several sites become one result."""
+
+    fixed: Literal["joint", "inverse-variance"] = "joint"
+    """Fixed effect: ``joint`` (the model of all participants with a constant per site, from the
+    sites' coefficients and their covariances; Becker and Wu 2007), or the mean of the sites'
+    estimates by ``inverse-variance``."""
+    random: Literal["reml", "dl"] = "reml"
+    """Variance between sites: ``reml`` (restricted maximum likelihood, with tests of Knapp and
+    Hartung 2003) or ``dl`` (DerSimonian and Laird 1986, with normal tests)."""
+    knapp_hartung: Literal["modified", "plain"] = "modified"
+    """``modified``: no standard error is smaller than without this correction, so that peaks are
+    not where sites agree by chance (Roever, Knapp and Friede 2015); ``plain`` lets them shrink,
+    which holds the level more exactly."""
+    min_sites: Annotated[int, Field(ge=2)] = 2
+    """Fewest sites with an estimate at a point."""
+    confidence: OpenFraction = 0.95
+    """Coverage of two-sided confidence and prediction limits, fraction."""
+
+
 class GroupSettings(SettingsTable):
     """All settings of the group level."""
 
@@ -340,6 +371,8 @@ class GroupSettings(SettingsTable):
     classification: ClassificationSettings = ClassificationSettings()
     retest: RetestSettings = RetestSettings()
     power: PowerSettings = PowerSettings()
+    exchange: ExchangeSettings = ExchangeSettings()
+    meta: MetaSettings = MetaSettings()
 
 
 def load_group_settings(path: Path | None) -> GroupSettings:

@@ -1,7 +1,8 @@
 """Surfaces as a viewer sees them: what each pixel shows, lit from above, without a GPU."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +10,9 @@ from scipy import ndimage
 
 from hipsta_bids.group.data import Bool, Float, Int
 from hipsta_bids.types import Mesh
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 #: Pixels are a square of this many, whose mean is shown.
 _FINER = 2
@@ -205,3 +209,39 @@ def _thick(line: Bool, width: float) -> Bool:
     reach = int(np.ceil(radius))
     i, j = np.mgrid[-reach : reach + 1, -reach : reach + 1]
     return np.asarray(ndimage.binary_dilation(line, i**2 + j**2 <= radius**2))
+
+
+def draw_mesh(axes: "Axes", mesh: Mesh, values: Float, scale: Mapping[str, Any]) -> None:
+    """Draw a map on a flat surface, in its own coordinates."""
+    plane, triangles, words = laid_out(mesh)
+    known = np.isfinite(values.ravel()[triangles]).all(axis=1)
+    axes.set_aspect("equal")
+    axes.set_ylabel(words[1], labelpad=2)
+    (left, bottom), (right, top) = plane.min(axis=0), plane.max(axis=0)
+    if known.any():
+        some = triangles[known]
+        colors = values.ravel()[some].mean(axis=1)
+        axes.tripcolor(
+            plane[:, 0],
+            plane[:, 1],
+            triangles=some,
+            facecolors=colors,
+            **scale,
+            edgecolors="none",
+            rasterized=True,
+        )
+    axes.set_xlim(left, right)
+    axes.set_ylim(*((top, bottom) if words[1].startswith("x") else (bottom, top)))
+
+
+def laid_out(mesh: Mesh) -> tuple[Float, Int, tuple[str, str]]:
+    """Positions of a flat surface in the plane, triangles, and what the axes are.
+
+    HippUnfold's runs from anterior to posterior along x and from the subiculum to the dentate
+    gyrus along y, so that x goes down and y to the right, as on a sheet.
+    """
+    reach = np.ptp(mesh.points, axis=0)
+    names = ("x of the surface", "y of the surface")
+    if reach[0] > reach[1]:
+        return mesh.points[:, [1, 0]], mesh.triangles, (names[1], names[0])
+    return mesh.points[:, :2], mesh.triangles, names

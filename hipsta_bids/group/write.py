@@ -56,17 +56,22 @@ _SUFFIXES = {
 Columns = dict[str, pa.Array]
 
 
+def model_folder(root: Path, name: str) -> contextlib.AbstractContextManager[Path]:
+    """Make the folder of a model, whole or not at all."""
+    return whole_folder(root / GROUP_FOLDER / name)
+
+
 @contextlib.contextmanager
-def model_folder(root: Path, name: str) -> Iterator[Path]:
+def whole_folder(path: Path) -> Iterator[Path]:
     """Make a folder to write into, which is renamed to its final name if all went well."""
-    parent = root / GROUP_FOLDER
+    parent, name = path.parent, path.name
     aside = parent / f".{name}.{os.getpid()}.tmp"
     files.make_folder(parent)
     try:
         aside.mkdir()
         try:
             yield aside
-            _replace(aside, parent / name)
+            _replace(aside, path)
         except BaseException:
             shutil.rmtree(aside, ignore_errors=True)
             raise
@@ -74,7 +79,7 @@ def model_folder(root: Path, name: str) -> Iterator[Path]:
         for left in parent.glob(f".{name}.*.tmp"):
             shutil.rmtree(left, ignore_errors=True)
     except OSError as error:
-        raise files.output_error(parent / name, error) from error
+        raise files.output_error(path, error) from error
 
 
 def _replace(aside: Path, final: Path) -> None:
@@ -185,14 +190,21 @@ def write_figures(folder: Path, drawings: Iterable[tuple[str, Drawing]]) -> list
     return problems
 
 
-def write_table(folder: Path, name: str, table: pd.DataFrame, *, described: bool = True) -> None:
+def write_table(
+    folder: Path,
+    name: str,
+    table: pd.DataFrame,
+    *,
+    described: bool = True,
+    meaning: Mapping[str, str] = COLUMNS,
+) -> None:
     """Write a table, with a sidecar unless the columns are the user's or the model's."""
     columns = [str(column) for column in table.columns]
     cells = [[_cell(value) for value in table[column].tolist()] for column in table.columns]
     files.write_tsv(folder / f"{name}.tsv", columns, zip(*cells, strict=True))
     if described:
         meanings = {
-            column: COLUMNS.get(column)
+            column: meaning.get(column)
             or f"registered coordinate of node {column.removeprefix('node_')}, 0..1"
             for column in columns
         }

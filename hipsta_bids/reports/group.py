@@ -290,7 +290,8 @@ def _sections_of_groups(results: GroupResults) -> Mapping[str, Any] | None:
     return {"picture": pictures[0]} if pictures else None
 
 
-def _methods(results: GroupResults) -> Mapping[str, Any] | None:
+def methods(results: GroupResults) -> Mapping[str, Any] | None:
+    """Take the methods paragraph apart for the page."""
     path = results.folder / "methods.md"
     if not path.exists():
         return None
@@ -356,9 +357,7 @@ SECTIONS: tuple[Section[GroupResults], ...] = (
         template="group/sections.html",
         build=_sections_of_groups,
     ),
-    Section(
-        key="methods", title="Methods paragraph", template="group/methods.html", build=_methods
-    ),
+    Section(key="methods", title="Methods paragraph", template="group/methods.html", build=methods),
     Section(key="origin", title="Origin", template="group/origin.html", build=origin),
 )
 

@@ -12,6 +12,7 @@ from hipsta_bids.reports.group_tables import (
     SIDES,
     GroupResults,
     display_name,
+    map_unit,
     number_text,
     records,
     unit_of,
@@ -51,7 +52,7 @@ def map_scenes(results: GroupResults) -> Mapping[str, Any] | None:
         means = means[means["measure"] == measure] if len(means) else means
         scene: dict[str, Any] | None = None
         if "node_x" in results.table(str(own["file"].iloc[0])):
-            unit = unit_of(str(means["unit"].iloc[0]) if len(means) else "1")
+            unit = unit_of(map_unit(results, measure))
             sides = [
                 _side(results, str(hemi), means, rows)
                 for hemi, rows in own.groupby("hemi", sort=False)

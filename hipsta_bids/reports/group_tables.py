@@ -37,7 +37,7 @@ _SUBFIELD = re.compile(
 _TEXT = (
     *("measure", "unit", "contrast", "hemi", "group", "subfield", "shares", "test", "effect"),
     *("file", "model", "control", "case", "base", "added", "classifier", "region"),
-    *("participant_id", "session_id", "reason", "message", "site", "kind"),
+    *("participant_id", "session_id", "reason", "message", "site", "kind", "version", "template"),
 )
 
 
@@ -120,7 +120,7 @@ def statistic_text(row: Mapping[str, Any]) -> str:
     """Write a statistic with its degrees of freedom; of F, those of the error."""
     value = number_text(row["statistic"])
     if row["test"] == "t":
-        return f"t({row['df']:.0f}) {value}"
+        return f"t({row['df']:.0f}) {value}" if np.isfinite(row["df"]) else f"z {value}"
     return f"{row['test']} {value}, error df {row['df']:.0f}"
 
 
@@ -148,7 +148,8 @@ def direction(results: GroupResults, contrast: str, hemi: str, sign: float) -> s
     if contrast == "mean" and comparison.get("pair"):
         return "with an increase" if sign > 0 else "with a decrease"
     # Contrasts as users write them, and as the default model names them: of change in time, too.
-    short = re.sub(r"\w+\[([^\]]*)\]", r"\1", contrast).replace(" - ", "-")
+    short = re.sub(r" \((fixed|random) effects?\)$", "", contrast)
+    short = re.sub(r"\w+\[([^\]]*)\]", r"\1", short).replace(" - ", "-")
     for first in results.levels:
         for second in results.levels:
             if re.fullmatch(rf"(?:.* in )?{re.escape(first)}-{re.escape(second)}", short):
@@ -235,13 +236,15 @@ def _peak(results: GroupResults, peak: Mapping[str, Any], points: pd.DataFrame) 
     here = point_of(peak, points)
     what = [f"{effect_name(peak['effect'])} {number_text(peak['effect_size'])}"]
     if here is not None and np.isfinite(here["estimate"]):
-        unit = _unit(results, str(peak["measure"]))
+        unit = map_unit(results, str(peak["measure"]))
         what.insert(0, f"estimate {with_unit(number_text(here['estimate']), unit)}")
     return f"{position_text(peak)}: {', '.join(what)}, corrected p {p_text(peak['p_corrected'])}"
 
 
-def _unit(results: GroupResults, measure: str) -> str:
+def map_unit(results: GroupResults, measure: str) -> str:
+    """Look up the unit of a map, by the means of groups or in forest plots."""
     means = results.everywhere("means")
+    means = means if len(means) else results.table("forest")
     if not len(means):
         return "1"
     own = means.loc[means["measure"] == measure, "unit"]

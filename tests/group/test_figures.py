@@ -18,10 +18,10 @@ from hipsta_bids.group.analysis import Analysis
 from hipsta_bids.group.classify import Area, calibrate
 from hipsta_bids.group.figures import draw_calibration, draw_roc, draw_sections, encode
 from hipsta_bids.group.inference import Discoveries, MapKey
-from hipsta_bids.group.panels import Seen, draw_measure, draw_mesh, laid_out
+from hipsta_bids.group.panels import Seen, draw_measure
 from hipsta_bids.group.settings import ClassificationSettings
 from hipsta_bids.group.shapes import AverageShape
-from hipsta_bids.group.views import across, look
+from hipsta_bids.group.views import across, draw_mesh, laid_out, look
 from hipsta_bids.io.gifti import sheet_triangles
 from hipsta_bids.reports.maps import new_figure
 from hipsta_bids.types import Mesh

@@ -31,7 +31,7 @@
       const { estimate, statistic, df, p, p_corrected: adjusted, n } = item.values;
       const is_t = item.kind === "t";
       if (is_t) rows.push([item.contrast, spell(estimate[at]) + unit]);
-      rows.push([is_t ? `t(${spell(df[at])})` : "F", spell(statistic[at])], ["p", probability(p[at])]);
+      rows.push([is_t ? (df[at] === null ? "z" : `t(${spell(df[at])})`) : "F", spell(statistic[at])], ["p", probability(p[at])]);
       rows.push(["corrected p", probability(adjusted[at]) + (item.significant[at] ? ", survives" : "")]);
       rows.push([is_t ? "Cohen's d" : "partial η²", spell(item.effect[at])], ["n", spell(n[at])]);
     }

@@ -1,0 +1,313 @@
+"""Meta-analysis: estimates of several sites become one, at all points at once.
+
+Fixed effect: the sites' models are joined to one, as if their participants were in one table.
+Random effects: sites differ in their true effects, with a variance that is estimated.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from hipsta_bids.group.data import Bool, Float
+from hipsta_bids.group.settings import MetaSettings
+
+#: Steps of the scoring end when no variance changes by more than this, relative to its scale.
+_TOLERANCE, _MOST_STEPS = 1e-10, 200
+_ZERO = 1e-9  # of weights that differences leave
+#: What the two models are called.
+FIXED, RANDOM = "fixed effect", "random effects"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Combined:
+    """One estimate out of several at each point; NaN where too few sites have one."""
+
+    estimate: Float
+    """(points,) in the unit of the estimates."""
+    se: Float
+    """(points,)"""
+    df: Float
+    """(points,) degrees of freedom of t; infinite for the normal distribution."""
+
+    @property
+    def statistic(self) -> Float:
+        """(points,) t, or z where the degrees of freedom are infinite."""
+        return self.estimate / np.where(self.se > 0, self.se, np.nan)
+
+    @property
+    def p(self) -> Float:
+        """(points,) two-sided."""
+        return np.asarray(2 * stats.t.sf(np.abs(self.statistic), self.df), dtype=np.float64)
+
+    def limits(self, confidence: float) -> tuple[Float, Float]:
+        """Confidence limits of the estimates."""
+        reach = stats.t.ppf((1 + confidence) / 2, self.df) * self.se
+        return self.estimate - reach, self.estimate + reach
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomEffects(Combined):
+    """Random effects, and how much the sites differ."""
+
+    tau2: Float
+    """(points,) variance of the true effects between sites."""
+    q: Float
+    """(points,) Cochran's Q; chi squared with ``sites - 1`` degrees of freedom where all sites have
+    the same effect."""
+    i2: Float
+    """(points,) share of the estimates' variance that is between sites."""
+    sites: Float
+    """(points,) sites with an estimate."""
+    weights: Float
+    """(sites, points) share of each site in the estimate; 0 without one."""
+
+    @property
+    def q_p(self) -> Float:
+        """(points,) p-value of Q."""
+        return np.asarray(stats.chi2.sf(self.q, self.sites - 1), dtype=np.float64)
+
+    def prediction(self, confidence: float) -> tuple[Float, Float]:
+        """Limits of the true effect of a further site, by t with ``sites - 2`` degrees of freedom.
+
+        Higgins, Thompson and Spiegelhalter (2009); NaN below three sites.
+        """
+        df = np.where(self.sites > 2, self.sites - 2, np.nan)  # noqa: PLR2004
+        reach = stats.t.ppf((1 + confidence) / 2, df) * np.sqrt(self.tau2 + self.se**2)
+        return self.estimate - reach, self.estimate + reach
+
+
+def combine(
+    estimates: Float,
+    variances: Float,
+    method: str,
+    *,
+    test: str = "normal",
+    least: int = 2,
+) -> RandomEffects:
+    """Combine independent estimates with known variances, at each point.
+
+    Parameters
+    ----------
+    estimates, variances : array
+        (sites, points); NaN where a site has none.
+    method : str
+        How the variance between sites is estimated: ``fixed`` (it is zero, so that weights are
+        inverse variances), ``dl`` (DerSimonian and Laird 1986) or ``reml`` (restricted maximum
+        likelihood by Fisher scoring, Viechtbauer 2005).
+    test : str
+        ``normal``; ``plain``: standard errors from the spread of the sites' estimates, and t with
+        ``sites - 1`` degrees of freedom (Knapp and Hartung 2003); or ``modified``: the same, but no
+        standard error smaller than that of ``normal`` (Roever, Knapp and Friede 2015).
+    least : int
+        Sites below which a point has no result.
+
+    Returns
+    -------
+    RandomEffects
+        I squared is that of Higgins and Thompson (2002) in terms of tau squared: tau squared over
+        its sum with the typical variance within sites. For ``fixed`` and ``dl`` it is
+        (Q - df) / Q.
+    """
+    known = np.isfinite(estimates) & np.isfinite(variances) & (variances > 0)
+    sites = known.sum(axis=0).astype(np.float64)
+    usable = sites >= least
+    values = np.where(known, estimates, 0.0)
+    plain = np.where(known, 1 / np.where(known, variances, 1.0), 0.0)
+    center = _mean(values, plain)
+    q = np.sum(plain * (values - center) ** 2, axis=0)
+    total, squares = plain.sum(axis=0), np.sum(plain**2, axis=0)
+    spread = np.where(usable, total - squares / np.where(total > 0, total, 1.0), 1.0)
+    tau2 = np.maximum(0.0, (q - (sites - 1)) / spread)
+    i2 = tau2 / (tau2 + np.where(usable, sites - 1, 1.0) / spread)
+    if method == "fixed":
+        tau2 = np.zeros_like(q)
+    elif method == "reml":
+        tau2 = _reml(values, np.where(known, variances, 1.0), known, usable, tau2)
+        i2 = tau2 / (tau2 + np.where(usable, sites - 1, 1.0) / spread)
+    weights = np.where(known, 1 / (np.where(known, variances, 1.0) + tau2), 0.0)
+    estimate = _mean(values, weights)
+    share = weights / np.where(usable, weights.sum(axis=0), 1.0)
+    se = np.sqrt(1 / np.where(usable, weights.sum(axis=0), 1.0))
+    df = np.full_like(se, np.inf)
+    if test != "normal":
+        df = np.where(usable, sites - 1, 1.0)
+        factor = np.sum(weights * (values - estimate) ** 2, axis=0) / df
+        se = se * np.sqrt(np.maximum(factor, 1.0) if test == "modified" else factor)
+    values_of = {"estimate": estimate, "se": se, "df": df, "tau2": tau2, "q": q, "i2": i2}
+    found = {name: np.where(usable, value, np.nan) for name, value in values_of.items()}
+    return RandomEffects(**found, sites=sites, weights=np.where(usable, share, 0.0))
+
+
+def _mean(values: Float, weights: Float) -> Float:
+    total = weights.sum(axis=0)
+    return np.asarray(np.sum(weights * values, axis=0) / np.where(total > 0, total, 1.0))
+
+
+def _reml(values: Float, variances: Float, known: Bool, usable: Bool, start: Float) -> Float:
+    """Between-site variance that maximizes the restricted likelihood, not below zero.
+
+    A step of Fisher scoring is (y'PPy - tr P) / tr PP with P = W - W1(1'W1)^-1 1'W; here for all
+    points, which drop out when they have settled.
+    """
+    tau2 = start.copy()
+    active = np.flatnonzero(usable)
+    for _ in range(_MOST_STEPS):
+        now = tau2[active]
+        own = known[:, active]
+        w = np.where(own, 1 / (variances[:, active] + now), 0.0)
+        one, two, three = (np.sum(w**power, axis=0) for power in (1, 2, 3))
+        squares = np.sum((w * (values[:, active] - _mean(values[:, active], w))) ** 2, axis=0)
+        information = two - 2 * three / one + (two / one) ** 2
+        step = (squares - (one - two / one)) / information
+        new = np.maximum(0.0, now + step)
+        tau2[active] = new
+        scale = own.sum(axis=0) / one
+        active = active[np.abs(new - now) > _TOLERANCE * scale]
+        if not len(active):
+            break
+    return tau2
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SiteFit:
+    """What one site sends of one model: all that its participants say about the coefficients."""
+
+    coefficients: Float
+    """(columns, points)"""
+    covariance: Float
+    """(columns, columns) of the coefficients, over the residual variance."""
+    sd: Float
+    """(points,) residual standard deviation; NaN where the site has no fit."""
+    df: int
+    """Residual degrees of freedom."""
+
+    def estimate(self, weights: Float) -> Float:
+        """(points,) of a contrast."""
+        return np.where(np.isfinite(self.sd), weights @ self.coefficients, np.nan)
+
+    def se(self, weights: Float) -> Float:
+        """(points,) standard error of a contrast."""
+        return self.sd * np.sqrt(weights @ self.covariance @ weights)
+
+
+def join(fits: list[SiteFit], weights: Float, intercept: int | None, least: int) -> Combined:
+    """Test a contrast in the model of all participants with a constant per site.
+
+    The estimates of least squares with common slopes follow from the sites' own coefficients and
+    their covariances (Becker and Wu 2007), exactly: they are what one table with all
+    participants gives, with the site as a further factor.
+
+    Parameters
+    ----------
+    fits : list of SiteFit
+        The same columns in all.
+    weights : array
+        (columns,) of the contrast; 0 for the constant, which differs between sites.
+    intercept : int or None
+        Column of the constant, ``None`` without one: then all coefficients are common.
+    least : int
+        Sites below which a point has no result.
+    """
+    slopes = np.arange(len(weights)) != (-1 if intercept is None else intercept)
+    present = np.stack([np.isfinite(fit.sd) for fit in fits])
+    estimate, se, df = (np.full(present.shape[1], np.nan) for _ in range(3))
+    for pattern in np.unique(present, axis=1).T:
+        if pattern.sum() < least:
+            continue
+        points = np.flatnonzero((present == pattern[:, None]).all(axis=0))
+        own = [fit for fit, there in zip(fits, pattern, strict=True) if there]
+        information = [np.linalg.inv(fit.covariance[np.ix_(slopes, slopes)]) for fit in own]
+        betas = [fit.coefficients[np.ix_(slopes, points)] for fit in own]
+        inverse = np.linalg.inv(np.sum(information, axis=0))
+        common = inverse @ np.sum([m @ b for m, b in zip(information, betas, strict=True)], axis=0)
+        residual = np.sum([fit.df * fit.sd[points] ** 2 for fit in own], axis=0)
+        for matrix, beta in zip(information, betas, strict=True):
+            residual = residual + np.einsum(
+                "ip,ij,jp->p", beta - common, matrix, beta - common, optimize=True
+            )
+        freedom = sum(fit.df for fit in own) + (len(own) - 1) * int(slopes.sum())
+        row = weights[slopes]
+        estimate[points] = row @ common
+        se[points] = np.sqrt(row @ inverse @ row * residual / freedom)
+        df[points] = freedom
+    return Combined(estimate=estimate, se=se, df=df)
+
+
+def pooled_sd(fits: list[SiteFit]) -> Float:
+    """(points,) residual standard deviation within sites, over all that have the point."""
+    sds = np.stack([fit.sd for fit in fits])
+    df = np.where(np.isfinite(sds), np.array([[fit.df] for fit in fits]), 0)
+    squares = np.sum(df * np.nan_to_num(sds) ** 2, axis=0)
+    return np.asarray(np.sqrt(squares / np.where(df.any(axis=0), df.sum(axis=0), np.nan)))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MetaResult:
+    """One contrast, combined over sites."""
+
+    fixed: Combined
+    random: RandomEffects
+    sd: Float
+    """(points,) residual standard deviation within sites."""
+    estimates: Float
+    """(sites, points)"""
+    ses: Float
+    """(sites, points)"""
+    without: list["MetaResult"]
+    """The same without each of the sites; empty for these, and with fewer than three."""
+
+    @property
+    def models(self) -> dict[str, Combined]:
+        """Both results, by what they are called."""
+        return {FIXED: self.fixed, RANDOM: self.random}
+
+
+def meta_analyze(
+    fits: list[SiteFit],
+    weights: list[Float],
+    intercept: int | None,
+    settings: MetaSettings,
+    *,
+    leave_out: bool = True,
+) -> MetaResult:
+    """Combine a contrast by both models, with all sites and without each of them.
+
+    ``weights`` has the contrast at each site, the same at all but for a mean over participants.
+    Where the contrast includes the constant, as the mean does, the fixed effect is that of inverse
+    variances: a model with a constant per site says nothing about it.
+    """
+    estimates = np.stack([fit.estimate(row) for fit, row in zip(fits, weights, strict=True)])
+    ses = np.stack([fit.se(row) for fit, row in zip(fits, weights, strict=True)])
+    random = combine(
+        estimates,
+        ses**2,
+        settings.random,
+        test=settings.knapp_hartung if settings.random == "reml" else "normal",
+        least=settings.min_sites,
+    )
+    own_constant = intercept is not None and abs(weights[0][intercept]) > _ZERO
+    if settings.fixed == "inverse-variance" or own_constant:
+        fixed: Combined = combine(estimates, ses**2, "fixed", least=settings.min_sites)
+    else:
+        fixed = join(fits, weights[0], intercept, settings.min_sites)
+    without = []
+    if leave_out and len(fits) > settings.min_sites:
+        without = [
+            meta_analyze(
+                [*fits[:i], *fits[i + 1 :]],
+                [*weights[:i], *weights[i + 1 :]],
+                intercept,
+                settings,
+                leave_out=False,
+            )
+            for i in range(len(fits))
+        ]
+    return MetaResult(
+        fixed=fixed,
+        random=random,
+        sd=pooled_sd(fits),
+        estimates=estimates,
+        ses=ses,
+        without=without,
+    )

@@ -1,0 +1,279 @@
+"""The page of a meta-analysis: what sites have in common, where they differ, and how."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from scipy import stats
+
+from hipsta_bids.derivatives.names import META, META_REPORT
+from hipsta_bids.io import files
+from hipsta_bids.reports.group import methods, origin
+from hipsta_bids.reports.group_maps import map_scenes
+from hipsta_bids.reports.group_tables import (
+    SIDES,
+    GroupResults,
+    display_name,
+    findings,
+    number_text,
+    p_text,
+    peaks,
+    position_text,
+    records,
+    summaries,
+    summary_side,
+    unit_of,
+    with_brackets,
+    with_unit,
+)
+from hipsta_bids.reports.page import Section, build_sections, render
+
+_PREFIX = "meta"
+#: Forest plots of summary measures on the page; all are in the table.
+_MOST_FORESTS = 60
+_SITE, _PREDICTION, _RANDOM = "site", "prediction", "random effects"
+#: Layout of a forest plot, pixels.
+_NAMES, _PLOT, _TEXTS, _ROW, _TOP = 156, 236, 222, 21, 10
+_LARGEST = 12.0  # side of the square of a site with all of the weight
+_TICKS = 4
+
+
+def _forests(results: GroupResults, *, maps: bool) -> Iterator[dict[str, Any]]:
+    """Lay out the forest plots of peaks, or of summary measures."""
+    table = results.table("forest")
+    if not len(table):
+        return
+    at = table["x"].notna() if "x" in table else pd.Series(data=False, index=table.index)
+    for number, rows in table[at == maps].groupby("plot", sort=False):
+        first = records(rows.head(1))[0]
+        side = SIDES[first["hemi"]] if maps else summary_side(first["hemi"], first["measure"])
+        position = f" at {position_text(first)}" if maps else ""
+        title = f"{display_name(first['measure']).capitalize()}, {side}, {first['contrast']}"
+        drawing = _drawing(records(rows), str(first["unit"]))
+        yield {
+            "number": int(str(number)),
+            "title": title + position,
+            "model": first["model"],
+            "measure": first["measure"],
+            **drawing,
+        }
+
+
+def _drawing(rows: Sequence[Mapping[str, Any]], unit: str) -> dict[str, Any]:
+    """Place the marks of a forest plot; rows from top to bottom."""
+    known = [row for row in rows if math.isfinite(row["estimate_low"])]
+    drawn = [row for row in known if row["kind"] != _PREDICTION]
+    ends = [row[name] for row in drawn for name in ("estimate_low", "estimate_high")]
+    low, high = min(0.0, *ends), max(0.0, *ends)
+    low, high = low - 0.04 * (high - low), high + 0.04 * (high - low)
+    scale = _PLOT / max(high - low, 1e-300)
+
+    def across(value: float) -> float:
+        return float(round(_NAMES + (min(max(value, low), high) - low) * scale, 1))
+
+    marks = []
+    for number, row in enumerate(known):
+        is_site = row["kind"] == _SITE
+        estimate = row["estimate"]
+        limits = f"{number_text(row['estimate_low'])} to {number_text(row['estimate_high'])}"
+        said = (
+            f"[{limits}]" if row["kind"] == _PREDICTION else f"{number_text(estimate)} [{limits}]"
+        )
+        size = _LARGEST * math.sqrt(row["weight"]) if is_site else 0.0
+        marks.append(
+            {
+                "kind": "diamond" if not is_site and row["kind"] != _PREDICTION else row["kind"],
+                "name": row["site"],
+                "n": f"n {row['n']:.0f}" if math.isfinite(row["n"]) else "",
+                "y": _TOP + _ROW * number + _ROW / 2 + (6 if not is_site else 0),
+                "low": across(row["estimate_low"]),
+                "high": across(row["estimate_high"]),
+                "at": across(estimate) if math.isfinite(estimate) else 0.0,
+                "size": round(max(3.0, size), 1),
+                "text": said,
+            }
+        )
+    random = next(row for row in rows if row["kind"] == _RANDOM)
+    height = _TOP + _ROW * len(known) + 10
+    values = "; ".join(f"{mark['name']} {mark['text']}" for mark in marks)
+    return {
+        "marks": marks,
+        "names": _NAMES,
+        "plot": _PLOT,
+        "width": _NAMES + _PLOT + _TEXTS,
+        "height": height + 34,
+        "bottom": height,
+        "zero": across(0.0),
+        "rule": _TOP + _ROW * sum(mark["kind"] == _SITE for mark in marks) + 3,
+        "ticks": [(across(value), number_text(value)) for value in _ticks(low, high)],
+        "unit": unit_of(unit),
+        "text_at": _NAMES + _PLOT + _TEXTS,
+        "middle": _NAMES + _PLOT / 2,
+        "alt": f"estimates with limits [{unit_of(unit)}]: {values}",
+        "between": f"I² {_percent(random['i2'])}, τ {with_unit(_root(random['tau2']), unit)},"
+        f" Q p {p_text(random['q_p'])}",
+        "p": random["p"],
+        "p_text": p_text(random["p"]),
+    }
+
+
+def _root(variance: float) -> str:
+    return number_text(math.sqrt(variance))
+
+
+def _percent(share: float) -> str:
+    return f"{share:.0%}" if math.isfinite(share) else files.MISSING
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    """Choose a few round numbers between two values."""
+    rough = (high - low) / _TICKS
+    power = 10.0 ** math.floor(math.log10(rough))
+    step = power * min((1, 2, 5, 10), key=lambda times: abs(times * power - rough))
+    return [step * i for i in range(math.ceil(low / step), math.floor(high / step) + 1)]
+
+
+def _explained(results: GroupResults) -> Mapping[str, Any]:
+    settings = (results.record.get("settings") or {}).get("meta") or {}
+    sites = len(results.record.get("sites") or ())
+    return {
+        "joint": settings.get("fixed") == "joint",
+        "reml": settings.get("random") == "reml",
+        "sites": sites,
+        "needed": number_text(float(stats.t.isf(0.0005, max(1, sites - 1)))),
+        "confidence": f"{settings.get('confidence', 0.95):.0%}",
+    }
+
+
+def _maps(results: GroupResults) -> Mapping[str, Any] | None:
+    scenes = map_scenes(results)
+    return None if scenes is None else {**scenes, "flat": True}
+
+
+def _peak_forests(results: GroupResults) -> Mapping[str, Any] | None:
+    plots = sorted(_forests(results, maps=True), key=lambda plot: plot["measure"] != "thickness")
+    return {"plots": plots, "more": 0, "what": "peak"} if plots else None
+
+
+def _summary_forests(results: GroupResults) -> Mapping[str, Any] | None:
+    plots = list(_forests(results, maps=False))
+    if not plots:
+        return None
+    plots.sort(key=lambda plot: (not math.isfinite(plot["p"]), plot["p"]))
+    return {
+        "plots": plots[:_MOST_FORESTS],
+        "more": max(0, len(plots) - _MOST_FORESTS),
+        "what": "summary measure",
+    }
+
+
+def _heterogeneity(results: GroupResults) -> Mapping[str, Any] | None:
+    """Summarize I squared and Q of maps."""
+    maps = results.table("maps")
+    rows = []
+    for row in records(maps):
+        if f"({_RANDOM})" not in row["contrast"]:
+            continue
+        points = results.table(str(row["file"]))
+        own = points[points["i2"].notna()]
+        rows.append(
+            {
+                "measure": display_name(row["measure"]),
+                "contrast": row["contrast"].removesuffix(f" ({_RANDOM})"),
+                "side": SIDES[row["hemi"]],
+                "i2": _percent(own["i2"].median()) if len(own) else files.MISSING,
+                "most": _percent(float(own["i2"].quantile(0.95))) if len(own) else files.MISSING,
+                "share": _percent(float((own["q_p"] < 0.05).mean())),  # noqa: PLR2004 -- in words
+            }
+        )
+    return {"rows": rows} if rows else None
+
+
+def _left_out(results: GroupResults) -> Mapping[str, Any] | None:
+    table = results.table("leave_one_out")
+    if not len(table):
+        return None
+    return {
+        "rows": [
+            {
+                "measure": display_name(row["measure"]),
+                "contrast": row["contrast"],
+                "side": SIDES[row["hemi"]],
+                "site": row["site"],
+                "found": row["n_significant"],
+                "kept": row["n_kept"],
+                "change": number_text(row["largest_change"]),
+            }
+            for row in records(table)
+        ]
+    }
+
+
+def _sites(results: GroupResults) -> Mapping[str, Any]:
+    table = results.table("sites")
+    columns = [name for name in table if name not in {"template", "version"}]
+    return {
+        "columns": [with_brackets(str(name).replace("_", " "), "1") for name in columns],
+        "rows": [
+            [value if isinstance(value, str) else number_text(float(value)) for value in row]
+            for row in table[columns].to_numpy(object).tolist()
+        ],
+        "template": table["template"].iloc[0],
+        "versions": sorted(set(table["version"].astype(str))),
+    }
+
+
+#: Sections of the page, from top to bottom.
+SECTIONS: tuple[Section[GroupResults], ...] = (
+    Section(key="found", title="What was found", template="group/found.html", build=findings),
+    Section(
+        key="effects", title="Fixed and random", template="meta/effects.html", build=_explained
+    ),
+    Section(key="sites", title="Sites", template="meta/sites.html", build=_sites),
+    Section(
+        key="forests", title="Peaks by site", template="meta/forests.html", build=_peak_forests
+    ),
+    Section(
+        key="measures",
+        title="Summary measures by site",
+        template="meta/forests.html",
+        build=_summary_forests,
+    ),
+    Section(key="maps", title="Maps", template="group/maps.html", build=_maps),
+    Section(
+        key="between",
+        title="Heterogeneity",
+        template="meta/heterogeneity.html",
+        build=_heterogeneity,
+    ),
+    Section(key="without", title="Without a site", template="meta/without.html", build=_left_out),
+    Section(key="peaks", title="Clusters and peaks", template="group/peaks.html", build=peaks),
+    Section(
+        key="summaries", title="Summary measures", template="group/summaries.html", build=summaries
+    ),
+    Section(key="methods", title="Methods paragraph", template="group/methods.html", build=methods),
+    Section(key="origin", title="Origin", template="group/origin.html", build=origin),
+)
+
+
+def meta_page(folder: Path) -> str:
+    """Make the page about a meta-analysis from its files."""
+    results = GroupResults(folder=folder, record=files.read_json(folder / "meta.json"))
+    record = results.record
+    return render(
+        "group.html",
+        title=f"Meta-analysis of {len(record.get('sites') or ())} sites",
+        folder=folder.name,
+        formula=record.get("formula"),
+        n=record.get("participants"),
+        made_by=record.get("version"),
+        cohort=False,
+        sections=build_sections(SECTIONS, results, _PREFIX),
+    )
+
+
+def write_meta_report(root: Path) -> None:
+    """Write the page of a meta-analysis, beside its folder."""
+    files.write_text(root / META_REPORT, meta_page(root / META))

@@ -1,0 +1,387 @@
+"""Summaries of sites from files to files: what is in them, what is refused, and what they give."""
+
+import json
+import re
+
+import numpy as np
+import pandas as pd
+import pytest
+from page_outline import Outline
+from small_cohorts import place_of, write_dataset
+
+from hipsta_bids.cli.main import main
+from hipsta_bids.group import analysis, consortium, write
+from hipsta_bids.io import files
+
+SITES = {
+    "a": [f"{i:02d}" for i in (*range(1, 9), *range(17, 24))],
+    "b": [f"{i:02d}" for i in (*range(9, 17), *range(24, 31))],
+}
+EVIL = "<script>document.title='owned'</script>"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _only_what_counts():
+    """Figures and classifiers take longer than all else."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(write, "draw_figures", lambda *_: iter(()))
+        patch.setattr(consortium, "write_figures", lambda *_: [])
+        patch.setattr(analysis, "classify_groups", lambda *_: ([], []))
+        yield
+
+
+@pytest.fixture(scope="module")
+def cohort(tmp_path_factory):
+    """A dataset of two sites, and its output."""
+    data, out = write_dataset(tmp_path_factory.mktemp("sites"))
+    rows = [[f"sub-{label}", site] for site, labels in SITES.items() for label in labels]
+    files.write_tsv(data.parent / "site.tsv", ["participant_id", "site"], rows)
+    return data, out
+
+
+def run(cohort, name, *options, site=None):
+    data, out = cohort
+    chosen = ["--participant-label", *SITES[site]] if site else []
+    arguments = [str(data), str(out), "group", "--name", name, *chosen, *options]
+    return main(arguments), out / "group" / name
+
+
+def export(cohort, site, *options, name=None):
+    code, folder = run(cohort, name or site, "--export-summary", site, *options, site=site)
+    assert code == 0
+    return folder / "summary.json"
+
+
+@pytest.fixture(scope="module")
+def plain(cohort):
+    """Summaries of both sites, without registration."""
+    return [export(cohort, site, "--align", "none") for site in SITES]
+
+
+@pytest.fixture(scope="module")
+def registered(cohort):
+    """Summaries of both sites, registered to the template of the first."""
+    first = export(cohort, "a", name="a-registered")
+    return [first, export(cohort, "b", "--template", str(first), name="b-registered")]
+
+
+@pytest.fixture(scope="module")
+def combined(plain, tmp_path_factory):
+    """Results of both, with figures."""
+    out = tmp_path_factory.mktemp("meta")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(consortium, "write_figures", write.write_figures)
+        assert main(["meta", *map(str, plain), str(out)]) == 0
+    return out
+
+
+def edited(path, target, **changes):
+    """A copy with other entries, or with what a function makes of it."""
+    content = json.loads(path.read_text())
+    for key, value in changes.items():
+        content[key] = value(content[key]) if callable(value) else value
+    target.write_text(json.dumps(content))
+    return target
+
+
+def table(path):
+    return pd.read_csv(path, sep="\t", na_values="n/a", keep_default_na=False)
+
+
+def statmap(folder, effects, hemi="L"):
+    return table(folder / f"hemi-{hemi}_contrast-CNAD{effects}_desc-thickness_statmap.tsv")
+
+
+def test_sites_together_are_the_analysis_of_all_participants(cohort, combined):
+    sites = ["--covariates", str(cohort[0].parent / "site.tsv"), "--align", "none"]
+    formula = "group + age + sex + site"
+    code, pooled = run(cohort, "pooled", *sites, "--formula", formula)
+    assert code == 0
+    theirs = table(pooled / "hemi-L_contrast-CNAD_desc-thickness_statmap.tsv")
+    ours = statmap(combined / "meta", "FixedEffect")
+    sd = theirs.estimate / theirs.cohen_d
+    np.testing.assert_allclose(ours.estimate / sd, theirs.estimate / sd, atol=1e-6)
+    for name in ("se", "statistic", "df", "p_corrected"):
+        np.testing.assert_allclose(ours[name], theirs[name], rtol=1e-5, err_msg=name)
+    assert (ours.significant == theirs.significant).all()
+    assert ours.significant.sum() > 5
+    peaks = table(pooled / "peaks.tsv").merge(
+        table(combined / "meta" / "peaks.tsv").query("contrast == 'CN-AD (fixed effect)'"),
+        on=["measure", "hemi", "x", "y", "extent"],
+    )
+    assert len(peaks) == len(table(pooled / "peaks.tsv"))
+    summaries = table(pooled / "measures.tsv").query("measure == 'volume' and hemi == 'LR'")
+    own = table(combined / "meta" / "measures.tsv")
+    own = own.query("measure == 'volume' and hemi == 'LR' and contrast == 'CN-AD (fixed effect)'")
+    assert own.estimate.item() == pytest.approx(summaries.estimate.item())
+    assert own.p.item() == pytest.approx(summaries.p.item())
+
+
+def test_a_summary_has_no_value_of_a_participant(cohort, plain):
+    text = plain[0].read_text()
+    content = json.loads(text)
+    assert "sub-" not in text
+    assert content["participants"] == 15
+    assert content["groups"] == {"CN": 8, "AD": 7}
+    (maps,) = (m for m in content["models"] if m["hemi"] == "L" and m["measures"] == ["thickness"])
+    assert maps["df"] == 11
+    assert len(maps["sd"]) == 147
+    # No number of a participant's sheet or summary occurs.
+    sheet = files.read_tsv(place_of(cohort[1], "01", "L").path("sheet"))
+    numbers = set(re.findall(r"-?\d+\.\d{3,}", text))
+    assert not numbers & {row["thickness"] for row in sheet}
+
+
+def test_a_point_that_nobody_may_know_of_is_left_out(plain, tmp_path):
+    """Where one site has nothing, the other alone is no meta-analysis."""
+
+    def empty(models):
+        for model in models:
+            if model["hemi"] == "L" and model["measures"] == ["thickness"]:
+                none = [None] * len(model["sd"])
+                model |= {"sd": none, "coefficients": [none] * len(model["columns"])}
+                model |= {"estimate": {"CN-AD": none}, "se": {"CN-AD": none}}
+        return models
+
+    other = edited(plain[1], tmp_path / "other.json", models=empty)
+    assert main(["meta", str(plain[0]), str(other), str(tmp_path / "out")]) == 0
+    assert statmap(tmp_path / "out" / "meta", "FixedEffect").estimate.isna().all()
+    assert statmap(tmp_path / "out" / "meta", "FixedEffect", "R").estimate.notna().all()
+    assert "could not be" not in (tmp_path / "out" / "meta.html").read_text()
+
+
+def test_every_number_is_about_the_same_participants(cohort, tmp_path, capsys):
+    """Who lacks a hemisphere is in neither, and a point that one lacks is in none."""
+    excluded = tmp_path / "exclude.tsv"
+    files.write_tsv(excluded, ["participant_id", "hemi"], [["sub-01", "R"]])
+    summary = export(cohort, "a", "--align", "none", "--exclude", str(excluded), name="lacking")
+    content = json.loads(summary.read_text())
+    assert content["participants"] == 14
+    assert {model["df"] for model in content["models"]} == {10}
+    assert len({json.dumps(m["covariance"]) for m in content["models"]}) == 1
+    assert "without 1 participants who lack a hemisphere" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ((), "too few participants for group CN (8), group AD (7)"),
+        (("--formula", "group + scale(age)"), "with scale() has other columns at each site"),
+        (("--formula", "group", "--contrast", "g = group[CN], group[AD]"), "contrast"),
+    ],
+)
+def test_what_could_be_traced_or_not_combined_is_refused(cohort, tmp_path, capsys, options, said):
+    strict = tmp_path / "strict.toml"
+    strict.write_text("[exchange]\nmin_cell = 9\n")
+    options = ["--align", "none", "--settings", str(strict), *options]
+    code, folder = run(cohort, "refused", "--export-summary", "a", *options, site="a")
+    assert code == 65
+    error = capsys.readouterr().err.strip()
+    assert said in error
+    assert "\n" not in error
+    assert not folder.exists()
+
+
+def test_harmonized_values_are_refused(cohort, tmp_path, capsys):
+    loose = tmp_path / "loose.toml"
+    loose.write_text("[harmonization]\nleast_participants = 5\n")
+    options = ["--covariates", str(cohort[0].parent / "site.tsv"), "--align", "none"]
+    options += ["--harmonize", "site", "--settings", str(loose)]
+    code, folder = run(cohort, "harmonized", *options, "--export-summary", "all")
+    assert code == 65
+    error = capsys.readouterr().err.strip()
+    assert error.splitlines()[-1].endswith("cannot be combined; leave --harmonize out")
+    assert not folder.exists()
+
+
+def test_a_value_that_decides_alone_is_refused(cohort, tmp_path, capsys):
+    rows = [[f"sub-{label}", "1000" if label == "01" else label] for label in SITES["a"]]
+    extra = tmp_path / "dose.tsv"
+    files.write_tsv(extra, ["participant_id", "dose"], rows)
+    options = ["--align", "none", "--covariates", str(extra), "--formula", "group + dose"]
+    code, _ = run(cohort, "dose", "--export-summary", "a", *options, site="a")
+    assert code == 65
+    assert "one participant determines its own fitted value by" in capsys.readouterr().err
+
+
+def test_other_sites_register_to_the_template_in_a_summary(registered, plain, tmp_path, capsys):
+    first, second = (json.loads(path.read_text()) for path in registered)
+    assert first["template"] == second["template"]
+    assert main(["meta", *map(str, registered), str(tmp_path / "out")]) == 0
+    assert (
+        "registered their maps to one template"
+        in (tmp_path / "out" / "meta" / "methods.md").read_text()
+    )
+    capsys.readouterr()
+    assert main(["meta", str(registered[0]), str(plain[1]), str(tmp_path / "no")]) == 65
+    assert "site b: registration: none, but at a registr" in capsys.readouterr().err
+    moved = edited(
+        registered[1],
+        tmp_path / "moved.json",
+        template=lambda t: json.loads(json.dumps(t).replace("0.", "0.1", 1)),
+    )
+    assert main(["meta", str(registered[0]), str(moved), str(tmp_path / "no")]) == 65
+    assert "hash of the template of registration" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"seg": "other"}, "site b: segmentation protocol: other, but at a demo"),
+        ({"settings_hash": "1234"}, "hash of the participant level's settings"),
+        ({"axes": "x from lateral to medial"}, "direction of the axes"),
+        ({"x": lambda x: [*x[:-1], 0.95]}, "grid of the sheet: 21 nodes from -0.9 to 0.95"),
+        ({"models": lambda m: m[1:]}, "site b: lacks thickness, L (map); give all sites the same"),
+        (
+            {"models": lambda m: json.loads(json.dumps(m).replace('"sex[T.M]"', '"sex[T.F]"'))},
+            "terms of the model",
+        ),
+        (
+            {"models": lambda m: json.loads(json.dumps(m).replace('"CN-AD"', '"AD-CN"'))},
+            "contrasts: AD-CN, but at a CN-AD",
+        ),
+    ],
+)
+def test_sites_that_differ_are_refused_by_name(plain, tmp_path, capsys, change, said):
+    other = edited(plain[1], tmp_path / "other.json", **change)
+    assert main(["meta", str(plain[0]), str(other), str(tmp_path / "out")]) == 65
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_contrasts_that_mean_something_else_are_refused(plain, tmp_path, capsys):
+    """As those of an interaction do, where they hold the mean age of a site."""
+
+    def doubled(models):
+        for model in models:
+            for name in ("contrasts", "estimate", "se"):
+                model[name]["CN-AD"] = [v and 2 * v for v in model[name]["CN-AD"]]
+        return models
+
+    other = edited(plain[1], tmp_path / "other.json", models=doubled)
+    assert main(["meta", str(plain[0]), str(other), str(tmp_path / "out")]) == 65
+    error = capsys.readouterr().err
+    assert "thickness, L: weights of CN-AD on Intercept, group[T.AD], age, sex[T.M]: 0, -2" in error
+    assert "write the contrast by columns" in error
+
+
+def spoiled(change):
+    def make(models):
+        change(models[0])
+        return models
+
+    return {"models": make}
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"site": "../../etc"}, "site is '../../etc'"),
+        ({"site": "\x1b[31mred"}, "not a summary"),
+        ({"format": 2}, "format is 2"),
+        ({"people": [1]}, "unknown key people"),
+        (spoiled(lambda m: m["sd"].append(1.0)), "numbers of points that are not 147"),
+        (spoiled(lambda m: m["sd"].__setitem__(0, "1")), "has to be a number"),
+        (spoiled(lambda m: m["estimate"]["CN-AD"].__setitem__(0, 9.0)), "estimates of CN-AD"),
+        (spoiled(lambda m: m["contrasts"].clear()), "contrasts"),
+        (spoiled(lambda m: m["measures"].__setitem__(0, "../x")), "measures"),
+        (spoiled(lambda m: m.__setitem__("df", 400)), "other degrees of freedom"),
+        (spoiled(lambda m: m["covariance"][0].__setitem__(0, -1.0)), "a covariance"),
+    ],
+)
+def test_files_of_other_sites_are_checked(plain, tmp_path, capsys, change, said):
+    other = edited(plain[1], tmp_path / "other.json", **change)
+    assert main(["meta", str(plain[0]), str(other), str(tmp_path / "out")]) == 65
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+    assert "\x1b" not in error
+
+
+@pytest.mark.parametrize("content", ["{", "[" * 100_000, "[1]", '{"site": NaN}', ""])
+def test_other_files_are_no_summaries(plain, tmp_path, capsys, content):
+    path = tmp_path / "file.json"
+    path.write_text(content)
+    assert main(["meta", str(plain[0]), str(path), str(tmp_path / "out")]) == 65
+    assert str(path) in capsys.readouterr().err
+
+
+def test_wrong_use_is_one_line(plain, tmp_path, capsys):
+    first, second = map(str, plain)
+    permuted = tmp_path / "permuted.toml"
+    permuted.write_text('[multiplicity]\nmethod = "permutation-max"\n')
+    for arguments, code, said in (
+        ([first], 64, "two sites or more"),
+        ([first, first], 64, "are the same summary"),
+        ([f"x={first}", f"x={second}"], 64, "two sites are called x"),
+        ([first, second, "--settings", str(permuted)], 64, "nobody to permute"),
+        ([first, str(tmp_path / "none.json")], 65, "no summary"),
+    ):
+        assert main(["meta", *arguments, str(tmp_path / "out")]) == code
+        error = capsys.readouterr().err
+        assert said in error
+        assert error.count("\n") == 1
+    (tmp_path / "taken" / "meta").mkdir(parents=True)
+    assert main(["meta", first, second, str(tmp_path / "taken")]) == 73
+    assert "choose another output folder" in capsys.readouterr().err
+
+
+def test_forest_rows_are_the_sites_own_estimates(combined, plain):
+    forest = table(combined / "meta" / "forest.tsv")
+    own = forest[(forest.measure == "volume") & (forest.hemi == "LR")].set_index("site")
+    for path in plain:
+        content = json.loads(path.read_text())
+        (model,) = (m for m in content["models"] if m["kind"] == "summary" and m["hemi"] == "LR")
+        at = model["measures"].index("volume")
+        row = own.loc[content["site"]]
+        assert float(row.estimate) == pytest.approx(model["estimate"]["CN-AD"][at])
+        assert float(row.se) == pytest.approx(model["se"]["CN-AD"][at])
+    assert list(own.kind) == ["site", "site", "fixed effect", "random effects", "prediction"]
+    assert own.weight[:2].astype(float).sum() == pytest.approx(1)
+
+
+def test_the_page_is_whole_and_escapes_what_sites_send(plain, tmp_path):
+    hostile = [
+        edited(
+            path,
+            tmp_path / f"{i}.json",
+            models=lambda m: json.loads(json.dumps(m).replace("CN-AD", EVIL)),
+        )
+        for i, path in enumerate(plain)
+    ]
+    assert main(["meta", *map(str, hostile), "--random", "dl", str(tmp_path / "out")]) == 0
+    page = (tmp_path / "out" / "meta.html").read_text(encoding="utf-8")
+    outline = Outline(page)
+    assert outline.open == []
+    assert outline.unlabeled == []
+    assert max(np.diff(outline.headings)) <= 1
+    assert len(outline.ids) == len(set(outline.ids))
+    assert "could not be" not in page
+    assert EVIL not in page
+    assert "&lt;script&gt;document" in page
+    assert page.count('<figure class="forest">') > 4
+    assert "DerSimonian" in page
+
+
+def test_the_page_has_the_maps_of_both_models_and_of_heterogeneity(combined):
+    drawing = (combined / "meta" / "figures" / "thickness_maps.svg").read_text(encoding="utf-8")
+    for title in ("CN-AD (fixed effect)", "CN-AD (random effects)", "Heterogeneity, CN-AD"):
+        assert title in drawing
+    page = (combined / "meta.html").read_text(encoding="utf-8")
+    assert page.count('data-kind="effect"') == page.count('data-kind="significance"') > 0
+    assert "not drawn" not in page
+
+
+def test_tables_say_what_their_columns_are(combined):
+    for path in sorted((combined / "meta").glob("*.tsv")):
+        if path.stem == "sites":
+            continue
+        columns = path.read_text().split("\n", 1)[0].split("\t")
+        described = json.loads(path.with_suffix(".json").read_text())
+        assert list(described) == columns
+        wrong = [
+            c for c, about in described.items() if "registered coordinate" in about["Description"]
+        ]
+        assert wrong == [], path.name
