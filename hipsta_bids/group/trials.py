@@ -425,7 +425,7 @@ def _figures(cohort: Cohort, found: Sequence[MapFound]) -> Iterator[tuple[str, D
                 if one.measures[0] == measure and question in one.tables
             }
             unit = cohort.units.get(measure, "1")
-            if rows := list(make(own, with_brackets(display_name(measure), unit))):
+            if rows := list(make(own, display_name(measure), unit)):
                 places = {hemi: one.place for hemi, one in own.items()}
                 yield f"{measure}_{question}", partial(_draw, cohort, places, rows)
 
@@ -434,12 +434,12 @@ def _draw(cohort: Cohort, places: Mapping[str, FittedMaps], rows: Sequence[Row])
     return [draw_rows(cohort, places, {}, rows, {})]
 
 
-def _agreement(found: Mapping[str, MapFound], measure: str) -> Iterator[Row]:
+def _agreement(found: Mapping[str, MapFound], measure: str, unit: str) -> Iterator[Row]:
     """Show agreement between sessions."""
     if found:
         within, icc = (_values(found, "retest", name) for name in ("sd_within", "icc"))
         title = "Within-subject SD"
-        label = f"{title},\n{measure}"
+        label = with_brackets(f"within-subject SD,\n{measure}", unit)
         scale = _scale("magma", within)
         yield Row(kind="error", index=0, title=title, label=label, scale=scale, values=within)
         title = "ICC(2,1)"
@@ -447,7 +447,7 @@ def _agreement(found: Mapping[str, MapFound], measure: str) -> Iterator[Row]:
         yield Row(kind="agreement", index=0, title=title, label=title, scale=scale, values=icc)
 
 
-def _sizes(found: Mapping[str, MapFound], measure: str) -> Iterator[Row]:
+def _sizes(found: Mapping[str, MapFound], measure: str, _: str) -> Iterator[Row]:
     """Show participants per arm, by their logarithm."""
     values = {hemi: np.log10(own) for hemi, own in _values(found, "power", "per_arm").items()}
     if any(np.isfinite(own).any() for own in values.values()):

@@ -1,6 +1,7 @@
 """Test-retest and sample sizes from files to files, and what they refuse."""
 
 import json
+import re
 
 import nibabel as nib
 import numpy as np
@@ -179,7 +180,12 @@ def test_sample_size_of_slowing_among_patients_draws_a_map(dataset):
     assert (summary.power >= 0.9).all()
     reasons = table(folder / "excluded.tsv").reason
     assert reasons.value_counts().to_dict() == {"not-asked": 20}
-    assert (folder / "figures" / "thickness_power.svg").is_file()
+    drawn = (folder / "figures" / "thickness_power.svg").read_text(encoding="utf-8")
+    ticks = [int(n.replace(",", "")) for n in re.findall(r">([\d,]+)</text>", drawn)]
+    per_arm = table(folder / "power_points.tsv").per_arm
+    # Numbers of participants, though colors go by their logarithm.
+    assert ticks == sorted({*ticks} & {20, 30, 50, 100, 200, 300, 500, 1000, 2000, 3000, 5000})
+    assert per_arm.min() <= ticks[0] < ticks[-1] <= per_arm.max()
     text = (folder / "methods.md").read_text()
     assert "25 % of the change over time is prevented, with a power of 0.9" in text
     assert "`time + age_first + sex`" in text
