@@ -42,6 +42,8 @@ SAMPLES = {
     "map_interpolation": ["nearest"],
     "mem": "8G",
     "shard": "1/4",
+    "power": "thinning=5%",
+    "visits": "0,12,24",
     "contrast": ["group[NAME]-group[SEG]", "age"],
     "formula": "thickness ~ group * age",
     "exclude_qc": "a > 1 or b < 2",

@@ -25,9 +25,21 @@ def test_registered_must_pass_and_unregistered_must_fail(monkeypatch, unregister
 
     monkeypatch.setattr(group, "run_simulation", simulate)
     monkeypatch.setattr(group, "_corrections", lambda _cohorts: None)
-    table, _ = group.run(full=False).tables
+    monkeypatch.setattr(group, "_amplitudes", lambda _cohorts: None)
+    table, *_ = group.run(full=False).tables
     assert table.targets == 3
     assert table.missed == missed
+
+
+def test_the_default_moves_groups_least_where_curvature_differs(monkeypatch):
+    some = ("the same", "all 30 % smaller")
+    monkeypatch.setattr(group, "AMPLITUDES", {name: group.AMPLITUDES[name] for name in some})
+    table = group._amplitudes(2)
+    assert table.targets == 4
+    assert table.missed == 0
+    shifted = table.rows[-1]
+    assert shifted["registr, each standardized"] < 0.25
+    assert shifted["registr, as measured"] > 0.4
 
 
 def test_corrections_keep_the_family_wise_error_and_find_the_effect(monkeypatch):
