@@ -103,6 +103,7 @@ def _impersonal(path: Path, names):
             text = _anywhere(json.loads(text), path.parent)
         if path.suffix == ".html":  # the folder of the labels, in commands
             text = re.sub(r"(?<= )(LABELS_DIR|\.\./\S*)/(?=[^/\s]+\.(mgz|nii))", "", text)
+            text = re.sub(r"; LABELS_DIR stands for [^:<]*", "", text)
         for name, stand_in in names.items():
             text = text.replace(name, stand_in)
         return re.sub(r"\d{4}-\d{2}-\d{2} \d{2}:\d{2}", "TIME", text)
