@@ -112,7 +112,9 @@ def make_input(folder, subject="01", *, hemi="L", act="ok", problem=None, sessio
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"sub-{subject}_{hemi}.txt"
-    path.write_text(f"{act} is what sub-{subject} {session} {hemi} does")  # each file another one
+    text = f"{act} is what sub-{subject} {session} {hemi} does"  # each file another one
+    if not path.is_file() or path.read_text() != text:  # never empty while another run reads it
+        path.write_text(text)
     return HemisphereInput(
         subject=subject,
         session=session,
