@@ -29,7 +29,7 @@ $(STAMP): requirements-dev.lock pyproject.toml
 	 make PYTHON=/path/to/python3 ..." >&2; exit 1; }
 	@echo "Making the environment in $(VENV) from requirements-dev.lock (some minutes at first)"
 	@"$(BIN)/python" -c '$(USABLE)' >/dev/null 2>&1 || "$(PYTHON)" -m venv --clear "$(VENV)"
-	"$(BIN)/python" -m pip install -qq --disable-pip-version-check --require-hashes \
+	"$(BIN)/python" -m pip install -qq --disable-pip-version-check --require-hashes --no-compile \
 		-r requirements-dev.lock
 	"$(BIN)/python" -m pip install -qq --disable-pip-version-check --no-deps \
 		--no-build-isolation -e .
@@ -55,8 +55,9 @@ types: $(STAMP)
 layers: $(STAMP)
 	"$(BIN)/lint-imports" --no-cache
 
+# A thread each: the two processes would wait for each other's.
 unit: $(STAMP)
-	"$(BIN)/python" -m pytest -n 2 --dist loadfile
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 "$(BIN)/python" -m pytest -n 2 --dist loadfile
 
 docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 "$(BIN)/python" -m mkdocs build --strict --quiet

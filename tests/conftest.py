@@ -1,5 +1,6 @@
-"""What every test gets: no pages unless asked for, and no reason that the table does not know."""
+"""What tests get: pages and a browser on request only, and no reason that the table lacks."""
 
+import os
 import sys
 from pathlib import Path
 
@@ -9,6 +10,24 @@ import hipsta_bids
 from hipsta_bids.errors import HipstaError
 from hipsta_bids.reports.page import reason_sections
 from hipsta_bids.types import Flag
+
+
+def pytest_collection_modifyitems(items):
+    """Skip what takes a browser, and do not prepare it, unless ``tools/test-reports`` asks."""
+    if os.environ.get("HIPSTA_BIDS_BROWSER") != "required":
+        skip = pytest.mark.skip(reason="takes a browser: run tools/test-reports")
+        for item in items:
+            if "browser" in item.fixturenames:
+                item.add_marker(skip)
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    """Chromium without a network."""
+    from browsing import open_browser  # noqa: PLC0415  (takes selenium)
+
+    with open_browser(tmp_path_factory.mktemp("browser")) as session:
+        yield session
 
 
 @pytest.fixture(scope="module", autouse=True)

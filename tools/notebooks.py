@@ -54,6 +54,17 @@ def run_notebook(path: Path) -> tuple[str, dict[str, bytes]]:
     return "\n\n".join(parts) + "\n", figures
 
 
+def notebook_text(path: Path) -> str:
+    """All cells as Markdown, without running them."""
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    texts = ("".join(cell["source"]) for cell in cells)
+    shown = (
+        text if cell["cell_type"] == "markdown" else f"```python\n{text}\n```"
+        for cell, text in zip(cells, texts, strict=True)
+    )
+    return "\n\n".join(shown) + "\n"
+
+
 def _outputs(text: str, names: dict[str, Any]) -> Iterator[str]:
     """Run a cell; yield what it printed, and the value of its last expression."""
     tree = ast.parse(_SHELL_LINE.sub(lambda line: f"_shell({line[1]!r})", text))

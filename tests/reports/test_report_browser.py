@@ -5,16 +5,10 @@ import re
 
 import numpy as np
 import pytest
-from browsing import colored, fits, one, open_browser, open_page, pixels, texts, until, watched
+from browsing import colored, fits, one, open_page, pixels, texts, until, watched
 from selenium import webdriver
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    with open_browser(tmp_path_factory.mktemp("browser")) as session:
-        yield session
 
 
 @pytest.fixture

@@ -11,7 +11,6 @@ from browsing import (
     faint,
     fits,
     one,
-    open_browser,
     open_page,
     pixels,
     texts,
@@ -26,12 +25,6 @@ from selenium.webdriver.common.keys import Keys
 
 from hipsta_bids.reports.cohort import read_cohort
 from hipsta_bids.reports.participant import participant_page
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    with open_browser(tmp_path_factory.mktemp("browser")) as session:
-        yield session
 
 
 @pytest.fixture
