@@ -333,7 +333,8 @@ def _time_of(hemisphere: Hemisphere, cohort: Cohort) -> str:
 
 
 def _status(series: Series) -> Mapping[str, Any]:
-    return {"cards": [card_of(h, series.cohort) for h in series.hemispheres], "ratings": RATINGS}
+    cards = [card_of(h, series.cohort, series.view(h)) for h in series.hemispheres]
+    return {"cards": cards, "ratings": RATINGS}
 
 
 def _points(series: Series) -> Mapping[str, Any] | None:
@@ -372,7 +373,7 @@ def _input(series: Series) -> Mapping[str, Any]:
                 "missing": view.missing if view else "neither labels nor mask are available",
                 "empty": view is not None and not panels,
                 "panels": panels,
-                "anatomy": view.anatomy.name if view and view.anatomy else None,
+                "anatomy": view.anatomy.path.name if view and view.anatomy else None,
                 "unused": view.unused if view else None,
                 "stack": stack_of(view) if panels and view else None,
             }

@@ -242,7 +242,7 @@ class LabelName:
 class Anatomy:
     """The part of an anatomical image round the body."""
 
-    name: str
+    path: Path
     """Of the file."""
     shares: NDArray[np.float32]
     """(I, J, K) from 0, black, to 1, white."""
@@ -262,7 +262,7 @@ class Anatomy:
         return np.round(255 * shares).astype(np.uint8)
 
 
-def anatomy_of(name: str, volume: ScalarVolume) -> Anatomy | None:
+def anatomy_of(path: Path, volume: ScalarVolume) -> Anatomy | None:
     """Scale an image between its percentiles; ``None`` where it has one value."""
     values = volume.values[..., 0]
     known = values[np.isfinite(values)]
@@ -270,7 +270,7 @@ def anatomy_of(name: str, volume: ScalarVolume) -> Anatomy | None:
     if not low < high:
         return None
     shares = np.interp(np.nan_to_num(values, nan=low), (low, high), (0, 1)).astype(np.float32)
-    return Anatomy(name=name, shares=shares, affine=volume.affine)
+    return Anatomy(path=path, shares=shares, affine=volume.affine)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -360,7 +360,7 @@ def _read_anatomy(
                 beyond = _MARGIN + _BEYOND
                 corners = np.stack([points.min(axis=0) - beyond, points.max(axis=0) + beyond])
                 box = np.stack(np.meshgrid(*corners.T), axis=-1)
-                anatomy = anatomy_of(candidate.path.name, read_scalars(candidate.path, box))
+                anatomy = anatomy_of(candidate.path, read_scalars(candidate.path, box))
                 if anatomy is not None:
                     return anatomy, None
                 problem = "has one value everywhere round the body"

@@ -9,14 +9,18 @@ from typing import Any
 from hipsta_bids.derivatives.dataset import container_of_process
 from hipsta_bids.derivatives.names import output_name, participant_report
 from hipsta_bids.reports.cohort import Cohort, title_of
-from hipsta_bids.reports.results import SURFACES, Hemisphere, input_path
+from hipsta_bids.reports.results import SURFACES, Hemisphere, Views, input_path
 from hipsta_bids.reports.verdict import verdict_of
 
 #: Colors of the edges of surfaces where FreeView cuts them, as in the slices of a page.
 _EDGES = dict(zip(SURFACES, ("green", "white", "magenta"), strict=True))
 
 
-def card_of(hemisphere: Hemisphere, cohort: Cohort) -> Mapping[str, Any]:
+#: What ITK-SNAP reads.
+_NIFTI = (".nii", ".nii.gz")
+
+
+def card_of(hemisphere: Hemisphere, cohort: Cohort, views: Views | None) -> Mapping[str, Any]:
     """Collect what the page says first about a hemisphere, and what leads on from there."""
     key, record = title_of(hemisphere.place.name), hemisphere.record
     order = [title_of(other.place.name) for other in cohort.ranking]
@@ -36,7 +40,9 @@ def card_of(hemisphere: Hemisphere, cohort: Cohort) -> Mapping[str, Any]:
             ("previous", _link(before, cohort)),
             ("next", _link(after, cohort)),
         ],
-        "commands": open_commands(hemisphere),
+        "commands": open_commands(
+            hemisphere, views.anatomy.path if views and views.anatomy else None
+        ),
     }
 
 
@@ -53,24 +59,26 @@ def _link(hemisphere: Hemisphere | None, cohort: Cohort) -> tuple[str, str] | No
     return f"{participant_report(name.subject, name.session)}#{title}", f"{words}: {verdict}"
 
 
-def open_commands(hemisphere: Hemisphere) -> list[tuple[str, str]]:
+def open_commands(hemisphere: Hemisphere, anatomy: Path | None = None) -> list[tuple[str, str]]:
     """Write commands, by program, that open the files of a hemisphere from the output folder.
 
     In a container the folder with the labels is ``LABELS_DIR``, to be replaced.
     """
     place = hemisphere.place
     labels, mask = input_path(hemisphere), place.path("body_mask")
-    volumes = []
+    volumes, behind = [], []
     if labels is not None and labels.exists():
         # Docker's own paths mean nothing outside; Apptainer's are those of the machine.
         hidden = container_of_process().get("Type") == "docker"
         own = f"LABELS_DIR/{labels.name}" if hidden else _from(place.root, labels)
         volumes.append((own, ":colormap=lut:opacity=0.5"))
+        if anatomy is not None and not hidden:
+            behind = [_from(place.root, anatomy)]
     if mask.exists():
         volumes.append((_from(place.root, mask), ":colormap=heat:opacity=0.3"))
     if not volumes:
         return []
-    freeview = ["freeview", "-v", *(path + look for path, look in volumes)]
+    freeview = ["freeview", "-v", *behind, *(path + look for path, look in volumes)]
     surfaces = {name: place.path(f"{name}_surface") for name in SURFACES}
     if all(path.exists() for path in surfaces.values()):
         freeview.append("-f")
@@ -81,11 +89,12 @@ def open_commands(hemisphere: Hemisphere) -> list[tuple[str, str]]:
     if point is not None:
         freeview += ["-ras", *(f"{value:g}" for value in point)]
     first, before = volumes[0][0], ""
-    if not first.endswith((".nii", ".nii.gz")):
+    if not first.endswith(_NIFTI):
         before, first = f"mri_convert {shlex.quote(first)} labels.nii.gz && ", "labels.nii.gz"
     snap = ["itksnap", "-g", first]
     if len(volumes) > 1:
         snap += ["-s", volumes[1][0]]
+    snap += [word for path in behind if path.endswith(_NIFTI) for word in ("-o", path)]
     return [("FreeView", shlex.join(freeview)), ("ITK-SNAP", before + shlex.join(snap))]
 
 

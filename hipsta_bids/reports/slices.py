@@ -190,7 +190,7 @@ def stack_of(views: Views) -> dict[str, Any]:
     grid = np.maximum(2, np.round(count)).astype(int)
     centers = (np.indices(grid) + 0.5).T / grid * np.array(views.shape) - 0.5
     grays = views.anatomy.grays(apply_affine(views.affine, centers)).T // (256 // _LEVELS)
-    anatomy = {"name": views.anatomy.name, "shape": grid.tolist(), "stack": _packed(grays)}
+    anatomy = {"name": views.anatomy.path.name, "shape": grid.tolist(), "stack": _packed(grays)}
     return scene | {"anatomy": anatomy, "levels": _LEVELS}
 
 

@@ -42,6 +42,7 @@ def test_the_page_shows_it_and_says_which_file(shown):
     assert text.count("Behind the labels: <code>norm.mgz</code>") == 2
     assert len(re.findall(r'<image class="anatomy" href="data:image/jpeg;base64,', text)) >= 12
     assert len(text) < 2_500_000
+    assert f"freeview -v ../in/{MRI}/norm.mgz ../in/{MRI}/lh." in text
     assert "Behind the labels" not in (shown / "sub-02.html").read_text()
 
 
@@ -52,7 +53,7 @@ def test_values_are_those_of_the_image_at_the_same_points(tmp_path):
     nib.save(nib.Nifti1Image(image.astype(np.float32), affine), tmp_path / "a.nii.gz")
     index = np.random.default_rng(0).uniform(4, 15, (50, 3))
     points = nib.affines.apply_affine(affine, index)
-    anatomy = anatomy_of("a.nii.gz", read_scalars(tmp_path / "a.nii.gz", points))
+    anatomy = anatomy_of(tmp_path / "a.nii.gz", read_scalars(tmp_path / "a.nii.gz", points))
     read = anatomy.grays(points).astype(float)
     assert 0 < read.min() < read.max() < 255
     # Gray is linear in the value between black and white, and the image linear in the index.
@@ -178,7 +179,7 @@ def test_an_image_of_unknown_space_has_to_have_the_grid_of_the_labels(copy, monk
     def shown_of(*candidates):
         monkeypatch.setattr(results, "find_anatomy", lambda *_: iter(candidates))
         views = views_of(copy)[1]
-        return views.anatomy and views.anatomy.name, views.unused
+        return views.anatomy and views.anatomy.path.name, views.unused
 
     unknown = [Candidate(path=path, proven=False) for path in (other, same)]
     assert shown_of(*unknown) == ("same_T1w.nii.gz", None)

@@ -184,6 +184,10 @@ def test_commands_open_the_files_from_the_output_folder(out):
     assert " ".join(words[words.index("-ras") + 1 :]) in record["repairs"][0]
     labels, mask = files[:2]
     assert snap == (f"mri_convert {labels} labels.nii.gz && itksnap -g labels.nii.gz -s {mask}")
+    image = out.parent / "T2w.nii.gz"
+    (_, freeview), (_, snap) = open_commands(hemisphere(out, "01", "R"), image)
+    assert freeview.split()[2] == "../T2w.nii.gz"
+    assert snap.endswith(f"-s {mask} -o ../T2w.nii.gz")
 
 
 def test_commands_of_a_container_name_no_folder_of_it(out, monkeypatch):
