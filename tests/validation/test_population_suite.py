@@ -192,7 +192,7 @@ def test_a_damage_that_is_refused_is_a_result():
 
 
 def test_mirrored_specimens_change_sides():
-    sides = {make_labels(Specimen(body=SPEC, number=n, voxel=FINE))[1] for n in range(1, 6)}
+    sides = {make_labels(Specimen(body=SPEC, number=n, voxel=FINE))[1] for n in (1, 3)}
     assert sides == {"L", "R"}
 
 
