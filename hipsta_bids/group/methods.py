@@ -9,6 +9,7 @@ from hipsta_bids import __version__
 from hipsta_bids.group.analysis import Analysis
 from hipsta_bids.group.data import PARTICIPANT, Cohort
 from hipsta_bids.group.inference import PERMUTATIONS, control_fdr
+from hipsta_bids.group.joint import JointMap
 from hipsta_bids.group.normative import Scores
 from hipsta_bids.group.settings import GroupSettings, MultiplicitySettings
 
@@ -33,6 +34,9 @@ REFERENCES: Mapping[str, str] = {
     " doi:10.1016/j.neuroimage.2014.01.060",
     "repeated": "Winkler AM, Webster MA, Vidaurre D, Nichols TE, Smith SM. Multi-level block"
     " permutation. NeuroImage 2015;123:253-268. doi:10.1016/j.neuroimage.2015.05.092",
+    "joint": "Winkler AM, Webster MA, Brooks JC, Tracey I, Smith SM, Nichols TE. Non-parametric"
+    " combination and related permutation tests for neuroimaging. Human Brain Mapping"
+    " 2016;37(4):1486-1511. doi:10.1002/hbm.23115",
     "tfce": "Smith SM, Nichols TE. Threshold-free cluster enhancement: addressing problems of"
     " smoothing, threshold dependence and localisation in cluster inference. NeuroImage"
     " 2009;44(1):83-98. doi:10.1016/j.neuroimage.2008.03.061",
@@ -119,6 +123,7 @@ def methods_text(
     n_out: int,
     *,
     others: Sequence[str] = (),
+    joint: Sequence[JointMap] = (),
     region: str = "body",
     ratings: Mapping[str, int] | None = None,
 ) -> str:
@@ -137,6 +142,7 @@ def methods_text(
         paragraphs.append(_alignment(analysis, settings, cite, others))
     paragraphs += _harmonization(analysis, cite)
     paragraphs.append(_models(analysis, settings, cite))
+    paragraphs += [_joint(joint, settings, cite)] if joint else []
     if analysis.comparison.asymmetry:
         paragraphs.append(_asymmetry(settings, cite("asymmetry")))
     if analysis.scores is not None:
@@ -367,6 +373,30 @@ def _correction(how: MultiplicitySettings, cite: Callable[[str], str], *, repeat
     return (
         f"The false discovery rate was held at {how.alpha:g} by {kind} {cite(how.method)}, for"
         f" {family}."
+    )
+
+
+def _joint(joint: Sequence[JointMap], settings: GroupSettings, cite: Callable[[str], str]) -> str:
+    how = settings.multiplicity
+    maps = _words(list(joint[0].parts))
+    by = (
+        "minus twice the sum of the logarithms of their two-sided p-values (Fisher)"
+        if settings.joint.combine == "fisher"
+        else "the smallest of their two-sided p-values (Tippett)"
+    )
+    statistic = "largest combined evidence over the points"
+    if how.method == "permutation-tfce":
+        statistic = f"largest threshold-free cluster enhancement of it {cite('tfce')}"
+    family = "each side" if how.scope == "map" else "both sides together"
+    return (
+        f"The {maps} were also tested together by non-parametric combination {cite('joint')}: at"
+        f" each point the evidence is {by}, as the normal quantile of its p-value for independent"
+        f" measures. In each of {how.permutations} permutations of residuals (Freedman and Lane's;"
+        f" seed {how.seed}) {cite('permutation')} all maps were shuffled alike, so that their"
+        f" dependence is kept. The distribution of the {statistic} holds the family-wise error"
+        f" rate at {how.alpha:g} for {family}. The null hypothesis of a point is that there is no"
+        " effect in any of the maps; of a point that survives, the tests of single maps say where"
+        " the effect is."
     )
 
 

@@ -134,7 +134,7 @@ def test_damaged_files_are_refused(tmp_path, content, words):
     path = tmp_path / "x.shape.gii"
     path.write_bytes(content)
     with pytest.raises(InputError, match=words):
-        read_map(path, "x")
+        read_map(path, "x", "L")
 
 
 def test_half_a_file_is_refused(tmp_path):
@@ -142,21 +142,21 @@ def test_half_a_file_is_refused(tmp_path):
     write_map(path, np.arange(1000.0))
     path.write_bytes(path.read_bytes()[:1500])
     with pytest.raises(InputError, match="not readable as GIFTI"):
-        read_map(path, "x")
+        read_map(path, "x", "L")
 
 
 def test_files_of_several_maps_are_refused_unless_a_column_has_the_name(tmp_path):
     write_map(tmp_path / "x.func.gii", np.zeros(5), np.ones(5))
     with pytest.raises(InputError, match="holds 2 maps"):
-        read_map(tmp_path / "x.func.gii", "a")
+        read_map(tmp_path / "x.func.gii", "a", "L")
     files.write_tsv(tmp_path / "x.tsv", ["a", "b"], [["1", "2"], ["3", "inf"]])
-    assert read_map(tmp_path / "x.tsv", "a").values.tolist() == [1, 3]
-    np.testing.assert_array_equal(read_map(tmp_path / "x.tsv", "b").values, [2, np.nan])
+    assert read_map(tmp_path / "x.tsv", "a", "L").values.tolist() == [1, 3]
+    np.testing.assert_array_equal(read_map(tmp_path / "x.tsv", "b", "L").values, [2, np.nan])
     with pytest.raises(InputError, match="has columns a, b"):
-        read_map(tmp_path / "x.tsv", "c")
+        read_map(tmp_path / "x.tsv", "c", "L")
     files.write_tsv(tmp_path / "y.tsv", ["a"], [["much"]])
     with pytest.raises(InputError, match="no numbers"):
-        read_map(tmp_path / "y.tsv", "a")
+        read_map(tmp_path / "y.tsv", "a", "L")
 
 
 @pytest.mark.parametrize(
