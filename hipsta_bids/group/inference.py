@@ -124,7 +124,7 @@ def combine_evidence(p: Float, how: str) -> Float:
     else:
         joined = -np.expm1(count * np.log1p(-p.min(axis=0)))
     joined = np.clip(joined, np.finfo(np.float64).tiny, 0.5)  # of 0.5, z is 0
-    return np.asarray(-special.ndtri(joined), dtype=np.float64)
+    return np.asarray(np.abs(special.ndtri(joined)), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)

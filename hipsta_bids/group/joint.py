@@ -23,7 +23,6 @@ from hipsta_bids.reports.group_tables import (
     BOTH_SIDES,
     JOINT,
     SIDES,
-    display_name,
     effect_name,
     number_text,
     p_text,
@@ -73,6 +72,22 @@ class JointMap:
         }
 
 
+def check_joint(known: Sequence[str], settings: GroupSettings) -> None:
+    """Refuse measures that cannot be tested together, before anything is fitted."""
+    names, sides = settings.joint.measures, settings.joint.sides
+    what = None
+    if unknown := [name for name in names if name not in known]:
+        what = f"no map is called {unknown[0]!r}; there are {', '.join(known)}"
+    elif names and JOINT in known:
+        what = f"a map is called {JOINT}, as its results would be; give it another name"
+    elif len(set(names)) < len(names):
+        what = "a measure is named twice; leave it out"
+    elif len(names) < 1 + (not sides) and (names or sides):
+        what = "name two measures, or one and --joint-sides"
+    if what is not None:
+        raise ModelError(f"--joint {' '.join(names)}".strip() + f": {what}", reason="joint-maps")
+
+
 def combine_maps(analyses: Sequence[Analysis], settings: GroupSettings) -> dict[MapKey, JointMap]:
     """Test the measures of the setting ``joint`` together; empty without any.
 
@@ -84,7 +99,6 @@ def combine_maps(analyses: Sequence[Analysis], settings: GroupSettings) -> dict[
     fits = {
         (m, hemi): one for each in analyses for hemi, one in each.fitted.items() for m in one.fits
     }
-    _check_names(names, list(dict.fromkeys(measure for measure, _ in fits)), sides=sides)
     groups: dict[MapKey, list[tuple[FittedMaps, str]]] = {}
     titles: dict[MapKey, list[str]] = {}
     contrasts = {}
@@ -110,20 +124,6 @@ def combine_maps(analyses: Sequence[Analysis], settings: GroupSettings) -> dict[
         )
         for key, (test, own) in found.items()
     }
-
-
-def _check_names(names: Sequence[str], known: Sequence[str], *, sides: bool) -> None:
-    unknown = [name for name in names if name not in known]
-    if unknown or JOINT in known or len(set(names)) < len(names):
-        what = f"no map is called {unknown[0]!r}" if unknown else "names have to differ"
-        raise ModelError(
-            f"--joint: {what}; maps of this analysis are {', '.join(known)}", reason="joint-maps"
-        )
-    if len(names) == 1 and not sides:
-        raise ModelError(
-            f"--joint {names[0]}: is one measure; name a second, or add --joint-sides",
-            reason="joint-maps",
-        )
 
 
 def _check_points(names: Sequence[str], parts: Sequence[FittedMaps]) -> None:
@@ -215,15 +215,13 @@ def _rows(number: int, contrast: str, own: Mapping[str, JointMap]) -> Iterator[R
     z = {hemi: one.test.statistic for hemi, one in own.items()}
     survive = {hemi: one.found.rejected for hemi, one in own.items()}
     logs = {hemi: signed_logarithm(one.found.adjusted, z[hemi]) for hemi, one in own.items()}
-    counts = ", ".join(
-        f"{int(found.sum())} of {int(np.isfinite(z[hemi]).sum())} {SIDES[hemi]}"
-        for hemi, found in survive.items()
-    )
+    counts = ", ".join(f"{int(found.sum())} {SIDES[hemi]}" for hemi, found in survive.items())
+    tested = "/".join(dict.fromkeys(str(int(np.isfinite(one).sum())) for one in z.values()))
     first = next(iter(own.values()))
     yield Row(
         kind="effect",
         index=number,
-        title=f"{' and '.join(map(display_name, first.parts))} together, {contrast}".capitalize(),
+        title=f"Joint evidence, {contrast}",
         label=EFFECT_NAMES["z"],
         scale={"cmap": colors, "vmin": 0.0, "vmax": max(_LEAST_Z, *map(np.nanmax, z.values()))},
         values=z,
@@ -232,7 +230,7 @@ def _rows(number: int, contrast: str, own: Mapping[str, JointMap]) -> Iterator[R
     yield Row(
         kind="significance",
         index=number,
-        title=f"Significant: {counts} points",
+        title=f"Significant: {counts} of {tested} points",
         label="corrected p",
         scale={
             "cmap": p_colors,

@@ -27,7 +27,7 @@ from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Measures
 from hipsta_bids.group.exchange import SUMMARY, summarize, write_summary
 from hipsta_bids.group.formula import parse_model, with_factors
 from hipsta_bids.group.harmonize import harmonization_record
-from hipsta_bids.group.joint import combine_maps
+from hipsta_bids.group.joint import check_joint, combine_maps
 from hipsta_bids.group.model import (
     ModelRequest,
     choose_references,
@@ -160,6 +160,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
     dataset.check_own_dataset(options.out_dir)
     tell("reading")
     inputs = read_inputs(options, settings)
+    check_joint([*inputs.measures.maps, *inputs.others], settings)
     cohort = inputs.cohort
     references, groups = choose_references(options.model, cohort.table, settings)
     document = model_document(

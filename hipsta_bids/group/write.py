@@ -434,7 +434,8 @@ def write_surface(folder: Path, cohort: Cohort, one: FittedMaps, hemi: str) -> N
         points = np.zeros((nx * ny, 3))
         points[:, 0], points[:, 1] = np.repeat(cohort.x, ny), np.tile(cohort.y, nx)
         triangles = gifti.sheet_triangles(nx, ny)
-    content = gifti.surface_bytes(points, triangles, hemi=hemi, secondary=secondary, unfolded=True)
+    flat = one.maps.mesh is None or one.maps.mesh.flat
+    content = gifti.surface_bytes(points, triangles, hemi=hemi, secondary=secondary, unfolded=flat)
     files.write_bytes(folder / f"hemi-{hemi}_space-{space}_midthickness.surf.gii", content)
 
 

@@ -19,7 +19,7 @@ from xml.parsers.expat import ExpatError
 
 import nibabel as nib
 import numpy as np
-from nibabel.cifti2.cifti2 import Cifti2Image
+from nibabel.cifti2.cifti2 import Cifti2BrainModel, Cifti2Image
 from nibabel.cifti2.cifti2_axes import BrainModelAxis, ScalarAxis
 from nibabel.filebasedimages import ImageFileError
 from nibabel.gifti.gifti import (
@@ -30,6 +30,7 @@ from nibabel.gifti.gifti import (
     GiftiLabelTable,
     GiftiMetaData,
 )
+from nibabel.spatialimages import HeaderDataError
 from numpy.typing import NDArray
 
 from hipsta_bids.errors import InputError
@@ -43,6 +44,15 @@ DENSE_SCALARS = ".dscalar.nii"
 _STRUCTURE = {"L": "HippocampusLeft", "R": "HippocampusRight"}
 
 Image = TypeVar("Image", GiftiImage, Cifti2Image)
+
+#: Sides at the end of CIFTI's names of structures.
+_CIFTI_SIDES = {"LEFT": "L", "RIGHT": "R"}
+
+#: What nibabel raises on files that are damaged.
+_DAMAGE = (
+    *(OSError, ValueError, TypeError, LookupError, AttributeError),
+    *(ImageFileError, HeaderDataError, ExpatError, zlib.error, struct.error),
+)
 
 #: Names of the harmonic coordinates as point data of the tetrahedral mesh, in their order.
 COORDINATE_NAMES = ("medial_lateral", "posterior_anterior", "interior_exterior")
@@ -156,21 +166,20 @@ def cifti_sides(path: Path) -> list[str]:
     return list(_surface_models(path, _load(path, Cifti2Image)))
 
 
-def _surface_models(path: Path, image: Cifti2Image) -> dict[str, tuple[slice, BrainModelAxis]]:
-    """Find the part of the data, and the vertices, of each hemisphere."""
-    axis = image.header.get_axis(image.ndim - 1)
-    found: dict[str, tuple[slice, BrainModelAxis]] = {}
-    models = axis.iter_structures() if isinstance(axis, BrainModelAxis) else ()
-    for structure, part, model in models:
-        hemi = structure.rpartition("_")[2][:1]
-        if not model.nvertices or f"_{hemi}" not in {"_L", "_R"}:
+def _surface_models(path: Path, image: Cifti2Image) -> dict[str, Cifti2BrainModel]:
+    """Find where the data of each hemisphere are, and of which vertices."""
+    found: dict[str, Cifti2BrainModel] = {}
+    # The axes that nibabel makes of it would hold a word per vertex.
+    for model in image.header.get_index_map(image.ndim - 1).brain_models:
+        hemi = _CIFTI_SIDES.get(model.brain_structure.rpartition("_")[2])
+        if hemi is None or not model.surface_number_of_vertices:
             continue
         if hemi in found:
             raise InputError(
                 f"{path}: has several surfaces of hemisphere {hemi}; give a file with one",
                 reason="several-maps",
             )
-        found[hemi] = part, model
+        found[hemi] = model
     return found
 
 
@@ -181,15 +190,18 @@ def _from_cifti(path: Path, hemi: str) -> PointMap:
         raise InputError(
             f"{path}: holds {image.shape[0]} maps; give a file with one", reason="several-maps"
         )
-    models = _surface_models(path, image)
-    if hemi not in models:
+    model = _surface_models(path, image).get(hemi)
+    if model is None:
         raise InputError(
             f"{path}: has no surface of hemisphere {hemi}; leave {{hemi}} out of the pattern",
             reason="unreadable-map",
         )
-    part, model = models[hemi]
-    values = np.full(next(iter(model.nvertices.values())), np.nan)
-    values[model.vertex] = image.get_fdata(dtype=np.float64)[0, part]
+    values = np.full(model.surface_number_of_vertices, np.nan)
+    first, count = model.index_offset, model.index_count
+    try:
+        values[list(model.vertex_indices)] = image.dataobj[0, first : first + count]
+    except _DAMAGE as error:
+        raise _unreadable(path, "CIFTI", error) from error
     suffix = entities(path.name)["suffix"]
     return PointMap(values=_finite(values), unit=_UNITS.get(suffix, ARBITRARY))
 
@@ -273,25 +285,19 @@ def read_mesh(path: Path) -> Mesh:
     return mesh
 
 
+def _unreadable(path: Path, what: str, error: Exception) -> InputError:
+    first = str(error).partition("\n")[0]
+    return InputError(
+        f"{path}: not readable as {what} ({first}); write it again", reason="unreadable-map"
+    )
+
+
 def _load(path: Path, kind: type[Image]) -> Image:
     what = "GIFTI" if kind is GiftiImage else "CIFTI"
     try:
         image = nib.load(path)
-    except (
-        OSError,
-        ValueError,
-        TypeError,
-        KeyError,
-        AttributeError,
-        ImageFileError,
-        ExpatError,
-        zlib.error,
-        struct.error,
-    ) as error:
-        first = str(error).partition("\n")[0]
-        raise InputError(
-            f"{path}: not readable as {what} ({first}); write it again", reason="unreadable-map"
-        ) from error
+    except _DAMAGE as error:
+        raise _unreadable(path, what, error) from error
     if not isinstance(image, kind):
         raise InputError(
             f"{path}: is no {what} file; maps are .shape.gii, .func.gii, .dscalar.nii or .tsv"

@@ -48,7 +48,8 @@ def map_scenes(results: GroupResults) -> Mapping[str, Any] | None:
     if not len(maps):
         return None
     blocks, data = [], list[dict[str, Any]]()
-    for measure in maps["measure"].unique().tolist()[:_MOST_FIGURES]:
+    measures = sorted(maps["measure"].unique().tolist(), key=lambda name: name != JOINT)
+    for measure in measures[:_MOST_FIGURES]:
         own = maps[maps["measure"] == measure]
         means = results.table("means")
         means = means[means["measure"] == measure] if len(means) else means
@@ -70,7 +71,8 @@ def map_scenes(results: GroupResults) -> Mapping[str, Any] | None:
         blocks.append({"title": title, "plates": plates})
         if scene and plates:
             data.append({**scene, "sides": list(map(_rounded, scene["sides"]))})
-    return {"blocks": blocks[:_OPEN], "more": blocks[_OPEN:], "data": data}
+    first = _OPEN + (JOINT in measures)
+    return {"blocks": blocks[:first], "more": blocks[first:], "data": data}
 
 
 def embedded(results: GroupResults, name: str, caption: str, alt: str = "") -> list[Picture]:
