@@ -118,12 +118,13 @@ def combine_evidence(p: Float, how: str) -> Float:
     smallest (Tippett 1931). As what is permuted, z only has to rise with the evidence. Below zero,
     where there is none, it is zero; it is NaN where any p is.
     """
-    count, p = len(p), np.maximum(p, np.finfo(np.float64).tiny)
+    limits = np.finfo(np.float64)
+    count, p = len(p), np.clip(p, limits.tiny, 1 - limits.eps)
     if how == "fisher":
         joined = special.chdtrc(2 * count, -2 * np.log(p).sum(axis=0))
     else:
         joined = -np.expm1(count * np.log1p(-p.min(axis=0)))
-    joined = np.clip(joined, np.finfo(np.float64).tiny, 0.5)  # of 0.5, z is 0
+    joined = np.clip(joined, limits.tiny, 0.5)  # of 0.5, z is 0
     return np.asarray(np.abs(special.ndtri(joined)), dtype=np.float64)
 
 

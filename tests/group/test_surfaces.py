@@ -2,7 +2,15 @@
 
 import numpy as np
 import pytest
-from hippunfold_like import PATTERNS, flat_surface, names, write_map, write_surface
+from hippunfold_like import (
+    PATTERNS,
+    cifti_name,
+    flat_surface,
+    names,
+    write_cifti,
+    write_map,
+    write_surface,
+)
 
 from hipsta_bids.errors import InputError, NothingToDoError, UsageError
 from hipsta_bids.group.surfaces import find_maps, map_patterns, read_maps
@@ -135,6 +143,60 @@ def test_damaged_files_are_refused(tmp_path, content, words):
     path.write_bytes(content)
     with pytest.raises(InputError, match=words):
         read_map(path, "x", "L")
+
+
+@pytest.mark.parametrize("structure", ["CORTEX", "HIPPOCAMPUS"])
+def test_cifti_files_of_hippunfold_are_both_sides(tmp_path, version, structure):
+    values = np.linspace(0.5, 2, 50)
+    for subject in ("01", "02"):
+        sides = {"L": values * int(subject), "R": np.where(values < 1, np.nan, values)}
+        if subject == "02":
+            del sides["R"]
+        write_cifti(
+            cifti_name(tmp_path / "hippunfold", subject, version=version),
+            sides,
+            structure=structure,
+        )
+        for hemi in "LR":
+            _, surface = names(tmp_path / "hippunfold", subject, hemi, version=version)
+            write_surface(surface, POINTS + 100 * (hemi == "R"), TRIANGLES)
+    pattern = "hippunfold/sub-{subject}/*/*_label-hipp_thickness.dscalar.nii"
+    sides, unit, visits = find_and_read(tmp_path, pattern)
+    assert unit == "mm"
+    assert visits_of(sides["L"], visits) == [("01", None), ("02", None)]
+    assert visits_of(sides["R"], visits) == [("01", None)]
+    left = sides["L"].maps["hipp"][..., 0]
+    np.testing.assert_allclose(left, [values, 2 * values], rtol=1e-6)
+    right = sides["R"].maps["hipp"][0, :, 0]
+    np.testing.assert_allclose(right, np.where(values < 1, np.nan, values), rtol=1e-6)
+    assert sides["R"].mesh.points.min() >= 100  # each side has its own surface
+
+
+def spoiled_cifti(path, kind):
+    sides = {"L": np.arange(300.0), "R": np.arange(300.0)}
+    if kind == "one side":
+        del sides["R"]
+    write_cifti(path, sides, names=("a", "b") if kind == "two maps" else ("a",))
+    cut = {"cut in the header": 700, "cut in the data": -100, "empty": 0}
+    if kind in cut:
+        path.write_bytes(path.read_bytes()[: cut[kind]])
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("cut in the header", "not readable as CIFTI"),
+        ("cut in the data", "not readable as CIFTI"),
+        ("empty", "not readable as CIFTI"),
+        ("two maps", "holds 2 maps"),
+        ("one side", "no surface of hemisphere R"),
+    ],
+)
+def test_cifti_files_that_are_refused(tmp_path, kind, words):
+    path = tmp_path / "x_thickness.dscalar.nii"
+    spoiled_cifti(path, kind)
+    with pytest.raises(InputError, match=words):
+        read_map(path, "x", "R")
 
 
 def test_half_a_file_is_refused(tmp_path):
