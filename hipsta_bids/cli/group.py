@@ -93,8 +93,9 @@ def _add_sheets(parser: Parser) -> None:
     add(
         "--maps",
         "NAME=PATTERN...",
-        "other programs' maps with corresponding points, GIFTI or TSV, with sheets or alone:"
-        " path (also in BIDS_DIR) with {subject}, {session}, {hemi} or {side} (lh, rh), *",
+        "other programs' maps with corresponding points, GIFTI, CIFTI or TSV, with sheets or alone:"
+        " path (also in BIDS_DIR) with {subject}, {session}, {hemi} or {side} (lh, rh), *; CIFTI"
+        " (.dscalar.nii) without {hemi}",
         type=named_pattern,
     )
     add(
