@@ -53,6 +53,8 @@ class JointMap:
     key: MapKey
     parts: Mapping[str, tuple[FittedMaps, str]]
     """Fit and measure of each map, by its title."""
+    cohort: Cohort
+    """What has the coordinates of the points."""
     test: PermutationTest
     found: Discoveries
 
@@ -99,10 +101,11 @@ def combine_maps(analyses: Sequence[Analysis], settings: GroupSettings) -> dict[
     fits = {
         (m, hemi): one for each in analyses for hemi, one in each.fitted.items() for m in one.fits
     }
+    cohort = next(each.compared for each in analyses if names[0] in each.measured.maps)
     groups: dict[MapKey, list[tuple[FittedMaps, str]]] = {}
     titles: dict[MapKey, list[str]] = {}
     contrasts = {}
-    for hemis in [("L", "R"), ("LR",)] if sides else [("L",), ("R",), ("LR",)]:
+    for hemis in [("L", "R")] if sides else [("L",), ("R",)]:
         own = [(fits.get((name, hemi)), name, hemi) for hemi, name in product(hemis, names)]
         parts = [(one, name) for one, name, _ in own if one is not None]
         if len(parts) < len(own):
@@ -120,7 +123,11 @@ def combine_maps(analyses: Sequence[Analysis], settings: GroupSettings) -> dict[
     found = correct_joint(groups, contrasts, model, analyses[0].compared.table, settings)
     return {
         key: JointMap(
-            key=key, parts=dict(zip(titles[key], groups[key], strict=True)), test=test, found=own
+            key=key,
+            parts=dict(zip(titles[key], groups[key], strict=True)),
+            cohort=cohort,
+            test=test,
+            found=own,
         )
         for key, (test, own) in found.items()
     }
@@ -128,9 +135,14 @@ def combine_maps(analyses: Sequence[Analysis], settings: GroupSettings) -> dict[
 
 def _check_points(names: Sequence[str], parts: Sequence[FittedMaps]) -> None:
     """Refuse maps whose points do not correspond."""
-    shapes = {(*one.maps.shape, one.maps.mesh is None) for one in parts}
-    if len(shapes) > 1:
-        counts = ", ".join(str(x * y) for x, y, _ in sorted(shapes))
+    first, *others = [one.maps for one in parts]
+    same = [
+        one.shape == first.shape
+        and np.array_equal(edges_of(one, 4), edges_of(first, 4))  # the triangles of meshes
+        for one in others
+    ]
+    if not all(same):
+        counts = ", ".join(str(np.prod(one.maps.shape)) for one in parts)
         raise ModelError(
             f"--joint {' '.join(names)}: maps lie on different surfaces ({counts} points); choose"
             " maps of one surface" + (", or leave --joint-sides out" if len(names) == 1 else ""),
@@ -138,9 +150,9 @@ def _check_points(names: Sequence[str], parts: Sequence[FittedMaps]) -> None:
         )
 
 
-def joint_points(cohort: Cohort, one: JointMap) -> pd.DataFrame:
+def joint_points(one: JointMap) -> pd.DataFrame:
     """List all points of a map, with the p-value of each measure by itself."""
-    frame = frame_of(cohort, one.place)
+    frame = frame_of(one.cohort, one.place)
     columns = {
         **frame.number,
         **frame.position,
@@ -155,11 +167,11 @@ def joint_points(cohort: Cohort, one: JointMap) -> pd.DataFrame:
     return pd.DataFrame(columns)
 
 
-def joint_peaks(cohort: Cohort, joint: Sequence[JointMap], settings: GroupSettings) -> pd.DataFrame:
+def joint_peaks(joint: Sequence[JointMap], settings: GroupSettings) -> pd.DataFrame:
     """List clusters with their peaks; of a map without findings its strongest point."""
     rows = []
     for one in joint:
-        frame, tests, z = frame_of(cohort, one.place), one.tests, one.test.statistic
+        frame, tests, z = frame_of(one.cohort, one.place), one.tests, one.test.statistic
         edges = edges_of(one.place.maps, settings.multiplicity.neighbors)
         clusters = find_clusters(one.found.rejected, z, frame.subfield, edges)
         if not clusters and np.isfinite(z).any():
@@ -193,21 +205,15 @@ def joint_peaks(cohort: Cohort, joint: Sequence[JointMap], settings: GroupSettin
 
 
 def draw_joint(
-    cohort: Cohort, joint: Sequence[JointMap], shapes: Mapping[str, AverageShape], views: Views
+    joint: Sequence[JointMap], shapes: Mapping[str, AverageShape], views: Views
 ) -> "list[Figure]":
     """Draw combined evidence and corrected p of each contrast."""
     by_contrast: dict[str, dict[str, JointMap]] = {}
     for one in joint:
         by_contrast.setdefault(one.key.contrast, {})[one.key.hemi] = one
-    # Of asymmetry there may be contrasts that single sides lack.
-    sides = {one.key.hemi: one.place for one in joint}
-    figures = []
-    for own_sides in dict.fromkeys(tuple(own) for own in by_contrast.values()):
-        same = {name: own for name, own in by_contrast.items() if tuple(own) == own_sides}
-        blocks = [list(_rows(number, name, own)) for number, (name, own) in enumerate(same.items())]
-        places = {hemi: sides[hemi] for hemi in own_sides}
-        figures += draw_pages(cohort, places, shapes, views, blocks)
-    return figures
+    places = {one.key.hemi: one.place for one in joint}
+    blocks = [list(_rows(i, name, own)) for i, (name, own) in enumerate(by_contrast.items())]
+    return draw_pages(joint[0].cohort, places, shapes, views, blocks)
 
 
 def _rows(number: int, contrast: str, own: Mapping[str, JointMap]) -> Iterator[Row]:

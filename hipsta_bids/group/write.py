@@ -146,7 +146,7 @@ def write_results(
         _write_surfaces(folder, *one)
         _write_stats(folder, _stats(one[1]))
         _write_scores(folder, *one)
-    _write_joint(folder, cohort, joint, settings)
+    _write_joint(folder, joint, settings)
     text = methods_text(
         cohort,
         analysis,
@@ -180,7 +180,7 @@ def draw(
     every = ((cohort, analysis, shapes), *((*one, {}) for one in others.values()))
     drawings = [figure for one in every for figure in draw_figures(*one)]
     if joint:
-        drawings.append((f"{JOINT}_maps", partial(draw_joint, cohort, joint, shapes, {})))
+        drawings.append((f"{JOINT}_maps", partial(draw_joint, joint, shapes, {})))
     return write_figures(folder, drawings)
 
 
@@ -401,22 +401,19 @@ def _write_stats(folder: Path, maps: Mapping[MapKey, _Stats]) -> None:
         files.write_bytes(folder / f"{name}.dscalar.nii", gifti.cifti_bytes(both, names))
 
 
-def _write_joint(
-    folder: Path, cohort: Cohort, joint: Sequence[JointMap], settings: GroupSettings
-) -> None:
+def _write_joint(folder: Path, joint: Sequence[JointMap], settings: GroupSettings) -> None:
     """Write tests of several measures together."""
     if not joint:
         return
     meaning = {**COLUMNS, **JOINT_COLUMNS}
-    write_table(folder, f"{JOINT}_peaks", joint_peaks(cohort, joint, settings), meaning=meaning)
+    write_table(folder, f"{JOINT}_peaks", joint_peaks(joint, settings), meaning=meaning)
     for one in joint:
         name = map_name(one.key.hemi, one.key.measure, one.key.contrast)
         parts = {
             f"p_{title.replace(' ', '_')}": f"p-value of {title} alone, not corrected"
             for title in one.parts
         }
-        table = joint_points(cohort, one)
-        write_table(folder, name, table, meaning={**meaning, **parts})
+        write_table(folder, name, joint_points(one), meaning={**meaning, **parts})
     _write_stats(
         folder,
         {one.key: {"z": one.test.statistic, "pcorrected": one.found.adjusted} for one in joint},

@@ -194,11 +194,11 @@ def _test(results: GroupResults, row: Mapping[str, Any]) -> dict[str, Any]:
         "n_tests": int(row["n_tests"]),
         "n_significant": int(row["n_significant"]),
         "effect": rows[_EFFECT_COLUMNS[kind]].to_numpy(dtype=np.float64),
-        "parts": {
-            str(name).replace("_", " ").replace("p ", "p of ", 1): rows[name].to_numpy(np.float64)
+        "parts": [
+            [f"p of {display_name(str(name)[2:])}", rows[name].to_numpy(np.float64)]
             for name in rows
             if joint and str(name).startswith("p_") and name != "p_corrected"
-        },
+        ],
         "significant": significant.astype(int).tolist(),
         "values": numbers,
         "peaks": peaks.loc[same, ["x", "y"]].round(6).to_numpy().tolist(),

@@ -33,7 +33,7 @@
       if (is_t) rows.push([item.contrast, spell(estimate[at]) + unit]);
       const name = item.kind === "z" || (is_t && df[at] === null) ? "z" : is_t ? `t(${spell(df[at])})` : "F";
       rows.push([name, spell(statistic[at])]);
-      for (const [part, values] of Object.entries(item.parts)) rows.push([part, probability(values[at])]);
+      for (const [part, values] of item.parts) rows.push([part, probability(values[at])]);
       rows.push(["p", probability(p[at])]);
       rows.push(["corrected p", probability(adjusted[at]) + (item.significant[at] ? ", survives" : "")]);
       if (item.kind !== "z") rows.push([is_t ? "Cohen's d" : "partial η²", spell(item.effect[at])]);
