@@ -112,11 +112,11 @@ def permute(
 
 
 def combine_evidence(p: Float, how: str) -> Float:
-    """Combine p-values (measures, ...) into z: the normal quantile that they have if independent.
+    """Combine p-values (measures, ...) into z: the normal quantile of their two-sided p together.
 
     ``fisher`` sums minus twice their logarithms (chi squared; Fisher 1932), ``tippett`` takes the
-    smallest (Tippett 1931). As what is permuted, z only has to rise with the evidence. Below zero,
-    where there is none, it is zero; it is NaN where any p is.
+    smallest (Tippett 1931). That p holds if they are independent; as what is permuted, z only has
+    to rise with the evidence. It is not negative, and NaN where any p is.
     """
     limits = np.finfo(np.float64)
     count, p = len(p), np.clip(p, limits.tiny, 1 - limits.eps)
@@ -124,8 +124,7 @@ def combine_evidence(p: Float, how: str) -> Float:
         joined = special.chdtrc(2 * count, -2 * np.log(p).sum(axis=0))
     else:
         joined = -np.expm1(count * np.log1p(-p.min(axis=0)))
-    joined = np.clip(joined, limits.tiny, 0.5)  # of 0.5, z is 0
-    return np.asarray(np.abs(special.ndtri(joined)), dtype=np.float64)
+    return np.asarray(np.abs(special.ndtri(np.clip(joined, limits.tiny, 1) / 2)), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 #: Meaning of the columns that no other table has.
 JOINT_COLUMNS: Mapping[str, str] = {
     "hemi": "hemisphere, L or R; both where left and right are tested together",
-    "statistic": "combined evidence: the normal quantile of the combined p-value, if measures were"
-    " independent; zero where it is below",
+    "statistic": "combined evidence: the normal quantile of the combined two-sided p-value, if"
+    " measures were independent",
     "p": "p-value of the point by permutation, not corrected",
     "p_corrected": "p-value corrected for all points of the family by permutation",
     "n": "participants with a value, of the measure that has fewest",
@@ -221,7 +221,8 @@ def _rows(number: int, contrast: str, own: Mapping[str, JointMap]) -> Iterator[R
     z = {hemi: one.test.statistic for hemi, one in own.items()}
     survive = {hemi: one.found.rejected for hemi, one in own.items()}
     logs = {hemi: signed_logarithm(one.found.adjusted, z[hemi]) for hemi, one in own.items()}
-    counts = ", ".join(f"{int(found.sum())} {SIDES[hemi]}" for hemi, found in survive.items())
+    sides = {hemi: "" if hemi == BOTH_SIDES else f" {SIDES[hemi]}" for hemi in own}
+    counts = ", ".join(f"{int(found.sum())}{sides[hemi]}" for hemi, found in survive.items())
     tested = "/".join(dict.fromkeys(str(int(np.isfinite(one).sum())) for one in z.values()))
     first = next(iter(own.values()))
     yield Row(

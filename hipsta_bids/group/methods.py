@@ -9,7 +9,6 @@ from hipsta_bids import __version__
 from hipsta_bids.group.analysis import Analysis
 from hipsta_bids.group.data import PARTICIPANT, Cohort
 from hipsta_bids.group.inference import PERMUTATIONS, control_fdr
-from hipsta_bids.group.joint import JointMap
 from hipsta_bids.group.normative import Scores
 from hipsta_bids.group.settings import GroupSettings, MultiplicitySettings
 
@@ -123,7 +122,6 @@ def methods_text(
     n_out: int,
     *,
     others: Sequence[str] = (),
-    joint: Sequence[JointMap] = (),
     region: str = "body",
     ratings: Mapping[str, int] | None = None,
 ) -> str:
@@ -142,7 +140,7 @@ def methods_text(
         paragraphs.append(_alignment(analysis, settings, cite, others))
     paragraphs += _harmonization(analysis, cite)
     paragraphs.append(_models(analysis, settings, cite))
-    paragraphs += [_joint(joint, settings, cite)] if joint else []
+    paragraphs += [_joint(analysis, settings, cite)] if settings.joint.measures else []
     if analysis.comparison.asymmetry:
         paragraphs.append(_asymmetry(settings, cite("asymmetry")))
     if analysis.scores is not None:
@@ -376,27 +374,30 @@ def _correction(how: MultiplicitySettings, cite: Callable[[str], str], *, repeat
     )
 
 
-def _joint(joint: Sequence[JointMap], settings: GroupSettings, cite: Callable[[str], str]) -> str:
-    how = settings.multiplicity
-    maps = _words(list(joint[0].parts))
+def _joint(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], str]) -> str:
+    how, joint = settings.multiplicity, settings.joint
     by = (
         "minus twice the sum of the logarithms of their two-sided p-values (Fisher)"
-        if settings.joint.combine == "fisher"
+        if joint.combine == "fisher"
         else "the smallest of their two-sided p-values (Tippett)"
     )
-    statistic = "largest combined evidence over the points"
+    shuffled = "permutations of residuals (Freedman and Lane's"
+    if analysis.comparison.longitudinal:
+        shuffled = "flips of the signs of each participant's residuals (of the linear model"
+    statistic = "the combined evidence"
     if how.method == "permutation-tfce":
-        statistic = f"largest threshold-free cluster enhancement of it {cite('tfce')}"
-    family = "each side" if how.scope == "map" else "both sides together"
+        statistic = f"its threshold-free cluster enhancement {cite('tfce')}"
+    family = "" if joint.sides else " of each side" if how.scope == "map" else " of both sides"
+    names = " and ".join(name.replace("_", " ") for name in joint.measures)
     return (
-        f"The {maps} were also tested together by non-parametric combination {cite('joint')}: at"
-        f" each point the evidence is {by}, as the normal quantile of its p-value for independent"
-        f" measures. In each of {how.permutations} permutations of residuals (Freedman and Lane's;"
-        f" seed {how.seed}) {cite('permutation')} all maps were shuffled alike, so that their"
-        f" dependence is kept. The distribution of the {statistic} holds the family-wise error"
-        f" rate at {how.alpha:g} for {family}. The null hypothesis of a point is that there is no"
-        " effect in any of the maps; of a point that survives, the tests of single maps say where"
-        " the effect is."
+        f"Maps of {names}{', of the left and the right side,' if joint.sides else ''} were also"
+        f" tested together by non-parametric combination {cite('joint')}. At each point the"
+        f" evidence is {by}, as the normal quantile of its two-sided p-value for independent maps."
+        f" In each of {how.permutations} {shuffled}; seed {how.seed}) {cite('permutation')} all maps were"
+        f" shuffled alike, so that their dependence is kept. The largest value of {statistic} in"
+        f" each holds the family-wise error rate at {how.alpha:g} over the points{family}. The null"
+        " hypothesis of a point is that none of the maps has an effect there; the effect sizes of"
+        " each map say where a finding comes from."
     )
 
 

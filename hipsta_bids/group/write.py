@@ -153,7 +153,6 @@ def write_results(
         settings,
         len(exclusions),
         others=tuple(others),
-        joint=joint,
         region=region,
         ratings=ratings,
     )

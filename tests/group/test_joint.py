@@ -24,8 +24,8 @@ GROUP = Contrast("group", np.array([0.0, 1.0, 0.0]))
 @pytest.mark.parametrize("how", ["fisher", "tippett"])
 def test_evidence_is_that_of_scipy(how):
     p = np.random.default_rng(0).uniform(0, 0.3, (3, 50))
-    expected = stats.norm.isf(stats.combine_pvalues(p, method=how, axis=0).pvalue)
-    np.testing.assert_allclose(combine_evidence(p, how), np.maximum(expected, 0), rtol=1e-9)
+    expected = stats.norm.isf(stats.combine_pvalues(p, method=how, axis=0).pvalue / 2)
+    np.testing.assert_allclose(combine_evidence(p, how), expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize("how", ["fisher", "tippett"])
@@ -33,7 +33,7 @@ def test_evidence_of_extreme_and_missing_p_values(how):
     z = combine_evidence(np.array([[0.0, 1.0, np.nan, 1e-200], [0.0, 1.0, 0.1, 0.5]]), how)
     assert np.isfinite(z[[0, 3]]).all()
     assert z[0] >= z[3] > 20
-    assert z[1] == 0
+    assert z[1] == pytest.approx(0, abs=1e-7)
     assert np.isnan(z[2])
 
 
@@ -55,10 +55,8 @@ def test_a_measure_with_itself_has_its_own_p(contrast):
     (alone,) = permute([part], contrast, settings=HOW)
     for how in ("fisher", "tippett"):
         (twice,) = permute([JointPart([part, part], how)], contrast, settings=HOW)
-        some = twice.statistic > 0
-        assert some.sum() > 10
-        np.testing.assert_array_equal(twice.p_uncorrected[some], alone.p_uncorrected[some])
-        np.testing.assert_array_equal(twice.p_max[some], alone.p_max[some])
+        np.testing.assert_array_equal(twice.p_uncorrected, alone.p_uncorrected)
+        np.testing.assert_array_equal(twice.p_max, alone.p_max)
 
 
 def test_evidence_of_a_part_is_that_of_its_t_tests():
