@@ -393,9 +393,9 @@ def _joint(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], st
         f"Maps of {names}{', of the left and the right side,' if joint.sides else ''} were also"
         f" tested together by non-parametric combination {cite('joint')}. At each point the"
         f" evidence is {by}, as the normal quantile of its two-sided p-value for independent maps."
-        f" In each of {how.permutations} {shuffled}; seed {how.seed}) {cite('permutation')} all maps"
-        f" were shuffled alike, so that their dependence is kept. The largest value of {statistic} in"
-        f" each holds the family-wise error rate at {how.alpha:g} over the points{family}. The null"
+        f" In each of {how.permutations} {shuffled}; seed {how.seed}) {cite('permutation')} all"
+        f" maps were shuffled alike, so that their dependence is kept. The largest value of"
+        f" {statistic} in each holds the family-wise error rate at {how.alpha:g} over the points{family}. The null"
         " hypothesis of a point is that none of the maps has an effect there; the effect sizes of"
         " each map say where a finding comes from."
     )
