@@ -395,9 +395,9 @@ def _joint(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], st
         f" evidence is {by}, as the normal quantile of its two-sided p-value for independent maps."
         f" In each of {how.permutations} {shuffled}; seed {how.seed}) {cite('permutation')} all"
         f" maps were shuffled alike, so that their dependence is kept. The largest value of"
-        f" {statistic} in each holds the family-wise error rate at {how.alpha:g} over the points{family}. The null"
-        " hypothesis of a point is that none of the maps has an effect there; the effect sizes of"
-        " each map say where a finding comes from."
+        f" {statistic} in each holds the family-wise error rate at {how.alpha:g} over the"
+        f" points{family}. The null hypothesis of a point is that none of the maps has an effect"
+        " there; the effect sizes of each map say where a finding comes from."
     )
 
 
