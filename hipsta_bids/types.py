@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from hipsta_bids.protocols.protocol import Protocol
 
+_FLAT = 1e-3  # a surface is flat if it is thinner than this share of its length
+
 Float = NDArray[np.float64]
 Int = NDArray[np.int32]
 Bool = NDArray[np.bool_]
@@ -348,3 +350,9 @@ class Mesh:
     """(V, 3) RAS mm."""
     triangles: NDArray[np.int64]
     """(F, 3) vertex indices."""
+
+    @property
+    def flat(self) -> bool:
+        """Whether it lies in the plane of the first two axes, as unfolded surfaces do."""
+        reach = np.ptp(self.points, axis=0)
+        return bool(reach[2] <= _FLAT * reach.max())

@@ -7,6 +7,7 @@ the first axis (anterior to posterior) and 20 mm along the second (subiculum to 
 """
 
 import numpy as np
+from nibabel.cifti2 import BrainModelAxis, Cifti2Image, ScalarAxis
 from nibabel.gifti import GiftiDataArray, GiftiImage
 from scipy.spatial import Delaunay
 
@@ -33,6 +34,20 @@ def write_map(path, *values):
     write(path, [GiftiDataArray(v.astype(np.float32), intent="NIFTI_INTENT_SHAPE") for v in values])
 
 
+def write_cifti(path, values, *, structure="CORTEX", names=("thickness",)):
+    """Left and right as one file; vertices of NaN are left out, as a medial wall is."""
+    sides = {"L": "LEFT", "R": "RIGHT"}
+    known = {hemi: np.flatnonzero(np.isfinite(own)) for hemi, own in values.items()}
+    models = [
+        BrainModelAxis.from_surface(known[hemi], len(own), f"{structure}_{sides[hemi]}")
+        for hemi, own in values.items()
+    ]
+    data = np.concatenate([own[known[hemi]] for hemi, own in values.items()])
+    axes = ScalarAxis(list(names)), sum(models[1:], start=models[0])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Cifti2Image(np.tile(data, (len(names), 1)).astype(np.float32), axes).to_filename(path)
+
+
 def write(path, arrays):
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(GiftiImage(darrays=arrays).to_bytes())
@@ -48,6 +63,13 @@ def names(root, subject, hemi, *, version, measure="thickness", session=None):
         name = f"{stem}_hemi-{hemi}_space-T1w_{den}_{measure}.shape.gii"
         return folder / "surf" / name, surface
     return folder / "metric" / f"{stem}_hemi-{hemi}_{den}_{measure}.shape.gii", surface
+
+
+def cifti_name(root, subject, *, version):
+    """Path of the map of both sides."""
+    folder = root / f"sub-{subject}" / ("surf" if version == 1 else "cifti")
+    space = "_space-T1w" if version == 1 else ""
+    return folder / f"sub-{subject}{space}_den-{DENSITY[version]}_label-hipp_thickness.dscalar.nii"
 
 
 PATTERNS = {

@@ -22,6 +22,7 @@ from hipsta_bids.derivatives.names import (
 from hipsta_bids.derivatives.sidecars import SHARED
 from hipsta_bids.errors import EXIT_MEANINGS
 from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY, Column
+from hipsta_bids.group.joint import JOINT_COLUMNS
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.tables import COLUMNS
 from hipsta_bids.reports.page import reason_actions, reason_sections
@@ -150,7 +151,10 @@ def outputs_page() -> str:
         _table(columns, _named(layers)),
         "## Columns of the group level's tables",
         COLUMNS_TEXT,
-        _table(("column", "what it is"), ((f"`{k}`", v) for k, v in COLUMNS.items())),
+        _table(
+            ("column", "what it is"),
+            ((f"`{k}`", v) for k, v in {**COLUMNS, **JOINT_COLUMNS, **COLUMNS}.items()),
+        ),
     ]
     return _page(parts)
 

@@ -31,6 +31,7 @@ _TRIAL_ONLY = (*_POWER_ONLY, "among")
 _COMPARISON_ONLY = (
     *("longitudinal", "paired", "asymmetry", "normative", "model", "contrast", "weights"),
     *("permutations", "blocks", "fdr_scope", "base", "no_classification"),
+    *("joint", "joint_sides"),
     *("harmonize", "harmonize_model"),
 )
 
@@ -92,8 +93,9 @@ def _add_sheets(parser: Parser) -> None:
     add(
         "--maps",
         "NAME=PATTERN...",
-        "other programs' maps with corresponding points, GIFTI or TSV, with sheets or alone:"
-        " path (also in BIDS_DIR) with {subject}, {session}, {hemi} or {side} (lh, rh), *",
+        "other programs' maps with corresponding points, GIFTI, CIFTI or TSV, with sheets or alone:"
+        " path (also in BIDS_DIR) with {subject}, {session}, {hemi} or {side} (lh, rh), *; CIFTI"
+        " (.dscalar.nii) without {hemi}",
         type=named_pattern,
     )
     add(
@@ -251,6 +253,13 @@ def _add_methods(parser: Parser) -> None:
         "what is one family of tests, for permutations too (default: map)",
         choices=["map", "hemispheres"],
     )
+    add(
+        "--joint",
+        "MEASURE...",
+        "also test these maps together at each point, as thickness curvature, by permutation"
+        " (non-parametric combination, family-wise error)",
+    )
+    add("--joint-sides", "", "with --joint: left and right together, too")
     add(
         "--base",
         "MEASURE...",
@@ -476,6 +485,10 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
         "classification": {
             "base": tuple(parsed.base) or None,
             "added": () if parsed.no_classification else None,
+        },
+        "joint": {
+            "measures": tuple(parsed.joint) or None,
+            "sides": parsed.joint_sides or None,
         },
         "power": {"power": parsed.power_level, "dropout": parsed.dropout},
     }

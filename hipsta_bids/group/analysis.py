@@ -302,6 +302,7 @@ def _check_weights(comparison: Comparison, settings: GroupSettings) -> None:
         "--asymmetry": comparison.asymmetry,
         "--normative": comparison.normative,
         "permutations": settings.multiplicity.method in PERMUTATIONS,
+        "--joint": settings.joint.measures,
     }
     wrong = [name for name, given in others.items() if given]
     if settings.glm.weights != "none" and wrong:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from scipy import special
 from scipy.linalg import null_space
 from statsmodels.stats.multitest import multipletests
 
@@ -62,8 +63,17 @@ class PermutationPart:
     """(subjects,) whose each is, if they are visits of which people have several."""
 
 
+@dataclass(frozen=True, eq=False)
+class JointPart:
+    """Maps of several measures, or sides, at the same points, whose evidence is combined."""
+
+    parts: Sequence[PermutationPart]
+    combine: str
+    """As the setting ``joint.combine``."""
+
+
 def permute(
-    parts: Sequence[PermutationPart],
+    parts: Sequence[PermutationPart | JointPart],
     contrast: Contrast,
     *,
     settings: MultiplicitySettings,
@@ -81,10 +91,13 @@ def permute(
     Missing values count as what the covariates predict, which shrinks an effect; degrees of
     freedom are those of the subjects present. ``family`` is the number of this one, from 0, and of
     how many, to tell how far all are.
+
+    Measures of a joint part are shuffled alike, which keeps their dependence, and combined at each
+    point by :func:`combine_evidence` (non-parametric combination; Winkler et al. 2016).
     """
     runs = [_Run.build(part, contrast, settings, blocks) for part in parts]
     random = np.random.default_rng(settings.seed)
-    n_subjects = 1 + max(int(part.subjects.max()) for part in parts)
+    n_subjects = 1 + max(int(one.part.subjects.max()) for run in runs for one in run.members)
     for start in range(1, settings.permutations, _BATCH):
         count = min(_BATCH, settings.permutations - start)
         done = family[0] * settings.permutations + start - 1
@@ -98,28 +111,32 @@ def permute(
     return [run.result() for run in runs]
 
 
+def combine_evidence(p: Float, how: str) -> Float:
+    """Combine p-values (measures, ...) into z: the normal quantile of their two-sided p together.
+
+    ``fisher`` sums minus twice their logarithms (chi squared; Fisher 1932), ``tippett`` takes the
+    smallest (Tippett 1931). That p holds if they are independent; as what is permuted, z only has
+    to rise with the evidence. It is not negative, and NaN where any p is.
+    """
+    limits = np.finfo(np.float64)
+    count, p = len(p), np.clip(p, limits.tiny, 1 - limits.eps)
+    if how == "fisher":
+        joined = special.chdtrc(2 * count, -2 * np.log(p).sum(axis=0))
+    else:
+        joined = -np.expm1(count * np.log1p(-p.min(axis=0)))
+    return np.asarray(np.abs(special.ndtri(np.clip(joined, limits.tiny, 1) / 2)), dtype=np.float64)
+
+
 @dataclass(frozen=True, eq=False)
-class _Run:
-    """One part, with its counts of what reached the observed statistics."""
+class _Member:
+    """One map of a run."""
 
     part: PermutationPart
-    contrast: Contrast
-    settings: MultiplicitySettings
     model: "_Model"
     blocks: Int | None
-    observed: Float
-    enhanced: Float
-    counts: Float
-    """(3, points) of each point alone, of the maximum, and of the enhanced maximum."""
 
     @classmethod
-    def build(
-        cls,
-        part: PermutationPart,
-        contrast: Contrast,
-        settings: MultiplicitySettings,
-        blocks: Int | None,
-    ) -> "_Run":
+    def build(cls, part: PermutationPart, contrast: Contrast, blocks: Int | None) -> "_Member":
         maps, matrix = part.maps, part.matrix
         if part.edges.max(initial=-1) >= maps.shape[1] or maps.shape[0] != matrix.shape[0]:
             raise ModelError(
@@ -131,19 +148,52 @@ class _Run:
         own = None if blocks is None else blocks[part.subjects]
         if own is not None and not model.tests_common_part():
             _check_blocks(matrix @ np.linalg.pinv(contrast.weights), own, contrast)
-        observed = model.statistics(model.basis[None])
-        enhanced = _enhanced(observed, part.edges, settings)
-        counts = np.ones((3, maps.shape[1]))
-        return cls(part, contrast, settings, model, own, observed, enhanced, counts)
+        return cls(part, model, own)
 
-    def shuffled(self, keys: Float) -> tuple[Float, Float]:
-        """Statistics, and enhanced ones, of the permutations that are given by keys of subjects."""
+    def shuffled(self, keys: Float) -> Float:
+        """Permuted designs that are given by keys of subjects."""
         people = self.part.people
         flip = people is not None or self.model.tests_common_part()
         own = self.part.subjects if people is None else people
         bases = [_shuffle(self.model.basis, self.blocks, key[own], flip=flip) for key in keys]
-        t = self.model.statistics(np.stack(bases))
-        return t, _enhanced(t, self.part.edges, self.settings)
+        return np.stack(bases)
+
+
+@dataclass(frozen=True, eq=False)
+class _Run:
+    """One part, with its counts of what reached the observed statistics."""
+
+    members: Sequence[_Member]
+    """One map, or several that are combined."""
+    combine: str | None
+    contrast: Contrast
+    settings: MultiplicitySettings
+    observed: Float
+    enhanced: Float
+    counts: Float
+    """(3, points) of each point alone, of the maximum, and of the enhanced maximum."""
+
+    @classmethod
+    def build(
+        cls,
+        part: PermutationPart | JointPart,
+        contrast: Contrast,
+        settings: MultiplicitySettings,
+        blocks: Int | None,
+    ) -> "_Run":
+        own = part.parts if isinstance(part, JointPart) else [part]
+        combine = part.combine if isinstance(part, JointPart) else None
+        members = [_Member.build(one, contrast, blocks) for one in own]
+        observed = _together(members, [m.model.basis[None] for m in members], combine)
+        enhanced = _enhanced(observed, own[0].edges, settings)
+        counts = np.ones((3, observed.shape[1]))
+        return cls(members, combine, contrast, settings, observed, enhanced, counts)
+
+    def shuffled(self, keys: Float) -> tuple[Float, Float]:
+        """Statistics, and enhanced ones, of the permutations that are given by keys of subjects."""
+        bases = [member.shuffled(keys) for member in self.members]
+        t = _together(self.members, bases, self.combine)
+        return t, _enhanced(t, self.members[0].part.edges, self.settings)
 
     def count(self, t: Float, highest: Float, highest_enhanced: Float) -> None:
         """Count permutations that reach what was observed."""
@@ -157,7 +207,17 @@ class _Run:
         p = np.where(np.isnan(t), np.nan, self.counts / self.settings.permutations)
         if self.settings.method == _MAXIMUM:
             p[2] = np.nan
-        return PermutationTest(p[0], p[1], p[2], t if self.contrast.n_rows == 1 else t**2)
+        as_it_is = self.contrast.n_rows == 1 or self.combine is not None
+        return PermutationTest(p[0], p[1], p[2], t if as_it_is else t**2)
+
+
+def _together(members: Sequence[_Member], bases: Sequence[Float], how: str | None) -> Float:
+    """Return the statistics of one map, or of several combined, by designs."""
+    pairs = zip(members, bases, strict=True)
+    own = [(one.model, one.model.statistics(basis)) for one, basis in pairs]
+    if how is None:
+        return own[0][1]
+    return combine_evidence(np.stack([model.p_values(t) for model, t in own]), how)
 
 
 def _check_blocks(tested: Float, blocks: Int, contrast: Contrast) -> None:
@@ -224,6 +284,12 @@ class _Model:
         # Rounding only may take the noise below zero, where the model fits perfectly.
         t = np.sqrt(gained * self.df / np.maximum(noise, np.finfo(np.float64).eps * self.squares))
         return np.asarray(np.copysign(t, tested[:, 0]) if self.rows == 1 else t, dtype=np.float64)
+
+    def p_values(self, t: Float) -> Float:
+        """Two-sided p-values of these statistics."""
+        if self.rows == 1:
+            return np.asarray(2 * special.stdtr(self.df, -np.abs(t)), dtype=np.float64)
+        return np.asarray(special.fdtrc(self.rows, self.df, t**2), dtype=np.float64)
 
 
 def _shuffle(basis: Float, blocks: Int | None, key: Float, *, flip: bool) -> Float:
@@ -322,6 +388,49 @@ def discover(
     return {key: found[key] for key in maps}
 
 
+def correct_joint(
+    groups: Mapping[MapKey, Sequence[tuple[FittedMaps, str]]],
+    contrasts: Mapping[str, Contrast],
+    model: RowModel,
+    table: pd.DataFrame,
+    settings: GroupSettings,
+) -> dict[MapKey, tuple[PermutationTest, Discoveries]]:
+    """Test maps together that have the same points: fits and measures by the key of the result."""
+    how = settings.multiplicity
+    if how.method not in PERMUTATIONS:
+        how = how.changed(method=_MAXIMUM)
+    blocks = _blocks(model, table, how)
+    found: dict[MapKey, tuple[PermutationTest, Discoveries]] = {}
+    together = families(groups, how.scope)
+    for number, keys in enumerate(together):
+        results = permute(
+            [
+                JointPart([_part(*one, model, how) for one in groups[key]], settings.joint.combine)
+                for key in keys
+            ],
+            contrasts[keys[0].contrast],
+            settings=how,
+            blocks=blocks,
+            family=(number, len(together)),
+        )
+        raw = [result.p_uncorrected for result in results]
+        survive = _permuted_discoveries(results, raw, how)
+        found |= dict(zip(keys, zip(results, survive, strict=True), strict=True))
+    return found
+
+
+def _part(
+    one: FittedMaps, measure: str, model: RowModel, how: MultiplicitySettings
+) -> PermutationPart:
+    return PermutationPart(
+        maps=one.values(measure),
+        matrix=model.design.matrix[one.rows],
+        subjects=one.rows,
+        edges=edges_of(one.maps, how.neighbors),
+        people=None if model.people is None else model.people[one.rows],
+    )
+
+
 def correct(
     fitted: Mapping[str, FittedMaps], model: RowModel, table: pd.DataFrame, settings: GroupSettings
 ) -> dict[MapKey, Discoveries]:
@@ -340,17 +449,7 @@ def correct(
     found: dict[MapKey, Discoveries] = {}
     together = families(tests, how.scope)
     for number, keys in enumerate(together):
-        parts = [
-            PermutationPart(
-                maps=one.values(key.measure),
-                matrix=model.design.matrix[one.rows],
-                subjects=one.rows,
-                edges=edges_of(one.maps, how.neighbors),
-                people=None if model.people is None else model.people[one.rows],
-            )
-            for key in keys
-            for one in [fitted[key.hemi]]
-        ]
+        parts = [_part(fitted[key.hemi], key.measure, model, how) for key in keys]
         results = permute(
             parts,
             tests[keys[0]].contrast,
@@ -365,7 +464,7 @@ def correct(
 
 def check_permutations(model: RowModel, settings: GroupSettings) -> None:
     """Refuse permutations where rows cannot be exchanged."""
-    if settings.multiplicity.method not in PERMUTATIONS:
+    if settings.multiplicity.method not in PERMUTATIONS and not settings.joint.measures:
         return
     if model.people is not None and settings.multiplicity.blocks:
         raise ModelError(

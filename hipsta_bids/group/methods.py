@@ -33,6 +33,9 @@ REFERENCES: Mapping[str, str] = {
     " doi:10.1016/j.neuroimage.2014.01.060",
     "repeated": "Winkler AM, Webster MA, Vidaurre D, Nichols TE, Smith SM. Multi-level block"
     " permutation. NeuroImage 2015;123:253-268. doi:10.1016/j.neuroimage.2015.05.092",
+    "joint": "Winkler AM, Webster MA, Brooks JC, Tracey I, Smith SM, Nichols TE. Non-parametric"
+    " combination and related permutation tests for neuroimaging. Human Brain Mapping"
+    " 2016;37(4):1486-1511. doi:10.1002/hbm.23115",
     "tfce": "Smith SM, Nichols TE. Threshold-free cluster enhancement: addressing problems of"
     " smoothing, threshold dependence and localisation in cluster inference. NeuroImage"
     " 2009;44(1):83-98. doi:10.1016/j.neuroimage.2008.03.061",
@@ -137,6 +140,7 @@ def methods_text(
         paragraphs.append(_alignment(analysis, settings, cite, others))
     paragraphs += _harmonization(analysis, cite)
     paragraphs.append(_models(analysis, settings, cite))
+    paragraphs += [_joint(analysis, settings, cite)] if settings.joint.measures else []
     if analysis.comparison.asymmetry:
         paragraphs.append(_asymmetry(settings, cite("asymmetry")))
     if analysis.scores is not None:
@@ -367,6 +371,33 @@ def _correction(how: MultiplicitySettings, cite: Callable[[str], str], *, repeat
     return (
         f"The false discovery rate was held at {how.alpha:g} by {kind} {cite(how.method)}, for"
         f" {family}."
+    )
+
+
+def _joint(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], str]) -> str:
+    how, joint = settings.multiplicity, settings.joint
+    by = (
+        "minus twice the sum of the logarithms of their two-sided p-values (Fisher)"
+        if joint.combine == "fisher"
+        else "the smallest of their two-sided p-values (Tippett)"
+    )
+    shuffled = "permutations of residuals (Freedman and Lane's"
+    if analysis.comparison.longitudinal:
+        shuffled = "flips of the signs of each participant's residuals (of the linear model"
+    statistic = "the combined evidence"
+    if how.method == "permutation-tfce":
+        statistic = f"its threshold-free cluster enhancement {cite('tfce')}"
+    family = "" if joint.sides else " of each side" if how.scope == "map" else " of both sides"
+    names = " and ".join(name.replace("_", " ") for name in joint.measures)
+    return (
+        f"Maps of {names}{', of the left and the right side,' if joint.sides else ''} were also"
+        f" tested together by non-parametric combination {cite('joint')}. At each point the"
+        f" evidence is {by}, as the normal quantile of its two-sided p-value for independent maps."
+        f" In each of {how.permutations} {shuffled}; seed {how.seed}) {cite('permutation')} all"
+        f" maps were shuffled alike, so that their dependence is kept. The largest value of"
+        f" {statistic} in each holds the family-wise error rate at {how.alpha:g} over the"
+        f" points{family}. The null hypothesis of a point is that none of the maps has an effect"
+        " there; the effect sizes of each map say where a finding comes from."
     )
 
 

@@ -51,7 +51,6 @@ _FIELD_LINE, _FOUND_LINE = 0.6, 1.3  # borders of subfields and of what survives
 _POINT = DOTS_PER_INCH / 72  # pixels
 _LETTER_WIDTH = 0.57  # of type, over its size
 _UNKNOWN = 0.92  # brightness where there is no value
-_FLAT = 1e-3  # a surface is flat if it is thinner than this share of its length
 _HALF = 0.5
 _HEAD_PIXELS = round(_HEAD * MM)
 _FAR_APART = 0.35  # of the most extreme ticks of p
@@ -253,10 +252,7 @@ class _Surface:
 
 def _unfolded(one: FittedMaps) -> bool:
     """Whether maps lie on a plane: the sheet's, or that of other programs."""
-    if one.maps.mesh is None:
-        return True
-    reach = np.ptp(one.maps.mesh.points, axis=0)
-    return bool(reach[2] <= _FLAT * reach.max())
+    return one.maps.mesh is None or one.maps.mesh.flat
 
 
 @dataclass(frozen=True, eq=False)

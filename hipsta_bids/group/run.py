@@ -27,6 +27,7 @@ from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Measures
 from hipsta_bids.group.exchange import SUMMARY, summarize, write_summary
 from hipsta_bids.group.formula import parse_model, with_factors
 from hipsta_bids.group.harmonize import harmonization_record
+from hipsta_bids.group.joint import check_joint, combine_maps
 from hipsta_bids.group.model import (
     ModelRequest,
     choose_references,
@@ -159,6 +160,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
     dataset.check_own_dataset(options.out_dir)
     tell("reading")
     inputs = read_inputs(options, settings)
+    check_joint([*inputs.measures.maps, *inputs.others], settings)
     cohort = inputs.cohort
     references, groups = choose_references(options.model, cohort.table, settings)
     document = model_document(
@@ -191,6 +193,8 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
     found = dict(analysis.found)
     for _, other in others.values():
         found |= other.found
+    joint = combine_maps([analysis, *(other for _, other in others.values())], settings)
+    found |= {key: one.found for key, one in joint.items()}
     analysis = replace(analysis, found=found)
     exclusions = [*inputs.exclusions, *_incomplete(analysis)]
     wanted = wanted_measures(options.model, options.measures)
@@ -211,6 +215,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
             settings,
             exclusions,
             others=others,
+            joint=tuple(joint.values()),
             region=region,
             ratings=inputs.found.ratings,
         )
@@ -220,7 +225,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         write_shapes(folder, shapes)
         if analysis.sides and inputs.found.records and not shapes:
             notes.append("no average surfaces: those of the participant level are missing")
-        notes += draw(folder, cohort, analysis, shapes, others=others)
+        notes += draw(folder, cohort, analysis, shapes, others=others, joint=tuple(joint.values()))
         told = [*inputs.found.warnings, *notes]
         record = _record(options, inputs.found, settings, analysis, told)
         files.write_json(folder / "analysis.json", record)

@@ -222,6 +222,18 @@ class MultiplicitySettings(SettingsTable):
     """Neighbors of a point on the sheet, 4 or 8."""
 
 
+class JointSettings(SettingsTable):
+    """Tests of several measures together, by permutation (non-parametric combination)."""
+
+    measures: Texts = ()
+    """Maps that are tested together at each point; empty is no such test."""
+    combine: Literal["fisher", "tippett"] = "fisher"
+    """``fisher`` adds up the evidence of all measures, ``tippett`` takes the strongest (Winkler et
+    al. 2016)."""
+    sides: bool = False
+    """Whether the left and the right map of a measure are combined too, point by point."""
+
+
 class HarmonizationSettings(SettingsTable):
     """ComBat: effects of sites or scanners, taken out of maps and summary measures."""
 
@@ -367,6 +379,7 @@ class GroupSettings(SettingsTable):
     harmonization: HarmonizationSettings = HarmonizationSettings()
     asymmetry: AsymmetrySettings = AsymmetrySettings()
     multiplicity: MultiplicitySettings = MultiplicitySettings()
+    joint: JointSettings = JointSettings()
     shapes: ShapeSettings = ShapeSettings()
     classification: ClassificationSettings = ClassificationSettings()
     retest: RetestSettings = RetestSettings()

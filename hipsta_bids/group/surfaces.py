@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from hipsta_bids.group.data import Cohort, Int, SideMaps
 from hipsta_bids.group.read import CURVATURE, Measured
 from hipsta_bids.inputs.maps import Found, check_pattern, fields_of, fill, find, scan
 from hipsta_bids.io.files import entities
-from hipsta_bids.io.gifti import PointMap, read_map, read_mesh
+from hipsta_bids.io.gifti import DENSE_SCALARS, PointMap, cifti_sides, read_map, read_mesh
 from hipsta_bids.types import Mesh, VisitKey
 
 
@@ -65,9 +66,11 @@ def map_patterns(
             )
         check_pattern("--maps", name, pattern)
         fields = fields_of(pattern)
-        if "subject" not in fields or not fields & {"hemi", "side"}:
+        one_side = fields & {"hemi", "side"} or pattern.endswith(DENSE_SCALARS)
+        if "subject" not in fields or not one_side:
             raise UsageError(
-                f"--maps {name}: the pattern needs {{subject}}, and {{hemi}} or {{side}}",
+                f"--maps {name}: the pattern needs {{subject}}, and {{hemi}} or {{side}} unless it"
+                f" ends with {DENSE_SCALARS}",
                 reason="usage",
             )
     if lost := [name for name, _ in surfaces if name is not None and name not in names]:
@@ -98,16 +101,15 @@ def find_maps(
         sessions.setdefault(subject, []).append(session)
     found: dict[str, dict[VisitKey, Path]] = {}
     for one in scan(request.pattern, root):
-        if one.hemi is None:
-            continue
-        for session in _sessions(one, sessions):
-            if not is_wanted(one.subject, session, one.hemi):
+        hemis = [one.hemi] if one.hemi else cifti_sides(one.path)
+        for hemi, session in product(hemis, _sessions(one, sessions)):
+            if not is_wanted(one.subject, session, hemi):
                 continue
-            first = found.setdefault(one.hemi, {}).setdefault((one.subject, session), one.path)
+            first = found.setdefault(hemi, {}).setdefault((one.subject, session), one.path)
             if first != one.path:
                 raise InputError(
                     f"--maps {request.name}: {first} and {one.path} are both for sub-{one.subject}"
-                    f" hemi-{one.hemi}; make the pattern match one of them",
+                    f" hemi-{hemi}; make the pattern match one of them",
                     reason="several-files",
                 )
     if not found:
@@ -142,7 +144,7 @@ def read_maps(
     for hemi, path_of in found.files.items():
         own = sorted(path_of, key=row_of.__getitem__)
         paths = [path_of[visit] for visit in own]
-        maps = [read_map(path, name) for path in paths]
+        maps = [read_map(path, name, hemi) for path in paths]
         _refuse_mixed(name, hemi, paths, maps)
         first, points = maps[0], len(maps[0].values)
         nodes = first.nodes if first.nodes is not None and not with_sheets else grid
@@ -190,7 +192,7 @@ def _mesh(found: ExternalFiles, hemi: str, points: int) -> Mesh | None:
     if found.request.surface is not None:
         return _named_surface(found, hemi, points)
     for path in paths.values():
-        for candidate in _surfaces_beside(path):
+        for candidate in _surfaces_beside(path, hemi):
             mesh = read_mesh(candidate)
             if len(mesh.points) == points:
                 return mesh
@@ -219,9 +221,9 @@ def _named_surface(found: ExternalFiles, hemi: str, points: int) -> Mesh:
     )
 
 
-def _surfaces_beside(path: Path) -> list[Path]:
+def _surfaces_beside(path: Path, hemi: str) -> list[Path]:
     """HippUnfold's unfolded surface: beside the map, or in version 2 in ``surf/``."""
-    own = entities(path.name)
+    own = {**entities(path.name), "hemi": hemi}
     folders = [path.parent, path.parent.parent / "surf"]
     return [
         candidate

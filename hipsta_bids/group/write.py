@@ -7,6 +7,7 @@ import re
 import shutil
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,14 @@ from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float, Int, Sid
 from hipsta_bids.group.figures import Drawing, draw_figures, encode
 from hipsta_bids.group.glm import FittedMaps
 from hipsta_bids.group.harmonize import digests, effects_of
+from hipsta_bids.group.inference import MapKey
+from hipsta_bids.group.joint import (
+    JOINT_COLUMNS,
+    JointMap,
+    draw_joint,
+    joint_peaks,
+    joint_points,
+)
 from hipsta_bids.group.methods import methods_text
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.shapes import AverageShape
@@ -36,6 +45,7 @@ from hipsta_bids.group.tables import (
 from hipsta_bids.group.warps import templates_to_json
 from hipsta_bids.io import files, gifti
 from hipsta_bids.progress import tell
+from hipsta_bids.reports.group_tables import JOINT
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -99,6 +109,7 @@ def write_results(
     exclusions: Sequence[Exclusion],
     *,
     others: Mapping[str, tuple[Cohort, Analysis]],
+    joint: Sequence[JointMap] = (),
     region: str = "body",
     ratings: Mapping[str, int] | None = None,
 ) -> None:
@@ -132,8 +143,10 @@ def write_results(
         if effects := effects_of([one for one in done if one is not None], how):
             save_effects(folder / "harmonization.json", effects)
     for one in ((cohort, analysis), *others.values()):
-        _write_gifti(folder, *one)
+        _write_surfaces(folder, *one)
+        _write_stats(folder, _stats(one[1]))
         _write_scores(folder, *one)
+    _write_joint(folder, joint, settings)
     text = methods_text(
         cohort,
         analysis,
@@ -160,10 +173,14 @@ def draw(
     shapes: Mapping[str, AverageShape],
     *,
     others: Mapping[str, tuple[Cohort, Analysis]],
+    joint: Sequence[JointMap] = (),
 ) -> list[str]:
     """Draw the figures of all models, and say what is wrong with them."""
     every = ((cohort, analysis, shapes), *((*one, {}) for one in others.values()))
-    return write_figures(folder, (figure for one in every for figure in draw_figures(*one)))
+    drawings = [figure for one in every for figure in draw_figures(*one)]
+    if joint:
+        drawings.append((f"{JOINT}_maps", partial(draw_joint, joint, shapes, {})))
+    return write_figures(folder, drawings)
 
 
 def write_figures(folder: Path, drawings: Iterable[tuple[str, Drawing]]) -> list[str]:
@@ -340,22 +357,66 @@ def _subfields(side: SideMaps, part: slice) -> pa.Array:
     return pa.DictionaryArray.from_arrays(indices, pa.array(side.names, pa.string()))
 
 
-def _write_gifti(folder: Path, cohort: Cohort, analysis: Analysis) -> None:
-    """Write statistics, effect sizes and corrected p-values, and the surfaces to draw them on."""
+def _write_surfaces(folder: Path, cohort: Cohort, analysis: Analysis) -> None:
+    """Write the surfaces to draw statistics on."""
     for hemi, one in analysis.fitted.items():
         if hemi in cohort.sides:
             write_surface(folder, cohort, one, hemi)
-    for key, test, found in tested_maps(analysis):
-        for stat, values in (
-            (test.kind, test.statistic),
-            ("d", test.cohen_d) if test.kind == "t" else ("eta2", test.eta_squared),
-            ("pcorrected", found.adjusted),
-        ):
+
+
+#: Maps of one contrast by the value of ``stat-``.
+_Stats = dict[str, Float]
+
+
+def _stats(analysis: Analysis) -> dict[MapKey, _Stats]:
+    """Collect statistics, effect sizes and corrected p-values."""
+    return {
+        key: {
+            test.kind: test.statistic,
+            **({"d": test.cohen_d} if test.kind == "t" else {"eta2": test.eta_squared}),
+            "pcorrected": found.adjusted,
+        }
+        for key, test, found in tested_maps(analysis)
+    }
+
+
+def _write_stats(folder: Path, maps: Mapping[MapKey, _Stats]) -> None:
+    """Write maps of statistics as GIFTI, and those of both sides as one CIFTI file."""
+    together: dict[str, dict[str, _Stats]] = {}
+    for key, stats in maps.items():
+        for stat, values in stats.items():
             stem = map_name(key.hemi, key.measure, key.contrast)
             stem = stem.replace("_desc-", f"_stat-{stat}_desc-")
-            # Left minus right lies on the left sheet; the name has no hemisphere.
-            content = gifti.shape_bytes(values, hemi=key.hemi[0], name=stem, unit="1")
+            # Left minus right, and both, lie on the left sheet; the name has no hemisphere.
+            hemi = key.hemi if key.hemi in {"L", "R"} else "L"
+            content = gifti.shape_bytes(values, hemi=hemi, name=stem, unit="1")
             files.write_bytes(folder / f"{stem}.shape.gii", content)
+        if key.hemi in {"L", "R"}:
+            name = map_name("", key.measure, key.contrast)
+            together.setdefault(name, {})[key.hemi] = stats
+    for name, sides in together.items():
+        names = list(next(iter(sides.values())))
+        both = {hemi: np.stack([own[stat] for stat in names]) for hemi, own in sides.items()}
+        files.write_bytes(folder / f"{name}.dscalar.nii", gifti.cifti_bytes(both, names))
+
+
+def _write_joint(folder: Path, joint: Sequence[JointMap], settings: GroupSettings) -> None:
+    """Write tests of several measures together."""
+    if not joint:
+        return
+    meaning = {**COLUMNS, **JOINT_COLUMNS}
+    write_table(folder, f"{JOINT}_peaks", joint_peaks(joint, settings), meaning=meaning)
+    for one in joint:
+        name = map_name(one.key.hemi, one.key.measure, one.key.contrast)
+        parts = {
+            f"p_{title.replace(' ', '_')}": f"p-value of {title} alone, not corrected"
+            for title in one.parts
+        }
+        write_table(folder, name, joint_points(one), meaning={**meaning, **parts})
+    _write_stats(
+        folder,
+        {one.key: {"z": one.test.statistic, "pcorrected": one.found.adjusted} for one in joint},
+    )
 
 
 def write_surface(folder: Path, cohort: Cohort, one: FittedMaps, hemi: str) -> None:
@@ -369,7 +430,8 @@ def write_surface(folder: Path, cohort: Cohort, one: FittedMaps, hemi: str) -> N
         points = np.zeros((nx * ny, 3))
         points[:, 0], points[:, 1] = np.repeat(cohort.x, ny), np.tile(cohort.y, nx)
         triangles = gifti.sheet_triangles(nx, ny)
-    content = gifti.surface_bytes(points, triangles, hemi=hemi, secondary=secondary, unfolded=True)
+    flat = one.maps.mesh is None or one.maps.mesh.flat
+    content = gifti.surface_bytes(points, triangles, hemi=hemi, secondary=secondary, unfolded=flat)
     files.write_bytes(folder / f"hemi-{hemi}_space-{space}_midthickness.surf.gii", content)
 
 

@@ -1,8 +1,11 @@
-"""Surfaces and maps on them as GIFTI, which Workbench, nilearn and nibabel load; meshes as VTU.
+"""Surfaces and maps on them as GIFTI and CIFTI-2, which Workbench and nibabel load; meshes as VTU.
 
 Structure names are those of Connectome Workbench's ``StructureEnum``, which knows
 ``HippocampusLeft`` and ``HippocampusRight``; the metadata keys are those of the GIFTI 1.0
-specification (Harwell et al. 2011) and of Workbench.
+specification (Harwell et al. 2011) and of Workbench. CIFTI-2 calls them
+``CIFTI_STRUCTURE_HIPPOCAMPUS_LEFT`` and ``_RIGHT``. HippUnfold's own CIFTI files are made by
+Workbench from a left and a right map, which makes their structures those of the cortex; both are
+read.
 """
 
 import struct
@@ -11,11 +14,13 @@ import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 from xml.parsers.expat import ExpatError
 
 import nibabel as nib
 import numpy as np
+from nibabel.cifti2.cifti2 import Cifti2BrainModel, Cifti2Image
+from nibabel.cifti2.cifti2_axes import BrainModelAxis, ScalarAxis
 from nibabel.filebasedimages import ImageFileError
 from nibabel.gifti.gifti import (
     GiftiCoordSystem,
@@ -25,6 +30,7 @@ from nibabel.gifti.gifti import (
     GiftiLabelTable,
     GiftiMetaData,
 )
+from nibabel.spatialimages import HeaderDataError
 from numpy.typing import NDArray
 
 from hipsta_bids.errors import InputError
@@ -32,7 +38,21 @@ from hipsta_bids.io import files
 from hipsta_bids.io.files import entities
 from hipsta_bids.types import Coordinates, Float, Int, Mesh, TetMesh
 
+#: Ending of the names of CIFTI files with one number per vertex.
+DENSE_SCALARS = ".dscalar.nii"
+
 _STRUCTURE = {"L": "HippocampusLeft", "R": "HippocampusRight"}
+
+Image = TypeVar("Image", GiftiImage, Cifti2Image)
+
+#: Sides at the end of CIFTI's names of structures.
+_CIFTI_SIDES = {"LEFT": "L", "RIGHT": "R"}
+
+#: What nibabel raises on files that are damaged.
+_DAMAGE = (
+    *(OSError, ValueError, TypeError, LookupError, AttributeError),
+    *(ImageFileError, HeaderDataError, ExpatError, zlib.error, struct.error),
+)
 
 #: Names of the harmonic coordinates as point data of the tetrahedral mesh, in their order.
 COORDINATE_NAMES = ("medial_lateral", "posterior_anterior", "interior_exterior")
@@ -85,6 +105,18 @@ def maps_bytes(values: Float, *, hemi: str, names: Sequence[str], series: bool =
     return _encode(arrays, hemi)
 
 
+def cifti_bytes(values: Mapping[str, Float], names: Sequence[str]) -> bytes:
+    """Encode maps of both sides as CIFTI-2; ``values`` are (maps, vertices) by hemisphere."""
+    models = [
+        BrainModelAxis.from_surface(np.arange(one.shape[1]), one.shape[1], _STRUCTURE[hemi])
+        for hemi, one in values.items()
+    ]
+    data = np.concatenate(list(values.values()), axis=1).astype(np.float32)
+    axes = ScalarAxis(list(names)), sum(models[1:], start=models[0])
+    content: bytes = Cifti2Image(data, axes).to_bytes()
+    return content
+
+
 def label_bytes(
     keys: NDArray[np.uint8], *, hemi: str, name: str, table: Mapping[int, tuple[str, str]]
 ) -> bytes:
@@ -129,11 +161,58 @@ class PointMap:
     """Nodes along x and y, where a table says that they are the sheet's."""
 
 
-def read_map(path: Path, name: str) -> PointMap:
-    """Read a map."""
+def cifti_sides(path: Path) -> list[str]:
+    """List the hemispheres that a CIFTI file has on surfaces."""
+    return list(_surface_models(path, _load(path, Cifti2Image)))
+
+
+def _surface_models(path: Path, image: Cifti2Image) -> dict[str, Cifti2BrainModel]:
+    """Find where the data of each hemisphere are, and of which vertices."""
+    found: dict[str, Cifti2BrainModel] = {}
+    # The axes that nibabel makes of it would hold a word per vertex.
+    for model in image.header.get_index_map(image.ndim - 1).brain_models:
+        hemi = _CIFTI_SIDES.get(model.brain_structure.rpartition("_")[2])
+        if hemi is None or not model.surface_number_of_vertices:
+            continue
+        if hemi in found:
+            raise InputError(
+                f"{path}: has several surfaces of hemisphere {hemi}; give a file with one",
+                reason="several-maps",
+            )
+        found[hemi] = model
+    return found
+
+
+def _from_cifti(path: Path, hemi: str) -> PointMap:
+    """Read the map of one side; vertices that the file leaves out are missing."""
+    image = _load(path, Cifti2Image)
+    if image.ndim != 2 or image.shape[0] != 1:  # noqa: PLR2004 -- maps by vertices
+        raise InputError(
+            f"{path}: holds {image.shape[0]} maps; give a file with one", reason="several-maps"
+        )
+    model = _surface_models(path, image).get(hemi)
+    if model is None:
+        raise InputError(
+            f"{path}: has no surface of hemisphere {hemi}; leave {{hemi}} out of the pattern",
+            reason="unreadable-map",
+        )
+    values = np.full(model.surface_number_of_vertices, np.nan)
+    first, count = model.index_offset, model.index_count
+    try:
+        values[list(model.vertex_indices)] = image.dataobj[0, first : first + count]
+    except _DAMAGE as error:
+        raise _unreadable(path, "CIFTI", error) from error
+    suffix = entities(path.name)["suffix"]
+    return PointMap(values=_finite(values), unit=_UNITS.get(suffix, ARBITRARY))
+
+
+def read_map(path: Path, name: str, hemi: str) -> PointMap:
+    """Read the map of a hemisphere."""
     if path.suffix == ".tsv":
         return _from_table(path, name)
-    image = _load(path)
+    if path.name.endswith(DENSE_SCALARS):
+        return _from_cifti(path, hemi)
+    image = _load(path, GiftiImage)
     arrays = [array for array in image.darrays if array.data.dtype.kind in "fiu"]
     arrays = [array for array in arrays if array.data.ndim == 1]
     if len(arrays) != 1:
@@ -183,7 +262,7 @@ def _nodes(rows: list[dict[str, str]]) -> tuple[int, int] | None:
 
 def read_mesh(path: Path) -> Mesh:
     """Read a surface."""
-    image = _load(path)
+    image = _load(path, GiftiImage)
     found = [
         image.get_arrays_from_intent(f"NIFTI_INTENT_{intent}")
         for intent in ("POINTSET", "TRIANGLE")
@@ -206,27 +285,23 @@ def read_mesh(path: Path) -> Mesh:
     return mesh
 
 
-def _load(path: Path) -> GiftiImage:
+def _unreadable(path: Path, what: str, error: Exception) -> InputError:
+    first = str(error).partition("\n")[0]
+    return InputError(
+        f"{path}: not readable as {what} ({first}); write it again", reason="unreadable-map"
+    )
+
+
+def _load(path: Path, kind: type[Image]) -> Image:
+    what = "GIFTI" if kind is GiftiImage else "CIFTI"
     try:
         image = nib.load(path)
-    except (
-        OSError,
-        ValueError,
-        TypeError,
-        KeyError,
-        AttributeError,
-        ImageFileError,
-        ExpatError,
-        zlib.error,
-        struct.error,
-    ) as error:
-        first = str(error).partition("\n")[0]
+    except _DAMAGE as error:
+        raise _unreadable(path, what, error) from error
+    if not isinstance(image, kind):
         raise InputError(
-            f"{path}: not readable as GIFTI ({first}); write it again", reason="unreadable-map"
-        ) from error
-    if not isinstance(image, GiftiImage):
-        raise InputError(
-            f"{path}: is no GIFTI file; maps are .shape.gii, .func.gii or .tsv files",
+            f"{path}: is no {what} file; maps are .shape.gii, .func.gii, .dscalar.nii or .tsv"
+            " files",
             reason="unreadable-map",
         )
     return image

@@ -20,6 +20,7 @@ from hipsta_bids.io.files import hide_home
 from hipsta_bids.reports.display import DESIGN_COLORS, colors_of
 from hipsta_bids.reports.group_maps import embedded, map_scenes
 from hipsta_bids.reports.group_tables import (
+    JOINT,
     SIDES,
     GroupResults,
     classification,
@@ -56,7 +57,7 @@ def design(results: GroupResults) -> Mapping[str, Any] | None:
     comparison = record.get("comparison") or {}
     return {
         "formula": record.get("formula"),
-        "measures": [display_name(m) for m in measures["measure"].unique()]
+        "measures": [display_name(m) for m in measures["measure"].unique() if m != JOINT]
         if len(measures)
         else [],
         "what": _what(comparison),

@@ -9,6 +9,7 @@ import pandas as pd
 
 from hipsta_bids.reports.display import known
 from hipsta_bids.reports.group_tables import (
+    JOINT,
     SIDES,
     GroupResults,
     display_name,
@@ -21,7 +22,8 @@ from hipsta_bids.reports.maps import Picture, picture_of_file
 from hipsta_bids.types import Float
 
 #: Kinds of effect sizes, by the test.
-EFFECT_NAMES = {"t": "Cohen's d", "F": "partial eta squared"}
+EFFECT_NAMES = {"t": "Cohen's d", "F": "partial eta squared", "z": "combined evidence, z"}
+_EFFECT_COLUMNS = {"t": "cohen_d", "F": "eta_squared", "z": "statistic"}
 #: Kinds of maps.
 KINDS = ("mean", "effect", "significance")
 _SMALLEST_P = 1e-10
@@ -46,7 +48,8 @@ def map_scenes(results: GroupResults) -> Mapping[str, Any] | None:
     if not len(maps):
         return None
     blocks, data = [], list[dict[str, Any]]()
-    for measure in maps["measure"].unique().tolist()[:_MOST_FIGURES]:
+    measures = sorted(maps["measure"].unique().tolist(), key=lambda name: name != JOINT)
+    for measure in measures[:_MOST_FIGURES]:
         own = maps[maps["measure"] == measure]
         means = results.table("means")
         means = means[means["measure"] == measure] if len(means) else means
@@ -68,7 +71,8 @@ def map_scenes(results: GroupResults) -> Mapping[str, Any] | None:
         blocks.append({"title": title, "plates": plates})
         if scene and plates:
             data.append({**scene, "sides": list(map(_rounded, scene["sides"]))})
-    return {"blocks": blocks[:_OPEN], "more": blocks[_OPEN:], "data": data}
+    first = _OPEN + (JOINT in measures)
+    return {"blocks": blocks[:first], "more": blocks[first:], "data": data}
 
 
 def embedded(results: GroupResults, name: str, caption: str, alt: str = "") -> list[Picture]:
@@ -83,7 +87,8 @@ def _alternative(title: str, maps: pd.DataFrame) -> str:
         f"{row['contrast']}, {SIDES[row['hemi']]}: {row['n_significant']} of {row['n_tests']}"
         for row in records(maps)
     )
-    return f"{title}: means, effects and significance. Points that survive: {found}"
+    what = "evidence" if maps["measure"].iloc[0] == JOINT else "means, effects"
+    return f"{title}: {what} and significance. Points that survive: {found}"
 
 
 def _spots(picture: Picture, scene: Mapping[str, Any], block: int) -> list[dict[str, Any]]:
@@ -172,13 +177,15 @@ def _side(
 
 def _test(results: GroupResults, row: Mapping[str, Any]) -> dict[str, Any]:
     rows = results.table(str(row["file"]))
-    kind = "t" if rows["cohen_d"].notna().any() else "F"
+    joint = row["measure"] == JOINT
+    kind = "z" if joint else "t" if rows["cohen_d"].notna().any() else "F"
     significant = rows["significant"].to_numpy() == True  # noqa: E712  (may hold missing values)
     numbers = {
         name: rows[name].to_numpy(dtype=np.float64)
         for name in ("estimate", "statistic", "df", "p", "p_corrected", "n")
+        if name in rows
     }
-    peaks = results.table("peaks")
+    peaks = results.everywhere("peaks")
     same = (peaks["measure"] == row["measure"]) & (peaks["hemi"] == row["hemi"])
     same &= (peaks["contrast"] == row["contrast"]) & (peaks["extent"] > 0)
     return {
@@ -186,7 +193,12 @@ def _test(results: GroupResults, row: Mapping[str, Any]) -> dict[str, Any]:
         "kind": kind,
         "n_tests": int(row["n_tests"]),
         "n_significant": int(row["n_significant"]),
-        "effect": rows["cohen_d" if kind == "t" else "eta_squared"].to_numpy(dtype=np.float64),
+        "effect": rows[_EFFECT_COLUMNS[kind]].to_numpy(dtype=np.float64),
+        "parts": [
+            [f"p of {display_name(str(name)[2:])}", rows[name].to_numpy(np.float64)]
+            for name in rows
+            if joint and str(name).startswith("p_") and name != "p_corrected"
+        ],
         "significant": significant.astype(int).tolist(),
         "values": numbers,
         "peaks": peaks.loc[same, ["x", "y"]].round(6).to_numpy().tolist(),

@@ -16,8 +16,11 @@ from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.reports.display import subfield_title
 
 #: Names of the sides in tables of maps; in those of summary measures LR may be a mean.
-SIDES = {"L": "left", "R": "right", "LR": "left minus right"}
-BOTH = "LR"
+SIDES = {"L": "left", "R": "right", "LR": "left minus right", "both": "both sides"}
+BOTH, BOTH_SIDES = "LR", "both"
+
+#: Name of the map that tests several measures together, among those of measures.
+JOINT = "joint"
 
 MINUS = "\N{MINUS SIGN}"
 
@@ -80,7 +83,7 @@ class GroupResults:
 
     def everywhere(self, name: str) -> pd.DataFrame:
         """Join a table of the sheets and those of other programs' maps."""
-        others = (self.record.get("inputs") or {}).get("maps") or {}
+        others = [*((self.record.get("inputs") or {}).get("maps") or {}), JOINT]
         parts = [self.table(name), *(self.table(f"{other}_{name}") for other in others)]
         return pd.concat([part for part in parts if len(part)] or parts[:1], ignore_index=True)
 
@@ -119,6 +122,8 @@ def with_unit(text: str, unit: str) -> str:
 def statistic_text(row: Mapping[str, Any]) -> str:
     """Write a statistic with its degrees of freedom; of F, those of the error."""
     value = number_text(row["statistic"])
+    if row["test"] == "z":
+        return f"z {value}"
     if row["test"] == "t":
         return f"t({row['df']:.0f}) {value}" if np.isfinite(row["df"]) else f"z {value}"
     return f"{row['test']} {value}, error df {row['df']:.0f}"
@@ -183,7 +188,19 @@ def findings(results: GroupResults) -> Mapping[str, Any] | None:
         "classification": list(_classification(results)),
         "method": multiplicity.get("method"),
         "alpha": multiplicity.get("alpha"),
+        "joint": _joint(settings),
     }
+
+
+def _joint(settings: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Say what was tested together."""
+    joint = settings.get("joint") or {}
+    if not joint.get("measures"):
+        return None
+    names = [display_name(str(name)) for name in joint["measures"]]
+    sides = ["on the left", "on the right"] if joint.get("sides") else []
+    what = " and ".join(names) + (f", {' and '.join(sides)}," if sides else "")
+    return {**joint, "what": what, "permutations": settings["multiplicity"]["permutations"]}
 
 
 def _side(results: GroupResults, row: Mapping[str, Any]) -> dict[str, Any]:
@@ -217,7 +234,7 @@ def _percent(share: float) -> str:
 def _where(results: GroupResults, row: Mapping[str, Any], points: pd.DataFrame) -> str:
     """Count the points in each subfield, by direction."""
     found = points[points["significant"] == True]  # noqa: E712  (may hold missing values)
-    signed = points["cohen_d"].notna().any()
+    signed = "cohen_d" in points and points["cohen_d"].notna().any()
     parts = []
     for sign in (1, -1):
         own = found[np.sign(found["statistic"]) == sign]
@@ -233,6 +250,9 @@ def _where(results: GroupResults, row: Mapping[str, Any], points: pd.DataFrame) 
 
 
 def _peak(results: GroupResults, peak: Mapping[str, Any], points: pd.DataFrame) -> str:
+    if peak["measure"] == JOINT:
+        together = f"together corrected p {p_text(peak['p_corrected'])}"
+        return f"{position_text(peak)}: {peak['measures']}; {together}"
     here = point_of(peak, points)
     what = [f"{effect_name(peak['effect'])} {number_text(peak['effect_size'])}"]
     if here is not None and np.isfinite(here["estimate"]):
@@ -327,7 +347,8 @@ def peaks(results: GroupResults) -> Mapping[str, Any] | None:
     rows = []
     for number, row in zip(numbers, records(table), strict=True):
         points = results.table(file_of[row["measure"], row["contrast"], row["hemi"]])
-        here = point_of(row, points)
+        joint = row["measure"] == JOINT
+        here = None if joint else point_of(row, points)
         rows.append(
             {
                 "number": int(number) if row["extent"] > 0 else "",
@@ -341,7 +362,7 @@ def peaks(results: GroupResults) -> Mapping[str, Any] | None:
                 "statistic": statistic_text(row),
                 "p": p_text(row["p"]),
                 "adjusted": p_text(row["p_corrected"]),
-                "effect": effect_text(row),
+                "effect": row["measures"] if joint else effect_text(row),
             }
         )
     return {"rows": rows[:_MOST_ROWS], "more": max(0, len(rows) - _MOST_ROWS)}

@@ -7,13 +7,14 @@ import numpy as np
 import pandas as pd
 from scipy import ndimage
 
+from hipsta_bids.group.clusters import sheet_edges
 from hipsta_bids.group.data import SideMaps
 from hipsta_bids.group.formula import Contrast
 from hipsta_bids.group.glm import RowModel, fit_maps
-from hipsta_bids.group.inference import MapKey, correct
+from hipsta_bids.group.inference import JointPart, MapKey, PermutationPart, correct, permute
 from hipsta_bids.group.model import Design
 from hipsta_bids.group.registration import mean_profiles, register
-from hipsta_bids.group.settings import CORRECTIONS, GroupSettings
+from hipsta_bids.group.settings import CORRECTIONS, GroupSettings, MultiplicitySettings
 from hipsta_bids.group.warps import warp_values
 from hipsta_bids.types import Bool, Float
 from hipsta_bids.validation.report import Cells, Suite, Table
@@ -80,6 +81,11 @@ AMPLITUDES = {
     "middle bend 40 % smaller": (1.0, 1.0, 0.6, 1.0),
     "lateral bend twice as large": (1.0, 1.0, 1.0, 2.0),
 }
+
+#: For joint tests: cohorts, their subjects and nodes, correlation of the measures, effect sizes.
+JOINT_COHORTS, FEW_JOINT_COHORTS, JOINT_RANGE = 200, 10, (0.02, 0.08)
+_JOINT_N, _JOINT_NODES, _JOINT_R, _JOINT_EFFECT = 40, (21, 11), 0.3, 1.2
+_JOINT_CORE = (slice(8, 13), slice(3, 8))
 
 _CORRECTIONS = {
     "fdr2": "false discovery rate, two stages (default)",
@@ -297,6 +303,7 @@ def run(full: bool) -> Suite:
             ),
             _amplitudes(BIAS_COHORTS if full else FEW_BIAS_COHORTS),
             _corrections(NULL_COHORTS if full else FEW_NULL_COHORTS),
+            _together(JOINT_COHORTS if full else FEW_JOINT_COHORTS),
         ),
     )
 
@@ -397,4 +404,78 @@ def _corrections(cohorts: int) -> Table:
         f" permutations. Target: at most {most:.2g} of the null cohorts have findings, that is"
         f" {LEVEL:g} and three standard deviations of this many cohorts. The false discovery rate"
         " is held at the same level by the first two only; by the others, it comes out as it may.",
+    )
+
+
+def joint_findings(effects: tuple[float, float], seed: int) -> dict[str, Bool]:
+    """(x, y) what tests of two measures, alone and together, find in one cohort of two groups."""
+    random = np.random.default_rng(seed)
+    group = np.arange(_JOINT_N) % 2
+    age = random.normal(0.0, 8.0, _JOINT_N)
+    first, second = (smooth_noise(random, (_JOINT_N, *_JOINT_NODES), 1.5) for _ in range(2))
+    fields = first, _JOINT_R * first + (1 - _JOINT_R**2) ** 0.5 * second
+    parts = []
+    for field, effect in zip(fields, effects, strict=True):
+        field[(group == 1, *_JOINT_CORE)] -= effect
+        parts.append(
+            PermutationPart(
+                maps=field.reshape(_JOINT_N, -1),
+                matrix=np.column_stack([np.ones(_JOINT_N), group, age]),
+                subjects=np.arange(_JOINT_N),
+                edges=sheet_edges(*_JOINT_NODES),
+            )
+        )
+    contrast = Contrast(_GROUP, np.array([0.0, 1.0, 0.0]))
+    how = MultiplicitySettings(
+        method="permutation-tfce", permutations=PERMUTATIONS, alpha=LEVEL, seed=seed
+    )
+    single = how.changed(method="permutation-max")
+    one, two = (permute([part], contrast, settings=single)[0].p_max for part in parts)
+    (tippett,) = permute([JointPart(parts, "tippett")], contrast, settings=single)
+    (fisher,) = permute([JointPart(parts, "fisher")], contrast, settings=how)
+    found = {
+        "first measure alone, largest t": one <= LEVEL,
+        "either, each at half the level": np.minimum(one, two) <= LEVEL / 2,
+        "together, Fisher (default)": fisher.p_max <= LEVEL,
+        "together, Fisher, cluster enhancement": fisher.p_enhanced <= LEVEL,
+        "together, Tippett": tippett.p_max <= LEVEL,
+    }
+    return {name: own.reshape(_JOINT_NODES) for name, own in found.items()}
+
+
+def _together(cohorts: int) -> Table:
+    """Count what tests of two measures together find: nothing there, in both, and in one."""
+    seeds = range(cohorts)
+    null = [joint_findings((0.0, 0.0), seed) for seed in seeds]
+    both = [joint_findings((_JOINT_EFFECT, _JOINT_EFFECT), seed) for seed in seeds]
+    single = [joint_findings((_JOINT_EFFECT, 0.0), seed) for seed in seeds]
+    # Few cohorts cannot say more than that their number is within three standard deviations.
+    most = max(JOINT_RANGE[1], LEVEL + 3 * (LEVEL * (1 - LEVEL) / cohorts) ** 0.5)
+    least = JOINT_RANGE[0] if cohorts >= JOINT_COHORTS else 0.0
+    rows: list[Cells] = []
+    for name in null[0]:
+        false = float(np.mean([found[name].any() for found in null]))
+        power, in_one = (
+            float(np.mean([found[name][_JOINT_CORE].mean() for found in some]))
+            for some in (both, single)
+        )
+        rows.append(
+            {
+                "test": name,
+                "cohorts": cohorts,
+                "null cohorts with findings": false,
+                "power, effect in both": power,
+                "power, effect in the first": in_one,
+                "met": least <= false <= most,
+            }
+        )
+    return Table(
+        title="Two measures together",
+        rows=rows,
+        notes=f"Cohorts of {_JOINT_N} subjects in two groups, {_JOINT_NODES[0]} x"
+        f" {_JOINT_NODES[1]} nodes (smaller than a sheet, for speed), two measures whose noise is"
+        f" correlated by {_JOINT_R:g}, and differences of {_JOINT_EFFECT:g} SD between the groups"
+        f" in 25 nodes; {PERMUTATIONS} permutations, family-wise error {LEVEL:g}. Power: share of"
+        f" these nodes that is found. Target: {least:.2g} to {most:.2g} of the null cohorts have"
+        " findings.",
     )

@@ -2,12 +2,21 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import nibabel as nib
 import numpy as np
 import pandas as pd
 import pytest
-from hippunfold_like import PATTERNS, flat_surface, names, write_map, write_surface
+from hippunfold_like import (
+    PATTERNS,
+    cifti_name,
+    flat_surface,
+    names,
+    write_cifti,
+    write_map,
+    write_surface,
+)
 from pyarrow import parquet
 from small_cohorts import (
     NODES,
@@ -25,6 +34,9 @@ from hipsta_bids.group.glm import fit_points
 from hipsta_bids.group.settings import GlmSettings
 from hipsta_bids.io import files
 from hipsta_bids.reports.group import group_page
+
+#: One person and templates, where the shared data are present.
+HIPPUNFOLD = Path(__file__).parents[2] / ".." / "shared" / "data" / "hippunfold"
 
 COUNT = sum(PLAN.sizes)
 MODEL = "group-age-sex"
@@ -352,3 +364,79 @@ def test_maps_of_others_are_scored_against_a_reference_group(written):
     rows = table(folder / "hipp_wscores.tsv")
     assert set(rows.region) == {"all"}
     assert rows[~rows.reference].low.mean() > rows[rows.reference].low.mean()
+
+
+def test_cifti_files_give_what_gifti_files_give_and_go_together(study, alone):
+    for subject in subjects():
+        both = {hemi: thickness(subject, hemi) for hemi in "LR" if (subject, hemi) != MISSING}
+        write_cifti(cifti_name(study / "bids" / "hippunfold", subject, version=1), both)
+    cifti = "hippunfold/sub-{subject}/surf/*_label-hipp_thickness.dscalar.nii"
+    options = ["--maps", f"hipp={PATTERNS[1]}", f"dense={cifti}", "--joint", "hipp", "dense"]
+    assert run(study, *options, "--permutations", "50", "--name", "two", out="new") == 0
+    folder = study / "new" / "group" / "two"
+    for hemi in "LR":
+        expected = statmap(alone, hemi)
+        # Both formats have single precision.
+        for name in ("hipp", "dense"):
+            np.testing.assert_allclose(statmap(folder, hemi, name).p, expected.p, rtol=1e-6)
+        joint = statmap(folder, hemi, "joint")
+        assert joint.significant[thinned(hemi)].mean() > 0.8
+        assert joint.significant[~thinned(hemi)].mean() < 0.1
+        np.testing.assert_allclose(joint.p_dense, expected.p, rtol=1e-6)
+    assert "Strongest at vertex " in group_page(folder)
+
+
+def test_joint_maps_have_to_lie_on_one_surface(study, capsys):
+    options = ["--maps", f"hipp={PATTERNS[1]}", "--joint", "thickness", "hipp", "--align", "none"]
+    assert run(study, *options, "--measures", "thickness", "hipp", "--name", "no") == 65
+    error = capsys.readouterr().err
+    assert "different surfaces" in error
+    assert error.count("\n") == 1
+
+
+@pytest.fixture(scope="module")
+def template(tmp_path_factory):
+    """Twelve participants on HippUnfold's template: its thickness, noise, and thinning in CA1."""
+    if not HIPPUNFOLD.is_dir():
+        pytest.skip("surfaces of HippUnfold not found")
+    folder = tmp_path_factory.mktemp("template")
+    name = "tpl-MNI152NLin2009bAsym"
+    surface = str(
+        HIPPUNFOLD / f"templates/{name}/{name}_hemi-{{hemi}}_space-T1w_den-0p5mm_label-hipp_"
+    )
+    data, random = folder / "bids", np.random.default_rng(0)
+    for hemi in "LR":
+        inner, outer = (
+            nib.load(f"{surface.format(hemi=hemi)}{wall}.surf.gii").agg_data("pointset")
+            for wall in ("inner", "outer")
+        )
+        labels = HIPPUNFOLD / "templates" / f"hemi-{hemi}_den-0p5mm_label-hipp_subfields.label.gii"
+        thin = nib.load(labels).darrays[0].data == 2  # CA1
+        np.save(folder / f"{hemi}.npy", thin)
+        wall = np.linalg.norm(inner - outer, axis=1)
+        for i in range(12):
+            path, _ = names(data / "hippunfold", f"{i + 1:02d}", hemi, version=1)
+            write_map(path, wall + random.normal(0, 0.1, len(wall)) - 0.4 * thin * (i >= 6))
+    rows = [[f"sub-{i + 1:02d}", "AD" if i >= 6 else "CN"] for i in range(12)]
+    files.write_tsv(data / "participants.tsv", ["participant_id", "group"], rows)
+    options = ["--maps", f"hipp={PATTERNS[1]}", "--maps-surface", f"{surface}midthickness.surf.gii"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(write, "draw_figures", lambda *_: iter(()))
+        assert main([str(data), str(folder / "out"), "group", *options, "--name", "t"]) == 0
+    return folder
+
+
+def test_real_surfaces_of_hippunfold(template):
+    folder = template / "out" / "group" / "t"
+    image = nib.load(folder / "contrast-CNAD_desc-hipp_statmap.dscalar.nii")
+    parts = list(image.header.get_axis(1).iter_structures())
+    for hemi, (structure, part, _) in zip("LR", parts, strict=True):
+        assert structure.startswith("CIFTI_STRUCTURE_HIPPOCAMPUS_")
+        thin, rows = np.load(template / f"{hemi}.npy"), statmap(folder, hemi)
+        assert len(rows) == len(thin) == 7262
+        # Four standard deviations, in six against six.
+        assert rows.significant[thin].mean() > 0.9
+        assert rows.significant[~thin].mean() < 0.08
+        np.testing.assert_allclose(image.get_fdata()[0, part], rows.statistic, rtol=1e-5)
+        surface = nib.load(folder / f"hemi-{hemi}_space-hipp_midthickness.surf.gii")
+        assert surface.darrays[0].meta["GeometricType"] == "Anatomical"

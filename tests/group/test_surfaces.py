@@ -2,7 +2,15 @@
 
 import numpy as np
 import pytest
-from hippunfold_like import PATTERNS, flat_surface, names, write_map, write_surface
+from hippunfold_like import (
+    PATTERNS,
+    cifti_name,
+    flat_surface,
+    names,
+    write_cifti,
+    write_map,
+    write_surface,
+)
 
 from hipsta_bids.errors import InputError, NothingToDoError, UsageError
 from hipsta_bids.group.surfaces import find_maps, map_patterns, read_maps
@@ -134,7 +142,61 @@ def test_damaged_files_are_refused(tmp_path, content, words):
     path = tmp_path / "x.shape.gii"
     path.write_bytes(content)
     with pytest.raises(InputError, match=words):
-        read_map(path, "x")
+        read_map(path, "x", "L")
+
+
+@pytest.mark.parametrize("structure", ["CORTEX", "HIPPOCAMPUS"])
+def test_cifti_files_of_hippunfold_are_both_sides(tmp_path, version, structure):
+    values = np.linspace(0.5, 2, 50)
+    for subject in ("01", "02"):
+        sides = {"L": values * int(subject), "R": np.where(values < 1, np.nan, values)}
+        if subject == "02":
+            del sides["R"]
+        write_cifti(
+            cifti_name(tmp_path / "hippunfold", subject, version=version),
+            sides,
+            structure=structure,
+        )
+        for hemi in "LR":
+            _, surface = names(tmp_path / "hippunfold", subject, hemi, version=version)
+            write_surface(surface, POINTS + 100 * (hemi == "R"), TRIANGLES)
+    pattern = "hippunfold/sub-{subject}/*/*_label-hipp_thickness.dscalar.nii"
+    sides, unit, visits = find_and_read(tmp_path, pattern)
+    assert unit == "mm"
+    assert visits_of(sides["L"], visits) == [("01", None), ("02", None)]
+    assert visits_of(sides["R"], visits) == [("01", None)]
+    left = sides["L"].maps["hipp"][..., 0]
+    np.testing.assert_allclose(left, [values, 2 * values], rtol=1e-6)
+    right = sides["R"].maps["hipp"][0, :, 0]
+    np.testing.assert_allclose(right, np.where(values < 1, np.nan, values), rtol=1e-6)
+    assert sides["R"].mesh.points.min() >= 100  # each side has its own surface
+
+
+def spoiled_cifti(path, kind):
+    sides = {"L": np.arange(300.0), "R": np.arange(300.0)}
+    if kind == "one side":
+        del sides["R"]
+    write_cifti(path, sides, names=("a", "b") if kind == "two maps" else ("a",))
+    cut = {"cut in the header": 700, "cut in the data": -100, "empty": 0}
+    if kind in cut:
+        path.write_bytes(path.read_bytes()[: cut[kind]])
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("cut in the header", "not readable as CIFTI"),
+        ("cut in the data", "not readable as CIFTI"),
+        ("empty", "not readable as CIFTI"),
+        ("two maps", "holds 2 maps"),
+        ("one side", "no surface of hemisphere R"),
+    ],
+)
+def test_cifti_files_that_are_refused(tmp_path, kind, words):
+    path = tmp_path / "x_thickness.dscalar.nii"
+    spoiled_cifti(path, kind)
+    with pytest.raises(InputError, match=words):
+        read_map(path, "x", "R")
 
 
 def test_half_a_file_is_refused(tmp_path):
@@ -142,21 +204,21 @@ def test_half_a_file_is_refused(tmp_path):
     write_map(path, np.arange(1000.0))
     path.write_bytes(path.read_bytes()[:1500])
     with pytest.raises(InputError, match="not readable as GIFTI"):
-        read_map(path, "x")
+        read_map(path, "x", "L")
 
 
 def test_files_of_several_maps_are_refused_unless_a_column_has_the_name(tmp_path):
     write_map(tmp_path / "x.func.gii", np.zeros(5), np.ones(5))
     with pytest.raises(InputError, match="holds 2 maps"):
-        read_map(tmp_path / "x.func.gii", "a")
+        read_map(tmp_path / "x.func.gii", "a", "L")
     files.write_tsv(tmp_path / "x.tsv", ["a", "b"], [["1", "2"], ["3", "inf"]])
-    assert read_map(tmp_path / "x.tsv", "a").values.tolist() == [1, 3]
-    np.testing.assert_array_equal(read_map(tmp_path / "x.tsv", "b").values, [2, np.nan])
+    assert read_map(tmp_path / "x.tsv", "a", "L").values.tolist() == [1, 3]
+    np.testing.assert_array_equal(read_map(tmp_path / "x.tsv", "b", "L").values, [2, np.nan])
     with pytest.raises(InputError, match="has columns a, b"):
-        read_map(tmp_path / "x.tsv", "c")
+        read_map(tmp_path / "x.tsv", "c", "L")
     files.write_tsv(tmp_path / "y.tsv", ["a"], [["much"]])
     with pytest.raises(InputError, match="no numbers"):
-        read_map(tmp_path / "y.tsv", "a")
+        read_map(tmp_path / "y.tsv", "a", "L")
 
 
 @pytest.mark.parametrize(

@@ -26,6 +26,7 @@ def test_registered_must_pass_and_unregistered_must_fail(monkeypatch, unregister
     monkeypatch.setattr(group, "run_simulation", simulate)
     monkeypatch.setattr(group, "_corrections", lambda _cohorts: None)
     monkeypatch.setattr(group, "_amplitudes", lambda _cohorts: None)
+    monkeypatch.setattr(group, "_together", lambda _cohorts: None)
     table, *_ = group.run(full=False).tables
     assert table.targets == 3
     assert table.missed == missed
@@ -53,6 +54,23 @@ def test_corrections_keep_the_family_wise_error_and_find_the_effect(monkeypatch)
     )
     # The effect is wide and weak, as cluster enhancement likes it.
     assert wide > single > 0.2
+
+
+def test_measures_together_keep_the_family_wise_error_and_find_more(monkeypatch):
+    monkeypatch.setattr(group, "PERMUTATIONS", 60)
+    table = group._together(10)
+    assert table.targets == 5
+    assert table.missed == 0
+    both, single = (
+        {row["test"]: row[f"power, effect in {what}"] for row in table.rows}
+        for what in ("both", "the first")
+    )
+    fisher, either = both["together, Fisher (default)"], both["either, each at half the level"]
+    assert fisher > either + 0.05
+    assert either > both["first measure alone, largest t"]
+    assert both["together, Fisher, cluster enhancement"] > fisher
+    # What it costs where one measure has no effect.
+    assert single["together, Fisher (default)"] < single["first measure alone, largest t"]
 
 
 def test_group_is_short_for_its_suite():

@@ -31,9 +31,13 @@
       const { estimate, statistic, df, p, p_corrected: adjusted, n } = item.values;
       const is_t = item.kind === "t";
       if (is_t) rows.push([item.contrast, spell(estimate[at]) + unit]);
-      rows.push([is_t ? (df[at] === null ? "z" : `t(${spell(df[at])})`) : "F", spell(statistic[at])], ["p", probability(p[at])]);
+      const name = item.kind === "z" || (is_t && df[at] === null) ? "z" : is_t ? `t(${spell(df[at])})` : "F";
+      rows.push([name, spell(statistic[at])]);
+      for (const [part, values] of item.parts) rows.push([part, probability(values[at])]);
+      rows.push(["p", probability(p[at])]);
       rows.push(["corrected p", probability(adjusted[at]) + (item.significant[at] ? ", survives" : "")]);
-      rows.push([is_t ? "Cohen's d" : "partial η²", spell(item.effect[at])], ["n", spell(n[at])]);
+      if (item.kind !== "z") rows.push([is_t ? "Cohen's d" : "partial η²", spell(item.effect[at])]);
+      rows.push(["n", spell(n[at])]);
     }
     return rows;
   }
