@@ -4,6 +4,7 @@ Those of maps are in ``panels``. Colors are those of the pages (``reports.displa
 """
 
 import io
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -11,6 +12,7 @@ from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 
 from hipsta_bids.group.analysis import Analysis, mean_of_known, members_of, spread_of_known
 from hipsta_bids.group.classify import ClassifierResult, PairComparison, roc_curve
@@ -27,7 +29,8 @@ from hipsta_bids.group.panels import (
     draw_measure,
 )
 from hipsta_bids.group.shapes import AverageShape
-from hipsta_bids.reports.display import COLORS, X_ENDS
+from hipsta_bids.io.files import MISSING
+from hipsta_bids.reports.display import COLORS, HEMISPHERE_COLORS, X_ENDS
 from hipsta_bids.reports.group_tables import SIDES, display_name, with_brackets
 from hipsta_bids.reports.maps import new_figure
 
@@ -333,6 +336,44 @@ def _spread(axis: "Axes", values: Float, row: int, number: int, name: str) -> No
     axis.plot([low, high], [y, y], color=color, linewidth=1.0)
     axis.plot([first, third], [y, y], color=color, linewidth=4.5, label=name, solid_capstyle="butt")
     axis.plot([middle], [y], "|", color="white", markersize=4.5)
+
+
+def draw_norms(lines: pd.DataFrame, dots: pd.DataFrame) -> "list[Figure]":
+    """Draw centiles over age, a row for each sex and a column for each side; and people on it.
+
+    Controls that a site was adapted to are open circles.
+    """
+    sexes, sides = lines["sex"].unique(), lines["hemi"].unique()
+    width = TWO_COLUMNS if len(sides) > 1 else ONE_COLUMN
+    figure, axes = _panels(len(sexes), len(sides), (width, 60.0 * len(sexes)))
+    measure, unit = lines[["measure", "unit"]].iloc[0]
+    names = [name for name in lines.columns if re.fullmatch(r"p\d+", name)]
+    shown = np.concatenate([lines[names].to_numpy().ravel(), dots["value"]])
+    low, high = np.nanmin(shown), np.nanmax(shown)
+    margin = 0.03 * (high - low)
+    for row, sex in zip(axes, sexes, strict=True):
+        for axis, hemi in zip(row, sides, strict=True):
+            own = lines[(lines["hemi"] == hemi) & (lines["sex"] == sex)]
+            age, color = own["age"], HEMISPHERE_COLORS[hemi]
+            for first, last in ((0, -1), (1, -2)):
+                edges = own[names[first]], own[names[last]]
+                axis.fill_between(age, *edges, color=color, alpha=0.15, linewidth=0)
+            for name in names:
+                middle = name == names[len(names) // 2]
+                axis.plot(age, own[name], color=color, linewidth=1.4 if middle else 0.6)
+                end = (1.01, own[name].iloc[-1])
+                axis.annotate(name[1:], end, xycoords=("axes fraction", "data"), va="center")
+            some = dots[(dots["hemi"] == hemi) & (dots["sex"] == sex)]
+            for control, face in ((False, "black"), (True, "none")):
+                one = some[some["adapted"] == control]
+                axis.plot(one["age"], one["value"], "o", color="black", mfc=face, ms=2.5, mew=0.5)
+            axis.set_title(SIDES[hemi] if sex == MISSING else f"{SIDES[hemi]}, {sex}")
+            axis.set_xlabel("age [years]")
+            axis.set_xlim(age.min(), age.max())
+            axis.set_ylim(low - margin, high + margin)
+        row[0].set_ylabel(with_brackets(display_name(measure), unit))
+    _name(axes.flat)
+    return [figure]
 
 
 def draw_figures(

@@ -69,6 +69,14 @@ REFERENCES: Mapping[str, str] = {
     "normative": "Jack CR, Petersen RC, Xu YC, et al. Medial temporal atrophy on MRI in normal"
     " aging and very mild Alzheimer's disease. Neurology 1997;49(3):786-794."
     " doi:10.1212/WNL.49.3.786",
+    "shash": "Jones MC, Pewsey A. Sinh-arcsinh distributions. Biometrika 2009;96(4):761-780."
+    " doi:10.1093/biomet/asp053",
+    "gamlss": "Rigby RA, Stasinopoulos DM. Generalized additive models for location, scale and"
+    " shape. Journal of the Royal Statistical Society C 2005;54(3):507-554."
+    " doi:10.1111/j.1467-9876.2005.00510.x",
+    "warped": "Fraza CJ, Dinga R, Beckmann CF, Marquand AF. Warped Bayesian linear regression for"
+    " normative modelling of big data. NeuroImage 2021;245:118715."
+    " doi:10.1016/j.neuroimage.2021.118715",
     "combat": "Fortin JP, Cullen N, Sheline YI, et al. Harmonization of cortical thickness"
     " measurements across scanners and sites. NeuroImage 2018;167:104-120."
     " doi:10.1016/j.neuroimage.2017.11.024",
