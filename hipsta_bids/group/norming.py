@@ -1,10 +1,9 @@
 """Norms from files to files: fitted to a reference cohort, or for the scores of new people."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,23 +13,26 @@ from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group import write
-from hipsta_bids.group.analysis import SideResult, mean_of_known
+from hipsta_bids.group.analysis import SideResult
 from hipsta_bids.group.comparison import BOTH
-from hipsta_bids.group.data import Bool, Cohort, Float, Int, SideMaps
-from hipsta_bids.group.figures import Drawing, draw_norms
+from hipsta_bids.group.data import Bool, Cohort, Float, Int
+from hipsta_bids.group.figures import Drawing, deviation_rows, draw_norms, norm_rows
 from hipsta_bids.group.formula import check_names, listed, typed
-from hipsta_bids.group.glm import FittedMaps, most_frequent
+from hipsta_bids.group.glm import most_frequent
+from hipsta_bids.group.methods import norms_text
 from hipsta_bids.group.normative import NormativeScores, ScoredMaps, map_rows, score_rows
 from hipsta_bids.group.norms import (
     LEVELS,
     Norms,
     NormsFile,
     People,
+    choose_knots,
     fit_norms,
     load_norms,
     save_norms,
+    too_few,
 )
-from hipsta_bids.group.panels import Row
+from hipsta_bids.group.reference import place_of
 from hipsta_bids.group.run import (
     GroupInputs,
     GroupOptions,
@@ -43,11 +45,9 @@ from hipsta_bids.group.site_effects import level_labels
 from hipsta_bids.group.summaries import hemispheres, summary_values
 from hipsta_bids.group.tables import registration_tables
 from hipsta_bids.group.trials import (
-    document,
     draw_maps,
     members,
     register_cohorts,
-    spanned,
     templates_of,
     write_answer,
 )
@@ -55,8 +55,6 @@ from hipsta_bids.group.warps import Template, templates_from_json, templates_to_
 from hipsta_bids.io import files
 from hipsta_bids.progress import tell
 from hipsta_bids.protocols.toml import resolve
-from hipsta_bids.reports.display import kind_of
-from hipsta_bids.reports.group_tables import display_name, with_brackets
 
 #: File of norms, in the folder of their results.
 NORMS = "norms.json"
@@ -93,7 +91,7 @@ class _Chosen:
     """Reason and message by visit."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class _Made:
     """What is written."""
 
@@ -129,22 +127,14 @@ def run_norms(options: GroupOptions, request: NormsRequest, settings: GroupSetti
     file = _counted(file, people, how)
     templates = read_templates(options.template, chosen.cohort)
     sides, cohorts, found = _registered(chosen, settings, templates)
-    made = templates_of(sides)
-    file = file.model_copy(update={"template": templates_to_json(made) if made else None})
     tell("norms")
+    if made := templates_of(sides):
+        file = file.model_copy(update={"template": templates_to_json(made)})
     norms, table = _fit(found, people, file, how)
     tables = dict(registration_tables(chosen.cohort, sides)) if sides else {}
-    tables["norms"] = table
-    done = _Made(
-        file=file,
-        norms=norms,
-        people=people,
-        cohorts=cohorts,
-        found=found,
-        tables=tables,
-        known=len(file.sites),
-    )
+    tables["coverage"] = table
     chosen.left_out.update(left_out)
+    done = _Made(file, norms, people, cohorts, found, tables, len(file.sites))
     return _write(options, request, settings, chosen, done, ())
 
 
@@ -184,17 +174,7 @@ def _score_people(
         name: _score_maps(one, found, extended, people, adapted) for name, one in cohorts.items()
     }
     tables = dict(registration_tables(chosen.cohort, sides)) if sides else {}
-    made = _Made(
-        file=file,
-        norms=extended,
-        people=people,
-        cohorts=cohorts,
-        found=found,
-        tables=tables,
-        known=known,
-        scored=scored,
-        adapted=adapted,
-    )
+    made = _Made(file, extended, people, cohorts, found, tables, known, scored, adapted)
     tables["zscores"] = pd.concat(_score_rows(made, adapted, settings), ignore_index=True)
     chosen.left_out.update(left_out)
     return _write(options, request, settings, chosen, made, notes)
@@ -243,19 +223,34 @@ def _write(  # noqa: PLR0917
     notes: Iterable[str],
 ) -> GroupResult:
     file, people, cohort = made.file, made.people, chosen.cohort
-    keys = [key for key in made.norms if key[1] in settings.norms.charts and key[0] != BOTH]
-    if keys:
-        made.tables["centiles"] = pd.concat([_centiles(made, key) for key in keys])
+    charts = [
+        file.centiles(norms).assign(hemi=hemi, measure=name, unit=cohort.units.get(name, "1"))
+        for (hemi, name), norms in made.norms.items()
+        if name in settings.norms.charts and hemi != BOTH
+    ]
+    if charts:
+        table = pd.concat(charts, ignore_index=True)
+        first = ["hemi", "measure", "unit"]
+        made.tables["centiles"] = table[[*first, *table.columns.drop(first)]]
+    among = f" ({' '.join(request.among)})" if request.among else ""
+    text = norms_text(
+        file,
+        settings.norms,
+        who=f"{people.known.sum()} participants{among}",
+        coverage=made.tables.get("coverage"),
+        new=list(file.sites)[made.known :],
+        controls=request.controls,
+    )
 
     def fill(folder: Path) -> list[str]:
         save_norms(folder / NORMS, file, made.norms)
         for surface, one in made.cohorts.items():
             for hemi, side in one.sides.items():
                 if side.maps:
-                    write.write_surface(folder, one, _place(side), hemi)
+                    write.write_surface(folder, one, place_of(side), hemi)
             if found := made.scored.get(surface):
                 write.write_scores(folder, one, one.table, found, letter="z", sheets=not surface)
-        files.write_text(folder / "methods.md", _methods(made, request, settings))
+        files.write_text(folder / "methods.md", text)
         return write.write_figures(folder, _figures(made))
 
     counts = np.bincount(people.site[people.known], minlength=len(file.sites)).tolist()
@@ -294,21 +289,7 @@ def _planned(chosen: _Chosen, settings: GroupSettings) -> NormsFile:
     check_names([how.age], table.columns)
     sexes = level_labels(table[how.sex], settings.design).dropna() if how.sex in table else ()
     sites = _site_labels(table, how.site, settings).dropna()
-    ages = np.sort(_ages(table, how.age, settings))
-    ages = ages[np.isfinite(ages)]
-    if len(ages) < how.least_participants:
-        raise _too_few(len(ages), how)
-    # No age of a single person: some are beyond the ends.
-    low, high = np.floor(ages[how.edge - 1]), np.ceil(ages[-how.edge])
-    inside = ages[(ages >= low) & (ages <= high)]
-    inner = np.quantile(inside, np.linspace(0, 1, how.knots)[1:-1]).round(1)
-    knots = np.array([low, *inner, high], dtype=np.float64)
-    if not (np.diff(knots) > 0).all():
-        raise ModelError(
-            f"--fit-norms: too few different ages for {how.knots} knots of a spline"
-            f" ({listed([f'{age:g}' for age in knots])}); set norms.knots to fewer",
-            reason="norms-reference",
-        )
+    knots = choose_knots(_ages(table, how.age, settings), how)
     found = inputs.found
     return NormsFile(
         description="norms of maps and summary measures by age, sex and site",
@@ -331,15 +312,6 @@ def _planned(chosen: _Chosen, settings: GroupSettings) -> NormsFile:
         sites=dict.fromkeys(sorted(set(sites)), 1),
         participants=1,
         norms={},
-    )
-
-
-def _too_few(count: int, how: NormSettings) -> ModelError:
-    return ModelError(
-        f"--fit-norms: {count} participants with age, sex and site are too few; norms need"
-        f" {how.least_participants} or more: join the reference cohorts of several sites by"
-        " --derivatives",
-        reason="norms-reference",
     )
 
 
@@ -386,7 +358,7 @@ def _counted(file: NormsFile, people: People, how: NormSettings) -> NormsFile:
     """Count a reference cohort; refuse one that is too small, or whose sexes are those of sites."""
     known = people.known
     if known.sum() < how.least_participants:
-        raise _too_few(int(known.sum()), how)
+        raise too_few(int(known.sum()), how)
     counts = np.bincount(people.site[known], minlength=len(file.sites)).tolist()
     sites = dict(zip(file.sites, counts, strict=True))
     if small := [f"{site} ({n})" for site, n in sites.items() if n < how.least_site]:
@@ -515,6 +487,8 @@ def _score_maps(
     for hemi, side in cohort.sides.items():
         scores = {}
         for measure in side.maps:
+            if (hemi, measure) not in norms:
+                continue
             one = norms[hemi, measure]
             z = one.score(values[hemi, measure][1], people.take(side.rows))
             scores[measure] = NormativeScores(z, 2 * special.ndtr(-np.abs(z)), one.n.sum(axis=0))
@@ -546,27 +520,6 @@ def _score_rows(made: _Made, adapted: Bool, settings: GroupSettings) -> Iterator
             yield score_rows(made.cohorts[""], known, **what, centile=100 * special.ndtr(z))
 
 
-def _centiles(made: _Made, key: Key) -> pd.DataFrame:
-    """List centiles of a summary measure at each year, by sex, at the average site."""
-    file, unit = made.file, made.cohorts[""].units.get(key[1], "1")
-    ages = np.arange(file.knots[0], file.knots[-1] + 1)
-    blocks = []
-    for number, sex in enumerate(file.sexes or [files.MISSING]):
-        kind = np.eye(max(len(file.sexes), 1))[number, 1:]
-        people = People(age=ages, sex=np.tile(kind, (len(ages), 1)), site=np.zeros(len(ages), int))
-        values = made.norms[key].centiles(people, LEVELS)[:, :, 0]
-        columns = {f"p{100 * one:g}": row for one, row in zip(LEVELS, values, strict=True)}
-        what = {"hemi": key[0], "measure": key[1], "unit": unit, "sex": sex}
-        blocks.append(pd.DataFrame({**what, "age": ages, **columns}))
-    return pd.concat(blocks)
-
-
-def _place(side: SideMaps) -> FittedMaps:
-    every: Int = np.arange(len(side.rows))
-    subfield = most_frequent(side.subfield, len(side.names))
-    return FittedMaps(maps=side, used=every, rows=every, subfield=subfield, fits={})
-
-
 def _figures(made: _Made) -> Iterator[tuple[str, Drawing]]:
     """List charts of summary measures, and maps."""
     if "centiles" in made.tables:
@@ -574,12 +527,14 @@ def _figures(made: _Made) -> Iterator[tuple[str, Drawing]]:
             yield f"{measure}_norms", partial(draw_norms, own, _dots(made, own))
     for surface, cohort in made.cohorts.items():
         for measure in dict.fromkeys(n for side in cohort.sides.values() for n in side.maps):
-            sides = {hemi: one for hemi, one in cohort.sides.items() if measure in one.maps}
-            places = {hemi: _place(one) for hemi, one in sides.items()}
+            sides = {h: one for h, one in cohort.sides.items() if (h, measure) in made.norms}
+            places = {hemi: place_of(one) for hemi, one in sides.items()}
             unit = cohort.units.get(measure, "1")
-            rows = _expectations(made, list(sides), measure, unit)
+            middle = made.file.middle
+            means = {hemi: made.norms[hemi, measure].expected(middle) for hemi in sides}
+            rows = norm_rows(means, float(middle.age[0]), measure, unit)
             if made.adapted is not None:
-                rows = _deviations(made.scored[surface], measure)
+                rows = deviation_rows(made.scored[surface], measure)
             yield f"{measure}_normmaps", partial(draw_maps, cohort, places, list(rows))
 
 
@@ -596,110 +551,3 @@ def _dots(made: _Made, lines: pd.DataFrame) -> pd.DataFrame:
         adapted = np.zeros(0, bool) if made.adapted is None else made.adapted
         blocks.append(pd.DataFrame({**what, "value": moved, "adapted": adapted}))
     return pd.concat(blocks, ignore_index=True).dropna()
-
-
-def _expectations(made: _Made, sides: Sequence[str], measure: str, unit: str) -> Iterator[Row]:
-    """Show mean and SD at the middle knot of age, halfway between the sexes."""
-    knots, n_sexes = made.file.knots, max(len(made.file.sexes), 1)
-    age = knots[len(knots) // 2]
-    one = People(
-        age=np.array([age]), sex=np.full((1, n_sexes - 1), 1 / n_sexes), site=np.zeros(1, int)
-    )
-    found = {hemi: made.norms[hemi, measure].expected(one) for hemi in sides}
-    kind = kind_of(measure)
-    for i, (what, colors) in enumerate({"mean": kind.colors, "SD": "magma"}.items()):
-        values = {hemi: pair[i][0] for hemi, pair in found.items()}
-        scale = spanned(colors, values)
-        if kind.limits and what == "mean":
-            scale = {"cmap": colors, "vmin": kind.limits[0], "vmax": kind.limits[1]}
-        title = f"{what[0].upper()}{what[1:]} at {age:g} years"
-        label = with_brackets(f"{what},\n{display_name(measure)}", unit)
-        yield Row(kind="expected", index=i, title=title, label=label, scale=scale, values=values)
-
-
-def _deviations(scored: Mapping[str, ScoredMaps], measure: str) -> Iterator[Row]:
-    """Show mean deviations, and shares of low ones, of those whom no site was adapted to."""
-    z = {
-        hemi: side.scores[measure].w[~side.reference]
-        for hemi, side in scored.items()
-        if measure in side.scores
-    }
-    means = {hemi: mean_of_known(own, 0) for hemi, own in z.items()}
-    below = special.ndtri(LEVELS[0])
-    low = {
-        hemi: 100 * mean_of_known(np.where(np.isfinite(own), own < below, np.nan), 0)
-        for hemi, own in z.items()
-    }
-    reach = max(1.0, *(np.nanmax(np.abs(one), initial=0.0) for one in means.values()))
-    most = max(20.0, *(np.nanmax(one, initial=0.0) for one in low.values()))
-    for kind, title, label, colors, ends, values in (
-        ("effect", "Mean deviation", "mean z", "RdBu_r", (-reach, reach), means),
-        ("error", "Below the 5th centile", "participants [%]", "magma", (0.0, most), low),
-    ):
-        scale: dict[str, Any] = {"cmap": colors, "vmin": ends[0], "vmax": ends[1]}
-        yield Row(kind=kind, index=0, title=title, label=label, scale=scale, values=values)
-
-
-def _methods(made: _Made, request: NormsRequest, settings: GroupSettings) -> str:
-    """Word what was done, with the works it rests on."""
-    file, cited = made.file, list[str]()
-
-    def cite(key: str) -> str:
-        if key not in cited:
-            cited.append(key)
-        return f"[{cited.index(key) + 1}]"
-
-    among = f" ({' '.join(request.among)})" if request.among else ""
-    first = (
-        f"Measures of the hippocampus {cite('method')} of {made.people.known.sum()}"
-        f" participants{among} were "
-    )
-    ages = f"{file.knots[0]:g} to {file.knots[-1]:g} years"
-    if request.file is None:
-        first += f"taken as norms for ages of {ages} with hipsta_bids {__version__}."
-    else:
-        first += (
-            f"compared with norms of {file.participants} participants of {ages} from {made.known} sites"
-            f" (hipsta_bids {__version__}; norms made by {file.version})."
-        )
-    if file.template is not None:
-        whose = "each other" if request.file is None else "the template of the norms"
-        first += (
-            f" Sheets were registered to {whose} by their curvature profiles {cite('registr')}."
-        )
-    sex = "sex and " if file.sexes else ""
-    model = (
-        f"Norms have a mean with a natural cubic spline of age ({len(file.knots)} knots) and"
-        f" constants for {sex}site, and an SD whose logarithm is linear in age with a constant for"
-        f" each site {cite('gamlss')}, at each point and for each summary measure. Where a"
-        f" likelihood-ratio test (p < {settings.norms.shape_level:g}) rejected a normal"
-        f" distribution, residuals have a sinh-arcsinh distribution {cite('shash')}, as in"
-        f" {cite('warped')}. Deviations z are normal quantiles of the probability of a value;"
-        " shift and scale of a site count as known from its participants only (Student's t)."
-    )
-    paragraphs = [first, model]
-    if request.file is None:
-        table = made.tables["norms"]
-        of_maps = table["n_points"] > 1
-        parts = [
-            f"{_shares(own)} % of {what}"
-            for what, own in (
-                ("points of maps", table[of_maps]),
-                ("summary measures", table[~of_maps]),
-            )
-            if len(own)
-        ]
-        paragraphs.append(
-            f"In {settings.norms.folds}-fold cross-validation {' and '.join(parts)} lay below"
-            f" centiles {listed([f'{100 * one:g}' for one in LEVELS])}."
-        )
-    if new := [f"{site} ({n})" for site, n in list(file.sites.items())[made.known :]]:
-        paragraphs.append(
-            "Shift and scale of sites without norms were estimated from their controls"
-            f" {'='.join(request.controls or ())}: {listed(new)}. All else was kept."
-        )
-    return document(paragraphs, cited)
-
-
-def _shares(table: pd.DataFrame) -> str:
-    return listed([f"{100 * table[f'below_{100 * one:g}'].mean():.1f}" for one in LEVELS])

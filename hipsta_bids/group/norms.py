@@ -15,6 +15,7 @@ from textwrap import shorten
 from typing import Annotated, Any, Literal
 
 import numpy as np
+import pandas as pd
 from pydantic import Field, ValidationError
 from scipy import special
 
@@ -114,8 +115,9 @@ class Norms:
         """(visits, points) deviations z; their normal probability is the centile.
 
         Shift and scale of a site are known from its ``n`` participants only, so that a deviation is
-        one of Student's distribution with ``n - 1`` degrees of freedom and a variance larger by
-        ``1 / n``; z is the normal quantile of the same probability.
+        one of Student's distribution with ``n - 1`` degrees of freedom, and a variance larger by
+        ``1 / n`` and by the mean leverage of age and sex; z is the normal quantile of the same
+        probability.
         """
         found = np.full(values.shape, np.nan)
         known = np.flatnonzero(people.known)
@@ -125,8 +127,10 @@ class Norms:
             mean, sd = some.expected(own)
             rest = values[known, part] - mean - some.shift[own.site]
             z = to_normal(rest / (sd * some.scale[own.site]), some.shape)
-            n = some.n[own.site].astype(np.float64)
-            tail = special.stdtr(n - 1, -np.abs(z) / np.sqrt(1 + 1 / n))
+            n = np.maximum(some.n[own.site], 1)  # without any, the shift is missing
+            # Mean of the leverage of the spline and of sex.
+            others = (len(some.mean) - 1) / np.maximum(some.n.sum(axis=0), 1)
+            tail = special.stdtr(n - 1, -np.abs(z) / np.sqrt(1 + 1 / n + others))
             found[known, part] = -np.sign(z) * special.ndtri(tail)
         return found
 
@@ -187,6 +191,34 @@ def age_columns(age: Float, knots: Float) -> Float:
     cubes = np.maximum(t[:, None] - at, 0.0) ** 3
     slopes = (cubes[:, :-1] - cubes[:, -1:]) / (at[-1] - at[:-1])
     return np.column_stack([t, slopes[:, :-1] - slopes[:, -1:]])
+
+
+def choose_knots(ages: Float, how: NormSettings) -> Float:
+    """Knots at equal shares of people; beyond the outer ones are some, so that nobody is told."""
+    ages = np.sort(ages[np.isfinite(ages)])
+    if len(ages) < how.least_participants:
+        raise too_few(len(ages), how)
+    low, high = np.floor(ages[how.edge - 1]), np.ceil(ages[-how.edge])
+    inside = ages[(ages >= low) & (ages <= high)]
+    inner = np.quantile(inside, np.linspace(0, 1, how.knots)[1:-1]).round(1)
+    knots = np.array([low, *inner, high], dtype=np.float64)
+    if not (np.diff(knots) > 0).all():
+        raise ModelError(
+            f"--fit-norms: too few different ages for {how.knots} knots of a spline"
+            f" ({', '.join(f'{age:g}' for age in knots)}); set norms.knots to fewer",
+            reason="norms-reference",
+        )
+    return knots
+
+
+def too_few(count: int, how: NormSettings) -> ModelError:
+    """Say that a reference cohort is too small."""
+    return ModelError(
+        f"--fit-norms: {count} participants with age, sex and site are too few; norms need"
+        f" {how.least_participants} or more: join the reference cohorts of several sites by"
+        " --derivatives",
+        reason="norms-reference",
+    )
 
 
 def fit_norms(
@@ -422,6 +454,25 @@ class NormsFile(TomlTable):
     norms: dict[Literal["L", "R", "LR"], dict[Text, NormArrays]]
     """By hemisphere and measure; summary measures are single points."""
 
+    @property
+    def middle(self) -> People:
+        """Somebody of the age of the middle knot, halfway between the sexes."""
+        age, n = self.knots[len(self.knots) // 2], max(len(self.sexes), 1)
+        sex = np.full((1, n - 1), 1 / n)
+        return People(age=np.array([age]), sex=sex, site=np.zeros(1, dtype=np.int64))
+
+    def centiles(self, norms: Norms) -> pd.DataFrame:
+        """List centiles of a summary measure at each year, by sex, at the average site."""
+        ages = np.arange(self.knots[0], self.knots[-1] + 1)
+        blocks = []
+        for number, sex in enumerate(self.sexes or [files.MISSING]):
+            kind = np.tile(np.eye(max(len(self.sexes), 1))[number, 1:], (len(ages), 1))
+            people = People(age=ages, sex=kind, site=np.zeros(len(ages), dtype=np.int64))
+            values = norms.centiles(people, LEVELS)[:, :, 0]
+            columns = {f"p{100 * one:g}": row for one, row in zip(LEVELS, values, strict=True)}
+            blocks.append(pd.DataFrame({"sex": sex, "age": ages, **columns}))
+        return pd.concat(blocks)
+
     def arrays(self) -> dict[tuple[str, str], Norms]:
         """Norms by hemisphere and measure."""
         knots = np.array(self.knots, dtype=np.float64)
@@ -431,10 +482,12 @@ class NormsFile(TomlTable):
         found = {}
         for hemi, measures in self.norms.items():
             for measure, entry in measures.items():
-                own = {name: np.array(value, dtype=np.float64) for name, value in entry}
-                wanted = [(rows.get(name, len(self.sites)), own["mean"].shape[-1]) for name in own]
-                if [value.shape for value in own.values()] != wanted:
+                lengths = {len(row) for _, value in entry for row in value}
+                if len(lengths) != 1 or any(
+                    len(value) != rows.get(name, len(self.sites)) for name, value in entry
+                ):
                     raise ValueError(f"numbers of {measure}, {hemi}, that do not fit each other")
+                own = {name: np.array(value, dtype=np.float64) for name, value in entry}
                 found[str(hemi), measure] = Norms(knots=knots, **{**own, "n": own["n"].astype(int)})
         return found
 

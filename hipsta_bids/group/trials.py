@@ -22,8 +22,8 @@ from hipsta_bids.group.data import PARTICIPANT, SESSION, Bool, Cohort, Float
 from hipsta_bids.group.figures import Drawing
 from hipsta_bids.group.formula import check_names, listed
 from hipsta_bids.group.glm import FittedMaps
-from hipsta_bids.group.methods import REFERENCES
-from hipsta_bids.group.panels import Row, Scale, draw_rows
+from hipsta_bids.group.methods import document
+from hipsta_bids.group.panels import Row, draw_rows, spanned
 from hipsta_bids.group.power import (
     THINNING,
     TrialEffect,
@@ -50,7 +50,6 @@ from hipsta_bids.group.warps import Template, templates_to_json
 from hipsta_bids.io import files, gifti
 from hipsta_bids.progress import each, tell
 from hipsta_bids.protocols.toml import resolve
-from hipsta_bids.reports.display import known
 from hipsta_bids.reports.group_tables import display_name, with_brackets
 
 if TYPE_CHECKING:
@@ -395,16 +394,6 @@ def _methods(
     return document(paragraphs, cited)
 
 
-def document(paragraphs: Sequence[str], cited: Sequence[str]) -> str:
-    """Write paragraphs and the works that they cite, by their keys."""
-    lines = ["# Methods and findings", "", "This text may be used freely, as it stands or changed."]
-    for paragraph in paragraphs:
-        lines += ["", paragraph]
-    lines += ["", "# References", ""]
-    lines += [f"{i}. {REFERENCES[key]}" for i, key in enumerate(cited, start=1)]
-    return "\n".join(lines) + "\n"
-
-
 def _write_measures(folder: Path, cohort: Cohort, found: Sequence[Found]) -> None:
     """Write what was found for summary measures, those first that need fewest participants."""
     for question, (title, _) in TRIAL_TABLES.items():
@@ -517,10 +506,3 @@ def _values(found: Mapping[str, MapFound], question: str, column: str) -> dict[s
         hemi: np.asarray(one.tables[question][column], dtype=np.float64)
         for hemi, one in found.items()
     }
-
-
-def spanned(colors: str, values: Mapping[str, Float]) -> Scale:
-    """Colors from the 1st to the 99th percentile."""
-    every = known(list(values.values()))
-    low, high = np.percentile(every, (1, 99)) if len(every) else (0.0, 1.0)
-    return {"cmap": colors, "vmin": float(low), "vmax": float(high if high > low else low + 1)}

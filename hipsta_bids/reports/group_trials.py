@@ -115,7 +115,7 @@ def norms(results: GroupResults) -> Mapping[str, Any] | None:
     about = results.record.get("norms")
     if not about:
         return None
-    table, scores = results.table("norms"), results.table("zscores")
+    table, scores = results.table("coverage"), results.table("zscores")
     shares = [name for name in table.columns if name.startswith("below_")]
     pictures = []
     for kind, what in (("norms", "centiles by age"), ("normmaps", "maps")):
