@@ -337,7 +337,8 @@ class NormSettings(SettingsTable):
     knots: Annotated[int, Field(ge=3)] = 5
     """Knots of the natural cubic spline of age, at equal shares of the participants."""
     edge: Annotated[int, Field(ge=3)] = 5
-    """Norms reach from the fifth lowest to the fifth highest age, rounded to years."""
+    """Norms reach from the age that has this place from below to that from above, rounded to years
+    outward, so that they tell the age of no single person."""
     least_participants: Annotated[int, Field(ge=50)] = 100
     """Smaller reference cohorts are refused."""
     least_site: Annotated[int, Field(ge=25)] = 25
@@ -352,10 +353,8 @@ class NormSettings(SettingsTable):
     """Points of each map, spread evenly, that are cross-validated."""
     seed: NonNegativeInt = 0
     """Of the folds."""
-    confidence: OpenFraction = 0.95
-    """Points of a participant count as low or high outside this central range of the norms."""
     charts: Texts = ("thickness_mean", "volume", "curvature_mean", "area_mid", "extent_y")
-    """Summary measures that get a chart, unless others are asked for by ``--measures``."""
+    """Summary measures that get a chart."""
 
 
 class ExchangeSettings(SettingsTable):
