@@ -56,15 +56,12 @@ from hipsta_bids.io import files
 from hipsta_bids.progress import tell
 from hipsta_bids.protocols.toml import resolve
 
-#: File of norms, in the folder of their results.
-NORMS = "norms.json"
-#: Site of everybody where there is no column of sites.
-_NO_SITE = "unnamed"
+_NO_SITE = "unnamed"  # of everybody, where there is no column of sites
 
 Key = tuple[str, str]
 """Hemisphere and measure."""
 Values = Mapping[Key, tuple[Int, Float]]
-"""Rows of the cohort's table, and (rows, points); summary measures are single points."""
+"""Rows of the table, and (rows, points); summary measures are single points."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,16 +141,16 @@ def _score_people(
     """Score people by the norms of a file."""
     file, norms = load_norms(path)
     known = len(file.sites)
-    every = tuple(dict.fromkeys(measure for _, measure in norms))
-    options = replace(options, measures=options.measures or every)
+    options = replace(options, measures=options.measures or tuple({m: 0 for _, m in norms}))
     settings = settings.changed(registration=file.registration)
     chosen = _choose(options, request, settings)
     notes = _check(file, path, chosen.inputs)
     table = chosen.cohort.table
     people, left_out = _people(table, file, settings)
-    controls = np.zeros(len(table), dtype=bool)
-    if request.controls is not None:
-        controls = members(table, request.controls, "--controls")
+    if not people.known.any():
+        why = "; ".join(dict.fromkeys(message for _, message in left_out.values()))
+        raise ModelError(f"{path}: nobody here can be scored: {why}", reason="norms-differ")
+    controls = members(table, request.controls, "--controls") & (request.controls is not None)
     file = _with_new_sites(file, table, people, controls, request, settings)
     templates = None if file.template is None else templates_from_json(file.template, str(path))
     sides, cohorts, found = _registered(chosen, settings, templates)
@@ -163,11 +160,8 @@ def _score_people(
     extended = {}
     for key, (rows, own) in found.items():
         if norms[key].mean.shape[1] != own.shape[1]:
-            raise ModelError(
-                f"{path}: norms of {key[1]}, hemisphere {key[0]}, have"
-                f" {norms[key].mean.shape[1]} points, these people {own.shape[1]}",
-                reason="norms-differ",
-            )
+            points = f"{norms[key].mean.shape[1]} points, these people {own.shape[1]}"
+            raise ModelError(f"{path}: norms of {listed(key)} have {points}", reason="norms-differ")
         at, least = adapted[rows], settings.norms.least_site // 2
         extended[key] = norms[key].extended(own[at], people.take(rows[at]), len(file.sites), least)
     scored = {
@@ -184,8 +178,8 @@ def _choose(options: GroupOptions, request: NormsRequest, settings: GroupSetting
     tell("reading")
     inputs = read_inputs(options, settings)
     keep = members(inputs.cohort.table, request.among)
-    others = map(str, inputs.cohort.table.index[~keep])
-    left_out = dict.fromkeys(others, ("not-asked", "another level than --among"))
+    why = "not-asked", "another level than --among"
+    left_out = dict.fromkeys(map(str, inputs.cohort.table.index[~keep]), why)
     return _Chosen(inputs=inputs, keep=keep, cohort=inputs.cohort.take(keep), left_out=left_out)
 
 
@@ -222,6 +216,7 @@ def _write(  # noqa: PLR0917
     made: _Made,
     notes: Iterable[str],
 ) -> GroupResult:
+    """Write all results; charts are of the measures that the settings name."""
     file, people, cohort = made.file, made.people, chosen.cohort
     charts = [
         file.centiles(norms).assign(hemi=hemi, measure=name, unit=cohort.units.get(name, "1"))
@@ -243,7 +238,7 @@ def _write(  # noqa: PLR0917
     )
 
     def fill(folder: Path) -> list[str]:
-        save_norms(folder / NORMS, file, made.norms)
+        save_norms(folder / "norms.json", file, made.norms)
         for surface, one in made.cohorts.items():
             for hemi, side in one.sides.items():
                 if side.maps:
@@ -270,35 +265,37 @@ def _write(  # noqa: PLR0917
     }
     parts = ["norms" if request.file is None else "scores", *(request.among or ())[1:]]
     name = "_".join("".join(c if c.isalnum() else "-" for c in part) for part in parts)
+    notes = [*chosen.inputs.notes, *notes]
+    if file.site not in cohort.table:
+        notes.append(f"no column {file.site!r}: all are taken to be at one, {_NO_SITE!r}")
     return write_answer(
-        options, name, chosen.inputs, settings, left_out=chosen.left_out,
-        notes=[*chosen.inputs.notes, *notes], visits=cohort.table[people.known],
-        tables=made.tables, record=record, fill=fill,
+        options, name, chosen.inputs, settings, left_out=chosen.left_out, notes=notes,
+        visits=cohort.table[people.known], tables=made.tables, record=record, fill=fill,
     )  # fmt: skip
 
 
-def _protocol(inputs: GroupInputs) -> str:
+def _protocol(inputs: GroupInputs) -> tuple[str, str]:
+    """Segmentation protocol and region of the sheets, if there are sheets."""
     records = inputs.found.records
-    return records[0].place.name.seg if records else "none"
+    return (records[0].place.name.seg, records[0].place.name.region) if records else ("none",) * 2
 
 
 def _planned(chosen: _Chosen, settings: GroupSettings) -> NormsFile:
     """Say what norms are about, before they are fitted."""
     how, cohort, inputs = settings.norms, chosen.cohort, chosen.inputs
-    table = cohort.table
+    found, table = inputs.found, cohort.table
     check_names([how.age], table.columns)
     sexes = level_labels(table[how.sex], settings.design).dropna() if how.sex in table else ()
     sites = _site_labels(table, how.site, settings).dropna()
     knots = choose_knots(_ages(table, how.age, settings), how)
-    found = inputs.found
     return NormsFile(
         description="norms of maps and summary measures by age, sex and site",
         format=1,
         hash="",
         version=__version__,
         versions=list(found.versions),
-        seg=_protocol(inputs),
-        region=found.records[0].place.name.region if found.records else "none",
+        seg=_protocol(inputs)[0],
+        region=_protocol(inputs)[1],
         settings_hash=found.settings_hash,
         registration=resolve(settings)["registration"],
         template=None,
@@ -385,9 +382,9 @@ def _check(file: NormsFile, path: Path, inputs: GroupInputs) -> list[str]:
     )
     here = f"{len(cohort.x)} by {len(cohort.y)} nodes"
     there = here if same else f"others, {len(file.x)} by {len(file.y)} nodes"
-    region = found.records[0].place.name.region if found.records else "none"
+    seg, region = _protocol(inputs)
     for what, own, wanted in (
-        ("segmentation protocol", _protocol(inputs), file.seg),
+        ("segmentation protocol", seg, file.seg),
         ("region", region, file.region),
         ("hash of the participant level's settings", found.settings_hash, file.settings_hash),
         ("grid of the sheet", here, there),

@@ -7,6 +7,7 @@ import nibabel as nib
 import numpy as np
 import pandas as pd
 import pytest
+from hippunfold_like import flat_surface, write_map, write_surface
 from norm_cohorts import write_people
 from pyarrow import parquet
 from scipy import stats
@@ -231,7 +232,12 @@ def test_measures_and_versions_are_compared(people, norms, capsys):
     options = ["--measures", "volume", "--name", "other", "--no-reports"]
     assert main([str(one) for one in [*call, "--norms", other, *options]]) == 0
     assert "a version may change numbers" in capsys.readouterr().out
-    refused(capsys, [*call, "--norms", people[0] / "participants.tsv"], "JSON", code=65)
+    refused(capsys, [*call, "--norms", people[0] / "participants.tsv"], "JSON")
+
+
+def test_if_nobody_can_be_scored_it_says_why(people, norms, capsys):
+    call = [*people, "group", "--norms", norms, "--participant-label", "2000"]
+    refused(capsys, call, "nobody here can be scored: outside of the norms' 2")
 
 
 def test_small_references_are_refused(people, reference, capsys, tmp_path):
@@ -271,3 +277,32 @@ def test_it_draws_charts_and_maps(people, norms):
     page = group_page(folder)
     assert "Volume: centiles by age" in page
     assert page.count("data:image/svg+xml") == 2
+
+
+def test_maps_of_other_programs_without_sheets_or_sites(tmp_path, capsys):
+    random = np.random.default_rng(0)
+    points, triangles = flat_surface(12)
+    data, out = tmp_path / "bids", tmp_path / "out"
+    pattern = str(tmp_path / "maps" / "sub-{subject}_hemi-{hemi}.shape.gii")
+    surface = tmp_path / "flat.surf.gii"
+    write_surface(surface, points, triangles)
+    rows = []
+    for i in range(118):
+        age = 20 + 60 * random.random()
+        values = 2 - 0.01 * age + 0.1 * random.standard_normal(12) - 0.5 * (i > 115)
+        write_map(tmp_path / "maps" / f"sub-{i:03d}_hemi-L.shape.gii", values)
+        rows.append([f"sub-{i:03d}", "AD" if i > 115 else "CN", f"{age:.1f}"])
+    write_participants(data, rows, TABLE[:3])
+    options = ["--maps", f"wall={pattern}", "--maps-surface", str(surface)]
+    call = [str(data), str(out), "group", *options]
+    assert main([*call, "--fit-norms", "--among", "group=CN"]) == 0
+    folder = out / "group" / "norms_CN"
+    assert table(folder / "coverage.tsv").measure.tolist() == ["wall"]
+    assert json.loads((folder / "norms.json").read_text())["sites"] == {"unnamed": 108}
+    capsys.readouterr()
+    assert main([*call, "--norms", str(folder / "norms.json"), "--among", "group=AD"]) == 0
+    assert "no column 'site': all are taken to be at one, 'unnamed'" in capsys.readouterr().out
+    found = table(out / "group" / "scores_AD" / "zscores.tsv")
+    whole = found[found.region == "all"]
+    assert whole.participant_id.tolist() == ["sub-116", "sub-117"]
+    assert (whole.z < -3).all()
