@@ -17,29 +17,21 @@ from hipsta_bids.cli.parser import (
     named_pattern,
 )
 from hipsta_bids.cli.participant import REGIONS
+from hipsta_bids.cli.questions import add_questions, is_question, run_comparison, run_question
 from hipsta_bids.errors import ExitCode, NothingToDoError, UsageError
 
 if TYPE_CHECKING:
-    from hipsta_bids.group.run import GroupOptions, GroupResult
+    from hipsta_bids.group.run import GroupOptions
     from hipsta_bids.group.settings import GroupSettings
 
 LEVEL = "group"
-
-#: Options that only sample sizes have, only these and test-retest, or only comparisons.
-_POWER_ONLY = ("power_level", "dropout", "visits")
-_TRIAL_ONLY = (*_POWER_ONLY, "among")
-_COMPARISON_ONLY = (
-    *("longitudinal", "paired", "asymmetry", "normative", "model", "contrast", "weights"),
-    *("permutations", "blocks", "fdr_scope", "base", "no_classification"),
-    *("joint", "joint_sides"),
-    *("harmonize", "harmonize_model"),
-)
 
 _EPILOG = """\
 without --model and --formula: group + age + sex (+ site), each group against its reference level
 (CN, CU, HC, control ..., else the most frequent), from BIDS_DIR/participants.tsv
 
---retest and --power answer questions of their own, in OUT_DIR/group/retest/ or power-.../
+--retest, --power, --fit-norms and --norms answer questions of their own, in OUT_DIR/group/retest/,
+power-.../, norms/ and scores/
 
 results: OUT_DIR/group/MODEL/; begin with OUT_DIR/group/MODEL.html
 
@@ -63,7 +55,7 @@ def group_parser() -> Parser:
     _add_model(parser)
     _add_comparison(parser)
     _add_methods(parser)
-    _add_trials(parser)
+    add_questions(parser)
     adder(parser.add_argument_group("other sites"))(
         "--export-summary",
         "SITE",
@@ -271,38 +263,6 @@ def _add_methods(parser: Parser) -> None:
     )
 
 
-def _add_trials(parser: Parser) -> None:
-    add = adder(
-        parser.add_argument_group("for trials (instead of a comparison; --formula: covariates)")
-    )
-    add(
-        "--retest",
-        "",
-        "agreement of repeated sessions: within-subject SD, ICC(2,1), minimal detectable change",
-    )
-    add(
-        "--power",
-        "EFFECT=SHARE",
-        "participants per arm of a trial that is to find thinning=5%% of the mean, or"
-        " slowing=25%% of the change over time; from these participants, or from --retest",
-        type=_effect,
-    )
-    add("--power-level", "P", "power to reach (default: 0.8)", type=float)
-    add("--dropout", "SHARE", "share of those enrolled who drop out (default: 0)", type=float)
-    add(
-        "--visits",
-        "MONTHS",
-        "when the trial measures, as 0,12,24; its end point is the slope (default: one visit)",
-        type=_months,
-    )
-    add(
-        "--among",
-        "COLUMN=LEVEL",
-        "only participants like this, as group=AD",
-        type=factor_level,
-    )
-
-
 def _add_reports(parser: Parser) -> None:
     group = parser.add_argument_group("report")
     add = adder(group.add_mutually_exclusive_group())
@@ -323,32 +283,6 @@ def _folder(text: str) -> Path:
 def _maybe_named(text: str) -> tuple[str | None, str]:
     name, equals, pattern = text.partition("=")
     return (name, pattern) if equals and name.isalnum() else (None, text)
-
-
-def _effect(text: str) -> tuple[str, float]:
-    """Read ``thinning=5%``."""
-    kind, _, share = text.partition("=")
-    try:
-        value = float(share.removesuffix("%")) / 100
-    except ValueError:
-        value = 0.0
-    if kind not in {"thinning", "slowing"} or not share.endswith("%") or not 0 < value <= 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not of the form thinning=5% or slowing=25%")
-    return kind, value
-
-
-def _months(text: str) -> tuple[float, ...]:
-    """Read ``0,12,24``."""
-    try:
-        months = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        months = ()
-    finite = all(0 <= month < float("inf") for month in months)
-    if len(months) < 2 or not finite or list(months) != sorted(set(months)):  # noqa: PLR2004
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is not a list of two or more months in their order, as 0,12,24"
-        )
-    return months
 
 
 def _name(text: str) -> str:
@@ -392,17 +326,13 @@ def _run(parsed: argparse.Namespace, arguments: Sequence[str]) -> ExitCode:
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
     echo_start(LEVEL, parsed.bids_dir)
-    from hipsta_bids.group.run import run_group  # noqa: PLC0415  (heavy)
     from hipsta_bids.io.files import check_scratch  # noqa: PLC0415  (heavy)
 
     check_scratch()
     settings = _settings(parsed)
     with Progress(-1 if parsed.quiet else 0):
-        if parsed.retest or parsed.power:
-            result = _run_trial(parsed, arguments, settings)
-        else:
-            _refuse(parsed, _TRIAL_ONLY, "without --retest or --power")
-            result = run_group(_options(parsed, arguments), settings)
+        answer = run_question if is_question(parsed) else run_comparison
+        result = answer(parsed, _options(parsed, arguments), settings)
     for warning in result.warnings:
         warn(f"warning: {warning}")
     for note in result.notes:
@@ -413,33 +343,6 @@ def _run(parsed: argparse.Namespace, arguments: Sequence[str]) -> ExitCode:
     if result.problem is not None:
         warn(f"report: {result.problem}")
     return ExitCode.OK
-
-
-def _run_trial(
-    parsed: argparse.Namespace, arguments: Sequence[str], settings: "GroupSettings"
-) -> "GroupResult":
-    """Measure the agreement of sessions, or find sample sizes."""
-    from hipsta_bids.group.power import TrialEffect  # noqa: PLC0415  (heavy)
-    from hipsta_bids.group.trials import TrialRequest, run_trial  # noqa: PLC0415  (heavy)
-
-    _refuse(parsed, _COMPARISON_ONLY, "with --retest or --power")
-    if parsed.power is None:
-        _refuse(parsed, _POWER_ONLY, "without --power")
-    if parsed.retest:
-        _refuse(parsed, ("formula", "age_model"), "with --retest")
-    effect = None
-    if parsed.power is not None:
-        kind, share = parsed.power
-        effect = TrialEffect(kind=kind, share=share, visits=parsed.visits or ())
-    request = TrialRequest(retest=parsed.retest, effect=effect, among=parsed.among)
-    return run_trial(_options(parsed, arguments), request, settings)
-
-
-def _refuse(parsed: argparse.Namespace, names: Sequence[str], when: str) -> None:
-    """Refuse options that would have no effect."""
-    given = [f"--{name.replace('_', '-')}" for name in names if getattr(parsed, name)]
-    if given:
-        raise UsageError(f"{', '.join(given)}: has no meaning {when}; leave it out", reason="usage")
 
 
 def _rebuild_reports(root: Path, name: str | None) -> ExitCode:

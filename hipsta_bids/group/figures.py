@@ -4,6 +4,7 @@ Those of maps are in ``panels``. Colors are those of the pages (``reports.displa
 """
 
 import io
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -11,11 +12,13 @@ from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 
 from hipsta_bids.group.analysis import Analysis, mean_of_known, members_of, spread_of_known
 from hipsta_bids.group.classify import ClassifierResult, PairComparison, roc_curve
 from hipsta_bids.group.data import Cohort, Float
 from hipsta_bids.group.glm import FittedMaps
+from hipsta_bids.group.normative import ScoredMaps
 from hipsta_bids.group.panels import (
     DOTS_PER_INCH,
     LETTER,
@@ -23,11 +26,14 @@ from hipsta_bids.group.panels import (
     SMALL,
     TITLE,
     TWO_COLUMNS,
+    Row,
     Views,
     draw_measure,
+    spanned,
 )
 from hipsta_bids.group.shapes import AverageShape
-from hipsta_bids.reports.display import COLORS, X_ENDS
+from hipsta_bids.io.files import MISSING
+from hipsta_bids.reports.display import COLORS, HEMISPHERE_COLORS, X_ENDS, kind_of
 from hipsta_bids.reports.group_tables import SIDES, display_name, with_brackets
 from hipsta_bids.reports.maps import new_figure
 
@@ -80,6 +86,9 @@ _SECTIONS = {0.1: "posterior", 0.5: "middle", 0.9: "anterior"}
 _WIDTHS = (1.2, 0.7, 1.2)  # of the lines of interior, middle and exterior, points
 _STYLES = ("-", ":", "-")
 _LETTERS = "abcdefghijklmnopqrstuvwxyz"
+
+#: Deviation of the 5th centile.
+_LOW = -1.645
 
 Drawing = Callable[[], "list[Figure]"]
 
@@ -333,6 +342,82 @@ def _spread(axis: "Axes", values: Float, row: int, number: int, name: str) -> No
     axis.plot([low, high], [y, y], color=color, linewidth=1.0)
     axis.plot([first, third], [y, y], color=color, linewidth=4.5, label=name, solid_capstyle="butt")
     axis.plot([middle], [y], "|", color="white", markersize=4.5)
+
+
+def draw_norms(lines: pd.DataFrame, dots: pd.DataFrame) -> "list[Figure]":
+    """Draw centiles over age, a row for each sex and a column for each side; and people on it.
+
+    Controls that a site was adapted to are open circles.
+    """
+    sexes, sides = lines["sex"].unique(), lines["hemi"].unique()
+    width = TWO_COLUMNS if len(sides) > 1 else ONE_COLUMN
+    figure, axes = _panels(len(sexes), len(sides), (width, 60.0 * len(sexes)))
+    measure, unit = lines[["measure", "unit"]].iloc[0]
+    names = [name for name in lines.columns if re.fullmatch(r"p\d+", name)]
+    shown = np.concatenate([lines[names].to_numpy().ravel(), dots["value"]])
+    low, high = np.nanmin(shown), np.nanmax(shown)
+    margin = 0.03 * (high - low)
+    for row, sex in zip(axes, sexes, strict=True):
+        for axis, hemi in zip(row, sides, strict=True):
+            own = lines[(lines["hemi"] == hemi) & (lines["sex"] == sex)]
+            age, color = own["age"], HEMISPHERE_COLORS[hemi]
+            for first, last in ((0, -1), (1, -2)):
+                edges = own[names[first]], own[names[last]]
+                axis.fill_between(age, *edges, color=color, alpha=0.15, linewidth=0)
+            for name in names:
+                middle = name == names[len(names) // 2]
+                axis.plot(age, own[name], color=color, linewidth=1.4 if middle else 0.6)
+                end = (1.01, own[name].iloc[-1])
+                axis.annotate(name[1:], end, xycoords=("axes fraction", "data"), va="center")
+            some = dots[(dots["hemi"] == hemi) & (dots["sex"] == sex)]
+            for control, face in ((False, "black"), (True, "none")):
+                one = some[some["adapted"] == control]
+                axis.plot(one["age"], one["value"], "o", color="black", mfc=face, ms=2.5, mew=0.5)
+            axis.set_title(SIDES[hemi] if sex == MISSING else f"{SIDES[hemi]}, {sex}")
+            axis.set_xlabel("age [years]")
+            axis.set_xlim(age.min(), age.max())
+            axis.set_ylim(low - margin, high + margin)
+        row[0].set_ylabel(with_brackets(display_name(measure), unit))
+    _name(axes.flat)
+    return [figure]
+
+
+def norm_rows(
+    found: Mapping[str, tuple[Float, Float]], age: float, measure: str, unit: str
+) -> Iterator[Row]:
+    """Show mean and SD of norms by side, at an age."""
+    kind = kind_of(measure)
+    for i, (what, colors) in enumerate({"mean": kind.colors, "SD": "magma"}.items()):
+        values = {hemi: pair[i].ravel() for hemi, pair in found.items()}
+        scale = spanned(colors, values)
+        if kind.limits and what == "mean":
+            scale = {"cmap": colors, "vmin": kind.limits[0], "vmax": kind.limits[1]}
+        title = f"{what[0].upper()}{what[1:]} at {age:g} years"
+        label = with_brackets(f"{what},\n{display_name(measure)}", unit)
+        yield Row(kind="expected", index=i, title=title, label=label, scale=scale, values=values)
+
+
+def deviation_rows(scored: Mapping[str, ScoredMaps], measure: str) -> Iterator[Row]:
+    """Show mean deviations, and shares of low ones, of those whom no site was adapted to."""
+    z = {
+        hemi: side.scores[measure].w[~side.reference]
+        for hemi, side in scored.items()
+        if measure in side.scores
+    }
+    means = {hemi: mean_of_known(own, 0) for hemi, own in z.items()}
+    below = _LOW
+    low = {
+        hemi: 100 * mean_of_known(np.where(np.isfinite(own), own < below, np.nan), 0)
+        for hemi, own in z.items()
+    }
+    reach = max(1.0, *(np.nanmax(np.abs(one), initial=0.0) for one in means.values()))
+    most = max(20.0, *(np.nanmax(one, initial=0.0) for one in low.values()))
+    for kind, title, label, colors, ends, values in (
+        ("effect", "Mean deviation", "mean z", "RdBu_r", (-reach, reach), means),
+        ("error", "Below the 5th centile", "participants [%]", "magma", (0.0, most), low),
+    ):
+        scale: dict[str, Any] = {"cmap": colors, "vmin": ends[0], "vmax": ends[1]}
+        yield Row(kind=kind, index=0, title=title, label=label, scale=scale, values=values)
 
 
 def draw_figures(

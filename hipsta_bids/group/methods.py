@@ -4,13 +4,15 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
+import pandas as pd
 
 from hipsta_bids import __version__
 from hipsta_bids.group.analysis import Analysis
 from hipsta_bids.group.data import PARTICIPANT, Cohort
 from hipsta_bids.group.inference import PERMUTATIONS, control_fdr
 from hipsta_bids.group.normative import Scores
-from hipsta_bids.group.settings import GroupSettings, MultiplicitySettings
+from hipsta_bids.group.norms import LEVELS, NormsFile
+from hipsta_bids.group.settings import GroupSettings, MultiplicitySettings, NormSettings
 
 # Works that methods of the group level rest on.
 
@@ -72,6 +74,14 @@ REFERENCES: Mapping[str, str] = {
     "normative": "Jack CR, Petersen RC, Xu YC, et al. Medial temporal atrophy on MRI in normal"
     " aging and very mild Alzheimer's disease. Neurology 1997;49(3):786-794."
     " doi:10.1212/WNL.49.3.786",
+    "shash": "Jones MC, Pewsey A. Sinh-arcsinh distributions. Biometrika 2009;96(4):761-780."
+    " doi:10.1093/biomet/asp053",
+    "gamlss": "Rigby RA, Stasinopoulos DM. Generalized additive models for location, scale and"
+    " shape. Journal of the Royal Statistical Society C 2005;54(3):507-554."
+    " doi:10.1111/j.1467-9876.2005.00510.x",
+    "warped": "Fraza CJ, Dinga R, Beckmann CF, Marquand AF. Warped Bayesian linear regression for"
+    " normative modelling of big data. NeuroImage 2021;245:118715."
+    " doi:10.1016/j.neuroimage.2021.118715",
     "combat": "Fortin JP, Cullen N, Sheline YI, et al. Harmonization of cortical thickness"
     " measurements across scanners and sites. NeuroImage 2018;167:104-120."
     " doi:10.1016/j.neuroimage.2017.11.024",
@@ -399,6 +409,81 @@ def _joint(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], st
         f" points{family}. The null hypothesis of a point is that none of the maps has an effect"
         " there; the effect sizes of each map say where a finding comes from."
     )
+
+
+def document(paragraphs: Sequence[str], cited: Sequence[str]) -> str:
+    """Write paragraphs and the works that they cite, by their keys."""
+    lines = ["# Methods and findings", "", "This text may be used freely, as it stands or changed."]
+    for paragraph in paragraphs:
+        lines += ["", paragraph]
+    lines += ["", "# References", ""]
+    lines += [f"{i}. {REFERENCES[key]}" for i, key in enumerate(cited, start=1)]
+    return "\n".join(lines) + "\n"
+
+
+def norms_text(
+    file: NormsFile,
+    settings: NormSettings,
+    *,
+    who: str,
+    coverage: pd.DataFrame | None,
+    new: Sequence[str],
+    controls: tuple[str, str] | None,
+) -> str:
+    """Word how norms were made, or how people were scored by them.
+
+    ``who`` was in it; ``coverage`` is that of norms that were made; ``new`` sites come last.
+    """
+    cited: list[str] = []
+
+    def cite(key: str) -> str:
+        if key not in cited:
+            cited.append(key)
+        return f"[{cited.index(key) + 1}]"
+
+    ages = f"{file.knots[0]:g} to {file.knots[-1]:g} years"
+    first = f"Measures of the hippocampus {cite('method')} of {who} were "
+    if coverage is not None:
+        first += f"taken as norms for ages of {ages} with hipsta_bids {__version__}."
+    else:
+        first += (
+            f"compared with norms of {file.participants} participants of {ages} from"
+            f" {len(file.sites) - len(new)} sites (hipsta_bids {__version__}; norms made by"
+            f" {file.version})."
+        )
+    if file.template is not None:
+        whose = "each other" if coverage is not None else "the template of the norms"
+        first += f" Sheets were registered to {whose} by curvature profiles {cite('registr')}."
+    model = (
+        f"Norms have a mean with a natural cubic spline of age ({len(file.knots)} knots) and"
+        f" constants for {'sex and ' if file.sexes else ''}site, and an SD whose logarithm is"
+        f" linear in age with a constant for each site {cite('gamlss')}, at each point and for each"
+        f" summary measure. Where a likelihood-ratio test (p < {settings.shape_level:g}) rejected a"
+        f" normal distribution, residuals have a sinh-arcsinh distribution {cite('shash')}, as in"
+        f" {cite('warped')}. Deviations z are normal quantiles of the probability of a value, which"
+        " allows for how well shift and scale of the site are known (Student's t)."
+    )
+    paragraphs = [first, model]
+    if coverage is not None:
+        of_maps = coverage["n_points"] > 1
+        kinds = {"points of maps": coverage[of_maps], "summary measures": coverage[~of_maps]}
+        parts = []
+        for what, own in kinds.items():
+            below = [own[name].mean() for name in own.columns if name.startswith("below_")]
+            if len(own):
+                parts.append(f"{', '.join(f'{100 * one:.1f}' for one in below)} % of {what}")
+        levels = ", ".join(f"{100 * one:g}" for one in LEVELS)
+        paragraphs.append(
+            f"In {settings.folds}-fold cross-validation {' and '.join(parts)} lay below centiles"
+            f" {levels}."
+        )
+    if new:
+        counts = ", ".join(f"{site} ({file.sites[site]})" for site in new)
+        paragraphs.append(
+            "Shift and scale of sites without norms were estimated from their controls"
+            f" {'='.join(controls or ())}: {counts}. All else was kept."
+        )
+    return document(paragraphs, cited)
 
 
 def _asymmetry(settings: GroupSettings, source: str) -> str:

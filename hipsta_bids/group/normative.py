@@ -180,7 +180,7 @@ def score_cohort(
             names=side.names,
         )
     parts = [
-        *_map_rows(cohort, sides, settings),
+        *map_rows(cohort, sides, settings),
         *_summary_rows(
             cohort, design.rows, design.matrix, reference, measures=measures, settings=settings
         ),
@@ -205,7 +205,7 @@ def without_variable(formula: str, factor: str) -> str:
     return " + ".join(terms) or "1"
 
 
-def _map_rows(
+def map_rows(
     cohort: Cohort, sides: Mapping[str, ScoredMaps], settings: GroupSettings
 ) -> Iterator[pd.DataFrame]:
     """Means over the sheet and over each subfield, and the share of points that are outliers."""
@@ -222,7 +222,7 @@ def _map_rows(
                 w = found.w[:, points]
                 count = np.isfinite(w).sum(axis=1).astype(np.float64)
                 count[count == 0] = np.nan
-                yield _rows(
+                yield score_rows(
                     cohort,
                     side.rows,
                     hemi=hemi,
@@ -255,7 +255,7 @@ def _summary_rows(
             values[varying].to_numpy(dtype=np.float64), matrix, reference, settings.glm
         )
         for i, measure in enumerate(varying):
-            yield _rows(
+            yield score_rows(
                 cohort,
                 rows,
                 hemi=hemi,
@@ -269,7 +269,8 @@ def _summary_rows(
             )
 
 
-def _rows(cohort: Cohort, rows: Int, **columns: object) -> pd.DataFrame:
+def score_rows(cohort: Cohort, rows: Int, **columns: object) -> pd.DataFrame:
+    """Put participants and sessions before columns."""
     visits = cohort.table.iloc[rows]
     names = {name: visits[name].to_numpy() for name in (PARTICIPANT, SESSION)}
     return pd.DataFrame({**names, **columns})

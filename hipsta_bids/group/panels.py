@@ -85,6 +85,13 @@ class Row:
     """Positions and texts on the color bar, where it is not to choose them."""
 
 
+def spanned(colors: str, values: Mapping[str, Float]) -> Scale:
+    """Colors from the 1st to the 99th percentile."""
+    every = display.known(list(values.values()))
+    low, high = np.percentile(every, (1, 99)) if len(every) else (0.0, 1.0)
+    return {"cmap": colors, "vmin": float(low), "vmax": float(high if high > low else low + 1)}
+
+
 def draw_measure(
     cohort: Cohort,
     analysis: Analysis,

@@ -73,6 +73,13 @@ class Reference:
     """Of true changes per month between participants; None if they are taken to change alike."""
 
 
+def place_of(side: SideMaps) -> FittedMaps:
+    """Locate the points of maps of one hemisphere, to which nothing was fitted."""
+    every = np.arange(len(side.rows))
+    subfield = most_frequent(side.subfield, len(side.names))
+    return FittedMaps(maps=side, used=every, rows=every, subfield=subfield, fits={})
+
+
 class Retested:
     """Means and variances of repeated sessions."""
 
@@ -86,9 +93,7 @@ class Retested:
 
     def place(self, _: str, side: SideMaps) -> FittedMaps:
         """Locate the points of maps of one hemisphere."""
-        every = np.arange(len(side.rows))
-        subfield = most_frequent(side.subfield, len(side.names))
-        return FittedMaps(maps=side, used=every, rows=every, subfield=subfield, fits={})
+        return place_of(side)
 
     def of_map(self, one: FittedMaps, measure: str) -> tuple[Tables, Reference]:
         """Describe the points of one map."""

@@ -337,6 +337,38 @@ class PowerSettings(SettingsTable):
     """Months per unit of a column of time that is not called years, months or days."""
 
 
+class NormSettings(SettingsTable):
+    """Norms of a reference cohort, and scores of new people."""
+
+    age: str = "age"
+    """Column of age, in years."""
+    sex: str = "sex"
+    """Column of sex."""
+    site: str = "site"
+    """Column of the site or scanner; its values are names."""
+    knots: Annotated[int, Field(ge=3)] = 5
+    """Knots of the natural cubic spline of age, at equal shares of the participants."""
+    edge: Annotated[int, Field(ge=3)] = 5
+    """Norms reach from the age that has this place from below to that from above, rounded to years
+    outward, so that they tell the age of no single person."""
+    least_participants: Annotated[int, Field(ge=50)] = 100
+    """Smaller reference cohorts are refused."""
+    least_site: Annotated[int, Field(ge=25)] = 25
+    """Participants that a site of the reference needs, and controls that a new site needs; a point
+    needs half as many with a value."""
+    shape_level: OpenFraction = 0.05
+    """Values at a point are transformed if a likelihood-ratio test rejects the normal distribution
+    at this level."""
+    folds: AtLeastTwo = 5
+    """Folds of the cross-validation of centiles."""
+    checked_points: PositiveInt = 200
+    """Points of each map, spread evenly, that are cross-validated."""
+    seed: NonNegativeInt = 0
+    """Of the folds."""
+    charts: Texts = ("thickness_mean", "volume", "curvature_mean", "area_mid", "extent_y")
+    """Summary measures that get a chart."""
+
+
 class ExchangeSettings(SettingsTable):
     """What a summary for other sites may say."""
 
@@ -384,6 +416,7 @@ class GroupSettings(SettingsTable):
     classification: ClassificationSettings = ClassificationSettings()
     retest: RetestSettings = RetestSettings()
     power: PowerSettings = PowerSettings()
+    norms: NormSettings = NormSettings()
     exchange: ExchangeSettings = ExchangeSettings()
     meta: MetaSettings = MetaSettings()
 

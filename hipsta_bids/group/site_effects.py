@@ -79,14 +79,15 @@ def _nested(effects: Effects) -> dict[str, dict[str, Any]]:
     """Write lists by hemisphere and measure; what is missing is null."""
     nested: dict[str, dict[str, Any]] = {}
     for (hemi, measure), one in effects.items():
-        arrays = {name: _listed(getattr(one, name)) for name in _ARRAYS}
+        arrays = {name: as_lists(getattr(one, name)) for name in _ARRAYS}
         nested.setdefault(hemi, {})[measure] = arrays
     return nested
 
 
-def _listed(values: Float) -> list[Any]:
+def as_lists(values: Float) -> list[Any]:
+    """Write an array as lists of rounded numbers, as files for others have them."""
     if values.ndim > 1:
-        return [_listed(row) for row in values]
+        return [as_lists(row) for row in values]
     return [float(f"{one:.{_DIGITS}g}") if np.isfinite(one) else None for one in values.tolist()]
 
 

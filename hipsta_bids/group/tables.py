@@ -21,6 +21,7 @@ from hipsta_bids.group.clusters import edges_of, frame_of, peak_table
 from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float
 from hipsta_bids.group.harmonize import Harmonization
 from hipsta_bids.group.inference import control_fdr
+from hipsta_bids.group.norms import NORM_COLUMNS
 from hipsta_bids.group.reference import TRIAL_COLUMNS
 from hipsta_bids.group.registration import ShiftDifference
 from hipsta_bids.group.settings import GroupSettings
@@ -128,6 +129,7 @@ COLUMNS: Mapping[str, str] = {
     "w": "observed minus expected from the reference group, in its residual standard deviations",
     "low": "share of points with a two-sided p below the level, and w below zero",
     "high": "the same, and w above zero",
+    **NORM_COLUMNS,
     **TRIAL_COLUMNS,
     "kind": "map, or summary measure",
     "site": "level of the column that was harmonized",

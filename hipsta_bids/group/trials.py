@@ -1,10 +1,10 @@
 """Agreement of repeated sessions and sample sizes of trials, from files to files."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -22,8 +22,8 @@ from hipsta_bids.group.data import PARTICIPANT, SESSION, Bool, Cohort, Float
 from hipsta_bids.group.figures import Drawing
 from hipsta_bids.group.formula import check_names, listed
 from hipsta_bids.group.glm import FittedMaps
-from hipsta_bids.group.methods import REFERENCES
-from hipsta_bids.group.panels import Row, Scale, draw_rows
+from hipsta_bids.group.methods import document
+from hipsta_bids.group.panels import Row, draw_rows, spanned
 from hipsta_bids.group.power import (
     THINNING,
     TrialEffect,
@@ -50,7 +50,6 @@ from hipsta_bids.group.warps import Template, templates_to_json
 from hipsta_bids.io import files, gifti
 from hipsta_bids.progress import each, tell
 from hipsta_bids.protocols.toml import resolve
-from hipsta_bids.reports.display import known
 from hipsta_bids.reports.group_tables import display_name, with_brackets
 
 if TYPE_CHECKING:
@@ -114,17 +113,10 @@ def run_trial(options: GroupOptions, request: TrialRequest, settings: GroupSetti
     options = replace(options, comparison=Comparison(longitudinal=repeated))
     tell("reading")
     inputs = read_inputs(options, settings)
-    table = inputs.cohort.table
     cohort, retest, left_out = _choose(inputs.cohort, request, settings)
-    kept = table.index.isin(cohort.table.index)
+    kept = inputs.cohort.table.index.isin(cohort.table.index)
     templates = read_templates(options.template, cohort)
-    sides = {
-        hemi: register_side(cohort, hemi, groups=None, settings=settings, templates=templates)
-        for hemi in each("registration", list(cohort.sides) if inputs.measures.maps else [])
-    }
-    registered = {hemi: side.registered for hemi, side in sides.items()} or cohort.sides
-    cohorts = {"": replace(cohort, sides=registered)}
-    cohorts |= {name: other.take(kept) for name, other in inputs.others.items()}
+    sides, cohorts = register_cohorts(cohort, inputs, kept, settings, templates)
     tell("points and measures")
     source: Source
     if retest is not None:
@@ -144,56 +136,103 @@ def run_trial(options: GroupOptions, request: TrialRequest, settings: GroupSetti
     }
     measures = list(_of_measures(cohorts[""], inputs.measures.summaries, source, effect, settings))
     notes = [*inputs.notes, *_notes(maps, inputs, source, effect)]
-    exclusions = [*inputs.exclusions, *_excluded(table, left_out)]
-    region = options.sheets.region
-    name = options.model.name or request.name + ("" if region == "body" else f"_{region}")
     modeled = cohort.table
     if isinstance(source, Modeled):
         modeled = modeled.iloc[source.model.design.rows]
     people = int(modeled[PARTICIPANT].nunique())
-    describe_dataset(options)
-    with write.model_folder(options.out_dir, name) as folder:
-        tell("tables and maps")
+
+    def fill(folder: Path) -> list[str]:
         _write_measures(folder, cohort, measures)
         for surface, found in maps.items():
             _write_maps(folder, surface, cohorts[surface], found)
-        for title, content in registration_tables(cohort, sides) if sides else ():
-            write.write_table(folder, title, content)
-        if templates := _templates(sides):
+        if templates := templates_of(sides):
             files.write_json(folder / "template.json", templates_to_json(templates))
-        write.write_exclusions(folder, exclusions)
-        write.write_table(folder, "covariates", modeled, described=False)
         files.write_text(folder / "methods.md", _methods(source, request, modeled, maps, settings))
         figures = (figure for key, own in maps.items() for figure in _figures(cohorts[key], own))
-        notes += write.write_figures(folder, figures)
-        record = {
+        return write.write_figures(folder, figures)
+
+    record = {
+        "formula": source.spec.formula if isinstance(source, Modeled) else None,
+        "hemispheres": {hemi: len(side.rows) for hemi, side in cohort.sides.items()},
+        "retest": retest and {"participants": people, "sessions": retest.sessions},
+        "power": effect and asdict(effect) | {"alpha_point": point_level(settings)},
+        "among": request.among,
+    }
+    return write_answer(
+        options, request.name, inputs, settings, left_out=left_out, notes=notes, visits=modeled,
+        tables=dict(registration_tables(cohort, sides)) if sides else {}, record=record, fill=fill,
+    )  # fmt: skip
+
+
+def register_cohorts(
+    cohort: Cohort,
+    inputs: GroupInputs,
+    kept: Bool,
+    settings: GroupSettings,
+    templates: Mapping[str, Template] | None,
+) -> tuple[dict[str, SideResult], dict[str, Cohort]]:
+    """Register sheets of the visits that are kept; with them, other maps of these by name."""
+    sides = {
+        hemi: register_side(cohort, hemi, groups=None, settings=settings, templates=templates)
+        for hemi in each("registration", list(cohort.sides) if inputs.measures.maps else [])
+    }
+    registered = {hemi: side.registered for hemi, side in sides.items()} or cohort.sides
+    others = {name: other.take(kept) for name, other in inputs.others.items()}
+    return sides, {"": replace(cohort, sides=registered), **others}
+
+
+def write_answer(
+    options: GroupOptions,
+    name: str,
+    inputs: GroupInputs,
+    settings: GroupSettings,
+    *,
+    left_out: Mapping[str, tuple[str, str]],
+    notes: Sequence[str],
+    visits: pd.DataFrame,
+    tables: Mapping[str, pd.DataFrame],
+    record: Mapping[str, Any],
+    fill: Callable[[Path], list[str]],
+) -> GroupResult:
+    """Write what all questions other than comparisons have in common, and make the page.
+
+    ``fill`` writes all else into the folder, and returns notes.
+    """
+    excluded = [*inputs.exclusions, *_excluded(inputs.cohort.table, left_out)]
+    region, people = options.sheets.region, int(visits[PARTICIPANT].nunique())
+    name = options.model.name or name + ("" if region == "body" else f"_{region}")
+    describe_dataset(options)
+    with write.model_folder(options.out_dir, name) as folder:
+        tell("tables and maps")
+        for title, table in tables.items():
+            write.write_table(folder, title, table)
+        write.write_exclusions(folder, excluded)
+        write.write_table(folder, "covariates", visits, described=False)
+        notes = [*notes, *fill(folder)]
+        every = {
             "command": list(options.command),
             "version": __version__,
             "inputs": record_inputs(options, inputs.found),
-            "formula": source.spec.formula if isinstance(source, Modeled) else None,
             "participants": people,
-            "rows": len(modeled),
-            "hemispheres": {hemi: len(side.rows) for hemi, side in cohort.sides.items()},
-            "retest": retest and {"participants": people, "sessions": retest.sessions},
-            "power": effect and asdict(effect) | {"alpha_point": point_level(settings)},
-            "among": request.among,
+            "rows": len(visits),
+            **record,
             "notes": [*inputs.found.warnings, *notes],
             "settings": resolve(settings),
         }
-        files.write_json(folder / "analysis.json", record)
+        files.write_json(folder / "analysis.json", every)
     page, problem = make_page(options, name)
     return GroupResult(
         folder=options.out_dir / write.GROUP_FOLDER / name,
         page=page,
         problem=problem,
         n_participants=people,
-        n_excluded=len(exclusions),
+        n_excluded=len(excluded),
         notes=tuple(notes),
         warnings=inputs.found.warnings,
     )
 
 
-def _templates(sides: Mapping[str, SideResult]) -> dict[str, Template]:
+def templates_of(sides: Mapping[str, SideResult]) -> dict[str, Template]:
     """Templates of registration by hemisphere, where it made or used one."""
     found = {hemi: side.registration.template for hemi, side in sides.items()}
     return {hemi: template for hemi, template in found.items() if template is not None}
@@ -203,7 +242,7 @@ def _choose(
     cohort: Cohort, request: TrialRequest, settings: GroupSettings
 ) -> tuple[Cohort, RetestCohort | None, dict[str, tuple[str, str]]]:
     """Keep the visits that are asked for; of others reason and message."""
-    keep = _members(cohort.table, request)
+    keep = members(cohort.table, request.among)
     message = "another level than --among"
     left_out = dict.fromkeys(cohort.table.index[~keep].astype(str), ("not-asked", message))
     cohort = cohort.take(keep)
@@ -214,17 +253,17 @@ def _choose(
     return retest.cohort, retest, left_out
 
 
-def _members(table: pd.DataFrame, request: TrialRequest) -> Bool:
+def members(table: pd.DataFrame, among: tuple[str, str] | None, option: str = "--among") -> Bool:
     """Tell whose visits are asked for."""
-    if request.among is None:
+    if among is None:
         return np.ones(len(table), dtype=bool)
-    column, level = request.among
+    column, level = among
     check_names([column], table.columns)
     values = table[column].map(lambda value: None if value is None else str(value))
     keep = (values == level).to_numpy()
     if not keep.any():
         raise ModelError(
-            f"--among {column}={level}: no participant has it; there are"
+            f"{option} {column}={level}: no participant has it; there are"
             f" {listed(sorted(values.dropna().unique()))}",
             reason="unknown-level",
         )
@@ -352,12 +391,7 @@ def _methods(
         paragraphs.append(retest_text(source.retest, settings.retest, cite))
     if request.effect is not None:
         paragraphs.append(power_text(request.effect, settings, source.words, cite))
-    lines = ["# Methods and findings", "", "This text may be used freely, as it stands or changed."]
-    for paragraph in paragraphs:
-        lines += ["", paragraph]
-    lines += ["", "# References", ""]
-    lines += [f"{i}. {REFERENCES[key]}" for i, key in enumerate(cited, start=1)]
-    return "\n".join(lines) + "\n"
+    return document(paragraphs, cited)
 
 
 def _write_measures(folder: Path, cohort: Cohort, found: Sequence[Found]) -> None:
@@ -427,10 +461,13 @@ def _figures(cohort: Cohort, found: Sequence[MapFound]) -> Iterator[tuple[str, D
             unit = cohort.units.get(measure, "1")
             if rows := list(make(own, display_name(measure), unit)):
                 places = {hemi: one.place for hemi, one in own.items()}
-                yield f"{measure}_{question}", partial(_draw, cohort, places, rows)
+                yield f"{measure}_{question}", partial(draw_maps, cohort, places, rows)
 
 
-def _draw(cohort: Cohort, places: Mapping[str, FittedMaps], rows: Sequence[Row]) -> "list[Figure]":
+def draw_maps(
+    cohort: Cohort, places: Mapping[str, FittedMaps], rows: Sequence[Row]
+) -> "list[Figure]":
+    """Draw rows of maps that no test was made of."""
     return [draw_rows(cohort, places, {}, rows, {})]
 
 
@@ -440,7 +477,7 @@ def _agreement(found: Mapping[str, MapFound], measure: str, unit: str) -> Iterat
         within, icc = (_values(found, "retest", name) for name in ("sd_within", "icc"))
         title = "Within-subject SD"
         label = with_brackets(f"within-subject SD,\n{measure}", unit)
-        scale = _scale("magma", within)
+        scale = spanned("magma", within)
         yield Row(kind="error", index=0, title=title, label=label, scale=scale, values=within)
         title = "ICC(2,1)"
         scale = {"cmap": "viridis", "vmin": 0.0, "vmax": 1.0}
@@ -451,7 +488,7 @@ def _sizes(found: Mapping[str, MapFound], measure: str, _: str) -> Iterator[Row]
     """Show participants per arm, by their logarithm."""
     values = {hemi: np.log10(own) for hemi, own in _values(found, "power", "per_arm").items()}
     if any(np.isfinite(own).any() for own in values.values()):
-        scale = _scale("viridis_r", values)
+        scale = spanned("viridis_r", values)
         ticks = [n for n in _COUNTS if scale["vmin"] <= np.log10(n) <= scale["vmax"]]
         yield Row(
             kind="size",
@@ -469,10 +506,3 @@ def _values(found: Mapping[str, MapFound], question: str, column: str) -> dict[s
         hemi: np.asarray(one.tables[question][column], dtype=np.float64)
         for hemi, one in found.items()
     }
-
-
-def _scale(colors: str, values: Mapping[str, Float]) -> Scale:
-    """Colors from the 1st to the 99th percentile."""
-    every = known(list(values.values()))
-    low, high = np.percentile(every, (1, 99)) if len(every) else (0.0, 1.0)
-    return {"cmap": colors, "vmin": float(low), "vmax": float(high if high > low else low + 1)}

@@ -31,6 +31,7 @@ from hipsta_bids.group.joint import (
     joint_points,
 )
 from hipsta_bids.group.methods import methods_text
+from hipsta_bids.group.normative import ScoredMaps
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.shapes import AverageShape
 from hipsta_bids.group.site_effects import save_effects
@@ -142,10 +143,11 @@ def write_results(
         how = digests({hemi: side.registration for hemi, side in analysis.sides.items()})
         if effects := effects_of([one for one in done if one is not None], how):
             save_effects(folder / "harmonization.json", effects)
-    for one in ((cohort, analysis), *others.values()):
-        _write_surfaces(folder, *one)
-        _write_stats(folder, _stats(one[1]))
-        _write_scores(folder, *one)
+    for own, one in ((cohort, analysis), *others.values()):
+        _write_surfaces(folder, own, one)
+        _write_stats(folder, _stats(one))
+        found = {} if one.scores is None else one.scores.sides
+        write_scores(folder, own, one.compared.table, found, letter="w", sheets=bool(one.sides))
     _write_joint(folder, joint, settings)
     text = methods_text(
         cohort,
@@ -435,35 +437,41 @@ def write_surface(folder: Path, cohort: Cohort, one: FittedMaps, hemi: str) -> N
     files.write_bytes(folder / f"hemi-{hemi}_space-{space}_midthickness.surf.gii", content)
 
 
-def _write_scores(folder: Path, cohort: Cohort, analysis: Analysis) -> None:
-    """Write each participant's w-scores as maps; those of the sheet also as one Parquet file."""
-    scores, table = analysis.scores, analysis.compared.table
-    if scores is None:
-        return
-    for hemi, side in scores.sides.items():
+def write_scores(
+    folder: Path,
+    cohort: Cohort,
+    table: pd.DataFrame,
+    sides: Mapping[str, ScoredMaps],
+    *,
+    letter: str,
+    sheets: bool,
+) -> None:
+    """Write each participant's scores as maps; those of the sheet also as one Parquet file."""
+    for hemi, side in sides.items():
         names = [str(name) for name in table.index[side.rows]]
         for measure, found in side.scores.items():
             content = gifti.maps_bytes(found.w.T, hemi=hemi, names=names, series=False)
-            name = f"hemi-{hemi}_stat-w_desc-{entity_label(measure)}_statmap.shape.gii"
+            name = f"hemi-{hemi}_stat-{letter}_desc-{entity_label(measure)}_statmap.shape.gii"
             files.write_bytes(folder / name, content)
-    if not (analysis.sides and scores.sides):
+    if not (sheets and sides):
         return
     shape = len(cohort.x), len(cohort.y)
-    measures = list(next(iter(scores.sides.values())).scores)
+    measures = list(next(iter(sides.values())).scores)
+    about = {"unit": "1"}
     fields = [pa.field(name, _WORD) for name in (PARTICIPANT, SESSION, "hemi")]
     fields += [pa.field(name, pa.int16()) for name in ("node_x", "node_y")]
-    fields += [pa.field(f"{name}_w", pa.float32(), metadata={"unit": "1"}) for name in measures]
+    fields += [pa.field(f"{name}_{letter}", pa.float32(), metadata=about) for name in measures]
     about = {
-        "description": "w-scores, one row per participant, hemisphere and node of the registered"
-        " sheet; nodes along x from medial to lateral, y from posterior to anterior"
+        "description": f"{letter}-scores, one row per participant, hemisphere and node of the"
+        " registered sheet; nodes along x from medial to lateral, y from posterior to anterior"
     }
     blocks = (
         {
             **_visit_columns(table, side.rows[part], shape[0] * shape[1], hemi=hemi),
             **_node_columns(cohort, shape, len(side.rows[part])),
-            **_value_columns({name: one.w for name, one in side.scores.items()}, part, "_w"),
+            **_value_columns({n: one.w for n, one in side.scores.items()}, part, f"_{letter}"),
         }
-        for hemi, side in scores.sides.items()
+        for hemi, side in sides.items()
         for part in _parts(len(side.rows), _ROWS_OF_SCORES)
     )
-    _write_parquet(folder / "wscores.parquet", pa.schema(fields, metadata=about), blocks)
+    _write_parquet(folder / f"{letter}scores.parquet", pa.schema(fields, metadata=about), blocks)

@@ -37,7 +37,7 @@ from hipsta_bids.reports.group_tables import (
     visit_of,
     with_brackets,
 )
-from hipsta_bids.reports.group_trials import power, retest
+from hipsta_bids.reports.group_trials import norms, power, retest
 from hipsta_bids.reports.page import Section, build_sections, render
 
 _LOGGER = logging.getLogger(__name__)
@@ -325,6 +325,7 @@ def _runs(text: str) -> list[tuple[bool, str]]:
 SECTIONS: tuple[Section[GroupResults], ...] = (
     Section(key="power", title="Sample size", template="group/power.html", build=power),
     Section(key="retest", title="Test-retest", template="group/retest.html", build=retest),
+    Section(key="norms", title="Norms", template="group/norms.html", build=norms),
     Section(key="found", title="What was found", template="group/found.html", build=findings),
     Section(key="maps", title="Maps", template="group/maps.html", build=map_scenes),
     Section(key="peaks", title="Clusters and peaks", template="group/peaks.html", build=peaks),

@@ -508,13 +508,14 @@ def scores(results: GroupResults) -> Mapping[str, Any] | None:
     whole = table[table["region"].isna() | (table["region"] == "all")]
     return {
         "reference": "=".join(str(part) for part in level),
-        "rows": list(_score_rows(whole)),
-        "far": list(_far(whole)),
+        "rows": list(score_rows(whole)),
+        "far": list(far_scores(whole)),
         "limit": _FAR,
     }
 
 
-def _score_rows(table: pd.DataFrame) -> Iterator[dict[str, Any]]:
+def score_rows(table: pd.DataFrame) -> Iterator[dict[str, Any]]:
+    """Describe scores ``w`` of each measure, of the ``reference`` and of the others."""
     for (measure, hemi), rows in table.groupby(["measure", "hemi"], sort=False):
         reference = rows["reference"].astype(bool)
         cells = []
@@ -530,7 +531,8 @@ def _score_rows(table: pd.DataFrame) -> Iterator[dict[str, Any]]:
         }
 
 
-def _far(table: pd.DataFrame) -> Iterator[dict[str, str]]:
+def far_scores(table: pd.DataFrame) -> Iterator[dict[str, str]]:
+    """List scores ``w`` far from zero, the farthest first."""
     far = table[table["w"].abs() > _FAR]
     far = far.reindex(far["w"].abs().sort_values(ascending=False, kind="stable").index)
     for row in records(far.head(_MOST_ROWS)):

@@ -1,4 +1,4 @@
-"""What a group page says about repeated sessions and the size of trials."""
+"""What a group page says about repeated sessions, the size of trials, and norms."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -13,10 +13,12 @@ from hipsta_bids.reports.group_tables import (
     SIDES,
     GroupResults,
     display_name,
+    far_scores,
     number_text,
     p_text,
     position_text,
     records,
+    score_rows,
     summary_side,
     with_brackets,
 )
@@ -105,6 +107,47 @@ def power(results: GroupResults) -> Mapping[str, Any] | None:
         "usual": _USUAL,
         "maps": [_spread(title, side, own) for title, side, own in _maps(points)],
         "pictures": _pictures(results, points, "power"),
+    }
+
+
+def norms(results: GroupResults) -> Mapping[str, Any] | None:
+    """Describe norms and how well they hold, or people against them."""
+    about = results.record.get("norms")
+    if not about:
+        return None
+    table, scores = results.table("coverage"), results.table("zscores")
+    shares = [name for name in table.columns if name.startswith("below_")]
+    pictures = []
+    for kind, what in (("norms", "centiles by age"), ("normmaps", "maps")):
+        for path in sorted((results.folder / "figures").glob(f"*_{kind}.svg")):
+            measure = display_name(path.stem.removesuffix(f"_{kind}"))
+            pictures += embedded(results, path.stem, f"{measure.capitalize()}: {what}")
+    far: list[dict[str, str]] = []
+    rows: list[dict[str, Any]] = []
+    if len(scores):
+        whole = scores[scores["region"].isna() | (scores["region"] == "all")]
+        whole = whole.rename(columns={"z": "w", "adapted": "reference"})
+        rows = list(score_rows(whole))
+        far = list(far_scores(whole[~whole["reference"].astype(bool)]))
+    return {
+        **about,
+        "levels": [name.removeprefix("below_") for name in shares],
+        "calibration": [
+            {
+                "measure": display_name(row["measure"]),
+                "side": summary_side(row["hemi"], row["measure"]),
+                "n": row["n"],
+                "points": row["n_points"],
+                "transformed": f"{row['transformed']:.0%}",
+                "shares": [f"{100 * row[name]:.1f}" for name in shares],
+            }
+            for row in records(table)
+        ],
+        "folds": results.record["settings"]["norms"]["folds"],
+        "rows": rows,
+        "adapted": any(site["new"] for site in about["sites"]),
+        "far": far,
+        "pictures": pictures,
     }
 
 

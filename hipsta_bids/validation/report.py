@@ -37,6 +37,7 @@ SUITES: Mapping[str, str] = MappingProxyType(
         "group": "group:run",
         "trials": "trials:run",
         "harmonization": "harmonization:run",
+        "norms": "norms:run",
         "surrogate": "surrogate:run",
         "hippunfold": "hippunfold:run",
     }
@@ -72,6 +73,7 @@ QUESTIONS: Mapping[str, str] = MappingProxyType(
         "group": "Tests of the group level hold their level, and find a planted effect",
         "trials": "Trials of the sample size that was found have the power that was asked for",
         "harmonization": "Harmonization removes sites, and leaves effects as they are",
+        "norms": "Centiles of norms hold in other people, also at a new site",
         "surrogate": "Thickness without a mesh agrees with that of the mesh",
         "hippunfold": "Thickness agrees with HippUnfold's own",
     }

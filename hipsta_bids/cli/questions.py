@@ -1,0 +1,156 @@
+"""Questions of the group level other than comparisons: their options, and which go together."""
+
+import argparse
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from hipsta_bids.cli.parser import Parser, adder, factor_level
+from hipsta_bids.errors import UsageError
+
+if TYPE_CHECKING:
+    from hipsta_bids.group.run import GroupOptions, GroupResult
+    from hipsta_bids.group.settings import GroupSettings
+
+#: Options that only sample sizes have; questions; and options that only comparisons have.
+_POWER_ONLY = ("power_level", "dropout", "visits")
+_TRIALS, _NORMS = ("retest", "power"), ("fit_norms", "norms")
+_COMPARISON_ONLY = (
+    *("longitudinal", "paired", "asymmetry", "normative", "model", "contrast", "weights"),
+    *("permutations", "blocks", "fdr_scope", "base", "no_classification"),
+    *("joint", "joint_sides"),
+    *("harmonize", "harmonize_model", "export_summary"),
+)
+
+
+def add_questions(parser: Parser) -> None:
+    """Add all options of these questions."""
+    add = adder(
+        parser.add_argument_group("for trials (instead of a comparison; --formula: covariates)")
+    )
+    add(
+        "--retest",
+        "",
+        "agreement of repeated sessions: within-subject SD, ICC(2,1), minimal detectable change",
+    )
+    add(
+        "--power",
+        "EFFECT=SHARE",
+        "participants per arm of a trial that is to find thinning=5%% of the mean, or"
+        " slowing=25%% of the change over time; from these participants, or from --retest",
+        type=_effect,
+    )
+    add("--power-level", "P", "power to reach (default: 0.8)", type=float)
+    add("--dropout", "SHARE", "share of those enrolled who drop out (default: 0)", type=float)
+    add(
+        "--visits",
+        "MONTHS",
+        "when the trial measures, as 0,12,24; its end point is the slope (default: one visit)",
+        type=_months,
+    )
+    add = adder(parser.add_argument_group("norms (instead of a comparison)"))
+    add(
+        "--fit-norms",
+        "",
+        "take these participants as a reference: mean and SD by age, sex and site at each point and"
+        " of each summary measure; norms.json holds no value of a participant",
+    )
+    add(
+        "--norms",
+        "FILE",
+        "score these participants by the norms.json of --fit-norms: deviations and centiles",
+    )
+    add(
+        "--controls",
+        "COLUMN=LEVEL",
+        "who tells shift and scale of sites that the norms do not have, as group=CN; at least 25"
+        " at each",
+        type=factor_level,
+    )
+    add = adder(parser.add_argument_group("for trials and norms"))
+    add(
+        "--among",
+        "COLUMN=LEVEL",
+        "only participants like this, as group=AD",
+        type=factor_level,
+    )
+
+
+def _effect(text: str) -> tuple[str, float]:
+    """Read ``thinning=5%``."""
+    kind, _, share = text.partition("=")
+    try:
+        value = float(share.removesuffix("%")) / 100
+    except ValueError:
+        value = 0.0
+    if kind not in {"thinning", "slowing"} or not share.endswith("%") or not 0 < value <= 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form thinning=5% or slowing=25%")
+    return kind, value
+
+
+def _months(text: str) -> tuple[float, ...]:
+    """Read ``0,12,24``."""
+    try:
+        months = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        months = ()
+    finite = all(0 <= month < float("inf") for month in months)
+    if len(months) < 2 or not finite or list(months) != sorted(set(months)):  # noqa: PLR2004
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a list of two or more months in their order, as 0,12,24"
+        )
+    return months
+
+
+def is_question(parsed: argparse.Namespace) -> bool:
+    """Tell whether something other than a comparison is asked."""
+    return any(getattr(parsed, name) for name in (*_TRIALS, *_NORMS))
+
+
+def run_comparison(
+    parsed: argparse.Namespace, options: "GroupOptions", settings: "GroupSettings"
+) -> "GroupResult":
+    """Compare participants."""
+    from hipsta_bids.group.run import run_group  # noqa: PLC0415  (heavy)
+
+    _refuse(parsed, (*_POWER_ONLY, "among"), "without --retest or --power")
+    _refuse(parsed, ("controls",), "without --norms")
+    return run_group(options, settings)
+
+
+def run_question(
+    parsed: argparse.Namespace, options: "GroupOptions", settings: "GroupSettings"
+) -> "GroupResult":
+    """Measure the agreement of sessions, find sample sizes, fit norms or score by them."""
+    asked = [f"--{name.replace('_', '-')}" for name in (*_TRIALS, *_NORMS) if getattr(parsed, name)]
+    if len(asked) > 1 and asked != ["--retest", "--power"]:
+        raise UsageError(f"give one of {', '.join(asked)}", reason="usage")
+    _refuse(parsed, _COMPARISON_ONLY, f"with {' and '.join(asked)}")
+    if parsed.power is None:
+        _refuse(parsed, _POWER_ONLY, "without --power")
+    if parsed.power is None or parsed.retest:
+        _refuse(parsed, ("formula", "age_model"), f"with {asked[0]}")
+    if parsed.norms is None:
+        _refuse(parsed, ("controls",), "without --norms")
+    else:
+        _refuse(parsed, ("align", "template"), "with --norms, whose registration is taken")
+    if parsed.fit_norms or parsed.norms:
+        from hipsta_bids.group.norming import NormsRequest, run_norms  # noqa: PLC0415  (heavy)
+
+        norms = NormsRequest(file=parsed.norms, among=parsed.among, controls=parsed.controls)
+        return run_norms(options, norms, settings)
+    from hipsta_bids.group.power import TrialEffect  # noqa: PLC0415  (heavy)
+    from hipsta_bids.group.trials import TrialRequest, run_trial  # noqa: PLC0415  (heavy)
+
+    effect = None
+    if parsed.power is not None:
+        kind, share = parsed.power
+        effect = TrialEffect(kind=kind, share=share, visits=parsed.visits or ())
+    request = TrialRequest(retest=parsed.retest, effect=effect, among=parsed.among)
+    return run_trial(options, request, settings)
+
+
+def _refuse(parsed: argparse.Namespace, names: Sequence[str], when: str) -> None:
+    """Refuse options that would have no effect."""
+    given = [f"--{name.replace('_', '-')}" for name in names if getattr(parsed, name)]
+    if given:
+        raise UsageError(f"{', '.join(given)}: has no meaning {when}; leave it out", reason="usage")

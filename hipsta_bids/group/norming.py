@@ -1,0 +1,550 @@
+"""Norms from files to files: fitted to a reference cohort, or for the scores of new people."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from scipy import special
+
+from hipsta_bids import __version__
+from hipsta_bids.derivatives import dataset
+from hipsta_bids.errors import ModelError
+from hipsta_bids.group import write
+from hipsta_bids.group.analysis import SideResult
+from hipsta_bids.group.comparison import BOTH
+from hipsta_bids.group.data import Bool, Cohort, Float, Int
+from hipsta_bids.group.figures import Drawing, deviation_rows, draw_norms, norm_rows
+from hipsta_bids.group.formula import check_names, listed, typed
+from hipsta_bids.group.glm import most_frequent
+from hipsta_bids.group.methods import norms_text
+from hipsta_bids.group.normative import NormativeScores, ScoredMaps, map_rows, score_rows
+from hipsta_bids.group.norms import (
+    LEVELS,
+    Norms,
+    NormsFile,
+    People,
+    choose_knots,
+    fit_norms,
+    load_norms,
+    save_norms,
+    too_few,
+)
+from hipsta_bids.group.reference import place_of
+from hipsta_bids.group.run import (
+    GroupInputs,
+    GroupOptions,
+    GroupResult,
+    read_inputs,
+    read_templates,
+)
+from hipsta_bids.group.settings import GroupSettings, NormSettings
+from hipsta_bids.group.site_effects import level_labels
+from hipsta_bids.group.summaries import hemispheres, summary_values
+from hipsta_bids.group.tables import registration_tables
+from hipsta_bids.group.trials import (
+    draw_maps,
+    members,
+    register_cohorts,
+    templates_of,
+    write_answer,
+)
+from hipsta_bids.group.warps import Template, templates_from_json, templates_to_json
+from hipsta_bids.io import files
+from hipsta_bids.progress import tell
+from hipsta_bids.protocols.toml import resolve
+
+_NO_SITE = "unnamed"  # of everybody, where there is no column of sites
+
+Key = tuple[str, str]
+"""Hemisphere and measure."""
+Values = Mapping[Key, tuple[Int, Float]]
+"""Rows of the table, and (rows, points); summary measures are single points."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class NormsRequest:
+    """What is asked for."""
+
+    file: Path | None = None
+    """Norms that score; ``None`` to fit norms."""
+    among: tuple[str, str] | None = None
+    """Column and level of the participants; all without."""
+    controls: tuple[str, str] | None = None
+    """Column and level of those who tell shift and scale of new sites."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Chosen:
+    """Visits that are asked for."""
+
+    inputs: GroupInputs
+    keep: Bool
+    """Of the visits that were read."""
+    cohort: Cohort
+    left_out: dict[str, tuple[str, str]]
+    """Reason and message by visit."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Made:
+    """What is written."""
+
+    file: NormsFile
+    norms: Mapping[Key, Norms]
+    people: People
+    cohorts: Mapping[str, Cohort]
+    """With registered sheets; with other programs' maps by their names."""
+    found: Values
+    tables: dict[str, pd.DataFrame]
+    known: int
+    """Sites that the norms had before."""
+    scored: Mapping[str, Mapping[str, ScoredMaps]] = field(default_factory=dict)
+    """By cohort and hemisphere; empty where norms were fitted."""
+    adapted: Bool | None = None
+    """(visits,) controls from whom a site was estimated; ``None`` where norms were fitted."""
+
+
+def run_norms(options: GroupOptions, request: NormsRequest, settings: GroupSettings) -> GroupResult:
+    """Fit norms, or score people by them, and write all results or none.
+
+    Raises
+    ------
+    HipstaError
+        If inputs, file or output folder do not allow it.
+    """
+    dataset.check_own_dataset(options.out_dir)
+    if request.file is not None:
+        return _score_people(options, request, request.file, settings)
+    chosen = _choose(options, request, settings)
+    file, how = _planned(chosen, settings), settings.norms
+    people, left_out = _people(chosen.cohort.table, file, settings)
+    file = _counted(file, people, how)
+    templates = read_templates(options.template, chosen.cohort)
+    sides, cohorts, found = _registered(chosen, settings, templates)
+    tell("norms")
+    if made := templates_of(sides):
+        file = file.model_copy(update={"template": templates_to_json(made)})
+    norms, table = _fit(found, people, file, how)
+    tables = dict(registration_tables(chosen.cohort, sides)) if sides else {}
+    tables["coverage"] = table
+    chosen.left_out.update(left_out)
+    done = _Made(file, norms, people, cohorts, found, tables, len(file.sites))
+    return _write(options, request, settings, chosen, done, ())
+
+
+def _score_people(
+    options: GroupOptions, request: NormsRequest, path: Path, settings: GroupSettings
+) -> GroupResult:
+    """Score people by the norms of a file."""
+    file, norms = load_norms(path)
+    known = len(file.sites)
+    options = replace(options, measures=options.measures or tuple({m: 0 for _, m in norms}))
+    settings = settings.changed(registration=file.registration)
+    chosen = _choose(options, request, settings)
+    notes = _check(file, path, chosen.inputs)
+    table = chosen.cohort.table
+    people, left_out = _people(table, file, settings)
+    if not people.known.any():
+        why = "; ".join(dict.fromkeys(message for _, message in left_out.values()))
+        raise ModelError(f"{path}: nobody here can be scored: {why}", reason="norms-differ")
+    controls = members(table, request.controls, "--controls") & (request.controls is not None)
+    file = _with_new_sites(file, table, people, controls, request, settings)
+    templates = None if file.template is None else templates_from_json(file.template, str(path))
+    sides, cohorts, found = _registered(chosen, settings, templates)
+    found = {key: own for key, own in found.items() if key in norms}
+    adapted = controls & people.known & (people.site >= known)
+    tell("norms")
+    extended = {}
+    for key, (rows, own) in found.items():
+        if norms[key].mean.shape[1] != own.shape[1]:
+            points = f"{norms[key].mean.shape[1]} points, these people {own.shape[1]}"
+            raise ModelError(f"{path}: norms of {listed(key)} have {points}", reason="norms-differ")
+        at, least = adapted[rows], settings.norms.least_site // 2
+        extended[key] = norms[key].extended(own[at], people.take(rows[at]), len(file.sites), least)
+    scored = {
+        name: _score_maps(one, found, extended, people, adapted) for name, one in cohorts.items()
+    }
+    tables = dict(registration_tables(chosen.cohort, sides)) if sides else {}
+    made = _Made(file, extended, people, cohorts, found, tables, known, scored, adapted)
+    tables["zscores"] = pd.concat(_score_rows(made, adapted, settings), ignore_index=True)
+    chosen.left_out.update(left_out)
+    return _write(options, request, settings, chosen, made, notes)
+
+
+def _choose(options: GroupOptions, request: NormsRequest, settings: GroupSettings) -> _Chosen:
+    tell("reading")
+    inputs = read_inputs(options, settings)
+    keep = members(inputs.cohort.table, request.among)
+    why = "not-asked", "another level than --among"
+    left_out = dict.fromkeys(map(str, inputs.cohort.table.index[~keep]), why)
+    return _Chosen(inputs=inputs, keep=keep, cohort=inputs.cohort.take(keep), left_out=left_out)
+
+
+def _registered(
+    chosen: _Chosen, settings: GroupSettings, templates: Mapping[str, Template] | None
+) -> tuple[dict[str, SideResult], dict[str, Cohort], Values]:
+    """Register maps, and collect them and summary measures of each side and of the mean of both."""
+    inputs = chosen.inputs
+    sides, cohorts = register_cohorts(chosen.cohort, inputs, chosen.keep, settings, templates)
+    names = [*inputs.measures.maps, *inputs.others]
+    found: dict[Key, tuple[Int, Float]] = {}
+    for name, cohort in cohorts.items():
+        own = {
+            hemi: side.only([name for name in names if name in side.maps])
+            for hemi, side in cohort.sides.items()
+        }
+        cohorts[name] = replace(cohort, sides=own)
+        for hemi, side in own.items():
+            for measure, values in side.maps.items():
+                found[hemi, measure] = side.rows, values.reshape(len(side.rows), -1)
+    every: Int = np.arange(len(chosen.cohort.table))
+    for hemi in hemispheres(chosen.cohort):
+        table = summary_values(chosen.cohort, hemi, inputs.measures.summaries)
+        for name in table.columns:
+            found[hemi, str(name)] = every, table[[name]].to_numpy(dtype=np.float64)
+    return sides, cohorts, found
+
+
+def _write(  # noqa: PLR0917
+    options: GroupOptions,
+    request: NormsRequest,
+    settings: GroupSettings,
+    chosen: _Chosen,
+    made: _Made,
+    notes: Iterable[str],
+) -> GroupResult:
+    """Write all results; charts are of the measures that the settings name."""
+    file, people, cohort = made.file, made.people, chosen.cohort
+    charts = [
+        file.centiles(norms).assign(hemi=hemi, measure=name, unit=cohort.units.get(name, "1"))
+        for (hemi, name), norms in made.norms.items()
+        if name in settings.norms.charts and hemi != BOTH
+    ]
+    if charts:
+        table = pd.concat(charts, ignore_index=True)
+        first = ["hemi", "measure", "unit"]
+        made.tables["centiles"] = table[[*first, *table.columns.drop(first)]]
+    among = f" ({' '.join(request.among)})" if request.among else ""
+    text = norms_text(
+        file,
+        settings.norms,
+        who=f"{people.known.sum()} participants{among}",
+        coverage=made.tables.get("coverage"),
+        new=list(file.sites)[made.known :],
+        controls=request.controls,
+    )
+
+    def fill(folder: Path) -> list[str]:
+        save_norms(folder / "norms.json", file, made.norms)
+        for surface, one in made.cohorts.items():
+            for hemi, side in one.sides.items():
+                if side.maps:
+                    write.write_surface(folder, one, place_of(side), hemi)
+            if found := made.scored.get(surface):
+                write.write_scores(folder, one, one.table, found, letter="z", sheets=not surface)
+        files.write_text(folder / "methods.md", text)
+        return write.write_figures(folder, _figures(made))
+
+    counts = np.bincount(people.site[people.known], minlength=len(file.sites)).tolist()
+    record = {
+        "hemispheres": {hemi: len(side.rows) for hemi, side in cohort.sides.items()},
+        "norms": {
+            "file": request.file and str(request.file),
+            "participants": file.participants,
+            "ages": [file.knots[0], file.knots[-1]],
+            "sites": [
+                {"site": site, "n": n, "here": counts[i], "new": i >= made.known}
+                for i, (site, n) in enumerate(file.sites.items())
+            ],
+            "controls": request.controls,
+        },
+        "among": request.among,
+    }
+    parts = ["norms" if request.file is None else "scores", *(request.among or ())[1:]]
+    name = "_".join("".join(c if c.isalnum() else "-" for c in part) for part in parts)
+    notes = [*chosen.inputs.notes, *notes]
+    if file.site not in cohort.table:
+        notes.append(f"no column {file.site!r}: all are taken to be at one, {_NO_SITE!r}")
+    return write_answer(
+        options, name, chosen.inputs, settings, left_out=chosen.left_out, notes=notes,
+        visits=cohort.table[people.known], tables=made.tables, record=record, fill=fill,
+    )  # fmt: skip
+
+
+def _protocol(inputs: GroupInputs) -> tuple[str, str]:
+    """Segmentation protocol and region of the sheets, if there are sheets."""
+    records = inputs.found.records
+    return (records[0].place.name.seg, records[0].place.name.region) if records else ("none",) * 2
+
+
+def _planned(chosen: _Chosen, settings: GroupSettings) -> NormsFile:
+    """Say what norms are about, before they are fitted."""
+    how, cohort, inputs = settings.norms, chosen.cohort, chosen.inputs
+    found, table = inputs.found, cohort.table
+    check_names([how.age], table.columns)
+    sexes = level_labels(table[how.sex], settings.design).dropna() if how.sex in table else ()
+    sites = _site_labels(table, how.site, settings).dropna()
+    knots = choose_knots(_ages(table, how.age, settings), how)
+    return NormsFile(
+        description="norms of maps and summary measures by age, sex and site",
+        format=1,
+        hash="",
+        version=__version__,
+        versions=list(found.versions),
+        seg=_protocol(inputs)[0],
+        region=_protocol(inputs)[1],
+        settings_hash=found.settings_hash,
+        registration=resolve(settings)["registration"],
+        template=None,
+        x=cohort.x.tolist(),
+        y=cohort.y.tolist(),
+        age=how.age,
+        sex=how.sex,
+        site=how.site,
+        knots=knots.tolist(),
+        sexes=sorted(set(sexes)),
+        sites=dict.fromkeys(sorted(set(sites)), 1),
+        participants=1,
+        norms={},
+    )
+
+
+def _ages(table: pd.DataFrame, column: str, settings: GroupSettings) -> Float:
+    ages = typed(table[column], settings.design)
+    if not pd.api.types.is_numeric_dtype(ages):
+        raise ModelError(f"norms: column {column!r} has to hold years", reason="not-numeric")
+    return ages.to_numpy(dtype=np.float64)
+
+
+def _site_labels(table: pd.DataFrame, column: str, settings: GroupSettings) -> pd.Series:
+    if column not in table:
+        return pd.Series(_NO_SITE, index=table.index, dtype=object)
+    return level_labels(table[column], settings.design)
+
+
+def _people(
+    table: pd.DataFrame, file: NormsFile, settings: GroupSettings
+) -> tuple[People, dict[str, tuple[str, str]]]:
+    """Describe visits as norms have to know them, new sites last; of others reason and message."""
+    check_names([file.age, *([file.sex] if file.sexes else [])], table.columns)
+    age, labels = _ages(table, file.age, settings), _site_labels(table, file.site, settings)
+    low, high = file.knots[0], file.knots[-1]
+    reach = f"outside of the norms' {low:g} to {high:g} years"
+    sex = np.zeros((len(table), max(len(file.sexes) - 1, 0)))
+    lacks = {file.age: np.isnan(age), file.site: labels.isna().to_numpy()}
+    problems = {("norms-age", reach): (age < low) | (age > high)}
+    if file.sexes:
+        levels = level_labels(table[file.sex], settings.design)
+        lacks[file.sex] = levels.isna().to_numpy()
+        strange = levels.notna() & ~levels.isin(file.sexes)
+        problems["norms-sex", f"{file.sex} is none of {listed(file.sexes)}"] = strange.to_numpy()
+        for i, level in enumerate(file.sexes[1:]):
+            sex[:, i] = levels == level
+    problems |= {("incomplete", f"{name} is missing"): where for name, where in lacks.items()}
+    left_out = {str(v): why for why, where in problems.items() for v in table.index[where]}
+    usable = ~np.any(list(problems.values()), axis=0)
+    sites = [*file.sites, *sorted(set(labels[usable]) - set(file.sites))]
+    site = np.where(usable, pd.Categorical(labels, categories=sites).codes, -1).astype(np.int64)
+    return People(age=age, sex=sex, site=site), left_out
+
+
+def _counted(file: NormsFile, people: People, how: NormSettings) -> NormsFile:
+    """Count a reference cohort; refuse one that is too small, or whose sexes are those of sites."""
+    known = people.known
+    if known.sum() < how.least_participants:
+        raise too_few(int(known.sum()), how)
+    counts = np.bincount(people.site[known], minlength=len(file.sites)).tolist()
+    sites = dict(zip(file.sites, counts, strict=True))
+    if small := [f"{site} ({n})" for site, n in sites.items() if n < how.least_site]:
+        raise ModelError(
+            f"--fit-norms: too few participants at {file.site} {listed(small)}; each needs"
+            f" {how.least_site}: leave these out by --exclude, or join those of one scanner",
+            reason="norms-reference",
+        )
+    both = np.hstack([np.eye(len(sites))[people.site[known]], people.sex[known]])
+    if np.linalg.matrix_rank(both) < both.shape[1]:
+        raise ModelError(
+            f"--fit-norms: {file.sex} does not vary within {file.site}, so that their effects"
+            " cannot be told apart; add sites with both",
+            reason="norms-reference",
+        )
+    return file.model_copy(update={"sites": sites, "participants": int(known.sum())})
+
+
+def _check(file: NormsFile, path: Path, inputs: GroupInputs) -> list[str]:
+    """Refuse people who were measured in another way; note what may differ."""
+    cohort, found = inputs.cohort, inputs.found
+    same = all(
+        len(a) == len(b) and np.allclose(a, b) for a, b in ((file.x, cohort.x), (file.y, cohort.y))
+    )
+    here = f"{len(cohort.x)} by {len(cohort.y)} nodes"
+    there = here if same else f"others, {len(file.x)} by {len(file.y)} nodes"
+    seg, region = _protocol(inputs)
+    for what, own, wanted in (
+        ("segmentation protocol", seg, file.seg),
+        ("region", region, file.region),
+        ("hash of the participant level's settings", found.settings_hash, file.settings_hash),
+        ("grid of the sheet", here, there),
+    ):
+        if own != wanted:
+            raise ModelError(
+                f"{path}: {what}: {wanted}, but here {own}; measure people as the reference"
+                " cohort of the norms was",
+                reason="norms-differ",
+            )
+    known = {measure for measures in file.norms.values() for measure in measures}
+    asked = [*inputs.measures.maps, *inputs.others, *(inputs.measures.summaries or ())]
+    if unknown := [name for name in asked if name not in known]:
+        raise ModelError(
+            f"{path}: has no norms of {listed(unknown)}, only of {listed(sorted(known))};"
+            " choose by --measures",
+            reason="norms-differ",
+        )
+    if set(found.versions) - set(file.versions):
+        note = (
+            f"the norms are of maps of hipsta_bids {listed(file.versions)}, these people were"
+            f" measured with {listed(found.versions)}; a version may change numbers"
+        )
+        return [note]
+    return []
+
+
+def _with_new_sites(  # noqa: PLR0917
+    file: NormsFile,
+    table: pd.DataFrame,
+    people: People,
+    controls: Bool,
+    request: NormsRequest,
+    settings: GroupSettings,
+) -> NormsFile:
+    """Add the names of new sites, if they have controls enough."""
+    least, sites = settings.norms.least_site, dict(file.sites)
+    labels = _site_labels(table, file.site, settings).to_numpy()
+    for number in range(len(sites), int(people.site.max(initial=-1)) + 1):
+        own = people.site == number
+        site, count = str(labels[own][0]), int((own & controls).sum())
+        if count < least:
+            which = "=".join(request.controls) if request.controls else "(--controls COLUMN=LEVEL)"
+            raise ModelError(
+                f"{request.file}: {file.site} {site!r} is none of the norms'"
+                f" ({listed(list(file.sites))}) and has {count} controls {which} within the range"
+                f" of ages; {least} are needed to tell a site from its people",
+                reason="norms-site",
+            )
+        sites[site] = count
+    return file.model_copy(update={"sites": sites})
+
+
+def _fit(
+    values: Values, people: People, file: NormsFile, how: NormSettings
+) -> tuple[dict[Key, Norms], pd.DataFrame]:
+    """Fit all norms, and tell by cross-validation how many lie below each centile."""
+    n_sites, knots = len(file.sites), np.array(file.knots)
+    # Folds are spread evenly over sites.
+    order = np.lexsort((np.random.default_rng(how.seed).random(len(people.site)), people.site))
+    fold = np.empty(len(order), dtype=np.int64)
+    fold[order] = np.arange(len(order)) % how.folds
+    norms, rows = {}, []
+    for (hemi, measure), (visits, own) in values.items():
+        who = people.take(visits)
+        fitted = fit_norms(own, who, n_sites, knots, how)
+        known = np.isfinite(fitted.mean).all(axis=0)
+        if not known.any():
+            continue  # constant, or of too few people
+        norms[hemi, measure] = fitted
+        some = own[:, :: -(-own.shape[1] // how.checked_points)]
+        z = np.full(some.shape, np.nan)
+        for left in range(how.folds):
+            out = fold[visits] == left
+            rest = fit_norms(some[~out], who.take(~out), n_sites, knots, how)
+            z[out] = rest.score(some[out], who.take(out))
+        scores = z[np.isfinite(z)]
+        below = {f"below_{100 * one:g}": np.mean(scores < special.ndtri(one)) for one in LEVELS}
+        rows.append(
+            {
+                "hemi": hemi,
+                "measure": measure,
+                "n": int(fitted.n.sum(axis=0).max()),
+                "n_points": int(known.sum()),
+                "transformed": float(np.any(fitted.shape[:, known] != 0, axis=0).mean()),
+                **below,
+            }
+        )
+    return norms, pd.DataFrame(rows)
+
+
+def _score_maps(
+    cohort: Cohort, values: Values, norms: Mapping[Key, Norms], people: People, adapted: Bool
+) -> dict[str, ScoredMaps]:
+    """Score the maps of each hemisphere."""
+    scored = {}
+    for hemi, side in cohort.sides.items():
+        scores = {}
+        for measure in side.maps:
+            if (hemi, measure) not in norms:
+                continue
+            one = norms[hemi, measure]
+            z = one.score(values[hemi, measure][1], people.take(side.rows))
+            scores[measure] = NormativeScores(z, 2 * special.ndtr(-np.abs(z)), one.n.sum(axis=0))
+        if scores:
+            scored[hemi] = ScoredMaps(
+                rows=side.rows,
+                reference=adapted[side.rows],
+                scores=scores,
+                subfield=most_frequent(side.subfield, len(side.names)),
+                names=side.names,
+            )
+    return scored
+
+
+def _score_rows(made: _Made, adapted: Bool, settings: GroupSettings) -> Iterator[pd.DataFrame]:
+    """List scores: of maps over regions, of summary measures also centiles."""
+    maps = set()
+    for name, found in made.scored.items():
+        maps |= {(hemi, measure) for hemi, one in found.items() for measure in one.scores}
+        for rows in map_rows(made.cohorts[name], found, settings):
+            table = rows.drop(columns="p").rename(columns={"w": "z", "reference": "adapted"})
+            yield table[table["z"].notna()].assign(centile=np.nan)
+    for (hemi, measure), (visits, own) in made.found.items():
+        if (hemi, measure) not in maps:
+            known = visits[made.people.known[visits] & np.isfinite(own[:, 0])]
+            z = made.norms[hemi, measure].score(own[known], made.people.take(known))[:, 0]
+            columns = {"adapted": adapted[known], "z": z, "low": np.nan, "high": np.nan}
+            what = {"hemi": hemi, "measure": measure, "region": None, **columns}
+            yield score_rows(made.cohorts[""], known, **what, centile=100 * special.ndtr(z))
+
+
+def _figures(made: _Made) -> Iterator[tuple[str, Drawing]]:
+    """List charts of summary measures, and maps."""
+    if "centiles" in made.tables:
+        for measure, own in made.tables["centiles"].groupby("measure", sort=False):
+            yield f"{measure}_norms", partial(draw_norms, own, _dots(made, own))
+    for surface, cohort in made.cohorts.items():
+        for measure in dict.fromkeys(n for side in cohort.sides.values() for n in side.maps):
+            sides = {h: one for h, one in cohort.sides.items() if (h, measure) in made.norms}
+            places = {hemi: place_of(one) for hemi, one in sides.items()}
+            unit = cohort.units.get(measure, "1")
+            middle = made.file.middle
+            means = {hemi: made.norms[hemi, measure].expected(middle) for hemi in sides}
+            rows = norm_rows(means, float(middle.age[0]), measure, unit)
+            if made.adapted is not None:
+                rows = deviation_rows(made.scored[surface], measure)
+            yield f"{measure}_normmaps", partial(draw_maps, cohort, places, list(rows))
+
+
+def _dots(made: _Made, lines: pd.DataFrame) -> pd.DataFrame:
+    """Collect values of new people as they would be at the average site."""
+    sexes, blocks = made.file.sexes or [files.MISSING], []
+    for key in lines[["hemi", "measure"]].drop_duplicates().itertuples(index=False, name=None):
+        rows, own = made.found[key]
+        rows, own = (rows, own) if made.adapted is not None else (rows[:0], own[:0])
+        who = made.people.take(rows)
+        level = (who.sex @ np.arange(1, len(sexes))).astype(np.int64)
+        what = {"hemi": key[0], "sex": np.array(sexes)[level], "age": who.age}
+        moved = made.norms[key].average_site(own, who)[:, 0]
+        adapted = np.zeros(0, bool) if made.adapted is None else made.adapted
+        blocks.append(pd.DataFrame({**what, "value": moved, "adapted": adapted}))
+    return pd.concat(blocks, ignore_index=True).dropna()
