@@ -113,7 +113,9 @@ def cifti_bytes(values: Mapping[str, Float], names: Sequence[str]) -> bytes:
     ]
     data = np.concatenate(list(values.values()), axis=1).astype(np.float32)
     axes = ScalarAxis(list(names)), sum(models[1:], start=models[0])
-    content: bytes = Cifti2Image(data, axes).to_bytes()
+    image = Cifti2Image(data, axes)
+    image.nifti_header.set_intent("ConnDenseScalar")
+    content: bytes = image.to_bytes()
     return content
 
 

@@ -136,6 +136,7 @@ def test_both_sides_of_a_measure_together(dataset, quick, monkeypatch):
 def test_statistics_of_both_sides_are_one_cifti_file(dataset, quick):
     folder = run(dataset, quick, "--measures", "thickness", "--align", "none")
     image = nib.load(folder / "contrast-CNAD_desc-thickness_statmap.dscalar.nii")
+    assert image.nifti_header.get_intent()[0] == "ConnDenseScalar"
     assert list(image.header.get_axis(0).name) == ["t", "d", "pcorrected"]
     parts = list(image.header.get_axis(1).iter_structures())
     names = [name for name, *_ in parts]
