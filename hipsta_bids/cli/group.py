@@ -414,6 +414,12 @@ def _run_trial(
     from hipsta_bids.group.trials import TrialRequest, run_trial  # noqa: PLC0415  (heavy)
 
     _refuse(parsed, _COMPARISON_ONLY, "with --retest or --power")
+    if settings.harmonization.column:
+        raise UsageError(
+            "--retest and --power do not harmonize: leave harmonization.column out of the settings;"
+            " for --power, put the site into --formula",
+            reason="usage",
+        )
     if parsed.power is None:
         _refuse(parsed, _POWER_ONLY, "without --power")
     if parsed.retest:

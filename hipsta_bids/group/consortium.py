@@ -212,24 +212,28 @@ def _methods(meta: Meta) -> str:
         else "All sites registered their maps to one template of curvature profiles (hash"
         f" {sites[0].template_hash})."
     )
+    joint = how.model == "joint"
     fixed = "The fixed effect is the mean of the sites' estimates, weighted by inverse variances."
-    if how.fixed == "joint":
+    if joint:
         fixed = (
             "The fixed effect is that of the model of all participants with a constant per site,"
             f" from the sites' coefficients and their covariances {cite('join')}; contrasts that"
             " include the constant are combined by inverse variances."
         )
-    modified = (
-        f", with standard errors not smaller than without their correction {cite('modified')}"
-        if how.random == "reml" and how.knapp_hartung == "modified"
-        else ""
-    )
-    random = (
-        f"restricted maximum likelihood {cite('reml')}, tests and limits are those of Knapp and"
-        f" Hartung {cite('knapp-hartung')}{modified}"
-        if how.random == "reml"
-        else f"the moments of DerSimonian and Laird {cite('dl')}, tests are normal"
-    )
+    if how.random == "dl":
+        random = f"the moments of DerSimonian and Laird {cite('dl')}, tests are normal"
+    elif joint:
+        random = (
+            f"restricted maximum likelihood {cite('reml')} in the same model with a random slope of"
+            " the site, tests and limits are those of t with one degree of freedom less than there"
+            " are sites"
+        )
+    else:
+        random = (
+            f"restricted maximum likelihood {cite('reml')}, tests and limits are those of Knapp and"
+            f" Hartung {cite('knapp-hartung')}, with standard errors not smaller than without their"
+            f" correction {cite('modified')}"
+        )
     correction = meta.settings.multiplicity
     kind = (
         "the procedure of Benjamini and Hochberg"

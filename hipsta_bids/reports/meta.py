@@ -139,7 +139,7 @@ def _explained(results: GroupResults) -> Mapping[str, Any]:
     settings = (results.record.get("settings") or {}).get("meta") or {}
     sites = len(results.record.get("sites") or ())
     return {
-        "joint": settings.get("fixed") == "joint",
+        "joint": settings.get("model") == "joint",
         "reml": settings.get("random") == "reml",
         "sites": sites,
         "needed": number_text(float(stats.t.isf(0.0005, max(1, sites - 1)))),

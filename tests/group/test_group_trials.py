@@ -247,6 +247,15 @@ def test_who_lacks_a_covariate_is_not_in_the_reference(dataset, tmp_path):
     assert f"{PEOPLE - 1} participants" in (folder / "methods.md").read_text()
 
 
+def test_harmonization_of_the_settings_is_refused(dataset, tmp_path, capsys):
+    settings = tmp_path / "group.toml"
+    settings.write_text('[harmonization]\ncolumn = "site"\n')
+    data, out = dataset
+    asked = ["--power", "thinning=5%", "--settings", str(settings)]
+    assert main([str(data), str(out), "group", *asked]) == 64
+    assert "do not harmonize" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("options", "code", "message"),
     [
@@ -259,6 +268,7 @@ def test_who_lacks_a_covariate_is_not_in_the_reference(dataset, tmp_path):
         (["--power", "thinning=5%", "--dropout", "1"], 64, "dropout"),
         (["--power", "thinning=5%", "--correction", "permutation-max"], 64, "fdr2 or bh"),
         (["--power", "thinning=5%", "--paired", "1", "2"], 64, "--paired: has no meaning"),
+        (["--retest", "--harmonize", "site"], 64, "--harmonize: has no meaning with --retest"),
         (["--visits", "0,12"], 64, "without --retest or --power"),
         (["--retest", "--dropout", ".1"], 64, "without --power"),
         (["--retest", "--formula", "age"], 64, "--formula: has no meaning with --retest"),
