@@ -19,7 +19,7 @@ from hipsta_bids.group.figures import Drawing
 from hipsta_bids.group.glm import FittedMaps, PointTest, PointwiseFit
 from hipsta_bids.group.inference import PERMUTATIONS
 from hipsta_bids.group.meta import FIXED, RANDOM
-from hipsta_bids.group.methods import REFERENCES
+from hipsta_bids.group.methods import Citations
 from hipsta_bids.group.panels import Row, contrasts, draw_pages
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.sites import (
@@ -195,13 +195,7 @@ def _record(meta: Meta, options: MetaOptions, notes: Sequence[str]) -> dict[str,
 def _methods(meta: Meta) -> str:
     """Word what was done and what came out."""
     how, sites = meta.settings.meta, meta.sites
-    cited: list[str] = []
-
-    def cite(key: str) -> str:
-        if key not in cited:
-            cited.append(key)
-        return f"[{cited.index(key) + 1}]"
-
+    cite = Citations()
     counts = Counter[str]()
     for site in sites:
         counts.update(site.groups)
@@ -268,9 +262,4 @@ def _methods(meta: Meta) -> str:
     ]
     if survivors:
         paragraphs.append(f"Points that survive: {'; '.join(survivors)}.")
-    lines = ["# Methods and findings", "", "This text may be used freely, as it stands or changed."]
-    for paragraph in paragraphs:
-        lines += ["", paragraph]
-    lines += ["", "# References", ""]
-    lines += [f"{i}. {REFERENCES[key]}" for i, key in enumerate(cited, start=1)]
-    return "\n".join(lines) + "\n"
+    return cite.page(paragraphs)

@@ -112,6 +112,26 @@ _MEASURED = {
 }
 
 
+class Citations:
+    """Numbers works in the order in which a text names them."""
+
+    def __init__(self) -> None:
+        self._keys: list[str] = []
+
+    def __call__(self, key: str) -> str:
+        """Return the number of a work in brackets."""
+        if key not in self._keys:
+            self._keys.append(key)
+        return f"[{self._keys.index(key) + 1}]"
+
+    def page(self, paragraphs: Sequence[str]) -> str:
+        """Return the text with its references."""
+        works = "\n".join(f"{i}. {REFERENCES[key]}" for i, key in enumerate(self._keys, start=1))
+        use = "This text may be used freely, as it stands or changed."
+        parts = ["# Methods and findings", use, *paragraphs, "# References", works]
+        return "\n\n".join(parts) + "\n"
+
+
 def methods_text(
     cohort: Cohort,
     analysis: Analysis,
@@ -123,13 +143,7 @@ def methods_text(
     ratings: Mapping[str, int] | None = None,
 ) -> str:
     """Word what was done and what came out."""
-    cited: list[str] = []
-
-    def cite(key: str) -> str:
-        if key not in cited:
-            cited.append(key)
-        return f"[{cited.index(key) + 1}]"
-
+    cite = Citations()
     paragraphs = [_sample(cohort, analysis, n_out, cite("method"), others)]
     paragraphs[0] = paragraphs[0].replace("the hippocampus", _MEASURED[region], 1)
     paragraphs[0] += _rated(ratings)
@@ -147,14 +161,9 @@ def methods_text(
         )
     if analysis.found:
         paragraphs.append(_findings(analysis))
-    lines = ["# Methods and findings", "", "This text may be used freely, as it stands or changed."]
-    for paragraph in paragraphs:
-        lines += ["", paragraph]
     if analysis.skipped:
-        lines += ["", "Left out:", "", *(f"- {note}" for note in analysis.skipped)]
-    lines += ["", "# References", ""]
-    lines += [f"{i}. {REFERENCES[key]}" for i, key in enumerate(cited, start=1)]
-    return "\n".join(lines) + "\n"
+        paragraphs.append("\n".join(["Left out:", "", *(f"- {one}" for one in analysis.skipped)]))
+    return cite.page(paragraphs)
 
 
 def _sample(

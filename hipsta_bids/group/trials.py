@@ -22,7 +22,7 @@ from hipsta_bids.group.data import PARTICIPANT, SESSION, Bool, Cohort, Float
 from hipsta_bids.group.figures import Drawing
 from hipsta_bids.group.formula import check_names, listed
 from hipsta_bids.group.glm import FittedMaps
-from hipsta_bids.group.methods import REFERENCES
+from hipsta_bids.group.methods import Citations
 from hipsta_bids.group.panels import Row, Scale, draw_rows
 from hipsta_bids.group.power import (
     THINNING,
@@ -321,13 +321,7 @@ def _methods(
     settings: GroupSettings,
 ) -> str:
     """Word what was done, with the works it rests on."""
-    cited: list[str] = []
-
-    def cite(key: str) -> str:
-        if key not in cited:
-            cited.append(key)
-        return f"[{cited.index(key) + 1}]"
-
+    cite = Citations()
     people = int(visits[PARTICIPANT].nunique())
     among = f" ({' '.join(request.among)})" if request.among else ""
     first = (
@@ -352,12 +346,7 @@ def _methods(
         paragraphs.append(retest_text(source.retest, settings.retest, cite))
     if request.effect is not None:
         paragraphs.append(power_text(request.effect, settings, source.words, cite))
-    lines = ["# Methods and findings", "", "This text may be used freely, as it stands or changed."]
-    for paragraph in paragraphs:
-        lines += ["", paragraph]
-    lines += ["", "# References", ""]
-    lines += [f"{i}. {REFERENCES[key]}" for i, key in enumerate(cited, start=1)]
-    return "\n".join(lines) + "\n"
+    return cite.page(paragraphs)
 
 
 def _write_measures(folder: Path, cohort: Cohort, found: Sequence[Found]) -> None:
