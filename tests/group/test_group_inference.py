@@ -8,13 +8,11 @@ import pandas as pd
 import pytest
 from pyarrow import parquet
 from scipy import stats
-from small_cohorts import NODES, PLAN, SETTINGS, place_of, write_dataset, write_hemisphere
+from small_cohorts import GROUPS, PLAN, place_of, write_dataset, write_participants, write_sessions
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.derivatives import dataset as derivative
 from hipsta_bids.group import write
 from hipsta_bids.group.inference import control_fdr
-from hipsta_bids.io import files
 from hipsta_bids.reports.group import group_page
 from hipsta_bids.validation.group import simulate_cohort
 
@@ -35,33 +33,22 @@ def dataset(tmp_path_factory):
 @pytest.fixture(scope="module")
 def sessions(tmp_path_factory):
     """Three yearly sessions; patients' wall thins by 0.1 mm per year, that of others by 0.02."""
-    folder = tmp_path_factory.mktemp("sessions")
-    data, out = folder / "bids", folder / "out"
-    out.mkdir()
-    derivative.settle_settings(out, SETTINGS)
-    derivative.write_description(out, {"fs": folder / "fs"})
     cohort = simulate_cohort(PLAN, 0)
-    random = np.random.default_rng(0)
-    rows = []
-    for i, patient in enumerate(cohort.group):
-        subject = f"{i + 1:02d}"
-        dates = []
-        for year, session in enumerate("123"):
-            for hemi in "LR":
-                place = place_of(out, subject, hemi, session=session)
-                noise = 0.02 * random.standard_normal(NODES)
-                wall = cohort.thickness[i] - (0.1 if patient else 0.02) * year + noise
-                bend = cohort.curvature[i] + 0.01 * random.standard_normal(NODES)
-                write_hemisphere(place, wall, bend, volume=500 - 5 * year + random.random())
-            dates.append([f"ses-{session}", f"20{10 + year}-03-0{1 + i % 9}T12:00:00"])
-        files.write_tsv(
-            data / f"sub-{subject}" / f"sub-{subject}_sessions.tsv",
-            ["session_id", "acq_time"],
-            dates,
+    data, out = write_sessions(
+        tmp_path_factory.mktemp("sessions"),
+        cohort,
+        np.where(cohort.group, 0.1, 0.02),
+        noise=0.02,
+        column="acq_time",
+        times=lambda i, year: f"20{10 + year}-03-0{1 + i % 9}T12:00:00",
+    )
+    rows = [
+        [f"sub-{i + 1:02d}", GROUPS[int(patient)], f"{age:.1f}", "MF"[int(sex)]]
+        for i, (patient, age, sex) in enumerate(
+            zip(cohort.group, cohort.age, cohort.sex, strict=True)
         )
-        sex = "F" if cohort.sex[i] else "M"
-        rows.append([f"sub-{subject}", "AD" if patient else "CN", f"{cohort.age[i]:.1f}", sex])
-    files.write_tsv(data / "participants.tsv", ["participant_id", "group", "age", "sex"], rows)
+    ]
+    write_participants(data, rows)
     return data, out
 
 
