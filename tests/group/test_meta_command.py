@@ -372,6 +372,8 @@ def test_the_page_has_the_maps_of_both_models_and_of_heterogeneity(combined):
     page = (combined / "meta.html").read_text(encoding="utf-8")
     assert page.count('data-kind="effect"') == page.count('data-kind="significance"') > 0
     assert "not drawn" not in page
+    assert "What was found" in page
+    assert re.search(r"\d+ of 147 points survive", page)
 
 
 def test_tables_say_what_their_columns_are(combined):
