@@ -255,7 +255,7 @@ def _harmonization(analysis: Analysis, cite: Callable[[str], str]) -> list[str]:
     plan = done.plan
     counts = ", ".join(f"{site} {n}" for site, n in plan.counts.items())
     sources = f"{cite('johnson')}, {cite('combat')}"
-    kept = f"`{plan.formula}`" if plan.columns else "no variable"
+    kept = f"`{plan.kept.formula}`" if plan.kept.names else "no variable"
     if plan.icv is not None:
         kept += f", for volumes also {plan.icv}"
     text = (

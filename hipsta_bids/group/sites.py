@@ -129,11 +129,9 @@ def check_agreement(sites: Sequence[SiteSummary]) -> list[str]:
         "registration": lambda site: site.align,
         "hash of the template of registration": lambda site: site.template_hash,
         "measures with a relative asymmetry": lambda site: ", ".join(site.asymmetry),
-        "terms of the model": lambda site: " + ".join(site.models[0].columns),
         "reference levels": lambda site: ", ".join(
             f"{name} {next(iter(levels), '')}" for name, levels in site.factors.items()
         ),
-        "contrasts": lambda site: ", ".join(site.models[0].contrasts),
     }
     for item, value in items.items():
         _agree(sites, item, [str(value(site)) for site in sites])
@@ -149,10 +147,8 @@ def check_agreement(sites: Sequence[SiteSummary]) -> list[str]:
                 words = [", ".join(f"{weight:.6g}" for weight in row) for row in rows]
                 item = f"{title}: weights of {name} on {', '.join(model.columns)}"
                 _agree(sites, item, words, _BY_COLUMNS)
-    notes = []
-    if len({site.version for site in sites}) > 1:
-        notes.append("sites used several versions of hipsta_bids, see sites.tsv")
-    return notes
+    several = len({site.version for site in sites}) > 1
+    return ["sites used several versions of hipsta_bids, see sites.tsv"] if several else []
 
 
 def _agree(

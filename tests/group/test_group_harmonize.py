@@ -192,6 +192,7 @@ def test_repeated_sessions(tmp_path, quick, capsys):
         path.parent.mkdir()
         files.write_tsv(path, ["session_id", "years"], rows)
     call = [str(data), str(out), "group", "--harmonize", "site", "--no-reports", *quick]
+    call += ["--no-classification", "--measures", "thickness"]
     assert main([*call, "--longitudinal"]) == 0
     (folder,) = (out / "group").glob("*_longitudinal")
     sites = table(folder / "sites.tsv")

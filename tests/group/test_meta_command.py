@@ -234,7 +234,7 @@ def test_other_sites_register_to_the_template_in_a_summary(registered, plain, tm
         ({"models": lambda m: m[1:]}, "site b: lacks thickness, L (map); give all sites the same"),
         (
             {"models": lambda m: json.loads(json.dumps(m).replace('"sex[T.M]"', '"sex[T.F]"'))},
-            "terms of the model",
+            "columns: Intercept, group[T.AD], age, sex[T.F], but at a Intercept, group[T.AD], age",
         ),
         (
             {"models": lambda m: json.loads(json.dumps(m).replace('"CN-AD"', '"AD-CN"'))},
