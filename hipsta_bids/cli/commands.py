@@ -130,8 +130,8 @@ def meta_parser() -> Parser:
     add(
         "--random",
         "",
-        "variance between sites: restricted maximum likelihood with tests of Knapp and Hartung"
-        " (reml, the default), or DerSimonian and Laird (dl)",
+        "variance between sites: restricted maximum likelihood with t tests (reml, the default),"
+        " or DerSimonian and Laird (dl)",
         choices=["reml", "dl"],
     )
     add(
