@@ -298,10 +298,15 @@ class _Joined:
             return share / (1 - share) / typical
 
         low, high = np.zeros_like(self.residual), np.full_like(self.residual, _MOST_BETWEEN)
+        inner = [low + (1 - _GOLDEN) * (high - low), low + _GOLDEN * (high - low)]
+        values = [self.at(ratio(share))[0] for share in inner]
         for _ in range(_SECTIONS):
-            inner = low + (1 - _GOLDEN) * (high - low), low + _GOLDEN * (high - low)
-            left = self.at(ratio(inner[0]))[0] > self.at(ratio(inner[1]))[0]
+            left = values[0] > values[1]
             low, high = np.where(left, low, inner[0]), np.where(left, inner[1], high)
+            new = np.where(left, high - _GOLDEN * (high - low), low + _GOLDEN * (high - low))
+            value = self.at(ratio(new))[0]
+            inner = [np.where(left, new, inner[1]), np.where(left, inner[0], new)]
+            values = [np.where(left, value, values[1]), np.where(left, values[0], value)]
         found = ratio((low + high) / 2)
         none = np.zeros_like(found)
         return np.where(self.at(found)[0] > self.at(none)[0], found, none)
