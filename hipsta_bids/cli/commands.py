@@ -72,6 +72,7 @@ def phantom_parser() -> Parser:
         "planted shift along x, to lateral, of the wall's pattern and subfields (default: 0)",
         default=0.0,
     )
+    add("--site", "NAME", "site of all, which labels begin with (default: two sites)", default="")
     add("--kind", "", "slab, arc, spiral (default), s-shape or tight", default="spiral")
     add(
         "--cortex",
@@ -129,8 +130,8 @@ def meta_parser() -> Parser:
     add(
         "--random",
         "",
-        "variance between sites: restricted maximum likelihood with tests of Knapp and Hartung"
-        " (reml, the default), or DerSimonian and Laird (dl)",
+        "variance between sites: restricted maximum likelihood with t tests (reml, the default),"
+        " or DerSimonian and Laird (dl)",
         choices=["reml", "dl"],
     )
     add(

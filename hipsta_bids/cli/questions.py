@@ -125,6 +125,12 @@ def run_question(
     if len(asked) > 1 and asked != ["--retest", "--power"]:
         raise UsageError(f"give one of {', '.join(asked)}", reason="usage")
     _refuse(parsed, _COMPARISON_ONLY, f"with {' and '.join(asked)}")
+    if settings.harmonization.column:
+        raise UsageError(
+            f"{' and '.join(asked)}: nothing is harmonized; leave harmonization.column out of the"
+            " settings (norms have sites in their model; for --power, put the site into --formula)",
+            reason="usage",
+        )
     if parsed.power is None:
         _refuse(parsed, _POWER_ONLY, "without --power")
     if parsed.power is None or parsed.retest:

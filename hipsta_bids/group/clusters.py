@@ -18,7 +18,7 @@ from hipsta_bids.group.glm import FittedMaps, PointTest
 from hipsta_bids.group.settings import MultiplicitySettings
 
 if TYPE_CHECKING:
-    from hipsta_bids.group.inference import Discoveries
+    from hipsta_bids.group.inference import Discoveries, MapKey
 
 
 def sheet_edges(nx: int, ny: int, neighbors: int = 8) -> Int:
@@ -152,6 +152,64 @@ def frame_of(cohort: Cohort, one: FittedMaps) -> Frame:
     return Frame({"vertex": np.arange(len(mesh.points))}, position, subfield.ravel())
 
 
+def test_columns(test: PointTest) -> dict[str, Float]:
+    """Columns of a test in tables of points; of an F test without estimate."""
+    none = np.full(test.p.shape, np.nan)
+    single = test.kind == "t"
+    return {
+        "estimate": test.estimate[0] if single else none,
+        "se": test.se[0] if single else none,
+        "statistic": test.statistic,
+        "df": test.df,
+        "p": test.p,
+    }
+
+
+def effect_columns(test: PointTest) -> dict[str, str | Float]:
+    """Columns of the effect size: Cohen's d for t, else partial eta squared."""
+    single = test.kind == "t"
+    limits = test.cohen_d_limits if single else test.eta_squared_limits
+    return {
+        "effect": "cohen_d" if single else "partial_eta_squared",
+        "effect_size": test.effect,
+        "effect_low": limits[0],
+        "effect_high": limits[1],
+    }
+
+
+def point_columns(test: PointTest, found: "Discoveries", frame: Frame, n: Int) -> dict[str, object]:
+    """Columns of a map of statistics, with the participants (points,) of each point."""
+    return {
+        **frame.number,
+        **frame.position,
+        "subfield": frame.subfield,
+        "n": n,
+        **test_columns(test),
+        "p_corrected": found.adjusted,
+        "significant": found.rejected,
+        "cohen_d": test.cohen_d,
+        "cohen_d_low": test.cohen_d_limits[0],
+        "cohen_d_high": test.cohen_d_limits[1],
+        "eta_squared": test.eta_squared,
+        "eta_squared_low": test.eta_squared_limits[0],
+        "eta_squared_high": test.eta_squared_limits[1],
+    }
+
+
+def overview_row(name: str, key: "MapKey", found: "Discoveries") -> dict[str, object]:
+    """Say of a map in the file ``name`` how many points survive, and at which p."""
+    return {
+        "measure": key.measure,
+        "contrast": key.contrast,
+        "hemi": key.hemi,
+        "file": name,
+        "n_tests": found.n_tests,
+        "n_significant": int(found.rejected.sum()),
+        "p_cutoff": found.cutoff,
+        "lenient": found.lenient,
+    }
+
+
 def peak_table(test: PointTest, found: "Discoveries", frame: Frame, edges: Int) -> pd.DataFrame:
     """List the peak of each significant cluster, largest first; of the whole map if there is none.
 
@@ -161,23 +219,21 @@ def peak_table(test: PointTest, found: "Discoveries", frame: Frame, edges: Int) 
     if not clusters and np.isfinite(test.statistic).any():
         clusters = [Cluster(0, int(np.nanargmax(np.abs(test.statistic))), {})]
     where = {**(frame.number if "vertex" in frame.number else {}), **frame.position}
-    is_t = test.kind == "t"
-    limits = test.cohen_d_limits if is_t else test.eta_squared_limits
+    values = {**test_columns(test), "p_corrected": found.adjusted.ravel()}
+    del values["estimate"], values["se"]
+    effect = effect_columns(test)
     return pd.DataFrame(
         [
             {
                 "contrast": test.contrast.name,
                 "test": test.kind,
-                **{name: values[point] for name, values in where.items()},
+                **{name: own[point] for name, own in where.items()},
                 "subfield": frame.subfield[point],
-                "statistic": test.statistic[point],
-                "df": test.df[point],
-                "p": test.p[point],
-                "p_corrected": found.adjusted.ravel()[point],
-                "effect": "cohen_d" if is_t else "partial_eta_squared",
-                "effect_size": test.effect[point],
-                "effect_low": limits[0, point],
-                "effect_high": limits[1, point],
+                **{name: own[point] for name, own in values.items()},
+                **{
+                    name: own if isinstance(own, str) else own[point]
+                    for name, own in effect.items()
+                },
                 "extent": cluster.extent,
                 "shares": "; ".join(
                     f"{name} {share:.0%}" for name, share in cluster.shares.items()

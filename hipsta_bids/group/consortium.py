@@ -19,7 +19,7 @@ from hipsta_bids.group.figures import Drawing
 from hipsta_bids.group.glm import FittedMaps, PointTest, PointwiseFit
 from hipsta_bids.group.inference import PERMUTATIONS
 from hipsta_bids.group.meta import FIXED, RANDOM
-from hipsta_bids.group.methods import REFERENCES
+from hipsta_bids.group.methods import Citations
 from hipsta_bids.group.panels import Row, contrasts, draw_pages
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.sites import (
@@ -179,6 +179,7 @@ def _record(meta: Meta, options: MetaOptions, notes: Sequence[str]) -> dict[str,
         },
         "formula": first.models[0].formula,
         "columns": first.models[0].columns,
+        "contrasts": first.models[0].contrasts,
         "groups": {"levels": list(first.groups)},
         "comparison": {},
         "participants": meta.people,
@@ -195,13 +196,7 @@ def _record(meta: Meta, options: MetaOptions, notes: Sequence[str]) -> dict[str,
 def _methods(meta: Meta) -> str:
     """Word what was done and what came out."""
     how, sites = meta.settings.meta, meta.sites
-    cited: list[str] = []
-
-    def cite(key: str) -> str:
-        if key not in cited:
-            cited.append(key)
-        return f"[{cited.index(key) + 1}]"
-
+    cite = Citations()
     counts = Counter[str]()
     for site in sites:
         counts.update(site.groups)
@@ -212,24 +207,28 @@ def _methods(meta: Meta) -> str:
         else "All sites registered their maps to one template of curvature profiles (hash"
         f" {sites[0].template_hash})."
     )
+    joint = how.model == "joint"
     fixed = "The fixed effect is the mean of the sites' estimates, weighted by inverse variances."
-    if how.fixed == "joint":
+    if joint:
         fixed = (
             "The fixed effect is that of the model of all participants with a constant per site,"
             f" from the sites' coefficients and their covariances {cite('join')}; contrasts that"
             " include the constant are combined by inverse variances."
         )
-    modified = (
-        f", with standard errors not smaller than without their correction {cite('modified')}"
-        if how.random == "reml" and how.knapp_hartung == "modified"
-        else ""
-    )
-    random = (
-        f"restricted maximum likelihood {cite('reml')}, tests and limits are those of Knapp and"
-        f" Hartung {cite('knapp-hartung')}{modified}"
-        if how.random == "reml"
-        else f"the moments of DerSimonian and Laird {cite('dl')}, tests are normal"
-    )
+    if how.random == "dl":
+        random = f"the moments of DerSimonian and Laird {cite('dl')}, tests are normal"
+    elif joint:
+        random = (
+            f"restricted maximum likelihood {cite('reml')} in the same model with a random slope of"
+            " the site, tests and limits are those of t with one degree of freedom less than there"
+            " are sites"
+        )
+    else:
+        random = (
+            f"restricted maximum likelihood {cite('reml')}, tests and limits are those of Knapp and"
+            f" Hartung {cite('knapp-hartung')}, with standard errors not smaller than without their"
+            f" correction {cite('modified')}"
+        )
     correction = meta.settings.multiplicity
     kind = (
         "the procedure of Benjamini and Hochberg"
@@ -264,9 +263,4 @@ def _methods(meta: Meta) -> str:
     ]
     if survivors:
         paragraphs.append(f"Points that survive: {'; '.join(survivors)}.")
-    lines = ["# Methods and findings", "", "This text may be used freely, as it stands or changed."]
-    for paragraph in paragraphs:
-        lines += ["", paragraph]
-    lines += ["", "# References", ""]
-    lines += [f"{i}. {REFERENCES[key]}" for i, key in enumerate(cited, start=1)]
-    return "\n".join(lines) + "\n"
+    return cite.page(paragraphs)

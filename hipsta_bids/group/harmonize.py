@@ -38,6 +38,19 @@ from hipsta_bids.group.warps import templates_to_json
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class Kept:
+    """Columns whose effects are kept."""
+
+    matrix: Float
+    """(visits, columns) without an intercept; NaN where a variable is missing."""
+    names: tuple[str, ...]
+    formula: str
+    levels: Mapping[str, Sequence[str]]
+    portable: bool = True
+    """Whether the columns of other people can be made from the formula."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class SitePlan:
     """What is taken out, and what is kept."""
 
@@ -50,10 +63,7 @@ class SitePlan:
     """Participants by site whose visits are harmonized."""
     visits: Visits
     """Rows of the cohort's table."""
-    formula: str
-    """What is kept."""
-    columns: tuple[str, ...]
-    levels: Mapping[str, Sequence[str]]
+    kept: Kept
     icv: str | None
     """Column that volumes keep besides."""
     icv_values: Float
@@ -61,8 +71,6 @@ class SitePlan:
     explained: Mapping[str, float]
     """Share of the variance of each column that sites explain."""
     saved: SavedEffects | None
-    portable: bool
-    """Whether the columns of other people can be made from the formula."""
     lost: int
     """Visits without a site or a variable that is kept."""
 
@@ -87,19 +95,7 @@ class Harmonization:
         A classifier has to tell the groups of people whose groups are not known, so that it
         cannot have them among what is kept, nor sites that were estimated with them.
         """
-        return bool(self.plan.estimated) or groups in closed_formula(self.plan.formula).names
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Kept:
-    """Columns whose effects are kept."""
-
-    matrix: Float
-    """(visits, columns) without an intercept; NaN where a variable is missing."""
-    names: tuple[str, ...]
-    formula: str
-    levels: Mapping[str, Sequence[str]]
-    portable: bool
+        return bool(self.plan.estimated) or groups in closed_formula(self.plan.kept.formula).names
 
 
 def plan_sites(
@@ -164,19 +160,16 @@ def plan_sites(
             columns=kept.matrix,
             participant=np.unique(people, return_inverse=True)[1] if several else None,
         ),
-        formula=kept.formula,
-        columns=kept.names,
-        levels=kept.levels,
+        kept=kept,
         icv=volume,
         icv_values=values,
         explained=explained,
         saved=saved,
-        portable=kept.portable,
         lost=int((~usable).sum()),
     )
 
 
-def _saved_columns(table: pd.DataFrame, saved: SavedEffects, settings: DesignSettings) -> _Kept:
+def _saved_columns(table: pd.DataFrame, saved: SavedEffects, settings: DesignSettings) -> Kept:
     """Make the columns of an earlier analysis for these visits."""
     matrix, names, complete = columns_of(
         table, saved.formula, saved.levels, settings, f"{saved.file}: "
@@ -185,9 +178,7 @@ def _saved_columns(table: pd.DataFrame, saved: SavedEffects, settings: DesignSet
         raise damaged(saved.file, f"columns {listed(saved.columns)}, not {listed(names)}")
     values = np.full((len(table), len(names)), np.nan)
     values[complete] = matrix
-    return _Kept(
-        matrix=values, names=names, formula=saved.formula, levels=saved.levels, portable=True
-    )
+    return Kept(matrix=values, names=names, formula=saved.formula, levels=saved.levels)
 
 
 def _own_columns(
@@ -196,7 +187,7 @@ def _own_columns(
     model: ModelSpec,
     settings: GroupSettings,
     context: tuple[Mapping[str, str], Comparison],
-) -> _Kept:
+) -> Kept:
     """Make the columns of the model without the site; of two sessions, with their interactions."""
     references, comparison = context
     table = modeled_table(cohort.table, comparison)
@@ -216,7 +207,7 @@ def _own_columns(
         later = (cohort.table[SESSION] == session).to_numpy(np.float64)[:, None]
         values = np.hstack([values, later, later * values])
         names = (*names, session, *(f"{name} x {session}" for name in names))
-    return _Kept(
+    return Kept(
         matrix=values, names=names, formula=formula, levels=design.levels, portable=portable
     )
 
@@ -273,7 +264,7 @@ def _check_sizes(
 def _explained(
     column: str,
     member: Float,
-    kept: "_Kept",
+    kept: Kept,
     usable: Bool,
     settings: GroupSettings,
     *,
@@ -444,7 +435,7 @@ def _notes(plan: SitePlan, settings: GroupSettings, unknown: set[str]) -> Iterat
             yield f"{plan.column} explains {share:.0%} of {name}: its effect is poorly known"
     if unknown and plan.saved:
         yield f"{plan.saved.file} has not these measures, which are left out: {listed(unknown)}"
-    if plan.saved is None and not plan.portable:
+    if plan.saved is None and not plan.kept.portable:
         yield "harmonization.json is not written: this model's columns depend on all participants"
 
 
@@ -479,8 +470,8 @@ def harmonization_record(done: Harmonization, groups: Groups | None) -> dict[str
         "column": plan.column,
         "participants": dict(plan.counts),
         "estimated": list(plan.estimated),
-        "formula": plan.formula,
-        "kept": list(plan.columns),
+        "formula": plan.kept.formula,
+        "kept": list(plan.kept.names),
         "explained": dict(plan.explained),
         "icv": plan.icv,
         "repeated": plan.visits.participant is not None,
@@ -491,15 +482,15 @@ def harmonization_record(done: Harmonization, groups: Groups | None) -> dict[str
 def effects_of(parts: Sequence[Harmonization], templates: Mapping[str, str]) -> SavedEffects | None:
     """Collect parameters for other people; ``None`` if they have no meaning there."""
     plan = parts[0].plan
-    if not plan.portable:
+    if not plan.kept.portable:
         return None
     known = plan.saved.sites if plan.saved else {}
     return SavedEffects(
         file="",
         column=plan.column,
-        formula=plan.formula,
-        levels=plan.levels,
-        columns=plan.columns,
+        formula=plan.kept.formula,
+        levels=plan.kept.levels,
+        columns=plan.kept.names,
         sites={one: known.get(one, plan.counts.get(one, 0)) for one in plan.sites},
         repeated=plan.visits.participant is not None,
         icv=plan.icv,

@@ -4,7 +4,7 @@ Fixed effect: the sites' models are joined to one, as if their participants were
 Random effects: sites differ in their true effects, with a variance that is estimated.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
@@ -15,6 +15,8 @@ from hipsta_bids.group.settings import MetaSettings
 #: Steps of the scoring end when no variance changes by more than this, relative to its scale.
 _TOLERANCE, _MOST_STEPS = 1e-10, 200
 _ZERO = 1e-9  # of weights that differences leave
+#: Golden sections that find the variance between sites, up to this share of the total.
+_GOLDEN, _SECTIONS, _MOST_BETWEEN = (np.sqrt(5) - 1) / 2, 30, 0.9999
 #: What the two models are called.
 FIXED, RANDOM = "fixed effect", "random effects"
 
@@ -80,7 +82,7 @@ class RandomEffects(Combined):
 def combine(
     estimates: Float,
     variances: Float,
-    method: str,
+    method: str | Float,
     *,
     test: str = "normal",
     least: int = 2,
@@ -94,7 +96,7 @@ def combine(
     method : str
         How the variance between sites is estimated: ``fixed`` (it is zero, so that weights are
         inverse variances), ``dl`` (DerSimonian and Laird 1986) or ``reml`` (restricted maximum
-        likelihood by Fisher scoring, Viechtbauer 2005).
+        likelihood by Fisher scoring, Viechtbauer 2005); or that variance (points,).
     test : str
         ``normal``; ``plain``: standard errors from the spread of the sites' estimates, and t with
         ``sites - 1`` degrees of freedom (Knapp and Hartung 2003); or ``modified``: the same, but no
@@ -119,12 +121,13 @@ def combine(
     total, squares = plain.sum(axis=0), np.sum(plain**2, axis=0)
     spread = np.where(usable, total - squares / np.where(total > 0, total, 1.0), 1.0)
     tau2 = np.maximum(0.0, (q - (sites - 1)) / spread)
-    i2 = tau2 / (tau2 + np.where(usable, sites - 1, 1.0) / spread)
-    if method == "fixed":
-        tau2 = np.zeros_like(q)
+    if not isinstance(method, str):
+        tau2 = np.where(usable, method, 0.0)
     elif method == "reml":
         tau2 = _reml(values, np.where(known, variances, 1.0), known, usable, tau2)
-        i2 = tau2 / (tau2 + np.where(usable, sites - 1, 1.0) / spread)
+    i2 = tau2 / (tau2 + np.where(usable, sites - 1, 1.0) / spread)
+    if isinstance(method, str) and method == "fixed":
+        tau2 = np.zeros_like(q)
     weights = np.where(known, 1 / (np.where(known, variances, 1.0) + tau2), 0.0)
     estimate = _mean(values, weights)
     share = weights / np.where(usable, weights.sum(axis=0), 1.0)
@@ -191,12 +194,19 @@ class SiteFit:
         return self.sd * np.sqrt(weights @ self.covariance @ weights)
 
 
-def join(fits: list[SiteFit], weights: Float, intercept: int | None, least: int) -> Combined:
+def join(
+    fits: list[SiteFit],
+    weights: Float,
+    intercept: int | None,
+    least: int,
+    *,
+    vary: bool = False,
+) -> tuple[Combined, Float]:
     """Test a contrast in the model of all participants with a constant per site.
 
-    The estimates of least squares with common slopes follow from the sites' own coefficients and
-    their covariances (Becker and Wu 2007), exactly: they are what one table with all
-    participants gives, with the site as a further factor.
+    The likelihood of that model depends on participants by the sites' coefficients, their
+    covariances and residual variances only, so that results are exactly those of one table with
+    all participants and the site as a further factor (Becker and Wu 2007).
 
     Parameters
     ----------
@@ -208,30 +218,98 @@ def join(fits: list[SiteFit], weights: Float, intercept: int | None, least: int)
         Column of the constant, ``None`` without one: then all coefficients are common.
     least : int
         Sites below which a point has no result.
+    vary : bool
+        Whether the contrast has a random deviation at each site, a random slope: its variance is
+        estimated by restricted maximum likelihood, and tests are by t with ``sites - 1`` degrees of
+        freedom.
+
+    Returns
+    -------
+    Combined, array
+        And the variance between sites (points,), 0 unless it varies.
     """
     slopes = np.arange(len(weights)) != (-1 if intercept is None else intercept)
     present = np.stack([np.isfinite(fit.sd) for fit in fits])
-    estimate, se, df = (np.full(present.shape[1], np.nan) for _ in range(3))
+    estimate, se, df, tau2 = np.full((4, present.shape[1]), np.nan)
+    row = weights[slopes]
     for pattern in np.unique(present, axis=1).T:
         if pattern.sum() < least:
             continue
         points = np.flatnonzero((present == pattern[:, None]).all(axis=0))
         own = [fit for fit, there in zip(fits, pattern, strict=True) if there]
-        information = [np.linalg.inv(fit.covariance[np.ix_(slopes, slopes)]) for fit in own]
-        betas = [fit.coefficients[np.ix_(slopes, points)] for fit in own]
-        inverse = np.linalg.inv(np.sum(information, axis=0))
-        common = inverse @ np.sum([m @ b for m, b in zip(information, betas, strict=True)], axis=0)
-        residual = np.sum([fit.df * fit.sd[points] ** 2 for fit in own], axis=0)
-        for matrix, beta in zip(information, betas, strict=True):
-            residual = residual + np.einsum(
-                "ip,ij,jp->p", beta - common, matrix, beta - common, optimize=True
-            )
-        freedom = sum(fit.df for fit in own) + (len(own) - 1) * int(slopes.sum())
-        row = weights[slopes]
+        covariances = np.stack([fit.covariance[np.ix_(slopes, slopes)] for fit in own])
+        model = _Joined(
+            information=np.asarray(np.linalg.inv(covariances), dtype=np.float64),
+            betas=np.stack([fit.coefficients[np.ix_(slopes, points)] for fit in own]),
+            residual=np.sum([fit.df * fit.sd[points] ** 2 for fit in own], axis=0),
+            freedom=sum(fit.df for fit in own) + (len(own) - 1) * int(slopes.sum()),
+            direction=row / (row @ row),
+        )
+        ratio = model.best_ratio() if vary else np.zeros(len(points))
+        _, common, inverse, variance = model.at(ratio)
         estimate[points] = row @ common
-        se[points] = np.sqrt(row @ inverse @ row * residual / freedom)
-        df[points] = freedom
-    return Combined(estimate=estimate, se=se, df=df)
+        se[points] = np.sqrt(np.einsum("i,pij,j,p->p", row, inverse, row, variance))
+        df[points] = len(own) - 1 if vary else model.freedom
+        tau2[points] = ratio * variance
+    return Combined(estimate=estimate, se=se, df=df), tau2
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Joined:
+    """The likelihood of all participants, from what sites say about slopes."""
+
+    information: Float
+    """(sites, columns, columns) inverse of the covariance over the residual variance."""
+    betas: Float
+    """(sites, columns, points)"""
+    residual: Float
+    """(points,) sum of squares within sites."""
+    freedom: int
+    direction: Float
+    """(columns,) in which sites differ by one unit of the contrast."""
+
+    def at(self, ratio: Float) -> tuple[Float, Float, Float, Float]:
+        """Restricted log-likelihood, coefficients, their covariance, and residual variance.
+
+        ``ratio`` (points,) is the variance between sites over the residual variance.
+        """
+        along = self.information @ self.direction
+        scale = 1 + np.outer(along @ self.direction, ratio)
+        share = ratio / scale
+        total = self.information.sum(axis=0) - np.einsum("sp,si,sj->pij", share, along, along)
+        right = np.einsum("sij,sjp->pi", self.information, self.betas)
+        right -= np.einsum("sp,si,sj,sjp->pi", share, along, along, self.betas, optimize=True)
+        inverse = np.linalg.inv(total)
+        common = np.einsum("pij,pj->ip", inverse, right)
+        away = self.betas - common
+        squares = self.residual + np.einsum(
+            "sip,sij,sjp->p", away, self.information, away, optimize=True
+        )
+        squares -= np.sum(share * np.einsum("si,sip->sp", along, away) ** 2, axis=0)
+        likelihood = self.freedom * np.log(squares) + np.log(scale).sum(axis=0)
+        likelihood = -(likelihood + np.linalg.slogdet(total)[1]) / 2
+        return likelihood, common, inverse, squares / self.freedom
+
+    def best_ratio(self) -> Float:
+        """Ratio (points,) with the largest likelihood, by golden sections of I squared."""
+        typical = float(np.mean(self.information @ self.direction @ self.direction))
+
+        def ratio(share: Float) -> Float:
+            return share / (1 - share) / typical
+
+        low, high = np.zeros_like(self.residual), np.full_like(self.residual, _MOST_BETWEEN)
+        inner = [low + (1 - _GOLDEN) * (high - low), low + _GOLDEN * (high - low)]
+        values = [self.at(ratio(share))[0] for share in inner]
+        for _ in range(_SECTIONS):
+            left = values[0] > values[1]
+            low, high = np.where(left, low, inner[0]), np.where(left, inner[1], high)
+            new = np.where(left, high - _GOLDEN * (high - low), low + _GOLDEN * (high - low))
+            value = self.at(ratio(new))[0]
+            inner = [np.where(left, new, inner[1]), np.where(left, inner[0], new)]
+            values = [np.where(left, value, values[1]), np.where(left, values[0], value)]
+        found = ratio((low + high) / 2)
+        none = np.zeros_like(found)
+        return np.where(self.at(found)[0] > self.at(none)[0], found, none)
 
 
 def pooled_sd(fits: list[SiteFit]) -> Float:
@@ -274,23 +352,28 @@ def meta_analyze(
     """Combine a contrast by both models, with all sites and without each of them.
 
     ``weights`` has the contrast at each site, the same at all but for a mean over participants.
-    Where the contrast includes the constant, as the mean does, the fixed effect is that of inverse
-    variances: a model with a constant per site says nothing about it.
+    Where the contrast includes the constant, as the mean does, estimates are combined in two
+    stages: a model with a constant per site says nothing about it.
     """
     estimates = np.stack([fit.estimate(row) for fit, row in zip(fits, weights, strict=True)])
     ses = np.stack([fit.se(row) for fit, row in zip(fits, weights, strict=True)])
-    random = combine(
-        estimates,
-        ses**2,
-        settings.random,
-        test=settings.knapp_hartung if settings.random == "reml" else "normal",
-        least=settings.min_sites,
-    )
+    sd, least = pooled_sd(fits), settings.min_sites
+    test = "modified" if settings.random == "reml" else "normal"
+    random = combine(estimates, ses**2, settings.random, test=test, least=least)
     own_constant = intercept is not None and abs(weights[0][intercept]) > _ZERO
-    if settings.fixed == "inverse-variance" or own_constant:
-        fixed: Combined = combine(estimates, ses**2, "fixed", least=settings.min_sites)
+    if settings.model == "two-stage" or own_constant:
+        fixed: Combined = combine(estimates, ses**2, "fixed", least=least)
     else:
-        fixed = join(fits, weights[0], intercept, settings.min_sites)
+        fixed, _ = join(fits, weights[0], intercept, least)
+        if settings.random == "reml":
+            found, tau2 = join(fits, weights[0], intercept, least, vary=True)
+            common = np.stack([replace(fit, sd=sd).se(weights[0]) for fit in fits]) ** 2
+            random = replace(
+                combine(estimates, common, tau2, least=least),
+                estimate=found.estimate,
+                se=found.se,
+                df=found.df,
+            )
     without = []
     if leave_out and len(fits) > settings.min_sites:
         without = [
@@ -306,7 +389,7 @@ def meta_analyze(
     return MetaResult(
         fixed=fixed,
         random=random,
-        sd=pooled_sd(fits),
+        sd=sd,
         estimates=estimates,
         ses=ses,
         without=without,

@@ -125,6 +125,26 @@ _MEASURED = {
 }
 
 
+class Citations:
+    """Numbers works in the order in which a text names them."""
+
+    def __init__(self) -> None:
+        self._keys: list[str] = []
+
+    def __call__(self, key: str) -> str:
+        """Return the number of a work in brackets."""
+        if key not in self._keys:
+            self._keys.append(key)
+        return f"[{self._keys.index(key) + 1}]"
+
+    def page(self, paragraphs: Sequence[str]) -> str:
+        """Return the text with its references."""
+        works = "\n".join(f"{i}. {REFERENCES[key]}" for i, key in enumerate(self._keys, start=1))
+        use = "This text may be used freely, as it stands or changed."
+        parts = ["# Methods and findings", use, *paragraphs, "# References", works]
+        return "\n\n".join(parts) + "\n"
+
+
 def methods_text(
     cohort: Cohort,
     analysis: Analysis,
@@ -136,13 +156,7 @@ def methods_text(
     ratings: Mapping[str, int] | None = None,
 ) -> str:
     """Word what was done and what came out."""
-    cited: list[str] = []
-
-    def cite(key: str) -> str:
-        if key not in cited:
-            cited.append(key)
-        return f"[{cited.index(key) + 1}]"
-
+    cite = Citations()
     paragraphs = [_sample(cohort, analysis, n_out, cite("method"), others)]
     paragraphs[0] = paragraphs[0].replace("the hippocampus", _MEASURED[region], 1)
     paragraphs[0] += _rated(ratings)
@@ -161,14 +175,9 @@ def methods_text(
         )
     if analysis.found:
         paragraphs.append(_findings(analysis))
-    lines = ["# Methods and findings", "", "This text may be used freely, as it stands or changed."]
-    for paragraph in paragraphs:
-        lines += ["", paragraph]
     if analysis.skipped:
-        lines += ["", "Left out:", "", *(f"- {note}" for note in analysis.skipped)]
-    lines += ["", "# References", ""]
-    lines += [f"{i}. {REFERENCES[key]}" for i, key in enumerate(cited, start=1)]
-    return "\n".join(lines) + "\n"
+        paragraphs.append("\n".join(["Left out:", "", *(f"- {one}" for one in analysis.skipped)]))
+    return cite.page(paragraphs)
 
 
 def _sample(
@@ -260,7 +269,7 @@ def _harmonization(analysis: Analysis, cite: Callable[[str], str]) -> list[str]:
     plan = done.plan
     counts = ", ".join(f"{site} {n}" for site, n in plan.counts.items())
     sources = f"{cite('johnson')}, {cite('combat')}"
-    kept = f"`{plan.formula}`" if plan.columns else "no variable"
+    kept = f"`{plan.kept.formula}`" if plan.kept.names else "no variable"
     if plan.icv is not None:
         kept += f", for volumes also {plan.icv}"
     text = (
@@ -411,16 +420,6 @@ def _joint(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], st
     )
 
 
-def document(paragraphs: Sequence[str], cited: Sequence[str]) -> str:
-    """Write paragraphs and the works that they cite, by their keys."""
-    lines = ["# Methods and findings", "", "This text may be used freely, as it stands or changed."]
-    for paragraph in paragraphs:
-        lines += ["", paragraph]
-    lines += ["", "# References", ""]
-    lines += [f"{i}. {REFERENCES[key]}" for i, key in enumerate(cited, start=1)]
-    return "\n".join(lines) + "\n"
-
-
 def norms_text(
     file: NormsFile,
     settings: NormSettings,
@@ -434,13 +433,7 @@ def norms_text(
 
     ``who`` was in it; ``coverage`` is that of norms that were made; ``new`` sites come last.
     """
-    cited: list[str] = []
-
-    def cite(key: str) -> str:
-        if key not in cited:
-            cited.append(key)
-        return f"[{cited.index(key) + 1}]"
-
+    cite = Citations()
     ages = f"{file.knots[0]:g} to {file.knots[-1]:g} years"
     first = f"Measures of the hippocampus {cite('method')} of {who} were "
     if coverage is not None:
@@ -483,7 +476,7 @@ def norms_text(
             "Shift and scale of sites without norms were estimated from their controls"
             f" {'='.join(controls or ())}: {counts}. All else was kept."
         )
-    return document(paragraphs, cited)
+    return cite.page(paragraphs)
 
 
 def _asymmetry(settings: GroupSettings, source: str) -> str:

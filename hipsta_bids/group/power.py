@@ -1,7 +1,7 @@
 """Sample size: how many participants a trial needs for an effect on a measure or at a point."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import special, stats
@@ -67,7 +67,7 @@ class SampleSize:
     power: Float
     """With that many."""
     enrolled: Float
-    """Per arm, with those who drop out."""
+    """Per arm, so that those who drop out leave as much information."""
     limits: Float | None = None
     """(2, points) participants per arm at the confidence limits of the reference."""
 
@@ -115,7 +115,9 @@ def sample_size(
         alpha=alpha,
         per_arm=per_arm,
         power=power_of(difference / sd, per_arm, alpha),
-        enrolled=np.ceil(np.round(per_arm / (1 - settings.power.dropout), 9)),
+        enrolled=np.ceil(
+            np.round(per_arm / information_left(effect, reference, settings.power.dropout), 9)
+        ),
         limits=ends,
     )
 
@@ -126,6 +128,24 @@ def endpoint_sd(effect: TrialEffect, reference: Reference) -> Float:
         return np.sqrt(reference.variance)
     slopes = 0.0 if reference.slope_variance is None else reference.slope_variance
     return np.asarray(np.sqrt(slopes + reference.variance / effect.spread), dtype=np.float64)
+
+
+def information_left(effect: TrialEffect, reference: Reference, dropout: float) -> Float:
+    """Information that a participant who is enrolled gives on average, over that of all visits.
+
+    A constant hazard leaves ``1 - dropout`` at the last visit, and who leaves is in the mixed model
+    with the visits before: the information of a pattern is the inverse variance of its slope, if
+    it has two visits. With a single visit, who leaves gives none.
+    """
+    if not effect.visits:
+        return np.asarray(1.0 - dropout)
+    passed = (np.array(effect.visits) - effect.visits[0]) / effect.duration
+    stay = np.append((1 - dropout) ** passed, 0.0)
+    whole, total = endpoint_sd(effect, reference) ** 2, np.zeros(reference.mean.shape)
+    for count in range(2, len(effect.visits) + 1):
+        part = replace(effect, visits=effect.visits[:count])
+        total += (stay[count - 1] - stay[count]) * whole / endpoint_sd(part, reference) ** 2
+    return total
 
 
 def _difference(effect: TrialEffect, mean: Float, slope: Float | None) -> Float:
@@ -246,6 +266,8 @@ def power_text(
         else "the two-stage procedure of Benjamini, Krieger and Yekutieli"
     )
     lost = f", if {100 * plan.dropout:g} % drop out" if plan.dropout else ""
+    if lost and effect.visits:
+        lost += " at a constant hazard and are analyzed with the visits before"
     return (
         f"Sample sizes are those of a trial of two arms of equal size in which {question}, with a"
         f" power of {plan.power:g}{lost}. {end} Means, changes and variances are those of"

@@ -48,7 +48,7 @@ TRIAL_COLUMNS: Mapping[str, str] = {
     "per_arm_low": "the same at the better confidence limit, of the mean change for slowing, else"
     " of the SD",
     "per_arm_high": "at the worse one; n/a if no number is enough",
-    "enrolled_per_arm": "participants per arm to enroll, as some drop out",
+    "enrolled_per_arm": "participants per arm to enroll, as some leave before the last visit",
     "power": "with this number per arm",
 }
 

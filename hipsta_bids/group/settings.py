@@ -325,7 +325,8 @@ class PowerSettings(SettingsTable):
     power: OpenFraction = 0.8
     """Chance to find the effect."""
     dropout: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """Share of those enrolled that does not complete the trial, and is not in its analysis."""
+    """Share of those enrolled that has left before the last visit, at a constant hazard; the visits
+    before are in the mixed model of several visits."""
     alpha: OpenFraction = 0.05
     """Two-sided level of the test of a summary measure, one of which is the end point. Maps hold
     the false discovery rate ``multiplicity.alpha``."""
@@ -383,17 +384,14 @@ class ExchangeSettings(SettingsTable):
 class MetaSettings(SettingsTable):
     """Summaries of several sites become one result."""
 
-    fixed: Literal["joint", "inverse-variance"] = "joint"
-    """Fixed effect: ``joint`` (the model of all participants with a constant per site, from the
-    sites' coefficients and their covariances; Becker and Wu 2007), or the mean of the sites'
-    estimates by ``inverse-variance``."""
+    model: Literal["joint", "two-stage"] = "joint"
+    """``joint``: the model of all participants with a constant per site, from the sites'
+    coefficients and their covariances (Becker and Wu 2007); ``two-stage``: the mean of the sites'
+    estimates, each with its own residual variance and slopes of covariates."""
     random: Literal["reml", "dl"] = "reml"
-    """Variance between sites: ``reml`` (restricted maximum likelihood, with tests of Knapp and
-    Hartung 2003) or ``dl`` (DerSimonian and Laird 1986, with normal tests)."""
-    knapp_hartung: Literal["modified", "plain"] = "modified"
-    """``modified``: no standard error is smaller than without this correction, so that peaks are
-    not where sites agree by chance (Roever, Knapp and Friede 2015); ``plain`` lets them shrink,
-    which holds the level more exactly."""
+    """Variance between sites: ``reml`` (restricted maximum likelihood, with t tests; in two stages
+    those of Knapp and Hartung 2003, with no standard error below that without their correction) or
+    ``dl`` (DerSimonian and Laird 1986, in two stages with normal tests)."""
     min_sites: Annotated[int, Field(ge=2)] = 2
     """Fewest sites with an estimate at a point."""
     confidence: OpenFraction = 0.95

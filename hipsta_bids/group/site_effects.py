@@ -22,6 +22,7 @@ from hipsta_bids.io import files
 _FORMAT = 1
 _LARGEST = 1_000_000_000  # bytes
 _DIGITS = 9
+_PLAIN = ("column", "formula", "levels", "columns", "sites", "repeated", "icv", "templates")
 _ARRAYS = tuple(one.name for one in fields(SiteEffects))
 #: Column that is not kept: sites have the means.
 INTERCEPT = "Intercept"
@@ -61,14 +62,7 @@ def save_effects(path: Path, effects: SavedEffects) -> None:
         "Description": "effects of sites on maps and summary measures (ComBat)",
         "Format": _FORMAT,
         "Version": __version__,
-        "Column": effects.column,
-        "Formula": effects.formula,
-        "Levels": {name: list(levels) for name, levels in effects.levels.items()},
-        "Columns": list(effects.columns),
-        "Sites": dict(effects.sites),
-        "Repeated": effects.repeated,
-        "Icv": effects.icv,
-        "Templates": dict(effects.templates),
+        **{name.capitalize(): getattr(effects, name) for name in _PLAIN},
         "Maps": _nested(effects.maps),
         "Summaries": _nested(effects.summaries),
     }

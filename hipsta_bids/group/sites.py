@@ -11,13 +11,21 @@ import pandas as pd
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group import tables
-from hipsta_bids.group.clusters import Frame, peak_table, sheet_edges
+from hipsta_bids.group.clusters import (
+    Frame,
+    effect_columns,
+    overview_row,
+    peak_table,
+    point_columns,
+    sheet_edges,
+    test_columns,
+)
 from hipsta_bids.group.data import Float
 from hipsta_bids.group.exchange import ModelSummary, SiteSummary
 from hipsta_bids.group.formula import Contrast, listed
 from hipsta_bids.group.glm import MEAN, PointTest
-from hipsta_bids.group.inference import Discoveries, MapKey, control_fdr, discover
-from hipsta_bids.group.meta import FIXED, RANDOM, Combined, MetaResult, combine, meta_analyze
+from hipsta_bids.group.inference import Discoveries, MapKey, discover
+from hipsta_bids.group.meta import Combined, MetaResult, combine, meta_analyze
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.io import files
 
@@ -121,11 +129,9 @@ def check_agreement(sites: Sequence[SiteSummary]) -> list[str]:
         "registration": lambda site: site.align,
         "hash of the template of registration": lambda site: site.template_hash,
         "measures with a relative asymmetry": lambda site: ", ".join(site.asymmetry),
-        "terms of the model": lambda site: " + ".join(site.models[0].columns),
         "reference levels": lambda site: ", ".join(
             f"{name} {next(iter(levels), '')}" for name, levels in site.factors.items()
         ),
-        "contrasts": lambda site: ", ".join(site.models[0].contrasts),
     }
     for item, value in items.items():
         _agree(sites, item, [str(value(site)) for site in sites])
@@ -141,10 +147,8 @@ def check_agreement(sites: Sequence[SiteSummary]) -> list[str]:
                 words = [", ".join(f"{weight:.6g}" for weight in row) for row in rows]
                 item = f"{title}: weights of {name} on {', '.join(model.columns)}"
                 _agree(sites, item, words, _BY_COLUMNS)
-    notes = []
-    if len({site.version for site in sites}) > 1:
-        notes.append("sites used several versions of hipsta_bids, see sites.tsv")
-    return notes
+    several = len({site.version for site in sites}) > 1
+    return ["sites used several versions of hipsta_bids, see sites.tsv"] if several else []
 
 
 def _agree(
@@ -270,19 +274,8 @@ def meta_tables(meta: Meta) -> Iterator[tuple[str, pd.DataFrame]]:
             key, test = item.key(effects), point_test(item, effects, confidence)
             found = meta.found[key]
             stem = tables.map_name(key.hemi, key.measure, key.contrast)
-            rows.append(
-                {
-                    "measure": key.measure,
-                    "contrast": key.contrast,
-                    "hemi": key.hemi,
-                    "file": stem,
-                    "n_tests": found.n_tests,
-                    "n_significant": int(found.rejected.sum()),
-                    "p_cutoff": found.cutoff,
-                    "lenient": found.lenient,
-                }
-            )
-            yield stem, _statmap(meta, item, test, found, frame)
+            rows.append(overview_row(stem, key, found))
+            yield stem, _statmap(meta, item, effects, found, frame)
             table = peak_table(test, found, frame, edges)
             peaks.append(table.assign(measure=key.measure, hemi=key.hemi))
             own.append(table)
@@ -331,35 +324,18 @@ def _sites(meta: Meta) -> pd.DataFrame:
 
 
 def _statmap(
-    meta: Meta, item: Item, test: PointTest, found: Discoveries, frame: Frame
+    meta: Meta, item: Item, effects: str, found: Discoveries, frame: Frame
 ) -> pd.DataFrame:
-    low, high = item.result.models[_effects(test)].limits(meta.settings.meta.confidence)
+    test = point_test(item, effects, meta.settings.meta.confidence)
+    low, high = item.result.models[effects].limits(meta.settings.meta.confidence)
     columns = {
-        **frame.number,
-        **frame.position,
-        "subfield": frame.subfield,
-        "n": meta.counts(item).astype(int),
+        **point_columns(test, found, frame, meta.counts(item).astype(int)),
         "n_sites": item.result.random.sites.astype(int),
-        "estimate": test.estimate[0],
-        "se": test.se[0],
         "estimate_low": low,
         "estimate_high": high,
-        "statistic": test.statistic,
-        "df": test.df,
-        "p": test.p,
-        "p_corrected": found.adjusted,
-        "significant": found.rejected,
-        "cohen_d": test.cohen_d,
-        "cohen_d_low": test.cohen_d_limits[0],
-        "cohen_d_high": test.cohen_d_limits[1],
-        "eta_squared": test.eta_squared,
         **_between(item),
     }
     return pd.DataFrame(columns)
-
-
-def _effects(test: PointTest) -> str:
-    return RANDOM if test.contrast.name.endswith(f"({RANDOM})") else FIXED
 
 
 def _between(item: Item) -> dict[str, Float]:
@@ -456,7 +432,7 @@ def _row(one: Combined, point: int, confidence: float) -> dict[str, float]:
 
 def _summaries(meta: Meta) -> pd.DataFrame:
     """List summary measures by fixed and random effects; the latter also by DerSimonian-Laird."""
-    confidence, how = meta.settings.meta.confidence, meta.settings.multiplicity
+    confidence = meta.settings.meta.confidence
     parts = []
     for item in meta.of("summary"):
         for effects, one in item.result.models.items():
@@ -474,17 +450,11 @@ def _summaries(meta: Meta) -> pd.DataFrame:
                         "n": meta.counts(item).astype(int),
                         "visits": meta.counts(item).astype(int),
                         "n_sites": item.result.random.sites.astype(int),
-                        "estimate": one.estimate,
-                        "se": one.se,
+                        **test_columns(test),
+                        "p_fdr": np.nan,
                         "estimate_low": low,
                         "estimate_high": high,
-                        "statistic": one.statistic,
-                        "df": one.df,
-                        "p": one.p,
-                        "effect": "cohen_d",
-                        "effect_size": test.cohen_d,
-                        "effect_low": test.cohen_d_limits[0],
-                        "effect_high": test.cohen_d_limits[1],
+                        **effect_columns(test),
                         **_between(item),
                         **_dersimonian_laird(item, meta.settings.meta.min_sites),
                     }
@@ -492,14 +462,7 @@ def _summaries(meta: Meta) -> pd.DataFrame:
             )
     table = pd.concat(parts, ignore_index=True)
     table = table[table["estimate"].notna()]
-    # One family: all summary measures of a contrast.
-    adjusted = [
-        pd.Series(control_fdr(own.to_numpy(), how.alpha, how.method).adjusted, own.index)
-        for _, own in table.groupby("contrast", sort=False)["p"]
-    ]
-    corrected = pd.concat(adjusted) if adjusted else pd.Series(dtype=np.float64)
-    table.insert(int(np.flatnonzero(table.columns == "p")[0]) + 1, "p_fdr", corrected)
-    return table
+    return tables.with_fdr(table, meta.settings)
 
 
 def _dersimonian_laird(item: Item, least: int) -> dict[str, Float]:

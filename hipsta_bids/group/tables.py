@@ -17,7 +17,15 @@ from hipsta_bids.group.analysis import (
     tested_maps,
 )
 from hipsta_bids.group.classify import ClassifierResult, roc_curve
-from hipsta_bids.group.clusters import edges_of, frame_of, peak_table
+from hipsta_bids.group.clusters import (
+    edges_of,
+    effect_columns,
+    frame_of,
+    overview_row,
+    peak_table,
+    point_columns,
+    test_columns,
+)
 from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float
 from hipsta_bids.group.harmonize import Harmonization
 from hipsta_bids.group.inference import control_fdr
@@ -160,7 +168,7 @@ def result_tables(cohort: Cohort, analysis: Analysis, settings: GroupSettings) -
         yield from _registration_tables(cohort, analysis)
     yield from _sites("sites", cohort, analysis)
     if analysis.measures:
-        yield "measures", _with_fdr(_stacked(_measures(cohort, analysis)), settings)
+        yield "measures", with_fdr(_stacked(_measures(cohort, analysis)), settings)
         if grouped:
             yield "descriptives", _stacked(_descriptives(analysis))
     if analysis.scores is not None and len(analysis.scores.table):
@@ -221,27 +229,7 @@ def _stacked(blocks: Iterable[Columns]) -> pd.DataFrame:
 def _statistics(cohort: Cohort, analysis: Analysis) -> Iterator[Named]:
     for key, test, found in tested_maps(analysis):
         one = analysis.fitted[key.hemi]
-        frame = frame_of(cohort, one)
-        single = test.kind == "t"
-        columns = {
-            **frame.number,
-            **frame.position,
-            "subfield": frame.subfield,
-            "n": one.fits[key.measure].n,
-            "estimate": test.estimate[0] if single else np.nan,
-            "se": test.se[0] if single else np.nan,
-            "statistic": test.statistic,
-            "df": test.df,
-            "p": test.p,
-            "p_corrected": found.adjusted,
-            "significant": found.rejected,
-            "cohen_d": test.cohen_d,
-            "cohen_d_low": test.cohen_d_limits[0],
-            "cohen_d_high": test.cohen_d_limits[1],
-            "eta_squared": test.eta_squared,
-            "eta_squared_low": test.eta_squared_limits[0],
-            "eta_squared_high": test.eta_squared_limits[1],
-        }
+        columns = point_columns(test, found, frame_of(cohort, one), one.fits[key.measure].n)
         yield map_name(key.hemi, key.measure, key.contrast), pd.DataFrame(columns)
 
 
@@ -301,16 +289,7 @@ def _overview(analysis: Analysis) -> pd.DataFrame:
     """One row per map: how many points survive, and at which p."""
     return pd.DataFrame(
         [
-            {
-                "measure": key.measure,
-                "contrast": key.contrast,
-                "hemi": key.hemi,
-                "file": map_name(key.hemi, key.measure, key.contrast),
-                "n_tests": found.n_tests,
-                "n_significant": int(found.rejected.sum()),
-                "p_cutoff": found.cutoff,
-                "lenient": found.lenient,
-            }
+            overview_row(map_name(key.hemi, key.measure, key.contrast), key, found)
             for key, found in analysis.found.items()
         ]
     )
@@ -319,8 +298,6 @@ def _overview(analysis: Analysis) -> pd.DataFrame:
 def _measures(cohort: Cohort, analysis: Analysis) -> Iterator[Columns]:
     for one in analysis.measures:
         for test in one.fit.tests:
-            single = test.kind == "t"
-            limits = test.cohen_d_limits if single else test.eta_squared_limits
             yield {
                 "hemi": one.hemi,
                 "measure": one.measures,
@@ -330,20 +307,13 @@ def _measures(cohort: Cohort, analysis: Analysis) -> Iterator[Columns]:
                 "test": test.kind,
                 "n": one.participants,
                 "visits": one.fit.n,
-                "estimate": test.estimate[0] if single else np.nan,
-                "se": test.se[0] if single else np.nan,
-                "statistic": test.statistic,
-                "df": test.df,
-                "p": test.p,
+                **test_columns(test),
                 "p_fdr": np.nan,
-                "effect": "cohen_d" if single else "partial_eta_squared",
-                "effect_size": test.effect,
-                "effect_low": limits[0],
-                "effect_high": limits[1],
+                **effect_columns(test),
             }
 
 
-def _with_fdr(table: pd.DataFrame, settings: GroupSettings) -> pd.DataFrame:
+def with_fdr(table: pd.DataFrame, settings: GroupSettings) -> pd.DataFrame:
     """Correct the tests of one contrast for the number of measures, sides and models."""
     how = settings.multiplicity
     method = "bh" if how.method == "bh" else "fdr2"

@@ -22,7 +22,7 @@ from hipsta_bids.group.data import PARTICIPANT, SESSION, Bool, Cohort, Float
 from hipsta_bids.group.figures import Drawing
 from hipsta_bids.group.formula import check_names, listed
 from hipsta_bids.group.glm import FittedMaps
-from hipsta_bids.group.methods import document
+from hipsta_bids.group.methods import Citations
 from hipsta_bids.group.panels import Row, draw_rows, spanned
 from hipsta_bids.group.power import (
     THINNING,
@@ -360,13 +360,7 @@ def _methods(
     settings: GroupSettings,
 ) -> str:
     """Word what was done, with the works it rests on."""
-    cited: list[str] = []
-
-    def cite(key: str) -> str:
-        if key not in cited:
-            cited.append(key)
-        return f"[{cited.index(key) + 1}]"
-
+    cite = Citations()
     people = int(visits[PARTICIPANT].nunique())
     among = f" ({' '.join(request.among)})" if request.among else ""
     first = (
@@ -391,7 +385,7 @@ def _methods(
         paragraphs.append(retest_text(source.retest, settings.retest, cite))
     if request.effect is not None:
         paragraphs.append(power_text(request.effect, settings, source.words, cite))
-    return document(paragraphs, cited)
+    return cite.page(paragraphs)
 
 
 def _write_measures(folder: Path, cohort: Cohort, found: Sequence[Found]) -> None:

@@ -97,6 +97,8 @@ class CohortPlan:
     """mm per year."""
     sites: tuple[float, ...] = (0.0, 0.03)
     """mm that each site adds to thickness."""
+    site: str = ""
+    """Name of the one site of all, which labels begin with; the thickness is that of its mean."""
     cortex: float = 0.0
     """mm of neighboring cortex, by which the mid-curve extends beyond the subiculum."""
 
@@ -113,6 +115,8 @@ class CohortPlan:
             problem = f"the shape {self.kind} cannot extend into cortex; choose another kind"
         if self.n_subjects < 1 or not self.groups or len(set(self.groups)) < len(self.groups):
             problem = "give at least one subject, and groups with different names"
+        if self.site and not (self.site.isascii() and self.site.isalnum()):
+            problem = f"site {self.site!r}: labels have letters and digits only"
         if problem is not None:
             raise UsageError(f"phantom: {problem}", reason="phantom-setting")
 
@@ -156,12 +160,13 @@ def _make_subject(plan: CohortPlan, number: int) -> Subject:
     sex = "FM"[int(random.integers(2))]
     icv = round(float(random.normal(_ICV[sex], _ICV_SD)), 1)
     site = int(random.integers(len(plan.sites)))
-    wall = plan.thickness + plan.age_slope * (age - _MEAN_AGE) + plan.sites[site]
+    wall = plan.thickness + plan.age_slope * (age - _MEAN_AGE)
+    wall += 0.0 if plan.site else plan.sites[site]
     wall += plan.subject_sd * float(random.standard_normal())
     scale = float(np.cbrt(icv / _ICV_MEAN))
     offset = plan.shift * dose + plan.offset_sd * float(random.standard_normal())
     pose = rigid_motion(_three(random, _TURN), _three(random, _SHIFT))
-    label = f"{number + 1:0{max(2, len(str(plan.n_subjects)))}d}"
+    label = f"{plan.site}{number + 1:0{max(2, len(str(plan.n_subjects)))}d}"
     hemispheres = []
     for hemi in "LR":
         own = wall + plan.hemisphere_sd * float(random.standard_normal())
@@ -173,7 +178,7 @@ def _make_subject(plan: CohortPlan, number: int) -> Subject:
         age=age,
         sex=sex,
         icv=icv,
-        site=f"site{site + 1}",
+        site=plan.site or f"site{site + 1}",
         hemispheres=tuple(hemispheres),
     )
 
@@ -254,6 +259,8 @@ def _participants(plan: CohortPlan, subjects: Sequence[Subject]) -> Participants
         for dose, name in enumerate(plan.groups)
     }
     sites = {f"site{i}": f"{add:+g} mm of thickness" for i, add in enumerate(plan.sites, 1)}
+    if plan.site:
+        sites = {plan.site: f"{plan.thickness:g} mm of thickness at 65 years"}
     return Participants(
         columns={
             "group": {"Description": "group of the cohort", "Levels": groups},

@@ -14,6 +14,7 @@ from hipsta_bids.reports.group_tables import (
     GroupResults,
     display_name,
     map_unit,
+    measure_title,
     number_text,
     records,
     unit_of,
@@ -61,7 +62,7 @@ def map_scenes(results: GroupResults) -> Mapping[str, Any] | None:
                 for hemi, rows in own.groupby("hemi", sort=False)
             ]
             scene = {"unit": unit, "sides": sides}
-        title = display_name(measure).capitalize()
+        title = measure_title(measure)
         plates = [
             {"picture": picture, "spots": _spots(picture, scene, len(data)) if scene else []}
             for number in range(1, _MOST_FIGURES)

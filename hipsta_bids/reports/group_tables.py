@@ -104,6 +104,12 @@ def display_name(measure: str) -> str:
     return words.replace("_", " ")
 
 
+def measure_title(measure: object) -> str:
+    """Name a measure at the beginning of a line."""
+    name = display_name(str(measure))
+    return name[:1].upper() + name[1:]
+
+
 def unit_of(unit: str) -> str:
     """Write a unit with superscripts; nothing for pure numbers."""
     return "" if unit == "1" else unit.replace("^2", "²").replace("^3", "³")
@@ -173,7 +179,7 @@ def findings(results: GroupResults) -> Mapping[str, Any] | None:
             sides = [_side(results, row) for row in records(rows)]
             cards.append(
                 {
-                    "title": f"{display_name(str(measure)).capitalize()}, {contrast}",
+                    "title": f"{measure_title(measure)}, {contrast}",
                     "found": any(side["found"] for side in sides),
                     "sides": sides,
                 }

@@ -14,6 +14,7 @@ from hipsta_bids.reports.group_tables import (
     GroupResults,
     display_name,
     far_scores,
+    measure_title,
     number_text,
     p_text,
     position_text,
@@ -220,6 +221,6 @@ def _pictures(results: GroupResults, points: pd.DataFrame, question: str) -> lis
         for picture in embedded(
             results,
             f"{measure}_{question}",
-            f"{display_name(str(measure)).capitalize()}: {what}",
+            f"{measure_title(measure)}: {what}",
         )
     ]

@@ -17,6 +17,7 @@ from hipsta_bids.reports.group_tables import (
     GroupResults,
     display_name,
     findings,
+    measure_title,
     number_text,
     p_text,
     peaks,
@@ -50,7 +51,7 @@ def _forests(results: GroupResults, *, maps: bool) -> Iterator[dict[str, Any]]:
         first = records(rows.head(1))[0]
         side = SIDES[first["hemi"]] if maps else summary_side(first["hemi"], first["measure"])
         position = f" at {position_text(first)}" if maps else ""
-        title = f"{display_name(first['measure']).capitalize()}, {side}, {first['contrast']}"
+        title = f"{measure_title(first['measure'])}, {side}, {first['contrast']}"
         drawing = _drawing(records(rows), str(first["unit"]))
         yield {
             "number": int(str(number)),
@@ -139,7 +140,7 @@ def _explained(results: GroupResults) -> Mapping[str, Any]:
     settings = (results.record.get("settings") or {}).get("meta") or {}
     sites = len(results.record.get("sites") or ())
     return {
-        "joint": settings.get("fixed") == "joint",
+        "joint": settings.get("model") == "joint",
         "reml": settings.get("random") == "reml",
         "sites": sites,
         "needed": number_text(float(stats.t.isf(0.0005, max(1, sites - 1)))),

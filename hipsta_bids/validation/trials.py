@@ -11,6 +11,8 @@ from statsmodels.stats.multitest import multipletests
 
 from hipsta_bids.group.covariates import VisitTime
 from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, SideMaps
+from hipsta_bids.group.formula import Contrast
+from hipsta_bids.group.mixed import fit_mixed
 from hipsta_bids.group.model import ModelRequest
 from hipsta_bids.group.power import (
     SLOWING,
@@ -27,7 +29,7 @@ from hipsta_bids.types import Bool, Float
 from hipsta_bids.validation.group import smooth_noise
 from hipsta_bids.validation.report import Cells, Suite, Table
 
-TRIALS, MAP_TRIALS, FEW_MAP_TRIALS = 4000, 400, 150
+TRIALS, MIXED_TRIALS, MAP_TRIALS, FEW_MAP_TRIALS = 4000, 1000, 400, 150
 #: Target: stated and observed power differ by at most this.
 MAX_DIFFERENCE = 0.03
 
@@ -35,6 +37,7 @@ _MEAN, _BETWEEN, _WITHIN = 1.6, 0.16, 0.04  # mm
 _SLOPE, _SLOPE_SD = -0.004, 0.003  # mm per month
 _COHORT, _MAP_COHORT = 5000, 400  # participants of the reference
 _FOLLOWED = (0.0, 12.0, 24.0)  # months of the reference's visits
+_AT_ONCE = 100  # trials with dropouts, by one mixed model
 _PROCEDURES = {"bh": "fdr_bh", "fdr2": "fdr_tsbky"}
 
 
@@ -96,6 +99,11 @@ DESIGNS = (
         nodes=(40, 21),
         power={"affected": 0.3, "power": 0.9},
     ),
+    TrialDesign(
+        title="measure, months 0, 12, 24, 36, 30 % slower, 40 % drop out",
+        effect=TrialEffect(kind=SLOWING, share=0.3, visits=(0, 12, 24, 36)),
+        power={"dropout": 0.4},
+    ),
 )
 
 
@@ -123,6 +131,12 @@ def simulate_design(design: TrialDesign, trials: int, seed: int = 0) -> TrialOut
     per_arm, enrolled = int(np.median(found.per_arm)), int(np.median(found.enrolled))
     if design.is_map:
         shares = [_map_trial(design, per_arm, random) for _ in range(trials)]
+    elif settings.power.dropout:
+        shares = [
+            share
+            for _ in range(trials // _AT_ONCE)
+            for share in _with_dropouts(design, enrolled, random)
+        ]
     else:
         shares = [_trial(design, enrolled, random) for _ in range(trials)]
     return TrialOutcome(
@@ -180,13 +194,33 @@ def _values(design: TrialDesign, people: int, random: np.random.Generator) -> Fl
     return _MEAN + _BETWEEN * noise
 
 
+def _with_dropouts(design: TrialDesign, enrolled: int, random: np.random.Generator) -> Bool:
+    """Run slowing trials in which the same participants leave, by mixed models of all visits."""
+    effect, settings = design.effect, design.settings
+    times = np.array(effect.visits)
+    hazard = -np.log1p(-settings.power.dropout) / effect.duration
+    leaves = random.exponential(1 / hazard, 2 * enrolled)
+    who, visit = np.nonzero(times - times[0] <= leaves[:, None])
+    treated, when = (who >= enrolled).astype(np.float64), times[visit]
+    shape = 2 * enrolled, _AT_ONCE
+    slopes = _SLOPE + _SLOPE_SD * random.standard_normal(shape)
+    slopes[enrolled:] -= effect.share * _SLOPE
+    first = _MEAN + _BETWEEN * random.standard_normal(shape)
+    values = first[who] + slopes[who] * when[:, None]
+    values += _WITHIN * random.standard_normal(values.shape)
+    matrix = np.column_stack([np.ones(len(who)), treated, when, treated * when])
+    contrast = [Contrast("slowing", np.array([0.0, 0, 0, 1]))]
+    how = settings.changed(longitudinal={"random": "slope"}).longitudinal
+    fit = fit_mixed(values, matrix, who.astype(np.str_), contrast, how, times=when)
+    return np.asarray(fit.tests[0].p <= settings.power.alpha)
+
+
 def _trial(design: TrialDesign, enrolled: int, random: np.random.Generator) -> bool:
     """Run one trial of a summary measure, and tell whether it finds the effect."""
     effect = design.effect
     arms = []
     for treated in (False, True):
-        stays = random.random(enrolled) >= design.settings.power.dropout
-        first = _MEAN + _BETWEEN * random.standard_normal(int(stays.sum()))
+        first = _MEAN + _BETWEEN * random.standard_normal(enrolled)
         if not effect.visits:
             arms.append(first - (effect.share * _MEAN if treated else 0.0))
             continue
@@ -222,7 +256,8 @@ def run(full: bool) -> Suite:
     """Simulate the trials of all designs."""
     rows: list[Cells] = []
     for design in DESIGNS:
-        trials = (MAP_TRIALS if full else FEW_MAP_TRIALS) if design.is_map else TRIALS
+        trials = MIXED_TRIALS if design.power.get("dropout") else TRIALS
+        trials = (MAP_TRIALS if full else FEW_MAP_TRIALS) if design.is_map else trials
         found = simulate_design(design, trials)
         rows.append(
             {

@@ -61,12 +61,42 @@ def write_hemisphere(place, thickness, curvature, *, volume=500.0, **record):
     files.write_json(place.path("qc"), content | record)
 
 
-def write_dataset(folder, *, session=None, region="body"):
-    """A BIDS dataset and the participant level's output; the second group is thinner."""
+def begin_dataset(folder):
+    """Folders of a BIDS dataset and of the participant level's output, which has no hemispheres."""
     data, out = folder / "bids", folder / "out"
     out.mkdir(parents=True)
     dataset.settle_settings(out, SETTINGS)
     dataset.write_description(out, {"fs": folder / "fs"})
+    return data, out
+
+
+def write_sessions(folder, cohort, losses, *, noise, column, times, lacking=()):
+    """Three yearly sessions, in which walls thin by ``losses`` (participants,) mm per year.
+
+    ``times(i, year)`` is a participant's value of a column of sessions.tsv.
+    """
+    data, out = begin_dataset(folder)
+    random = np.random.default_rng(0)
+    for i, loss in enumerate(losses):
+        subject, rows = f"{i + 1:02d}", []
+        for year, session in enumerate("123"):
+            if (i, session) in lacking:
+                continue
+            for hemi in "LR":
+                wall = cohort.thickness[i] - loss * year + noise * random.standard_normal(NODES)
+                bend = cohort.curvature[i] + 0.01 * random.standard_normal(NODES)
+                place = place_of(out, subject, hemi, session=session)
+                volume = 500 + 3 * i - 5 * year + random.random()
+                write_hemisphere(place, wall, bend, volume=volume)
+            rows.append([f"ses-{session}", times(i, year)])
+        path = data / f"sub-{subject}" / f"sub-{subject}_sessions.tsv"
+        files.write_tsv(path, ["session_id", column], rows)
+    return data, out
+
+
+def write_dataset(folder, *, session=None, region="body"):
+    """A BIDS dataset and the participant level's output; the second group is thinner."""
+    data, out = begin_dataset(folder)
     cohorts = {hemi: simulate_cohort(PLAN, seed) for seed, hemi in enumerate("LR")}
     left = cohorts["L"]
     rows = []

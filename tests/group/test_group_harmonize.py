@@ -11,7 +11,7 @@ from hippunfold_like import PATTERNS, flat_surface, names, write_map, write_surf
 from pyarrow import parquet
 from small_cohorts import (
     NODES,
-    SETTINGS,
+    begin_dataset,
     place_of,
     read_participants,
     write_hemisphere,
@@ -19,7 +19,6 @@ from small_cohorts import (
 )
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.derivatives import dataset
 from hipsta_bids.group import write
 from hipsta_bids.group.comparison import Comparison
 from hipsta_bids.group.data import Cohort, Measures, SideMaps
@@ -42,10 +41,7 @@ def write_study(folder, *, sessions=(None,), seed=0):
 
     Two of three of AD are at site B.
     """
-    data, out = folder / "bids", folder / "out"
-    out.mkdir(parents=True)
-    dataset.settle_settings(out, SETTINGS)
-    dataset.write_description(out, {"fs": folder / "fs"})
+    data, out = begin_dataset(folder)
     random = np.random.default_rng(seed)
     rows = []
     x = np.linspace(0, 1, NODES[0])[:, None] + np.zeros(NODES)
@@ -196,6 +192,7 @@ def test_repeated_sessions(tmp_path, quick, capsys):
         path.parent.mkdir()
         files.write_tsv(path, ["session_id", "years"], rows)
     call = [str(data), str(out), "group", "--harmonize", "site", "--no-reports", *quick]
+    call += ["--no-classification", "--measures", "thickness"]
     assert main([*call, "--longitudinal"]) == 0
     (folder,) = (out / "group").glob("*_longitudinal")
     sites = table(folder / "sites.tsv")

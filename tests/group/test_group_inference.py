@@ -8,17 +8,16 @@ import pandas as pd
 import pytest
 from pyarrow import parquet
 from scipy import stats
-from small_cohorts import NODES, PLAN, SETTINGS, place_of, write_dataset, write_hemisphere
+from small_cohorts import GROUPS, PLAN, place_of, write_dataset, write_participants, write_sessions
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.derivatives import dataset as derivative
 from hipsta_bids.group import write
 from hipsta_bids.group.inference import control_fdr
-from hipsta_bids.io import files
 from hipsta_bids.reports.group import group_page
 from hipsta_bids.validation.group import simulate_cohort
 
 ALIGNED = ["--align", "none"]
+PLAIN = [*ALIGNED, "--no-classification"]
 
 
 @pytest.fixture(autouse=True)
@@ -35,33 +34,22 @@ def dataset(tmp_path_factory):
 @pytest.fixture(scope="module")
 def sessions(tmp_path_factory):
     """Three yearly sessions; patients' wall thins by 0.1 mm per year, that of others by 0.02."""
-    folder = tmp_path_factory.mktemp("sessions")
-    data, out = folder / "bids", folder / "out"
-    out.mkdir()
-    derivative.settle_settings(out, SETTINGS)
-    derivative.write_description(out, {"fs": folder / "fs"})
     cohort = simulate_cohort(PLAN, 0)
-    random = np.random.default_rng(0)
-    rows = []
-    for i, patient in enumerate(cohort.group):
-        subject = f"{i + 1:02d}"
-        dates = []
-        for year, session in enumerate("123"):
-            for hemi in "LR":
-                place = place_of(out, subject, hemi, session=session)
-                noise = 0.02 * random.standard_normal(NODES)
-                wall = cohort.thickness[i] - (0.1 if patient else 0.02) * year + noise
-                bend = cohort.curvature[i] + 0.01 * random.standard_normal(NODES)
-                write_hemisphere(place, wall, bend, volume=500 - 5 * year + random.random())
-            dates.append([f"ses-{session}", f"20{10 + year}-03-0{1 + i % 9}T12:00:00"])
-        files.write_tsv(
-            data / f"sub-{subject}" / f"sub-{subject}_sessions.tsv",
-            ["session_id", "acq_time"],
-            dates,
+    data, out = write_sessions(
+        tmp_path_factory.mktemp("sessions"),
+        cohort,
+        np.where(cohort.group, 0.1, 0.02),
+        noise=0.02,
+        column="acq_time",
+        times=lambda i, year: f"20{10 + year}-03-0{1 + i % 9}T12:00:00",
+    )
+    rows = [
+        [f"sub-{i + 1:02d}", GROUPS[int(patient)], f"{age:.1f}", "MF"[int(sex)]]
+        for i, (patient, age, sex) in enumerate(
+            zip(cohort.group, cohort.age, cohort.sex, strict=True)
         )
-        sex = "F" if cohort.sex[i] else "M"
-        rows.append([f"sub-{subject}", "AD" if patient else "CN", f"{cohort.age[i]:.1f}", sex])
-    files.write_tsv(data / "participants.tsv", ["participant_id", "group", "age", "sex"], rows)
+    ]
+    write_participants(data, rows)
     return data, out
 
 
@@ -80,7 +68,7 @@ def run(dataset, *options):
 def test_permutations_are_in_the_tables_of_the_map(dataset, quick):
     corrected = {}
     for method in ("permutation-tfce", "permutation-max"):
-        options = [*quick, *ALIGNED, "--correction", method, "--permutations", "100"]
+        options = [*quick, *PLAIN, "--correction", method, "--permutations", "100"]
         folder = run(dataset, *options)
         found = table(folder / "hemi-L_contrast-CNAD_desc-thickness_statmap.tsv")
         assert found.p_corrected.min() == pytest.approx(1 / 100)
@@ -108,7 +96,7 @@ def test_permutations_are_in_the_tables_of_the_map(dataset, quick):
 
 
 def test_pooled_family_is_no_less_strict(dataset, quick):
-    options = [*quick, *ALIGNED, "--correction", "permutation-max", "--permutations", "100"]
+    options = [*quick, *PLAIN, "--correction", "permutation-max", "--permutations", "100"]
     single = run(dataset, *options)
     pooled = run(dataset, *options, "--fdr-scope", "hemispheres")
     name = "hemi-{}_contrast-CNAD_desc-thickness_statmap.tsv"
@@ -121,7 +109,7 @@ def test_pooled_family_is_no_less_strict(dataset, quick):
 
 def test_blocks_are_a_column_inside_which_the_contrast_varies(dataset, quick, capsys):
     data, out = dataset
-    options = [*quick, *ALIGNED, "--correction", "permutation-max", "--permutations", "20"]
+    options = [*quick, *PLAIN, "--correction", "permutation-max", "--permutations", "20"]
     folder = run(dataset, *options, "--blocks", "sex")
     assert "within levels of sex" in (folder / "methods.md").read_text()
     arguments = [str(data), str(out), "group", *options]
@@ -132,7 +120,7 @@ def test_blocks_are_a_column_inside_which_the_contrast_varies(dataset, quick, ca
 
 
 def test_two_sessions_give_the_paired_t_test(sessions, quick):
-    options = [*quick, *ALIGNED, "--paired", "1", "ses-3", "--formula", "1"]
+    options = [*quick, *PLAIN, "--paired", "1", "ses-3", "--formula", "1"]
     folder = run(sessions, *options)
     found = table(folder / "hemi-R_contrast-Mean_desc-thickness_statmap.tsv")
     _, out = sessions
@@ -156,7 +144,7 @@ def test_two_sessions_give_the_paired_t_test(sessions, quick):
 
 
 def test_changes_of_groups_are_compared_between_two_sessions(sessions, quick):
-    folder = run(sessions, *quick, *ALIGNED, "--paired", "1", "2")
+    folder = run(sessions, *quick, *PLAIN, "--paired", "1", "2")
     record = json.loads((folder / "analysis.json").read_text())
     assert record["formula"] == "group + age + sex"
     assert set(record["contrasts"]) == {"mean", "CN-AD"}
@@ -210,7 +198,7 @@ def test_longitudinal_model_finds_the_slopes(sessions, quick, random):
 def test_default_model_with_a_curve_of_age_tests_it(sessions, quick):
     """Also in a mixed model, where the spline's part beyond a line takes an F test."""
     options = ("--longitudinal", "--age-model", "spline", "--measures", "thickness")
-    folder = run(sessions, *quick, *ALIGNED, "--no-classification", *options)
+    folder = run(sessions, *quick, *PLAIN, *options)
     formula = json.loads((folder / "analysis.json").read_text())["formula"]
     assert formula == 'group * time + cr(age, df=3, constraints="center") + sex'
     found = table(folder / "hemi-L_contrast-AgeNonlinear_desc-thickness_statmap.tsv")
@@ -225,8 +213,8 @@ def test_default_model_with_a_curve_of_age_tests_it(sessions, quick):
 
 
 def test_permutations_of_repeated_visits_flip_signs_of_participants(sessions, quick):
-    options = ("--correction", "permutation-max", "--permutations", "20", "--no-classification")
-    folder = run(sessions, *quick, *ALIGNED, *options, "--longitudinal", "--measures", "thickness")
+    options = ("--correction", "permutation-max", "--permutations", "20")
+    folder = run(sessions, *quick, *PLAIN, *options, "--longitudinal", "--measures", "thickness")
     found = table(folder / "hemi-L_contrast-TimeInAD_desc-thickness_statmap.tsv")
     # The loss of .1 mm per session is in all: none of the other signs gives as much.
     np.testing.assert_allclose(found.p_corrected * 20, (found.p_corrected * 20).round(), atol=1e-6)
@@ -235,13 +223,13 @@ def test_permutations_of_repeated_visits_flip_signs_of_participants(sessions, qu
 
 
 def test_first_session_is_the_default_and_says_so(sessions, quick, capsys):
-    folder = run(sessions, *quick, *ALIGNED, "--formula", "group + age")
+    folder = run(sessions, *quick, *PLAIN, "--formula", "group + age")
     assert "60 later sessions are not in it" in capsys.readouterr().out
     assert json.loads((folder / "analysis.json").read_text())["rows"] == 30
 
 
 def test_asymmetry_is_left_minus_right_in_the_same_model(dataset, quick):
-    folder = run(dataset, *quick, *ALIGNED, "--asymmetry")
+    folder = run(dataset, *quick, *PLAIN, "--asymmetry")
     _, out = dataset
     wall = {
         hemi: np.array(
@@ -288,7 +276,7 @@ def test_refusals(sessions, capsys, options, code, message):
 
 
 def test_w_scores_are_those_of_a_model_without_the_participant(dataset, quick):
-    folder = run(dataset, *quick, *ALIGNED, "--normative", "group=CN")
+    folder = run(dataset, *quick, *PLAIN, "--normative", "group=CN")
     _, out = dataset
     people = table(folder / "covariates.tsv")
     wall = np.array(

@@ -8,18 +8,16 @@ import numpy as np
 import pandas as pd
 import pytest
 from hippunfold_like import flat_surface, names, write_map, write_surface
-from small_cohorts import NODES, SETTINGS, place_of, write_hemisphere, write_participants
+from small_cohorts import NODES, place_of, write_participants, write_sessions
 from statsmodels.api import OLS
 from statsmodels.stats.power import TTestIndPower
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.derivatives import dataset as derivative
 from hipsta_bids.group import trials
 from hipsta_bids.group.registration import mean_profiles, register
 from hipsta_bids.group.retest import repeatability
 from hipsta_bids.group.settings import RegistrationSettings
 from hipsta_bids.group.tables import COLUMNS
-from hipsta_bids.io import files
 from hipsta_bids.reports.group import group_page
 from hipsta_bids.validation.group import SimulationPlan, simulate_cohort
 
@@ -30,30 +28,18 @@ ALIGNED = ["--align", "none"]
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     """Three yearly sessions of patients and controls, thinning by .06 and .02 mm per year."""
-    folder = tmp_path_factory.mktemp("trials")
-    data, out = folder / "bids", folder / "out"
-    out.mkdir()
-    derivative.settle_settings(out, SETTINGS)
-    derivative.write_description(out, {"fs": folder / "fs"})
     cohort = simulate_cohort(SimulationPlan(sizes=(7, 7), nodes=NODES, effect=0.0), 0)
-    random = np.random.default_rng(0)
-    rows = []
-    for i in range(PEOPLE):
-        subject, patient, times = f"{i + 1:02d}", i % 2, []
-        own = (0.06 if patient else 0.02) + 0.01 * random.standard_normal()
-        for year, session in enumerate("123"):
-            if (i, session) == (0, "2"):
-                continue  # the first participant lacks a session
-            for hemi in "LR":
-                wall = cohort.thickness[i] - own * year + 0.03 * random.standard_normal(NODES)
-                bend = cohort.curvature[i] + 0.01 * random.standard_normal(NODES)
-                place = place_of(out, subject, hemi, session=session)
-                volume = 500 + 3 * i - 5 * year + random.standard_normal()
-                write_hemisphere(place, wall, bend, volume=volume)
-            times.append([f"ses-{session}", f"{60 + i + year}"])
-        sessions = data / f"sub-{subject}" / f"sub-{subject}_sessions.tsv"
-        files.write_tsv(sessions, ["session_id", "age"], times)
-        rows.append([f"sub-{subject}", "AD" if patient else "CN", "FM"[i // 2 % 2]])
+    patient = np.arange(PEOPLE) % 2
+    data, out = write_sessions(
+        tmp_path_factory.mktemp("trials"),
+        cohort,
+        np.where(patient, 0.06, 0.02) + 0.01 * np.random.default_rng(1).standard_normal(PEOPLE),
+        noise=0.03,
+        column="age",
+        times=lambda i, year: f"{60 + i + year}",
+        lacking={(0, "2")},
+    )
+    rows = [[f"sub-{i + 1:02d}", ("CN", "AD")[i % 2], "FM"[i // 2 % 2]] for i in range(PEOPLE)]
     write_participants(data, rows, ("participant_id", "group", "sex"))
     return data, out
 
@@ -247,6 +233,15 @@ def test_who_lacks_a_covariate_is_not_in_the_reference(dataset, tmp_path):
     assert f"{PEOPLE - 1} participants" in (folder / "methods.md").read_text()
 
 
+def test_harmonization_of_the_settings_is_refused(dataset, tmp_path, capsys):
+    settings = tmp_path / "group.toml"
+    settings.write_text('[harmonization]\ncolumn = "site"\n')
+    data, out = dataset
+    asked = ["--power", "thinning=5%", "--settings", str(settings)]
+    assert main([str(data), str(out), "group", *asked]) == 64
+    assert "nothing is harmonized" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("options", "code", "message"),
     [
@@ -259,6 +254,7 @@ def test_who_lacks_a_covariate_is_not_in_the_reference(dataset, tmp_path):
         (["--power", "thinning=5%", "--dropout", "1"], 64, "dropout"),
         (["--power", "thinning=5%", "--correction", "permutation-max"], 64, "fdr2 or bh"),
         (["--power", "thinning=5%", "--paired", "1", "2"], 64, "--paired: has no meaning"),
+        (["--retest", "--harmonize", "site"], 64, "--harmonize: has no meaning with --retest"),
         (["--visits", "0,12"], 64, "without --retest or --power"),
         (["--retest", "--dropout", ".1"], 64, "without --power"),
         (["--retest", "--formula", "age"], 64, "--formula: has no meaning with --retest"),

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize_scalar
 from statsmodels.regression.linear_model import OLS
 from statsmodels.stats.meta_analysis import combine_effects
 
@@ -146,7 +147,8 @@ def test_joined_models_are_that_of_all_participants(people):
     matrix, values, site = people
     fits = [fit_of(matrix[site == i], values[site == i]) for i in range(3)]
     fits[1].sd[3] = np.nan  # a point that one site does not have
-    found = join(fits, np.array([0.0, 1.0, 0.0]), 0, 2)
+    found, tau2 = join(fits, np.array([0.0, 1.0, 0.0]), 0, 2)
+    np.testing.assert_array_equal(tau2, 0)
     for point in range(4):
         keep = site != 1 if point == 3 else site >= 0
         constants = (site[keep, None] == np.unique(site[keep])).astype(float)
@@ -155,6 +157,52 @@ def test_joined_models_are_that_of_all_participants(people):
         assert found.se[point] == pytest.approx(pooled.bse[0])
         assert found.df[point] == pooled.df_resid
         assert found.p[point] == pytest.approx(pooled.pvalues[0])
+
+
+def mixed(ratio, values, design, slope, site):
+    """Restricted log-likelihood by its definition; estimate and SE of the last column, and tau2."""
+    between = ratio * np.outer(slope, slope) * (site[:, None] == site)
+    inverse = np.linalg.inv(np.eye(len(site)) + between)
+    covariance = np.linalg.inv(design.T @ inverse @ design)
+    beta = covariance @ design.T @ inverse @ values
+    rest = values - design @ beta
+    freedom = len(site) - design.shape[1]
+    variance = rest @ inverse @ rest / freedom
+    like = np.linalg.slogdet(inverse)[1] + np.linalg.slogdet(covariance)[1]
+    se = np.sqrt(variance * covariance[-1, -1])
+    return (like - freedom * np.log(variance)) / 2, beta[-1], se, ratio * variance
+
+
+def test_random_slopes_are_those_of_the_mixed_model_of_all_participants(people):
+    """Its likelihood, on all values in one table, is largest at what sites' summaries give."""
+    matrix, values, site = people
+    apart = np.array([-1.0, 0.2, 1.3])[site, None] * matrix[:, [1]] * np.array([0, 0.3, 1, 2])
+    values = values + apart
+    fits = [fit_of(matrix[site == i], values[site == i]) for i in range(3)]
+    found, tau2 = join(fits, np.array([0.0, 1.0, 0.0]), 0, 2, vary=True)
+    design = np.column_stack([site[:, None] == np.arange(3), matrix[:, 2], matrix[:, 1]])
+    for point in range(4):
+        own = values[:, point], design.astype(float), matrix[:, 1], site
+        best = minimize_scalar(
+            lambda ratio, own=own: -mixed(ratio, *own)[0], bounds=(0, 20), options={"xatol": 1e-9}
+        )
+        _, estimate, se, between = mixed(best.x, *own)
+        assert found.estimate[point] == pytest.approx(estimate, abs=1e-5)
+        assert found.se[point] == pytest.approx(se, rel=1e-3)
+        assert tau2[point] == pytest.approx(between, rel=1e-3)
+    assert tau2[3] > 1
+    assert tau2[0] < 0.2
+    assert (found.df == 2).all()
+
+
+def test_two_stages_combine_the_sites_own_estimates(people):
+    matrix, values, site = people
+    fits = [fit_of(matrix[site == i], values[site == i]) for i in range(3)]
+    found = meta_analyze(fits, [np.array([0.0, 1.0, 0.0])] * 3, 0, MetaSettings(model="two-stage"))
+    own = combine(found.estimates, found.ses**2, "reml", test="modified")
+    np.testing.assert_allclose(found.random.se, own.se)
+    plain = 1 / np.sqrt(np.sum(1 / found.ses**2, axis=0))
+    np.testing.assert_allclose(found.fixed.se, plain)
 
 
 def test_without_a_site_is_the_analysis_of_the_others(people):
@@ -192,5 +240,6 @@ def test_levels_hold_where_the_model_does():
         plain = combine(found.estimates, found.ses**2, "reml", test="plain")
         assert np.mean(plain.p < 0.05) == pytest.approx(0.05, abs=0.015)
         assert np.mean(found.random.p < 0.05) < 0.035
+        assert 0.1 < np.mean(found.random.tau2 == 0) < 0.8
         share = np.mean(found.fixed.p < 0.05)
         assert share > 0.12 if tau else share == pytest.approx(0.05, abs=0.015)

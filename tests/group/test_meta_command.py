@@ -234,7 +234,7 @@ def test_other_sites_register_to_the_template_in_a_summary(registered, plain, tm
         ({"models": lambda m: m[1:]}, "site b: lacks thickness, L (map); give all sites the same"),
         (
             {"models": lambda m: json.loads(json.dumps(m).replace('"sex[T.M]"', '"sex[T.F]"'))},
-            "terms of the model",
+            "columns: Intercept, group[T.AD], age, sex[T.F], but at a Intercept, group[T.AD], age",
         ),
         (
             {"models": lambda m: json.loads(json.dumps(m).replace('"CN-AD"', '"AD-CN"'))},
@@ -372,6 +372,8 @@ def test_the_page_has_the_maps_of_both_models_and_of_heterogeneity(combined):
     page = (combined / "meta.html").read_text(encoding="utf-8")
     assert page.count('data-kind="effect"') == page.count('data-kind="significance"') > 0
     assert "not drawn" not in page
+    assert "What was found" in page
+    assert re.search(r"\d+ of 147 points survive", page)
 
 
 def test_tables_say_what_their_columns_are(combined):

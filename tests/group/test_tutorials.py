@@ -1,4 +1,4 @@
-"""Both tutorials: their commands work, and print the numbers that the pages show.
+"""The tutorials: their commands work, and print the numbers that the pages show.
 
 The whole of them takes minutes: ``tools/test-tutorials`` runs it, which sets HIPSTA_BIDS_TUTORIALS.
 """
@@ -7,6 +7,7 @@ import os
 import re
 import shlex
 import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +16,14 @@ import pytest
 from scipy import ndimage
 from small_cohorts import write_dataset
 
+from hipsta_bids.cli.commands import meta_parser, phantom_parser
+from hipsta_bids.cli.group import group_parser
 from hipsta_bids.cli.main import main
 
 DOCS = Path(__file__).parents[2] / "docs"
-PHANTOM, OWN = ((DOCS / f"tutorial-{name}.md").read_text() for name in ("phantom", "own-data"))
+PHANTOM, OWN, SITES = (
+    (DOCS / f"tutorial-{name}.md").read_text() for name in ("phantom", "own-data", "consortium")
+)
 MODEL = "group-age-sex-site"
 THINNED = "187"  # points that were thinned, of `phantom_effect.tsv`
 whole = pytest.mark.skipif(
@@ -184,3 +189,99 @@ def test_the_sentences_of_the_phantom_tutorial_say_what_came_out(study):
     counts = [int((signs > 0).sum()) for signs in strict], int((strict[1] < 0).sum())
     assert f"{counts[0][0]} points remain on the left and {counts[0][1]} on the right" in page
     assert f"and {counts[1] or 'no'} violet ones" in page
+
+
+def consortium(page=SITES):
+    """Command lines of the page of the consortium, those of one site for all of the table."""
+    rows = re.findall(r"^\| (\w+) \| ([\d.]+) \| (\d) \|$", page, re.MULTILINE)
+    (first, thickness, seed), *_ = rows
+    for text in blocks(page):
+        lines = text.replace("\\\n", " ").splitlines()
+        for line in lines if re.match("hipsta-bids|mkdir", text) else ():
+            if not re.search(r" phantom | participant$| --export-summary ", line):
+                yield shlex.split(line) if line.startswith("hipsta") else line
+                continue
+            for site, own, number in rows if "--export" not in line or "Bonn" in line else ():
+                given = re.sub("Bonn|Berlin", site, line)
+                given = re.sub(r"(?<= )(bonn|berlin)(?=-out | )", site.lower(), given)
+                given = given.replace(f"--thickness {thickness}", f"--thickness {own}")
+                yield shlex.split(given.replace(f"--seed {seed}", f"--seed {number}"))
+    assert first == "Berlin"
+
+
+def test_the_commands_of_the_consortium_are_understood():
+    """Those that take long are only parsed here."""
+    every = [line for line in consortium() if not isinstance(line, str)]
+    assert len(every) == 5 + 5 + 1 + 5 + 1 + 2
+    for _, first, *rest in every:
+        if first == "phantom":
+            assert phantom_parser().parse_args(rest).n_subjects == 40
+        elif first == "meta":
+            assert len(meta_parser().parse_intermixed_args(rest).sites) == 5
+        elif rest[1] == "group":
+            group_parser().parse_args([first, *rest])
+    assert [one[2] for one in every[:5]] == ["berlin", "bonn", "lyon", "oslo", "turin"]
+
+
+@pytest.fixture(scope="module")
+def sites(tmp_path_factory):
+    """The folder in which every command of the consortium was run."""
+    folder = tmp_path_factory.mktemp("consortium")
+    before = Path.cwd()
+    os.chdir(folder)
+    for line in consortium():
+        if isinstance(line, str):
+            subprocess.run(["sh", "-c", line], check=True)
+        else:
+            assert main(line[1:]) == 0
+    os.chdir(before)
+    return folder
+
+
+@whole
+def test_the_sentences_of_the_consortium_say_what_came_out(sites):
+    check_consortium(sites)
+
+
+def check_consortium(folder):
+    page = plain(SITES)
+    meta, pooled = folder / "consortium" / "meta", folder / "pooled" / "group"
+    for _, row in table(meta / "peaks.tsv").iterrows():
+        cells = [row.hemi, row.contrast.split("(")[1].rstrip(")"), f"{row.x:.2f}", f"{row.y:.2f}"]
+        cells += [f"{row.statistic:.1f}", f"{row.df:.0f}", f"{row.p_corrected:.0e}"]
+        assert f"| {' | '.join([*cells, f'{row.effect_size:.2f}', str(row.extent)])} |" in page
+    thinned = table(folder / "berlin" / "phantom_effect.tsv").in_region.to_numpy() == 1
+    maps, counts, between = {}, {}, []
+    for hemi in "LR":
+        for kind, path in (
+            ("fixed", meta / f"hemi-{hemi}_contrast-ControlPatientFixedEffect"),
+            ("random", meta / f"hemi-{hemi}_contrast-ControlPatientRandomEffects"),
+            ("pooled", pooled / "pooled" / f"hemi-{hemi}_contrast-ControlPatient"),
+            ("harmonized", pooled / "harmonized" / f"hemi-{hemi}_contrast-ControlPatient"),
+        ):
+            own = maps[kind, hemi] = table(f"{path}_desc-thickness_statmap.tsv")
+            found = (own.significant == True).to_numpy()  # noqa: E712
+            counts[kind, hemi] = int(found[thinned].sum()), int(found[~thinned].sum())
+        between.append(f"{maps['random', hemi].i2.median():.0%}".replace("%", " %"))
+        sd = (maps["pooled", hemi].estimate / maps["pooled", hemi].cohen_d).to_numpy()
+        away = {
+            kind: np.nanmax(np.abs(maps[kind, hemi].estimate - maps["pooled", hemi].estimate) / sd)
+            for kind in ("fixed", "random")
+        }
+        assert away["fixed"] < 1e-6
+        assert away["random"] < 0.02
+    for kind in ("fixed", "random"):
+        (left, more), (right, beside) = counts[kind, "L"], counts[kind, "R"]
+        assert (
+            f"{left} and {right} of its {THINNED} points, and {more} and {beside} beside it" in page
+        )
+    assert f"{between[0]} on the left and {between[1]} on the right" in page
+    assert counts["pooled", "L"] == counts["fixed", "L"]
+    assert counts["pooled", "R"] == counts["fixed", "R"]
+    total = [sum(counts["harmonized", hemi]) for hemi in "LR"]
+    assert f"{total[0]} and {total[1]} points survive" in page
+    left_out = table(meta / "leave_one_out.tsv").set_index("contrast").n_significant
+    assert f"at least {left_out['control-patient (fixed effect)'].min()} points" in page
+    shifts = table(pooled / "harmonized" / "sites.tsv").query("measure == 'thickness'")
+    for name in ("offset_before", "offset_after"):
+        assert f"{shifts[name].min():.2f} to {shifts[name].max():.2f}" in page

@@ -198,3 +198,14 @@ def test_a_folder_with_something_else_is_left_alone(tmp_path, capsys):
 def test_plans_are_checked_at_once():
     with pytest.raises(UsageError, match="region 'x' is unknown"):
         CohortPlan(region="x")
+
+
+def test_subjects_of_one_site_are_named_after_it():
+    plain = make_cohort(CohortPlan(n_subjects=2, thickness=1.9, sites=(0.0,)))
+    own = make_cohort(CohortPlan(n_subjects=2, thickness=1.9, site="Oslo"))
+    assert [subject.label for subject in own] == ["Oslo01", "Oslo02"]
+    assert {subject.site for subject in own} == {"Oslo"}
+    walls = [[item.spec.thickness for s in some for item in s.hemispheres] for some in (plain, own)]
+    assert walls[0] == walls[1]
+    with pytest.raises(UsageError, match="letters and digits"):
+        CohortPlan(site="New York")
