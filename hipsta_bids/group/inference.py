@@ -68,7 +68,7 @@ def permute(
     *,
     settings: MultiplicitySettings,
     blocks: Int | None = None,
-    family: tuple[int, int] = (0, 1),
+    family: tuple[int, int] | None = None,
 ) -> list[PermutationTest]:
     """Permutation test of one contrast at all points (Freedman and Lane 1983).
 
@@ -80,15 +80,16 @@ def permute(
 
     Missing values count as what the covariates predict, which shrinks an effect; degrees of
     freedom are those of the subjects present. ``family`` is the number of this one, from 0, and of
-    how many, to tell how far all are.
+    how many, to tell how far all are; without it nothing is told.
     """
     runs = [_Run.build(part, contrast, settings, blocks) for part in parts]
     random = np.random.default_rng(settings.seed)
     n_subjects = 1 + max(int(part.subjects.max()) for part in parts)
     for start in range(1, settings.permutations, _BATCH):
         count = min(_BATCH, settings.permutations - start)
-        done = family[0] * settings.permutations + start - 1
-        tell("permutations", done, family[1] * settings.permutations)
+        if family is not None:
+            done = family[0] * settings.permutations + start - 1
+            tell("permutations", done, family[1] * settings.permutations)
         keys = random.random((count, n_subjects))
         maps = [run.shuffled(keys) for run in runs]
         highest = np.max([_maximum(t) for t, _ in maps], axis=0)
@@ -131,7 +132,7 @@ class _Run:
         own = None if blocks is None else blocks[part.subjects]
         if own is not None and not model.tests_common_part():
             _check_blocks(matrix @ np.linalg.pinv(contrast.weights), own, contrast)
-        observed = model.statistics(model.basis[None])
+        observed = model.statistics(model.basis.T[None])
         enhanced = _enhanced(observed, part.edges, settings)
         counts = np.ones((3, maps.shape[1]))
         return cls(part, contrast, settings, model, own, observed, enhanced, counts)
@@ -141,7 +142,7 @@ class _Run:
         people = self.part.people
         flip = people is not None or self.model.tests_common_part()
         own = self.part.subjects if people is None else people
-        bases = [_shuffle(self.model.basis, self.blocks, key[own], flip=flip) for key in keys]
+        bases = [_shuffle(self.model.basis, self.blocks, key[own], flip=flip).T for key in keys]
         t = self.model.statistics(np.stack(bases))
         return t, _enhanced(t, self.part.edges, self.settings)
 
@@ -216,8 +217,9 @@ class _Model:
         return bool(np.linalg.norm(ones - rest @ (rest.T @ ones)) > _CONSTANT)
 
     def statistics(self, bases: Float) -> Float:
-        """Signed t, or square root of F, of (batch, points)."""
-        scores = np.swapaxes(bases, 1, 2) @ self.residuals
+        """Signed t, or square root of F, (batch, points) of bases (batch, columns, subjects)."""
+        # One product of large matrices is many times as fast as one for each basis.
+        scores = (bases.reshape(-1, bases.shape[2]) @ self.residuals).reshape(*bases.shape[:2], -1)
         noise = self.squares - np.einsum("bcp,bcp->bp", scores, scores)
         tested = scores[:, : self.rows]
         gained = np.einsum("bcp,bcp->bp", tested, tested) / self.rows

@@ -453,11 +453,12 @@ def _draw_sheet(
     """Draw a map of the sheet, and borders and names of the most frequent subfields."""
     x, y = cohort.x, cohort.y
     fields = one.subfield
-    axes.pcolormesh(
-        x, y, values.reshape(fields.shape).T, **scale, shading="nearest", rasterized=True
-    )
     edges = _beyond(x), _beyond(y)
-    axes.set(xlim=edges[0][[0, -1]], ylim=edges[1][[0, -1]])
+    extent = *edges[0][[0, -1]], *edges[1][[0, -1]]
+    image = values.reshape(fields.shape).T
+    axes.imshow(
+        image, **scale, extent=extent, origin="lower", aspect="auto", interpolation="nearest"
+    )
     line: Any = {"levels": [_HALF], "colors": "black", "linewidths": _FIELD_LINE}
     width = axes.bbox.width * 72 / axes.figure.dpi  # points
     for number, name in enumerate(one.maps.names):
