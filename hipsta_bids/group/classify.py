@@ -26,6 +26,8 @@ from hipsta_bids.group.logistic import (
 )
 from hipsta_bids.group.settings import ClassificationSettings
 
+#: Points of a curve that are written and drawn.
+_MOST_POINTS = 1001
 #: Members of training sets that are fitted at once; does not change a result.
 _CHUNK = 100_000
 #: Subjects in a group of the table of calibration, or there are fewer groups.
@@ -60,9 +62,13 @@ def delong(score: Float, case: Bool, confidence: float) -> Area:
 
 
 def roc_curve(score: Float, case: Bool) -> tuple[Float, Float]:
-    """Shares of controls and of cases at or above each score, from none to all."""
+    """Shares of controls and of cases at or above each score, from none to all.
+
+    Of more than a thousand scores, a thousand are taken.
+    """
     wrong, right, _ = metrics.roc_curve(case, score, drop_intermediate=False)
-    return wrong, right
+    few = np.linspace(0, len(wrong) - 1, min(len(wrong), _MOST_POINTS)).round().astype(np.int64)
+    return wrong[few], right[few]
 
 
 @dataclass(frozen=True)
@@ -203,7 +209,7 @@ def cross_validate(matrix: Float, case: Bool, settings: ClassificationSettings) 
     return _cross_validated(matrix.tobytes(), matrix.shape[1], case.tobytes(), settings)
 
 
-@lru_cache(maxsize=128)
+@lru_cache(maxsize=32)
 def _cross_validated(
     values: bytes, columns: int, cases: bytes, settings: ClassificationSettings
 ) -> CrossValidation:
@@ -213,9 +219,13 @@ def _cross_validated(
     basis = orthonormal(matrix)
     total, means = np.zeros(len(case)), []
     fold_of = _folds(cases, folds, settings.repeats, settings.seed)
-    for some in np.array_split(fold_of, -(-fold_of.size * folds // _CHUNK)):
+    # What all subjects give is near what training sets do.
+    every, settled = maxima(basis, case, np.ones((1, len(case))))
+    start = every[0] if settled[0] else None
+    parts = min(-(-fold_of.size * folds // _CHUNK), settings.repeats)
+    for some in np.array_split(fold_of, parts):
         train = some[:, None] != np.arange(folds)[:, None]
-        beta = _coefficients(basis, case, train.reshape(-1, len(case)), settings)
+        beta = _coefficients(basis, case, train.reshape(-1, len(case)), start, settings)
         for own, by_fold, coefficients in zip(
             some, train, beta.reshape(len(some), folds, -1), strict=True
         ):
@@ -230,10 +240,12 @@ def _cross_validated(
     return CrossValidation(float(np.mean(means)), spread, total / settings.repeats, folds)
 
 
-def _coefficients(basis: Float, case: Bool, train: Bool, settings: ClassificationSettings) -> Float:
+def _coefficients(
+    basis: Float, case: Bool, train: Bool, start: Float | None, settings: ClassificationSettings
+) -> Float:
     """Coefficients (sets, columns) of training sets (sets, subjects); NaN of those to look at."""
     kept = train.astype(np.float64)
-    beta, settled = maxima(basis, case, kept)
+    beta, settled = maxima(basis, case, kept, start)
     # Steps that do not end lead to where groups are apart, if they are.
     wild = np.flatnonzero(~settled)
     apart = ((beta[wild] @ basis.T > 0) == case) | ~train[wild]

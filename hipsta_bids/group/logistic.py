@@ -107,7 +107,7 @@ def orthonormal(matrix: Float) -> Float:
     return np.asarray(basis[:, size > RANK * size[0]] * np.sqrt(len(matrix)), dtype=np.float64)
 
 
-def maxima(basis: Float, case: Bool, kept: Float) -> tuple[Float, Bool]:
+def maxima(basis: Float, case: Bool, kept: Float, start: Float | None = None) -> tuple[Float, Bool]:
     """Maximize the likelihood in several sets of subjects at once, by Newton's method.
 
     ``kept`` is (sets, subjects), 1 for members. Gives coefficients (sets, columns), and in which
@@ -115,7 +115,7 @@ def maxima(basis: Float, case: Bool, kept: Float) -> tuple[Float, Bool]:
     """
     columns = basis.shape[1]
     products = _products(basis)
-    beta = np.zeros((len(kept), columns))
+    beta = np.tile(np.zeros(columns) if start is None else start, (len(kept), 1))
     settled = np.zeros(len(kept), dtype=bool)
     lost = np.zeros(len(kept), dtype=bool)
     for _ in range(_NEWTON_STEPS):

@@ -246,7 +246,7 @@ def mean_profiles(maps: Float, settings: RegistrationSettings) -> Float:
     """Profiles of curvature along x: means over y, with gaps filled linearly."""
     present = np.isfinite(maps)
     counts = present.sum(axis=2)
-    sums = np.where(present, maps, 0.0).sum(axis=2)
+    sums = np.where(present, maps, 0.0).sum(axis=2, dtype=np.float64)
     profiles = sums / np.maximum(counts, 1)
     empty = counts == 0
     bad = np.flatnonzero(empty.mean(axis=1) > settings.max_gap)
