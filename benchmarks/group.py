@@ -1,144 +1,167 @@
-"""Time and memory of the group level's analysis, by the number of participants.
+"""Time and memory of the group level's default run, by the number of participants and by stage.
 
-Simulated sheets of both hemispheres (see ``hipsta_bids/group/simulation.py``) are registered, and
-group + age + sex is fitted to thickness with the contrasts of three groups, with FDR2::
+Writes sheets, summaries and surfaces as the participant level leaves them: those of a phantom that
+was measured, with simulated maps (``hipsta_bids/validation/group.py``) and scattered summary
+measures, for three groups. Then runs the command::
 
-    .venv/bin/python benchmarks/group.py [--sizes 100 1500 5000] [--json FILE]
+    .venv/bin/python benchmarks/group.py [--sizes 40 1500 5000] [--json FILE]
 
-Each size has a process of its own, so that memory is its own. Reading and writing of files is not
-part of it: ``hipsta-bids validate --group`` and the tests do that.
+Each size has a process of its own, so that memory is its own. Beyond 1,000 participants files are
+links to those of the first 1,000, since reading them costs the same; covariates are each one's own.
 """
 
 import argparse
 import json
+import os
 import resource
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Sequence
+from contextlib import redirect_stdout
 from dataclasses import asdict, dataclass, replace
-from itertools import combinations
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 from report import print_table, write_report
 
-from hipsta_bids.group.analysis import analyze_cohort
-from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Measures, SideMaps
-from hipsta_bids.group.formula import model_from_shortcut, parse_model
-from hipsta_bids.group.model import Groups
-from hipsta_bids.group.settings import GroupSettings
-from hipsta_bids.validation.group import SimulationPlan, simulate_cohort
+from hipsta_bids import progress
+from hipsta_bids.cli import console
+from hipsta_bids.cli.main import main as run_command
+from hipsta_bids.derivatives.hemisphere import ResultPlace, format_column, list_results
+from hipsta_bids.io import files
+from hipsta_bids.validation.group import SimulatedCohort, SimulationPlan, simulate_cohort
 
+COMMAND = (sys.executable, "-m", "hipsta_bids.cli.main")
 GROUPS = ("CN", "MCI", "AD")
-#: Drawn at once: a simulation needs several times the memory of its maps.
-BLOCK = 500
-MB = 1024.0
+#: Participants with files of their own.
+OWN = 1000
+#: Spread of summary measures, as a share of the phantom's.
+SPREAD = 0.1
+#: What all participants have in common with the phantom.
+SURFACES = ("interior_surface", "midthickness_surface", "exterior_surface")
+SAME = (*SURFACES, "sheet_sidecar", "summary_sidecar", "qc")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """One analysis."""
+    """One run of the group level."""
 
     participants: int
     wall: float
     """s"""
     cpu: float
-    """s"""
-    maps: float
-    """What the sheets themselves take, MB."""
+    """s, the system's included."""
     memory: float
-    """Peak of the process, MB, the maps and libraries included."""
-    found: int
-    """Points at which any contrast survives, of both hemispheres."""
+    """Peak of the process, MB."""
+    stages: dict[str, float]
+    """Processor time by stage, s."""
 
 
-def simulate(size: int) -> Cohort:
-    """Draw a cohort of three groups with both hemispheres."""
-    plan = SimulationPlan()
-    groups = np.resize(GROUPS, size)
-    table = pd.DataFrame(
-        {PARTICIPANT: [f"sub-{i:06d}" for i in range(size)], SESSION: None, "group": groups}
+def write_study(data: Path, out: Path, size: int) -> None:
+    """Write a dataset, and what the participant level leaves of it."""
+    for more in (["phantom", data, "--n-subjects", 1], [data, out, "participant", "--no-reports"]):
+        command = [*COMMAND, *map(str, more)]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)  # noqa: S603
+    (out / "status.tsv").unlink()
+    random = np.random.default_rng(0)
+    names = [f"sub-{i:06d}" for i in range(size)]
+    age, sex = random.uniform(55, 85, size), random.choice(["F", "M"], size)
+    rows = zip(names, np.resize(GROUPS, size), [f"{years:.1f}" for years in age], sex, strict=True)
+    files.write_tsv(data / "participants.tsv", ["participant_id", "group", "age", "sex"], rows)
+    for seed, place in enumerate(list_results(out)):
+        plan = SimulationPlan(sizes=(min(size, OWN), 0), effect=0)
+        _write_side(place, simulate_cohort(plan, seed), names, random)
+        place.path("qc").unlink()
+
+
+def _write_side(
+    place: ResultPlace,
+    cohort: SimulatedCohort,
+    names: Sequence[str],
+    random: np.random.Generator,
+) -> None:
+    """Write one hemisphere of all participants, from that of the phantom."""
+    sheet, summary = (
+        [line.split("\t") for line in place.path(key).read_text(encoding="utf-8").splitlines()]
+        for key in ("sheet", "summary")
     )
-    sides = {}
-    for seed, hemi in enumerate("LR"):
-        maps = {name: np.empty((size, *plan.nodes)) for name in ("thickness", "curvature")}
-        table["age"], table["sex"] = 0.0, "F"
-        for start in range(0, size, BLOCK):
-            rows = slice(start, min(start + BLOCK, size))
-            count = rows.stop - rows.start
-            sizes = (count // 2, count - count // 2)
-            drawn = simulate_cohort(replace(plan, sizes=sizes), seed=1000 * seed + start)
-            maps["thickness"][rows], maps["curvature"][rows] = drawn.thickness, drawn.curvature
-            table.loc[table.index[rows], "age"] = drawn.age
-            table.loc[table.index[rows], "sex"] = np.where(drawn.sex, "M", "F")
-            table.loc[table.index[rows], "group"] = np.where(
-                drawn.group, "AD", np.resize(GROUPS[:2], count)
-            )
-        sides[hemi] = SideMaps(
-            rows=np.arange(size),
-            maps=maps,
-            subfield=np.zeros((size, *plan.nodes), dtype=np.int8),
-            names=("CA1",),
-            summary=pd.DataFrame(
-                {name: maps["thickness"].mean(axis=(1, 2)) for name in ("volume", "thickness_mean")}
-            ),
-        )
-    x, y = (np.linspace(-0.9, 0.9, n) for n in plan.nodes)
-    units = {"thickness": "mm", "curvature": "mm^-1", "volume": "mm^3", "thickness_mean": "mm"}
-    return Cohort(
-        table=table.set_index(PARTICIPANT, drop=False), sides=sides, x=x, y=y, units=units
-    )
+    every = [
+        replace(place, name=replace(place.name, subject=name.removeprefix("sub-")))
+        for name in names
+    ]
+    for i, new in enumerate(every):
+        new.path("qc").parent.mkdir(parents=True, exist_ok=True)
+        for key in SAME if i < OWN else ("sheet", "summary", "qc"):
+            os.link((place if i < OWN else every[i % OWN]).path(key), new.path(key))
+        if i >= OWN:
+            continue
+        for name, maps, digits in (
+            ("thickness", cohort.thickness, 4),
+            ("curvature", cohort.curvature, 5),
+        ):
+            column = sheet[0].index(name)
+            for row, value in zip(sheet[1:], format_column(maps[i], digits), strict=True):
+                row[column] = value
+        files.write_tsv(new.path("sheet"), sheet[0], sheet[1:])
+        factors = 1 + SPREAD * random.standard_normal(len(summary[1]))
+        values = [
+            cell if cell == files.MISSING else f"{float(cell) * factor:.5g}"
+            for cell, factor in zip(summary[1], factors, strict=True)
+        ]
+        files.write_tsv(new.path("summary"), summary[0], [values])
 
 
-def run(size: int) -> Run:
-    """Simulate and analyze in this process."""
-    cohort = simulate(size)
-    contrasts = [f"group[{a}]-group[{b}]" for a, b in combinations(GROUPS, 2)]
-    formula = "thickness ~ group + age + sex"
-    model = parse_model(model_from_shortcut(formula, contrasts, "benchmark"))
-    groups = Groups(column="group", levels=GROUPS)
-    maps = sum(one.nbytes for side in cohort.sides.values() for one in side.maps.values())
-    start = time.perf_counter(), time.process_time()
-    result = analyze_cohort(
-        cohort,
-        model,
-        groups,
-        GroupSettings(),
-        measures=Measures(maps=("thickness",), summaries=()),
-        references={"group": "CN"},
-    )
+def run(data: Path, out: Path, size: int) -> Run:
+    """Run the command in this process."""
+    stages: dict[str, float] = {}
+    now = ["start", 0.0]
+
+    def note(stage: str, _done: int, _total: int) -> None:
+        used = time.process_time()
+        stages[now[0]] = stages.get(now[0], 0.0) + used - now[1]
+        now[:] = [stage, used]
+
+    console.listening = lambda _: progress.listening(note)
+    start = time.perf_counter()
+    with Path(os.devnull).open("w", encoding="utf-8") as nothing, redirect_stdout(nothing):
+        code = run_command([str(data), str(out), "group"])
+    if code:
+        raise SystemExit(code)
+    note("end", 0, 0)
+    used = resource.getrusage(resource.RUSAGE_SELF)
     return Run(
         participants=size,
-        wall=time.perf_counter() - start[0],
-        cpu=time.process_time() - start[1],
-        maps=maps / MB**2,
-        memory=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / MB,
-        found=sum(int(one.rejected.sum()) for one in result.found.values()),
+        wall=time.perf_counter() - start,
+        cpu=used.ru_utime + used.ru_stime,
+        memory=used.ru_maxrss / 1024,
+        stages=stages,
     )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run from the command line."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--sizes", type=int, nargs="+", default=(100, 1500, 5000), metavar="N")
-    parser.add_argument("--one", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--sizes", type=int, nargs="+", default=(40, 1500, 5000), metavar="N")
+    parser.add_argument("--one", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--json", type=Path, metavar="FILE")
     options = parser.parse_args(arguments)
     if options.one:
-        print(json.dumps(asdict(run(options.one))))
+        done = run(options.one / "bids", options.one / "out", options.sizes[0])
+        print(json.dumps(asdict(done)))
         return
     runs = []
     for size in options.sizes:
-        command = [sys.executable, __file__, "--one", str(size)]
-        done = subprocess.run(command, check=True, capture_output=True, text=True)  # noqa: S603
-        runs.append(Run(**json.loads(done.stdout)))
-    header = ["participants", "wall s", "CPU s", "maps MB", "memory MB", "found"]
-    rows = {
-        str(one.participants): [one.wall, one.cpu, one.maps, one.memory, one.found] for one in runs
-    }
-    print_table(header, rows)
+        with tempfile.TemporaryDirectory() as folder:
+            write_study(Path(folder) / "bids", Path(folder) / "out", size)
+            command = [sys.executable, __file__, "--one", folder, "--sizes", str(size)]
+            done = subprocess.run(command, check=True, stdout=subprocess.PIPE)  # noqa: S603
+            runs.append(Run(**json.loads(done.stdout)))
+    sizes = [str(one.participants) for one in runs]
+    rows = {name: [getattr(one, name) for one in runs] for name in ("wall", "cpu", "memory")}
+    rows |= {name: [one.stages.get(name, 0.0) for one in runs] for name in runs[0].stages}
+    print_table(["s, MB", *sizes], rows)
     if options.json:
         write_report(options.json, {"runs": [asdict(one) for one in runs]})
 

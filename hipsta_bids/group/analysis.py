@@ -17,7 +17,15 @@ from hipsta_bids.group.comparison import (
     compare_sessions,
     modeled_table,
 )
-from hipsta_bids.group.data import PARTICIPANT, Cohort, Float, Measures, SideMaps
+from hipsta_bids.group.data import (
+    MOST_KEPT,
+    PARTICIPANT,
+    Cohort,
+    Float,
+    Measures,
+    SideMaps,
+    WarpedMaps,
+)
 from hipsta_bids.group.formula import ModelSpec
 from hipsta_bids.group.glm import FittedMaps, PointTest, RowModel, fit_maps, with_mean
 from hipsta_bids.group.grammar import closed_formula
@@ -383,14 +391,13 @@ def register_side(
 
 
 def _register_maps(side: SideMaps, warps: Float) -> SideMaps:
-    labels = warp_labels(side.subfield.astype(np.int64), warps)
-    return SideMaps(
-        rows=side.rows,
-        maps={name: warp_values(maps, warps) for name, maps in side.maps.items()},
-        errors={name: warp_values(maps, warps) for name, maps in side.errors.items()},
-        subfield=labels.astype(np.int8),
-        names=side.names,
-        summary=side.summary,
+    kept = len(warps) <= MOST_KEPT
+    maps, errors = (WarpedMaps(one, warps, warp_values) for one in (side.maps, side.errors))
+    return replace(
+        side,
+        maps=dict(maps) if kept else maps,
+        errors=dict(errors) if kept else errors,
+        subfield=warp_labels(side.subfield, warps),
     )
 
 
@@ -420,12 +427,13 @@ def mean_of_known(values: Float, axis: int) -> Float:
     """Mean without what is missing; NaN where nothing is known."""
     known = np.isfinite(values)
     count = known.sum(axis=axis)
-    total = np.where(known, values, 0.0).sum(axis=axis)
+    total = values.sum(axis=axis, dtype=np.float64, where=known)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
 def spread_of_known(values: Float) -> Float:
     """Take the standard deviation over the first axis of what is known; NaN below two values."""
     count = np.isfinite(values).sum(axis=0)
-    variance = mean_of_known((values - mean_of_known(values, 0)) ** 2, 0)
+    deviations = values - mean_of_known(values, 0).astype(values.dtype)
+    variance = mean_of_known(deviations**2, 0)
     return np.where(count > 1, np.sqrt(variance * count / np.maximum(count - 1, 1)), np.nan)

@@ -16,6 +16,7 @@ from hipsta_bids.group.data import Bool, Float, Int
 from hipsta_bids.group.logistic import (
     RANK,
     LogisticFit,
+    firth_maxima,
     fit_logistic,
     fit_overlapping_or_firth,
     is_separated,
@@ -25,6 +26,10 @@ from hipsta_bids.group.logistic import (
 )
 from hipsta_bids.group.settings import ClassificationSettings
 
+#: Points of a curve that are written and drawn.
+_MOST_POINTS = 1001
+#: Members of training sets that are fitted at once; does not change a result.
+_CHUNK = 100_000
 #: Subjects in a group of the table of calibration, or there are fewer groups.
 _LEAST_IN_BIN = 5
 
@@ -57,9 +62,13 @@ def delong(score: Float, case: Bool, confidence: float) -> Area:
 
 
 def roc_curve(score: Float, case: Bool) -> tuple[Float, Float]:
-    """Shares of controls and of cases at or above each score, from none to all."""
+    """Shares of controls and of cases at or above each score, from none to all.
+
+    Of more than a thousand scores, a thousand are taken.
+    """
     wrong, right, _ = metrics.roc_curve(case, score, drop_intermediate=False)
-    return wrong, right
+    few = np.linspace(0, len(wrong) - 1, min(len(wrong), _MOST_POINTS)).round().astype(np.int64)
+    return wrong[few], right[few]
 
 
 @dataclass(frozen=True)
@@ -200,7 +209,7 @@ def cross_validate(matrix: Float, case: Bool, settings: ClassificationSettings) 
     return _cross_validated(matrix.tobytes(), matrix.shape[1], case.tobytes(), settings)
 
 
-@lru_cache(maxsize=128)
+@lru_cache(maxsize=32)
 def _cross_validated(
     values: bytes, columns: int, cases: bytes, settings: ClassificationSettings
 ) -> CrossValidation:
@@ -209,17 +218,42 @@ def _cross_validated(
     folds = min(settings.folds, int(case.sum()), int((~case).sum()))
     basis = orthonormal(matrix)
     total, means = np.zeros(len(case)), []
-    for fold_of in _folds(cases, folds, settings.repeats, settings.seed):
-        train = fold_of != np.arange(folds)[:, None]
-        beta, settled = maxima(basis, case, train.astype(np.float64))
-        score = np.einsum("sj,sj->s", basis, beta[fold_of])
-        for fold in np.flatnonzero(~settled):
-            test = ~train[fold]
-            score[test] = _predict(matrix[~test], case[~test], matrix[test], settings)
-        total += score
-        means.append(np.mean([_area(score[~own & case], score[~own & ~case]) for own in train]))
+    fold_of = _folds(cases, folds, settings.repeats, settings.seed)
+    # What all subjects give is near what training sets do.
+    every, settled = maxima(basis, case, np.ones((1, len(case))))
+    start = every[0] if settled[0] else None
+    parts = min(-(-fold_of.size * folds // _CHUNK), settings.repeats)
+    for some in np.array_split(fold_of, parts):
+        train = some[:, None] != np.arange(folds)[:, None]
+        beta = _coefficients(basis, case, train.reshape(-1, len(case)), start, settings)
+        for own, by_fold, coefficients in zip(
+            some, train, beta.reshape(len(some), folds, -1), strict=True
+        ):
+            score = np.einsum("sj,sj->s", basis, coefficients[own])
+            for fold in np.flatnonzero(np.isnan(coefficients[:, 0])):
+                test = ~by_fold[fold]
+                score[test] = _predict(matrix[~test], case[~test], matrix[test], settings)
+            total += score
+            areas = [_area(score[~one & case], score[~one & ~case]) for one in by_fold]
+            means.append(np.mean(areas))
     spread = float(np.std(means, ddof=1)) if settings.repeats > 1 else float("nan")
     return CrossValidation(float(np.mean(means)), spread, total / settings.repeats, folds)
+
+
+def _coefficients(
+    basis: Float, case: Bool, train: Bool, start: Float | None, settings: ClassificationSettings
+) -> Float:
+    """Coefficients (sets, columns) of training sets (sets, subjects); NaN of those to look at."""
+    kept = train.astype(np.float64)
+    beta, settled = maxima(basis, case, kept, start)
+    # Steps that do not end lead to where groups are apart, if they are.
+    wild = np.flatnonzero(~settled)
+    apart = ((beta[wild] @ basis.T > 0) == case) | ~train[wild]
+    separated = wild[apart.all(axis=1)]
+    beta[wild] = np.nan
+    if len(separated):
+        beta[separated] = firth_maxima(basis, case, kept[separated], settings)[0]
+    return beta
 
 
 @lru_cache(maxsize=16)

@@ -1,6 +1,6 @@
 """Values passed between reading, analyzing and writing at the group level."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -15,6 +15,9 @@ Bool = NDArray[np.bool_]
 
 #: Columns that identify visits, with the prefixes of BIDS.
 PARTICIPANT, SESSION = "participant_id", "session_id"
+#: More sheets of a side are kept in single precision, whose rounding is less than a hundredth of
+#: that of the tables, and registered whenever they are asked for, to save memory.
+MOST_KEPT = 10_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,6 +28,31 @@ class Measures:
     """Maps of the sheet, by the names of their columns or by those that a user gave."""
     summaries: tuple[str, ...] | None = None
     """Summary measures; ``None`` for all."""
+
+
+@dataclass(frozen=True, eq=False)
+class WarpedMaps(Mapping[str, Float]):
+    """Maps (sheets, x, y) that are registered whenever they are asked for."""
+
+    source: Mapping[str, Float]
+    warps: Float
+    carry: Callable[[Float, Float], Float]
+
+    def __getitem__(self, name: str) -> Float:
+        return self.carry(self.source[name], self.warps)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.source)
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+
+def some_sheets(maps: Mapping[str, Float], own: slice | Bool) -> Mapping[str, Float]:
+    """Keep some sheets of maps."""
+    if isinstance(maps, WarpedMaps):
+        return WarpedMaps(some_sheets(maps.source, own), maps.warps[own], maps.carry)
+    return {name: values[own] for name, values in maps.items()}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -53,6 +81,8 @@ class SideMaps:
 
     def only(self, measures: Sequence[str]) -> "SideMaps":
         """Keep some maps."""
+        if set(measures) == set(self.maps):
+            return self
         return replace(self, maps={name: self.maps[name] for name in measures})
 
     def with_summary(self, columns: pd.DataFrame) -> "SideMaps":
@@ -72,8 +102,8 @@ class SideMaps:
         return replace(
             self,
             rows=self.rows[own],
-            maps={name: values[own] for name, values in self.maps.items()},
-            errors={name: values[own] for name, values in self.errors.items()},
+            maps=some_sheets(self.maps, own),
+            errors=some_sheets(self.errors, own),
             subfield=self.subfield[own],
             summary=self.summary[own].reset_index(drop=True),
         )

@@ -85,6 +85,7 @@ _INCH = 25.4  # mm
 _SECTIONS = {0.1: "posterior", 0.5: "middle", 0.9: "anterior"}
 _WIDTHS = (1.2, 0.7, 1.2)  # of the lines of interior, middle and exterior, points
 _STYLES = ("-", ":", "-")
+_MOST_LINES = 500  # of single warps on a panel: more hide each other
 _LETTERS = "abcdefghijklmnopqrstuvwxyz"
 
 #: Deviation of the 5th centile.
@@ -106,6 +107,7 @@ def encode(name: str, draw: Drawing) -> list[tuple[str, bytes]]:
                 buffer = io.BytesIO()
                 figure.savefig(buffer, format=kind, dpi=DOTS_PER_INCH, metadata=metadata)
                 encoded.append((f"{own}.{kind}", buffer.getvalue()))
+                figure.set_layout_engine(None)  # that of the first is for all: it takes long
     return encoded
 
 
@@ -222,11 +224,12 @@ def draw_registration(cohort: Cohort, analysis: Analysis) -> "list[Figure]":
         after.sharey(before)
         nodes = side.registration.warps.shape[1]
         moved = (side.registration.warps - np.linspace(0, 1, nodes)) * (nodes - 1)
+        every = -(-len(moved) // _MOST_LINES)
         for color, own in zip(cycle(COLORS), members.values(), strict=False):
-            shifts.plot(cohort.x, moved[own].T, color=color, alpha=0.25, linewidth=0.4)
+            shifts.plot(cohort.x, moved[own][::every].T, color=color, alpha=0.25, linewidth=0.4)
         _curves(shifts, cohort.x, moved, members)
         shifts.axhline(0, color="black", linewidth=0.5)
-        shifts.set_title(f"{SIDES[hemi]}, warps")
+        shifts.set_title(f"{SIDES[hemi]}, warps" + (f" (1 of {every} drawn)" if every > 1 else ""))
         shifts.set_ylabel("shift to lateral [nodes]")
         for axis in (before, after, shifts):
             mark_medial(axis, cohort)

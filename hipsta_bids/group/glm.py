@@ -489,16 +489,16 @@ def fit_maps(
     tested = model.design.contrasts if contrasts is None else contrasts
     try:
         fits = {
-            name: model.fit(_values(maps, used), rows, tested, settings)
+            name: model.fit(_values(side.maps[name], used), rows, tested, settings)
             if settings.glm.weights == "none"
             else fit_points(
-                _values(maps, used),
+                _values(side.maps[name], used),
                 model.design.matrix[rows],
                 tested,
                 settings.glm,
                 _values(side.errors[name], used),
             )
-            for name, maps in side.maps.items()
+            for name in side.maps
         }
     except ModelError as error:
         raise ModelError(f"hemisphere {hemi}: {error}", reason=error.reason) from error

@@ -1,7 +1,7 @@
 """Logistic models: by maximum likelihood, or by Firth's method where they separate the groups."""
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import optimize, special
@@ -107,15 +107,15 @@ def orthonormal(matrix: Float) -> Float:
     return np.asarray(basis[:, size > RANK * size[0]] * np.sqrt(len(matrix)), dtype=np.float64)
 
 
-def maxima(basis: Float, case: Bool, kept: Float) -> tuple[Float, Bool]:
+def maxima(basis: Float, case: Bool, kept: Float, start: Float | None = None) -> tuple[Float, Bool]:
     """Maximize the likelihood in several sets of subjects at once, by Newton's method.
 
     ``kept`` is (sets, subjects), 1 for members. Gives coefficients (sets, columns), and in which
     sets the steps converged: with separated groups each step is about as long as the one before.
     """
     columns = basis.shape[1]
-    products = (basis[:, :, None] * basis[:, None, :]).reshape(len(basis), -1)
-    beta = np.zeros((len(kept), columns))
+    products = _products(basis)
+    beta = np.tile(np.zeros(columns) if start is None else start, (len(kept), 1))
     settled = np.zeros(len(kept), dtype=bool)
     lost = np.zeros(len(kept), dtype=bool)
     for _ in range(_NEWTON_STEPS):
@@ -172,90 +172,116 @@ def _fit_maximum(matrix: Float, case: Bool, settings: ClassificationSettings) ->
 def _fit_firth(
     matrix: Float, case: Bool, settings: ClassificationSettings, free: Bool | None = None
 ) -> LogisticFit:
-    """Penalize the likelihood by the root of the information's determinant (Firth 1993).
-
-    This is Jeffreys' prior: estimates are finite under separation, and less biased.
-    """
+    """Fit all subjects by Firth's method; see :func:`firth_maxima`."""
     scale = _scales(matrix)
     scaled = matrix / scale
-    kept = np.ones(matrix.shape[1], dtype=bool) if free is None else free
-    beta = np.zeros(matrix.shape[1])
-    value = _penalized(scaled, case, beta)
-    for number in range(settings.firth_iterations):
-        bent = number >= _FISHER_STEPS
-        step, promised = _firth_step(scaled, case, beta, kept, bent=bent)
-        for halving in range(_HALVINGS):
-            new = _penalized(scaled, case, beta + step)
-            least = _SHARE * promised / 2**halving - _ROUNDING * (1 + abs(value))
-            if new >= value + least:
-                break
-            step = step / 2
-        beta, value = beta + step, new
-        if promised < settings.tolerance:
-            break
-    else:
-        raise _no_convergence(settings.firth_iterations)
-    covariance = np.linalg.inv(_information(scaled, beta))
+    everybody = np.ones((1, len(case)))
+    beta, value = firth_maxima(scaled, case, everybody, settings, free)
+    covariance = np.linalg.inv(_Sets.of(scaled, case, everybody).information(beta)[0])
     return LogisticFit(
-        coefficients=beta / scale,
+        coefficients=beta[0] / scale,
         se=np.sqrt(np.diagonal(covariance)) / scale,
         # The penalty is that of the columns as given.
-        log_likelihood=value + float(np.log(scale).sum()),
+        log_likelihood=float(value[0]) + float(np.log(scale).sum()),
         firth=True,
     )
 
 
-def _information(matrix: Float, beta: Float) -> Float:
-    chance = special.expit(matrix @ beta)
-    weighted: Float = matrix.T @ (matrix * (chance * (1 - chance))[:, None])
-    return weighted
+def firth_maxima(
+    matrix: Float,
+    case: Bool,
+    kept: Float,
+    settings: ClassificationSettings,
+    free: Bool | None = None,
+) -> tuple[Float, Float]:
+    """Penalize the likelihood by the root of the information's determinant (Firth 1993).
 
-
-def _penalized(matrix: Float, case: Bool, beta: Float) -> float:
-    """Penalized log likelihood."""
-    margin = np.where(case, 1.0, -1.0) * (matrix @ beta)
-    penalty = 0.5 * float(np.linalg.slogdet(_information(matrix, beta))[1])
-    return float(special.log_expit(margin).sum()) + penalty
-
-
-def _firth_step(
-    matrix: Float, case: Bool, beta: Float, kept: Bool, *, bent: bool
-) -> tuple[Float, float]:
-    """Next step by the information, or by Newton's method, and the gain that the slope promises.
-
-    The penalty bends as much as the likelihood where groups are far apart, so that steps by the
-    information alone may take thousands. For Newton's, the slope is differentiated along directions
-    in which the information is one.
+    This is Jeffreys' prior: estimates are finite under separation, and less biased. ``kept`` is
+    (sets, subjects), 1 for members. Gives coefficients (sets, columns), and the penalized log
+    likelihood of each set.
     """
-    size, axes = np.linalg.eigh(_information(matrix, beta)[np.ix_(kept, kept)])
-    directions = np.zeros((len(beta), len(size)))
-    directions[kept] = axes / np.sqrt(np.maximum(size, _FLATTEST * size[-1]))
-    gradient = directions.T @ _firth_score(matrix, case, beta)
-    if not bent:
-        step = directions @ gradient
-        share = min(1.0, _LONGEST_STEP / max(float(np.abs(step).max()), 1e-300))
-        return step * share, float(gradient @ gradient) * share
-    changes = [
-        directions.T
-        @ (
-            _firth_score(matrix, case, beta + _DIFFERENCE * one)
-            - _firth_score(matrix, case, beta - _DIFFERENCE * one)
-        )
-        for one in directions.T
-    ]
-    bend = -np.array(changes) / (2 * _DIFFERENCE)
-    curvature, turned = np.linalg.eigh((bend + bend.T) / 2)
-    along = (turned.T @ gradient) / np.maximum(np.abs(curvature), _LEAST_BEND)
-    shortened = turned @ along
-    step = directions @ shortened
-    share = min(1.0, _LONGEST_STEP / max(float(np.abs(step).max()), 1e-300))
-    return step * share, float(gradient @ shortened) * share
+    free = np.ones(matrix.shape[1], dtype=bool) if free is None else free
+    sets = _Sets.of(matrix, case, kept)
+    beta = np.zeros((len(kept), matrix.shape[1]))
+    value = sets.penalized(beta)
+    active = np.arange(len(kept))
+    for number in range(settings.firth_iterations):
+        own = replace(sets, kept=kept[active])
+        step, promised = own.step(beta[active], free, bent=number >= _FISHER_STEPS)
+        for halving in range(_HALVINGS):
+            new = own.penalized(beta[active] + step)
+            least = _SHARE * promised / 2**halving - _ROUNDING * (1 + np.abs(value[active]))
+            short = new < value[active] + least
+            if not short.any():
+                break
+            step[short] /= 2
+        beta[active] += step
+        value[active] = new
+        active = active[promised >= settings.tolerance]
+        if not len(active):
+            return beta, value
+    raise _no_convergence(settings.firth_iterations)
 
 
-def _firth_score(matrix: Float, case: Bool, beta: Float) -> Float:
-    """Slope of the penalized log likelihood."""
-    chance = special.expit(matrix @ beta)
-    information = _information(matrix, beta)
-    leverage = np.sum(matrix @ np.linalg.pinv(information, hermitian=True) * matrix, axis=1)
-    residual = case - chance + chance * (1 - chance) * leverage * (0.5 - chance)
-    return np.asarray(matrix.T @ residual, dtype=np.float64)
+@dataclass(frozen=True)
+class _Sets:
+    """The penalized likelihood of several sets of subjects, at coefficients (sets, columns)."""
+
+    matrix: Float
+    products: Float
+    """(subjects, columns * columns) of each subject's values."""
+    case: Bool
+    kept: Float
+
+    @classmethod
+    def of(cls, matrix: Float, case: Bool, kept: Float) -> "_Sets":
+        return cls(matrix, _products(matrix), case, kept)
+
+    def information(self, beta: Float) -> Float:
+        chance = special.expit(beta @ self.matrix.T)
+        found = (self.kept * chance * (1 - chance)) @ self.products
+        return np.asarray(found.reshape(len(beta), *[self.matrix.shape[1]] * 2), dtype=np.float64)
+
+    def penalized(self, beta: Float) -> Float:
+        """Penalized log likelihood."""
+        margins = np.where(self.case, 1.0, -1.0) * (beta @ self.matrix.T)
+        penalty = 0.5 * np.linalg.slogdet(self.information(beta))[1]
+        return np.asarray((self.kept * special.log_expit(margins)).sum(axis=1) + penalty)
+
+    def slope(self, beta: Float) -> Float:
+        """Slope of the penalized log likelihood."""
+        chance = special.expit(beta @ self.matrix.T)
+        inverse = np.linalg.pinv(self.information(beta), hermitian=True)
+        leverage = inverse.reshape(len(beta), -1) @ self.products.T
+        residual = self.case - chance + chance * (1 - chance) * leverage * (0.5 - chance)
+        return np.asarray((self.kept * residual) @ self.matrix, dtype=np.float64)
+
+    def step(self, beta: Float, free: Bool, *, bent: bool) -> tuple[Float, Float]:
+        """Next step by the information, or by Newton's method, and the gain the slope promises.
+
+        The penalty bends as much as the likelihood where groups are far apart, so that steps by the
+        information alone may take thousands. For Newton's, the slope is differentiated along
+        directions in which the information is one.
+        """
+        size, axes = np.linalg.eigh(self.information(beta)[:, free][:, :, free])
+        directions = np.zeros((*beta.shape, size.shape[1]))
+        directions[:, free] = axes / np.sqrt(np.maximum(size, _FLATTEST * size[:, -1:]))[:, None]
+        gradient = np.einsum("sck,sc->sk", directions, self.slope(beta))
+        along = gradient
+        if bent:
+            moved = [_DIFFERENCE * one for one in np.moveaxis(directions, 2, 0)]
+            changes = [self.slope(beta + one) - self.slope(beta - one) for one in moved]
+            bend = np.einsum("sck,lsc->slk", directions, changes) / (-2 * _DIFFERENCE)
+            curvature, turned = np.linalg.eigh((bend + np.swapaxes(bend, 1, 2)) / 2)
+            along = np.einsum("slk,sl->sk", turned, gradient)
+            along = along / np.maximum(np.abs(curvature), _LEAST_BEND)
+            along = np.einsum("slk,sk->sl", turned, along)
+        step = np.einsum("sck,sk->sc", directions, along)
+        longest = np.maximum(np.abs(step).max(axis=1), 1e-300)
+        share = np.minimum(1.0, _LONGEST_STEP / longest)
+        return step * share[:, None], np.sum(gradient * along, axis=1) * share
+
+
+def _products(matrix: Float) -> Float:
+    """(subjects, columns * columns) products of each subject's values."""
+    return (matrix[:, :, None] * matrix[:, None, :]).reshape(len(matrix), -1)

@@ -132,8 +132,9 @@ def _means(
     means: dict[str, dict[str, Float]] = {}
     counts: dict[str, dict[str, int]] = {}
     for hemi, one in sides.items():
+        maps = one.values(measure)
         for group, own in members_of(analysis, rows_of(analysis, one)).items():
-            means.setdefault(group, {})[hemi] = mean_of_known(one.values(measure)[own], 0)
+            means.setdefault(group, {})[hemi] = mean_of_known(maps[own], 0)
             counts.setdefault(group, {})[hemi] = int(own.sum())
     pair = bool(analysis.comparison.pair)
     kind = display.kind_of(measure, change=pair or set(sides) == {BOTH})
@@ -456,11 +457,12 @@ def _draw_sheet(
     """Draw a map of the sheet, and borders and names of the most frequent subfields."""
     x, y = cohort.x, cohort.y
     fields = one.subfield
-    axes.pcolormesh(
-        x, y, values.reshape(fields.shape).T, **scale, shading="nearest", rasterized=True
-    )
     edges = _beyond(x), _beyond(y)
-    axes.set(xlim=edges[0][[0, -1]], ylim=edges[1][[0, -1]])
+    extent = *edges[0][[0, -1]], *edges[1][[0, -1]]
+    image = values.reshape(fields.shape).T
+    axes.imshow(
+        image, **scale, extent=extent, origin="lower", aspect="auto", interpolation="nearest"
+    )
     line: Any = {"levels": [_HALF], "colors": "black", "linewidths": _FIELD_LINE}
     width = axes.bbox.width * 72 / axes.figure.dpi  # points
     for number, name in enumerate(one.maps.names):

@@ -19,7 +19,7 @@ from hipsta_bids.derivatives.hemisphere import (
 from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.group.collect import Exclusion, SheetRecord
-from hipsta_bids.group.data import PARTICIPANT, SESSION, Float, Measures, SideMaps
+from hipsta_bids.group.data import MOST_KEPT, PARTICIPANT, SESSION, Float, Measures, SideMaps
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.types import VisitKey
 
@@ -257,7 +257,8 @@ def _read_side(
     shape: tuple[int, int],
     names: Sequence[str],
 ) -> SideMaps:
-    maps = {name: np.full((len(records), *shape), np.nan) for name in names}
+    precision = np.float64 if len(records) <= MOST_KEPT else np.float32
+    maps = {name: np.full((len(records), *shape), np.nan, precision) for name in names}
     measured = [name for name in names if name in SHEET_MAPS]
     sampled = [name for name in names if name not in SHEET_MAPS]
     subfield = np.empty((len(records), *shape), dtype=np.int8)

@@ -10,7 +10,9 @@ from scipy import stats
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.data import Bool, Float
-from hipsta_bids.group.settings import RegistrationSettings
+from hipsta_bids.group.formula import Contrast
+from hipsta_bids.group.inference import PermutationPart, permute
+from hipsta_bids.group.settings import MultiplicitySettings, RegistrationSettings
 from hipsta_bids.group.warps import (
     Template,
     WarpBasis,
@@ -21,6 +23,9 @@ from hipsta_bids.group.warps import (
     subject_curves,
     warp_values,
 )
+
+#: Displacements that vary less, as a share of the largest variance, are those of fixed ends.
+_ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
@@ -241,7 +246,7 @@ def mean_profiles(maps: Float, settings: RegistrationSettings) -> Float:
     """Profiles of curvature along x: means over y, with gaps filled linearly."""
     present = np.isfinite(maps)
     counts = present.sum(axis=2)
-    sums = np.where(present, maps, 0.0).sum(axis=2)
+    sums = np.where(present, maps, 0.0).sum(axis=2, dtype=np.float64)
     profiles = sums / np.maximum(counts, 1)
     empty = counts == 0
     bad = np.flatnonzero(empty.mean(axis=1) > settings.max_gap)
@@ -295,32 +300,32 @@ def shift_difference(
     permutations : int
     seed : int
     """
-    persons, first, index = np.unique(people, return_index=True, return_inverse=True)
+    _, first, index = np.unique(people, return_index=True, return_inverse=True)
     nodes = registration.warps.shape[1]
     moved = (registration.warps - np.linspace(0, 1, nodes)) * (nodes - 1)
-    own = np.zeros((len(persons), nodes))
-    np.add.at(own, index, moved)
-    own /= np.bincount(index)[:, None]
+    totals = [np.bincount(index, column) for column in moved.T]
+    own: Float = np.stack(totals, axis=1) / np.bincount(index)[:, None]
     names, member = np.unique(np.asarray(groups)[first], return_inverse=True)
-    counts = np.bincount(member)
-    total = np.sum((own - own.mean(axis=0)) ** 2, axis=0)
-
-    def f_of(order: NDArray[np.intp]) -> Float:
-        sums = np.zeros((len(names), nodes))
-        np.add.at(sums, member, own[order])
-        between = np.sum(sums**2 / counts[:, None], axis=0) - len(own) * own.mean(axis=0) ** 2
-        within = np.maximum(total - between, 1e-12 * total.max() + 1e-300)
-        return np.asarray(between / within, dtype=np.float64)
-
-    means = np.stack([own[member == i].mean(axis=0) for i in range(len(names))])
-    spread = np.ptp(means, axis=0)
-    node = int(np.argmax(spread))
-    if len(names) < 2 or counts.min() < 2 or not total.any():  # noqa: PLR2004 -- a difference
-        return ShiftDifference(float(spread[node]), node, float("nan"))
-    random = np.random.default_rng(seed)
-    observed = f_of(np.arange(len(own))).max() * (1 - 1e-9)
-    above = sum(f_of(random.permutation(len(own))).max() >= observed for _ in range(permutations))
-    return ShiftDifference(float(spread[node]), node, (1 + above) / (1 + permutations))
+    matrix = np.eye(len(names))[member]
+    counts = matrix.sum(axis=0)
+    spread = np.ptp(matrix.T @ own / counts[:, None], axis=0)
+    node, p = int(np.argmax(spread)), float("nan")
+    varied = own.var(axis=0)
+    varying = varied > _ROUNDING * varied.max()
+    if len(names) > 1 and counts.min() > 1 and varying.any():
+        part = PermutationPart(
+            maps=own[:, varying],
+            matrix=matrix,
+            subjects=np.arange(len(own)),
+            edges=np.empty((0, 2), dtype=np.int64),
+        )
+        contrast = Contrast("groups", np.diff(np.eye(len(names)), axis=0))
+        how = MultiplicitySettings(
+            method="permutation-max", permutations=permutations + 1, seed=seed
+        )
+        (test,) = permute([part], contrast, settings=how)
+        p = float(np.nanmin(test.p_max))
+    return ShiftDifference(float(spread[node]), node, p)
 
 
 def shift_by_group(

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
 from hipsta_bids.errors import ModelError
@@ -366,7 +367,7 @@ def fit_warps(
 
 def warp_values(maps: Float, warps: Float) -> Float:
     """Carry maps of values to registered coordinates, linearly; NaN where a value lacks."""
-    carried = np.empty(maps.shape)
+    carried = np.empty(maps.shape, np.result_type(maps, np.float32))
     for block in _blocks(len(maps)):
         left, weight = _sources(warps[block])
         rows = np.arange(len(left))[:, None]
@@ -378,11 +379,14 @@ def warp_values(maps: Float, warps: Float) -> Float:
     return carried
 
 
-def warp_labels(labels: Int, warps: Float) -> Int:
+def warp_labels(labels: NDArray[np.int8], warps: Float) -> NDArray[np.int8]:
     """Carry maps of labels to registered coordinates, from the nearest node."""
-    left, weight = _sources(warps)
-    rows = np.arange(len(labels))[:, None]
-    return np.asarray(labels[rows, left + (weight >= 0.5)])  # noqa: PLR2004 -- nearest
+    carried = np.empty_like(labels)
+    for block in _blocks(len(labels)):
+        left, weight = _sources(warps[block])
+        rows = np.arange(len(left))[:, None]
+        carried[block] = labels[block][rows, left + (weight >= 0.5)]  # noqa: PLR2004 -- nearest
+    return carried
 
 
 def _sources(warps: Float) -> tuple[Int, Float]:

@@ -18,7 +18,7 @@ from pyarrow import parquet
 from hipsta_bids.derivatives.names import DATASET_FILES
 from hipsta_bids.group.analysis import Analysis, tested_maps
 from hipsta_bids.group.collect import Exclusion
-from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float, Int, SideMaps
+from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float, Int, SideMaps, some_sheets
 from hipsta_bids.group.figures import Drawing, draw_figures, encode
 from hipsta_bids.group.glm import FittedMaps
 from hipsta_bids.group.harmonize import digests, effects_of
@@ -56,6 +56,7 @@ GROUP_FOLDER = DATASET_FILES["group"]
 SHEET = "sheet"
 #: Values per row group of maps, and participants per row group of scores; bounds the memory.
 _BLOCK, _ROWS_OF_SCORES = 500_000, 500
+_ROWS = 10_000  # of tables that are spelled at once
 
 _WORD = pa.dictionary(pa.int32(), pa.string())
 _SUFFIXES = {
@@ -219,8 +220,13 @@ def write_table(
 ) -> None:
     """Write a table, with a sidecar unless the columns are the user's or the model's."""
     columns = [str(column) for column in table.columns]
-    cells = [[_cell(value) for value in table[column].tolist()] for column in table.columns]
-    files.write_tsv(folder / f"{name}.tsv", columns, zip(*cells, strict=True))
+    parts = (table.iloc[part] for part in _parts(len(table), _ROWS))
+    rows = (
+        row
+        for part in parts
+        for row in zip(*(map(_cell, part[c].tolist()) for c in table.columns), strict=True)
+    )
+    files.write_tsv(folder / f"{name}.tsv", columns, rows)
     if described:
         meanings = {
             column: meaning.get(column)
@@ -310,7 +316,8 @@ def _map_blocks(
                 if surface == SHEET:
                     for suffix, state in zip(_SUFFIXES, states, strict=False):
                         columns[f"subfield{suffix}"] = _subfields(state[hemi], part)
-                        columns |= _value_columns(state[hemi].maps, part, suffix)
+                        own_maps = some_sheets(state[hemi].maps, part)
+                        columns |= _value_columns(own_maps, slice(None), suffix)
                 else:
                     columns |= _value_columns(side.maps, part)
                 yield columns

@@ -338,15 +338,27 @@ def test_firth_converges_where_groups_hardly_do_not_overlap():
     assert found.auc == pytest.approx(0.96, abs=0.02)
 
 
-def test_folds_fitted_at_once_are_those_fitted_one_by_one():
+@pytest.mark.parametrize("effect", [0.5, 2.5, 8.0])  # of the last, all folds are separated
+def test_folds_fitted_at_once_are_those_fitted_one_by_one(effect):
     random = np.random.default_rng(4)
     case = np.arange(60) % 2 == 0
-    matrix = np.column_stack([np.ones(60), random.normal(0, 1, (60, 2)) + 0.5 * case[:, None]])
+    matrix = np.column_stack([np.ones(60), random.normal(0, 1, (60, 2)) + effect * case[:, None]])
     settings = ClassificationSettings(repeats=2, folds=5)
     score = np.zeros(60)
     splits = RepeatedStratifiedKFold(n_splits=5, n_repeats=2, random_state=settings.seed)
     for train, test in splits.split(matrix, case):
-        fit = fit_logistic(matrix[train], case[train], settings, firth=False)
+        fit = fit_overlapping_or_firth(matrix[train], case[train], settings)
         score[test] += matrix[test] @ fit.coefficients / 2
     found = cross_validate(matrix, case, settings)
     np.testing.assert_allclose(found.score, score, atol=1e-9)
+
+
+def test_long_curves_are_thinned():
+    random = np.random.default_rng(0)
+    score, case = random.normal(size=4000), random.random(4000) < 0.4
+    wrong, right = roc_curve(score + case, case)
+    assert len(wrong) == 1001
+    assert (wrong[0], right[0], wrong[-1], right[-1]) == (0, 0, 1, 1)
+    assert np.trapezoid(right, wrong) == pytest.approx(
+        delong(score + case, case, 0.95).area, abs=1e-3
+    )

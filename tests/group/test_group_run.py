@@ -12,7 +12,7 @@ from pyarrow import parquet
 from small_cohorts import GROUPS, NODES, PLAN, place_of, write_dataset
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.group import run, write
+from hipsta_bids.group import analysis, read, run, write
 from hipsta_bids.group.collect import GroupRequest
 from hipsta_bids.group.formula import Contrast
 from hipsta_bids.group.glm import fit_points
@@ -324,6 +324,24 @@ def test_same_run_gives_the_same_files(results, dataset, quick):
     assert main([str(data), str(out), "group", *quick]) == 0
     after = {path.name: path.read_bytes() for path in results.rglob("*") if path.is_file()}
     assert before == after
+
+
+def test_large_cohorts_take_single_precision_and_no_copies(results, dataset, quick, monkeypatch):
+    """Only numbers too small for the tables' decimals change."""
+    for module in (analysis, read):
+        monkeypatch.setattr(module, "MOST_KEPT", 3)
+    data, out = dataset
+    assert main([str(data), str(out), "group", *quick, "--name", "large", "--no-reports"]) == 0
+    large = out / "group" / "large"
+    names = sorted(path.name for path in results.glob("*.tsv"))
+    assert names == sorted(path.name for path in large.glob("*.tsv"))
+    for name in names:
+        pd.testing.assert_frame_equal(
+            table(large / name), table(results / name), rtol=1e-4, atol=1e-5
+        )
+    maps = [parquet.read_table(folder / "maps.parquet").to_pandas() for folder in (large, results)]
+    pd.testing.assert_frame_equal(*maps, rtol=1e-6)
+    assert not maps[0].equals(maps[1])
 
 
 def test_first_of_several_sessions_is_analyzed(tmp_path, quick):
