@@ -162,7 +162,7 @@ def _score_people(
         if norms[key].mean.shape[1] != own.shape[1]:
             points = f"{norms[key].mean.shape[1]} points, these people {own.shape[1]}"
             raise ModelError(f"{path}: norms of {listed(key)} have {points}", reason="norms-differ")
-        at, least = adapted[rows], settings.norms.least_site // 2
+        at, least = adapted[rows], settings.norms.least_controls // 2
         extended[key] = norms[key].extended(own[at], people.take(rows[at]), len(file.sites), least)
     scored = {
         name: _score_maps(one, found, extended, people, adapted) for name, one in cohorts.items()
@@ -421,7 +421,7 @@ def _with_new_sites(  # noqa: PLR0917
     settings: GroupSettings,
 ) -> NormsFile:
     """Add the names of new sites, if they have controls enough."""
-    least, sites = settings.norms.least_site, dict(file.sites)
+    least, sites = settings.norms.least_controls, dict(file.sites)
     labels = _site_labels(table, file.site, settings).to_numpy()
     for number in range(len(sites), int(people.site.max(initial=-1)) + 1):
         own = people.site == number

@@ -354,9 +354,10 @@ class NormSettings(SettingsTable):
     outward, so that they tell the age of no single person."""
     least_participants: Annotated[int, Field(ge=50)] = 100
     """Smaller reference cohorts are refused."""
-    least_site: Annotated[int, Field(ge=25)] = 25
-    """Participants that a site of the reference needs, and controls that a new site needs; a point
-    needs half as many with a value."""
+    least_site: Annotated[int, Field(ge=10)] = 15
+    """Participants that a site of the reference needs; a point needs half as many with a value."""
+    least_controls: Annotated[int, Field(ge=25)] = 25
+    """Controls that a new site needs; a point needs half as many with a value."""
     shape_level: OpenFraction = 0.05
     """Values at a point are transformed if a likelihood-ratio test rejects the normal distribution
     at this level."""
