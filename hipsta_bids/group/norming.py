@@ -30,7 +30,6 @@ from hipsta_bids.group.norms import (
     fit_norms,
     load_norms,
     save_norms,
-    too_few,
 )
 from hipsta_bids.group.reference import place_of
 from hipsta_bids.group.run import (
@@ -354,8 +353,6 @@ def _people(
 def _counted(file: NormsFile, people: People, how: NormSettings) -> NormsFile:
     """Count a reference cohort; refuse one that is too small, or whose sexes are those of sites."""
     known = people.known
-    if known.sum() < how.least_participants:
-        raise too_few(int(known.sum()), how)
     counts = np.bincount(people.site[known], minlength=len(file.sites)).tolist()
     sites = dict(zip(file.sites, counts, strict=True))
     if small := [f"{site} ({n})" for site, n in sites.items() if n < how.least_site]:

@@ -197,7 +197,12 @@ def choose_knots(ages: Float, how: NormSettings) -> Float:
     """Knots at equal shares of people; beyond the outer ones are some, so that nobody is told."""
     ages = np.sort(ages[np.isfinite(ages)])
     if len(ages) < how.least_participants:
-        raise too_few(len(ages), how)
+        raise ModelError(
+            f"--fit-norms: {len(ages)} participants of known age are too few; norms need"
+            f" {how.least_participants} or more: join the reference cohorts of several sites by"
+            " --derivatives",
+            reason="norms-reference",
+        )
     low, high = np.floor(ages[how.edge - 1]), np.ceil(ages[-how.edge])
     inside = ages[(ages >= low) & (ages <= high)]
     inner = np.quantile(inside, np.linspace(0, 1, how.knots)[1:-1]).round(1)
@@ -209,16 +214,6 @@ def choose_knots(ages: Float, how: NormSettings) -> Float:
             reason="norms-reference",
         )
     return knots
-
-
-def too_few(count: int, how: NormSettings) -> ModelError:
-    """Say that a reference cohort is too small."""
-    return ModelError(
-        f"--fit-norms: {count} participants with age, sex and site are too few; norms need"
-        f" {how.least_participants} or more: join the reference cohorts of several sites by"
-        " --derivatives",
-        reason="norms-reference",
-    )
 
 
 def fit_norms(

@@ -3,6 +3,7 @@
 The whole of them takes minutes: ``tools/test-tutorials`` runs it, which sets HIPSTA_BIDS_TUTORIALS.
 """
 
+import json
 import os
 import re
 import shlex
@@ -13,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from scipy import ndimage
+from scipy import ndimage, stats
 from small_cohorts import write_dataset
 
 from hipsta_bids.cli.commands import meta_parser, phantom_parser
@@ -198,7 +199,8 @@ def consortium(page=SITES):
     for text in blocks(page):
         lines = text.replace("\\\n", " ").splitlines()
         for line in lines if re.match("hipsta-bids|mkdir", text) else ():
-            if not re.search(r" phantom | participant$| --export-summary ", line):
+            own_site = "paris" in line  # the sixth, which has commands of its own
+            if own_site or not re.search(r" phantom | participant$| --export-summary ", line):
                 yield shlex.split(line) if line.startswith("hipsta") else line
                 continue
             for site, own, number in rows if "--export" not in line or "Bonn" in line else ():
@@ -212,10 +214,10 @@ def consortium(page=SITES):
 def test_the_commands_of_the_consortium_are_understood():
     """Those that take long are only parsed here."""
     every = [line for line in consortium() if not isinstance(line, str)]
-    assert len(every) == 5 + 5 + 1 + 5 + 1 + 2
+    assert len(every) == 5 + 5 + 1 + 5 + 1 + 2 + 4
     for _, first, *rest in every:
         if first == "phantom":
-            assert phantom_parser().parse_args(rest).n_subjects == 40
+            assert phantom_parser().parse_args(rest).n_subjects == (70 if "paris" in rest else 40)
         elif first == "meta":
             assert len(meta_parser().parse_intermixed_args(rest).sites) == 5
         elif rest[1] == "group":
@@ -285,3 +287,36 @@ def check_consortium(folder):
     shifts = table(pooled / "harmonized" / "sites.tsv").query("measure == 'thickness'")
     for name in ("offset_before", "offset_after"):
         assert f"{shifts[name].min():.2f} to {shifts[name].max():.2f}" in page
+    check_norms(folder, page, thinned)
+
+
+def check_norms(folder, page, thinned):
+    norms, scores = folder / "norms" / "group" / "norms_control", folder / "paris-out/group/scores"
+    reference = len(table(norms / "covariates.tsv"))
+    first, *_, last = json.loads((norms / "norms.json").read_text())["knots"]
+    assert f"{reference} of the 100 controls" in page
+    assert f"of ages of {first:g} to {last:g} years" in page
+    people = table(folder / "paris" / "participants.tsv").set_index("participant_id").group
+    z = pd.read_parquet(scores / "zscores.parquet")
+    scored = z[z.thickness_z.notna()].participant_id.unique()
+    left_out = table(scores / "excluded.tsv").participant_id.nunique()
+    controls = int((people[scored] == "control").sum())
+    words = f"{len(scored)} people are scored, {controls} of them controls; the other {left_out}"
+    assert words in page
+    means, low, beside, healthy = [], [], [], []
+    for hemi in "LR":
+        for group in ("patient", "control"):
+            own = z[(z.hemi == hemi) & (people[z.participant_id].to_numpy() == group)]
+            of_all = own.thickness_z.to_numpy().reshape(-1, len(thinned))
+            known = of_all[np.isfinite(of_all).any(axis=1)]
+            below = known < stats.norm.ppf(0.05)
+            if group == "control":
+                healthy.append(f"{below[:, thinned].mean():.0%}".replace("%", " %"))
+                continue
+            means.append(f"{known[:, thinned].mean():.2f}")
+            low.append(f"{below[:, thinned].mean():.0%}".replace("%", " %"))
+            beside.append(f"{below[:, ~thinned].mean():.0%}".replace("%", " %"))
+    assert f"mean z of {means[0]} on the left and {means[1]} on the right" in page
+    assert f"{low[0]} and {low[1]} of its points are below the 5th centile" in page
+    assert f"elsewhere {beside[0]} and {beside[1]} are" in page
+    assert f"points in the region {healthy[0]} and {healthy[1]}." in page
