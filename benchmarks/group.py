@@ -22,6 +22,7 @@ from collections.abc import Sequence
 from contextlib import redirect_stdout
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 from report import print_table, write_report
@@ -116,16 +117,20 @@ def _write_side(
 def run(data: Path, out: Path, size: int) -> Run:
     """Run the command in this process."""
     stages: dict[str, float] = {}
-    now = ["start", 0.0]
+    now, since = "start", 0.0
 
     def note(stage: str, _done: int, _total: int) -> None:
+        nonlocal now, since
         used = time.process_time()
-        stages[now[0]] = stages.get(now[0], 0.0) + used - now[1]
-        now[:] = [stage, used]
+        stages[now] = stages.get(now, 0.0) + used - since
+        now, since = stage, used
 
-    console.listening = lambda _: progress.listening(note)
     start = time.perf_counter()
-    with Path(os.devnull).open("w", encoding="utf-8") as nothing, redirect_stdout(nothing):
+    with (
+        Path(os.devnull).open("w", encoding="utf-8") as nothing,
+        redirect_stdout(nothing),
+        patch.object(console, "listening", lambda _: progress.listening(note)),
+    ):
         code = run_command([str(data), str(out), "group"])
     if code:
         raise SystemExit(code)
@@ -156,8 +161,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         with tempfile.TemporaryDirectory() as folder:
             write_study(Path(folder) / "bids", Path(folder) / "out", size)
             command = [sys.executable, __file__, "--one", folder, "--sizes", str(size)]
-            done = subprocess.run(command, check=True, stdout=subprocess.PIPE)  # noqa: S603
-            runs.append(Run(**json.loads(done.stdout)))
+            said = subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout  # noqa: S603
+            runs.append(Run(**json.loads(said)))
     sizes = [str(one.participants) for one in runs]
     rows = {name: [getattr(one, name) for one in runs] for name in ("wall", "cpu", "memory")}
     rows |= {name: [one.stages.get(name, 0.0) for one in runs] for name in runs[0].stages}
