@@ -369,9 +369,9 @@ def run_group_level(arguments: Sequence[str]) -> ExitCode:
 
 
 def _run(parsed: argparse.Namespace, arguments: Sequence[str]) -> ExitCode:
-    if options.region in EXPERIMENTAL:
+    if parsed.region in EXPERIMENTAL:
         raise UsageError(
-            f"--region {options.region}: the group level does not take it yet", reason="usage"
+            f"--region {parsed.region}: the group level does not take it yet", reason="usage"
         )
     if parsed.model is not None and (parsed.formula or parsed.contrast):
         raise UsageError("give --model, or --formula and --contrast", reason="usage")

@@ -18,6 +18,8 @@ _FLOOR, _CEILING = 0.05, 20.0
 """Bounds of the weights of edges: negative ones would fold the map."""
 _STIFF = 1e3
 """How much more a line of given values weighs than an edge that it crosses."""
+_PARTS = 60
+"""Into so many parts head and tail are divided to space their rows."""
 _SLACK = 1e-6
 """Nodes on the sides of triangles must not be lost by rounding."""
 
@@ -188,6 +190,12 @@ def find_edges(disk: Disk, medial: Float, lateral: Float, height: Float) -> Edge
     for step_aside in (1, -1):  # a vertex of each end lies between
         taken |= np.roll(taken, step_aside)
     second = _best_arc(np.where(taken, -length.sum(), lateral * length))
+    if not (len(first) and len(second)):
+        raise GeometryError(
+            "the sheet has no medial or no lateral edge: check the labels of the subiculum, and of "
+            "CA2 and CA3 beside the dentate gyrus",
+            reason="whole-edges",
+        )
     arcs = [first, second]
     count = len(disk.loop)
     between = [
@@ -229,6 +237,33 @@ def map_to_rectangle(
     inner = (edges.posterior, ends[0]), (edges.anterior, ends[1])
     y = _harmonic(matrix, inner, lines)
     return np.column_stack([x, y])
+
+
+def space_rows(disk: Disk, plane: Float, extent: float, ends: tuple[float, float]) -> Float:
+    """Space lines of equal y beyond plus and minus ``extent`` evenly by distance from the body.
+
+    A harmonic function changes most beside a short end: there its lines would all lie. The mean
+    distance along the sheet of what lies on a line takes its place. Returns new values (V, 2).
+    """
+    edges = unique_edges(disk.triangles)
+    lengths = np.linalg.norm(np.diff(disk.vertices[edges], axis=1)[:, 0], axis=1)
+    result, y = plane.copy(), plane[:, 1]
+    inner = np.flatnonzero(np.abs(y) <= extent)
+    graph = edge_graph(edges, lengths, len(y))
+    far = sparse.csgraph.dijkstra(graph, directed=False, indices=inner, min_only=True)
+    for sign, end in ((-1.0, -ends[0]), (1.0, ends[1])):
+        beyond = np.flatnonzero(sign * y > extent)
+        if end <= extent or not len(beyond):
+            continue
+        order = beyond[np.argsort(sign * y[beyond], kind="stable")]
+        parts = np.array_split(order, min(_PARTS, len(order)))
+        level = [extent, *(float(sign * y[part].mean()) for part in parts), end]
+        mean = [0.0, *(float(far[part].mean()) for part in parts)]
+        depth = np.maximum.accumulate([*mean, float(far[order].max())])
+        depth += _SLACK * np.arange(len(depth))  # lines must not merge
+        reached = np.interp(sign * y[beyond], level, depth)
+        result[beyond, 1] = sign * (extent + (end - extent) * reached / depth[-1])
+    return result
 
 
 def find_line(disk: Disk, edges: Edges, height: Float, value: float) -> Line | None:

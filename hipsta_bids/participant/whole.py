@@ -36,6 +36,7 @@ from hipsta_bids.geometry.disk import (
     make_disk,
     map_to_rectangle,
     masked_area,
+    space_rows,
 )
 from hipsta_bids.geometry.ends import EndPlanes
 from hipsta_bids.geometry.faces import find_faces, whole_surface, whole_tissue
@@ -120,6 +121,7 @@ def measure_whole(
         axes, limits = grid_levels(settings.sheet, region)
         lines = _end_lines(disk, edges, ends, body, settings.sheet)
         plane = map_to_rectangle(disk, edges, lines, limits)
+        plane = space_rows(disk, plane, settings.sheet.y_extent, limits)
     with clock("sheet"):
         lines_of = Lines(mesh, laplace.gradient(u))
         sheet = _sample(disk, plane, lines_of, axes, MARGIN)
