@@ -26,10 +26,10 @@ from hipsta_bids.protocols.toml import (
 class BodySettings(SettingsTable):
     """From labels to the body's mask and end planes."""
 
-    region: Literal["body", "extended", "entorhinal"] = "body"
-    """What is measured between the end planes: ``body`` (the hippocampal subfields), ``extended``
-    (with the neighboring cortex) or ``entorhinal`` (that cortex alone); the command line's
-    ``--region`` goes first."""
+    region: Literal["body", "extended", "entorhinal", "headbody", "whole"] = "body"
+    """What is measured: ``body`` (the subfields between the end planes), ``extended`` (with the
+    neighboring cortex), ``entorhinal`` (that cortex alone), and, experimental, ``headbody`` and
+    ``whole`` (with the tail)."""
     min_cortex_reach: PositiveFraction = 0.9
     """Refuse cortex with labels along less than this share of the body."""
     layer_rule: Literal["nearest-sheet", "nearest-label"] = "nearest-sheet"

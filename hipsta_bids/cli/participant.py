@@ -44,7 +44,8 @@ if TYPE_CHECKING:
 
 COLLECT = "collect"
 LEVELS = ("participant", COLLECT)
-REGIONS = ("body", "extended", "entorhinal")
+EXPERIMENTAL = ("headbody", "whole")
+REGIONS = ("body", "extended", "entorhinal", *EXPERIMENTAL)
 
 #: Options of other BIDS Apps, and why they change nothing here.
 _NO_MEANING = {
@@ -196,7 +197,8 @@ def _add_processing(parser: Parser) -> None:
     add(
         "--region",
         "NAME",
-        "body (default), extended (with neighboring cortex), entorhinal (that alone)",
+        "body (default), extended (with neighboring cortex), entorhinal (that alone); experimental:"
+        " headbody, whole (with head and tail)",
         choices=REGIONS,
     )
     add(
@@ -342,6 +344,8 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
     settings = load_settings(options.settings)
     if options.region is not None:
         settings = settings.changed(body={"region": options.region})
+    if settings.body.region in EXPERIMENTAL:
+        echo(f"note: region {settings.body.region} is experimental")
     request = input_request(options)
     echo_start(options.analysis_level, options.bids_dir)
     from hipsta_bids.inputs.ends import attach_ends  # noqa: PLC0415  (heavy)

@@ -289,6 +289,10 @@ _REGIONS = {
     "entorhinal": " For files with label-entorhinal, the neighboring cortex alone was taken,"
     " between the same end planes; its interior side is the one that continues the hippocampal"
     " sheet's.",
+    "headbody": " For files with label-headbody, head and body were laid out on one sheet, which is"
+    " experimental.",
+    "whole": " For files with label-whole, head, body and tail were laid out on one sheet, which is"
+    " experimental.",
 }
 
 #: Key and entry of each work that the methods rest on.
@@ -380,7 +384,8 @@ COLUMNS: dict[str, str] = {
     "session": "session, with its ses- prefix",
     "hemi": "L or R",
     "seg": "segmentation protocol",
-    "region": "what was measured: body, extended (and neighboring cortex), entorhinal (that alone)",
+    "region": "what was measured: body, extended (and neighboring cortex), entorhinal (that alone),"
+    " headbody or whole (experimental)",
     "status": "ok; repaired: small defects were mended; flagged: look before use;"
     " failed: there are no maps",
     "reason": "machine-readable reasons, joined by +",

@@ -26,6 +26,7 @@ from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY, 
 from hipsta_bids.geometry.sheet import is_left_handed, layer_depth
 from hipsta_bids.io import files, gifti
 from hipsta_bids.io.volumes import mask_bytes
+from hipsta_bids.protocols.load import WHOLE
 from hipsta_bids.protocols.protocol import Label, Part, Protocol, Tissue
 from hipsta_bids.types import BodyMask, Bool, Flag, Float, HemisphereMaps, Sheet, Status
 
@@ -65,6 +66,8 @@ _MEASURED_REGION = (
     "the sheet between the two end planes of the hippocampal body; head and tail are not measured"
     " and not part of any number"
 )
+
+_WHOLE_REGION = "the hippocampal sheet with head, and tail where it has subfields; experimental"
 
 _MILLIMETER_DIGITS = 4
 
@@ -125,7 +128,8 @@ def _write_table(
 ) -> None:
     """Write a table, and the sidecar that defines its columns."""
     files.write_tsv(place.path(key), list(columns), zip(*columns.values(), strict=True))
-    sidecar = {**definitions, "MeasuredRegion": _MEASURED_REGION}
+    region = _WHOLE_REGION if place.name.region in WHOLE else _MEASURED_REGION
+    sidecar = {**definitions, "MeasuredRegion": region}
     files.write_json(place.path(f"{key}_sidecar"), sidecar)
 
 

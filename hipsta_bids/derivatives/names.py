@@ -11,6 +11,7 @@ from pathlib import PurePosixPath
 
 from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.io.files import LOGS
+from hipsta_bids.protocols.load import WHOLE
 from hipsta_bids.types import Hemisphere
 
 
@@ -28,6 +29,12 @@ class HemisphereName(Hemisphere):
         """Entities that tell results of one hemisphere apart: protocol and region."""
         label = "" if self.region == "body" else f"_label-{self.region}"
         return f"seg-{self.seg}{label}"
+
+    @property
+    def region_title(self) -> str:
+        """The region in words; empty for the body."""
+        trial = " (experimental)" if self.region in WHOLE else ""
+        return "" if self.region == "body" else f"{self.region} region{trial}"
 
     @property
     def pattern(self) -> str:
@@ -194,6 +201,16 @@ _SPREAD = Output(
     desc="thicknessSd",
 )
 
+_DISTORTION = Output(
+    "distortion",
+    "morph",
+    ".shape.gii",
+    "area round each node over the mean, binary logarithm; per surface vertex, 1"
+    " (`--region headbody` and `whole`, experimental)",
+    unit="1",
+    desc="distortion",
+)
+
 _SAMPLED = (
     ("table", ".tsv", "another volume at each sheet point, one column per volume (`--map`)"),
     ("sidecar", ".json", "its source, how it was sampled, and how much of it is missing"),
@@ -223,6 +240,8 @@ EXTRA_OUTPUTS: tuple[Output, ...] = (
     ),
     _SPREAD,
     *_sidecars([_SPREAD]),
+    _DISTORTION,
+    *_sidecars([_DISTORTION]),
     *_table(
         "surrogate",
         "thickness from the medial axis of single slices (`hipsta-bids surrogate`)",
@@ -284,6 +303,8 @@ IGNORED: dict[str, str] = {
     "*desc-body_mask.*": "Masks per hemisphere; in BIDS, masks of voxels have no hemi and seg.",
     "*_label-extended_dseg.*": "Subfields and cortex; in BIDS, labels on surfaces have no label.",
     "*_label-entorhinal_dseg.*": "The cortex alone; likewise.",
+    "*_label-headbody_dseg.*": "Head and body; likewise.",
+    "*_label-whole_dseg.*": "Head, body and tail; likewise.",
 }
 
 _IGNORE_HEAD = """\

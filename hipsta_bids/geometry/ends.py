@@ -67,6 +67,15 @@ class EndPlanes:
             return np.asarray((points - self.posterior_point) @ self.posterior_normal)
         return np.asarray((points - self.anterior_point) @ self.anterior_normal)
 
+    def entry(self, end: End) -> dict[str, list[float]]:
+        """Describe one end plane for the quality record."""
+        point, normal = (
+            (self.posterior_point, self.posterior_normal)
+            if end == "posterior"
+            else (self.anterior_point, self.anterior_normal)
+        )
+        return {"point_ras_mm": point.round(3).tolist(), "normal_ras": normal.round(4).tolist()}
+
     def beyond(self, distance: float) -> "EndPlanes":
         """Planes that lie farther apart, each moved outward along the axis by a distance, mm."""
         step = distance * self.axis

@@ -92,6 +92,12 @@ def _check_sphere(count: int, faces: Int, edges: Int) -> None:
         )
 
 
+def smooth_vertices(nodes: Float, faces: Int, settings: SurfaceSettings) -> Float:
+    """Smooth a closed surface without caps (Taubin 1995)."""
+    none = np.zeros(len(nodes), dtype=bool)
+    return _taubin(nodes, faces, unique_edges(faces), (none, none), settings)
+
+
 def _adjacency(edges: Int, count: int) -> sparse.csr_array:
     ones = np.ones(2 * len(edges))
     both = np.vstack([edges, edges[:, ::-1]])

@@ -34,7 +34,7 @@ def sample_sheet(mesh: TetMesh, coordinates: Coordinates, settings: SheetSetting
             "check the labels near the end planes",
             reason="sheet-incomplete",
         )
-    return Sheet(points=_evenly(_filled(points)), valid=~missing)
+    return Sheet(points=_evenly(fill_points(points)), valid=~missing)
 
 
 def sheet_levels(settings: SheetSettings) -> tuple[Float, Float, Float]:
@@ -182,7 +182,7 @@ def _barycentric(corners: Float, points: Float) -> tuple[Float, Bool]:
     return weights, known
 
 
-def _filled(points: Float) -> Float:
+def fill_points(points: Float) -> Float:
     """Replace missing points by normalized averages of their neighbors in the same z level."""
     missing = np.asarray(~np.isfinite(points).all(axis=-1))
     if not missing.any():
@@ -225,7 +225,7 @@ def between_planes(mesh: TetMesh, coordinates: Coordinates, ends: EndPlanes) -> 
     x, y = np.linspace(-0.98, 0.98, 41), np.linspace(-0.998, 0.998, 121)
     # No point has z of 2: only the level in the middle is sought.
     levels = _invert(mesh, coordinates.values, (x, y, np.array([-2.0, 0.0, 2.0])))
-    middle = _filled(levels[:, :, 1:2])[:, :, 0]
+    middle = fill_points(levels[:, :, 1:2])[:, :, 0]
     limits = []
     for height in (ends.height(middle, "posterior"), ends.height(middle, "anterior")):
         rising = np.maximum.accumulate(np.nan_to_num(height, nan=-np.inf), axis=1)

@@ -93,11 +93,7 @@ class Wall:
     @cached_property
     def normals(self) -> Float:
         """(V, 3) unit outward normals, weighted by area."""
-        a, b, c = (self.vertices[self.triangles[:, k]] for k in range(3))
-        faces = np.repeat(np.cross(b - a, c - a), 3, axis=0)
-        index = self.triangles.ravel()
-        total = np.stack([np.bincount(index, column, len(self.vertices)) for column in faces.T], 1)
-        return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1), 1e-12)[:, None])
+        return vertex_normals(self.vertices, self.triangles)
 
     def near(self, curve: Float, reach: float) -> Bool:
         """Vertices within ``reach`` mm of a curve and connected to it along the wall."""
@@ -152,6 +148,15 @@ class Wall:
         sides = (~strips & (piece == first), ~strips & (piece == second))
         ends = all((side & end).any() for side in sides for end in (self.posterior, self.anterior))
         return sides if ends else None
+
+
+def vertex_normals(vertices: Float, triangles: Int) -> Float:
+    """(V, 3) unit normals, weighted by area."""
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    faces = np.repeat(np.cross(b - a, c - a), 3, axis=0)
+    index = triangles.ravel()
+    total = np.stack([np.bincount(index, column, len(vertices)) for column in faces.T], 1)
+    return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1), 1e-12)[:, None])
 
 
 def edge_graph(edges: Int, weights: Float, count: int) -> sparse.csr_array:

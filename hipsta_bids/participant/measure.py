@@ -62,7 +62,8 @@ from hipsta_bids.geometry.sheet import (
     whole_body,
 )
 from hipsta_bids.geometry.topology import Repair, SolidField, repair_topology, repaired_columns
-from hipsta_bids.protocols.load import for_region
+from hipsta_bids.participant.whole import measure_whole
+from hipsta_bids.protocols.load import WHOLE, for_region
 from hipsta_bids.protocols.protocol import LATERAL_END, MEDIAL_END, Tissue
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import (
@@ -257,8 +258,8 @@ def quality_metrics(evidence: Evidence, repaired: Bool) -> dict[str, Any]:
         "anterior_end_rule": ends.anterior_rule,
         "posterior_end_uncertainty_mm": ends.posterior_uncertainty,
         "anterior_end_uncertainty_mm": ends.anterior_uncertainty,
-        "posterior_plane": _plane(ends.posterior_point, ends.posterior_normal),
-        "anterior_plane": _plane(ends.anterior_point, ends.anterior_normal),
+        "posterior_plane": ends.entry("posterior"),
+        "anterior_plane": ends.entry("anterior"),
         "voxels_across": evidence.voxels_across,
         "euler_before": solid.euler_before,
         "euler_after": solid.euler_after,
@@ -286,10 +287,6 @@ def quality_metrics(evidence: Evidence, repaired: Bool) -> dict[str, Any]:
         "repaired_fraction": float(repaired.mean()),
         **({"mask_change": asdict(body.mask_change)} if body.mask_change else {}),
     }
-
-
-def _plane(point: Float, normal: Float) -> dict[str, list[float]]:
-    return {"point_ras_mm": point.round(3).tolist(), "normal_ras": normal.round(4).tolist()}
 
 
 Clock = Callable[[str], AbstractContextManager[None]]
@@ -378,6 +375,8 @@ def measure_hemisphere(
     GeometryError
         With the reason why this hemisphere cannot be measured.
     """
+    if settings.body.region in WHOLE:
+        return measure_whole(volume, hemi, settings, clock)
     evidence, coordinates = unfold(volume, hemi, settings, clock)
     measured, solid, boundaries = evidence.measured, evidence.solid, evidence.boundaries
     body, sheet = measured.body, measured.sheet

@@ -283,9 +283,28 @@ def _label(row: NamedCode, index: int) -> Label:
     )
 
 
+#: Regions with the head on the sheet, experimental: with the tail or without it.
+WHOLE = ("whole", "headbody")
+
+
 def for_region(protocol: Protocol, region: str) -> Protocol:
-    """Return a protocol with the sheet of a region: body, extended by cortex, or cortex alone."""
+    """Return a protocol with the sheet of a region: hippocampal, extended by cortex, cortex alone.
+
+    Head and tail are refused where they have no subfields.
+    """
     if region == "body":
+        return protocol
+    if region in WHOLE:
+        parts = (Part.HEAD, Part.TAIL) if region == "whole" else (Part.HEAD,)
+        for label in protocol.labels:
+            if label.tissue is Tissue.HIPPOCAMPUS and label.part in parts:
+                tail = label.part is Part.TAIL
+                raise ProtocolError(
+                    f"region {region}: the {label.part.name.lower()} has no subfields in the "
+                    f"protocol {protocol.name}; measure the "
+                    f"{'head and body (headbody)' if tail else 'body'}",
+                    reason="whole-subfields",
+                )
         return protocol
     if not protocol.neighbors:
         able = [name for name in protocol_names() if load_protocol(name).neighbors]

@@ -175,7 +175,7 @@ class Series:
         """Protocol and region."""
         first = self.hemispheres[0]
         name = first.place.name
-        return name.seg if name.region == "body" else f"{name.seg}, {name.region} region"
+        return ", ".join(filter(None, (name.seg, name.region_title)))
 
     @cached_property
     def views(self) -> Mapping[str, Views | None]:

@@ -55,7 +55,7 @@ def _link(hemisphere: Hemisphere | None, cohort: Cohort) -> tuple[str, str] | No
     verdict = cohort.verdicts[title].title.lower()
     words = f"sub-{name.subject}{f' ses-{name.session}' if name.session else ''} {hemisphere.side}"
     if len({other.place.name.protocol for other in cohort.hemispheres}) > 1:
-        words += f" {name.seg}" + ("" if name.region == "body" else f" {name.region}")
+        words += " " + " ".join(filter(None, (name.seg, name.region_title)))
     return f"{participant_report(name.subject, name.session)}#{title}", f"{words}: {verdict}"
 
 

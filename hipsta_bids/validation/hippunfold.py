@@ -9,10 +9,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from hipsta_bids.geometry.digital import to_ras
+from hipsta_bids.geometry.wall import vertex_normals
 from hipsta_bids.inputs.labels import read_label_volume
 from hipsta_bids.inputs.search import HemisphereInput, InputRequest, find_hemispheres
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import translate
+from hipsta_bids.settings import Settings
 from hipsta_bids.types import Float, HemisphereMaps, LabelVolume
 from hipsta_bids.validation.cases import Refusal, hippunfold_beside, measure_body, run_cases
 from hipsta_bids.validation.report import Cell, Cells, Suite, Table
@@ -29,6 +31,13 @@ _ROUNDING = 1e-6
 """Of barycentric coordinates: what lies on the face of two tetrahedra belongs to one at least."""
 _INNER = (slice(4, -4), slice(2, -2))
 """Nodes away from the edges, 65 % of all."""
+
+_UPRIGHT = 0.9
+"""Cosine of the angle between a line across the sheet and its normal, at least."""
+_BODY_ROWS = (10, 30)
+"""First and last row of the body on the whole sheet."""
+_WHOLE_BIAS, _WHOLE_SD = 0.02, {"all": 0.1, "head": 0.1, "body": 0.06, "tail": 0.1}
+"""mm; against known walls, from head to tail."""
 
 
 Codes = NDArray[np.intp]
@@ -65,12 +74,17 @@ def run(full: bool, labels: Path | None = None) -> Suite:
             for (path, hemi), r in zip(templates, known, strict=True)
         ),
     ]
-    return Suite(
-        name="hippunfold",
-        title="HippUnfold",
-        text=_TEXT,
-        tables=(Table(title="Thickness against HippUnfold's own, mm", rows=rows, notes=_NOTES),),
-    )
+    about = [Table(title="Thickness against HippUnfold's own, mm", rows=rows, notes=_NOTES)]
+    if templates:
+        results = run_cases(measure_whole_template, templates, timeout=120.0)
+        whole = [
+            {"hemisphere": f"{path.name.removeprefix('tpl-')} {hemi}", **row}
+            for (path, hemi), result in zip(templates, results, strict=True)
+            for row in _whole_rows(result)
+        ]
+        title = "Head, body and tail on one sheet (experimental), mm"
+        about.append(Table(title=title, rows=whole, notes=_WHOLE_NOTES))
+    return Suite(name="hippunfold", title="HippUnfold", text=_TEXT, tables=tuple(about))
 
 
 def measure_person(item: HemisphereInput) -> Pair:
@@ -86,6 +100,53 @@ def measure_template(case: tuple[Path, str]) -> Pair:
     """Measure labels that are drawn between a template's walls."""
     volume, points, thickness = draw_template(*case)
     return _pair(measure_body(volume, case[1]), points, thickness)
+
+
+def measure_whole_template(case: tuple[Path, str]) -> dict[str, tuple[Float, Float]]:
+    """Measure a template from head to tail: by part, our thickness and the true one, (N,) mm.
+
+    Corresponding vertices of the two walls may lie obliquely to each other, next to edges; where
+    they do by more than 26 degrees, their distance is not the thickness.
+    """
+    folder, hemi = case
+    volume, _, _ = draw_template(folder, hemi)
+    maps = measure_body(volume, hemi, Settings().changed(body={"region": "whole"}))
+    name = str(folder / f"*_hemi-{hemi}_*_label-hipp_")
+    inner, outer, middle = (
+        _values(f"{name}{wall}.surf.gii", "pointset") for wall in ("inner", "outer", "midthickness")
+    )
+    triangles = _values(f"{name}midthickness.surf.gii", "triangle").astype(np.int32)
+    across = outer - inner
+    true = np.linalg.norm(across, axis=1)
+    facing = np.abs((vertex_normals(middle, triangles) * across).sum(axis=1))
+    upright = facing > _UPRIGHT * true
+    valid = maps.sheet.valid
+    points = maps.sheet.points[:, :, maps.sheet.middle][valid]
+    nearest = np.asarray(cKDTree(middle).query(points)[1], dtype=np.intp)
+    row, ours = np.nonzero(valid)[1], maps.thickness[valid]
+    (tail, head), good = _BODY_ROWS, upright[nearest]
+    parts = {
+        "all": good,
+        "head": good & (row > head),
+        "body": good & (row >= tail) & (row <= head),
+        "tail": good & (row < tail),
+    }
+    return {part: (ours[rows], true[nearest[rows]]) for part, rows in parts.items()}
+
+
+def _whole_rows(result: dict[str, tuple[Float, Float]] | Refusal) -> list[Cells]:
+    """Compare the whole sheet's thickness with the true one, part by part."""
+    if isinstance(result, Refusal):
+        return [{"part": "all", "target": str(result), "met": False}]
+    rows: list[Cells] = []
+    for part, (ours, true) in result.items():
+        bias, (spread, same) = float((ours - true).mean()), _two(ours, true)
+        limit = _WHOLE_SD[part]
+        met = abs(bias) <= _WHOLE_BIAS and spread <= limit
+        target = f"bias within {_WHOLE_BIAS:g}, SD ≤ {limit:g}"
+        cells: Cells = {"part": part, "bias": f"{bias:+.3f}", "SD": spread, "r": same}
+        rows.append({**cells, "nodes": len(ours), "target": target, "met": met})
+    return rows
 
 
 def _values(pattern: str, kind: str | None = None) -> Float:
@@ -208,6 +269,13 @@ HippUnfold (DeKraker et al. 2022) has a thickness of its own: the distance of it
 outer surface. A person's labels are measured, and compared with it node by node. Of templates,
 whose two surfaces are known, labels are drawn between these in voxels of 0.4 mm: then the walls
 are the same.
+"""
+
+_WHOLE_NOTES = """\
+Of each node with a value, which lies at least 1 mm from edges, ends and holes, and the nearest
+vertex of HippUnfold's. Nodes where HippUnfold's corresponding vertices lie obliquely to each other
+are left out: their distance is not a thickness. Labels beside the walls come from the walls
+themselves, which favors the method.
 """
 
 _NOTES = """\

@@ -3,6 +3,7 @@ from fnmatch import fnmatch
 
 import pytest
 
+from hipsta_bids.cli.participant import REGIONS
 from hipsta_bids.derivatives.names import (
     DATASET_FILES,
     EXTRA_OUTPUTS,
@@ -90,7 +91,7 @@ def test_outputs_without_a_rule_are_ignored_by_validators():
 
 
 def test_every_line_of_the_ignore_file_hides_something_and_says_why():
-    regions = [replace(FULL, region=region) for region in ("body", "extended", "entorhinal")]
+    regions = [replace(FULL, region=region) for region in REGIONS]
     rows = (*OUTPUTS, *EXTRA_OUTPUTS)
     names = [output_name(name, row.key, row.desc) for name in regions for row in rows]
     names += [f"/{name}" for name in DATASET_FILES.values()]

@@ -23,7 +23,7 @@ from descriptors import (
 from hipsta_bids import __version__
 from hipsta_bids.cli.group import group_parser
 from hipsta_bids.cli.main import main
-from hipsta_bids.cli.participant import build_parser
+from hipsta_bids.cli.participant import REGIONS, build_parser
 from hipsta_bids.derivatives.names import (
     DATASET_FILES,
     EXTRA_OUTPUTS,
@@ -87,7 +87,7 @@ def test_kinds_of_values():
     assert inputs["n_procs"]["minimum"] == 1
     assert (inputs["timeout"]["minimum"], inputs["timeout"]["exclusive-minimum"]) == (0, True)
     assert inputs["hemi"]["value-choices"] == ["L", "R"]
-    assert inputs["region"]["value-choices"] == ["body", "extended", "entorhinal"]
+    assert inputs["region"]["value-choices"] == list(REGIONS)
     for key in ("freesurfer_dir", "ashs_dir", "hippunfold_dir", "derivatives", "bids_dir"):
         assert inputs[key]["type"] == "File"
     for key in ("output_dir", "work_dir", "bids_database_dir"):  # need not exist

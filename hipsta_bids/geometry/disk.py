@@ -1,0 +1,399 @@
+"""The mid-surface of the whole sheet as a disk, its edges and ends, and a map to a rectangle."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry.mesh import triangle_areas, unique_edges
+from hipsta_bids.geometry.wall import edge_graph
+from hipsta_bids.types import Float, Int, TetMesh
+
+_FLOOR, _CEILING = 0.05, 20.0
+"""Bounds of the weights of edges: negative ones would fold the map."""
+_STIFF = 1e3
+"""How much more a line of given values weighs than an edge that it crosses."""
+_PARTS = 60
+"""Into so many parts head and tail are divided to space their rows."""
+_SLACK = 1e-6
+"""Nodes on the sides of triangles must not be lost by rounding."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Disk:
+    """A triangle mesh with one boundary; what was filled is marked."""
+
+    vertices: Float
+    """(V, 3) RAS mm."""
+    triangles: Int
+    """(F, 3) all oriented alike, their normals towards the exterior."""
+    holes: tuple[float, ...]
+    """Perimeters of the holes, mm, longest first."""
+    centers: tuple[Float, ...]
+    """(3,) middle of each hole, RAS mm, in the same order."""
+    beside: float
+    """Area of all other pieces over that of this one."""
+    loop: Int
+    """(B,) vertices of the boundary, in order."""
+    cell: NDArray[np.intp]
+    """(F,) tetrahedron in which each triangle lies; -1 where it fills a hole."""
+
+
+def level_surface(
+    mesh: TetMesh, values: Float, level: float
+) -> tuple[Float, Int, NDArray[np.intp]]:
+    """Find where a function (V,) has a value: points, triangles, and a cell per triangle.
+
+    Triangles are oriented so that the function rises along their normals.
+    """
+    cells = mesh.tetrahedra
+    above = values[cells] > level
+    number = above.sum(axis=1)
+    order = np.argsort(~above, axis=1, kind="stable")  # corners above first
+    ends: list[Int] = []
+    owner: list[NDArray[np.intp]] = []
+    for count, faces in (
+        (1, (((0, 1), (0, 2), (0, 3)),)),
+        (3, (((0, 3), (1, 3), (2, 3)),)),
+        (2, (((0, 2), (0, 3), (1, 3)), ((0, 2), (1, 3), (1, 2)))),
+    ):
+        rows = np.flatnonzero(number == count)
+        corner = np.take_along_axis(cells[rows], order[rows], axis=1)
+        for face in faces:
+            ends.append(corner[:, np.array(face)])  # (N, 3, 2) vertices of three crossed edges
+            owner.append(rows)
+    edges = np.sort(np.concatenate(ends).reshape(-1, 2).astype(np.int64), axis=1)
+    cell = np.concatenate(owner)
+    code, index = np.unique(edges[:, 0] * len(values) + edges[:, 1], return_inverse=True)
+    a, b = code // len(values), code % len(values)
+    share = ((level - values[a]) / (values[b] - values[a]))[:, None]
+    points = mesh.vertices[a] + share * (mesh.vertices[b] - mesh.vertices[a])
+    triangles = index.reshape(-1, 3).astype(np.int32)
+    p = points[triangles]
+    normal = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
+    up = mesh.vertices[cells[cell]] - p[:, :1]
+    rise = ((values[cells[cell]] - level)[:, :, None] * up).sum(axis=1)
+    wrong = (normal * rise).sum(axis=1) < 0
+    triangles[wrong] = triangles[wrong][:, ::-1]
+    return points, triangles, cell
+
+
+def make_disk(points: Float, triangles: Int, cell: NDArray[np.intp]) -> Disk:
+    """Take the largest piece of a surface and fill all its holes but the longest boundary."""
+    graph = edge_graph(unique_edges(triangles), np.ones(len(unique_edges(triangles))), len(points))
+    piece = sparse.csgraph.connected_components(graph, directed=False)[1]
+    area = np.bincount(piece[triangles[:, 0]], triangle_areas(points, triangles))
+    kept = piece[triangles[:, 0]] == area.argmax()
+    triangles, cell = triangles[kept], cell[kept]
+    loops = _loops(triangles)
+    if not loops:
+        raise GeometryError("the mid-surface is closed: check the labels", reason="whole-topology")
+    length = [
+        float(np.linalg.norm(points[loop] - points[np.roll(loop, 1)], axis=1).sum())
+        for loop in loops
+    ]
+    order = np.argsort(length)[::-1]
+    filled, centers = list[Int](), list[Float]()
+    for number in order[1:]:
+        loop = loops[number]
+        center = len(points) + len(centers)
+        centers.append(points[loop].mean(axis=0))
+        # The boundary runs along its triangles; those of the filling run against it.
+        filled.append(np.column_stack([np.roll(loop, -1), loop, np.full(len(loop), center)]))
+    added = np.concatenate(filled) if filled else np.zeros((0, 3), np.int32)
+    vertices = np.vstack([points, *[c[None] for c in centers]])
+    every = np.vstack([triangles, added])
+    cell = np.concatenate([cell, np.full(len(added), -1)])
+    used = np.unique(every)
+    index = np.full(len(vertices), -1, dtype=np.int32)
+    index[used] = np.arange(len(used), dtype=np.int32)
+    every = index[every]
+    euler = len(used) - len(unique_edges(every)) + len(every)
+    if euler != 1:
+        raise GeometryError(
+            f"the sheet has {(1 - euler) // 2} handles: parts of it touch or are bridged; "
+            "correct the labels by hand",
+            reason="whole-topology",
+        )
+    return Disk(
+        vertices=vertices[used],
+        triangles=every,
+        holes=tuple(length[n] for n in order[1:]),
+        centers=tuple(centers),
+        beside=float(area.sum() / area.max() - 1),
+        loop=index[loops[order[0]]],
+        cell=cell,
+    )
+
+
+def _loops(triangles: Int) -> list[Int]:
+    """Find the boundaries, in the direction in which their triangles run."""
+    ways = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64)
+    size = int(ways.max()) + 1
+    code, back = ways[:, 0] * size + ways[:, 1], ways[:, 1] * size + ways[:, 0]
+    open_ = ways[~np.isin(code, back)]
+    after: dict[int, list[int]] = {}
+    for a, b in open_.tolist():
+        after.setdefault(a, []).append(b)
+    loops = []
+    while after:
+        start = next(iter(after))
+        loop, here = [], start
+        while here in after:
+            ahead = after[here]
+            loop.append(here)
+            here, rest = ahead[-1], ahead[:-1]
+            if rest:
+                after[loop[-1]] = rest
+            else:
+                del after[loop[-1]]
+        loops.append(np.array(loop, dtype=np.int32))
+    return loops
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Edges:
+    """The four sides of a disk, vertex numbers in the order of its boundary."""
+
+    medial: Int
+    lateral: Int
+    posterior: Int
+    anterior: Int
+
+
+class Line(NamedTuple):
+    """A line across a disk on which a function has a given value."""
+
+    edges: Int
+    """(N, 2) edges of triangles that it crosses."""
+    share: Float
+    """(N,) where on the way from the first vertex to the second."""
+    value: float
+
+
+def find_edges(disk: Disk, medial: Float, lateral: Float, height: Float) -> Edges:
+    """Divide the boundary by what speaks for (1) and against (-1) an edge at its vertices (B,).
+
+    An edge is the arc with the largest sum, by length; what is left are the ends. ``height`` (B,)
+    rises towards the anterior end.
+    """
+    points = disk.vertices[disk.loop]
+    step = np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1)
+    length = (step + np.roll(step, -1)) / 2
+    first = _best_arc(medial * length)
+    taken = np.isin(np.arange(len(length)), first)
+    for step_aside in (1, -1):  # a vertex of each end lies between
+        taken |= np.roll(taken, step_aside)
+    second = _best_arc(np.where(taken, -length.sum(), lateral * length))
+    if not (len(first) and len(second)):
+        raise GeometryError(
+            "the sheet has no medial or no lateral edge: check the labels of the subiculum, and of "
+            "CA2 and CA3 beside the dentate gyrus",
+            reason="whole-edges",
+        )
+    arcs = [first, second]
+    count = len(disk.loop)
+    between = [
+        (here[-1] + np.arange(1, (there[0] - here[-1]) % count)) % count
+        for here, there in (arcs, arcs[::-1])
+    ]
+    between.sort(key=lambda arc: float(np.median(height[arc])))
+    sides = [disk.loop[arc] for arc in (*arcs, *between)]
+    return Edges(medial=sides[0], lateral=sides[1], posterior=sides[2], anterior=sides[3])
+
+
+def _best_arc(score: Float) -> NDArray[np.intp]:
+    """Find the arc with the largest sum in a closed sequence of scores: its indices, in order."""
+    count = len(score)
+    total = np.concatenate([[0.0], np.cumsum(np.tile(score, 2))])
+    # An arc of a closed sequence either does not wrap, or what it leaves out does not.
+    low = np.minimum.accumulate(total[: count + 1])
+    end = int((total[: count + 1] - low).argmax())
+    high = np.maximum.accumulate(total[: count + 1])
+    gap = int((high - total[: count + 1]).argmax())
+    inner, outer = total[end] - low[end], total[count] + high[gap] - total[gap]
+    if inner >= outer:
+        first = int(np.flatnonzero(total[: end + 1] == low[end])[-1])
+        return np.arange(first, end)
+    begin = int(np.flatnonzero(total[: gap + 1] == high[gap])[-1])
+    return np.arange(gap, begin + count) % count
+
+
+def map_to_rectangle(
+    disk: Disk, edges: Edges, lines: Sequence[Line], ends: tuple[float, float]
+) -> Float:
+    """Two harmonic functions (V, 2): x from -1 to 1 between the edges, y between the ends.
+
+    y has the two values of ``ends`` at the posterior and the anterior end, and that of each line
+    along it.
+    """
+    matrix = _stiffness(disk.vertices, disk.triangles)
+    x = _harmonic(matrix, ((edges.medial, -1.0), (edges.lateral, 1.0)), ())
+    inner = (edges.posterior, ends[0]), (edges.anterior, ends[1])
+    y = _harmonic(matrix, inner, lines)
+    return np.column_stack([x, y])
+
+
+def space_rows(disk: Disk, plane: Float, extent: float, ends: tuple[float, float]) -> Float:
+    """Space lines of equal y beyond plus and minus ``extent`` evenly by distance from the body.
+
+    A harmonic function changes most beside a short end: there its lines would all lie. The mean
+    distance along the sheet of what lies on a line takes its place. Returns new values (V, 2).
+    """
+    edges = unique_edges(disk.triangles)
+    lengths = np.linalg.norm(np.diff(disk.vertices[edges], axis=1)[:, 0], axis=1)
+    result, y = plane.copy(), plane[:, 1]
+    inner = np.flatnonzero(np.abs(y) <= extent)
+    graph = edge_graph(edges, lengths, len(y))
+    far = sparse.csgraph.dijkstra(graph, directed=False, indices=inner, min_only=True)
+    for sign, end in ((-1.0, -ends[0]), (1.0, ends[1])):
+        beyond = np.flatnonzero(sign * y > extent)
+        if end <= extent or not len(beyond):
+            continue
+        order = beyond[np.argsort(sign * y[beyond], kind="stable")]
+        parts = np.array_split(order, min(_PARTS, len(order)))
+        level = [extent, *(float(sign * y[part].mean()) for part in parts), end]
+        mean = [0.0, *(float(far[part].mean()) for part in parts)]
+        depth = np.maximum.accumulate([*mean, float(far[order].max())])
+        depth += _SLACK * np.arange(len(depth))  # lines must not merge
+        reached = np.interp(sign * y[beyond], level, depth)
+        result[beyond, 1] = sign * (extent + (end - extent) * reached / depth[-1])
+    return result
+
+
+def find_line(disk: Disk, edges: Edges, height: Float, value: float) -> Line | None:
+    """Find where a plane, by heights (V,) above it, crosses from edge to edge, if it does."""
+    every = unique_edges(disk.triangles)
+    cut = every[(height[every[:, 0]] > 0) != (height[every[:, 1]] > 0)]
+    size = len(disk.vertices)
+    code = cut[:, 0].astype(np.int64) * size + cut[:, 1]
+    sides = np.sort(disk.triangles[:, [[0, 1], [1, 2], [2, 0]]], axis=2).astype(np.int64)
+    codes = sides[..., 0] * size + sides[..., 1]
+    rank = np.searchsorted(code, codes).clip(max=max(len(code) - 1, 0))
+    hit = code[rank] == codes if len(code) else np.zeros(codes.shape, dtype=bool)
+    links = rank[hit].reshape(-1, 2)  # a plane crosses two edges of a triangle
+    graph = edge_graph(links.astype(np.int32), np.ones(len(links)), len(cut))
+    piece = sparse.csgraph.connected_components(graph, directed=False)[1]
+    at = [np.isin(cut, side).all(axis=1) for side in (edges.medial, edges.lateral)]
+    through = np.intersect1d(piece[at[0]], piece[at[1]])
+    if not len(through):
+        return None
+    counts = np.bincount(piece)
+    chosen = cut[piece == through[counts[through].argmax()]]
+    first, second = height[chosen.T]
+    return Line(chosen, first / (first - second), value)
+
+
+def _stiffness(vertices: Float, triangles: Int) -> sparse.csr_array:
+    """Stiffness of a surface, all edge weights at least a floor, so that triangles do not flip."""
+    rows, weights = [], []
+    for k in range(3):
+        corner, i, j = (triangles[:, (k + n) % 3] for n in range(3))
+        u, v = vertices[i] - vertices[corner], vertices[j] - vertices[corner]
+        sine = np.linalg.norm(np.cross(u, v), axis=1)
+        weights.append(0.5 * (u * v).sum(axis=1) / np.maximum(sine, 1e-9))
+        rows.append(np.sort(np.column_stack([i, j]), axis=1))
+    size = len(vertices)
+    pair = np.concatenate(rows).astype(np.int64)
+    code, index = np.unique(pair[:, 0] * size + pair[:, 1], return_inverse=True)
+    total: Float = np.bincount(index, np.concatenate(weights)).astype(np.float64)
+    weight = np.clip(total, _FLOOR, _CEILING)
+    graph = edge_graph(np.column_stack([code // size, code % size]).astype(np.int32), weight, size)
+    return sparse.csr_array(sparse.diags_array(np.asarray(graph.sum(axis=1)).ravel()) - graph)
+
+
+def _harmonic(
+    matrix: sparse.csr_array,
+    fixed: tuple[tuple[Int, float], ...],
+    lines: Sequence[Line],
+) -> Float:
+    """Harmonic function (V,) with values at some vertices, and others along lines across edges."""
+    count = matrix.shape[0]
+    result, free = np.zeros(count), np.ones(count, dtype=bool)
+    for where, value in fixed:
+        result[where], free[where] = value, False
+    right = np.zeros(count)
+    for edges, share, value in lines:
+        row = np.arange(len(edges)).repeat(2)
+        weight = np.column_stack([1 - share, share]).ravel()
+        across = sparse.csr_array((weight, (row, edges.ravel())), shape=(len(edges), count))
+        matrix = matrix + _STIFF * (across.T @ across)
+        right += _STIFF * value * np.asarray(across.sum(axis=0)).ravel()
+    right -= matrix @ result
+    factor = splu(
+        sparse.csc_array(matrix[free][:, free]),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
+    result[free] = factor.solve(right[free])
+    return result
+
+
+def flipped_area(disk: Disk, plane: Float) -> float:
+    """Share of a disk's area that a map (V, 2) turns over."""
+    a, b, c = (plane[disk.triangles[:, k]] for k in range(3))
+    u, v = b - a, c - a
+    sign = np.sign(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
+    area = triangle_areas(disk.vertices, disk.triangles)
+    wrong = float(area[sign * np.sign((sign * area).sum()) <= 0].sum())
+    return wrong / float(area.sum())
+
+
+def locate_nodes(disk: Disk, plane: Float, x: Float, y: Float) -> tuple[NDArray[np.intp], Float]:
+    """Triangle (Nx, Ny) of a disk in which each node of a grid lies, and weights (Nx, Ny, 3).
+
+    -1 where there is none. Where a fold makes two triangles claim a node, the one that holds it
+    most centrally wins.
+    """
+    corner = plane[disk.triangles]
+    low = [
+        np.searchsorted(axis, corner[..., k].min(axis=1) - _SLACK) for k, axis in enumerate((x, y))
+    ]
+    high = [
+        np.searchsorted(axis, corner[..., k].max(axis=1) + _SLACK) for k, axis in enumerate((x, y))
+    ]
+    count = [b - a for a, b in zip(low, high, strict=True)]
+    number = count[0] * count[1]
+    cell = np.repeat(np.arange(len(number)), number)
+    rank = np.arange(len(cell)) - np.repeat(np.cumsum(number) - number, number)
+    i, j = low[0][cell] + rank // count[1][cell], low[1][cell] + rank % count[1][cell]
+    a, b, c = corner[cell].swapaxes(0, 1)
+    u, v, w = b - a, c - a, np.column_stack([x[i], y[j]]) - a
+    det = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
+    det = np.where(np.abs(det) < 1e-15, np.nan, det)  # noqa: PLR2004 -- flat
+    second = (w[:, 0] * v[:, 1] - w[:, 1] * v[:, 0]) / det
+    third = (u[:, 0] * w[:, 1] - u[:, 1] * w[:, 0]) / det
+    weight = np.column_stack([1 - second - third, second, third])
+    worst = weight.min(axis=1)
+    order = np.argsort(worst, kind="stable")  # not a number comes last
+    order = order[worst[order] > -_SLACK]
+    triangle = np.full((len(x), len(y)), -1, dtype=np.intp)
+    weights = np.zeros((len(x), len(y), 3))
+    triangle[i[order], j[order]] = cell[order]
+    weights[i[order], j[order]] = weight[order]
+    return triangle, weights
+
+
+def distance_from_rims(disk: Disk) -> Float:
+    """(V,) distance along the sheet from its edges, ends and filled holes, mm."""
+    measured = disk.triangles[disk.cell >= 0]
+    edges = unique_edges(measured)
+    lengths = np.linalg.norm(np.diff(disk.vertices[edges], axis=1)[:, 0], axis=1)
+    rims = np.union1d(disk.loop, disk.triangles[disk.cell < 0])
+    found: Float = sparse.csgraph.dijkstra(
+        edge_graph(edges, lengths, len(disk.vertices)), directed=False, indices=rims, min_only=True
+    )
+    return found
+
+
+def masked_area(disk: Disk, margin: float) -> float:
+    """Share of a disk's area within ``margin``, mm, of its edges, ends and filled holes."""
+    area = triangle_areas(disk.vertices, disk.triangles)
+    near = distance_from_rims(disk)[disk.triangles].mean(axis=1) < margin
+    return float(area[near].sum() / area.sum())

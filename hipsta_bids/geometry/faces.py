@@ -1,0 +1,211 @@
+"""The surface of the whole sheet, head and tail included, and its two faces.
+
+Nothing is cut, and nothing is made a ball of: where banks of the head touch, the labels do not tell
+them apart. A function on the surface, near 1 on the interior and near -1 on the exterior face, is
+found in one linear system from labels beside the surface, from sharp bends, and from the opposite
+wall; its zero line is the rim.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, sparse
+from scipy.spatial import cKDTree
+from skimage.measure import marching_cubes
+
+from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry.digital import FACES, piece_sizes, to_ras
+from hipsta_bids.geometry.fem import compact_groups, solve_two_level
+from hipsta_bids.geometry.mesh import signed_volume, smooth_vertices, triangle_areas, unique_edges
+from hipsta_bids.geometry.wall import edge_graph, vertex_normals
+from hipsta_bids.protocols.protocol import CORE, Tissue
+from hipsta_bids.settings import SurfaceSettings
+from hipsta_bids.types import Bool, Float, Int, LabelVolume, Surface
+
+SMOOTHING, MIN_SMOOTHING = 0.83, 0.25
+"""Standard deviation of the Gaussian, in-plane voxels, and its least, mm."""
+RIM_BEND = 0.35
+"""Neighbors across a sharper convex bend than this hardly have to be alike, 1/mm."""
+OPPOSITE = 0.6
+"""How much it weighs that opposite walls are different faces; that neighbors are alike: 2."""
+EVIDENCE = {
+    Tissue.MOLECULAR_LAYER: (1.0, 0.5),
+    **dict.fromkeys(CORE, (1.0, 0.05)),
+    Tissue.BACKGROUND: (-1.0, 0.04),
+    Tissue.OTHER: (-1.0, 0.04),
+}
+"""Face beside which a label lies, and how much that weighs. Dentate gyrus lies beside the lateral
+edge, too, and what has no label may be either."""
+PROBES = (0.25, 0.4, 0.55, 0.7)
+"""Where labels are looked for, mm outside the surface."""
+REACH = 3.5
+"""How far the opposite wall may be, mm."""
+STRIP = 0.75
+"""The rim strip reaches this far to both sides, multiples of the median distance across."""
+ISLAND = 5.0
+"""Smaller parts of one face inside of the other belong to that, mm2."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Faces:
+    """Which vertices of the surface belong to the two faces."""
+
+    side: Float
+    """(V,) near 1 on the interior, near -1 on the exterior face."""
+    free: Bool
+    """(V,) the strip along the rim, which belongs to neither."""
+
+    @property
+    def interior(self) -> Int:
+        """Vertices of the interior face."""
+        return np.flatnonzero(~self.free & (self.side > 0)).astype(np.int32)
+
+    @property
+    def exterior(self) -> Int:
+        """Vertices of the exterior face."""
+        return np.flatnonzero(~self.free & (self.side <= 0)).astype(np.int32)
+
+
+def whole_tissue(volume: LabelVolume) -> NDArray[np.uint8]:
+    """(I, J, K) the largest piece of the sheet's subfields, cavities filled; 0 elsewhere."""
+    tissue = np.where(np.isin(volume.tissue, volume.protocol.sheet), volume.tissue, 0)
+    pieces, count = ndimage.label(tissue > 0, structure=FACES)
+    if not count:
+        raise GeometryError(
+            "no voxel of the sheet's subfields: check the protocol", reason="no-sheet-labels"
+        )
+    kept = pieces == piece_sizes(pieces).argmax()
+    inside = ndimage.binary_fill_holes(kept)
+    nearest = ndimage.distance_transform_edt(~kept, return_distances=False, return_indices=True)
+    return np.where(inside, tissue[tuple(nearest)], 0).astype(np.uint8)
+
+
+def whole_surface(
+    inside: Bool, affine: Float, spacing: float, surface: SurfaceSettings
+) -> tuple[Surface, NDArray[np.float32], Float]:
+    """Smooth a mask and extract its surface; also the field, and its affine to RAS mm."""
+    edges = np.linalg.norm(affine[:3, :3], axis=0)
+    steps = spacing / edges
+    room = np.ceil(2.0 / edges).astype(int)  # mm of free space
+    padded = np.pad(inside, [(n, n) for n in room]).astype(np.float32)
+    shape = tuple(int(n) for n in (np.array(padded.shape) - 1) // steps + 1)
+    values = ndimage.affine_transform(padded, steps, output_shape=shape, order=1, output=np.float32)
+    sigma = max(MIN_SMOOTHING, SMOOTHING * float(np.sort(edges)[:2].mean()))
+    sigma /= spacing
+    field = ndimage.gaussian_filter(values, sigma, truncate=3.0)
+    field -= np.float32(0.5)
+    pieces, _ = ndimage.label(field > 0, structure=FACES)
+    field[(field > 0) & (pieces != piece_sizes(pieces).argmax())] = -0.01
+    grid = affine.copy()
+    grid[:3, :3] = affine[:3, :3] * steps
+    grid[:3, 3] = to_ras(-room, affine)
+    nodes, faces, _, _ = marching_cubes(field, level=0.0)  # type: ignore[no-untyped-call]
+    faces = faces.astype(np.int32)
+    nodes = smooth_vertices(nodes.astype(np.float64), faces, surface)
+    vertices = to_ras(nodes, grid)
+    if signed_volume(vertices, faces) < 0:
+        faces = faces[:, ::-1]
+    none = np.zeros(len(vertices), dtype=bool)
+    return (
+        Surface(vertices=vertices, triangles=faces, posterior_cap=none, anterior_cap=none),
+        field,
+        grid,
+    )
+
+
+def find_faces(
+    surface: Surface,
+    volume: LabelVolume,
+    field: NDArray[np.float32],
+    grid: Float,
+) -> Faces:
+    """Find the interior and the exterior face, and the strip between them."""
+    points, triangles = surface.vertices, surface.triangles
+    count = len(points)
+    edges = unique_edges(triangles)
+    normals = vertex_normals(points, triangles)
+    across, opposite = _opposite(points, normals, field, grid)
+    step, turn = (
+        points[edges[:, 1]] - points[edges[:, 0]],
+        normals[edges[:, 1]] - normals[edges[:, 0]],
+    )
+    lengths = np.linalg.norm(step, axis=1)
+    bend = np.maximum((step * turn).sum(axis=1) / lengths**2, 0)  # 1/mm along the edge, convex
+    weight = 2 / (1 + (bend / RIM_BEND) ** 4) + 0.02
+    graph = edge_graph(edges, weight, count)
+    diagonal: Float = np.asarray(graph.sum(axis=1), dtype=np.float64).ravel()
+    mated = np.flatnonzero(opposite >= 0)
+    pairs = edge_graph(
+        np.column_stack([mated, opposite[mated]]).astype(np.int32),
+        np.full(len(mated), OPPOSITE),
+        count,
+    )
+    diagonal += np.asarray(pairs.sum(axis=1)).ravel()
+    right: Float = np.zeros(count)
+    for target, strength in _label_evidence(points, normals, volume):
+        diagonal += strength
+        right += target * strength
+    matrix = sparse.csr_array(sparse.diags_array(diagonal) - graph + pairs)
+    side = solve_two_level(matrix, right, np.ones(count, dtype=bool), compact_groups(points), 1e-6)
+    side = _without_islands(side, edges, points, triangles)
+    crossing = side[edges[:, 0]] * side[edges[:, 1]] <= 0
+    reach = STRIP * float(np.nanmedian(across))
+    rim = np.unique(edges[crossing])
+    near = sparse.csgraph.dijkstra(
+        edge_graph(edges, lengths, count), directed=False, indices=rim, limit=reach, min_only=True
+    )
+    return Faces(side=side, free=np.isfinite(near))
+
+
+def _opposite(
+    points: Float,
+    normals: Float,
+    field: NDArray[np.float32],
+    grid: Float,
+) -> tuple[Float, NDArray[np.intp]]:
+    """Distance across the sheet, mm, and the vertex there; NaN and -1 unless both face so."""
+    step = 0.1
+    depth = np.arange(2 * step, REACH, step)
+    inverse = np.linalg.inv(grid)
+    start, way = to_ras(points, inverse), -normals @ inverse[:3, :3].T
+    inside = np.empty((len(depth), len(points)), dtype=bool)
+    for row, far in enumerate(depth):
+        inside[row] = ndimage.map_coordinates(field, (start + far * way).T, order=1) > 0
+    out = inside & ~np.vstack([inside[1:], inside[-1:]])  # the next one is outside
+    first = out.argmax(axis=0)
+    found = out.any(axis=0) & (first < len(depth) - 1)
+    across = np.where(found, depth[first] + step / 2, np.nan)
+    mate = cKDTree(points).query(points - np.nan_to_num(across)[:, None] * normals)[1]
+    back = across[mate]
+    facing = (normals * normals[mate]).sum(axis=1) < -0.5  # noqa: PLR2004 -- 60 degrees
+    mutual = np.abs(back - across) < 0.5 * np.fmin(across, back)
+    mutual &= facing & found
+    return np.where(mutual, across, np.nan), np.where(mutual, mate, -1)
+
+
+def _label_evidence(
+    points: Float, normals: Float, volume: LabelVolume
+) -> list[tuple[float, Float]]:
+    """Which side labels beside the surface speak for, and how strongly, (V,) each."""
+    inverse = np.linalg.inv(volume.affine)
+    evidence = {1.0: np.zeros(len(points)), -1.0: np.zeros(len(points))}
+    for distance in PROBES:
+        at = to_ras(points + distance * normals, inverse)
+        label = ndimage.map_coordinates(volume.tissue, at.T, order=0, mode="constant")
+        for tissue, (target, weight) in EVIDENCE.items():
+            evidence[target][label == tissue] += weight / len(PROBES)
+    return list(evidence.items())
+
+
+def _without_islands(side: Float, edges: Int, points: Float, triangles: Int) -> Float:
+    """Give islands of one face in the other, up to an area, to what is round them."""
+    share = np.zeros(len(points))
+    np.add.at(share, triangles.ravel(), np.repeat(triangle_areas(points, triangles) / 3, 3))
+    for _ in range(2):
+        same = (side[edges[:, 0]] > 0) == (side[edges[:, 1]] > 0)
+        graph = edge_graph(edges[same], np.ones(int(same.sum())), len(side))
+        piece = sparse.csgraph.connected_components(graph, directed=False)[1]
+        small = np.bincount(piece, share)[piece] < ISLAND
+        side = np.where(small, -side, side)
+    return side

@@ -1,0 +1,361 @@
+"""The whole hippocampus, or head and body, on one sheet (experimental): labels to maps.
+
+Head and tail bend and fold, so the solid has no ends to close and is not made a ball. It has two
+faces and a rim; edges and ends are found afterwards, on the boundary of the mid-surface. The
+body's rows of the grid are those of the body's own sheet: its end planes have the same y.
+"""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry.body import Body, check_side, extract_body
+from hipsta_bids.geometry.catalog import (
+    Measured,
+    average_profiles,
+    measure_maps,
+    measure_sections,
+    summarize,
+)
+from hipsta_bids.geometry.checks import name_place
+from hipsta_bids.geometry.digital import voxel_points
+from hipsta_bids.geometry.disk import (
+    Disk,
+    Edges,
+    Line,
+    distance_from_rims,
+    find_edges,
+    find_line,
+    flipped_area,
+    level_surface,
+    locate_nodes,
+    make_disk,
+    map_to_rectangle,
+    masked_area,
+    space_rows,
+)
+from hipsta_bids.geometry.ends import EndPlanes
+from hipsta_bids.geometry.faces import find_faces, whole_surface, whole_tissue
+from hipsta_bids.geometry.fem import volume_laplace
+from hipsta_bids.geometry.findings import flag_margins, raise_flags
+from hipsta_bids.geometry.lines import Lines
+from hipsta_bids.geometry.measures import column_area, labels_at
+from hipsta_bids.geometry.mesh import tetra_quality, tetrahedralize
+from hipsta_bids.geometry.sheet import fill_points, label_sheet, sheet_levels
+from hipsta_bids.protocols.protocol import CORE, LATERAL_END, MEDIAL_END, Tissue
+from hipsta_bids.settings import Settings, SheetSettings
+from hipsta_bids.types import (
+    Coordinates,
+    End,
+    Finding,
+    Flag,
+    Float,
+    HemisphereMaps,
+    Int,
+    LabelVolume,
+    Sheet,
+)
+
+Clock = Callable[[str], AbstractContextManager[None]]
+
+MAX_VOXEL = 0.5
+"""Refuse longer voxel edges, mm."""
+MARGIN = 1.0
+"""No value nearer than this to an edge, an end or a filled hole, mm."""
+MAX_PIECE = 0.02
+"""Refuse a piece beside the mid-surface with a larger share of its area."""
+MIN_EDGE = 30.0
+"""Refuse a shorter medial or lateral edge, mm."""
+FLAG_HOLE, FLAG_END = 10.0, 15.0
+"""Flag holes of a longer perimeter, and longer ends, mm."""
+FLAG_FOLDED, FLAG_MASKED = 0.01, 0.25
+"""Flag larger shares of the area that are turned over, and that have no values."""
+LATERAL_REACH = 1.6
+"""The lateral edge lies this near to dentate gyrus or CA4, mm."""
+CUT_REACH = 1.0
+"""Without a tail the sheet ends at the posterior plane: what is this near to it is no edge, mm."""
+MAX_SHIFT = 5.0
+"""How far inside an end plane the line is sought that has its y, mm."""
+MAX_LENGTH = 8.0
+"""Lines from the mid-surface to a wall that are longer than this are lost, mm."""
+_FAR = 500.0
+"""End planes moved by this far have all of the hippocampus between them, mm."""
+_SAME = 0.005
+"""mm; voxel edges that differ by less are the same."""
+_RIM = 0.9999
+"""Beside the edges themselves, where rounding does not choose the triangle."""
+
+
+def measure_whole(
+    volume: LabelVolume, hemi: str, settings: Settings, clock: Clock
+) -> HemisphereMaps:
+    """Measure head, body and, unless the region is ``headbody``, tail on one sheet.
+
+    Arguments, result and errors are those of `measure_hemisphere`.
+    """
+    region = settings.body.region
+    with clock("body"):
+        _check_voxel(volume)
+        body = extract_body(volume, settings.body.changed(region="body"))
+        side = check_side(body, hemi)
+        tissue = whole_tissue(volume)
+        ends = body.ends
+        far = ends.beyond(_FAR)
+        body = replace(body, tissue=tissue, inside=tissue > 0, region=region, ends=far)
+    with clock("surface"):
+        spacing = settings.grid.spacing
+        surface, field, grid = whole_surface(tissue > 0, volume.affine, spacing, settings.surface)
+    with clock("tetrahedra"):
+        mesh = tetrahedralize(surface, settings.tetra)
+    with clock("boundaries"):
+        faces = find_faces(surface, volume, field, grid)
+    with clock("coordinates"):
+        laplace = volume_laplace(mesh, settings.boundaries.solver)
+        u = laplace.between(faces.interior, faces.exterior)
+        disk = make_disk(*level_surface(mesh, u, 0.0))
+        _check_pieces(disk)
+        edges = _edges(disk, body, volume, ends.height, region)
+        axes, limits = grid_levels(settings.sheet, region)
+        lines = _end_lines(disk, edges, ends, body, settings.sheet)
+        plane = map_to_rectangle(disk, edges, lines, limits)
+        plane = space_rows(disk, plane, settings.sheet.y_extent, limits)
+    with clock("sheet"):
+        lines_of = Lines(mesh, laplace.gradient(u))
+        sheet = _sample(disk, plane, lines_of, axes, MARGIN)
+        edge_to_edge = (np.linspace(-_RIM, _RIM, len(axes[0])), axes[1], axes[2][::2])
+        whole = _sample(disk, plane, lines_of, edge_to_edge, 0.0)
+        subfield = label_sheet(sheet, body)
+    with clock("measures"):
+        measured = Measured(
+            body=body,
+            surface=surface,
+            mesh=mesh,
+            sheet=sheet,
+            subfield=subfield,
+            whole=whole,
+            settings=settings,
+        )
+        everywhere = measure_maps(measured)
+        maps = {k: np.where(sheet.valid, v, np.nan) for k, v in everywhere.items()}
+        maps["distortion"] = _distortion(sheet)
+        folded = flipped_area(disk, plane)
+        findings = _findings(disk, edges, folded, region)
+        return HemisphereMaps(
+            sheet=sheet,
+            layers=sheet,
+            maps=maps,
+            profiles=average_profiles(everywhere, sheet),
+            sections=measure_sections(measured),
+            subfield=subfield,
+            repaired=np.zeros(subfield.shape, dtype=bool),
+            body_mask=volume.in_file(tissue > 0),
+            summary=summarize(measured, volume.protocol.sheet),
+            qc={
+                "region": region,
+                "experimental": True,
+                "voxel_size_mm": np.linalg.norm(body.affine[:3, :3], axis=0).round(4).tolist(),
+                "body_voxels": int(np.count_nonzero(body.inside)),
+                "surface_vertices": len(surface.vertices),
+                "tetrahedra": len(mesh.tetrahedra),
+                "tetra_quality_median": float(np.median(tetra_quality(mesh))),
+                "holes_mm": [round(hole, 2) for hole in disk.holes],
+                "edge_lengths_mm": _lengths(disk, edges),
+                "folded_fraction": folded,
+                "masked_fraction": masked_area(disk, MARGIN),
+                "medial_offset_mm": side,
+                "posterior_end_rule": ends.posterior_rule,
+                "anterior_end_rule": ends.anterior_rule,
+                "posterior_plane": ends.entry("posterior"),
+                "anterior_plane": ends.entry("anterior"),
+                "flag_margins": flag_margins(findings),
+            },
+            flags=(
+                *raise_flags(findings, sheet, lambda at: name_place(at, body), settings.checks),
+                Flag(
+                    reason="whole-experimental",
+                    message=f"region {region} is experimental, and digitations of the head that"
+                    " touch count as one thick wall: compare thick places with the labels",
+                ),
+            ),
+            mesh=mesh,
+            coordinates=Coordinates(values=np.column_stack([np.full((len(u), 2), np.nan), u])),
+        )
+
+
+def grid_levels(
+    settings: SheetSettings, region: str
+) -> tuple[tuple[Float, Float, Float], tuple[float, float]]:
+    """Levels of the grid's nodes along x, y and z, and y at the two ends.
+
+    The body's rows are those of its own sheet. Before them lie as many again, less one, for the
+    head, and half as many behind them for the tail.
+    """
+    x, y, z = sheet_levels(settings)
+    step, head = y[1] - y[0], len(y) - 1
+    tail = 0 if region == "headbody" else head // 2
+    y = y[0] + step * np.arange(-tail, len(y) + head)
+    return (x, y, z), (float(y[0]), float(y[-1]))
+
+
+def _check_voxel(volume: LabelVolume) -> None:
+    longest = float(np.linalg.norm(volume.affine[:3, :3], axis=0).max())
+    if longest > MAX_VOXEL + _SAME:
+        raise GeometryError(
+            f"voxels of {longest:.2f} mm: head and tail need {MAX_VOXEL:g} mm or less along every "
+            "edge; measure the body, or use a finer segmentation",
+            reason="whole-voxels",
+        )
+
+
+def _check_pieces(disk: Disk) -> None:
+    if disk.beside > MAX_PIECE:
+        raise GeometryError(
+            f"{disk.beside:.0%} of the mid-surface is apart from the rest: the two faces of the "
+            "sheet cannot be told apart; look for missing dentate gyrus or molecular layer",
+            reason="whole-pieces",
+        )
+
+
+def _edges(
+    disk: Disk, body: Body, volume: LabelVolume, height: Callable[[Float, End], Float], region: str
+) -> Edges:
+    """Find edges and ends of the sheet on the boundary, by the labels beside it."""
+    points = disk.vertices[disk.loop]
+    tissue = labels_at(points, body)
+    core = cKDTree(voxel_points(np.isin(volume.tissue, CORE), volume.affine))
+    near = core.query(points, distance_upper_bound=LATERAL_REACH)[0] < LATERAL_REACH
+    medial = np.where(np.isin(tissue, MEDIAL_END), 1.0, -1.0)
+    ca1 = np.where(tissue == Tissue.CA1, 0.0, -1.0)  # it goes all round in the tail
+    lateral = np.where(near, np.where(np.isin(tissue, LATERAL_END), 1.0, ca1), -1.0)
+    above = height(points, "posterior")
+    if region == "headbody":
+        medial[above < CUT_REACH] = lateral[above < CUT_REACH] = -1.0
+    edges = find_edges(disk, medial, lateral, above)
+    for name in ("medial", "lateral"):
+        length = _length(disk, getattr(edges, name))
+        if length < MIN_EDGE:
+            raise GeometryError(
+                f"the {name} edge of the sheet is {length:.0f} mm long, {MIN_EDGE:g} mm are "
+                "needed: check the labels of the subiculum, CA2 and CA3",
+                reason="whole-edges",
+            )
+    return edges
+
+
+def _end_lines(
+    disk: Disk, edges: Edges, ends: EndPlanes, body: Body, settings: SheetSettings
+) -> list[Line]:
+    """Find the body's ends on the sheet, each with its y.
+
+    The head turns back medially. Where an end plane therefore does not cross the sheet from edge to
+    edge, one a little farther inside does, and has the y that it has in the body.
+    """
+    length = ends.length(body.inside_points()[1])
+    lines = []
+    signs: tuple[tuple[End, float], ...] = (("posterior", 1.0), ("anterior", -1.0))
+    for end, sign in signs[1 if body.region == "headbody" else 0 :]:
+        height = ends.height(disk.vertices, end)
+        for inward in np.arange(0.0, MAX_SHIFT, 0.25):
+            y = sign * settings.y_extent * (2 * inward / length - 1)
+            line = find_line(disk, edges, height - sign * inward, y)
+            if line is not None:
+                lines.append(line)
+                break
+        else:
+            raise GeometryError(
+                f"the {end} end plane of the body does not cross the sheet from edge to edge: "
+                "check the labels of head and tail, or place the end by hand",
+                reason="whole-ends",
+            )
+    return lines
+
+
+def _length(disk: Disk, arc: Int) -> float:
+    return float(np.linalg.norm(np.diff(disk.vertices[arc], axis=0), axis=1).sum())
+
+
+def _lengths(disk: Disk, edges: Edges) -> dict[str, float]:
+    return {name: round(_length(disk, getattr(edges, name)), 2) for name in Edges.__annotations__}
+
+
+def _sample(
+    disk: Disk, plane: Float, lines: Lines, axes: tuple[Float, Float, Float], margin: float
+) -> Sheet:
+    """Follow the lines through the nodes of a grid; without values near rims, and where lost."""
+    x, y, z = axes
+    triangle, weights = locate_nodes(disk, plane, x, y)
+    corner = disk.triangles[triangle]
+    middle = np.einsum("xyk,xykd->xyd", weights, disk.vertices[corner])
+    known = (triangle >= 0) & (disk.cell[triangle] >= 0)
+    cells = disk.cell[triangle[known]]
+    columns, arrived = lines.columns(cells, middle[known], len(z), MAX_LENGTH)
+    columns[~arrived] = np.nan
+    points = np.full((len(x), len(y), len(z), 3), np.nan)
+    points[known] = columns
+    rims = distance_from_rims(disk)
+    far = np.einsum("xyk,xyk->xy", weights, rims[corner]) > margin
+    valid = np.isfinite(points).all(axis=(2, 3)) & far
+    if not valid.any():
+        raise GeometryError(
+            "no node of the sheet is measured: check the labels", reason="sheet-incomplete"
+        )
+    return Sheet(points=fill_points(points), valid=valid)
+
+
+def _distortion(sheet: Sheet) -> Float:
+    """Area round each node over the mean, (Nx, Ny), binary logarithm: 1 is twice as large."""
+    area = np.where(sheet.valid, column_area(sheet), np.nan)
+    return np.asarray(np.log2(area / np.nanmean(area)))
+
+
+def _findings(disk: Disk, edges: Edges, folded: float, region: str) -> list[Finding]:
+    """List what was found on the whole sheet, within its limit or not."""
+    found = [
+        Finding(
+            reason="whole-hole",
+            value=length,
+            limit=FLAG_HOLE,
+            what=f"the sheet has a hole with a perimeter of {length:.0f} mm",
+            remedy="look at the labels there; it has no values",
+            points=center[None],
+        )
+        for length, center in zip(disk.holes, disk.centers, strict=True)
+    ]
+    ends = ("anterior",) if region == "headbody" else ("posterior", "anterior")
+    for end in ends:
+        arc = getattr(edges, end)
+        length = _length(disk, arc)
+        found.append(
+            Finding(
+                reason="whole-end",
+                value=length,
+                limit=FLAG_END,
+                what=f"the {end} end of the sheet is {length:.0f} mm long",
+                remedy="look where the subiculum, and CA2 or CA3, end there",
+                points=disk.vertices[arc],
+            )
+        )
+    masked = masked_area(disk, MARGIN)
+    return [
+        *found,
+        Finding(
+            reason="folded",
+            value=folded,
+            limit=FLAG_FOLDED,
+            what=f"the map folds in {folded:.1%} of the area",
+            remedy="look at the map",
+            share=folded,
+        ),
+        Finding(
+            reason="whole-masked",
+            value=masked,
+            limit=FLAG_MASKED,
+            what=f"{masked:.0%} of the area, beside edges, ends and holes, has no values",
+            remedy="look at the map",
+            share=masked,
+        ),
+    ]

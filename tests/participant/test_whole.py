@@ -1,0 +1,224 @@
+"""Head, body and tail on one sheet: a spiral wall along a hooked axis, whose thickness is known."""
+
+import json
+from contextlib import nullcontext
+from dataclasses import replace
+
+import nibabel as nib
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hipsta_bids.cli.main import main
+from hipsta_bids.derivatives.names import name_of_record
+from hipsta_bids.errors import GeometryError, ProtocolError
+from hipsta_bids.geometry.disk import find_edges, level_surface, make_disk
+from hipsta_bids.participant.measure import measure_hemisphere
+from hipsta_bids.protocols.load import for_region, load_protocol
+from hipsta_bids.protocols.protocol import Tissue, translate
+from hipsta_bids.settings import Settings
+from hipsta_bids.types import Bool, Float, GivenEnd, HemisphereMaps, LabelVolume, TetMesh
+
+VOXEL = 0.4
+LENGTH, BEND, ARC = 22.0, 9.0, np.deg2rad(240)
+RADIUS, THICKNESS = 4.0, 1.5
+WHOLE = Settings().changed(body={"region": "whole"})
+POSTERIOR, ANTERIOR = 5.0, 20.0
+
+
+def hooked(thickness: float = THICKNESS) -> LabelVolume:
+    """A left hemisphere: straight along y, then hooked medially in a circle, as the head is."""
+    low = np.array([-8.0, -3.0, -8.0])
+    shape = np.ceil((np.array([19.0, 38.0, 8.0]) - low) / VOXEL + 20).astype(int)
+    affine = np.eye(4)  # oblique, so that no wall runs along the voxels
+    affine[:3, :3] = VOXEL * Rotation.from_euler("xyz", [9, 6, 7], degrees=True).as_matrix()
+    affine[:3, 3] = low - affine[:3, :3] @ [7, 9, 7]
+    points = np.moveaxis(np.indices(shape), 0, -1) @ affine[:3, :3].T + affine[:3, 3]
+    x, y, z = np.moveaxis(points, -1, 0)
+    rho = np.hypot(x - BEND, y - LENGTH)
+    turn = np.arctan2(y - LENGTH, BEND - x)
+    hook = y > LENGTH
+    across = np.where(hook, BEND - rho, x)
+    within = np.where(hook, turn < np.deg2rad(100), y > 0)
+    r = np.hypot(across, z)
+    share = (-np.deg2rad(30) - np.arctan2(z, across)) % (2 * np.pi) / ARC
+    wall = (np.abs(r - RADIUS) < thickness / 2) & (share < 1)
+    codes = np.zeros(x.shape, dtype=int)
+    codes[r < RADIUS] = 6
+    codes[(r < 2) | ((r < RADIUS - 0.5) & (share > 1) & (share < 1.2))] = 4
+    codes[wall] = np.select([share < 0.25, share < 0.7], [2, 1], 5)[wall]
+    protocol = load_protocol("cobralab")
+    tissue, part = translate(np.where(within, codes, 0), protocol)
+    ends = (
+        GivenEnd(end="posterior", point=(0, POSTERIOR, 0), normal=(0, 1, 0)),
+        GivenEnd(end="anterior", point=(0, ANTERIOR, 0), normal=(0, 1, 0)),
+    )
+    return LabelVolume(tissue=tissue, part=part, affine=affine, protocol=protocol, given_ends=ends)
+
+
+def measure(volume: LabelVolume) -> HemisphereMaps:
+    return measure_hemisphere(volume, "L", WHOLE, lambda _: nullcontext())
+
+
+@pytest.fixture(scope="module")
+def maps() -> HemisphereMaps:
+    return measure(hooked())
+
+
+def middle(maps: HemisphereMaps) -> Float:
+    return maps.sheet.points[:, :, maps.sheet.middle]
+
+
+def test_thickness_is_known_in_head_body_and_tail(maps: HemisphereMaps) -> None:
+    y = np.broadcast_to(np.arange(51), maps.thickness.shape)
+    away = maps.sheet.valid & (middle(maps)[..., 1] > 2)  # mm from the blunt end of the tail
+    for rows in (y < 10, (y >= 10) & (y <= 30), y > 30):
+        values = maps.thickness[rows & away]
+        assert len(values) > 0.25 * np.count_nonzero(rows)
+        assert abs(values.mean() - THICKNESS) <= 0.03
+        assert values.std() <= 0.06
+
+
+def test_rows_of_the_body_lie_between_its_planes(maps: HemisphereMaps) -> None:
+    inner, edge = middle(maps)[4:-4], WHOLE.grid.spacing  # mm, of the triangles that planes cross
+    assert np.abs(inner[:, 10, 1] - POSTERIOR).max() < edge
+    assert np.abs(inner[:, 30, 1] - ANTERIOR).max() < edge
+
+
+def test_middle_lies_on_the_spiral_from_medial_to_lateral(maps: HemisphereMaps) -> None:
+    body = middle(maps)[:, 20]
+    assert np.abs(np.hypot(body[:, 0], body[:, 2])[4:-4] - RADIUS).max() < 0.1
+    assert maps.subfield[2, 20] == Tissue.SUBICULUM
+    assert maps.subfield[-3, 20] == Tissue.CA2_3
+
+
+def test_nothing_is_told_beside_rims(maps: HemisphereMaps) -> None:
+    assert np.isnan(maps.thickness[:, [0, -1]]).all()
+    assert np.isnan(maps.maps["curvature"][~maps.sheet.valid]).all()
+    assert np.isfinite(maps.maps["distortion"][maps.sheet.valid]).all()
+    assert maps.qc["experimental"]
+    assert maps.qc["holes_mm"] == []
+
+
+def test_mean_curvature_is_that_of_the_spiral(maps: HemisphereMaps) -> None:
+    values = maps.maps["curvature"][8:-8, 15:26]
+    assert abs(np.nanmean(values) - 1 / (2 * RADIUS)) < 0.01
+
+
+def test_coarse_voxels_are_refused() -> None:
+    volume = hooked()
+    with pytest.raises(GeometryError, match=r"0\.60 mm") as error:
+        measure(replace(volume, affine=volume.affine @ np.diag([1.5, 1, 1, 1])))
+    assert error.value.reason == "whole-voxels"
+
+
+def test_sheet_without_its_lateral_labels_is_refused() -> None:
+    volume = hooked()
+    tissue = np.where(volume.tissue == Tissue.DENTATE_GYRUS, Tissue.MOLECULAR_LAYER, volume.tissue)
+    tissue[0, 0, 0] = Tissue.DENTATE_GYRUS
+    with pytest.raises(GeometryError) as error:
+        measure(replace(volume, tissue=tissue))
+    assert error.value.reason == "whole-edges"
+
+
+def test_tail_without_subfields_is_refused() -> None:
+    protocol = load_protocol("freesurfer")
+    with pytest.raises(ProtocolError, match="headbody") as error:
+        for_region(protocol, "whole")
+    assert error.value.reason == "whole-subfields"
+    assert for_region(protocol, "headbody") == protocol
+
+
+def test_hole_is_filled_and_told() -> None:
+    volume = hooked()
+    points = np.moveaxis(np.indices(volume.tissue.shape), 0, -1) @ volume.affine[:3, :3].T
+    points = points + volume.affine[:3, 3]
+    hole = np.linalg.norm((points - [-RADIUS, 12.0, 0.0])[..., 1:], axis=-1) < 2.2
+    hole &= points[..., 0] < -RADIUS / 2
+    found = measure(replace(volume, tissue=np.where(hole, 0, volume.tissue)))
+    reasons = [flag.reason for flag in found.flags]
+    assert reasons.count("whole-hole") == 1
+    assert (
+        "whole-experimental" in reasons
+    )  # of each map, as long as fused digitations are not found
+    assert abs(found.qc["holes_mm"][0] - 2 * np.pi * 2.2) < 4
+    gap = np.linalg.norm(middle(found) - [-RADIUS, 12.0, 0.0], axis=-1)
+    assert np.isnan(found.thickness[gap < 2.5]).all()
+    assert np.isfinite(found.thickness[8:-8][(gap > 4)[8:-8] & (gap < 5)[8:-8]]).all()
+
+
+def cube(count: int) -> TetMesh:
+    """The unit cube in tetrahedra: Kuhn's six per cell."""
+    grid = np.stack(np.meshgrid(*[np.arange(count + 1)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    number = np.arange((count + 1) ** 3).reshape((count + 1,) * 3)
+    cells = []
+    for order in ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)):
+        corner, steps = np.zeros(3, dtype=int), [number[:-1, :-1, :-1]]
+        for axis in order:
+            corner[axis] = 1
+            part = tuple(slice(c, count + c) for c in corner)
+            steps.append(number[part])
+        cells.append(np.stack([s.ravel() for s in steps], axis=1))
+    return TetMesh(vertices=grid / count, tetrahedra=np.concatenate(cells))
+
+
+def test_level_of_a_linear_function_is_a_disk() -> None:
+    mesh = cube(4)
+    values = mesh.vertices @ [0.1, 0.2, 1.0]
+    disk = make_disk(*level_surface(mesh, values, 0.5371))
+    np.testing.assert_allclose(disk.vertices @ [0.1, 0.2, 1.0], 0.5371, atol=1e-12)
+    a, b, c = (disk.vertices[disk.triangles[:, k]] for k in range(3))
+    normals = np.cross(b - a, c - a)
+    assert (normals @ [0.1, 0.2, 1.0] > 0).all()
+    assert np.linalg.norm(normals, axis=1).sum() / 2 == pytest.approx(np.sqrt(1.05))
+    assert disk.holes == ()
+
+
+def sides(disk_points: Float, axis: int, value: float) -> Bool:
+    return np.abs(disk_points[:, axis] - value) < 1e-9
+
+
+def test_edges_wrap_round_the_boundary() -> None:
+    mesh = cube(6)
+    disk = make_disk(*level_surface(mesh, mesh.vertices[:, 2], 0.45))
+    points = disk.vertices[disk.loop]
+    for start in range(0, len(disk.loop), 5):
+        turned = replace(disk, loop=np.roll(disk.loop, start))
+        rolled = np.roll(points, start, axis=0)
+        medial, lateral = (np.where(sides(rolled, 0, v), 1.0, -1.0) for v in (0.0, 1.0))
+        found = find_edges(turned, medial, lateral, rolled[:, 1])
+        assert sides(disk.vertices[found.medial], 0, 0.0).all()
+        assert sides(disk.vertices[found.lateral], 0, 1.0).all()
+        assert np.median(disk.vertices[found.anterior][:, 1]) == 1.0
+
+
+def test_command_writes_beside_the_body_and_says_experimental(tmp_path, capsys) -> None:
+    volume = hooked()
+    derivative = tmp_path / "bids/derivatives/maget"
+    folder = derivative / "sub-01/anat"
+    folder.mkdir(parents=True)
+    about = {"Name": "x", "BIDSVersion": "1.8.0", "GeneratedBy": [{"Name": "MAGeTbrain"}]}
+    (derivative / "dataset_description.json").write_text(json.dumps(about))
+    codes = np.zeros(volume.tissue.shape, dtype=np.int16)
+    for label in volume.protocol.labels:
+        codes[volume.tissue == label.tissue] = 100 + label.code
+    image = nib.Nifti1Image(codes, volume.affine)
+    image.to_filename(folder / "sub-01_T1w_labels.nii.gz")
+    (tmp_path / "ends.tsv").write_text(
+        "participant_id\themi\tend\tr\ta\ts\tnr\tna\tns\n"
+        f"sub-01\tL\tposterior\t0\t{POSTERIOR}\t0\t0\t1\t0\n"
+        f"sub-01\tL\tanterior\t0\t{ANTERIOR}\t0\t0\t1\t0\n"
+    )
+    places = [str(tmp_path / "bids"), str(tmp_path / "out"), "participant", "--n-procs", "1"]
+    options = ["--ends", str(tmp_path / "ends.tsv"), "--hemi", "L", "--region", "whole"]
+    assert main([*places, *options]) == 0
+    assert "region whole is experimental" in capsys.readouterr().out
+    results = tmp_path / "out/sub-01/anat"
+    (path,) = results.glob("*_label-whole_desc-distortion_morph.shape.gii")
+    assert nib.load(path).agg_data().shape == (41 * 51,)
+    (record,) = results.glob("*_label-whole_desc-qc_metrics.json")
+    name = name_of_record(record.name)
+    assert name is not None
+    assert name.region_title == "whole region (experimental)"  # as pages have it
+    (sidecar,) = results.glob("*_label-whole_desc-sheet_morph.json")
+    assert "experimental" in json.loads(sidecar.read_text())["MeasuredRegion"]
