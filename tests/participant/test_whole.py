@@ -138,9 +138,7 @@ def test_hole_is_filled_and_told() -> None:
     found = measure(replace(volume, tissue=np.where(hole, 0, volume.tissue)))
     reasons = [flag.reason for flag in found.flags]
     assert reasons.count("whole-hole") == 1
-    assert (
-        "whole-experimental" in reasons
-    )  # of each map, as long as fused digitations are not found
+    assert "whole-experimental" in reasons  # of each map
     assert abs(found.qc["holes_mm"][0] - 2 * np.pi * 2.2) < 4
     gap = np.linalg.norm(middle(found) - [-RADIUS, 12.0, 0.0], axis=-1)
     assert np.isnan(found.thickness[gap < 2.5]).all()
