@@ -13,12 +13,14 @@ from hipsta_bids.types import Flag
 
 
 def pytest_collection_modifyitems(items):
-    """Skip what takes a browser, and do not prepare it, unless ``tools/test-reports`` asks."""
-    if os.environ.get("HIPSTA_BIDS_BROWSER") != "required":
-        skip = pytest.mark.skip(reason="takes a browser: run tools/test-reports")
-        for item in items:
-            if "browser" in item.fixturenames:
-                item.add_marker(skip)
+    """Skip what takes a browser, and what takes long, unless a script in ``tools`` asks for it."""
+    browser = os.environ.get("HIPSTA_BIDS_BROWSER") == "required"
+    long = os.environ.get("HIPSTA_BIDS_LONG") == "required"
+    for item in items:
+        if "browser" in item.fixturenames and not browser:
+            item.add_marker(pytest.mark.skip(reason="takes a browser: run tools/test-reports"))
+        if item.get_closest_marker("long") and not long:
+            item.add_marker(pytest.mark.skip(reason="takes long: run tools/test-long"))
 
 
 @pytest.fixture(scope="module")

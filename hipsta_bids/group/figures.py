@@ -117,6 +117,13 @@ def _panels(n_rows: int, n_columns: int, size: tuple[float, float]) -> tuple["Fi
     return figure, figure.subplots(n_rows, n_columns, squeeze=False)
 
 
+def _explain(figure: "Figure", axis: "Axes", title: str | None = None) -> None:
+    """Put the legend of a panel below all, where it covers no curve."""
+    handles = dict(zip(*axis.get_legend_handles_labels()[::-1], strict=True))
+    place = "outside lower center"
+    figure.legend(handles.values(), handles, title=title, loc=place, ncols=len(handles))
+
+
 def _name(axes: "Sequence[Axes]") -> None:
     """Put letters on panels, beside their titles."""
     for axis, letter in zip(axes, cycle(_LETTERS), strict=False):
@@ -233,7 +240,7 @@ def draw_registration(cohort: Cohort, analysis: Analysis) -> "list[Figure]":
         shifts.set_ylabel("shift to lateral [nodes]")
         for axis in (before, after, shifts):
             mark_medial(axis, cohort)
-    axes[0, 0].legend(title="mean, 2 standard errors")
+    _explain(figure, axes[0, 0], "mean, 2 standard errors")
     _name(axes.flat)
     return [figure]
 
@@ -271,7 +278,7 @@ def draw_sections(
             axis.set_xlabel("to lateral [mm]")
             axis.set_ylabel("to superior [mm]")
             axis.set_aspect("equal", adjustable="datalim")
-    axes[0, 0].legend(title="walls; dotted: middle")
+    _explain(figure, axes[0, 0], "walls; dotted: middle")
     _name(axes.flat)
     return [figure]
 
@@ -330,8 +337,7 @@ def draw_sites(cohort: Cohort, analysis: Analysis) -> "list[Figure]":
             axis.locator_params(axis="x", nbins=4)
             axis.set_xlabel(label)
         axes[0, j].set_title(f"{display_name(measure)}, {SIDES[hemi]}")
-    handles = dict(zip(*axes[0, 0].get_legend_handles_labels()[::-1], strict=True))
-    figure.legend(handles.values(), handles, loc="outside lower center", ncols=2)
+    _explain(figure, axes[0, 0])
     return [figure]
 
 

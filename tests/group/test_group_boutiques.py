@@ -21,6 +21,7 @@ def folder(tmp_path_factory):
     return root
 
 
+@pytest.mark.long
 def test_group_level_of_several_parts_leaves_all_outputs(folder):
     done = launch(
         folder,
@@ -58,6 +59,7 @@ def test_a_model_of_volumes_lacks_nothing_that_is_promised(folder):
     assert not {f"output_{key}" for key in (*maps, "pages")} & found
 
 
+@pytest.mark.long
 def test_group_level_in_place_by_the_descriptor_of_both(folder):
     for path in (folder / "part 1").glob("sub-*"):
         stats = folder / "subjects" / path.name / "stats" / "aseg.stats"

@@ -52,6 +52,7 @@ def test_registration_finds_the_warps_of_the_cohort():
     assert 40 * shift[20] == pytest.approx(2, abs=0.5)
 
 
+@pytest.mark.long
 def test_registered_analysis_passes_where_the_unregistered_one_fails():
     """Limits of the requirements; the same code runs on more cohorts in the validation."""
     registered = run_simulation(PLAN, REGISTERED, SEEDS)

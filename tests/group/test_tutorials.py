@@ -76,6 +76,7 @@ def participants():
     return text
 
 
+@pytest.mark.long
 def test_a_subject_of_the_tutorial_is_measured_as_printed(tmp_path, monkeypatch, capsys):
     """A subject is the same in a smaller cohort of the same seed."""
     monkeypatch.chdir(tmp_path)

@@ -53,6 +53,7 @@ if __name__ == "__main__":
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+@pytest.mark.long
 def test_jobs_on_dask_end_as_in_the_pool(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(SCRIPT.format(jobs=JOBS))

@@ -269,6 +269,7 @@ def test_regions_are_summed_up(done, sheet):
     assert set(json.loads(path_of(out, "roi_sidecar").read_text())) == {"region", *found.columns}
 
 
+@pytest.mark.long
 def test_a_run_with_other_maps_redoes_and_tidies_up(bids_dir, regions, tmp_path, capsys):
     def lines(*options):
         capsys.readouterr()

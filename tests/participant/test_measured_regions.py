@@ -146,6 +146,7 @@ def test_maps_and_drawn_regions_on_other_regions(bids, tmp_path):
         assert float(row["thickness_mean"]) == pytest.approx(spot.thickness.mean(), abs=1e-3)
 
 
+@pytest.mark.long
 def test_cohorts_with_cortex_can_be_measured_in_every_region(tmp_path):
     cohort = tmp_path / "bids"
     options = ["--n-subjects", "1", "--cortex", "10", "--layout", "ashsPMC", "--thinning", "0"]
@@ -286,6 +287,7 @@ def test_edited_masks_are_about_the_body():
     assert caught.value.reason == "edited-mask-region"
 
 
+@pytest.mark.long
 def test_thick_slices_of_a_longer_sheet():
     """Slices of 1.5 mm: outlines and their fragments know the cortex too."""
     spec = replace(S_SHAPE, length=12.0)

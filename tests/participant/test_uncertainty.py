@@ -241,6 +241,7 @@ def test_tables_tell_the_spread_of_every_measure(runs):
     assert median == pytest.approx(table.thickness_sd.median(), abs=1e-4)
 
 
+@pytest.mark.long
 def test_copies_are_made_once_and_again_for_another_number(runs):
     shutil.copytree(runs / "plain", runs / "again")
     run(runs, "again", "--uncertainty", "2", "--n-procs", "1")  # what was there lacked it

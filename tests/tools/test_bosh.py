@@ -247,6 +247,7 @@ def test_runs_that_leave_no_results_lack_nothing(dataset, tmp_path, descriptor, 
     assert (outputs_found(done), outputs_missing(done)) == (found, "")
 
 
+@pytest.mark.long
 def test_participant_level_by_the_descriptor_of_both_with_sessions(dataset):
     (dataset / "subjects dir" / "sub-01").rename(dataset / "subjects dir" / "sub-01_ses-1")
     try:
@@ -273,6 +274,7 @@ def test_participant_level_by_the_descriptor_of_both_with_sessions(dataset):
     assert all(list(dataset.glob(template)) for template in templates)
 
 
+@pytest.mark.long
 def test_tests_in_the_descriptor_pass(dataset):
     """``bosh test`` takes containers only, so the descriptor goes without its image."""
     descriptor = read_descriptor("hipsta_bids_participant")

@@ -29,6 +29,7 @@ def test_ends_of_a_phantom_are_found_where_its_labels_have_them():
     assert found.own[KEPT][0] < found.own[FOUND][0]
 
 
+@pytest.mark.long
 def test_ends_in_a_wrong_place_miss_the_target(monkeypatch):
     right = geometry_ends.find_ends
 
@@ -72,6 +73,7 @@ def test_spreads_are_judged(result, met):
         assert table.rows[0]["by slices alone"] == pytest.approx(np.sqrt(4.16 / 24))
 
 
+@pytest.mark.long
 def test_rows_at_oblique_planes_meet_the_target_and_miss_it_where_the_mesh_ends_there(monkeypatch):
     case = Oblique(spec=replace(ends.OBLIQUE[0], length=14.0), degrees=35.0, about="thickness")
     right = ends.measure_oblique(case)

@@ -32,6 +32,7 @@ def test_registered_must_pass_and_unregistered_must_fail(monkeypatch, unregister
     assert table.missed == missed
 
 
+@pytest.mark.long
 def test_the_default_moves_groups_least_where_curvature_differs(monkeypatch):
     some = ("the same", "all 30 % smaller")
     monkeypatch.setattr(group, "AMPLITUDES", {name: group.AMPLITUDES[name] for name in some})
@@ -43,6 +44,7 @@ def test_the_default_moves_groups_least_where_curvature_differs(monkeypatch):
     assert shifted["registr, as measured"] > 0.4
 
 
+@pytest.mark.long
 def test_corrections_keep_the_family_wise_error_and_find_the_effect(monkeypatch):
     monkeypatch.setattr(group, "PERMUTATIONS", 60)
     table = group._corrections(12)

@@ -26,6 +26,7 @@ def test_the_largest_change_is_judged(results, met):
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="shared test data not found")
+@pytest.mark.long
 def test_real_labels_have_the_same_map_in_another_form(monkeypatch):
     request = InputRequest(bids_dir=DATA, participant_labels=("03",), hemis=("L",))
     (item, *_) = find_hemispheres(request)

@@ -50,6 +50,7 @@ def without_handing_over(volume, tissue, _ends, _reach):
     return volume, tissue, 0
 
 
+@pytest.mark.long
 def test_tail_labels_in_the_body_make_a_map_impossible_if_they_are_not_handed_over(monkeypatch):
     (trial,) = trials(RAGGED[-1])
     right = measure_trial(trial)
@@ -63,6 +64,7 @@ def test_tail_labels_in_the_body_make_a_map_impossible_if_they_are_not_handed_ov
     assert [row["met"] for row in rows] == [True, False]
 
 
+@pytest.mark.long
 def test_an_uncus_is_left_out_with_a_warning_and_noticed_if_it_is_not(monkeypatch):
     detached, attached = trials(UNCUS[1], UNCUS[2])
     assert (detached.planted[0], attached.planted[0]) == ("uncus", "attached-uncus")

@@ -174,6 +174,7 @@ def test_tables_count_by_voxels_and_leave_brains_out():
     assert "no way" in left_out.notes
 
 
+@pytest.mark.long
 def test_a_specimen_is_measured_with_its_damage():
     injuries = (("hole", 0.8, (0.5, 0.5)), ("notch", 2.0, (0.5, 0.5)))
     found = measure_specimen(Specimen(body=SPEC, number=1, voxel=FINE, injuries=injuries))
@@ -191,6 +192,7 @@ def test_a_damage_that_is_refused_is_a_result():
     assert (refused.status, refused.margins) == ("failed", {})
 
 
+@pytest.mark.long
 def test_mirrored_specimens_change_sides():
     sides = {make_labels(Specimen(body=SPEC, number=n, voxel=FINE))[1] for n in (1, 3)}
     assert sides == {"L", "R"}

@@ -173,6 +173,7 @@ def test_no_pair_makes_no_row():
     assert not half_row((0.0, outcome(0.0)), (0.25, outcome(0.0)))
 
 
+@pytest.mark.long
 def test_a_phantom_in_thick_slices_meets_the_targets():
     trial = Trial(body=thick_slices.PHANTOMS[0], step=2.0, offset=1 / 3, tilt=10.0)
     found = thick_slices.measure_trial(trial)
