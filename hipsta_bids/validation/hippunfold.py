@@ -82,7 +82,7 @@ def run(full: bool, labels: Path | None = None) -> Suite:
             for (path, hemi), result in zip(templates, results, strict=True)
             for row in _whole_rows(result)
         ]
-        title = "Head, body and tail on one sheet (experimental), mm"
+        title = "Head to tail on one sheet (experimental), mm"
         about.append(Table(title=title, rows=whole, notes=_WHOLE_NOTES))
     return Suite(name="hippunfold", title="HippUnfold", text=_TEXT, tables=tuple(about))
 
