@@ -120,8 +120,10 @@ def _panels(n_rows: int, n_columns: int, size: tuple[float, float]) -> tuple["Fi
 def _explain(figure: "Figure", axis: "Axes", title: str | None = None) -> None:
     """Put the legend of a panel below all, where it covers no curve."""
     handles = dict(zip(*axis.get_legend_handles_labels()[::-1], strict=True))
-    place = "outside lower center"
-    figure.legend(handles.values(), handles, title=title, loc=place, ncols=len(handles))
+    legend = figure.legend(
+        handles.values(), handles, loc="outside lower center", ncols=len(handles)
+    )
+    legend.set_title(title or "")
 
 
 def _name(axes: "Sequence[Axes]") -> None:
