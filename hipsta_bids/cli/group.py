@@ -16,9 +16,10 @@ from hipsta_bids.cli.parser import (
     from_namespace,
     named_pattern,
 )
-from hipsta_bids.cli.participant import EXPERIMENTAL, REGIONS
+from hipsta_bids.cli.participant import REGIONS
 from hipsta_bids.cli.questions import add_questions, is_question, run_comparison, run_question
 from hipsta_bids.errors import ExitCode, NothingToDoError, UsageError
+from hipsta_bids.protocols import EXPERIMENTAL
 
 if TYPE_CHECKING:
     from hipsta_bids.group.run import GroupOptions

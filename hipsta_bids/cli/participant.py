@@ -34,6 +34,7 @@ from hipsta_bids.cli.parser import (
 from hipsta_bids.errors import ExitCode, NothingToDoError, UsageError, did_you_mean
 from hipsta_bids.participant.cluster import Cluster, Shard, check_cluster, parse_shard
 from hipsta_bids.participant.pool import pin_threads, processors
+from hipsta_bids.protocols import EXPERIMENTAL
 
 if TYPE_CHECKING:
     from argparse import Namespace
@@ -44,7 +45,6 @@ if TYPE_CHECKING:
 
 COLLECT = "collect"
 LEVELS = ("participant", COLLECT)
-EXPERIMENTAL = ("headbody", "whole")
 REGIONS = ("body", "extended", "entorhinal", *EXPERIMENTAL)
 
 #: Options of other BIDS Apps, and why they change nothing here.

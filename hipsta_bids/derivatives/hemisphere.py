@@ -26,7 +26,7 @@ from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY, 
 from hipsta_bids.geometry.sheet import is_left_handed, layer_depth
 from hipsta_bids.io import files, gifti
 from hipsta_bids.io.volumes import mask_bytes
-from hipsta_bids.protocols.load import WHOLE
+from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.protocols.protocol import Label, Part, Protocol, Tissue
 from hipsta_bids.types import BodyMask, Bool, Flag, Float, HemisphereMaps, Sheet, Status
 
@@ -128,7 +128,7 @@ def _write_table(
 ) -> None:
     """Write a table, and the sidecar that defines its columns."""
     files.write_tsv(place.path(key), list(columns), zip(*columns.values(), strict=True))
-    region = _WHOLE_REGION if place.name.region in WHOLE else _MEASURED_REGION
+    region = _WHOLE_REGION if place.name.region in EXPERIMENTAL else _MEASURED_REGION
     sidecar = {**definitions, "MeasuredRegion": region}
     files.write_json(place.path(f"{key}_sidecar"), sidecar)
 

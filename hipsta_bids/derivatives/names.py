@@ -11,7 +11,7 @@ from pathlib import PurePosixPath
 
 from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.io.files import LOGS
-from hipsta_bids.protocols.load import WHOLE
+from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.types import Hemisphere
 
 
@@ -33,7 +33,7 @@ class HemisphereName(Hemisphere):
     @property
     def region_title(self) -> str:
         """The region in words; empty for the body."""
-        trial = " (experimental)" if self.region in WHOLE else ""
+        trial = " (experimental)" if self.region in EXPERIMENTAL else ""
         return "" if self.region == "body" else f"{self.region} region{trial}"
 
     @property

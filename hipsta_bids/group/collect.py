@@ -17,7 +17,7 @@ from hipsta_bids.errors import InputError, NothingToDoError
 from hipsta_bids.group.covariates import relocate
 from hipsta_bids.group.exclusions import SHOWN, Choices, QualityCondition, read_choices
 from hipsta_bids.io import files
-from hipsta_bids.protocols.load import WHOLE
+from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.protocols.toml import resolve, settings_hash
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Status
@@ -203,7 +203,7 @@ def _other_regions(everything: Sequence[ResultPlace], request: GroupRequest) -> 
         f"{count} hemispheres of region {region} are not in this analysis;"
         + (
             " the group level does not take it yet"
-            if region in WHOLE
+            if region in EXPERIMENTAL
             else f" --region {region} takes them"
         )
         for region, count in sorted(counts.items())

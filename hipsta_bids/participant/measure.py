@@ -63,7 +63,8 @@ from hipsta_bids.geometry.sheet import (
 )
 from hipsta_bids.geometry.topology import Repair, SolidField, repair_topology, repaired_columns
 from hipsta_bids.participant.whole import measure_whole
-from hipsta_bids.protocols.load import WHOLE, for_region
+from hipsta_bids.protocols import EXPERIMENTAL
+from hipsta_bids.protocols.load import for_region
 from hipsta_bids.protocols.protocol import LATERAL_END, MEDIAL_END, Tissue
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import (
@@ -375,7 +376,7 @@ def measure_hemisphere(
     GeometryError
         With the reason why this hemisphere cannot be measured.
     """
-    if settings.body.region in WHOLE:
+    if settings.body.region in EXPERIMENTAL:
         return measure_whole(volume, hemi, settings, clock)
     evidence, coordinates = unfold(volume, hemi, settings, clock)
     measured, solid, boundaries = evidence.measured, evidence.solid, evidence.boundaries

@@ -12,6 +12,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from hipsta_bids.errors import ProtocolError
+from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.protocols.protocol import (
     CORE,
     FAR_TO_NEAR,
@@ -283,10 +284,6 @@ def _label(row: NamedCode, index: int) -> Label:
     )
 
 
-#: Regions with the head on the sheet, experimental: with the tail or without it.
-WHOLE = ("whole", "headbody")
-
-
 def for_region(protocol: Protocol, region: str) -> Protocol:
     """Return a protocol with the sheet of a region: hippocampal, extended by cortex, cortex alone.
 
@@ -294,7 +291,7 @@ def for_region(protocol: Protocol, region: str) -> Protocol:
     """
     if region == "body":
         return protocol
-    if region in WHOLE:
+    if region in EXPERIMENTAL:
         parts = (Part.HEAD, Part.TAIL) if region == "whole" else (Part.HEAD,)
         for label in protocol.labels:
             if label.tissue is Tissue.HIPPOCAMPUS and label.part in parts:

@@ -9,22 +9,23 @@ import pytest
 from measured_phantoms import Results, measure
 
 from hipsta_bids.cli import main
-from hipsta_bids.cli.participant import EXPERIMENTAL
 from hipsta_bids.cli.participant import REGIONS as ALL_REGIONS
 from hipsta_bids.derivatives.dataset import read_status
 from hipsta_bids.derivatives.names import HemisphereName, output_path
 from hipsta_bids.errors import ExitCode, GeometryError, ProtocolError
 from hipsta_bids.io import files
 from hipsta_bids.phantom import Hemisphere, Phantom, PhantomSpec, rigid_motion, write_dataset
+from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import BodySettings, Settings
 from hipsta_bids.types import EditedMask
 
-#: The cortex bends round its white matter, as in life: the other way than the hippocampus.
-S_SHAPE = PhantomSpec(kind="s-shape", width=30.0, curvature=(-0.15, 0.3), cortex=10.0, length=10.0)
 #: Those between the end planes; test_whole.py is about the others.
 REGIONS = [region for region in ALL_REGIONS if region not in EXPERIMENTAL]
+
+#: The cortex bends round its white matter, as in life: the other way than the hippocampus.
+S_SHAPE = PhantomSpec(kind="s-shape", width=30.0, curvature=(-0.15, 0.3), cortex=10.0, length=10.0)
 #: The cortex bends on as the hippocampus does, a little.
 SPIRAL = PhantomSpec(kind="spiral", width=28.0, curvature=(0.02, 0.3), cortex=8.0, length=10.0)
 HEMISPHERES = {"L": S_SHAPE, "R": SPIRAL}
