@@ -186,11 +186,12 @@ def first_result(main: "subprocess.Popen[str]") -> None:
 
 
 def measuring_process() -> int:
-    """Find the process below a Dask worker that measures: it has TetGen as its child."""
+    """Find the process of a job that measures: it has TetGen as its child."""
     while True:
         for path in Path("/proc").glob("[0-9]*/cmdline"):
             try:
-                if b"hipsta_bids.geometry.tetgen_worker" in path.read_bytes():
+                of_job = b"SLURM_JOB_ID=" in (path.parent / "environ").read_bytes()
+                if of_job and b"hipsta_bids.geometry.tetgen_worker" in path.read_bytes():
                     stat = (path.parent / "stat").read_text(encoding="utf-8")
                     return int(stat.rpartition(")")[2].split()[1])
             except OSError:
