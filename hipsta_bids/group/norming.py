@@ -284,9 +284,11 @@ def _planned(chosen: _Chosen, settings: GroupSettings) -> NormsFile:
     how, cohort, inputs = settings.norms, chosen.cohort, chosen.inputs
     found, table = inputs.found, cohort.table
     check_names([how.age], table.columns)
-    sexes = level_labels(table[how.sex], settings.design).dropna() if how.sex in table else ()
-    sites = _site_labels(table, how.site, settings).dropna()
-    knots = choose_knots(_ages(table, how.age, settings), how)
+    sites, complete = _site_labels(table, how.site, settings), np.ones(len(table), dtype=bool)
+    sexes = level_labels(table[how.sex], settings.design) if how.sex in table else None
+    for labels in (sites, sexes):
+        complete &= True if labels is None else labels.notna().to_numpy()
+    knots = choose_knots(_ages(table, how.age, settings)[complete], how)
     return NormsFile(
         description="norms of maps and summary measures by age, sex and site",
         format=1,
@@ -304,8 +306,8 @@ def _planned(chosen: _Chosen, settings: GroupSettings) -> NormsFile:
         sex=how.sex,
         site=how.site,
         knots=knots.tolist(),
-        sexes=sorted(set(sexes)),
-        sites=dict.fromkeys(sorted(set(sites)), 1),
+        sexes=[] if sexes is None else sorted(set(sexes.dropna())),
+        sites=dict.fromkeys(sorted(set(sites.dropna())), 1),
         participants=1,
         norms={},
     )

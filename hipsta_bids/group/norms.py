@@ -198,7 +198,7 @@ def choose_knots(ages: Float, how: NormSettings) -> Float:
     ages = np.sort(ages[np.isfinite(ages)])
     if len(ages) < how.least_participants:
         raise ModelError(
-            f"--fit-norms: {len(ages)} participants of known age are too few; norms need"
+            f"--fit-norms: {len(ages)} participants with age, sex and site are too few; norms need"
             f" {how.least_participants} or more: join the reference cohorts of several sites by"
             " --derivatives",
             reason="norms-reference",

@@ -249,6 +249,9 @@ def test_small_references_are_refused(people, reference, capsys, tmp_path):
     write_participants(data, [[*row[:4], "AC"[i > 98]] for i, row in enumerate(rows)], TABLE)
     small = [data, reference[1], "group", "--fit-norms"]
     refused(capsys, small, "too few participants at site C (8)", "each needs 15")
+    unknown = [[*row[:3], row[3] if i > 20 else "n/a", row[4]] for i, row in enumerate(rows)]
+    write_participants(data, unknown, TABLE)
+    refused(capsys, small, "participants with age, sex and site are too few", "100 or more")
     write_participants(data, [[*row[:3], row[4], row[4]] for row in rows], TABLE)
     refused(capsys, small, "sex does not vary within site")
 
