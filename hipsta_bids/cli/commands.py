@@ -154,6 +154,44 @@ def meta_parser() -> Parser:
     return parser
 
 
+def resample_parser() -> Parser:
+    """Describe ``hipsta-bids resample``."""
+    parser = Parser(
+        prog="hipsta-bids resample",
+        description="move maps of the whole sheet (--region whole, experimental) to HippUnfold's"
+        " vertices,\nor maps of HippUnfold to the whole sheet, by the same share of the way between"
+        " the same sides",
+        epilog="exit codes: 0 done; 64 wrong use; 65 a file cannot be read or does not fit;"
+        " 73 cannot write",
+    )
+    parser.add_argument(
+        "maps",
+        nargs="+",
+        type=Path,
+        metavar="MAP",
+        help="of the whole sheet: _morph.tsv, .shape.gii or _map.tsv; or HippUnfold's: .shape.gii,"
+        " .func.gii or .dscalar.nii; one file of each side",
+    )
+    parser.add_argument(
+        "out",
+        type=Path,
+        metavar="OUT",
+        help=".shape.gii, .func.gii, .dscalar.nii (of one or both sides), or .tsv of a sheet",
+    )
+    add = adder(parser)
+    add(
+        "--surface",
+        "FILE",
+        "HippUnfold's own space-unfold_..._label-hipp_midthickness.surf.gii of the density of its"
+        " maps; one, or one of each side",
+        nargs="+",
+        required=True,
+    )
+    add("--column", "NAME", "of a table (default: thickness)", default="thickness")
+    add("--settings", "FILE.toml", "those of the sheets, if not the defaults")
+    return parser
+
+
 def validate_parser() -> Parser:
     """Describe ``hipsta-bids validate``."""
     parser = Parser(
@@ -341,6 +379,17 @@ def _site(text: str) -> tuple[str | None, Path]:
     if equals and name and "/" not in name:
         return name, Path(path)
     return None, Path(text)
+
+
+def run_resample(arguments: Sequence[str]) -> ExitCode:
+    """Move maps between the whole sheet and HippUnfold's surfaces."""
+    options = resample_parser().parse_intermixed_args(arguments)
+    from hipsta_bids.participant.unfolded import resample  # noqa: PLC0415  (heavy)
+    from hipsta_bids.settings import load_settings  # noqa: PLC0415  (start-up time)
+
+    sheet = load_settings(options.settings).sheet
+    echo(resample(options.maps, options.out, options.surface, sheet, options.column))
+    return ExitCode.OK
 
 
 def run_validation(arguments: Sequence[str]) -> ExitCode:

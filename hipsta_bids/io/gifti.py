@@ -41,6 +41,7 @@ from hipsta_bids.types import Coordinates, Float, Int, Mesh, TetMesh
 #: Ending of the names of CIFTI files with one number per vertex.
 DENSE_SCALARS = ".dscalar.nii"
 
+_PRIMARY = "AnatomicalStructurePrimary"
 _STRUCTURE = {"L": "HippocampusLeft", "R": "HippocampusRight"}
 
 Image = TypeVar("Image", GiftiImage, Cifti2Image)
@@ -81,7 +82,7 @@ def surface_bytes(
 ) -> bytes:
     """Encode a surface, (N, 3) vertices in mm: scanner RAS, or the plane of the unfolded sheet."""
     meta = {
-        "AnatomicalStructurePrimary": _STRUCTURE[hemi],
+        _PRIMARY: _STRUCTURE[hemi],
         "GeometricType": "Flat" if unfolded else "Anatomical",
     }
     if secondary:
@@ -147,7 +148,7 @@ def _array(values: NDArray[Any], intent: str, meta: Mapping[str, str]) -> GiftiD
 def _encode(
     arrays: Sequence[GiftiDataArray], hemi: str, labels: GiftiLabelTable | None = None
 ) -> bytes:
-    meta = GiftiMetaData({"AnatomicalStructurePrimary": _STRUCTURE[hemi]})
+    meta = GiftiMetaData({_PRIMARY: _STRUCTURE[hemi]})
     content: bytes = GiftiImage(meta=meta, darrays=list(arrays), labeltable=labels).to_bytes()
     return content
 
@@ -161,6 +162,8 @@ class PointMap:
     unit: str
     nodes: tuple[int, int] | None = None
     """Nodes along x and y, where a table says that they are the sheet's."""
+    name: str = ""
+    """The column, of a table."""
 
 
 def cifti_sides(path: Path) -> list[str]:
@@ -250,7 +253,7 @@ def _from_table(path: Path, name: str) -> PointMap:
             " n/a",
             reason="unreadable-map",
         ) from error
-    return PointMap(values=_finite(values), unit=ARBITRARY, nodes=nodes)
+    return PointMap(values=_finite(values), unit=ARBITRARY, nodes=nodes, name=column)
 
 
 def _nodes(rows: list[dict[str, str]]) -> tuple[int, int] | None:
@@ -285,6 +288,14 @@ def read_mesh(path: Path) -> Mesh:
             reason="unreadable-surface",
         )
     return mesh
+
+
+def structure_side(path: Path) -> str | None:
+    """Tell the side of a GIFTI file by the structure that it or one of its arrays names."""
+    image = _load(path, GiftiImage)
+    named = [str(one.meta.get(_PRIMARY, "")) for one in (image, *image.darrays)]
+    sides = {side[0] for name in named for side in ("Left", "Right") if name.endswith(side)}
+    return sides.pop() if len(sides) == 1 else None
 
 
 def _unreadable(path: Path, what: str, error: Exception) -> InputError:

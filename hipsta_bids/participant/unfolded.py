@@ -1,0 +1,232 @@
+"""Maps between the whole sheet and HippUnfold's unfolded surfaces.
+
+Both cover the hippocampus from its posterior to its anterior end and from the subiculum to the end
+of the sheet at CA3. What has the same share of both ways is taken for the same place.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.interpolate import LinearNDInterpolator, RegularGridInterpolator
+
+from hipsta_bids.errors import InputError, UsageError
+from hipsta_bids.geometry.catalog import MAPS
+from hipsta_bids.io import files, gifti
+from hipsta_bids.io.gifti import DENSE_SCALARS, PointMap
+from hipsta_bids.participant.whole import grid_levels
+from hipsta_bids.settings import SheetSettings
+from hipsta_bids.types import Float
+
+TABLE, METRICS = ".tsv", (".shape.gii", ".func.gii")
+"""Endings of outputs, beside `DENSE_SCALARS`."""
+_LOW, _SIZE = np.array([-40.0, -200.0]), np.array([40.0, 20.0])
+"""HippUnfold's unfolded rectangle, mm: posterior to anterior, and subiculum to dentate gyrus.
+
+Of versions 1 and 2 (DeKraker et al. 2022, eLife 11:e77945), as their surfaces of `space-unfold`.
+"""
+_FLAT = 1e-3
+"""mm; vertices of a plane do not differ by more."""
+_COVERED = 0.9
+"""A surface covers this share of the rectangle along both axes, at least."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SheetMap(PointMap):
+    """One number per point of one side."""
+
+    hemi: str
+    path: Path
+
+
+class Correspondence:
+    """Where HippUnfold's vertices lie on the grid of the whole sheet."""
+
+    def __init__(self, vertices: Float, settings: SheetSettings) -> None:
+        """Place vertices (V, 3) of an unfolded surface, mm, as HippUnfold writes them."""
+        (self.x, self.y, _), (first, last) = grid_levels(settings, "whole")
+        anterior, lateral = ((vertices[:, :2] - _LOW) / _SIZE).T
+        #: (V, 2) x from -1 to 1 between the edges, y between the ends of the sheet.
+        self.places: Float = np.column_stack([2 * lateral - 1, first + anterior * (last - first)])
+
+    def to_vertices(self, values: Float) -> Float:
+        """Interpolate a map (Nx, Ny) at the vertices (V,); NaN beside NaN and beyond the grid."""
+        sample = RegularGridInterpolator((self.x, self.y), values, bounds_error=False)
+        return np.asarray(sample(self.places), dtype=np.float64)
+
+    def to_nodes(self, values: Float) -> Float:
+        """Interpolate numbers (V, ...) at the nodes (Nx, Ny, ...), NaN beside NaN and beyond."""
+        nodes = np.meshgrid(self.x, self.y, indexing="ij")
+        found = LinearNDInterpolator(self.places, values)(np.stack(nodes, axis=-1))
+        return np.asarray(found, dtype=np.float64)
+
+
+def resample(
+    paths: Sequence[Path],
+    out: Path,
+    surfaces: Sequence[Path],
+    settings: SheetSettings,
+    column: str,
+) -> str:
+    """Move maps of one or both sides to HippUnfold's vertices, or from there to the whole sheet.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Maps: tables or GIFTI files of the whole sheet, or GIFTI or CIFTI files of HippUnfold.
+    out : Path
+        GIFTI, CIFTI or, of one side of the sheet, a table, by its ending.
+    surfaces : sequence of Path
+        HippUnfold's unfolded surface: one for both sides or one for each.
+    settings : SheetSettings
+        Those that the sheets were measured with.
+    column : str
+        Column of a table that holds the map.
+
+    Returns
+    -------
+    str
+        What was done, in one line.
+
+    Raises
+    ------
+    UsageError
+        If the ending of the output is none of those, or does not go with the maps.
+    InputError
+        If a file cannot be read, is of another region, or does not fit the surface.
+    """
+    if not out.name.endswith((TABLE, *METRICS, DENSE_SCALARS)):
+        ends = ", ".join((*METRICS, DENSE_SCALARS))
+        raise UsageError(f"{out}: results end with {ends} or {TABLE}", reason="usage")
+    known = {_hemi(path): _vertices(path) for path in surfaces}
+    moved: dict[str, SheetMap] = {}
+    vertices = False
+    for one in (one for path in paths for one in _read(path, column)):
+        if one.hemi in moved:
+            raise _several(f"{moved[one.hemi].path} and {one.path}: both are of side {one.hemi}")
+        points = known.get(one.hemi, known.get(None))
+        if points is None:
+            raise InputError(
+                f"{one.path}: there is no unfolded surface of side {one.hemi}; add it to --surface",
+                reason="no-surface",
+            )
+        between = Correspondence(points, settings)
+        nodes = len(between.x), len(between.y)
+        ours = len(one.values) == nodes[0] * nodes[1] and one.nodes in (None, nodes)
+        if not ours and len(one.values) != len(points):
+            raise InputError(
+                f"{one.path}: has {len(one.values)} points, the whole sheet {nodes[0]} x"
+                f" {nodes[1]}, and the surface {len(points)}; give the surface of its density, or"
+                " the --settings of the results",
+                reason="mixed-grids",
+            )
+        if moved and ours != vertices:
+            raise _several(f"{one.path}: is not on the same points as {paths[0]}")
+        vertices = ours
+        if ours:
+            values = between.to_vertices(one.values.reshape(nodes))
+        else:
+            values = between.to_nodes(one.values)
+        moved[one.hemi] = replace(one, values=values)
+    _write(out, moved, to_nodes=not vertices)
+    missing = np.mean(np.isnan(np.concatenate([one.values.ravel() for one in moved.values()])))
+    where = "vertices of HippUnfold" if vertices else "nodes of the whole sheet"
+    points_each = ", ".join(f"{one.values.size} {hemi}" for hemi, one in moved.items())
+    return f"{out}: {points_each} {where}, {missing:.0%} without a value"
+
+
+def _write(out: Path, maps: Mapping[str, SheetMap], *, to_nodes: bool) -> None:
+    first, *others = maps.values()
+    flat = {hemi: one.values.ravel() for hemi, one in maps.items()}
+    if out.name.endswith(DENSE_SCALARS):
+        sides = {hemi: flat[hemi][None] for hemi in sorted(flat)}
+        files.write_bytes(out, gifti.cifti_bytes(sides, [first.name]))
+        return
+    if others:
+        raise UsageError(
+            f"{out}: holds one side; name a {DENSE_SCALARS} file for both", reason="usage"
+        )
+    if out.suffix != TABLE:
+        content = gifti.shape_bytes(
+            flat[first.hemi], hemi=first.hemi, name=first.name, unit=first.unit
+        )
+        files.write_bytes(out, content)
+        return
+    if not to_nodes:
+        raise UsageError(
+            f"{out}: tables are of sheets; name a {METRICS[0]} file for vertices", reason="usage"
+        )
+    nodes = np.argwhere(np.ones(first.values.shape, dtype=bool)) + 1
+    rows = (
+        (str(x), str(y), f"{value:.7g}" if np.isfinite(value) else files.MISSING)
+        for (x, y), value in zip(nodes, flat[first.hemi], strict=True)
+    )
+    files.write_tsv(out, ["x", "y", first.name], rows)
+
+
+def _read(path: Path, column: str) -> list[SheetMap]:
+    """Read the maps of one file: of one side, or of those that a CIFTI file has."""
+    pairs = files.entities(path.name)
+    region = pairs.get("label", "body")
+    if "seg" in pairs and region != "whole":  # HippUnfold's names have no seg
+        raise InputError(
+            f"{path}: is of region {region}, which does not reach both ends of HippUnfold's"
+            " surface; measure with --region whole",
+            reason="wrong-region",
+        )
+    if path.name.endswith(DENSE_SCALARS):
+        hemis = gifti.cifti_sides(path)
+    else:
+        hemis = [hemi] if (hemi := _hemi(path)) else []
+    if not hemis:
+        raise InputError(
+            f"{path}: does not say of which side it is; put hemi-L or hemi-R in its name",
+            reason="no-side",
+        )
+    units = {row.name: row.unit for row in MAPS}
+    found = []
+    for hemi in hemis:
+        one = gifti.read_map(path, column, hemi)
+        found.append(
+            SheetMap(
+                values=one.values,
+                unit=units.get(one.name, one.unit),
+                nodes=one.nodes,
+                name=one.name or pairs["suffix"],
+                hemi=hemi,
+                path=path,
+            )
+        )
+    return found
+
+
+def _hemi(path: Path) -> str | None:
+    """Side by a file's name and its structure, if they say it."""
+    named = files.entities(path.name).get("hemi")
+    inside = gifti.structure_side(path) if path.suffix == ".gii" else None
+    if named and inside and named != inside:
+        raise InputError(
+            f"{path}: its name says side {named}, its structure {inside}; correct one of them",
+            reason="no-side",
+        )
+    return named or inside
+
+
+def _vertices(path: Path) -> Float:
+    """Read the vertices of an unfolded surface of HippUnfold."""
+    points = gifti.read_mesh(path).points
+    low, high = points.min(axis=0), points.max(axis=0)
+    inside = (low[:2] >= _LOW - _FLAT).all() and (high[:2] <= _LOW + _SIZE + _FLAT).all()
+    covers = ((high - low)[:2] >= _COVERED * _SIZE).all()
+    if not (inside and covers and high[2] - low[2] <= _FLAT):
+        raise InputError(
+            f"{path}: is no unfolded surface of HippUnfold's (space-unfold, label-hipp): flat, with"
+            " x from -40 to 0 mm and y from -200 to -180 mm",
+            reason="not-unfolded",
+        )
+    return points
+
+
+def _several(problem: str) -> InputError:
+    return InputError(f"{problem}; give one map of each side", reason="several-maps")
