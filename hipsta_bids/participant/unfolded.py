@@ -26,8 +26,8 @@ _LOW, _SIZE = np.array([-40.0, -200.0]), np.array([40.0, 20.0])
 
 Of versions 1 and 2 (DeKraker et al. 2022, eLife 11:e77945), as their surfaces of `space-unfold`.
 """
-_FLAT = 1e-3
-"""mm; vertices of a plane do not differ by more."""
+_FLAT, _ROOM = 1e-3, 0.5
+"""mm; vertices of a plane do not differ by more, and lie no farther outside the rectangle."""
 _COVERED = 0.9
 """A surface covers this share of the rectangle along both axes, at least."""
 
@@ -217,7 +217,7 @@ def _vertices(path: Path) -> Float:
     """Read the vertices of an unfolded surface of HippUnfold."""
     points = gifti.read_mesh(path).points
     low, high = points.min(axis=0), points.max(axis=0)
-    inside = (low[:2] >= _LOW - _FLAT).all() and (high[:2] <= _LOW + _SIZE + _FLAT).all()
+    inside = (low[:2] >= _LOW - _ROOM).all() and (high[:2] <= _LOW + _SIZE + _ROOM).all()
     covers = ((high - low)[:2] >= _COVERED * _SIZE).all()
     if not (inside and covers and high[2] - low[2] <= _FLAT):
         raise InputError(

@@ -12,6 +12,7 @@ from hipsta_bids.geometry.digital import to_ras
 from hipsta_bids.geometry.wall import vertex_normals
 from hipsta_bids.inputs.labels import read_label_volume
 from hipsta_bids.inputs.search import HemisphereInput, InputRequest, find_hemispheres
+from hipsta_bids.participant.unfolded import Correspondence
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import translate
 from hipsta_bids.settings import Settings
@@ -36,11 +37,18 @@ _UPRIGHT = 0.9
 """Cosine of the angle between a line across the sheet and its normal, at least."""
 _BODY_ROWS = (10, 30)
 """First and last row of the body on the whole sheet."""
+_SAME_PLACE = 0.95
+"""Least correlation of the coordinates of the two unfolded sheets."""
 _WHOLE_BIAS, _WHOLE_SD = 0.02, {"all": 0.1, "head": 0.1, "body": 0.06, "tail": 0.1}
 """mm; against known walls, from head to tail."""
 
 
 Codes = NDArray[np.intp]
+_UNFOLDED = "*space-unfold*den-0p5mm*label-hipp*midthickness.surf.gii"
+
+
+Source = HemisphereInput | tuple[Path, str]
+"""A person's labels, or a template's folder and side."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -84,6 +92,23 @@ def run(full: bool, labels: Path | None = None) -> Suite:
         ]
         title = "Head to tail on one sheet (experimental), mm"
         about.append(Table(title=title, rows=whole, notes=_WHOLE_NOTES))
+    flat = [path for folder in folders for path in sorted(folder.rglob(_UNFOLDED))][:1]
+    if flat and templates:
+        sources: dict[str, Source] = {
+            **{
+                f"{path.name.removeprefix('tpl-')} {hemi}": (path, hemi) for path, hemi in templates
+            },
+            **{f"{item.subject} {item.hemi}": item for item in persons},
+        }
+        places = run_cases(measure_places, [(s, flat[0]) for s in sources.values()], timeout=120.0)
+        rows = [
+            {"hemisphere": name, "target": str(row), "met": False}
+            if isinstance(row, Refusal)
+            else {"hemisphere": name, **row}
+            for name, row in zip(sources, places, strict=True)
+        ]
+        title = "Coordinates against HippUnfold's"
+        about.append(Table(title=title, rows=rows, notes=_PLACE_NOTES))
     return Suite(name="hippunfold", title="HippUnfold", text=_TEXT, tables=tuple(about))
 
 
@@ -132,6 +157,42 @@ def measure_whole_template(case: tuple[Path, str]) -> dict[str, tuple[Float, Flo
         "tail": good & (row < tail),
     }
     return {part: (ours[rows], true[nearest[rows]]) for part, rows in parts.items()}
+
+
+def measure_places(case: tuple[Source, Path]) -> Cells:
+    """Compare x and y of the whole sheet with HippUnfold's coordinates, by its unfolded surface.
+
+    At each node with a value: coordinates of HippUnfold's nearest vertex, and how far off the place
+    lies at which `resample` takes HippUnfold's map.
+    """
+    source, flat = case
+    if isinstance(source, tuple):
+        folder, hemi = source
+        volume = draw_template(folder, hemi)[0]
+    else:
+        folder, hemi = source.files[0].parent.parent / "surf", source.hemi
+        volume = read_label_volume(source)
+    settings = Settings().changed(body={"region": "whole"})
+    sheet = measure_body(volume, hemi, settings).sheet
+    vertices = _values(
+        str(folder / f"*_hemi-{hemi}_*_label-hipp_midthickness.surf.gii"), "pointset"
+    )
+    between = Correspondence(_values(str(flat), "pointset"), settings.sheet)
+    points = sheet.points[:, :, sheet.middle]
+    off = np.linalg.norm(between.to_nodes(vertices) - points, axis=-1)[sheet.valid]
+    nearest = np.asarray(cKDTree(vertices).query(points[sheet.valid])[1], dtype=np.intp)
+    cells: dict[str, Cell] = {}
+    met = True
+    for name, axis, number in (("AP", between.y, 1), ("PD", between.x, 0)):
+        ours, theirs = axis[np.nonzero(sheet.valid)[number]], between.places[nearest, number]
+        extent = axis[-1] - axis[0] if name == "AP" else 2.0
+        same = _two(ours, theirs)[1]
+        away = float(np.abs(ours - theirs).mean() / extent)
+        cells |= {f"{name}, r": same, f"{name}, mean difference": f"{away:.1%}"}
+        met = met and same >= _SAME_PLACE
+    middle, high = np.nanpercentile(off, [50, 90])
+    cells |= {"nodes": len(nearest), "median, mm": float(middle), "90 %, mm": float(high)}
+    return {**cells, "target": f"r ≥ {_SAME_PLACE:g}", "met": met}
 
 
 def _whole_rows(result: dict[str, tuple[Float, Float]] | Refusal) -> list[Cells]:
@@ -269,6 +330,13 @@ HippUnfold (DeKraker et al. 2022) has a thickness of its own: the distance of it
 outer surface. A person's labels are measured, and compared with it node by node. Of templates,
 whose two surfaces are known, labels are drawn between these in voxels of 0.4 mm: then the walls
 are the same.
+"""
+
+_PLACE_NOTES = """\
+x and y of the whole sheet against HippUnfold's coordinates (PD, proximal to distal; AP, anterior to
+posterior), which `hipsta-bids resample` takes for the same. Of each node with a value, and the
+nearest vertex of HippUnfold's; mean differences in percent of the way between the sides. In mm:
+from the node to where HippUnfold's surface has the same coordinates.
 """
 
 _WHOLE_NOTES = """\
