@@ -6,7 +6,13 @@ import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 
-from hipsta_bids.cli.commands import phantom_parser, surrogate_parser, validate_parser
+from hipsta_bids.cli.commands import (
+    meta_parser,
+    phantom_parser,
+    resample_parser,
+    surrogate_parser,
+    validate_parser,
+)
 from hipsta_bids.cli.group import group_parser
 from hipsta_bids.cli.participant import build_parser
 from hipsta_bids.derivatives.hemisphere import LAYERS, NODES, POSITION, STATE
@@ -85,8 +91,8 @@ with the numbers. Here is what the names mean, in the order of what to do."""
 
 OPTIONS_TEXT = """\
 `hipsta-bids BIDS_DIR OUTPUT_DIR participant` measures, `... group` compares. Other commands:
-`demo`, `phantom`, `surrogate`, `meta`, `validate`, `settings`, `protocols`. All print these texts
-with `--help`. Underscores do in place of hyphens (`--n_procs`)."""
+`demo`, `phantom`, `surrogate`, `meta`, `resample`, `validate`, `settings`, `protocols`. All print
+these texts with `--help`. Underscores do in place of hyphens (`--n_procs`)."""
 
 _SHARED_TEXT = "of all images with these endings: what they are, unit, space"
 
@@ -236,6 +242,8 @@ def options_page() -> str:
         ("Group level", group_parser()),
         ("hipsta-bids phantom", phantom_parser()),
         ("hipsta-bids surrogate", surrogate_parser()),
+        ("hipsta-bids meta", meta_parser()),
+        ("hipsta-bids resample", resample_parser()),
         ("hipsta-bids validate", validate_parser()),
     ):
         parts.append(f"## {title}")

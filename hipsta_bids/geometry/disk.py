@@ -345,13 +345,15 @@ def flipped_area(disk: Disk, plane: Float) -> float:
     return wrong / float(area.sum())
 
 
-def locate_nodes(disk: Disk, plane: Float, x: Float, y: Float) -> tuple[NDArray[np.intp], Float]:
-    """Triangle (Nx, Ny) of a disk in which each node of a grid lies, and weights (Nx, Ny, 3).
+def locate_nodes(
+    triangles: Int, plane: Float, x: Float, y: Float
+) -> tuple[NDArray[np.intp], Float]:
+    """Triangle (Nx, Ny) of a plane (V, 2) that holds each node of a grid, and weights (Nx, Ny, 3).
 
     -1 where there is none. Where a fold makes two triangles claim a node, the one that holds it
     most centrally wins.
     """
-    corner = plane[disk.triangles]
+    corner = plane[triangles]
     low = [
         np.searchsorted(axis, corner[..., k].min(axis=1) - _SLACK) for k, axis in enumerate((x, y))
     ]

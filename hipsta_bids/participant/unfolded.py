@@ -9,25 +9,26 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.interpolate import LinearNDInterpolator, RegularGridInterpolator
+from scipy.interpolate import RegularGridInterpolator
 
 from hipsta_bids.errors import InputError, UsageError
 from hipsta_bids.geometry.catalog import MAPS
+from hipsta_bids.geometry.disk import locate_nodes
 from hipsta_bids.io import files, gifti
 from hipsta_bids.io.gifti import DENSE_SCALARS, PointMap
 from hipsta_bids.participant.whole import grid_levels
 from hipsta_bids.settings import SheetSettings
-from hipsta_bids.types import Float
+from hipsta_bids.types import Float, Mesh
 
 TABLE, METRICS = ".tsv", (".shape.gii", ".func.gii")
 """Endings of outputs, beside `DENSE_SCALARS`."""
 _LOW, _SIZE = np.array([-40.0, -200.0]), np.array([40.0, 20.0])
 """HippUnfold's unfolded rectangle, mm: posterior to anterior, and subiculum to dentate gyrus.
 
-Of versions 1 and 2 (DeKraker et al. 2022, eLife 11:e77945), as their surfaces of `space-unfold`.
+As in surfaces of `space-unfold` (DeKraker et al. 2022, eLife 11:e77945).
 """
-_FLAT, _ROOM = 1e-3, 0.5
-"""mm; vertices of a plane do not differ by more, and lie no farther outside the rectangle."""
+_ROOM = 0.5
+"""mm; vertices lie no farther outside the rectangle."""
 _COVERED = 0.9
 """A surface covers this share of the rectangle along both axes, at least."""
 
@@ -43,12 +44,13 @@ class SheetMap(PointMap):
 class Correspondence:
     """Where HippUnfold's vertices lie on the grid of the whole sheet."""
 
-    def __init__(self, vertices: Float, settings: SheetSettings) -> None:
-        """Place vertices (V, 3) of an unfolded surface, mm, as HippUnfold writes them."""
+    def __init__(self, flat: Mesh, settings: SheetSettings) -> None:
+        """Place the vertices of an unfolded surface, in mm as HippUnfold writes them."""
         (self.x, self.y, _), (first, last) = grid_levels(settings, "whole")
-        anterior, lateral = ((vertices[:, :2] - _LOW) / _SIZE).T
+        anterior, lateral = ((flat.points[:, :2] - _LOW) / _SIZE).T
         #: (V, 2) x from -1 to 1 between the edges, y between the ends of the sheet.
         self.places: Float = np.column_stack([2 * lateral - 1, first + anterior * (last - first)])
+        self._triangles = flat.triangles.astype(np.int32)
 
     def to_vertices(self, values: Float) -> Float:
         """Interpolate a map (Nx, Ny) at the vertices (V,); NaN beside NaN and beyond the grid."""
@@ -57,9 +59,10 @@ class Correspondence:
 
     def to_nodes(self, values: Float) -> Float:
         """Interpolate numbers (V, ...) at the nodes (Nx, Ny, ...), NaN beside NaN and beyond."""
-        nodes = np.meshgrid(self.x, self.y, indexing="ij")
-        found = LinearNDInterpolator(self.places, values)(np.stack(nodes, axis=-1))
-        return np.asarray(found, dtype=np.float64)
+        triangle, weights = locate_nodes(self._triangles, self.places, self.x, self.y)
+        found: Float = np.einsum("xyk,xyk...->xy...", weights, values[self._triangles[triangle]])
+        found[triangle < 0] = np.nan
+        return found
 
 
 def resample(
@@ -99,26 +102,26 @@ def resample(
     if not out.name.endswith((TABLE, *METRICS, DENSE_SCALARS)):
         ends = ", ".join((*METRICS, DENSE_SCALARS))
         raise UsageError(f"{out}: results end with {ends} or {TABLE}", reason="usage")
-    known = {_hemi(path): _vertices(path) for path in surfaces}
+    known = {_hemi(path): _unfolded(path) for path in surfaces}
     moved: dict[str, SheetMap] = {}
     vertices = False
     for one in (one for path in paths for one in _read(path, column)):
         if one.hemi in moved:
             raise _several(f"{moved[one.hemi].path} and {one.path}: both are of side {one.hemi}")
-        points = known.get(one.hemi, known.get(None))
-        if points is None:
+        flat = known.get(one.hemi, known.get(None))
+        if flat is None:
             raise InputError(
                 f"{one.path}: there is no unfolded surface of side {one.hemi}; add it to --surface",
                 reason="no-surface",
             )
-        between = Correspondence(points, settings)
+        between = Correspondence(flat, settings)
         nodes = len(between.x), len(between.y)
         ours = len(one.values) == nodes[0] * nodes[1] and one.nodes in (None, nodes)
-        if not ours and len(one.values) != len(points):
+        if not ours and len(one.values) != len(flat.points):
             raise InputError(
                 f"{one.path}: has {len(one.values)} points, the whole sheet {nodes[0]} x"
-                f" {nodes[1]}, and the surface {len(points)}; give the surface of its density, or"
-                " the --settings of the results",
+                f" {nodes[1]}, and the surface {len(flat.points)}; give the surface of its density,"
+                " or the --settings of the results",
                 reason="mixed-grids",
             )
         if moved and ours != vertices:
@@ -173,7 +176,7 @@ def _read(path: Path, column: str) -> list[SheetMap]:
         raise InputError(
             f"{path}: is of region {region}, which does not reach both ends of HippUnfold's"
             " surface; measure with --region whole",
-            reason="wrong-region",
+            reason="not-whole",
         )
     if path.name.endswith(DENSE_SCALARS):
         hemis = gifti.cifti_sides(path)
@@ -182,7 +185,7 @@ def _read(path: Path, column: str) -> list[SheetMap]:
     if not hemis:
         raise InputError(
             f"{path}: does not say of which side it is; put hemi-L or hemi-R in its name",
-            reason="no-side",
+            reason="unknown-hemisphere",
         )
     units = {row.name: row.unit for row in MAPS}
     found = []
@@ -208,24 +211,24 @@ def _hemi(path: Path) -> str | None:
     if named and inside and named != inside:
         raise InputError(
             f"{path}: its name says side {named}, its structure {inside}; correct one of them",
-            reason="no-side",
+            reason="unknown-hemisphere",
         )
     return named or inside
 
 
-def _vertices(path: Path) -> Float:
-    """Read the vertices of an unfolded surface of HippUnfold."""
-    points = gifti.read_mesh(path).points
-    low, high = points.min(axis=0), points.max(axis=0)
+def _unfolded(path: Path) -> Mesh:
+    """Read an unfolded surface of HippUnfold."""
+    flat = gifti.read_mesh(path)
+    low, high = flat.points.min(axis=0), flat.points.max(axis=0)
     inside = (low[:2] >= _LOW - _ROOM).all() and (high[:2] <= _LOW + _SIZE + _ROOM).all()
     covers = ((high - low)[:2] >= _COVERED * _SIZE).all()
-    if not (inside and covers and high[2] - low[2] <= _FLAT):
+    if not (inside and covers and flat.flat):
         raise InputError(
             f"{path}: is no unfolded surface of HippUnfold's (space-unfold, label-hipp): flat, with"
             " x from -40 to 0 mm and y from -200 to -180 mm",
             reason="not-unfolded",
         )
-    return points
+    return flat
 
 
 def _several(problem: str) -> InputError:

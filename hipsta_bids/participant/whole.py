@@ -287,7 +287,7 @@ def _sample(
 ) -> Sheet:
     """Follow the lines through the nodes of a grid; without values near rims, and where lost."""
     x, y, z = axes
-    triangle, weights = locate_nodes(disk, plane, x, y)
+    triangle, weights = locate_nodes(disk.triangles, plane, x, y)
     corner = disk.triangles[triangle]
     middle = np.einsum("xyk,xykd->xyd", weights, disk.vertices[corner])
     known = (triangle >= 0) & (disk.cell[triangle] >= 0)

@@ -12,6 +12,7 @@ from hipsta_bids.geometry.digital import to_ras
 from hipsta_bids.geometry.wall import vertex_normals
 from hipsta_bids.inputs.labels import read_label_volume
 from hipsta_bids.inputs.search import HemisphereInput, InputRequest, find_hemispheres
+from hipsta_bids.io.gifti import read_mesh
 from hipsta_bids.participant.unfolded import Correspondence
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import translate
@@ -177,7 +178,7 @@ def measure_places(case: tuple[Source, Path]) -> Cells:
     vertices = _values(
         str(folder / f"*_hemi-{hemi}_*_label-hipp_midthickness.surf.gii"), "pointset"
     )
-    between = Correspondence(_values(str(flat), "pointset"), settings.sheet)
+    between = Correspondence(read_mesh(flat), settings.sheet)
     points = sheet.points[:, :, sheet.middle]
     off = np.linalg.norm(between.to_nodes(vertices) - points, axis=-1)[sheet.valid]
     nearest = np.asarray(cKDTree(vertices).query(points[sheet.valid])[1], dtype=np.intp)
@@ -322,7 +323,8 @@ _TARGETS = {
 
 _LEFT_OUT = """\
 Left out: it needs `--labels DIR` and, beside DIR, a folder `hippunfold` with outputs of that
-program (its labels, and its surfaces in `surf`).
+program (its labels, and its surfaces in `surf`). Coordinates are compared if an unfolded surface
+(`space-unfold`, 0.5 mm) is there.
 """
 
 _TEXT = """\
