@@ -258,9 +258,9 @@ def options_page() -> str:
 
 
 def _option(action: argparse.Action) -> tuple[str, str]:
-    spellings = action.option_strings or [action.dest.upper()]
+    spellings = action.option_strings or [str(action.metavar or action.dest.upper())]
     names = [name for name in spellings if name[0] != "-" or "_" not in name]
-    values = action.metavar or (action.dest.upper() if action.option_strings else "")
+    values = (action.metavar or action.dest.upper()) if action.option_strings else ""
     if action.choices is not None and action.metavar is None:
         values = "{" + ",".join(map(str, action.choices)) + "}"
     text = values if isinstance(values, str) else " ".join(values)
