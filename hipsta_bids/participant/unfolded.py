@@ -95,13 +95,15 @@ def resample(
     Raises
     ------
     UsageError
-        If the ending of the output is none of those, or does not go with the maps.
+        If the output is an input, or its ending is none of those or does not go with the maps.
     InputError
         If a file cannot be read, is of another region, or does not fit the surface.
     """
     if not out.name.endswith((TABLE, *METRICS, DENSE_SCALARS)):
         ends = ", ".join((*METRICS, DENSE_SCALARS))
         raise UsageError(f"{out}: results end with {ends} or {TABLE}", reason="usage")
+    if out.resolve() in {path.resolve() for path in (*paths, *surfaces)}:
+        raise UsageError(f"{out}: is an input; choose another name", reason="usage")
     known = {_hemi(path): _unfolded(path) for path in surfaces}
     moved: dict[str, SheetMap] = {}
     vertices = False

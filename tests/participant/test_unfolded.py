@@ -137,6 +137,7 @@ def test_files_that_do_not_fit_are_refused_in_one_line(flat, tmp_path, capsys):
         ([tmp_path / "none_hemi-L_morph.tsv", out], surface, 65, "no such file"),
         ([sheet, tmp_path / "out.nii.gz"], surface, 64, "results end with .shape.gii"),
         ([sheet, tmp_path / "out.tsv"], surface, 64, "tables are of sheets"),
+        ([sheet, sheet], surface, 64, "is an input"),
         (
             [sheet, write_sheet(tmp_path, np.ones((len(X), len(Y))), "R"), out],
             surface,
