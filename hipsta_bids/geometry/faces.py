@@ -17,7 +17,7 @@ from skimage.measure import marching_cubes
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.digital import FACES, piece_sizes, to_ras
 from hipsta_bids.geometry.fem import compact_groups, solve_two_level
-from hipsta_bids.geometry.mesh import signed_volume, smooth_vertices, triangle_areas, unique_edges
+from hipsta_bids.geometry.mesh import signed_volume, smooth_vertices, unique_edges, vertex_areas
 from hipsta_bids.geometry.wall import edge_graph, vertex_normals
 from hipsta_bids.protocols.protocol import CORE, Tissue
 from hipsta_bids.settings import SurfaceSettings
@@ -55,6 +55,8 @@ class Faces:
     """(V,) near 1 on the interior, near -1 on the exterior face."""
     free: Bool
     """(V,) the strip along the rim, which belongs to neither."""
+    opposite: NDArray[np.intp]
+    """(V,) the vertex of the wall opposite; -1 where none faces it."""
 
     @property
     def interior(self) -> Int:
@@ -155,7 +157,7 @@ def find_faces(
     near = sparse.csgraph.dijkstra(
         edge_graph(edges, lengths, count), directed=False, indices=rim, limit=reach, min_only=True
     )
-    return Faces(side=side, free=np.isfinite(near))
+    return Faces(side=side, free=np.isfinite(near), opposite=opposite)
 
 
 def _opposite(
@@ -200,8 +202,7 @@ def _label_evidence(
 
 def _without_islands(side: Float, edges: Int, points: Float, triangles: Int) -> Float:
     """Give islands of one face in the other, up to an area, to what is round them."""
-    share = np.zeros(len(points))
-    np.add.at(share, triangles.ravel(), np.repeat(triangle_areas(points, triangles) / 3, 3))
+    share = vertex_areas(points, triangles)
     for _ in range(2):
         same = (side[edges[:, 0]] > 0) == (side[edges[:, 1]] > 0)
         graph = edge_graph(edges[same], np.ones(int(same.sum())), len(side))

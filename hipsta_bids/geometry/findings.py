@@ -60,9 +60,9 @@ def add_consequence(finding: Finding, sheet: Sheet, settings: CheckSettings) -> 
     """Add which share of the columns the points of a finding concern, and what that does.
 
     The mean thickness, weighted by area, is compared with that of a map in which the columns near
-    these points are as those around them.
+    these points are as those around them. A share that is known already is left as it is.
     """
-    if not len(finding.points):
+    if not len(finding.points) or not np.isnan(finding.share):
         return finding
     near = columns_near(sheet, finding.points, settings.flag_reach)
     thickness, area = measure_thickness(sheet), column_area(sheet)

@@ -55,6 +55,12 @@ def triangle_areas(vertices: Float, triangles: Int) -> Float:
     return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
 
 
+def vertex_areas(vertices: Float, triangles: Int) -> Float:
+    """Thirds of the triangles round each vertex, (V,), mm2."""
+    thirds = np.repeat(triangle_areas(vertices, triangles) / 3, 3)
+    return np.asarray(np.bincount(triangles.ravel(), thirds, len(vertices)), dtype=np.float64)
+
+
 def lateral_triangles(surface: Surface) -> Bool:
     """Whether each triangle belongs to the wall, not to a cap, (F,)."""
     first, second = (

@@ -41,18 +41,19 @@ from hipsta_bids.geometry.disk import (
 from hipsta_bids.geometry.ends import EndPlanes
 from hipsta_bids.geometry.faces import find_faces, whole_surface, whole_tissue
 from hipsta_bids.geometry.fem import volume_laplace
-from hipsta_bids.geometry.findings import flag_margins, raise_flags
+from hipsta_bids.geometry.findings import columns_near, flag_margins, raise_flags
+from hipsta_bids.geometry.folds import TouchingBanks, find_touching_banks
 from hipsta_bids.geometry.lines import Lines
-from hipsta_bids.geometry.measures import column_area, labels_at
+from hipsta_bids.geometry.measures import column_area, labels_at, measure_thickness
 from hipsta_bids.geometry.mesh import tetra_quality, tetrahedralize
 from hipsta_bids.geometry.sheet import fill_points, label_sheet, sheet_levels
 from hipsta_bids.protocols.protocol import CORE, LATERAL_END, MEDIAL_END, Tissue
 from hipsta_bids.settings import Settings, SheetSettings
 from hipsta_bids.types import (
+    Bool,
     Coordinates,
     End,
     Finding,
-    Flag,
     Float,
     HemisphereMaps,
     Int,
@@ -74,6 +75,11 @@ FLAG_HOLE, FLAG_END = 10.0, 15.0
 """Flag holes of a longer perimeter, and longer ends, mm."""
 FLAG_FOLDED, FLAG_MASKED = 0.01, 0.25
 """Flag larger shares of the area that are turned over, and that have no values."""
+FLAG_TOUCHING = 2.0
+"""Flag places where two banks of a fold touch over more than this, mm2 of one bank."""
+THICK_NEAR, THICK = 4.0, 1.5
+"""Beside such a place, up to this far, mm, columns thicker than this multiple of the median are
+part of it."""
 LATERAL_REACH = 1.6
 """The lateral edge lies this near to dentate gyrus or CA4, mm."""
 CUT_REACH = 1.0
@@ -113,6 +119,7 @@ def measure_whole(
         mesh = tetrahedralize(surface, settings.tetra)
     with clock("boundaries"):
         faces = find_faces(surface, volume, field, grid)
+        banks = [b for b in find_touching_banks(surface, faces) if b.area > FLAG_TOUCHING]
     with clock("coordinates"):
         laplace = volume_laplace(mesh, settings.boundaries.solver)
         u = laplace.between(faces.interior, faces.exterior)
@@ -126,6 +133,8 @@ def measure_whole(
     with clock("sheet"):
         lines_of = Lines(mesh, laplace.gradient(u))
         sheet = _sample(disk, plane, lines_of, axes, MARGIN)
+        touching = [_columns_of(place, sheet) for place in banks]
+        sheet = replace(sheet, valid=~np.any([~sheet.valid, *touching], axis=0))
         edge_to_edge = (np.linspace(-_RIM, _RIM, len(axes[0])), axes[1], axes[2][::2])
         whole = _sample(disk, plane, lines_of, edge_to_edge, 0.0)
         subfield = label_sheet(sheet, body)
@@ -143,7 +152,10 @@ def measure_whole(
         maps = {k: np.where(sheet.valid, v, np.nan) for k, v in everywhere.items()}
         maps["distortion"] = _distortion(sheet)
         folded = flipped_area(disk, plane)
-        findings = _findings(disk, edges, folded, region)
+        findings = [
+            *_findings(disk, edges, folded, region),
+            *(_touching(*place) for place in zip(banks, touching, strict=True)),
+        ]
         return HemisphereMaps(
             sheet=sheet,
             layers=sheet,
@@ -173,13 +185,8 @@ def measure_whole(
                 "anterior_plane": ends.entry("anterior"),
                 "flag_margins": flag_margins(findings),
             },
-            flags=(
-                *raise_flags(findings, sheet, lambda at: name_place(at, body), settings.checks),
-                Flag(
-                    reason="whole-experimental",
-                    message=f"region {region} is experimental, and digitations of the head that"
-                    " touch count as one thick wall: compare thick places with the labels",
-                ),
+            flags=tuple(
+                raise_flags(findings, sheet, lambda at: name_place(at, body), settings.checks)
             ),
             mesh=mesh,
             coordinates=Coordinates(values=np.column_stack([np.full((len(u), 2), np.nan), u])),
@@ -304,6 +311,27 @@ def _sample(
             "no node of the sheet is measured: check the labels", reason="sheet-incomplete"
         )
     return Sheet(points=fill_points(points), valid=valid)
+
+
+def _columns_of(banks: TouchingBanks, sheet: Sheet) -> Bool:
+    """Columns (Nx, Ny) with a value that lie where banks touch, and thick ones beside them."""
+    thickness = measure_thickness(sheet)
+    thick = thickness > THICK * np.median(thickness[sheet.valid])
+    beside = thick & columns_near(sheet, banks.points, THICK_NEAR)
+    return sheet.valid & (beside | columns_near(sheet, banks.points, MARGIN))
+
+
+def _touching(banks: TouchingBanks, columns: Bool) -> Finding:
+    return Finding(
+        reason="fused-digitation",
+        value=banks.area if columns.any() else 0.0,
+        limit=FLAG_TOUCHING,
+        what=f"two banks of a fold touch over {banks.area:.0f} mm2: the cleft between them on the"
+        f" {banks.lost} side is not in the labels",
+        remedy="correct the labels there; the sheet has no values there",
+        points=banks.points,
+        share=float(columns.mean()),
+    )
 
 
 def _distortion(sheet: Sheet) -> Float:

@@ -40,6 +40,7 @@ SUITES: Mapping[str, str] = MappingProxyType(
         "norms": "norms:run",
         "surrogate": "surrogate:run",
         "hippunfold": "hippunfold:run",
+        "heads": "heads:run",
     }
 )
 
@@ -76,6 +77,7 @@ QUESTIONS: Mapping[str, str] = MappingProxyType(
         "norms": "Centiles of norms hold in other people, also at a new site",
         "surrogate": "Thickness without a mesh agrees with that of the mesh",
         "hippunfold": "Thickness agrees with HippUnfold's own",
+        "heads": "Digitations of the head are measured, or found to touch",
     }
 )
 

@@ -7,53 +7,25 @@ from dataclasses import replace
 import nibabel as nib
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.derivatives.names import name_of_record
 from hipsta_bids.errors import GeometryError, ProtocolError
 from hipsta_bids.geometry.disk import find_edges, level_surface, make_disk
 from hipsta_bids.participant.measure import measure_hemisphere
+from hipsta_bids.phantom.head import RADIUS, HeadSpec, draw_head
 from hipsta_bids.protocols.load import for_region, load_protocol
-from hipsta_bids.protocols.protocol import Tissue, translate
+from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import Settings
-from hipsta_bids.types import Bool, Float, GivenEnd, HemisphereMaps, LabelVolume, TetMesh
+from hipsta_bids.types import Bool, Float, HemisphereMaps, LabelVolume, TetMesh
 
-VOXEL = 0.4
-LENGTH, BEND, ARC = 22.0, 9.0, np.deg2rad(240)
-RADIUS, THICKNESS = 4.0, 1.5
 WHOLE = Settings().changed(body={"region": "whole"})
-POSTERIOR, ANTERIOR = 5.0, 20.0
+SHAPE = HeadSpec()
+THICKNESS, (POSTERIOR, ANTERIOR) = SHAPE.thickness, SHAPE.ends
 
 
-def hooked(thickness: float = THICKNESS) -> LabelVolume:
-    """A left hemisphere: straight along y, then hooked medially in a circle, as the head is."""
-    low = np.array([-8.0, -3.0, -8.0])
-    shape = np.ceil((np.array([19.0, 38.0, 8.0]) - low) / VOXEL + 20).astype(int)
-    affine = np.eye(4)  # oblique, so that no wall runs along the voxels
-    affine[:3, :3] = VOXEL * Rotation.from_euler("xyz", [9, 6, 7], degrees=True).as_matrix()
-    affine[:3, 3] = low - affine[:3, :3] @ [7, 9, 7]
-    points = np.moveaxis(np.indices(shape), 0, -1) @ affine[:3, :3].T + affine[:3, 3]
-    x, y, z = np.moveaxis(points, -1, 0)
-    rho = np.hypot(x - BEND, y - LENGTH)
-    turn = np.arctan2(y - LENGTH, BEND - x)
-    hook = y > LENGTH
-    across = np.where(hook, BEND - rho, x)
-    within = np.where(hook, turn < np.deg2rad(100), y > 0)
-    r = np.hypot(across, z)
-    share = (-np.deg2rad(30) - np.arctan2(z, across)) % (2 * np.pi) / ARC
-    wall = (np.abs(r - RADIUS) < thickness / 2) & (share < 1)
-    codes = np.zeros(x.shape, dtype=int)
-    codes[r < RADIUS] = 6
-    codes[(r < 2) | ((r < RADIUS - 0.5) & (share > 1) & (share < 1.2))] = 4
-    codes[wall] = np.select([share < 0.25, share < 0.7], [2, 1], 5)[wall]
-    protocol = load_protocol("cobralab")
-    tissue, part = translate(np.where(within, codes, 0), protocol)
-    ends = (
-        GivenEnd(end="posterior", point=(0, POSTERIOR, 0), normal=(0, 1, 0)),
-        GivenEnd(end="anterior", point=(0, ANTERIOR, 0), normal=(0, 1, 0)),
-    )
-    return LabelVolume(tissue=tissue, part=part, affine=affine, protocol=protocol, given_ends=ends)
+def hooked() -> LabelVolume:
+    return draw_head(SHAPE)
 
 
 def measure(volume: LabelVolume) -> HemisphereMaps:
@@ -138,11 +110,26 @@ def test_hole_is_filled_and_told() -> None:
     found = measure(replace(volume, tissue=np.where(hole, 0, volume.tissue)))
     reasons = [flag.reason for flag in found.flags]
     assert reasons.count("whole-hole") == 1
-    assert "whole-experimental" in reasons  # of each map
     assert abs(found.qc["holes_mm"][0] - 2 * np.pi * 2.2) < 4
     gap = np.linalg.norm(middle(found) - [-RADIUS, 12.0, 0.0], axis=-1)
     assert np.isnan(found.thickness[gap < 2.5]).all()
     assert np.isfinite(found.thickness[8:-8][(gap > 4)[8:-8] & (gap < 5)[8:-8]]).all()
+
+
+def test_banks_that_touch_are_found_and_have_no_values() -> None:
+    open_, touching = (
+        measure(
+            draw_head(replace(SHAPE, thickness=1.2, straight=26.0, digitations=2, exterior=width))
+        )
+        for width in (0.8, 0.0)
+    )
+    assert "fused-digitation" not in [flag.reason for flag in open_.flags]
+    (flag,) = (flag for flag in touching.flags if flag.reason == "fused-digitation")
+    assert "exterior" in flag.message
+    assert flag.share is not None
+    assert 0 < flag.share < 0.1
+    assert np.nanmax(touching.thickness) < 2.0  # two walls have 2.4
+    assert np.isfinite(touching.thickness).sum() > 0.95 * np.isfinite(open_.thickness).sum()
 
 
 def cube(count: int) -> TetMesh:

@@ -1,0 +1,55 @@
+"""Folds of the head that touch: two banks that the labels do not tell apart.
+
+Where the cleft between two banks is lost, the wall there has the same face on both sides.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+from scipy.spatial import cKDTree
+
+from hipsta_bids.geometry.faces import Faces
+from hipsta_bids.geometry.mesh import vertex_areas
+from hipsta_bids.types import Float, Surface
+
+LINK = 1.0
+"""Parts of banks that touch are one place up to this distance, mm."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TouchingBanks:
+    """A place where two banks of a fold touch."""
+
+    points: Float
+    """(N, 3) midway between the two banks, RAS mm."""
+    area: float
+    """Of one bank, mm2."""
+    lost: str
+    """The side on which the cleft is lost: ``interior`` or ``exterior``."""
+
+
+def find_touching_banks(surface: Surface, faces: Faces) -> list[TouchingBanks]:
+    """Find where opposite walls are both interior, or both exterior, largest place first."""
+    side = np.where(faces.free, 0, np.sign(faces.side))
+    mated = np.flatnonzero((faces.opposite >= 0) & (side != 0))
+    mate = faces.opposite[mated]
+    touching = side[mated] == side[mate]
+    first, second = mated[touching], mate[touching]
+    middle = (surface.vertices[first] + surface.vertices[second]) / 2
+    pairs = cKDTree(middle).query_pairs(LINK, output_type="ndarray")
+    links = sparse.coo_array(
+        (np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(first), len(first))
+    )
+    count, place = sparse.csgraph.connected_components(links, directed=False)
+    area = vertex_areas(surface.vertices, surface.triangles)[first] / 2  # both banks are counted
+    found = [
+        TouchingBanks(
+            points=middle[place == number],
+            area=float(area[place == number].sum()),
+            # The cleft of the other face is lost: both walls that are left are of one face.
+            lost="exterior" if side[first[place == number]].sum() > 0 else "interior",
+        )
+        for number in range(count)
+    ]
+    return sorted(found, key=lambda banks: -banks.area)
