@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.classify import PairComparison
+from hipsta_bids.group.combat import SavedEffects
 from hipsta_bids.group.comparison import (
     BOTH,
     Comparison,
@@ -57,7 +58,6 @@ from hipsta_bids.group.registration import (
     shift_difference,
 )
 from hipsta_bids.group.settings import GroupSettings
-from hipsta_bids.group.site_effects import SavedEffects
 from hipsta_bids.group.summaries import MeasureFit, classify_groups, fit_summaries
 from hipsta_bids.group.warps import Template, warp_labels, warp_values
 from hipsta_bids.progress import each, tell

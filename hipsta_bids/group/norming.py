@@ -17,7 +17,7 @@ from hipsta_bids.group.analysis import SideResult
 from hipsta_bids.group.comparison import BOTH
 from hipsta_bids.group.data import Bool, Cohort, Float, Int
 from hipsta_bids.group.figures import Drawing, deviation_rows, draw_norms, norm_rows
-from hipsta_bids.group.formula import check_names, listed, typed
+from hipsta_bids.group.formula import check_names, level_labels, listed, typed
 from hipsta_bids.group.glm import most_frequent
 from hipsta_bids.group.methods import norms_text
 from hipsta_bids.group.normative import NormativeScores, ScoredMaps, map_rows, score_rows
@@ -40,7 +40,6 @@ from hipsta_bids.group.run import (
     read_templates,
 )
 from hipsta_bids.group.settings import GroupSettings, NormSettings
-from hipsta_bids.group.site_effects import level_labels
 from hipsta_bids.group.summaries import hemispheres, summary_values
 from hipsta_bids.group.tables import registration_tables
 from hipsta_bids.group.trials import (

@@ -21,6 +21,7 @@ from hipsta_bids.group.collect import (
     collect_sheets,
     wanted_by,
 )
+from hipsta_bids.group.combat import load_effects
 from hipsta_bids.group.comparison import Comparison, choose_visits
 from hipsta_bids.group.covariates import VisitTime, add_time, read_covariates, read_icv
 from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Measures
@@ -45,7 +46,6 @@ from hipsta_bids.group.read import (
 )
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.shapes import average_shapes, write_shapes
-from hipsta_bids.group.site_effects import SavedEffects, load_effects
 from hipsta_bids.group.surfaces import (
     ExternalCohorts,
     MapPattern,
@@ -184,7 +184,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         time=inputs.time.column if inputs.time else None,
         icv=inputs.icv,
         templates=templates,
-        site_effects=_site_effects(options),
+        site_effects=load_effects(options.harmonize_model) if options.harmonize_model else None,
     )
     others = {
         name: (other, analyze_points(other, analysis, settings))
@@ -266,11 +266,6 @@ def _summary(
     )
     notes += more
     return summary
-
-
-def _site_effects(options: GroupOptions) -> SavedEffects | None:
-    path = options.harmonize_model
-    return None if path is None else load_effects(path)
 
 
 def read_inputs(options: GroupOptions, settings: GroupSettings) -> GroupInputs:

@@ -34,7 +34,6 @@ from hipsta_bids.group.methods import methods_text
 from hipsta_bids.group.normative import ScoredMaps
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.shapes import AverageShape
-from hipsta_bids.group.site_effects import save_effects
 from hipsta_bids.group.tables import (
     COLUMNS,
     design_table,
@@ -143,7 +142,7 @@ def write_results(
         done = [analysis.harmonization, *(other.harmonization for _, other in others.values())]
         how = digests({hemi: side.registration for hemi, side in analysis.sides.items()})
         if effects := effects_of([one for one in done if one is not None], how):
-            save_effects(folder / "harmonization.json", effects)
+            files.write_json(folder / "harmonization.json", effects.model_dump(by_alias=True))
     for own, one in ((cohort, analysis), *others.values()):
         _write_surfaces(folder, own, one)
         _write_stats(folder, _stats(one))
