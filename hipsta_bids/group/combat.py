@@ -217,15 +217,36 @@ def _least_squares(values: Float, design: Float) -> Float:
         lost = design[~present[:, point]]
         grams[point] -= lost.T @ lost
     right = (design.T @ np.where(present, values, 0.0)).T
-    diagonal = np.arange(design.shape[1])
+    return solve_points(
+        grams, right, 0.5
+    )  # on the diagonal are numbers of values, but for rounding
+
+
+def solve_points(grams: Float, right: Float, least: float) -> Float:
+    """Solve the normal equations of each point.
+
+    Parameters
+    ----------
+    grams, right : array
+        (points, columns, columns) and (points, columns); ``grams`` is overwritten.
+    least : float
+        A column with no more than this on the diagonal has no values: its coefficient is 0.
+
+    Returns
+    -------
+    array
+        (columns, points), NaN where the coefficients are not unique.
+    """
+    diagonal = np.arange(grams.shape[1])
     size = grams[:, diagonal, diagonal]
-    absent = size < 0.5  # noqa: PLR2004 -- a number of values, but for rounding
-    grams[:, diagonal, diagonal] = np.where(absent, 1.0, size)
-    size = np.sqrt(grams[:, diagonal, diagonal])
+    size = grams[:, diagonal, diagonal] = np.where(size > least, size, 1.0)
+    size = np.sqrt(size)
     unit = grams / (size[:, :, None] * size[:, None, :])
-    unique = np.linalg.eigvalsh(unit)[:, 0] > np.sqrt(np.finfo(np.float64).eps)
-    grams[~unique] = np.eye(design.shape[1])
-    found = np.linalg.solve(grams, right[:, :, None])[:, :, 0]
+    finite = np.isfinite(unit).all(axis=(1, 2))
+    unit[~finite] = np.eye(len(diagonal))
+    unique = finite & (np.linalg.eigvalsh(unit)[:, 0] > np.sqrt(np.finfo(np.float64).eps))
+    unit[~unique] = np.eye(len(diagonal))
+    found = np.linalg.solve(unit, (right / size)[:, :, None])[:, :, 0] / size
     return np.where(unique[:, None], found, np.nan).T
 
 

@@ -19,7 +19,7 @@ from hipsta_bids.group.figures import Drawing
 from hipsta_bids.group.glm import FittedMaps, PointTest, PointwiseFit
 from hipsta_bids.group.inference import PERMUTATIONS
 from hipsta_bids.group.meta import FIXED, RANDOM
-from hipsta_bids.group.methods import Citations
+from hipsta_bids.group.methods import PROCEDURES, Citations
 from hipsta_bids.group.panels import Row, contrasts, draw_pages
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.sites import (
@@ -230,11 +230,6 @@ def _methods(meta: Meta) -> str:
             f" correction {cite('modified')}"
         )
     correction = meta.settings.multiplicity
-    kind = (
-        "the procedure of Benjamini and Hochberg"
-        if correction.method == "bh"
-        else "the two-stage procedure of Benjamini, Krieger and Yekutieli"
-    )
     family = "each map" if correction.scope == "map" else "both hemispheres together"
     what = (
         f"Measures of the hippocampus {cite('method')} of {meta.people} participants{groups} at"
@@ -250,10 +245,11 @@ def _methods(meta: Meta) -> str:
     if meta.items[0].result.without:
         effects += " All was repeated without each of the sites."
     errors = (
-        f"The false discovery rate was held at {correction.alpha:g} by {kind}"
-        f" {cite(correction.method)}, for {family}, and for all summary measures of a contrast"
-        " together. Effect sizes are Cohen's d: the estimate over the residual standard deviation"
-        f" within sites, with {how.confidence:.0%} confidence limits."
+        f"The false discovery rate was held at {correction.alpha:g} by"
+        f" {PROCEDURES[correction.method]} {cite(correction.method)}, for {family}, and for all"
+        " summary measures of a contrast together. Effect sizes are Cohen's d: the estimate over"
+        f" the residual standard deviation within sites, with {how.confidence:.0%} confidence"
+        " limits."
     )
     paragraphs = [f"{what} {aligned}", effects, errors]
     survivors = [

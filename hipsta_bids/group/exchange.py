@@ -19,7 +19,7 @@ from pydantic import AfterValidator, Field
 
 from hipsta_bids import __version__
 from hipsta_bids.errors import InputError, ModelError
-from hipsta_bids.group.analysis import Analysis
+from hipsta_bids.group.analysis import Analysis, templates_of
 from hipsta_bids.group.data import Cohort, Float, Int, read_foreign, rounded
 from hipsta_bids.group.formula import typed
 from hipsta_bids.group.glm import FittedMaps, fit_points, with_mean
@@ -28,7 +28,6 @@ from hipsta_bids.group.meta import SiteFit
 from hipsta_bids.group.model import Design, build_design
 from hipsta_bids.group.settings import ExchangeSettings, GroupSettings
 from hipsta_bids.group.summaries import summary_values
-from hipsta_bids.group.warps import templates_to_json
 from hipsta_bids.io import files
 from hipsta_bids.protocols.toml import TomlTable
 
@@ -291,11 +290,6 @@ def summarize(
                 f"{SUMMARY}: {model['measures'][0] if what == 'points' else 'summaries'},"
                 f" {model['hemi']}: without {lost} {what} that are not known of all participants"
             )
-    templates = {
-        hemi: side.registration.template
-        for hemi, side in analysis.sides.items()
-        if side.registration.template is not None
-    }
     numbers = {
         name: typed(table[name], settings.design).astype(np.float64)
         for name in closed_formula(analysis.model.formula).names
@@ -314,7 +308,7 @@ def summarize(
         "asymmetry": list(settings.asymmetry.relative),
         "change": analysis.comparison.pair is not None,
         "align": settings.registration.align,
-        "template": files.plain(templates_to_json(templates)) if templates else None,
+        "template": files.plain(templates_of(analysis.sides)),
         "participants": len(rows),
         "groups": groups,
         "factors": factors,

@@ -124,6 +124,12 @@ _MEASURED = {
     "entorhinal": "the cortex beside the hippocampus",
 }
 
+#: Procedures that hold false discovery rates.
+PROCEDURES: Mapping[str, str] = {
+    "bh": "the procedure of Benjamini and Hochberg",
+    "fdr2": "the two-stage procedure of Benjamini, Krieger and Yekutieli",
+}
+
 
 class Citations:
     """Numbers works in the order in which a text names them."""
@@ -382,13 +388,9 @@ def _correction(how: MultiplicitySettings, cite: Callable[[str], str], *, repeat
             f" {how.permutations} permutations{inside} of {shuffled}{'' if repeated else '; '}seed"
             f" {how.seed}) {cite('permutation')}, for {family}."
         )
-    kind = (
-        "the procedure of Benjamini and Hochberg"
-        if how.method == "bh"
-        else "the two-stage procedure of Benjamini, Krieger and Yekutieli"
-    )
     return (
-        f"The false discovery rate was held at {how.alpha:g} by {kind} {cite(how.method)}, for"
+        f"The false discovery rate was held at {how.alpha:g} by {PROCEDURES[how.method]}"
+        f" {cite(how.method)}, for"
         f" {family}."
     )
 

@@ -13,7 +13,7 @@ from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group import write
-from hipsta_bids.group.analysis import SideResult
+from hipsta_bids.group.analysis import SideResult, templates_of
 from hipsta_bids.group.comparison import BOTH
 from hipsta_bids.group.data import Bool, Cohort, Float, Int
 from hipsta_bids.group.figures import Drawing, deviation_rows, draw_norms, norm_rows
@@ -46,10 +46,9 @@ from hipsta_bids.group.trials import (
     draw_maps,
     members,
     register_cohorts,
-    templates_of,
     write_answer,
 )
-from hipsta_bids.group.warps import Template, templates_from_json, templates_to_json
+from hipsta_bids.group.warps import Template, templates_from_json
 from hipsta_bids.io import files
 from hipsta_bids.progress import tell
 from hipsta_bids.protocols.toml import resolve
@@ -123,8 +122,7 @@ def run_norms(options: GroupOptions, request: NormsRequest, settings: GroupSetti
     templates = read_templates(options.template, chosen.cohort)
     sides, cohorts, found = _registered(chosen, settings, templates)
     tell("norms")
-    if made := templates_of(sides):
-        file = file.model_copy(update={"template": templates_to_json(made)})
+    file = file.model_copy(update={"template": templates_of(sides)})
     norms, table = _fit(found, people, file, how)
     tables = dict(registration_tables(chosen.cohort, sides)) if sides else {}
     tables["coverage"] = table

@@ -19,6 +19,7 @@ from pydantic import Field
 from scipy import special
 
 from hipsta_bids.errors import ModelError
+from hipsta_bids.group.combat import solve_points
 from hipsta_bids.group.data import Bool, Float, Int, Key, as_nested, read_foreign
 from hipsta_bids.group.exchange import Known, Number, Text
 from hipsta_bids.group.glm import chunks
@@ -297,20 +298,7 @@ def _weighted(values: Float, weight: Float, design: Float) -> Float:
     for rows in chunks((columns**2, len(design)), 1):
         products = (design[rows, :, None] * design[rows, None, :]).reshape(-1, columns**2)
         grams += weight[rows].T @ products
-    grams = grams.reshape(-1, columns, columns)
-    right = ((weight * values).T @ design)[:, :, None]
-    diagonal = np.arange(columns)
-    size = grams[:, diagonal, diagonal]
-    # A site without values has the constant zero, and no say in the others.
-    grams[:, diagonal, diagonal] = np.where(size > 0, size, 1.0)
-    size = np.sqrt(grams[:, diagonal, diagonal])
-    unit = grams / (size[:, :, None] * size[:, None, :])
-    finite = np.isfinite(unit).all(axis=(1, 2))
-    unit[~finite] = np.eye(columns)
-    unique = finite & (np.linalg.eigvalsh(unit)[:, 0] > _LEAST_INFORMATION)
-    unit[~unique] = np.eye(columns)
-    found = np.linalg.solve(unit, right / size[:, :, None])[:, :, 0] / size
-    return np.where(unique[:, None], found, np.nan).T
+    return solve_points(grams.reshape(-1, columns, columns), (weight * values).T @ design, 0.0)
 
 
 def _power(order: Float) -> Float:

@@ -14,11 +14,11 @@ from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.names import TRIAL_MAPS, TRIAL_TABLES
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group import write
-from hipsta_bids.group.analysis import SideResult, register_side
+from hipsta_bids.group.analysis import SideResult, register_side, templates_of
 from hipsta_bids.group.clusters import frame_of
-from hipsta_bids.group.collect import Exclusion
+from hipsta_bids.group.collect import exclude_visits
 from hipsta_bids.group.comparison import Comparison
-from hipsta_bids.group.data import PARTICIPANT, SESSION, Bool, Cohort, Float
+from hipsta_bids.group.data import PARTICIPANT, Bool, Cohort, Float
 from hipsta_bids.group.figures import Drawing
 from hipsta_bids.group.formula import check_names, listed
 from hipsta_bids.group.glm import FittedMaps
@@ -46,7 +46,7 @@ from hipsta_bids.group.run import (
 )
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.tables import entity_label, registration_tables
-from hipsta_bids.group.warps import Template, templates_to_json
+from hipsta_bids.group.warps import Template
 from hipsta_bids.io import files, gifti
 from hipsta_bids.progress import each, tell
 from hipsta_bids.protocols.toml import resolve
@@ -82,7 +82,7 @@ class TrialRequest:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Found:
-    """What was found for some summary measures."""
+    """What was found for some summary measures, or at the points of one map."""
 
     hemi: str
     measures: tuple[str, ...]
@@ -91,10 +91,9 @@ class Found:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MapFound(Found):
-    """What was found at the points of one map."""
+    """With the places of the points."""
 
     place: FittedMaps
-    """Where the points are."""
 
 
 def run_trial(options: GroupOptions, request: TrialRequest, settings: GroupSettings) -> GroupResult:
@@ -146,7 +145,7 @@ def run_trial(options: GroupOptions, request: TrialRequest, settings: GroupSetti
         for surface, found in maps.items():
             _write_maps(folder, surface, cohorts[surface], found)
         if templates := templates_of(sides):
-            files.write_json(folder / "template.json", templates_to_json(templates))
+            files.write_json(folder / "template.json", templates)
         files.write_text(folder / "methods.md", _methods(source, request, modeled, maps, settings))
         figures = (figure for key, own in maps.items() for figure in _figures(cohorts[key], own))
         return write.write_figures(folder, figures)
@@ -198,7 +197,7 @@ def write_answer(
 
     ``fill`` writes all else into the folder, and returns notes.
     """
-    excluded = [*inputs.exclusions, *_excluded(inputs.cohort.table, left_out)]
+    excluded = [*inputs.exclusions, *exclude_visits(inputs.cohort.table, left_out)]
     region, people = options.sheets.region, int(visits[PARTICIPANT].nunique())
     name = options.model.name or name + ("" if region == "body" else f"_{region}")
     describe_dataset(options)
@@ -230,12 +229,6 @@ def write_answer(
         notes=tuple(notes),
         warnings=inputs.found.warnings,
     )
-
-
-def templates_of(sides: Mapping[str, SideResult]) -> dict[str, Template]:
-    """Templates of registration by hemisphere, where it made or used one."""
-    found = {hemi: side.registration.template for hemi, side in sides.items()}
-    return {hemi: template for hemi, template in found.items() if template is not None}
 
 
 def _choose(
@@ -337,19 +330,6 @@ def _notes(
         )
     if later := sum(one.reason == "later-session" for one in inputs.exclusions):
         yield f"{later} later sessions are not in it; --visits takes all"
-
-
-def _excluded(table: pd.DataFrame, left_out: Mapping[str, tuple[str, str]]) -> Iterator[Exclusion]:
-    """List visits that are left out, with reason and message."""
-    for row in table.loc[list(left_out), [PARTICIPANT, SESSION]].itertuples():
-        reason, message = left_out[str(row.Index)]
-        yield Exclusion(
-            participant=str(row[1]),
-            session=row[2],
-            hemi=files.MISSING,
-            reason=reason,
-            message=message,
-        )
 
 
 def _methods(

@@ -16,7 +16,7 @@ import pyarrow as pa
 from pyarrow import parquet
 
 from hipsta_bids.derivatives.names import DATASET_FILES
-from hipsta_bids.group.analysis import Analysis, tested_maps
+from hipsta_bids.group.analysis import Analysis, templates_of, tested_maps
 from hipsta_bids.group.collect import Exclusion
 from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float, Int, SideMaps, some_sheets
 from hipsta_bids.group.figures import Drawing, draw_figures, encode
@@ -42,7 +42,6 @@ from hipsta_bids.group.tables import (
     point_tables,
     result_tables,
 )
-from hipsta_bids.group.warps import templates_to_json
 from hipsta_bids.io import files, gifti
 from hipsta_bids.progress import tell
 from hipsta_bids.reports.group_tables import JOINT
@@ -131,13 +130,8 @@ def write_results(
         if analysis.harmonization is not None:
             states.append(analysis.harmonization.cohort.sides)
         _write_maps(folder / "maps.parquet", cohort, states if registered else [], points)
-    templates = {
-        hemi: side.registration.template
-        for hemi, side in analysis.sides.items()
-        if side.registration.template is not None
-    }
-    if templates:
-        files.write_json(folder / "template.json", templates_to_json(templates))
+    if templates := templates_of(analysis.sides):
+        files.write_json(folder / "template.json", templates)
     if analysis.harmonization is not None:
         done = [analysis.harmonization, *(other.harmonization for _, other in others.values())]
         how = digests({hemi: side.registration for hemi, side in analysis.sides.items()})

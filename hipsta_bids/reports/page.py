@@ -23,7 +23,7 @@ _LOGGER = logging.getLogger(__name__)
 _Topic = TypeVar("_Topic")
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Section(Generic[_Topic]):
     """One part of a page."""
 
