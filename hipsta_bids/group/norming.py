@@ -75,8 +75,11 @@ class NormsRequest:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Chosen:
-    """Visits that are asked for."""
+    """What is asked for, and of which visits."""
 
+    options: GroupOptions
+    request: NormsRequest
+    settings: GroupSettings
     inputs: GroupInputs
     keep: Bool
     """Of the visits that were read."""
@@ -116,19 +119,16 @@ def run_norms(options: GroupOptions, request: NormsRequest, settings: GroupSetti
     if request.file is not None:
         return _score_people(options, request, request.file, settings)
     chosen = _choose(options, request, settings)
-    file, how = _planned(chosen, settings), settings.norms
-    people, left_out = _people(chosen.cohort.table, file, settings)
+    file, how = _planned(chosen), settings.norms
+    people = _people(chosen, file)
     file = _counted(file, people, how)
-    templates = read_templates(options.template, chosen.cohort)
-    sides, cohorts, found = _registered(chosen, settings, templates)
+    sides, cohorts, found = _registered(chosen, read_templates(options.template, chosen.cohort))
     tell("norms")
     file = file.model_copy(update={"template": templates_of(sides)})
     norms, table = _fit(found, people, file, how)
     tables = dict(registration_tables(chosen.cohort, sides)) if sides else {}
     tables["coverage"] = table
-    chosen.left_out.update(left_out)
-    done = _Made(file, norms, people, cohorts, found, tables, len(file.sites))
-    return _write(options, request, settings, chosen, done, ())
+    return _write(chosen, _Made(file, norms, people, cohorts, found, tables, len(file.sites)), ())
 
 
 def _score_people(
@@ -141,15 +141,15 @@ def _score_people(
     settings = settings.changed(registration=file.registration)
     chosen = _choose(options, request, settings)
     notes = _check(file, path, chosen.inputs)
-    table = chosen.cohort.table
-    people, left_out = _people(table, file, settings)
+    people = _people(chosen, file)
     if not people.known.any():
-        why = "; ".join(dict.fromkeys(message for _, message in left_out.values()))
+        why = "; ".join(dict.fromkeys(message for _, message in chosen.left_out.values()))
         raise ModelError(f"{path}: nobody here can be scored: {why}", reason="norms-differ")
-    controls = members(table, request.controls, "--controls") & (request.controls is not None)
-    file = _with_new_sites(file, table, people, controls, request, settings)
+    everyone = members(chosen.cohort.table, request.controls, "--controls")
+    controls = everyone & (request.controls is not None)
+    file = _with_new_sites(chosen, file, people, controls)
     templates = None if file.template is None else templates_from_json(file.template, str(path))
-    sides, cohorts, found = _registered(chosen, settings, templates)
+    sides, cohorts, found = _registered(chosen, templates)
     found = {key: own for key, own in found.items() if key in norms}
     adapted = controls & people.known & (people.site >= known)
     tell("norms")
@@ -166,8 +166,7 @@ def _score_people(
     tables = dict(registration_tables(chosen.cohort, sides)) if sides else {}
     made = _Made(file, extended, people, cohorts, found, tables, known, scored, adapted)
     tables["zscores"] = pd.concat(_score_rows(made, adapted, settings), ignore_index=True)
-    chosen.left_out.update(left_out)
-    return _write(options, request, settings, chosen, made, notes)
+    return _write(chosen, made, notes)
 
 
 def _choose(options: GroupOptions, request: NormsRequest, settings: GroupSettings) -> _Chosen:
@@ -176,15 +175,20 @@ def _choose(options: GroupOptions, request: NormsRequest, settings: GroupSetting
     keep = members(inputs.cohort.table, request.among)
     why = "not-asked", "another level than --among"
     left_out = dict.fromkeys(map(str, inputs.cohort.table.index[~keep]), why)
-    return _Chosen(inputs=inputs, keep=keep, cohort=inputs.cohort.take(keep), left_out=left_out)
+    return _Chosen(
+        options=options, request=request, settings=settings, inputs=inputs, keep=keep,
+        cohort=inputs.cohort.take(keep), left_out=left_out,
+    )  # fmt: skip
 
 
 def _registered(
-    chosen: _Chosen, settings: GroupSettings, templates: Mapping[str, Template] | None
+    chosen: _Chosen, templates: Mapping[str, Template] | None
 ) -> tuple[dict[str, SideResult], dict[str, Cohort], Values]:
     """Register maps, and collect them and summary measures of each side and of the mean of both."""
     inputs = chosen.inputs
-    sides, cohorts = register_cohorts(chosen.cohort, inputs, chosen.keep, settings, templates)
+    sides, cohorts = register_cohorts(
+        chosen.cohort, inputs, chosen.keep, chosen.settings, templates
+    )
     names = [*inputs.measures.maps, *inputs.others]
     found: dict[Key, tuple[Int, Float]] = {}
     for name, cohort in cohorts.items():
@@ -204,16 +208,10 @@ def _registered(
     return sides, cohorts, found
 
 
-def _write(  # noqa: PLR0917
-    options: GroupOptions,
-    request: NormsRequest,
-    settings: GroupSettings,
-    chosen: _Chosen,
-    made: _Made,
-    notes: Iterable[str],
-) -> GroupResult:
+def _write(chosen: _Chosen, made: _Made, notes: Iterable[str]) -> GroupResult:
     """Write all results; charts are of the measures that the settings name."""
     file, people, cohort = made.file, made.people, chosen.cohort
+    request, settings = chosen.request, chosen.settings
     charts = [
         file.centiles(norms).assign(hemi=hemi, measure=name, unit=cohort.units.get(name, "1"))
         for (hemi, name), norms in made.norms.items()
@@ -265,7 +263,7 @@ def _write(  # noqa: PLR0917
     if file.site not in cohort.table:
         notes.append(f"no column {file.site!r}: all are taken to be at one, {_NO_SITE!r}")
     return write_answer(
-        options, name, chosen.inputs, settings, left_out=chosen.left_out, notes=notes,
+        chosen.options, name, chosen.inputs, settings, left_out=chosen.left_out, notes=notes,
         visits=cohort.table[people.known], tables=made.tables, record=record, fill=fill,
     )  # fmt: skip
 
@@ -276,10 +274,10 @@ def _protocol(inputs: GroupInputs) -> tuple[str, str]:
     return (records[0].place.name.seg, records[0].place.name.region) if records else ("none",) * 2
 
 
-def _planned(chosen: _Chosen, settings: GroupSettings) -> NormsFile:
+def _planned(chosen: _Chosen) -> NormsFile:
     """Say what norms are about, before they are fitted."""
-    how, cohort, inputs = settings.norms, chosen.cohort, chosen.inputs
-    found, table = inputs.found, cohort.table
+    cohort, inputs, settings = chosen.cohort, chosen.inputs, chosen.settings
+    how, found, table = settings.norms, inputs.found, cohort.table
     check_names([how.age], table.columns)
     sites, complete = _site_labels(table, how.site, settings), np.ones(len(table), dtype=bool)
     sexes = level_labels(table[how.sex], settings.design) if how.sex in table else None
@@ -323,10 +321,9 @@ def _site_labels(table: pd.DataFrame, column: str, settings: GroupSettings) -> p
     return level_labels(table[column], settings.design)
 
 
-def _people(
-    table: pd.DataFrame, file: NormsFile, settings: GroupSettings
-) -> tuple[People, dict[str, tuple[str, str]]]:
-    """Describe visits as norms have to know them, new sites last; of others reason and message."""
+def _people(chosen: _Chosen, file: NormsFile) -> People:
+    """Describe visits as norms have to know them, new sites last; others are left out."""
+    table, settings = chosen.cohort.table, chosen.settings
     check_names([file.age, *([file.sex] if file.sexes else [])], table.columns)
     age, labels = _ages(table, file.age, settings), _site_labels(table, file.site, settings)
     low, high = file.knots[0], file.knots[-1]
@@ -342,11 +339,12 @@ def _people(
         for i, level in enumerate(file.sexes[1:]):
             sex[:, i] = levels == level
     problems |= {("incomplete", f"{name} is missing"): where for name, where in lacks.items()}
-    left_out = {str(v): why for why, where in problems.items() for v in table.index[where]}
+    for why, where in problems.items():
+        chosen.left_out.update(dict.fromkeys(map(str, table.index[where]), why))
     usable = ~np.any(list(problems.values()), axis=0)
     sites = [*file.sites, *sorted(set(labels[usable]) - set(file.sites))]
     site = np.where(usable, pd.Categorical(labels, categories=sites).codes, -1).astype(np.int64)
-    return People(age=age, sex=sex, site=site), left_out
+    return People(age=age, sex=sex, site=site)
 
 
 def _counted(file: NormsFile, people: People, how: NormSettings) -> NormsFile:
@@ -408,15 +406,9 @@ def _check(file: NormsFile, path: Path, inputs: GroupInputs) -> list[str]:
     return []
 
 
-def _with_new_sites(  # noqa: PLR0917
-    file: NormsFile,
-    table: pd.DataFrame,
-    people: People,
-    controls: Bool,
-    request: NormsRequest,
-    settings: GroupSettings,
-) -> NormsFile:
+def _with_new_sites(chosen: _Chosen, file: NormsFile, people: People, controls: Bool) -> NormsFile:
     """Add the names of new sites, if they have controls enough."""
+    table, request, settings = chosen.cohort.table, chosen.request, chosen.settings
     least, sites = settings.norms.least_controls, dict(file.sites)
     labels = _site_labels(table, file.site, settings).to_numpy()
     for number in range(len(sites), int(people.site.max(initial=-1)) + 1):
