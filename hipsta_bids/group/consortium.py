@@ -23,13 +23,13 @@ from hipsta_bids.group.methods import PROCEDURES, Citations
 from hipsta_bids.group.panels import Row, contrasts, draw_pages
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.sites import (
-    COLUMNS,
     Meta,
     analyze_sites,
     check_agreement,
     meta_tables,
     point_test,
 )
+from hipsta_bids.group.tables import META_COLUMNS
 from hipsta_bids.group.write import whole_folder, write_figures, write_table
 from hipsta_bids.io import files
 from hipsta_bids.protocols.toml import resolve
@@ -70,7 +70,7 @@ def run_meta(options: MetaOptions, settings: GroupSettings) -> tuple[Path, list[
         )
     with whole_folder(folder) as aside:
         for name, table in meta_tables(meta):
-            write_table(aside, name, table, described=name != "sites", meaning=COLUMNS)
+            write_table(aside, name, table, described=name != "sites", meaning=META_COLUMNS)
         notes += write_figures(aside, _figures(meta))
         files.write_text(aside / "methods.md", _methods(meta))
         files.write_json(aside / "meta.json", _record(meta, options, notes))

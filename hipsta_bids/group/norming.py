@@ -15,7 +15,7 @@ from hipsta_bids.errors import ModelError
 from hipsta_bids.group import write
 from hipsta_bids.group.analysis import SideResult, templates_of
 from hipsta_bids.group.comparison import BOTH
-from hipsta_bids.group.data import Bool, Cohort, Float, Int
+from hipsta_bids.group.data import Bool, Cohort, Float, Int, Key
 from hipsta_bids.group.figures import Drawing, deviation_rows, draw_norms, norm_rows
 from hipsta_bids.group.formula import check_names, level_labels, listed, typed
 from hipsta_bids.group.glm import most_frequent
@@ -55,8 +55,6 @@ from hipsta_bids.protocols.toml import resolve
 
 _NO_SITE = "unnamed"  # of everybody, where there is no column of sites
 
-Key = tuple[str, str]
-"""Hemisphere and measure."""
 Values = Mapping[Key, tuple[Int, Float]]
 """Rows of the table, and (rows, points); summary measures are single points."""
 

@@ -29,24 +29,6 @@ from hipsta_bids.protocols.toml import TomlTable
 
 #: Probabilities of the centiles that tables and charts show.
 LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
-#: Meaning of columns of tables.
-NORM_COLUMNS: Mapping[str, str] = {
-    "n_points": "points with norms; 1 for summary measures",
-    "transformed": "share of points whose distribution is not normal",
-    "z": "deviation from the norms, a standard normal quantile; of maps mean over the region",
-    "centile": "percent of the norms, of the same age, sex and site, below the value",
-    "adapted": "true for controls from whom the site's shift and scale were estimated",
-    "sex": "sex",
-    "age": "age, years",
-    **{
-        name: text
-        for level in LEVELS
-        for name, text in (
-            (f"below_{100 * level:g}", f"share below centile {100 * level:g}, cross-validated"),
-            (f"p{100 * level:g}", f"centile {100 * level:g} at the average site, unit of measure"),
-        )
-    },
-}
 #: Bytes of the largest file that is read.
 _LARGEST = 1_000_000_000
 _ARRAYS = ("mean", "spread", "shape", "shift", "scale", "n")

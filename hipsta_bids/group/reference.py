@@ -29,29 +29,6 @@ _SLOPE_SESSIONS = 3
 Tables = Mapping[str, Mapping[str, Any]]
 """Columns of the tables of each question, ``retest`` and ``power``."""
 
-#: Meaning of these columns; the unit is that of the measure unless said.
-TRIAL_COLUMNS: Mapping[str, str] = {
-    "sd_between": "SD between participants, of their true values",
-    "sd_within": "SD within participants, between sessions",
-    "sd_within_low": "lower confidence limit",
-    "sd_within_high": "upper confidence limit",
-    "icc": "intraclass correlation ICC(2,1), absolute agreement of single measurements",
-    "icc_low": "lower confidence limit",
-    "icc_high": "upper confidence limit",
-    "detectable_change": "minimal detectable change in one participant, 1.96 sqrt(2) sd_within",
-    "p_sessions": "p-value of the F test that all sessions have the same mean",
-    "change_per_year": "mean change in the reference, unit of the measure per year",
-    "arm_difference": "between the arms, unit of the measure; with several visits, per year",
-    "sd_endpoint": "SD of a participant's value; with several visits, of the slope per year",
-    "alpha": "two-sided level of the test",
-    "per_arm": "participants per arm who complete the trial; n/a above ``power.most``",
-    "per_arm_low": "the same at the better confidence limit, of the mean change for slowing, else"
-    " of the SD",
-    "per_arm_high": "at the worse one; n/a if no number is enough",
-    "enrolled_per_arm": "participants per arm to enroll, as some leave before the last visit",
-    "power": "with this number per arm",
-}
-
 
 @dataclass(frozen=True, kw_only=True)
 class Reference:

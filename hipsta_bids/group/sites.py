@@ -37,33 +37,6 @@ _PREDICTION = "prediction"
 _BY_COLUMNS = "write the contrast by columns, as -1*group[T.AD]"
 _LONGEST = 200  # characters of what two sites have
 
-#: Meanings of columns of tables, beside those of the group level.
-COLUMNS: Mapping[str, str] = {
-    **tables.COLUMNS,
-    "site": "site; in forest.tsv also the combined estimates, and the limits of a further site",
-    "kind": "what the row is: site, fixed effect, random effects, or prediction",
-    "plot": "number of the forest plot",
-    "version": "version of hipsta_bids",
-    "template": "hash of the template of registration; none without registration",
-    "n_sites": "sites with an estimate",
-    "estimate_low": "lower confidence limit of the estimate; of prediction, of a further site's",
-    "estimate_high": "upper limit",
-    "weight": "share of the site in the random-effects estimate",
-    "without_estimate": "random-effects estimate without the site",
-    "without_low": "its lower confidence limit",
-    "without_high": "its upper confidence limit",
-    "without_p": "its p-value",
-    "tau2": "variance of the true effects between sites, unit of the measure squared",
-    "q": "Cochran's Q",
-    "q_p": "its p-value",
-    "i2": "I squared: share of the variance of the sites' estimates that is between sites",
-    "estimate_dl": "random-effects estimate with the variance of DerSimonian and Laird",
-    "se_dl": "its standard error",
-    "p_dl": "its p-value, from the normal distribution",
-    "n_kept": "points that survive with all sites, and without this one",
-    "largest_change": "largest change of the estimate without the site, in residual SDs",
-}
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Item:
