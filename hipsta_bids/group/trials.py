@@ -32,8 +32,16 @@ from hipsta_bids.group.power import (
     power_text,
     sample_size,
 )
-from hipsta_bids.group.reference import Modeled, Reference, Retested, Source, Tables
-from hipsta_bids.group.retest import RetestCohort, retest_cohort, retest_text
+from hipsta_bids.group.reference import (
+    Modeled,
+    Reference,
+    RetestCohort,
+    Retested,
+    Source,
+    Tables,
+    retest_cohort,
+    retest_text,
+)
 from hipsta_bids.group.run import (
     GroupInputs,
     GroupOptions,
