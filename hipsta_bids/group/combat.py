@@ -201,9 +201,8 @@ def harmonize(values: Float, visits: Visits, effects: SiteEffects) -> Float:
 def _varies(values: Float) -> Bool:
     """Tell points that have different values."""
     known = np.isfinite(values)
-    low = np.where(known, values, np.inf).min(axis=0)
-    high = np.where(known, values, -np.inf).max(axis=0)
-    return np.asarray(low < high)
+    low = values.min(axis=0, where=known, initial=np.inf)
+    return np.asarray(low < values.max(axis=0, where=known, initial=-np.inf))
 
 
 def _least_squares(values: Float, design: Float) -> Float:

@@ -44,6 +44,7 @@ from hipsta_bids.group.summaries import hemispheres, summary_values
 from hipsta_bids.group.tables import registration_tables
 from hipsta_bids.group.trials import (
     draw_maps,
+    folder_of,
     members,
     register_cohorts,
     write_answer,
@@ -255,8 +256,7 @@ def _write(chosen: _Chosen, made: _Made, notes: Iterable[str]) -> GroupResult:
         },
         "among": request.among,
     }
-    parts = ["norms" if request.file is None else "scores", *(request.among or ())[1:]]
-    name = "_".join("".join(c if c.isalnum() else "-" for c in part) for part in parts)
+    name = folder_of(["norms" if request.file is None else "scores"], request.among)
     notes = [*chosen.inputs.notes, *notes]
     if file.site not in cohort.table:
         notes.append(f"no column {file.site!r}: all are taken to be at one, {_NO_SITE!r}")

@@ -67,6 +67,12 @@ if TYPE_CHECKING:
 _COUNTS = tuple(n * 10**power for power in range(5) for n in (1, 2, 3, 5))
 
 
+def folder_of(parts: Sequence[str], among: tuple[str, str] | None) -> str:
+    """Name a folder of results by what was asked, and of whom."""
+    words = (*parts, *(among or ())[1:])
+    return "_".join("".join(c if c.isalnum() else "-" for c in word) for word in words)
+
+
 @dataclass(frozen=True, kw_only=True)
 class TrialRequest:
     """What is asked of repeated sessions, or of a reference cohort."""
@@ -84,8 +90,7 @@ class TrialRequest:
         if self.effect is not None:
             share = f"{100 * self.effect.share:g}".replace(".", "p")
             parts.append(f"power-{self.effect.kind}-{share}")
-        parts += [self.among[1]] if self.among else []
-        return "_".join("".join(c if c.isalnum() else "-" for c in part) for part in parts)
+        return folder_of(parts, self.among)
 
 
 @dataclass(frozen=True, eq=False)
