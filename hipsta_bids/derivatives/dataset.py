@@ -1,7 +1,9 @@
 """The files of a dataset as a whole: description, settings, methods text with references."""
 
 import os
+import tomllib
 from collections.abc import Iterable, Mapping, Sequence
+from importlib import resources
 from importlib.metadata import PackageNotFoundError, metadata
 from pathlib import Path
 from typing import Any
@@ -295,22 +297,14 @@ _REGIONS = {
     " experimental.",
 }
 
-#: Key and entry of each work that the methods rest on.
-REFERENCES: dict[str, str] = {
-    "method": "Diers K, Baumeister H, Jessen F, Düzel E, Berron D, Reuter M. An automated,"
-    " geometry-based method for hippocampal shape and thickness analysis. NeuroImage"
-    " 2023;276:120182. doi:10.1016/j.neuroimage.2023.120182",
-    "shapedna": "Reuter M, Wolter FE, Peinecke N. Laplace-Beltrami spectra as 'Shape-DNA' of"
-    " surfaces and solids. Computer-Aided Design 2006;38(4):342-366."
-    " doi:10.1016/j.cad.2005.10.011",
-    "brainprint": "Wachinger C, Golland P, Kremen W, Fischl B, Reuter M. BrainPrint: a"
-    " discriminative characterization of brain morphology. NeuroImage 2015;109:232-248."
-    " doi:10.1016/j.neuroimage.2015.01.032",
-    "tetgen": "Si H. TetGen, a Delaunay-based quality tetrahedral mesh generator. ACM Transactions"
-    " on Mathematical Software 2015;41(2):11. doi:10.1145/2629697",
-    "pybids": "Yarkoni T, Markiewicz CJ, de la Vega A, et al. PyBIDS: Python tools for BIDS"
-    " datasets. Journal of Open Source Software 2019;4(40):1294. doi:10.21105/joss.01294",
-}
+#: Works that the methods of the participant level rest on.
+_CITED = ("method", "shapedna", "brainprint", "tetgen", "pybids")
+
+
+def references() -> dict[str, str]:
+    """Read the entries of all works that methods rest on, by their keys."""
+    path = resources.files("hipsta_bids.derivatives") / "references.toml"
+    return tomllib.loads(path.read_text("utf-8"))
 
 
 def _layer_rule(settings: BodySettings, protocols: Sequence[Protocol]) -> str:
@@ -328,10 +322,11 @@ def _layer_rule(settings: BodySettings, protocols: Sequence[Protocol]) -> str:
 
 def citation_text(settings: Settings, protocols: Sequence[Protocol]) -> str:
     """Compose the methods paragraph, with all settings and the references."""
-    entries = list(REFERENCES.values())
+    works = references()
+    entries = [works[key] for key in _CITED]
     entries += [protocol.citation for protocol in protocols if protocol.citation not in entries]
     number = {entry: i for i, entry in enumerate(entries, start=1)}
-    cite = {key: f"[{number[entry]}]" for key, entry in REFERENCES.items()}
+    cite = {key: f"[{number[works[key]]}]" for key in _CITED}
     titles = ", ".join(f"{s.title} [{number[s.citation]}]" for s in protocols) or "none"
     lines = [
         "# Methods",

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.classify import PairComparison
+from hipsta_bids.group.combat import SavedEffects
 from hipsta_bids.group.comparison import (
     BOTH,
     Comparison,
@@ -57,9 +59,8 @@ from hipsta_bids.group.registration import (
     shift_difference,
 )
 from hipsta_bids.group.settings import GroupSettings
-from hipsta_bids.group.site_effects import SavedEffects
 from hipsta_bids.group.summaries import MeasureFit, classify_groups, fit_summaries
-from hipsta_bids.group.warps import Template, warp_labels, warp_values
+from hipsta_bids.group.warps import Template, templates_to_json, warp_labels, warp_values
 from hipsta_bids.progress import each, tell
 
 #: Group of all, where there are no groups.
@@ -79,6 +80,13 @@ class SideResult:
     """Shifts by group; empty without groups."""
     difference: ShiftDifference | None
     """Between the groups, if there are groups."""
+
+
+def templates_of(sides: Mapping[str, SideResult]) -> dict[str, Any] | None:
+    """Write the templates of registration for ``template.json``; ``None`` without registration."""
+    found = {hemi: side.registration.template for hemi, side in sides.items()}
+    known = {hemi: template for hemi, template in found.items() if template is not None}
+    return templates_to_json(known) if known else None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

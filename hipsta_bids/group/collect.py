@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from hipsta_bids.derivatives.dataset import NOT_FINISHED, name_of, read_status
 from hipsta_bids.derivatives.hemisphere import (
     ResultPlace,
@@ -15,6 +17,7 @@ from hipsta_bids.derivatives.hemisphere import (
 from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName
 from hipsta_bids.errors import InputError, NothingToDoError
 from hipsta_bids.group.covariates import relocate
+from hipsta_bids.group.data import PARTICIPANT, SESSION
 from hipsta_bids.group.exclusions import SHOWN, Choices, QualityCondition, read_choices
 from hipsta_bids.io import files
 from hipsta_bids.protocols import EXPERIMENTAL
@@ -70,7 +73,7 @@ class SheetRecord:
     """Whether the participant level asks to look before use."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Exclusion:
     """One hemisphere, or visit, that is left out."""
 
@@ -79,6 +82,21 @@ class Exclusion:
     hemi: str
     reason: str
     message: str
+
+    @classmethod
+    def of_sheet(cls, name: HemisphereName, reason: str, message: str) -> "Exclusion":
+        """Leave out one hemisphere."""
+        session = f"ses-{name.session}" if name.session else None
+        return cls(f"sub-{name.subject}", session, name.hemi, reason, message)
+
+
+def exclude_visits(table: pd.DataFrame, left_out: Mapping[str, tuple[str, str]]) -> list[Exclusion]:
+    """Leave out visits of a table; the index names them, as it does their reasons and messages."""
+    rows = table.loc[list(left_out), [PARTICIPANT, SESSION]].itertuples(name=None)
+    return [
+        Exclusion(participant, session, files.MISSING, *left_out[visit])
+        for visit, participant, session in rows
+    ]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -271,14 +289,7 @@ def _judge(place: ResultPlace, request: GroupRequest, choices: Choices) -> Sheet
             source=relocate(str(inputs[0].get("file", "")), request.segmentations),
             flagged=status == Status.FLAGGED,
         )
-    name = place.name
-    return Exclusion(
-        participant=f"sub-{name.subject}",
-        session=f"ses-{name.session}" if name.session else None,
-        hemi=name.hemi,
-        reason=reason,
-        message=message,
-    )
+    return Exclusion.of_sheet(place.name, reason, message)
 
 
 def _metrics(record: Mapping[str, Any]) -> dict[str, Any]:

@@ -6,19 +6,28 @@ of Beer et al. (2020, doi:10.1016/j.neuroimage.2020.117129). Values may be missi
 points are done at once.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Literal, Self
 
 import numpy as np
+from pydantic import ConfigDict, Field, model_validator
 
-from hipsta_bids.group.data import Bool, Float, Int
+from hipsta_bids import __version__
+from hipsta_bids.errors import ModelError
+from hipsta_bids.group.data import Bool, Float, Int, Key, Nested, read_foreign
 from hipsta_bids.group.formula import Contrast
 from hipsta_bids.group.glm import chunks
+from hipsta_bids.group.grammar import closed_formula
 from hipsta_bids.group.mixed import fit_mixed
 from hipsta_bids.group.settings import GroupSettings, HarmonizationSettings
+from hipsta_bids.protocols.toml import TomlTable
 
 #: Values of a site at a point, below which its variance says nothing about that of other points.
 _FEW = 3
+_LARGEST = 1_000_000_000  # bytes of a file
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -192,9 +201,8 @@ def harmonize(values: Float, visits: Visits, effects: SiteEffects) -> Float:
 def _varies(values: Float) -> Bool:
     """Tell points that have different values."""
     known = np.isfinite(values)
-    low = np.where(known, values, np.inf).min(axis=0)
-    high = np.where(known, values, -np.inf).max(axis=0)
-    return np.asarray(low < high)
+    low = values.min(axis=0, where=known, initial=np.inf)
+    return np.asarray(low < values.max(axis=0, where=known, initial=-np.inf))
 
 
 def _least_squares(values: Float, design: Float) -> Float:
@@ -208,15 +216,36 @@ def _least_squares(values: Float, design: Float) -> Float:
         lost = design[~present[:, point]]
         grams[point] -= lost.T @ lost
     right = (design.T @ np.where(present, values, 0.0)).T
-    diagonal = np.arange(design.shape[1])
+    return solve_points(
+        grams, right, 0.5
+    )  # on the diagonal are numbers of values, but for rounding
+
+
+def solve_points(grams: Float, right: Float, least: float) -> Float:
+    """Solve the normal equations of each point.
+
+    Parameters
+    ----------
+    grams, right : array
+        (points, columns, columns) and (points, columns); ``grams`` is overwritten.
+    least : float
+        A column with no more than this on the diagonal has no values: its coefficient is 0.
+
+    Returns
+    -------
+    array
+        (columns, points), NaN where the coefficients are not unique.
+    """
+    diagonal = np.arange(grams.shape[1])
     size = grams[:, diagonal, diagonal]
-    absent = size < 0.5  # noqa: PLR2004 -- a number of values, but for rounding
-    grams[:, diagonal, diagonal] = np.where(absent, 1.0, size)
-    size = np.sqrt(grams[:, diagonal, diagonal])
+    size = grams[:, diagonal, diagonal] = np.where(size > least, size, 1.0)
+    size = np.sqrt(size)
     unit = grams / (size[:, :, None] * size[:, None, :])
-    unique = np.linalg.eigvalsh(unit)[:, 0] > np.sqrt(np.finfo(np.float64).eps)
-    grams[~unique] = np.eye(design.shape[1])
-    found = np.linalg.solve(grams, right[:, :, None])[:, :, 0]
+    finite = np.isfinite(unit).all(axis=(1, 2))
+    unit[~finite] = np.eye(len(diagonal))
+    unique = finite & (np.linalg.eigvalsh(unit)[:, 0] > np.sqrt(np.finfo(np.float64).eps))
+    unit[~unique] = np.eye(len(diagonal))
+    found = np.linalg.solve(unit, (right / size)[:, :, None])[:, :, 0] / size
     return np.where(unique[:, None], found, np.nan).T
 
 
@@ -317,3 +346,96 @@ def _pool(
         if change < settings.tolerance:
             break
     return shift, square
+
+
+#: Names of the arrays of :class:`SiteEffects`, and those that have one value per point.
+ARRAYS = tuple(one.name for one in fields(SiteEffects))
+_FLAT = frozenset({"mean", "sd", "ratio"})
+
+
+class SavedEffects(TomlTable):
+    """Parameters of an analysis as a file, for other people of the same sites, or of new ones."""
+
+    model_config = ConfigDict(alias_generator=str.capitalize, validate_by_name=True)
+
+    file: Annotated[str, Field(exclude=True)] = ""
+    """Where it was read, for messages."""
+    description: str = "effects of sites on maps and summary measures (ComBat)"
+    format: Literal[1] = 1
+    version: str = __version__
+    column: str
+    formula: str
+    """What they kept."""
+    levels: dict[str, list[str]]
+    columns: list[str]
+    sites: dict[str, int]
+    """Participants by site."""
+    repeated: bool
+    """Whether participants had several visits."""
+    icv: str | None
+    """Column that volumes kept besides."""
+    templates: dict[str, str]
+    """Digest of the template of registration by hemisphere."""
+    maps: Nested
+    summaries: Nested
+    """Each is a single point."""
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        """Refuse arrays that do not fit each other."""
+        closed_formula(self.formula)
+        _ = self.effects_on_maps, self.effects_on_summaries
+        return self
+
+    @cached_property
+    def effects_on_maps(self) -> Mapping[Key, SiteEffects]:
+        """Effects by hemisphere and measure."""
+        return self._effects(self.maps)
+
+    @cached_property
+    def effects_on_summaries(self) -> Mapping[Key, SiteEffects]:
+        """Effects by hemisphere and measure."""
+        return self._effects(self.summaries)
+
+    def _effects(self, nested: Nested) -> dict[Key, SiteEffects]:
+        rows = {"slopes": {len(self.columns), len(self.columns) + (self.icv is not None)}}
+        found = {}
+        for hemi, measures in nested.items():
+            for measure, entry in measures.items():
+                arrays = {name: np.array(entry.get(name, ()), dtype=np.float64) for name in ARRAYS}
+                points = len(arrays["mean"])
+                arrays["slopes"] = arrays["slopes"].reshape(-1, points)  # without columns: (0,)
+                for name, values in arrays.items():
+                    counts = rows.get(name, {len(self.sites)})
+                    known = {(points,)} if name in _FLAT else {(row, points) for row in counts}
+                    if values.shape not in known:
+                        raise ValueError(f"{name} of {measure}, {hemi}, has {values.shape}")
+                    if name in {"sd", "scale"} and (values <= 0).any():
+                        raise ValueError(f"{name} of {measure}, {hemi}, is not positive")
+                found[hemi, measure] = SiteEffects(**arrays)
+        return found
+
+
+def load_effects(path: Path) -> SavedEffects:
+    """Read ``harmonization.json``; nothing in it is run.
+
+    Raises
+    ------
+    ModelError
+        If the file is too large, of another format, or its parts do not fit each other.
+    """
+    try:
+        return read_foreign(path, SavedEffects, most=_LARGEST).model_copy(
+            update={"file": str(path)}
+        )
+    except ValueError as error:
+        raise damaged(str(path), str(error)) from error
+
+
+def damaged(where: str, what: str) -> ModelError:
+    """Say that a file cannot be used."""
+    return ModelError(
+        f"{where}: not a file of harmonization ({what}); use the harmonization.json of another"
+        " analysis",
+        reason="harmonization-file",
+    )

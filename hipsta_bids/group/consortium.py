@@ -16,20 +16,20 @@ from hipsta_bids.errors import OutputError, UsageError
 from hipsta_bids.group.data import Cohort, SideMaps
 from hipsta_bids.group.exchange import SiteSummary, read_summary
 from hipsta_bids.group.figures import Drawing
-from hipsta_bids.group.glm import FittedMaps, PointTest, PointwiseFit
+from hipsta_bids.group.glm import FittedMaps, PointTest
 from hipsta_bids.group.inference import PERMUTATIONS
 from hipsta_bids.group.meta import FIXED, RANDOM
-from hipsta_bids.group.methods import Citations
+from hipsta_bids.group.methods import PROCEDURES, Citations
 from hipsta_bids.group.panels import Row, contrasts, draw_pages
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.sites import (
-    COLUMNS,
     Meta,
     analyze_sites,
     check_agreement,
     meta_tables,
     point_test,
 )
+from hipsta_bids.group.tables import META_COLUMNS
 from hipsta_bids.group.write import whole_folder, write_figures, write_table
 from hipsta_bids.io import files
 from hipsta_bids.protocols.toml import resolve
@@ -70,7 +70,7 @@ def run_meta(options: MetaOptions, settings: GroupSettings) -> tuple[Path, list[
         )
     with whole_folder(folder) as aside:
         for name, table in meta_tables(meta):
-            write_table(aside, name, table, described=name != "sites", meaning=COLUMNS)
+            write_table(aside, name, table, described=name != "sites", meaning=META_COLUMNS)
         notes += write_figures(aside, _figures(meta))
         files.write_text(aside / "methods.md", _methods(meta))
         files.write_json(aside / "meta.json", _record(meta, options, notes))
@@ -109,12 +109,18 @@ def _figures(meta: Meta) -> Iterator[tuple[str, Drawing]]:
     cohort = Cohort(
         table=pd.DataFrame(), sides={}, x=np.array(first.x), y=np.array(first.y), units={}
     )
-    hemis = dict.fromkeys(item.model.hemi for item in maps)
-    fitted: dict[str, FittedMaps] = {hemi: _fitted(meta, hemi, cohort) for hemi in hemis}
+    tests: dict[str, dict[str, list[PointTest]]] = {}
+    for item in maps:
+        measures = tests.setdefault(item.model.hemi, {})
+        measures.setdefault(item.model.measures[0], []).extend(
+            point_test(item, effects, meta.settings.meta.confidence)
+            for effects in item.result.models
+        )
+    places = {hemi: _place(meta, hemi, cohort) for hemi in tests}
     like = {item.label(RANDOM): item.label(FIXED) for item in maps}
     for measure in dict.fromkeys(item.model.measures[0] for item in maps):
-        sides = {hemi: one for hemi, one in fitted.items() if measure in one.fits}
-        blocks = list(contrasts(fitted, meta.found, measure, like))
+        sides = {hemi: one for hemi, one in places.items() if measure in tests[hemi]}
+        blocks = list(contrasts(tests, meta.found, measure, like))
         own = [item for item in maps if item.model.measures[0] == measure]
         for number, contrast in enumerate(dict.fromkeys(item.contrast for item in own)):
             row = Row(
@@ -133,8 +139,8 @@ def _figures(meta: Meta) -> Iterator[tuple[str, Drawing]]:
         yield f"{measure}_maps", partial(draw_pages, cohort, sides, {}, {}, blocks)
 
 
-def _fitted(meta: Meta, hemi: str, cohort: Cohort) -> FittedMaps:
-    """Put the tests of a hemisphere into the form of a fit, to draw them; without any sheets."""
+def _place(meta: Meta, hemi: str, cohort: Cohort) -> FittedMaps:
+    """Locate the points of maps of one hemisphere, of which there are no sheets."""
     shape, nobody = (len(cohort.x), len(cohort.y)), np.zeros(0, dtype=np.int64)
     words = meta.frame[hemi].subfield
     names = tuple(name for name in dict.fromkeys(words) if name != files.MISSING)
@@ -146,20 +152,8 @@ def _fitted(meta: Meta, hemi: str, cohort: Cohort) -> FittedMaps:
         names=names,
         summary=pd.DataFrame(),
     )
-    tests: dict[str, list[PointTest]] = {}
-    for item in meta.of("map"):
-        if item.model.hemi == hemi:
-            tests.setdefault(item.model.measures[0], []).extend(
-                point_test(item, effects, meta.settings.meta.confidence)
-                for effects in item.result.models
-            )
-    none = np.zeros(0)
-    fits = {
-        measure: PointwiseFit(coefficients=none[None], sigma=none, n=nobody, tests=tuple(own))
-        for measure, own in tests.items()
-    }
     return FittedMaps(
-        maps=maps, used=nobody, rows=nobody, subfield=subfield.reshape(shape), fits=fits
+        maps=maps, used=nobody, rows=nobody, subfield=subfield.reshape(shape), fits={}
     )
 
 
@@ -230,11 +224,6 @@ def _methods(meta: Meta) -> str:
             f" correction {cite('modified')}"
         )
     correction = meta.settings.multiplicity
-    kind = (
-        "the procedure of Benjamini and Hochberg"
-        if correction.method == "bh"
-        else "the two-stage procedure of Benjamini, Krieger and Yekutieli"
-    )
     family = "each map" if correction.scope == "map" else "both hemispheres together"
     what = (
         f"Measures of the hippocampus {cite('method')} of {meta.people} participants{groups} at"
@@ -250,10 +239,11 @@ def _methods(meta: Meta) -> str:
     if meta.items[0].result.without:
         effects += " All was repeated without each of the sites."
     errors = (
-        f"The false discovery rate was held at {correction.alpha:g} by {kind}"
-        f" {cite(correction.method)}, for {family}, and for all summary measures of a contrast"
-        " together. Effect sizes are Cohen's d: the estimate over the residual standard deviation"
-        f" within sites, with {how.confidence:.0%} confidence limits."
+        f"The false discovery rate was held at {correction.alpha:g} by"
+        f" {PROCEDURES[correction.method]} {cite(correction.method)}, for {family}, and for all"
+        " summary measures of a contrast together. Effect sizes are Cohen's d: the estimate over"
+        f" the residual standard deviation within sites, with {how.confidence:.0%} confidence"
+        " limits."
     )
     paragraphs = [f"{what} {aligned}", effects, errors]
     survivors = [

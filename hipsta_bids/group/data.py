@@ -1,18 +1,31 @@
 """Values passed between reading, analyzing and writing at the group level."""
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from textwrap import shorten
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
+from hipsta_bids.io import files
+from hipsta_bids.protocols.toml import Table, first_mistake
 from hipsta_bids.types import Mesh
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 Bool = NDArray[np.bool_]
+Key = tuple[str, str]
+"""Hemisphere and measure."""
+Nested = dict[str, dict[str, dict[str, list[Any]]]]
+"""Arrays by hemisphere, measure and name as lists, for JSON."""
 
+#: Characters of a mistake in a file.
+_LONGEST = 300
 #: Columns that identify visits, with the prefixes of BIDS.
 PARTICIPANT, SESSION = "participant_id", "session_id"
 #: More sheets of a side are kept in single precision, whose rounding is less than a hundredth of
@@ -131,3 +144,40 @@ class Cohort:
             table=self.table[keep],
             sides={hemi: side.take(keep) for hemi, side in self.sides.items()},
         )
+
+
+def read_foreign(path: Path, kind: type[Table], *, most: float) -> Table:
+    """Read a JSON file of other people, which may hold anything; nothing in it is run.
+
+    Raises
+    ------
+    ValueError
+        One line about what is wrong in it, or that it has more bytes than ``most``.
+    """
+    if path.is_file() and path.stat().st_size > most:
+        raise ValueError(f"larger than {most / 1e6:g} MB")
+    try:
+        return kind.model_validate(files.read_json(path))
+    except RecursionError as error:
+        raise ValueError("lists within lists without end") from error
+    except ValidationError as error:
+        mistake = first_mistake(error, kind)[1].encode("unicode_escape").decode()
+        raise ValueError(shorten(mistake, _LONGEST)) from error
+
+
+def rounded(value: Any) -> Any:  # noqa: ANN401  (nested lists of numbers)
+    """Round numbers to nine digits, in lists and arrays too; null where one is missing."""
+    if isinstance(value, (list, np.ndarray)):
+        return [rounded(one) for one in (value if isinstance(value, list) else value.tolist())]
+    if isinstance(value, int):
+        return value
+    return float(f"{value:.9g}") if math.isfinite(value) else None
+
+
+def as_nested(found: Mapping[Key, object], names: Sequence[str]) -> Nested:
+    """Write the named arrays of values by hemisphere and measure."""
+    nested: Nested = {}
+    for (hemi, measure), one in found.items():
+        arrays = {name: rounded(getattr(one, name)) for name in names}
+        nested.setdefault(hemi, {})[measure] = arrays
+    return nested

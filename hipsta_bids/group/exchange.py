@@ -11,17 +11,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from textwrap import shorten
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import pandas as pd
-from pydantic import AfterValidator, Field, ValidationError
+from pydantic import AfterValidator, Field
 
 from hipsta_bids import __version__
 from hipsta_bids.errors import InputError, ModelError
-from hipsta_bids.group.analysis import Analysis
-from hipsta_bids.group.data import Cohort, Float, Int
+from hipsta_bids.group.analysis import Analysis, templates_of
+from hipsta_bids.group.data import Cohort, Float, Int, read_foreign, rounded
 from hipsta_bids.group.formula import typed
 from hipsta_bids.group.glm import FittedMaps, fit_points, with_mean
 from hipsta_bids.group.grammar import closed_formula
@@ -29,21 +28,19 @@ from hipsta_bids.group.meta import SiteFit
 from hipsta_bids.group.model import Design, build_design
 from hipsta_bids.group.settings import ExchangeSettings, GroupSettings
 from hipsta_bids.group.summaries import summary_values
-from hipsta_bids.group.warps import templates_to_json
 from hipsta_bids.io import files
-from hipsta_bids.protocols.toml import TomlTable, first_mistake
+from hipsta_bids.protocols.toml import TomlTable
 
 #: File of a summary, in the folder of an analysis.
 SUMMARY = "summary.json"
 #: Changes when readers of earlier versions would misread a summary.
 _FORMAT = 1
 _AXES = "x from medial to lateral, y from posterior to anterior, on both sides"
-#: Digits written; summaries larger than this many bytes are not read.
-_DIGITS, _MOST_BYTES = 9, 50_000_000
+#: Summaries larger than this many bytes are not read.
+_MOST_BYTES = 50_000_000
 #: Sums in another order, and rounding to these digits, differ by less.
 _ROUNDING = 1e-5
 _LEAST = 1e-15  # eigenvalue of a covariance, relative to the largest
-_LONGEST = 300  # characters of a mistake
 #: Functions whose columns depend on who is in the table.
 _OF_THE_SAMPLE = re.compile(r"(?<![\w.])(bs|center|cr|poly|scale)\s*\(")
 
@@ -200,33 +197,16 @@ def write_summary(path: Path, summary: Mapping[str, Any]) -> None:
 def read_summary(path: Path) -> SiteSummary:
     """Read and check a summary of another site, which may hold anything."""
     path = path / SUMMARY if path.is_dir() else path
-    try:
-        size = path.stat().st_size
-    except OSError as error:
+    if not path.exists():
         raise InputError(
-            f"{path}: no summary ({error.strerror}); it is written by `group --export-summary`",
-            reason="no-file",
-        ) from error
-    if size > _MOST_BYTES:
-        raise InputError(
-            f"{path}: {size / 1e6:.0f} MB are too many for a summary; {_MOST_BYTES / 1e6:.0f} are"
-            " the limit",
-            reason="bad-summary",
+            f"{path}: no summary; it is written by `group --export-summary`", reason="no-file"
         )
     try:
-        content = files.read_json(path)
-        summary = SiteSummary.model_validate(content)
+        summary = read_foreign(path, SiteSummary, most=_MOST_BYTES)
         _ = summary.template_hash
-    except RecursionError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(
-            f"{path}: not a summary; ask for it again", reason="bad-summary"
-        ) from error
-    except ValidationError as error:
-        said = first_mistake(error, SiteSummary)[1]
-        said = shorten(said.encode("unicode_escape").decode(), _LONGEST)
-        raise InputError(
-            f"{path}: not a summary: {said}; ask the site for it again",
-            reason="bad-summary",
+            f"{path}: not a summary: {error}; ask the site for it again", reason="bad-summary"
         ) from error
     for model in summary.models:
         points = len(summary.x) * len(summary.y)
@@ -310,11 +290,6 @@ def summarize(
                 f"{SUMMARY}: {model['measures'][0] if what == 'points' else 'summaries'},"
                 f" {model['hemi']}: without {lost} {what} that are not known of all participants"
             )
-    templates = {
-        hemi: side.registration.template
-        for hemi, side in analysis.sides.items()
-        if side.registration.template is not None
-    }
     numbers = {
         name: typed(table[name], settings.design).astype(np.float64)
         for name in closed_formula(analysis.model.formula).names
@@ -333,12 +308,12 @@ def summarize(
         "asymmetry": list(settings.asymmetry.relative),
         "change": analysis.comparison.pair is not None,
         "align": settings.registration.align,
-        "template": files.plain(templates_to_json(templates)) if templates else None,
+        "template": files.plain(templates_of(analysis.sides)),
         "participants": len(rows),
         "groups": groups,
         "factors": factors,
         "covariates": {
-            name: {"mean": _round(values.mean()), "sd": _round(values.std())}
+            name: {"mean": rounded(values.mean()), "sd": rounded(values.std())}
             for name, values in numbers.items()
         },
         "models": models,
@@ -455,22 +430,17 @@ def _model(
     fit = fit_points(np.where(complete, values, 0.0), design.matrix, contrasts, settings.glm)
     there = complete & np.isfinite(fit.sigma)
 
-    def known(numbers: Float) -> list[float | None]:
-        return [_round(n) if ok else None for n, ok in zip(numbers, there, strict=True)]
+    def known(numbers: Float) -> list[Any]:
+        return rounded(np.where(there, numbers, np.nan))  # type: ignore[no-any-return]
 
-    inverse = np.linalg.inv(design.matrix.T @ design.matrix)
     return {
         **what,
         "columns": list(design.columns),
         "df": len(design.matrix) - len(design.columns),
-        "covariance": [[_round(value) for value in row] for row in inverse],
+        "covariance": rounded(np.linalg.inv(design.matrix.T @ design.matrix)),
         "contrasts": {one.name: one.weights[0].tolist() for one in contrasts},
-        "coefficients": [known(row) for row in fit.coefficients],
+        "coefficients": known(fit.coefficients),
         "sd": known(fit.sigma),
         "estimate": {test.contrast.name: known(test.estimate[0]) for test in fit.tests},
         "se": {test.contrast.name: known(test.se[0]) for test in fit.tests},
     }
-
-
-def _round(value: float) -> float:
-    return float(f"{value:.{_DIGITS}g}")

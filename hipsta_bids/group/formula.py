@@ -8,10 +8,12 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from formulaic import Formula
 from numpy.typing import NDArray
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.data import Float
+from hipsta_bids.group.data import Float, Int
+from hipsta_bids.group.grammar import CONTEXT, closed_formula
 from hipsta_bids.group.settings import DesignSettings, GroupSettings
 
 _VERSION = "1.0.0"
@@ -26,6 +28,8 @@ _TERM = re.compile(
 _MISSING = ("n/a", "NA", "N/A", "nan", "NaN", "")
 #: Numbers from here on overflow when they are squared and summed.
 _LARGEST = 1e100
+#: Name of the constant.
+INTERCEPT = "Intercept"
 #: Rows that a message names.
 _NAMED = 8
 #: Two values are the same on a line and as a factor.
@@ -297,6 +301,52 @@ def typed(values: pd.Series, settings: DesignSettings) -> pd.Series:
         )
     _refuse_spellings(text[present], settings)
     return text
+
+
+def level_labels(values: pd.Series, settings: DesignSettings) -> pd.Series:
+    """Names of levels, whatever they look like; ``None`` where missing."""
+    names = typed(values, settings).astype(object)
+    texts = names.map(lambda one: f"{one:g}" if isinstance(one, float) else str(one))
+    return texts.where(names.notna(), None)
+
+
+def columns_of(
+    table: pd.DataFrame,
+    formula: str,
+    levels: Mapping[str, Sequence[str]],
+    settings: DesignSettings,
+    where: str,
+) -> tuple[Float, tuple[str, ...], Int]:
+    """Make columns of a formula with given levels, without intercept; and rows that have all."""
+    closed = closed_formula(formula)
+    names = sorted(closed.names)
+    if not names:
+        return np.empty((len(table), 0)), (), np.arange(len(table))
+    check_names(names, table.columns)
+    used = pd.DataFrame(
+        {
+            n: level_labels(table[n], settings) if n in levels else typed(table[n], settings)
+            for n in names
+        }
+    )
+    complete = used.notna().all(axis=1).to_numpy()
+    used = used[complete].copy()
+    for name, known in levels.items():
+        if unknown := sorted(set(used[name]) - set(known)):
+            raise ModelError(
+                f"{where}has no {name!r} {listed(unknown)}, only {listed(known)}; leave these"
+                " participants out, or harmonize anew",
+                reason="harmonization-file",
+            )
+        used[name] = pd.Categorical(used[name], categories=list(known))
+    if text := [name for name in names if name not in levels and used[name].dtype == object]:
+        raise ModelError(
+            f"{where}{listed(text)} should be numbers, as where it was made",
+            reason="harmonization-file",
+        )
+    made = Formula(closed.text).get_model_matrix(used, na_action="raise", context=dict(CONTEXT))
+    inside = [str(name) for name in made.columns if str(name) != INTERCEPT]
+    return made[inside].to_numpy(np.float64), tuple(inside), np.flatnonzero(complete)
 
 
 def _refuse_spellings(text: pd.Series, settings: DesignSettings) -> None:

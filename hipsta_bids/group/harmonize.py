@@ -12,28 +12,32 @@ from formulaic import Formula
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.combat import (
+    ARRAYS,
+    SavedEffects,
     SiteEffects,
     SiteMoments,
     Visits,
+    damaged,
     extend_effects,
     fit_effects,
     harmonize,
 )
 from hipsta_bids.group.comparison import Comparison, modeled_table
-from hipsta_bids.group.data import PARTICIPANT, SESSION, Bool, Cohort, Float, Measures
-from hipsta_bids.group.formula import ModelSpec, check_names, listed, typed
+from hipsta_bids.group.data import PARTICIPANT, SESSION, Bool, Cohort, Float, Measures, as_nested
+from hipsta_bids.group.formula import (
+    INTERCEPT,
+    ModelSpec,
+    check_names,
+    columns_of,
+    level_labels,
+    listed,
+    typed,
+)
 from hipsta_bids.group.grammar import closed_formula
 from hipsta_bids.group.model import Design, Groups, build_design
 from hipsta_bids.group.normative import without_variable
 from hipsta_bids.group.registration import Registration
 from hipsta_bids.group.settings import DesignSettings, GroupSettings
-from hipsta_bids.group.site_effects import (
-    INTERCEPT,
-    SavedEffects,
-    columns_of,
-    damaged,
-    level_labels,
-)
 from hipsta_bids.group.warps import templates_to_json
 
 
@@ -174,7 +178,7 @@ def _saved_columns(table: pd.DataFrame, saved: SavedEffects, settings: DesignSet
     matrix, names, complete = columns_of(
         table, saved.formula, saved.levels, settings, f"{saved.file}: "
     )
-    if names != saved.columns:
+    if list(names) != saved.columns:
         raise damaged(saved.file, f"columns {listed(saved.columns)}, not {listed(names)}")
     values = np.full((len(table), len(names)), np.nan)
     values[complete] = matrix
@@ -374,7 +378,7 @@ def harmonize_cohort(
         for name in summary.columns:
             values = summary[[name]].to_numpy()
             own = _with_icv(visits, plan, side.rows) if name.startswith("volume") else visits
-            if plan.saved and (hemi, name) not in plan.saved.summaries:
+            if plan.saved and (hemi, name) not in plan.saved.effects_on_summaries:
                 unknown.add(name)
                 summary[name] = np.nan
             elif len(np.unique(values[np.isfinite(values)])) > 1:
@@ -411,7 +415,7 @@ def _effects(
     pooled = settings.harmonization.pooling and not summary
     if plan.saved is None:
         return fit_effects(values, visits, len(plan.sites), settings, pooled=pooled)
-    known = plan.saved.summaries if summary else plan.saved.maps
+    known = plan.saved.effects_on_summaries if summary else plan.saved.effects_on_maps
     if key not in known:
         raise ModelError(
             f"{plan.saved.file}: has no map of {key[1]} of hemisphere {key[0]}; choose others by"
@@ -486,15 +490,14 @@ def effects_of(parts: Sequence[Harmonization], templates: Mapping[str, str]) -> 
         return None
     known = plan.saved.sites if plan.saved else {}
     return SavedEffects(
-        file="",
         column=plan.column,
         formula=plan.kept.formula,
-        levels=plan.kept.levels,
-        columns=plan.kept.names,
+        levels={name: list(known) for name, known in plan.kept.levels.items()},
+        columns=list(plan.kept.names),
         sites={one: known.get(one, plan.counts.get(one, 0)) for one in plan.sites},
         repeated=plan.visits.participant is not None,
         icv=plan.icv,
-        templates=templates,
-        maps={key: found[0] for part in parts for key, found in part.maps.items()},
-        summaries={key: found[0] for key, found in parts[0].summaries.items()},
+        templates=dict(templates),
+        maps=as_nested({k: found[0] for part in parts for k, found in part.maps.items()}, ARRAYS),
+        summaries=as_nested({k: found[0] for k, found in parts[0].summaries.items()}, ARRAYS),
     )

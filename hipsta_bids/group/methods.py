@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 
 from hipsta_bids import __version__
+from hipsta_bids.derivatives.dataset import references
 from hipsta_bids.group.analysis import Analysis
 from hipsta_bids.group.data import PARTICIPANT, Cohort
 from hipsta_bids.group.inference import PERMUTATIONS, control_fdr
@@ -14,114 +15,17 @@ from hipsta_bids.group.normative import Scores
 from hipsta_bids.group.norms import LEVELS, NormsFile
 from hipsta_bids.group.settings import GroupSettings, MultiplicitySettings, NormSettings
 
-# Works that methods of the group level rest on.
-
-
-#: Key and entry of each work that the methods rest on.
-REFERENCES: Mapping[str, str] = {
-    "method": "Diers K, Baumeister H, Jessen F, Düzel E, Berron D, Reuter M. An automated,"
-    " geometry-based method for hippocampal shape and thickness analysis. NeuroImage"
-    " 2023;276:120182. doi:10.1016/j.neuroimage.2023.120182",
-    "registr": "Wrobel J. register: registration for exponential family functional data. Journal"
-    " of Open Source Software 2018;3(22):557. doi:10.21105/joss.00557",
-    "fdr2": "Benjamini Y, Krieger AM, Yekutieli D. Adaptive linear step-up procedures that"
-    " control the false discovery rate. Biometrika 2006;93(3):491-507."
-    " doi:10.1093/biomet/93.3.491",
-    "bh": "Benjamini Y, Hochberg Y. Controlling the false discovery rate: a"
-    " practical and powerful approach to multiple testing. Journal of the Royal Statistical"
-    " Society B 1995;57(1):289-300.",
-    "permutation": "Winkler AM, Ridgway GR, Webster MA, Smith SM, Nichols TE. Permutation inference"
-    " for the general linear model. NeuroImage 2014;92:381-397."
-    " doi:10.1016/j.neuroimage.2014.01.060",
-    "repeated": "Winkler AM, Webster MA, Vidaurre D, Nichols TE, Smith SM. Multi-level block"
-    " permutation. NeuroImage 2015;123:253-268. doi:10.1016/j.neuroimage.2015.05.092",
-    "joint": "Winkler AM, Webster MA, Brooks JC, Tracey I, Smith SM, Nichols TE. Non-parametric"
-    " combination and related permutation tests for neuroimaging. Human Brain Mapping"
-    " 2016;37(4):1486-1511. doi:10.1002/hbm.23115",
-    "tfce": "Smith SM, Nichols TE. Threshold-free cluster enhancement: addressing problems of"
-    " smoothing, threshold dependence and localisation in cluster inference. NeuroImage"
-    " 2009;44(1):83-98. doi:10.1016/j.neuroimage.2008.03.061",
-    "snell": "Snell KIE, Archer L, Ensor J, Bonnett LJ, Debray TPA, Phillips B, et al. External"
-    " validation of clinical prediction models: simulation-based sample size calculations were more"
-    " reliable than rules-of-thumb. Journal of Clinical Epidemiology 2021;135:79-89."
-    " doi:10.1016/j.jclinepi.2021.02.011",
-    "mixed": "Kuznetsova A, Brockhoff PB, Christensen RHB. lmerTest package: tests in linear mixed"
-    " effects models. Journal of Statistical Software 2017;82(13):1-26."
-    " doi:10.18637/jss.v082.i13",
-    "join": "Becker BJ, Wu MJ. The synthesis of regression slopes in meta-analysis. Statistical"
-    " Science 2007;22(3):414-429. doi:10.1214/07-STS243",
-    "reml": "Viechtbauer W. Bias and efficiency of meta-analytic variance estimators in the"
-    " random-effects model. Journal of Educational and Behavioral Statistics 2005;30(3):261-293."
-    " doi:10.3102/10769986030003261",
-    "dl": "DerSimonian R, Laird N. Meta-analysis in clinical trials. Controlled Clinical Trials"
-    " 1986;7(3):177-188. doi:10.1016/0197-2456(86)90046-2",
-    "knapp-hartung": "Knapp G, Hartung J. Improved tests for a random effects meta-regression with"
-    " a single covariate. Statistics in Medicine 2003;22(17):2693-2710. doi:10.1002/sim.1482",
-    "modified": "Röver C, Knapp G, Friede T. Hartung-Knapp-Sidik-Jonkman approach and its"
-    " modification for random-effects meta-analysis with few studies. BMC Medical Research"
-    " Methodology 2015;15:99. doi:10.1186/s12874-015-0091-1",
-    "i2": "Higgins JPT, Thompson SG. Quantifying heterogeneity in a meta-analysis. Statistics in"
-    " Medicine 2002;21(11):1539-1558. doi:10.1002/sim.1186",
-    "prediction": "Higgins JPT, Thompson SG, Spiegelhalter DJ. A re-evaluation of random-effects"
-    " meta-analysis. Journal of the Royal Statistical Society A 2009;172(1):137-159."
-    " doi:10.1111/j.1467-985X.2008.00552.x",
-    "moments": "Raudenbush SW. Analyzing effect sizes: random-effects models. In: Cooper H, Hedges"
-    " LV, Valentine JC, eds. The Handbook of Research Synthesis and Meta-Analysis. 2nd ed. Russell"
-    " Sage Foundation; 2009:295-315.",
-    "asymmetry": "Kong XZ, Mathias SR, Guadalupe T, et al. Mapping cortical brain asymmetry in"
-    " 17,141 healthy individuals worldwide via the ENIGMA Consortium. Proceedings of the National"
-    " Academy of Sciences 2018;115(22):E5154-E5163. doi:10.1073/pnas.1718418115",
-    "normative": "Jack CR, Petersen RC, Xu YC, et al. Medial temporal atrophy on MRI in normal"
-    " aging and very mild Alzheimer's disease. Neurology 1997;49(3):786-794."
-    " doi:10.1212/WNL.49.3.786",
-    "shash": "Jones MC, Pewsey A. Sinh-arcsinh distributions. Biometrika 2009;96(4):761-780."
-    " doi:10.1093/biomet/asp053",
-    "gamlss": "Rigby RA, Stasinopoulos DM. Generalized additive models for location, scale and"
-    " shape. Journal of the Royal Statistical Society C 2005;54(3):507-554."
-    " doi:10.1111/j.1467-9876.2005.00510.x",
-    "warped": "Fraza CJ, Dinga R, Beckmann CF, Marquand AF. Warped Bayesian linear regression for"
-    " normative modelling of big data. NeuroImage 2021;245:118715."
-    " doi:10.1016/j.neuroimage.2021.118715",
-    "combat": "Fortin JP, Cullen N, Sheline YI, et al. Harmonization of cortical thickness"
-    " measurements across scanners and sites. NeuroImage 2018;167:104-120."
-    " doi:10.1016/j.neuroimage.2017.11.024",
-    "johnson": "Johnson WE, Li C, Rabinovic A. Adjusting batch effects in microarray expression"
-    " data using empirical Bayes methods. Biostatistics 2007;8(1):118-127."
-    " doi:10.1093/biostatistics/kxj037",
-    "beer": "Beer JC, Tustison NJ, Cook PA, et al. Longitudinal ComBat: a method for harmonizing"
-    " longitudinal multi-scanner imaging data. NeuroImage 2020;220:117129."
-    " doi:10.1016/j.neuroimage.2020.117129",
-    "nygaard": "Nygaard V, Rødland EA, Hovig E. Methods that remove batch effects while retaining"
-    " group differences may lead to exaggerated confidence in downstream analyses. Biostatistics"
-    " 2016;17(1):29-39. doi:10.1093/biostatistics/kxv027",
-    "delong": "DeLong ER, DeLong DM, Clarke-Pearson DL. Comparing the areas under two or more"
-    " correlated receiver operating characteristic curves: a nonparametric approach. Biometrics"
-    " 1988;44(3):837-845.",
-    "shrout": "Shrout PE, Fleiss JL. Intraclass correlations: uses in assessing rater reliability."
-    " Psychological Bulletin 1979;86(2):420-428. doi:10.1037/0033-2909.86.2.420",
-    "mcgraw": "McGraw KO, Wong SP. Forming inferences about some intraclass correlation"
-    " coefficients. Psychological Methods 1996;1(1):30-46. doi:10.1037/1082-989X.1.1.30",
-    "bland": "Bland JM, Altman DG. Measurement error. BMJ 1996;313(7059):744."
-    " doi:10.1136/bmj.313.7059.744",
-    "weir": "Weir JP. Quantifying test-retest reliability using the intraclass correlation"
-    " coefficient and the SEM. Journal of Strength and Conditioning Research 2005;19(1):231-240."
-    " doi:10.1519/15184.1",
-    "ard": "Ard MC, Edland SD. Power calculations for clinical trials in Alzheimer's disease."
-    " Journal of Alzheimer's Disease 2011;26(s3):369-377. doi:10.3233/JAD-2011-0062",
-    "jung": "Jung SH. Sample size for FDR-control in microarray data analysis. Bioinformatics"
-    " 2005;21(14):3097-3104. doi:10.1093/bioinformatics/bti456",
-    "liu": "Liu P, Hwang JTG. Quick calculation for sample size while controlling false discovery"
-    " rate with application to microarray analysis. Bioinformatics 2007;23(6):739-746."
-    " doi:10.1093/bioinformatics/btl664",
-    "firth": "Heinze G, Schemper M. A solution to the problem of separation in logistic"
-    " regression. Statistics in Medicine 2002;21(16):2409-2419. doi:10.1002/sim.1047",
-}
-
 #: What was measured, by region.
 _MEASURED = {
     "body": "the hippocampus",
     "extended": "the hippocampus and the neighboring cortex",
     "entorhinal": "the cortex beside the hippocampus",
+}
+
+#: Procedures that hold false discovery rates.
+PROCEDURES: Mapping[str, str] = {
+    "bh": "the procedure of Benjamini and Hochberg",
+    "fdr2": "the two-stage procedure of Benjamini, Krieger and Yekutieli",
 }
 
 
@@ -139,7 +43,8 @@ class Citations:
 
     def page(self, paragraphs: Sequence[str]) -> str:
         """Return the text with its references."""
-        works = "\n".join(f"{i}. {REFERENCES[key]}" for i, key in enumerate(self._keys, start=1))
+        known = references()
+        works = "\n".join(f"{i}. {known[key]}" for i, key in enumerate(self._keys, start=1))
         use = "This text may be used freely, as it stands or changed."
         parts = ["# Methods and findings", use, *paragraphs, "# References", works]
         return "\n\n".join(parts) + "\n"
@@ -382,13 +287,9 @@ def _correction(how: MultiplicitySettings, cite: Callable[[str], str], *, repeat
             f" {how.permutations} permutations{inside} of {shuffled}{'' if repeated else '; '}seed"
             f" {how.seed}) {cite('permutation')}, for {family}."
         )
-    kind = (
-        "the procedure of Benjamini and Hochberg"
-        if how.method == "bh"
-        else "the two-stage procedure of Benjamini, Krieger and Yekutieli"
-    )
     return (
-        f"The false discovery rate was held at {how.alpha:g} by {kind} {cite(how.method)}, for"
+        f"The false discovery rate was held at {how.alpha:g} by {PROCEDURES[how.method]}"
+        f" {cite(how.method)}, for"
         f" {family}."
     )
 

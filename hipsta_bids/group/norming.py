@@ -13,11 +13,11 @@ from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group import write
-from hipsta_bids.group.analysis import SideResult
+from hipsta_bids.group.analysis import SideResult, templates_of
 from hipsta_bids.group.comparison import BOTH
-from hipsta_bids.group.data import Bool, Cohort, Float, Int
+from hipsta_bids.group.data import Bool, Cohort, Float, Int, Key
 from hipsta_bids.group.figures import Drawing, deviation_rows, draw_norms, norm_rows
-from hipsta_bids.group.formula import check_names, listed, typed
+from hipsta_bids.group.formula import check_names, level_labels, listed, typed
 from hipsta_bids.group.glm import most_frequent
 from hipsta_bids.group.methods import norms_text
 from hipsta_bids.group.normative import NormativeScores, ScoredMaps, map_rows, score_rows
@@ -40,25 +40,22 @@ from hipsta_bids.group.run import (
     read_templates,
 )
 from hipsta_bids.group.settings import GroupSettings, NormSettings
-from hipsta_bids.group.site_effects import level_labels
 from hipsta_bids.group.summaries import hemispheres, summary_values
 from hipsta_bids.group.tables import registration_tables
 from hipsta_bids.group.trials import (
     draw_maps,
+    folder_of,
     members,
     register_cohorts,
-    templates_of,
     write_answer,
 )
-from hipsta_bids.group.warps import Template, templates_from_json, templates_to_json
+from hipsta_bids.group.warps import Template, templates_from_json
 from hipsta_bids.io import files
 from hipsta_bids.progress import tell
 from hipsta_bids.protocols.toml import resolve
 
 _NO_SITE = "unnamed"  # of everybody, where there is no column of sites
 
-Key = tuple[str, str]
-"""Hemisphere and measure."""
 Values = Mapping[Key, tuple[Int, Float]]
 """Rows of the table, and (rows, points); summary measures are single points."""
 
@@ -77,8 +74,11 @@ class NormsRequest:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Chosen:
-    """Visits that are asked for."""
+    """What is asked for, and of which visits."""
 
+    options: GroupOptions
+    request: NormsRequest
+    settings: GroupSettings
     inputs: GroupInputs
     keep: Bool
     """Of the visits that were read."""
@@ -118,20 +118,16 @@ def run_norms(options: GroupOptions, request: NormsRequest, settings: GroupSetti
     if request.file is not None:
         return _score_people(options, request, request.file, settings)
     chosen = _choose(options, request, settings)
-    file, how = _planned(chosen, settings), settings.norms
-    people, left_out = _people(chosen.cohort.table, file, settings)
+    file, how = _planned(chosen), settings.norms
+    people = _people(chosen, file)
     file = _counted(file, people, how)
-    templates = read_templates(options.template, chosen.cohort)
-    sides, cohorts, found = _registered(chosen, settings, templates)
+    sides, cohorts, found = _registered(chosen, read_templates(options.template, chosen.cohort))
     tell("norms")
-    if made := templates_of(sides):
-        file = file.model_copy(update={"template": templates_to_json(made)})
+    file = file.model_copy(update={"template": templates_of(sides)})
     norms, table = _fit(found, people, file, how)
     tables = dict(registration_tables(chosen.cohort, sides)) if sides else {}
     tables["coverage"] = table
-    chosen.left_out.update(left_out)
-    done = _Made(file, norms, people, cohorts, found, tables, len(file.sites))
-    return _write(options, request, settings, chosen, done, ())
+    return _write(chosen, _Made(file, norms, people, cohorts, found, tables, len(file.sites)), ())
 
 
 def _score_people(
@@ -144,15 +140,15 @@ def _score_people(
     settings = settings.changed(registration=file.registration)
     chosen = _choose(options, request, settings)
     notes = _check(file, path, chosen.inputs)
-    table = chosen.cohort.table
-    people, left_out = _people(table, file, settings)
+    people = _people(chosen, file)
     if not people.known.any():
-        why = "; ".join(dict.fromkeys(message for _, message in left_out.values()))
+        why = "; ".join(dict.fromkeys(message for _, message in chosen.left_out.values()))
         raise ModelError(f"{path}: nobody here can be scored: {why}", reason="norms-differ")
-    controls = members(table, request.controls, "--controls") & (request.controls is not None)
-    file = _with_new_sites(file, table, people, controls, request, settings)
+    everyone = members(chosen.cohort.table, request.controls, "--controls")
+    controls = everyone & (request.controls is not None)
+    file = _with_new_sites(chosen, file, people, controls)
     templates = None if file.template is None else templates_from_json(file.template, str(path))
-    sides, cohorts, found = _registered(chosen, settings, templates)
+    sides, cohorts, found = _registered(chosen, templates)
     found = {key: own for key, own in found.items() if key in norms}
     adapted = controls & people.known & (people.site >= known)
     tell("norms")
@@ -169,8 +165,7 @@ def _score_people(
     tables = dict(registration_tables(chosen.cohort, sides)) if sides else {}
     made = _Made(file, extended, people, cohorts, found, tables, known, scored, adapted)
     tables["zscores"] = pd.concat(_score_rows(made, adapted, settings), ignore_index=True)
-    chosen.left_out.update(left_out)
-    return _write(options, request, settings, chosen, made, notes)
+    return _write(chosen, made, notes)
 
 
 def _choose(options: GroupOptions, request: NormsRequest, settings: GroupSettings) -> _Chosen:
@@ -179,15 +174,20 @@ def _choose(options: GroupOptions, request: NormsRequest, settings: GroupSetting
     keep = members(inputs.cohort.table, request.among)
     why = "not-asked", "another level than --among"
     left_out = dict.fromkeys(map(str, inputs.cohort.table.index[~keep]), why)
-    return _Chosen(inputs=inputs, keep=keep, cohort=inputs.cohort.take(keep), left_out=left_out)
+    return _Chosen(
+        options=options, request=request, settings=settings, inputs=inputs, keep=keep,
+        cohort=inputs.cohort.take(keep), left_out=left_out,
+    )  # fmt: skip
 
 
 def _registered(
-    chosen: _Chosen, settings: GroupSettings, templates: Mapping[str, Template] | None
+    chosen: _Chosen, templates: Mapping[str, Template] | None
 ) -> tuple[dict[str, SideResult], dict[str, Cohort], Values]:
     """Register maps, and collect them and summary measures of each side and of the mean of both."""
     inputs = chosen.inputs
-    sides, cohorts = register_cohorts(chosen.cohort, inputs, chosen.keep, settings, templates)
+    sides, cohorts = register_cohorts(
+        chosen.cohort, inputs, chosen.keep, chosen.settings, templates
+    )
     names = [*inputs.measures.maps, *inputs.others]
     found: dict[Key, tuple[Int, Float]] = {}
     for name, cohort in cohorts.items():
@@ -207,16 +207,10 @@ def _registered(
     return sides, cohorts, found
 
 
-def _write(  # noqa: PLR0917
-    options: GroupOptions,
-    request: NormsRequest,
-    settings: GroupSettings,
-    chosen: _Chosen,
-    made: _Made,
-    notes: Iterable[str],
-) -> GroupResult:
+def _write(chosen: _Chosen, made: _Made, notes: Iterable[str]) -> GroupResult:
     """Write all results; charts are of the measures that the settings name."""
     file, people, cohort = made.file, made.people, chosen.cohort
+    request, settings = chosen.request, chosen.settings
     charts = [
         file.centiles(norms).assign(hemi=hemi, measure=name, unit=cohort.units.get(name, "1"))
         for (hemi, name), norms in made.norms.items()
@@ -262,13 +256,12 @@ def _write(  # noqa: PLR0917
         },
         "among": request.among,
     }
-    parts = ["norms" if request.file is None else "scores", *(request.among or ())[1:]]
-    name = "_".join("".join(c if c.isalnum() else "-" for c in part) for part in parts)
+    name = folder_of(["norms" if request.file is None else "scores"], request.among)
     notes = [*chosen.inputs.notes, *notes]
     if file.site not in cohort.table:
         notes.append(f"no column {file.site!r}: all are taken to be at one, {_NO_SITE!r}")
     return write_answer(
-        options, name, chosen.inputs, settings, left_out=chosen.left_out, notes=notes,
+        chosen.options, name, chosen.inputs, settings, left_out=chosen.left_out, notes=notes,
         visits=cohort.table[people.known], tables=made.tables, record=record, fill=fill,
     )  # fmt: skip
 
@@ -279,10 +272,10 @@ def _protocol(inputs: GroupInputs) -> tuple[str, str]:
     return (records[0].place.name.seg, records[0].place.name.region) if records else ("none",) * 2
 
 
-def _planned(chosen: _Chosen, settings: GroupSettings) -> NormsFile:
+def _planned(chosen: _Chosen) -> NormsFile:
     """Say what norms are about, before they are fitted."""
-    how, cohort, inputs = settings.norms, chosen.cohort, chosen.inputs
-    found, table = inputs.found, cohort.table
+    cohort, inputs, settings = chosen.cohort, chosen.inputs, chosen.settings
+    how, found, table = settings.norms, inputs.found, cohort.table
     check_names([how.age], table.columns)
     sites, complete = _site_labels(table, how.site, settings), np.ones(len(table), dtype=bool)
     sexes = level_labels(table[how.sex], settings.design) if how.sex in table else None
@@ -326,10 +319,9 @@ def _site_labels(table: pd.DataFrame, column: str, settings: GroupSettings) -> p
     return level_labels(table[column], settings.design)
 
 
-def _people(
-    table: pd.DataFrame, file: NormsFile, settings: GroupSettings
-) -> tuple[People, dict[str, tuple[str, str]]]:
-    """Describe visits as norms have to know them, new sites last; of others reason and message."""
+def _people(chosen: _Chosen, file: NormsFile) -> People:
+    """Describe visits as norms have to know them, new sites last; others are left out."""
+    table, settings = chosen.cohort.table, chosen.settings
     check_names([file.age, *([file.sex] if file.sexes else [])], table.columns)
     age, labels = _ages(table, file.age, settings), _site_labels(table, file.site, settings)
     low, high = file.knots[0], file.knots[-1]
@@ -345,11 +337,12 @@ def _people(
         for i, level in enumerate(file.sexes[1:]):
             sex[:, i] = levels == level
     problems |= {("incomplete", f"{name} is missing"): where for name, where in lacks.items()}
-    left_out = {str(v): why for why, where in problems.items() for v in table.index[where]}
+    for why, where in problems.items():
+        chosen.left_out.update(dict.fromkeys(map(str, table.index[where]), why))
     usable = ~np.any(list(problems.values()), axis=0)
     sites = [*file.sites, *sorted(set(labels[usable]) - set(file.sites))]
     site = np.where(usable, pd.Categorical(labels, categories=sites).codes, -1).astype(np.int64)
-    return People(age=age, sex=sex, site=site), left_out
+    return People(age=age, sex=sex, site=site)
 
 
 def _counted(file: NormsFile, people: People, how: NormSettings) -> NormsFile:
@@ -411,15 +404,9 @@ def _check(file: NormsFile, path: Path, inputs: GroupInputs) -> list[str]:
     return []
 
 
-def _with_new_sites(  # noqa: PLR0917
-    file: NormsFile,
-    table: pd.DataFrame,
-    people: People,
-    controls: Bool,
-    request: NormsRequest,
-    settings: GroupSettings,
-) -> NormsFile:
+def _with_new_sites(chosen: _Chosen, file: NormsFile, people: People, controls: Bool) -> NormsFile:
     """Add the names of new sites, if they have controls enough."""
+    table, request, settings = chosen.cohort.table, chosen.request, chosen.settings
     least, sites = settings.norms.least_controls, dict(file.sites)
     labels = _site_labels(table, file.site, settings).to_numpy()
     for number in range(len(sites), int(people.site.max(initial=-1)) + 1):

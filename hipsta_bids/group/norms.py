@@ -11,43 +11,24 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from textwrap import shorten
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import pandas as pd
-from pydantic import Field, ValidationError
+from pydantic import Field
 from scipy import special
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.data import Bool, Float, Int
+from hipsta_bids.group.combat import solve_points
+from hipsta_bids.group.data import Bool, Float, Int, Key, as_nested, read_foreign
 from hipsta_bids.group.exchange import Known, Number, Text
 from hipsta_bids.group.glm import chunks
 from hipsta_bids.group.settings import NormSettings
-from hipsta_bids.group.site_effects import as_lists
 from hipsta_bids.io import files
-from hipsta_bids.protocols.toml import TomlTable, first_mistake
+from hipsta_bids.protocols.toml import TomlTable
 
 #: Probabilities of the centiles that tables and charts show.
 LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
-#: Meaning of columns of tables.
-NORM_COLUMNS: Mapping[str, str] = {
-    "n_points": "points with norms; 1 for summary measures",
-    "transformed": "share of points whose distribution is not normal",
-    "z": "deviation from the norms, a standard normal quantile; of maps mean over the region",
-    "centile": "percent of the norms, of the same age, sex and site, below the value",
-    "adapted": "true for controls from whom the site's shift and scale were estimated",
-    "sex": "sex",
-    "age": "age, years",
-    **{
-        name: text
-        for level in LEVELS
-        for name, text in (
-            (f"below_{100 * level:g}", f"share below centile {100 * level:g}, cross-validated"),
-            (f"p{100 * level:g}", f"centile {100 * level:g} at the average site, unit of measure"),
-        )
-    },
-}
 #: Bytes of the largest file that is read.
 _LARGEST = 1_000_000_000
 _ARRAYS = ("mean", "spread", "shape", "shift", "scale", "n")
@@ -299,20 +280,7 @@ def _weighted(values: Float, weight: Float, design: Float) -> Float:
     for rows in chunks((columns**2, len(design)), 1):
         products = (design[rows, :, None] * design[rows, None, :]).reshape(-1, columns**2)
         grams += weight[rows].T @ products
-    grams = grams.reshape(-1, columns, columns)
-    right = ((weight * values).T @ design)[:, :, None]
-    diagonal = np.arange(columns)
-    size = grams[:, diagonal, diagonal]
-    # A site without values has the constant zero, and no say in the others.
-    grams[:, diagonal, diagonal] = np.where(size > 0, size, 1.0)
-    size = np.sqrt(grams[:, diagonal, diagonal])
-    unit = grams / (size[:, :, None] * size[:, None, :])
-    finite = np.isfinite(unit).all(axis=(1, 2))
-    unit[~finite] = np.eye(columns)
-    unique = finite & (np.linalg.eigvalsh(unit)[:, 0] > _LEAST_INFORMATION)
-    unit[~unique] = np.eye(columns)
-    found = np.linalg.solve(unit, right / size[:, :, None])[:, :, 0] / size
-    return np.where(unique[:, None], found, np.nan).T
+    return solve_points(grams.reshape(-1, columns, columns), (weight * values).T @ design, 0.0)
 
 
 def _power(order: Float) -> Float:
@@ -468,8 +436,8 @@ class NormsFile(TomlTable):
             blocks.append(pd.DataFrame({"sex": sex, "age": ages, **columns}))
         return pd.concat(blocks)
 
-    def arrays(self) -> dict[tuple[str, str], Norms]:
-        """Norms by hemisphere and measure."""
+    def arrays(self) -> dict[Key, Norms]:
+        """Norms by hemisphere and measure; ValueError if these do not fit, or are others."""
         knots = np.array(self.knots, dtype=np.float64)
         if not (np.diff(knots) > 0).all():
             raise ValueError("knots of age do not ascend")
@@ -484,16 +452,14 @@ class NormsFile(TomlTable):
                     raise ValueError(f"numbers of {measure}, {hemi}, that do not fit each other")
                 own = {name: np.array(value, dtype=np.float64) for name, value in entry}
                 found[str(hemi), measure] = Norms(knots=knots, **{**own, "n": own["n"].astype(int)})
+        if self.hash != _digest(self.model_dump()):
+            raise ValueError("changed after it was written")
         return found
 
 
-def save_norms(path: Path, file: NormsFile, norms: Mapping[tuple[str, str], Norms]) -> None:
+def save_norms(path: Path, file: NormsFile, norms: Mapping[Key, Norms]) -> None:
     """Write norms, to be read by :func:`load_norms`."""
-    content = file.model_dump()
-    content["norms"] = {}
-    for (hemi, measure), one in norms.items():
-        arrays = {name: as_lists(getattr(one, name)) for name in _ARRAYS}
-        content["norms"].setdefault(hemi, {})[measure] = {**arrays, "n": one.n.tolist()}
+    content = {**file.model_dump(), "norms": as_nested(norms, _ARRAYS)}
     files.write_json(path, {**content, "hash": _digest(content)})
 
 
@@ -502,7 +468,7 @@ def _digest(content: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def load_norms(path: Path) -> tuple[NormsFile, dict[tuple[str, str], Norms]]:
+def load_norms(path: Path) -> tuple[NormsFile, dict[Key, Norms]]:
     """Read what :func:`save_norms` wrote; nothing in it is run.
 
     Raises
@@ -510,22 +476,11 @@ def load_norms(path: Path) -> tuple[NormsFile, dict[tuple[str, str], Norms]]:
     ModelError
         If the file is too large, changed, of another format, or its parts do not fit each other.
     """
-    if path.is_file() and path.stat().st_size > _LARGEST:
-        raise _damaged(path, f"larger than {_LARGEST / 1e9:g} GB")
-    content = files.read_json(path)
     try:
-        file = NormsFile.model_validate(content)
-        digest, norms = _digest(content), file.arrays()
+        file = read_foreign(path, NormsFile, most=_LARGEST)
+        return file, file.arrays()
     except (ValueError, RecursionError) as error:
-        said = first_mistake(error, NormsFile)[1] if isinstance(error, ValidationError) else error
-        raise _damaged(path, str(said)) from error
-    if file.hash != digest:
-        raise _damaged(path, "changed after it was written")
-    return file, norms
-
-
-def _damaged(path: Path, what: str) -> ModelError:
-    return ModelError(
-        f"{path}: not a file of norms ({shorten(what, 200)}); use the norms.json of --fit-norms",
-        reason="norms-file",
-    )
+        raise ModelError(
+            f"{path}: not a file of norms ({error}); use the norms.json of --fit-norms",
+            reason="norms-file",
+        ) from error

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from hipsta_bids.group.analysis import Analysis, mean_of_known, members_of, rows_of
 from hipsta_bids.group.data import Bool, Cohort, Float
-from hipsta_bids.group.glm import FittedMaps
+from hipsta_bids.group.glm import FittedMaps, PointTest
 from hipsta_bids.group.inference import Discoveries, MapKey
 from hipsta_bids.group.shapes import AverageShape
 from hipsta_bids.group.views import View, across, draw_mesh, laid_out, look
@@ -105,7 +105,11 @@ def draw_measure(
     """
     sides = {hemi: one for hemi, one in analysis.fitted.items() if measure in one.fits}
     blocks = [[row] for row in _means(cohort, analysis, sides, measure)]
-    blocks += contrasts(analysis.fitted, analysis.found, measure)
+    tests = {
+        hemi: {name: fit.tests for name, fit in one.fits.items()}
+        for hemi, one in analysis.fitted.items()
+    }
+    blocks += contrasts(tests, analysis.found, measure)
     return draw_pages(cohort, sides, shapes, views, blocks)
 
 
@@ -159,17 +163,18 @@ def _means(
 
 
 def contrasts(
-    fitted: Mapping[str, FittedMaps],
+    every_test: Mapping[str, Mapping[str, Sequence[PointTest]]],
     discoveries: Mapping[MapKey, Discoveries],
     measure: str,
     like: Mapping[str, str] | None = None,
 ) -> Iterator[list[Row]]:
     """Effect sizes and corrected p-values of each contrast.
 
-    ``like`` names contrasts of which others take the colors.
+    Tests are those of all measures, by side and measure, which share their colors; ``like`` names
+    contrasts of which others take these.
     """
-    sides = [hemi for hemi, one in fitted.items() if measure in one.fits]
-    tests = {hemi: fitted[hemi].fits[measure].tests for hemi in sides}
+    tests = {hemi: own[measure] for hemi, own in every_test.items() if measure in own}
+    sides = list(tests)
     found = {
         (test.contrast.name, hemi): discoveries[MapKey(measure, test.contrast.name, hemi)]
         for hemi, own in tests.items()
@@ -187,9 +192,9 @@ def contrasts(
         name = test.contrast.name
         every = [
             display.Effects(other.kind, other.effect, other.statistic, other.df)
-            for one in fitted.values()
-            for fit in one.fits.values()
-            for other in fit.tests
+            for own in every_test.values()
+            for some in own.values()
+            for other in some
             if other.contrast.name == (like or {}).get(name, name)
         ]
         reach = display.effect_reach(every)

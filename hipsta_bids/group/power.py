@@ -8,6 +8,7 @@ from scipy import special, stats
 
 from hipsta_bids.errors import ModelError, UsageError
 from hipsta_bids.group.data import Float
+from hipsta_bids.group.methods import PROCEDURES
 from hipsta_bids.group.reference import Reference
 from hipsta_bids.group.settings import GroupSettings, MultiplicitySettings
 
@@ -260,11 +261,6 @@ def power_text(
             " true slopes between participants plus the variance within participants over the sum"
             f" of squared times {cite('ard')}."
         )
-    procedure = (
-        "the procedure of Benjamini and Hochberg"
-        if how.method == "bh"
-        else "the two-stage procedure of Benjamini, Krieger and Yekutieli"
-    )
     lost = f", if {100 * plan.dropout:g} % drop out" if plan.dropout else ""
     if lost and effect.visits:
         lost += " at a constant hazard and are analyzed with the visits before"
@@ -274,7 +270,8 @@ def power_text(
         f" {source(cite)}. Power is that of Student's two-sided t test (non-central t), at the"
         f" level {plan.alpha:g} for a summary measure, without correction, since a trial has one"
         f" primary end point. At single points the level is {point_level(settings):.2g}: at that"
-        f" level {procedure} {cite(how.method)} holds the false discovery rate at {how.alpha:g} if"
+        f" level {PROCEDURES[how.method]} {cite(how.method)} holds the false discovery rate at"
+        f" {how.alpha:g} if"
         f" {100 * plan.affected:g} % of the points of a map differ and are found with this power"
         f" on average {cite('jung')} {cite('liu')}. Of many measures the one that needs fewest"
         " does so partly by chance; its number is too small on average."

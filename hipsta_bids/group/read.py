@@ -134,7 +134,11 @@ def read_sheets(
         if own:
             side = _read_side(own, np.array(rows, dtype=np.int64), shape, names)
             why = [_damage(side, i, rules) for i in range(len(own))]
-            found = [_excluded(r, text) for r, text in zip(own, why, strict=True) if text]
+            found = [
+                Exclusion.of_sheet(record.place.name, "damaged-map", text)
+                for record, text in zip(own, why, strict=True)
+                if text
+            ]
             if len(found) == len(own):
                 raise InputError(
                     f"hemisphere {hemi}: no sheet can be used; {found[0].participant}:"
@@ -185,17 +189,6 @@ def _damage(side: SideMaps, i: int, rules: GroupSettings) -> str | None:
         if worst > most:
             return f"{name} reaches {worst:.3g} {unit}, which no sheet does"
     return None
-
-
-def _excluded(record: SheetRecord, message: str) -> Exclusion:
-    name = record.place.name
-    return Exclusion(
-        participant=f"sub-{name.subject}",
-        session=name.session and f"ses-{name.session}",
-        hemi=name.hemi,
-        reason="damaged-map",
-        message=message,
-    )
 
 
 def _check_errors(records: Sequence[SheetRecord], maps: Sequence[str]) -> None:

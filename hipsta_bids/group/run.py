@@ -19,11 +19,13 @@ from hipsta_bids.group.collect import (
     Exclusion,
     GroupRequest,
     collect_sheets,
+    exclude_visits,
     wanted_by,
 )
+from hipsta_bids.group.combat import load_effects
 from hipsta_bids.group.comparison import Comparison, choose_visits
 from hipsta_bids.group.covariates import VisitTime, add_time, read_covariates, read_icv
-from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Measures
+from hipsta_bids.group.data import Cohort, Measures
 from hipsta_bids.group.exchange import SUMMARY, summarize, write_summary
 from hipsta_bids.group.formula import parse_model, with_factors
 from hipsta_bids.group.harmonize import harmonization_record
@@ -45,7 +47,6 @@ from hipsta_bids.group.read import (
 )
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.shapes import average_shapes, write_shapes
-from hipsta_bids.group.site_effects import SavedEffects, load_effects
 from hipsta_bids.group.surfaces import (
     ExternalCohorts,
     MapPattern,
@@ -184,7 +185,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         time=inputs.time.column if inputs.time else None,
         icv=inputs.icv,
         templates=templates,
-        site_effects=_site_effects(options),
+        site_effects=load_effects(options.harmonize_model) if options.harmonize_model else None,
     )
     others = {
         name: (other, analyze_points(other, analysis, settings))
@@ -268,11 +269,6 @@ def _summary(
     return summary
 
 
-def _site_effects(options: GroupOptions) -> SavedEffects | None:
-    path = options.harmonize_model
-    return None if path is None else load_effects(path)
-
-
 def read_inputs(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
     """Find and read sheets, other maps, volumes and covariates."""
     check_volumes(options.volumes)
@@ -306,6 +302,7 @@ def read_inputs(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
         time = add_time(cohort.table, settings)
         cohort = replace(cohort, table=time.table)
     own = tuple(name for name in measures.maps if name not in external.others)
+    other = "other-session" if options.comparison.pair else "later-session"
     return GroupInputs(
         found=found,
         cohort=cohort,
@@ -319,7 +316,9 @@ def read_inputs(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
         exclusions=(
             *found.exclusions,
             *measured.damaged,
-            *_other_visits(measured, reasons, options.comparison),
+            *exclude_visits(
+                measured.visits, {visit: (other, message) for visit, message in reasons.items()}
+            ),
         ),
         notes=(*found.notes, *external.notes, *volume_notes, *_damaged(measured)),
     )
@@ -361,23 +360,6 @@ def _damaged(measured: Measured) -> tuple[str, ...]:
     ]
     more = len(measured.damaged) - _SHOWN
     return (*shown, f"{more} more are left out alike, see excluded.tsv") if more > 0 else (*shown,)
-
-
-def _other_visits(
-    measured: Measured, reasons: Mapping[str, str], comparison: Comparison
-) -> list[Exclusion]:
-    """List the sessions that are not compared."""
-    return [
-        Exclusion(
-            participant=row[PARTICIPANT],
-            session=row[SESSION],
-            hemi=files.MISSING,
-            reason="other-session" if comparison.pair else "later-session",
-            message=message,
-        )
-        for visit, message in reasons.items()
-        for row in measured.visits.loc[[visit]].to_dict("records")
-    ]
 
 
 def _with_icv(
@@ -528,17 +510,11 @@ def read_templates(path: Path | None, cohort: Cohort) -> Mapping[str, Template] 
 
 def _incomplete(analysis: Analysis) -> list[Exclusion]:
     """Visits that lack a variable of the model."""
-    result = []
-    for variable, visits in analysis.design.dropped.items():
-        for visit in visits:
-            row = analysis.compared.table.loc[[visit], [PARTICIPANT, SESSION]].to_dict("records")[0]
-            result.append(
-                Exclusion(
-                    participant=row[PARTICIPANT],
-                    session=row[SESSION],
-                    hemi=files.MISSING,
-                    reason="incomplete",
-                    message=f"{variable} is missing",
-                )
-            )
-    return result
+    table = analysis.compared.table
+    return [
+        one
+        for variable, visits in analysis.design.dropped.items()
+        for one in exclude_visits(
+            table, dict.fromkeys(visits, ("incomplete", f"{variable} is missing"))
+        )
+    ]

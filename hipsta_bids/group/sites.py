@@ -37,33 +37,6 @@ _PREDICTION = "prediction"
 _BY_COLUMNS = "write the contrast by columns, as -1*group[T.AD]"
 _LONGEST = 200  # characters of what two sites have
 
-#: Meanings of columns of tables, beside those of the group level.
-COLUMNS: Mapping[str, str] = {
-    **tables.COLUMNS,
-    "site": "site; in forest.tsv also the combined estimates, and the limits of a further site",
-    "kind": "what the row is: site, fixed effect, random effects, or prediction",
-    "plot": "number of the forest plot",
-    "version": "version of hipsta_bids",
-    "template": "hash of the template of registration; none without registration",
-    "n_sites": "sites with an estimate",
-    "estimate_low": "lower confidence limit of the estimate; of prediction, of a further site's",
-    "estimate_high": "upper limit",
-    "weight": "share of the site in the random-effects estimate",
-    "without_estimate": "random-effects estimate without the site",
-    "without_low": "its lower confidence limit",
-    "without_high": "its upper confidence limit",
-    "without_p": "its p-value",
-    "tau2": "variance of the true effects between sites, unit of the measure squared",
-    "q": "Cochran's Q",
-    "q_p": "its p-value",
-    "i2": "I squared: share of the variance of the sites' estimates that is between sites",
-    "estimate_dl": "random-effects estimate with the variance of DerSimonian and Laird",
-    "se_dl": "its standard error",
-    "p_dl": "its p-value, from the normal distribution",
-    "n_kept": "points that survive with all sites, and without this one",
-    "largest_change": "largest change of the estimate without the site, in residual SDs",
-}
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Item:
@@ -275,7 +248,15 @@ def meta_tables(meta: Meta) -> Iterator[tuple[str, pd.DataFrame]]:
             found = meta.found[key]
             stem = tables.map_name(key.hemi, key.measure, key.contrast)
             rows.append(overview_row(stem, key, found))
-            yield stem, _statmap(meta, item, effects, found, frame)
+            low, high = item.result.models[effects].limits(confidence)
+            columns = {
+                **point_columns(test, found, frame, meta.counts(item).astype(int)),
+                "n_sites": item.result.random.sites.astype(int),
+                "estimate_low": low,
+                "estimate_high": high,
+                **_between(item),
+            }
+            yield stem, pd.DataFrame(columns)
             table = peak_table(test, found, frame, edges)
             peaks.append(table.assign(measure=key.measure, hemi=key.hemi))
             own.append(table)
@@ -323,21 +304,6 @@ def _sites(meta: Meta) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _statmap(
-    meta: Meta, item: Item, effects: str, found: Discoveries, frame: Frame
-) -> pd.DataFrame:
-    test = point_test(item, effects, meta.settings.meta.confidence)
-    low, high = item.result.models[effects].limits(meta.settings.meta.confidence)
-    columns = {
-        **point_columns(test, found, frame, meta.counts(item).astype(int)),
-        "n_sites": item.result.random.sites.astype(int),
-        "estimate_low": low,
-        "estimate_high": high,
-        **_between(item),
-    }
-    return pd.DataFrame(columns)
-
-
 def _between(item: Item) -> dict[str, Float]:
     random = item.result.random
     return {"tau2": random.tau2, "q": random.q, "q_p": random.q_p, "i2": random.i2}
@@ -383,39 +349,22 @@ def _forest(meta: Meta, item: Item, point: int) -> pd.DataFrame:
         what["subfield"] = frame.subfield[point]
     rows: list[dict[str, Any]] = []
     for number, site in enumerate(meta.sites):
-        estimate, se = result.estimates[number, point], result.ses[number, point]
-        own = Combined(
-            estimate=np.array([estimate]),
-            se=np.array([se]),
-            df=np.array([site.models[item.number].df], dtype=np.float64),
-        )
-        row = {
-            "site": site.site,
-            "kind": "site",
-            "n": site.participants,
-            **_row(own, 0, confidence),
-        }
-        row["weight"] = result.random.weights[number, point]
+        df = np.full(result.sd.shape, site.models[item.number].df, dtype=np.float64)
+        own = Combined(estimate=result.estimates[number], se=result.ses[number], df=df)
+        row = {"site": site.site, "kind": "site", "n": site.participants}
+        row |= _row(own, point, confidence) | {"weight": result.random.weights[number, point]}
         if result.without:
             rest = _row(result.without[number].random, point, confidence)
-            row |= {
-                f"without_{name.removeprefix('estimate_')}": rest[name]
-                for name in ("estimate", "estimate_low", "estimate_high", "p")
-            }
+            del rest["se"]
+            row |= {f"without_{k.removeprefix('estimate_')}": v for k, v in rest.items()}
         rows.append(row)
     n = int(meta.counts(item)[point])
     for name, one in result.models.items():
         rows.append({"site": name, "kind": name, "n": n, **_row(one, point, confidence)})
     rows[-1] |= {name: values[point] for name, values in _between(item).items()}
     low, high = result.random.prediction(confidence)
-    rows.append(
-        {
-            "site": _PREDICTION,
-            "kind": _PREDICTION,
-            "estimate_low": low[point],
-            "estimate_high": high[point],
-        }
-    )
+    limits = {"estimate_low": low[point], "estimate_high": high[point]}
+    rows.append({"site": _PREDICTION, "kind": _PREDICTION, **limits})
     return pd.DataFrame([{**what, **row} for row in rows])
 
 
@@ -432,9 +381,10 @@ def _row(one: Combined, point: int, confidence: float) -> dict[str, float]:
 
 def _summaries(meta: Meta) -> pd.DataFrame:
     """List summary measures by fixed and random effects; the latter also by DerSimonian-Laird."""
-    confidence = meta.settings.meta.confidence
+    confidence, least = meta.settings.meta.confidence, meta.settings.meta.min_sites
     parts = []
     for item in meta.of("summary"):
+        other = combine(item.result.estimates, item.result.ses**2, "dl", least=least)
         for effects, one in item.result.models.items():
             test = point_test(item, effects, confidence)
             low, high = one.limits(confidence)
@@ -456,18 +406,15 @@ def _summaries(meta: Meta) -> pd.DataFrame:
                         "estimate_high": high,
                         **effect_columns(test),
                         **_between(item),
-                        **_dersimonian_laird(item, meta.settings.meta.min_sites),
+                        "estimate_dl": other.estimate,
+                        "se_dl": other.se,
+                        "p_dl": other.p,
                     }
                 )
             )
     table = pd.concat(parts, ignore_index=True)
     table = table[table["estimate"].notna()]
     return tables.with_fdr(table, meta.settings)
-
-
-def _dersimonian_laird(item: Item, least: int) -> dict[str, Float]:
-    other = combine(item.result.estimates, item.result.ses**2, "dl", least=least)
-    return {"estimate_dl": other.estimate, "se_dl": other.se, "p_dl": other.p}
 
 
 def _left_out(meta: Meta) -> Iterator[dict[str, Any]]:

@@ -1,6 +1,8 @@
 """Results as tables, and the meaning of their columns."""
 
+import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from importlib.resources import files
 from typing import Any
 
 import numpy as np
@@ -29,8 +31,6 @@ from hipsta_bids.group.clusters import (
 from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float
 from hipsta_bids.group.harmonize import Harmonization
 from hipsta_bids.group.inference import control_fdr
-from hipsta_bids.group.norms import NORM_COLUMNS
-from hipsta_bids.group.reference import TRIAL_COLUMNS
 from hipsta_bids.group.registration import ShiftDifference
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.summaries import hemispheres, participants_with, summary_values
@@ -40,120 +40,11 @@ Named = tuple[str, pd.DataFrame]
 Columns = Mapping[str, Any]
 CurveOf = Callable[[ClassifierResult, NDArray[np.bool_]], Columns]
 
+_MEANINGS = tomllib.loads((files("hipsta_bids.group") / "columns.toml").read_text("utf-8"))
 #: Meaning of every column; the unit is that of the measure unless said.
-COLUMNS: Mapping[str, str] = {
-    "hemi": "hemisphere, L or R; LR is the mean of both, of asymmetry left minus right",
-    "measure": "map or summary measure; volume_NAME_STRUCTURE is from NAME's own table of volumes",
-    "unit": "unit of the measure",
-    "contrast": "name of the contrast; A-B is positive where A has more",
-    "model": "right-hand side of the model",
-    "test": "t, or F for contrasts of several rows",
-    "x": "sheet coordinate, -1 medial to 1 lateral",
-    "y": "sheet coordinate, -1 posterior to 1 anterior",
-    "vertex": "vertex of the surface, the first is 0",
-    "surface_x": "coordinate of the vertex on the surface that the maps lie on",
-    "surface_y": "the same along the second axis",
-    "surface_z": "the same along the third axis",
-    "node_x": "node along x, 1 is most medial; coordinates are registered",
-    "node_y": "node along y, 1 is most posterior",
-    "subfield": "subfield, most frequent after registration",
-    "n": "participants with a value; in maps of statistics, with --longitudinal, visits",
-    "visits": "visits with a value, as many as participants unless --longitudinal",
-    "n_cases": "of these, in the second group",
-    "n_incomplete": "participants of the two groups that lack a value",
-    "estimate": "contrast of the model's coefficients, unit of the measure; n/a for F",
-    "se": "standard error of the estimate, unit of the measure; n/a for F",
-    "statistic": "t or F",
-    "df": "degrees of freedom; of F, the denominator's",
-    "p": "two-sided p-value, not corrected",
-    "p_corrected": "p-value corrected for the number of points, by the method of analysis.json",
-    "p_fdr": "p-value with the false discovery rate held over all tests of the contrast in the"
-    " table: all measures, sides and models",
-    "significant": "true where the corrected p-value is at most the level",
-    "effect": "kind of effect size",
-    "effect_size": "Cohen's d (estimate over residual SD), or partial eta squared",
-    "effect_low": "lower confidence limit of the effect size",
-    "effect_high": "upper confidence limit of the effect size",
-    "cohen_d": "estimate over residual SD; n/a for F",
-    "cohen_d_low": "lower confidence limit",
-    "cohen_d_high": "upper confidence limit",
-    "eta_squared": "partial eta squared",
-    "eta_squared_low": "lower confidence limit",
-    "eta_squared_high": "upper confidence limit",
-    "extent": "points of the cluster; 0 for the largest statistic of a map without findings",
-    "shares": "share of the cluster in each subfield",
-    "file": "name of the files with this map, without suffix",
-    "n_tests": "points tested in the family",
-    "n_significant": "points of the map that survive",
-    "n_unregistered": "points that survive if the maps are not registered",
-    "n_both": "points that survive either way",
-    "p_cutoff": "largest p-value that survives; below all if none does; n/a if clusters decide",
-    "lenient": "true where p-values above the level survive, as they may with widespread effects",
-    "group": "group",
-    "registered": "false before registration, true after it",
-    "mean": "mean, unit of the measure",
-    "sd": "standard deviation, unit of the measure",
-    "mean_se": "standard error of the mean, unit of the measure",
-    "shift": "registered minus original position, in grid nodes; positive is lateral",
-    "shift_se": "standard error of the shift, grid nodes",
-    "explained_before": "share of the variance of curvature profiles that their mean explains",
-    "explained_after": "the same after registration",
-    "iterations": "turns of template and warps",
-    "converged": "whether warps had settled",
-    "difference": "largest difference of mean displacement between two groups, grid nodes",
-    "difference_node": "node along x where it is",
-    "difference_p": "p-value of the difference, corrected for all nodes by permutations of people",
-    "displacement": "root mean square of warp minus identity, grid nodes",
-    "extreme": "true where the displacement is out of line with the others",
-    "control": "first group of the pair",
-    "case": "second group of the pair",
-    "base": "measures of the base model",
-    "added": "measure that is added to it",
-    "auc_base": "area under the curve of the base model, on the participants fitted",
-    "auc_base_low": "lower confidence limit (DeLong)",
-    "auc_base_high": "upper confidence limit (DeLong)",
-    "auc_full": "area under the curve with the measure added, on the participants fitted",
-    "auc_full_low": "lower confidence limit (DeLong)",
-    "auc_full_high": "upper confidence limit (DeLong)",
-    "auc_base_cv": "cross-validated area of the base model",
-    "auc_full_cv": "cross-validated area with the measure added",
-    "auc_base_cv_sd": "standard deviation over repeats",
-    "auc_full_cv_sd": "standard deviation over repeats",
-    "calibration_intercept": "log odds by which cases are more frequent than the full model says,"
-    " cross-validated; 0 if it is right on average",
-    "calibration_slope": "of the full model, cross-validated; below 1 if it is too sure; as the"
-    " intercept, missing where a group has fewer than ``classification.least_calibrated`` members",
-    "brier": "mean squared error of the chance, full model, cross-validated",
-    "classifier": "base, or full with the measure added",
-    "false_positives": "share of the first group at or above a score, one minus specificity",
-    "true_positives": "share of the second group at or above this score, sensitivity",
-    "predicted": "mean predicted chance of a fifth of the participants, or less, cross-validated",
-    "observed": "share of cases among these",
-    "likelihood_ratio": "chi squared of the likelihood-ratio test, base against full model",
-    "lr_df": "its degrees of freedom",
-    "separated": "true where groups were separated, and both models are Firth's",
-    "region": "part of the map that w is the mean of: all, or a subfield; n/a of summary measures",
-    "reference": "true for members of the reference group, who are scored as if not in it",
-    "w": "observed minus expected from the reference group, in its residual standard deviations",
-    "low": "share of points with a two-sided p below the level, and w below zero",
-    "high": "the same, and w above zero",
-    **NORM_COLUMNS,
-    **TRIAL_COLUMNS,
-    "kind": "map, or summary measure",
-    "site": "level of the column that was harmonized",
-    "estimated": "true if its effects were estimated from these participants, not read from a file",
-    "site_shift": "added by the site and taken out: mean over points, unit of the measure",
-    "site_shift_rms": "the same, root mean square over points",
-    "site_scale": "factor of the site on residuals, divided out: mean over points",
-    "offset_before": "mean of the site's residuals, in SD of all: root mean square over points",
-    "offset_after": "the same after harmonization",
-    "spread_before": "SD of the site's residuals, in SD of all: mean over points",
-    "spread_after": "the same after harmonization",
-    "participant_id": "participant",
-    "session_id": "session",
-    "reason": "why",
-    "message": "what was said about it",
-}
+COLUMNS: Mapping[str, str] = _MEANINGS["group"]
+#: The same of a meta-analysis.
+META_COLUMNS: Mapping[str, str] = COLUMNS | _MEANINGS["meta"]
 
 
 def result_tables(cohort: Cohort, analysis: Analysis, settings: GroupSettings) -> Iterator[Named]:

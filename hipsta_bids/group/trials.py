@@ -14,11 +14,11 @@ from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.names import TRIAL_MAPS, TRIAL_TABLES
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group import write
-from hipsta_bids.group.analysis import SideResult, register_side
+from hipsta_bids.group.analysis import SideResult, register_side, templates_of
 from hipsta_bids.group.clusters import frame_of
-from hipsta_bids.group.collect import Exclusion
+from hipsta_bids.group.collect import exclude_visits
 from hipsta_bids.group.comparison import Comparison
-from hipsta_bids.group.data import PARTICIPANT, SESSION, Bool, Cohort, Float
+from hipsta_bids.group.data import PARTICIPANT, Bool, Cohort, Float
 from hipsta_bids.group.figures import Drawing
 from hipsta_bids.group.formula import check_names, listed
 from hipsta_bids.group.glm import FittedMaps
@@ -32,8 +32,16 @@ from hipsta_bids.group.power import (
     power_text,
     sample_size,
 )
-from hipsta_bids.group.reference import Modeled, Retested, Source, Tables
-from hipsta_bids.group.retest import RetestCohort, retest_cohort, retest_text
+from hipsta_bids.group.reference import (
+    Modeled,
+    Reference,
+    RetestCohort,
+    Retested,
+    Source,
+    Tables,
+    retest_cohort,
+    retest_text,
+)
 from hipsta_bids.group.run import (
     GroupInputs,
     GroupOptions,
@@ -46,7 +54,7 @@ from hipsta_bids.group.run import (
 )
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.tables import entity_label, registration_tables
-from hipsta_bids.group.warps import Template, templates_to_json
+from hipsta_bids.group.warps import Template
 from hipsta_bids.io import files, gifti
 from hipsta_bids.progress import each, tell
 from hipsta_bids.protocols.toml import resolve
@@ -57,6 +65,12 @@ if TYPE_CHECKING:
 
 #: Ticks of numbers of participants.
 _COUNTS = tuple(n * 10**power for power in range(5) for n in (1, 2, 3, 5))
+
+
+def folder_of(parts: Sequence[str], among: tuple[str, str] | None) -> str:
+    """Name a folder of results by what was asked, and of whom."""
+    words = (*parts, *(among or ())[1:])
+    return "_".join("".join(c if c.isalnum() else "-" for c in word) for word in words)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,13 +90,34 @@ class TrialRequest:
         if self.effect is not None:
             share = f"{100 * self.effect.share:g}".replace(".", "p")
             parts.append(f"power-{self.effect.kind}-{share}")
-        parts += [self.among[1]] if self.among else []
-        return "_".join("".join(c if c.isalnum() else "-" for c in part) for part in parts)
+        return folder_of(parts, self.among)
+
+
+@dataclass(frozen=True, eq=False)
+class _Question:
+    """What is asked, of whom, and how."""
+
+    source: Source
+    request: TrialRequest
+    settings: GroupSettings
+
+    def size(self, reference: Reference, *, alpha: float, limits: bool = False) -> dict[str, Any]:
+        """Find sample sizes, as columns of their table; none where they are not asked for."""
+        effect = self.request.effect
+        if effect is None:
+            return {}
+        size = sample_size(effect, reference, self.settings, alpha=alpha, limits=limits)
+        return {"power": power_columns(effect, size, reference)}
+
+    @property
+    def shares_mean(self) -> bool:
+        """Whether the effect is a share of the mean, without meaning where it has both signs."""
+        return self.request.effect is not None and self.request.effect.kind == THINNING
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Found:
-    """What was found for some summary measures."""
+    """What was found for some summary measures, or at the points of one map."""
 
     hemi: str
     measures: tuple[str, ...]
@@ -91,10 +126,9 @@ class Found:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MapFound(Found):
-    """What was found at the points of one map."""
+    """With the places of the points."""
 
     place: FittedMaps
-    """Where the points are."""
 
 
 def run_trial(options: GroupOptions, request: TrialRequest, settings: GroupSettings) -> GroupResult:
@@ -128,14 +162,13 @@ def run_trial(options: GroupOptions, request: TrialRequest, settings: GroupSetti
             for variable, visits in source.model.design.dropped.items()
             for visit in visits
         }
+    asked = _Question(source, request, settings)
     maps = {
-        name: list(
-            _of_maps(one, (name,) if name else inputs.measures.maps, source, effect, settings)
-        )
+        name: list(_of_maps(asked, one, (name,) if name else inputs.measures.maps))
         for name, one in cohorts.items()
     }
-    measures = list(_of_measures(cohorts[""], inputs.measures.summaries, source, effect, settings))
-    notes = [*inputs.notes, *_notes(maps, inputs, source, effect)]
+    measures = list(_of_measures(asked, cohorts[""], inputs.measures.summaries))
+    notes = [*inputs.notes, *_notes(asked, maps, inputs)]
     modeled = cohort.table
     if isinstance(source, Modeled):
         modeled = modeled.iloc[source.model.design.rows]
@@ -146,8 +179,8 @@ def run_trial(options: GroupOptions, request: TrialRequest, settings: GroupSetti
         for surface, found in maps.items():
             _write_maps(folder, surface, cohorts[surface], found)
         if templates := templates_of(sides):
-            files.write_json(folder / "template.json", templates_to_json(templates))
-        files.write_text(folder / "methods.md", _methods(source, request, modeled, maps, settings))
+            files.write_json(folder / "template.json", templates)
+        files.write_text(folder / "methods.md", _methods(asked, modeled, maps))
         figures = (figure for key, own in maps.items() for figure in _figures(cohorts[key], own))
         return write.write_figures(folder, figures)
 
@@ -198,7 +231,7 @@ def write_answer(
 
     ``fill`` writes all else into the folder, and returns notes.
     """
-    excluded = [*inputs.exclusions, *_excluded(inputs.cohort.table, left_out)]
+    excluded = [*inputs.exclusions, *exclude_visits(inputs.cohort.table, left_out)]
     region, people = options.sheets.region, int(visits[PARTICIPANT].nunique())
     name = options.model.name or name + ("" if region == "body" else f"_{region}")
     describe_dataset(options)
@@ -230,12 +263,6 @@ def write_answer(
         notes=tuple(notes),
         warnings=inputs.found.warnings,
     )
-
-
-def templates_of(sides: Mapping[str, SideResult]) -> dict[str, Template]:
-    """Templates of registration by hemisphere, where it made or used one."""
-    found = {hemi: side.registration.template for hemi, side in sides.items()}
-    return {hemi: template for hemi, template in found.items() if template is not None}
 
 
 def _choose(
@@ -270,51 +297,34 @@ def members(table: pd.DataFrame, among: tuple[str, str] | None, option: str = "-
     return np.asarray(keep, dtype=bool)
 
 
-def _of_maps(
-    cohort: Cohort,
-    names: Sequence[str],
-    source: Source,
-    effect: TrialEffect | None,
-    settings: GroupSettings,
-) -> Iterator[MapFound]:
+def _of_maps(asked: _Question, cohort: Cohort, names: Sequence[str]) -> Iterator[MapFound]:
     """Results at each point of the maps of a cohort."""
+    alpha = point_level(asked.settings) if asked.request.effect else np.nan
     for hemi, side in cohort.sides.items() if names else ():
-        place = source.place(hemi, side.only([name for name in names if name in side.maps]))
+        place = asked.source.place(hemi, side.only([name for name in names if name in side.maps]))
         for measure in place.maps.maps:
-            tables, reference = source.of_map(place, measure)
-            signed = effect is not None and effect.kind == THINNING
-            # A share of a mean has no meaning where values have both signs.
-            if effect is not None and not (signed and np.nanmin(place.values(measure)) <= 0):
-                size = sample_size(effect, reference, settings, alpha=point_level(settings))
-                tables = {**tables, "power": power_columns(effect, size, reference)}
+            tables, reference = asked.source.of_map(place, measure)
+            if not (asked.shares_mean and np.nanmin(place.values(measure)) <= 0):
+                tables = {**tables, **asked.size(reference, alpha=alpha)}
             yield MapFound(hemi=hemi, measures=(measure,), tables=tables, place=place)
 
 
-def _of_measures(
-    cohort: Cohort,
-    only: Sequence[str] | None,
-    source: Source,
-    effect: TrialEffect | None,
-    settings: GroupSettings,
-) -> Iterator[Found]:
+def _of_measures(asked: _Question, cohort: Cohort, only: Sequence[str] | None) -> Iterator[Found]:
     """Results of the summary measures of each hemisphere and of the mean of both."""
-    for hemi, names, values, tables, described in source.of_summaries(cohort, only):
-        own, reference = tables, described
-        if effect is not None:
-            if effect.kind == THINNING:
-                signed = np.where(np.isfinite(values), values, 1.0).min(axis=0) <= 0
-                reference = replace(described, mean=np.where(signed, np.nan, described.mean))
-            size = sample_size(effect, reference, settings, alpha=settings.power.alpha, limits=True)
-            own = {**tables, "power": power_columns(effect, size, reference)}
+    alpha = asked.settings.power.alpha
+    for hemi, names, values, tables, reference in asked.source.of_summaries(cohort, only):
+        known = reference
+        if asked.shares_mean:
+            signed = np.where(np.isfinite(values), values, 1.0).min(axis=0) <= 0
+            known = replace(reference, mean=np.where(signed, np.nan, reference.mean))
+        own = {**tables, **asked.size(known, alpha=alpha, limits=True)}
         yield Found(hemi=hemi, measures=names, tables=own)
 
 
 def _notes(
-    maps: Mapping[str, Sequence[MapFound]],
-    inputs: GroupInputs,
-    source: Source,
-    effect: TrialEffect | None,
+    asked: _Question, maps: Mapping[str, Sequence[MapFound]], inputs: GroupInputs
 ) -> Iterator[str]:
+    source, effect = asked.source, asked.request.effect
     if isinstance(source, Retested) and (n := len(source.retest.left_out)):
         yield f"{n} visits of participants who lack a session are left out, see excluded.tsv"
     if effect is None:
@@ -339,27 +349,9 @@ def _notes(
         yield f"{later} later sessions are not in it; --visits takes all"
 
 
-def _excluded(table: pd.DataFrame, left_out: Mapping[str, tuple[str, str]]) -> Iterator[Exclusion]:
-    """List visits that are left out, with reason and message."""
-    for row in table.loc[list(left_out), [PARTICIPANT, SESSION]].itertuples():
-        reason, message = left_out[str(row.Index)]
-        yield Exclusion(
-            participant=str(row[1]),
-            session=row[2],
-            hemi=files.MISSING,
-            reason=reason,
-            message=message,
-        )
-
-
-def _methods(
-    source: Source,
-    request: TrialRequest,
-    visits: pd.DataFrame,
-    maps: Mapping[str, Sequence[MapFound]],
-    settings: GroupSettings,
-) -> str:
+def _methods(asked: _Question, visits: pd.DataFrame, maps: Mapping[str, Sequence[MapFound]]) -> str:
     """Word what was done, with the works it rests on."""
+    source, request, settings = asked.source, asked.request, asked.settings
     cite = Citations()
     people = int(visits[PARTICIPANT].nunique())
     among = f" ({' '.join(request.among)})" if request.among else ""

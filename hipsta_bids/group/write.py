@@ -16,7 +16,7 @@ import pyarrow as pa
 from pyarrow import parquet
 
 from hipsta_bids.derivatives.names import DATASET_FILES
-from hipsta_bids.group.analysis import Analysis, tested_maps
+from hipsta_bids.group.analysis import Analysis, templates_of, tested_maps
 from hipsta_bids.group.collect import Exclusion
 from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float, Int, SideMaps, some_sheets
 from hipsta_bids.group.figures import Drawing, draw_figures, encode
@@ -34,7 +34,6 @@ from hipsta_bids.group.methods import methods_text
 from hipsta_bids.group.normative import ScoredMaps
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.shapes import AverageShape
-from hipsta_bids.group.site_effects import save_effects
 from hipsta_bids.group.tables import (
     COLUMNS,
     design_table,
@@ -43,7 +42,6 @@ from hipsta_bids.group.tables import (
     point_tables,
     result_tables,
 )
-from hipsta_bids.group.warps import templates_to_json
 from hipsta_bids.io import files, gifti
 from hipsta_bids.progress import tell
 from hipsta_bids.reports.group_tables import JOINT
@@ -132,18 +130,13 @@ def write_results(
         if analysis.harmonization is not None:
             states.append(analysis.harmonization.cohort.sides)
         _write_maps(folder / "maps.parquet", cohort, states if registered else [], points)
-    templates = {
-        hemi: side.registration.template
-        for hemi, side in analysis.sides.items()
-        if side.registration.template is not None
-    }
-    if templates:
-        files.write_json(folder / "template.json", templates_to_json(templates))
+    if templates := templates_of(analysis.sides):
+        files.write_json(folder / "template.json", templates)
     if analysis.harmonization is not None:
         done = [analysis.harmonization, *(other.harmonization for _, other in others.values())]
         how = digests({hemi: side.registration for hemi, side in analysis.sides.items()})
         if effects := effects_of([one for one in done if one is not None], how):
-            save_effects(folder / "harmonization.json", effects)
+            files.write_json(folder / "harmonization.json", effects.model_dump(by_alias=True))
     for own, one in ((cohort, analysis), *others.values()):
         _write_surfaces(folder, own, one)
         _write_stats(folder, _stats(one))

@@ -31,6 +31,7 @@ _EXPECTED = {
     "int_type": "a whole number",
     "string_type": "a text",
     "tuple_type": "a list",
+    "list_type": "a list",
     "model_type": "a table of keys and values",
     "literal_error": "{expected}",
     "greater_than": "above {gt:g}",

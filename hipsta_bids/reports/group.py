@@ -323,44 +323,22 @@ def _runs(text: str) -> list[tuple[bool, str]]:
 
 #: Sections of the page, from top to bottom.
 SECTIONS: tuple[Section[GroupResults], ...] = (
-    Section(key="power", title="Sample size", template="group/power.html", build=power),
-    Section(key="retest", title="Test-retest", template="group/retest.html", build=retest),
-    Section(key="norms", title="Norms", template="group/norms.html", build=norms),
-    Section(key="found", title="What was found", template="group/found.html", build=findings),
-    Section(key="maps", title="Maps", template="group/maps.html", build=map_scenes),
-    Section(key="peaks", title="Clusters and peaks", template="group/peaks.html", build=peaks),
-    Section(
-        key="summaries", title="Summary measures", template="group/summaries.html", build=summaries
-    ),
-    Section(
-        key="classification",
-        title="Classification",
-        template="group/classification.html",
-        build=_classification,
-    ),
-    Section(key="scores", title="w-scores", template="group/scores.html", build=scores),
-    Section(key="people", title="Participants", template="group/people.html", build=participants),
-    Section(key="model", title="Model", template="group/model.html", build=design),
-    Section(
-        key="registration",
-        title="Registration",
-        template="group/registration.html",
-        build=_registration,
-    ),
-    Section(
-        key="harmonization",
-        title="Harmonization",
-        template="group/harmonization.html",
-        build=_harmonization,
-    ),
-    Section(
-        key="sections",
-        title="Average cross-sections",
-        template="group/sections.html",
-        build=_sections_of_groups,
-    ),
-    Section(key="methods", title="Methods paragraph", template="group/methods.html", build=methods),
-    Section(key="origin", title="Origin", template="group/origin.html", build=origin),
+    Section("power", "Sample size", "group/power.html", power),
+    Section("retest", "Test-retest", "group/retest.html", retest),
+    Section("norms", "Norms", "group/norms.html", norms),
+    Section("found", "What was found", "group/found.html", findings),
+    Section("maps", "Maps", "group/maps.html", map_scenes),
+    Section("peaks", "Clusters and peaks", "group/peaks.html", peaks),
+    Section("summaries", "Summary measures", "group/summaries.html", summaries),
+    Section("classification", "Classification", "group/classification.html", _classification),
+    Section("scores", "w-scores", "group/scores.html", scores),
+    Section("people", "Participants", "group/people.html", participants),
+    Section("model", "Model", "group/model.html", design),
+    Section("registration", "Registration", "group/registration.html", _registration),
+    Section("harmonization", "Harmonization", "group/harmonization.html", _harmonization),
+    Section("sections", "Average cross-sections", "group/sections.html", _sections_of_groups),
+    Section("methods", "Methods paragraph", "group/methods.html", methods),
+    Section("origin", "Origin", "group/origin.html", origin),
 )
 
 

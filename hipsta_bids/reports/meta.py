@@ -228,34 +228,18 @@ def _sites(results: GroupResults) -> Mapping[str, Any]:
 
 #: Sections of the page, from top to bottom.
 SECTIONS: tuple[Section[GroupResults], ...] = (
-    Section(key="found", title="What was found", template="group/found.html", build=findings),
-    Section(
-        key="effects", title="Fixed and random", template="meta/effects.html", build=_explained
-    ),
-    Section(key="sites", title="Sites", template="meta/sites.html", build=_sites),
-    Section(
-        key="forests", title="Peaks by site", template="meta/forests.html", build=_peak_forests
-    ),
-    Section(
-        key="measures",
-        title="Summary measures by site",
-        template="meta/forests.html",
-        build=_summary_forests,
-    ),
-    Section(key="maps", title="Maps", template="group/maps.html", build=_maps),
-    Section(
-        key="between",
-        title="Heterogeneity",
-        template="meta/heterogeneity.html",
-        build=_heterogeneity,
-    ),
-    Section(key="without", title="Without a site", template="meta/without.html", build=_left_out),
-    Section(key="peaks", title="Clusters and peaks", template="group/peaks.html", build=peaks),
-    Section(
-        key="summaries", title="Summary measures", template="group/summaries.html", build=summaries
-    ),
-    Section(key="methods", title="Methods paragraph", template="group/methods.html", build=methods),
-    Section(key="origin", title="Origin", template="group/origin.html", build=origin),
+    Section("found", "What was found", "group/found.html", findings),
+    Section("effects", "Fixed and random", "meta/effects.html", _explained),
+    Section("sites", "Sites", "meta/sites.html", _sites),
+    Section("forests", "Peaks by site", "meta/forests.html", _peak_forests),
+    Section("measures", "Summary measures by site", "meta/forests.html", _summary_forests),
+    Section("maps", "Maps", "group/maps.html", _maps),
+    Section("between", "Heterogeneity", "meta/heterogeneity.html", _heterogeneity),
+    Section("without", "Without a site", "meta/without.html", _left_out),
+    Section("peaks", "Clusters and peaks", "group/peaks.html", peaks),
+    Section("summaries", "Summary measures", "group/summaries.html", summaries),
+    Section("methods", "Methods paragraph", "group/methods.html", methods),
+    Section("origin", "Origin", "group/origin.html", origin),
 )
 
 

@@ -23,7 +23,7 @@ _LOGGER = logging.getLogger(__name__)
 _Topic = TypeVar("_Topic")
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Section(Generic[_Topic]):
     """One part of a page."""
 
@@ -121,20 +121,19 @@ def reason_sections() -> tuple[ReasonSection, ...]:
             text=section["text"],
             reasons={name: Reason(**row) for name, row in section["reasons"].items()},
         )
-        for section in _reason_table()["section"]
+        for section in _table("reasons.toml")["section"]
     )
 
 
 def reason_actions() -> Mapping[str, str]:
     """Titles of what to do, in the order of the reference page, by the keys that reasons name."""
-    actions: Mapping[str, str] = _reason_table()["actions"]
+    actions: Mapping[str, str] = _table("reasons.toml")["actions"]
     return actions
 
 
 @cache
-def _reason_table() -> dict[str, Any]:
-    text = (files("hipsta_bids.reports") / "reasons.toml").read_text(encoding="utf-8")
-    return tomllib.loads(text)
+def _table(name: str) -> dict[str, Any]:
+    return tomllib.loads((files("hipsta_bids.reports") / name).read_text(encoding="utf-8"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,89 +166,19 @@ class Usual:
         return f"at most {self.text(self.high)}" if high else "any"
 
 
-def usual_ranges(thickness: float, settings: Mapping[str, Any]) -> tuple[Usual, ...]:
+def usual_ranges(thickness: float, settings: Mapping[str, Any]) -> list[Usual]:
     """List the quality numbers that a page shows; some limits are relative to the thickness, mm."""
-    usual = Settings().model_dump()
-    stages = {name: usual[name] | dict(settings.get(name) or {}) for name in usual}
-    checks, topology, body = stages["checks"], stages["topology"], stages["body"]
-    return (
-        Usual(
-            name="voxels_across",
-            title="Voxels across the sheet",
-            meaning="mean thickness in in-plane voxels: fewer make thickness coarse",
-            low=checks["min_voxels_across"],
-        ),
-        Usual(
-            name="body_length_mm",
-            title="Distance of the end planes",
-            meaning="along the body, from the posterior plane to the anterior one",
-            low=body["min_length"],
-            unit="mm",
-        ),
-        Usual(
-            name="length_difference_mm",
-            title="Difference of these distances",
-            meaning="this side minus the other; look at ends without labels",
-            low=-checks["usual_length_difference"],
-            high=checks["usual_length_difference"],
-            unit="mm",
-        ),
-        *(
-            Usual(
-                name=f"{end}_end_uncertainty_mm",
-                title=f"Uncertainty of the {end} end",
-                meaning="standard error over the cues by which it was found, 0 with labels",
-                high=checks["flag_end"],
-                unit="mm",
-            )
-            for end in ("posterior", "anterior")
-        ),
-        Usual(
-            name="changed_fraction",
-            title="Changed by repairs",
-            meaning="share of the body that repairs of its topology added or removed",
-            high=topology["flag_fraction"],
-            percent=True,
-        ),
-        Usual(
-            name="boundary_rim_distance_mm",
-            title="Disagreement of the boundaries",
-            meaning="how far two ways to find the medial and the lateral boundary differ",
-            high=checks["flag_rim_distance"] * thickness,
-            unit="mm",
-        ),
-        Usual(
-            name="label_order",
-            title="Order of labels",
-            meaning="rank correlation of x with the order of labels from medial to lateral",
-            low=checks["min_label_order"],
-        ),
-        Usual(
-            name="folded_fraction",
-            title="Folded coordinates",
-            meaning="share of the volume whose coordinates are inverted",
-            high=checks["flag_folded"],
-            percent=True,
-        ),
-        Usual(
-            name="filled_fraction",
-            title="Filled columns",
-            meaning="share of the columns that were filled from their neighbors",
-            high=checks["flag_filled"],
-            percent=True,
-        ),
-        Usual(
-            name="repaired_fraction",
-            title="Repaired columns",
-            meaning="share of the columns that a repair touched; they are hatched on the sheet",
-            percent=True,
-        ),
-        Usual(
-            name="tetra_quality_median",
-            title="Quality of tetrahedra",
-            meaning="median, 1 for regular ones",
-        ),
-    )
+    usual, ranges = Settings().model_dump(), []
+    for name, row in _table("usual.toml").items():
+        scale = thickness if row.get("relative") else 1.0
+        limits = {}
+        for end in row.keys() & {"low", "high"}:
+            stage, setting = row[end].removeprefix("-").split(".")
+            value = scale * (usual[stage] | dict(settings.get(stage) or {}))[setting]
+            limits[end] = -value if row[end].startswith("-") else value
+        about = {key: row[key] for key in row.keys() - {"low", "high", "relative"}}
+        ranges.append(Usual(name=name, **about, **limits))
+    return ranges
 
 
 def number(metrics: Mapping[str, Any], name: str) -> float:

@@ -2,13 +2,13 @@
 
 import platform
 import re
+import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib import import_module
+from importlib import import_module, resources
 from importlib.metadata import version
 from io import BytesIO
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from hipsta_bids import __version__
@@ -21,65 +21,15 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+_TABLE = tomllib.loads(
+    (resources.files("hipsta_bids.validation") / "suites.toml").read_text("utf-8")
+)
 #: Suites in the order of the report: name, and the function that runs it.
-SUITES: Mapping[str, str] = MappingProxyType(
-    {
-        "accuracy": "accuracy:run",
-        "limits": "accuracy:run_limits",
-        "slices": "thick_slices:run",
-        "ends": "ends:run",
-        "convergence": "accuracy:run_convergence",
-        "invariance": "invariance:run",
-        "uncertainty": "uncertainty:run",
-        "mending": "mending:run",
-        "defects": "defects:run",
-        "population": "population:run",
-        "group": "group:run",
-        "trials": "trials:run",
-        "harmonization": "harmonization:run",
-        "norms": "norms:run",
-        "surrogate": "surrogate:run",
-        "hippunfold": "hippunfold:run",
-        "heads": "heads:run",
-    }
-)
-
+SUITES: Mapping[str, str] = {name: row["run"] for name, row in _TABLE.items()}
 #: Suites that measure real segmentations too, where there are any.
-WITH_LABELS = frozenset(
-    {
-        "defects",
-        "ends",
-        "hippunfold",
-        "invariance",
-        "mending",
-        "population",
-        "slices",
-        "surrogate",
-    }
-)
-
+WITH_LABELS = frozenset(name for name, row in _TABLE.items() if row.get("labels"))
 #: What each suite asks, as the sentence that would hold if all its targets were met.
-QUESTIONS: Mapping[str, str] = MappingProxyType(
-    {
-        "accuracy": "Drawn shapes get the thickness, curvature, volume and areas that they have",
-        "limits": "Sheets too thin for their voxels are measured, or refused with the reason",
-        "slices": "Thick slices give the maps of full resolution",
-        "ends": "The ends of the body are found without labels of head and tail",
-        "convergence": "The error falls with the voxel size",
-        "invariance": "Position, axis order and mirroring leave a map as it is",
-        "uncertainty": "The SD from perturbed copies is that over positions",
-        "mending": "Labels that were mended are measured as undamaged ones",
-        "defects": "Damage is repaired rightly, flagged or refused",
-        "population": "Flags spare sound hemispheres, and find damaged ones, of other brains",
-        "group": "Tests of the group level hold their level, and find a planted effect",
-        "trials": "Trials of the sample size that was found have the power that was asked for",
-        "harmonization": "Harmonization removes sites, and leaves effects as they are",
-        "norms": "Centiles of norms hold in other people, also at a new site",
-        "surrogate": "Thickness without a mesh agrees with that of the mesh",
-        "hippunfold": "Thickness agrees with HippUnfold's own",
-        "heads": "Digitations of the head are measured, or found to touch",
-    }
-)
+QUESTIONS: Mapping[str, str] = {name: row["question"] for name, row in _TABLE.items()}
 
 #: What is written, below the output folder.
 PAGE = "validation.md"

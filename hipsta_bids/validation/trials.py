@@ -22,8 +22,7 @@ from hipsta_bids.group.power import (
     power_of,
     sample_size,
 )
-from hipsta_bids.group.reference import Modeled, Reference, Retested
-from hipsta_bids.group.retest import retest_cohort
+from hipsta_bids.group.reference import Modeled, Reference, Retested, retest_cohort
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.types import Bool, Float
 from hipsta_bids.validation.group import smooth_noise

@@ -290,14 +290,14 @@ def fewer_points(content):
 
 
 SPOILED = {
-    "format": (lambda c: c.update(Format=2), 65, "format 2, not 1"),
+    "format": (lambda c: c.update(Format=2), 65, "Format is 2, but has to be 1"),
     "shape": (
         lambda c: thickness(c, shift=c["Maps"]["L"]["thickness"]["shift"][:1]),
         65,
         "shift of thickness, L, has (1, 147)",
     ),
     "points": (fewer_points, 65, "has 146 points, those of these participants 147"),
-    "text": (lambda c: thickness(c, mean="os"), 65, "not a file of harmonization (ValueError"),
+    "text": (lambda c: thickness(c, mean="os"), 65, "mean is 'os', but has to be a list"),
     "negative": (
         lambda c: thickness(c, sd=[-1.0] * 147),
         65,

@@ -14,8 +14,8 @@ from statsmodels.stats.power import TTestIndPower
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.group import trials
+from hipsta_bids.group.reference import repeatability
 from hipsta_bids.group.registration import mean_profiles, register
-from hipsta_bids.group.retest import repeatability
 from hipsta_bids.group.settings import RegistrationSettings
 from hipsta_bids.group.tables import COLUMNS
 from hipsta_bids.reports.group import group_page
