@@ -146,7 +146,7 @@ class Measurement:
         from hipsta_bids.io.xarrays import make_dataset  # noqa: PLC0415  (an optional extra)
 
         sheet, layers = self.hemisphere.sheet, self.hemisphere.layers
-        nx, ny, nz = sheet.points.shape[:3]
+        nz = sheet.points.shape[2]
         grid = ("x", "y")
         state = {"subfield": self.subfield, "valid": sheet.valid, "repaired": self.table.repaired}
         variables: dict[str, Variable] = {
@@ -155,7 +155,7 @@ class Measurement:
         variables |= {name: (grid, values, attributes(name)) for name, values in state.items()}
         variables |= _three_dimensional(layers)
         coordinates = {
-            **node_axes(self.settings.sheet.model_dump(), (nx, ny)),
+            **node_axes(self.settings.sheet.model_dump(), self.settings.body.region),
             "layer": (["layer"], np.linspace(0, 1, nz), {"long_name": "interior to exterior"}),
             "ras": (["ras"], list(POSITION), {}),
         }
@@ -180,12 +180,10 @@ def attributes(name: str) -> dict[str, str]:
     return {"long_name": words, **({"units": unit} if unit else {})}
 
 
-def node_axes(grid: Mapping[str, Any], shape: tuple[int, int]) -> dict[str, Any]:
+def node_axes(grid: Mapping[str, Any], region: str) -> dict[str, Any]:
     """Coordinates of the nodes, by the settings of the sheet."""
-    return {
-        axis: ([axis], node_coordinates(float(grid[f"{axis}_extent"]), count), _NODES[axis])
-        for axis, count in zip("xy", shape, strict=True)
-    }
+    both = zip("xy", node_coordinates(grid, region), strict=True)
+    return {axis: ([axis], values, _NODES[axis]) for axis, values in both}
 
 
 def check_choice(name: str, value: object, choices: Mapping[str, object]) -> None:
@@ -403,8 +401,9 @@ def _row(one: Hemisphere) -> dict[str, object]:
 def _lazy_dataset(root: Path, own: list[Hemisphere], table: pd.DataFrame) -> "xr.Dataset":
     from hipsta_bids.io.xarrays import make_dataset, read_later  # noqa: PLC0415  (optional)
 
-    grid = settings_of(root)["sheet"]
-    shape = (int(grid["x_nodes"]), int(grid["y_nodes"]))
+    axes_of_nodes = node_axes(settings_of(root)["sheet"], table["region"].iloc[0])
+    nx, ny = (len(values) for _, values, _ in axes_of_nodes.values())
+    shape = nx, ny
     labels = [sorted(table[column].unique()) for column in ("participant_id", "session_id", "hemi")]
     outer = tuple(len(names) for names in labels)
     axes = ("participant", "session", "side")
@@ -442,7 +441,7 @@ def _lazy_dataset(root: Path, own: list[Hemisphere], table: pd.DataFrame) -> "xr
     variables["status"] = (axes, status, {"long_name": "how the hemisphere ended; empty: none"})
     coordinates = {
         **{name: ([name], values, {}) for name, values in zip(axes, labels, strict=True)},
-        **node_axes(grid, shape),
+        **axes_of_nodes,
         "ras": (["ras"], list(POSITION), {}),
     }
     about = {"protocol": table["protocol"].iloc[0], "region": table["region"].iloc[0]}

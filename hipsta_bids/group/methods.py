@@ -13,9 +13,7 @@ from hipsta_bids.group.inference import PERMUTATIONS, control_fdr
 from hipsta_bids.group.normative import Scores
 from hipsta_bids.group.norms import LEVELS, NormsFile
 from hipsta_bids.group.settings import GroupSettings, MultiplicitySettings, NormSettings
-
-# Works that methods of the group level rest on.
-
+from hipsta_bids.protocols import EXPERIMENTAL
 
 #: Key and entry of each work that the methods rest on.
 REFERENCES: Mapping[str, str] = {
@@ -122,6 +120,8 @@ _MEASURED = {
     "body": "the hippocampus",
     "extended": "the hippocampus and the neighboring cortex",
     "entorhinal": "the cortex beside the hippocampus",
+    "headbody": "the head and the body of the hippocampus on one sheet (experimental)",
+    "whole": "the whole hippocampus on one sheet (experimental)",
 }
 
 
@@ -162,6 +162,8 @@ def methods_text(
     paragraphs[0] += _rated(ratings)
     if analysis.sides or others:
         paragraphs.append(_alignment(analysis, settings, cite, others))
+    if region in EXPERIMENTAL and analysis.fitted:
+        paragraphs.append(_rims(analysis, settings))
     paragraphs += _harmonization(analysis, cite)
     paragraphs.append(_models(analysis, settings, cite))
     paragraphs += [_joint(analysis, settings, cite)] if settings.joint.measures else []
@@ -259,6 +261,19 @@ def _registration(analysis: Analysis, settings: GroupSettings, cite: Callable[[s
         f" registered by {method}, and the warps were applied to all maps. The share of the"
         f" variance of the profiles that their mean explains went from {shares}.{moved}"
         f" Warps out of line with the others: {extreme}."
+    )
+
+
+def _rims(analysis: Analysis, settings: GroupSettings) -> str:
+    """Say how points are handled that some participants lack."""
+    fits = [fit for one in analysis.fitted.values() for fit in one.fits.values()]
+    n = np.concatenate([fit.n[np.isfinite(fit.tests[0].p)] for fit in fits])
+    span = f" ({n.min()} to {n.max()} per point)" if len(n) else ""
+    return (
+        "Sheets have no values within 1 mm of edges, ends and filled holes, which differ between"
+        f" participants. None was imputed: a point was tested by those who have a value{span}, if"
+        f" {settings.glm.min_residual_df} or more degrees of freedom are left. Profiles for"
+        " registration are means of known values, interpolated where a whole position has none."
     )
 
 

@@ -21,6 +21,7 @@ from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.group.collect import Exclusion, SheetRecord
 from hipsta_bids.group.data import MOST_KEPT, PARTICIPANT, SESSION, Float, Measures, SideMaps
 from hipsta_bids.group.settings import GroupSettings
+from hipsta_bids.protocols import rows_beyond
 from hipsta_bids.types import VisitKey
 
 #: Map that registration rests on.
@@ -121,8 +122,8 @@ def read_sheets(
     """
     if error_window:
         _check_errors(records, maps)
-    grid = settings["sheet"]
-    shape = (int(grid["x_nodes"]), int(grid["y_nodes"]))
+    x, y = node_coordinates(settings["sheet"], records[0].place.name.region if records else "body")
+    shape = len(x), len(y)
     visits = visits_of(records) if visits is None else visits
     row_of = {visit: row for row, visit in enumerate(visits)}
     names = tuple(dict.fromkeys((*maps, CURVATURE)))
@@ -157,8 +158,8 @@ def read_sheets(
     return Measured(
         visits=table,
         sides=sides,
-        x=node_coordinates(grid["x_extent"], shape[0]),
-        y=node_coordinates(grid["y_extent"], shape[1]),
+        x=x,
+        y=y,
         units=(read_units(records[0].place) if records else {})
         | {n: ARBITRARY for n in names if n not in SHEET_MAPS},
         sources={
@@ -241,9 +242,17 @@ def visits_of(records: Sequence[SheetRecord]) -> list[VisitKey]:
     return list(dict.fromkeys((r.place.name.subject, r.place.name.session) for r in records))
 
 
-def node_coordinates(extent: float, nodes: int) -> Float:
-    """Coordinates of the nodes, without the rounding errors that would show in tables."""
-    return np.asarray(np.linspace(-extent, extent, nodes).round(10) + 0.0, dtype=np.float64)
+def node_coordinates(grid: Mapping[str, Any], region: str) -> tuple[Float, Float]:
+    """Coordinates of the nodes along x and y, by the settings of the sheet.
+
+    They are without the rounding errors that would show in tables.
+    """
+    nodes, extent = int(grid["y_nodes"]), float(grid["y_extent"])
+    tail, head = rows_beyond(region, nodes)
+    step = 2 * extent / (nodes - 1)
+    x = np.linspace(-float(grid["x_extent"]), float(grid["x_extent"]), int(grid["x_nodes"]))
+    y = np.linspace(-extent - tail * step, extent + head * step, tail + nodes + head)
+    return x.round(10) + 0.0, y.round(10) + 0.0
 
 
 def visit_name(subject: str, session: str | None) -> str:

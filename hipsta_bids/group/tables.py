@@ -50,6 +50,7 @@ COLUMNS: Mapping[str, str] = {
     "test": "t, or F for contrasts of several rows",
     "x": "sheet coordinate, -1 medial to 1 lateral",
     "y": "sheet coordinate, -1 posterior to 1 anterior",
+    "part": "tail (y below -1), body or head (y above 1), where these are on the sheet",
     "vertex": "vertex of the surface, the first is 0",
     "surface_x": "coordinate of the vertex on the surface that the maps lie on",
     "surface_y": "the same along the second axis",
