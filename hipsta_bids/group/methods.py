@@ -12,6 +12,7 @@ from hipsta_bids.group.data import PARTICIPANT, Cohort
 from hipsta_bids.group.inference import PERMUTATIONS, control_fdr
 from hipsta_bids.group.normative import Scores
 from hipsta_bids.group.norms import LEVELS, NormsFile
+from hipsta_bids.group.read import LEAST_SHARE
 from hipsta_bids.group.settings import GroupSettings, MultiplicitySettings, NormSettings
 from hipsta_bids.protocols import EXPERIMENTAL
 
@@ -163,7 +164,7 @@ def methods_text(
     if analysis.sides or others:
         paragraphs.append(_alignment(analysis, settings, cite, others))
     if region in EXPERIMENTAL and analysis.fitted:
-        paragraphs.append(_rims(analysis, settings))
+        paragraphs.append(_rims(analysis))
     paragraphs += _harmonization(analysis, cite)
     paragraphs.append(_models(analysis, settings, cite))
     paragraphs += [_joint(analysis, settings, cite)] if settings.joint.measures else []
@@ -264,16 +265,16 @@ def _registration(analysis: Analysis, settings: GroupSettings, cite: Callable[[s
     )
 
 
-def _rims(analysis: Analysis, settings: GroupSettings) -> str:
+def _rims(analysis: Analysis) -> str:
     """Say how points are handled that some participants lack."""
     fits = [fit for one in analysis.fitted.values() for fit in one.fits.values()]
     n = np.concatenate([fit.n[np.isfinite(fit.tests[0].p)] for fit in fits])
     span = f" ({n.min()} to {n.max()} per point)" if len(n) else ""
     return (
         "Sheets have no values within 1 mm of edges, ends and filled holes, which differ between"
-        f" participants. None was imputed: a point was tested by those who have a value{span}, if"
-        f" {settings.glm.min_residual_df} or more degrees of freedom are left. Profiles for"
-        " registration are means of known values, interpolated where a whole position has none."
+        f" participants; points that fewer than {LEAST_SHARE:.0%} have were left out. None was"
+        f" imputed: a point was tested by those who have a value{span}. Profiles for registration"
+        " are means of known values, interpolated where a whole position has none."
     )
 
 

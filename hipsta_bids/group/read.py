@@ -21,7 +21,7 @@ from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.group.collect import Exclusion, SheetRecord
 from hipsta_bids.group.data import MOST_KEPT, PARTICIPANT, SESSION, Float, Measures, SideMaps
 from hipsta_bids.group.settings import GroupSettings
-from hipsta_bids.protocols import rows_beyond
+from hipsta_bids.protocols import EXPERIMENTAL, rows_beyond
 from hipsta_bids.types import VisitKey
 
 #: Map that registration rests on.
@@ -35,6 +35,8 @@ SHEET_MAPS = tuple(row.name for row in MAPS)
 VOLUME = "volume_"
 #: Unit of sampled maps whose own unit is not known.
 ARBITRARY = "arbitrary"
+#: Share of the sheets that need a value at a point, where sheets have rims without values.
+LEAST_SHARE = 0.5
 #: Number of measures that a message lists.
 _SHOWN = 12
 
@@ -122,7 +124,8 @@ def read_sheets(
     """
     if error_window:
         _check_errors(records, maps)
-    x, y = node_coordinates(settings["sheet"], records[0].place.name.region if records else "body")
+    region = records[0].place.name.region if records else "body"
+    x, y = node_coordinates(settings["sheet"], region)
     shape = len(x), len(y)
     visits = visits_of(records) if visits is None else visits
     row_of = {visit: row for row, visit in enumerate(visits)}
@@ -145,6 +148,8 @@ def read_sheets(
             damaged += found
             sides[hemi] = side.sheets(np.array([not text for text in why]))
             own = [r for r, text in zip(own, why, strict=True) if not text]
+            if region in EXPERIMENTAL:
+                _leave_rare(sides[hemi])
         if own and error_window:
             errors = _read_errors(own, shape, maps, error_window)
             sides[hemi] = replace(sides[hemi], errors=errors)
@@ -168,6 +173,12 @@ def read_sheets(
         },
         damaged=tuple(damaged),
     )
+
+
+def _leave_rare(side: SideMaps) -> None:
+    """Take out points that few sheets have: beside rims, which differ, those are a selection."""
+    for values in side.maps.values():
+        values[:, np.isfinite(values).mean(axis=0) < LEAST_SHARE] = np.nan
 
 
 def _damage(side: SideMaps, i: int, rules: GroupSettings) -> str | None:

@@ -27,12 +27,11 @@ HOLE = (slice(4, 7), slice(TAIL + 1, TAIL + 4))
 
 
 def known_nodes():
-    """Rims of all, wider in some; a hole in all but two of either group; a place of one alone."""
+    """Rims of all, wider in some; a hole in all but two of either group."""
     known = np.ones((N, *SHAPE), dtype=bool)
     known[:, [0, -1]] = False
     known[::2, :, -1] = False
     known[2 : N - 2, *HOLE] = False
-    known[1:, 8, 0] = False
     return known
 
 
@@ -91,10 +90,10 @@ def test_no_value_is_made_where_there_was_none(points):
         n = table.n.to_numpy().reshape(SHAPE)
         assert (n[[0, -1]] == 0).all()
         assert n[:, -1].max() == N // 2
-        assert 0 < n[5, TAIL + 2] <= 4  # registration may carry a neighbor there
+        assert (n[5, TAIL + 1 : TAIL + 4] == 0).all()  # fewer than half have a value
         p = table.p.to_numpy().reshape(SHAPE)
         assert np.isnan(p[n < 2 + 3]).all()  # columns of the model, and degrees of freedom
-        assert np.isfinite(p[n > 8]).all()
+        assert np.isfinite(p[n > N / 2]).all()
 
 
 def test_what_is_experimental_is_said(folder):

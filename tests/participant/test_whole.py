@@ -1,11 +1,14 @@
 """Head, body and tail on one sheet: a spiral wall along a hooked axis, whose thickness is known."""
 
+import io
 import json
-from contextlib import nullcontext
+from contextlib import nullcontext, redirect_stdout
 from dataclasses import replace
+from pathlib import Path
 
 import nibabel as nib
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -190,7 +193,10 @@ def test_edges_wrap_round_the_boundary() -> None:
         assert np.median(disk.vertices[found.anterior][:, 1]) == 1.0
 
 
-def test_command_writes_beside_the_body_and_says_experimental(tmp_path, capsys) -> None:
+@pytest.fixture(scope="module")
+def out(tmp_path_factory) -> Path:
+    """Output of the command with all that it can add to a hemisphere."""
+    tmp_path = tmp_path_factory.mktemp("whole")
     volume = hooked()
     derivative = tmp_path / "bids/derivatives/maget"
     folder = derivative / "sub-01/anat"
@@ -202,6 +208,9 @@ def test_command_writes_beside_the_body_and_says_experimental(tmp_path, capsys) 
         codes[volume.tissue == label.tissue] = 100 + label.code
     image = nib.Nifti1Image(codes, volume.affine)
     image.to_filename(folder / "sub-01_T1w_labels.nii.gz")
+    points = np.moveaxis(np.indices(codes.shape), 0, -1) @ volume.affine[:3, :3].T
+    height = (points + volume.affine[:3, 3])[..., 1].astype(np.float32)
+    nib.Nifti1Image(height, volume.affine).to_filename(tmp_path / "height.nii.gz")
     (tmp_path / "ends.tsv").write_text(
         "participant_id\themi\tend\tr\ta\ts\tnr\tna\tns\n"
         f"sub-01\tL\tposterior\t0\t{POSTERIOR}\t0\t0\t1\t0\n"
@@ -209,9 +218,21 @@ def test_command_writes_beside_the_body_and_says_experimental(tmp_path, capsys) 
     )
     places = [str(tmp_path / "bids"), str(tmp_path / "out"), "participant", "--n-procs", "1"]
     options = ["--ends", str(tmp_path / "ends.tsv"), "--hemi", "L", "--region", "whole"]
-    assert main([*places, *options]) == 0
-    assert "region whole is experimental" in capsys.readouterr().out
-    results = tmp_path / "out/sub-01/anat"
+    options += ["--map", f"height={tmp_path / 'height.nii.gz'}", "--map-sampling", "mid"]
+    options += ["--uncertainty", "2", "--write-meshes"]
+    with redirect_stdout(io.StringIO()) as said:
+        assert main([*places, *options]) == 0
+    assert "region whole is experimental" in said.getvalue()
+    return tmp_path / "out"
+
+
+def sheet_of(out: Path) -> pd.DataFrame:
+    (path,) = out.glob("sub-01/anat/*_label-whole_desc-sheet_morph.tsv")
+    return pd.read_csv(path, sep="\t")
+
+
+def test_command_writes_beside_the_body_and_says_experimental(out: Path) -> None:
+    results = out / "sub-01/anat"
     (path,) = results.glob("*_label-whole_desc-distortion_morph.shape.gii")
     assert nib.load(path).agg_data().shape == (41 * 51,)
     (record,) = results.glob("*_label-whole_desc-qc_metrics.json")
@@ -220,3 +241,29 @@ def test_command_writes_beside_the_body_and_says_experimental(tmp_path, capsys) 
     assert name.region_title == "whole region (experimental)"  # as pages have it
     (sidecar,) = results.glob("*_label-whole_desc-sheet_morph.json")
     assert "experimental" in json.loads(sidecar.read_text())["MeasuredRegion"]
+
+
+def test_other_volumes_have_values_where_the_sheet_has(out: Path) -> None:
+    (path,) = out.glob("sub-01/anat/*_label-whole_desc-height_map.tsv")
+    sheet, found = sheet_of(out), pd.read_csv(path, sep="\t").height
+    assert 0.1 < sheet.thickness.isna().mean() < 0.5
+    np.testing.assert_array_equal(found.isna(), sheet.thickness.isna())
+    np.testing.assert_allclose(found, sheet.a.where(found.notna()), atol=0.002)  # rounded
+
+
+def test_uncertainty_is_that_of_the_whole_sheet(out: Path) -> None:
+    (path,) = out.glob("sub-01/anat/*_label-whole_desc-uncertainty_morph.tsv")
+    sheet, sd = sheet_of(out), pd.read_csv(path, sep="\t").thickness_sd
+    assert sd[sheet.thickness.isna()].isna().all()
+    assert sd[sheet.thickness.notna()].notna().mean() > 0.9
+    assert 0 < sd.median() < 0.2
+    record = json.loads(next(out.glob("sub-01/anat/*_desc-qc_metrics.json")).read_text())
+    assert record["metrics"]["uncertainty_failed"] == 0
+
+
+def test_mesh_and_layers_are_written(out: Path) -> None:
+    (path,) = out.glob("sub-01/anat/*_label-whole_desc-tet_mesh.vtu")
+    assert path.stat().st_size > 100_000
+    (path,) = out.glob("sub-01/anat/*_label-whole_desc-layers_morph.tsv")
+    layers = pd.read_csv(path, sep="\t")
+    assert len(layers) == 41 * 51 * 9
