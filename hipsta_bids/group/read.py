@@ -178,7 +178,9 @@ def read_sheets(
 def _leave_rare(side: SideMaps) -> None:
     """Take out points that few sheets have: beside rims, which differ, those are a selection."""
     for values in side.maps.values():
-        values[:, np.isfinite(values).mean(axis=0) < LEAST_SHARE] = np.nan
+        known = np.isfinite(values)
+        some = known.any(axis=(1, 2))  # other volumes may lack in a participant
+        values[:, known[some].sum(axis=0) < LEAST_SHARE * some.sum()] = np.nan
 
 
 def _damage(side: SideMaps, i: int, rules: GroupSettings) -> str | None:
