@@ -22,6 +22,7 @@ from hipsta_bids.inputs.labels import MARGIN, label_volume
 from hipsta_bids.io.gifti import sheet_triangles
 from hipsta_bids.io.volumes import LabelImage, read_labels
 from hipsta_bids.participant.measure import measure_hemisphere
+from hipsta_bids.protocols import body_ends
 from hipsta_bids.protocols.load import for_region, load_protocol
 from hipsta_bids.protocols.protocol import Protocol
 from hipsta_bids.reports.results import SIDES, Hemisphere, SheetTable, find_results
@@ -131,6 +132,7 @@ class Measurement:
             valid=sheet.valid,
             repaired=self.hemisphere.repaired,
             points={"midthickness": sheet.points[:, :, sheet.middle]},
+            ends=body_ends(self.settings.body.region, sheet.valid.shape[1]),
         )
 
     @cached_property

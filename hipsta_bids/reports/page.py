@@ -167,8 +167,13 @@ class Usual:
         return f"at most {self.text(self.high)}" if high else "any"
 
 
-def usual_ranges(thickness: float, settings: Mapping[str, Any]) -> tuple[Usual, ...]:
-    """List the quality numbers that a page shows; some limits are relative to the thickness, mm."""
+def usual_ranges(
+    thickness: float, settings: Mapping[str, Any], *, whole: bool = False
+) -> tuple[Usual, ...]:
+    """List the quality numbers that a page shows; some limits are relative to the thickness, mm.
+
+    ``whole`` are sheets with a head, which are folded where their map is.
+    """
     usual = Settings().model_dump()
     stages = {name: usual[name] | dict(settings.get(name) or {}) for name in usual}
     checks, topology, body = stages["checks"], stages["topology"], stages["body"]
@@ -227,8 +232,14 @@ def usual_ranges(thickness: float, settings: Mapping[str, Any]) -> tuple[Usual, 
         Usual(
             name="folded_fraction",
             title="Folded coordinates",
-            meaning="share of the volume whose coordinates are inverted",
-            high=checks["flag_folded"],
+            meaning=f"share of the {'area' if whole else 'volume'} whose coordinates are inverted",
+            high=math.inf if whole else checks["flag_folded"],
+            percent=True,
+        ),
+        Usual(
+            name="masked_fraction",
+            title="Area without values",
+            meaning="share of the sheet within 1 mm of edges, ends and holes",
             percent=True,
         ),
         Usual(

@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 from contextlib import nullcontext, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,8 @@ import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
+import hipsta_bids as hb
+from hipsta_bids.api.maps import Measurement
 from hipsta_bids.cli.main import main
 from hipsta_bids.derivatives.names import name_of_record
 from hipsta_bids.errors import GeometryError, ProtocolError
@@ -19,6 +22,8 @@ from hipsta_bids.geometry.disk import find_edges, level_surface, make_disk
 from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.protocols.load import for_region, load_protocol
 from hipsta_bids.protocols.protocol import Tissue, translate
+from hipsta_bids.reports.cohort import read_cohort
+from hipsta_bids.reports.participant import participant_page
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Bool, Float, GivenEnd, HemisphereMaps, LabelVolume, TetMesh
 
@@ -267,3 +272,37 @@ def test_mesh_and_layers_are_written(out: Path) -> None:
     (path,) = out.glob("sub-01/anat/*_label-whole_desc-layers_morph.tsv")
     layers = pd.read_csv(path, sep="\t")
     assert len(layers) == 41 * 51 * 9
+
+
+def test_page_names_the_parts_and_what_has_no_value(out: Path) -> None:
+    page = participant_page(out, "01", None, read_cohort(out)) or ""
+    assert "whole region (experimental)" in page
+    assert "Gray: no value, within 1 mm of edges, ends and holes." in page
+    (data,) = re.findall(r'<script type="application/json">(\{"scales".*?)</script>', page)
+    (scene,) = json.loads(data)["scenes"]
+    assert scene["parts"] == [["tail", 0, 9], ["body", 10, 30], ["head", 31, 50]]
+    assert scene["ends"] == [10, 30]
+    for part in ("tail", "body", "head"):
+        assert f"{part}, " in "".join(re.findall("<figcaption>(.*?)</figcaption>", page))
+    assert "participant --edited-dir EDITS --participant-label 01 --region whole" in page
+    assert "nan mm" not in page
+
+
+def test_interface_loads_the_whole_sheet(out: Path) -> None:
+    pytest.importorskip("xarray")
+    maps, table = hb.load(out, region="whole")
+    one = maps.sel(participant="sub-01", side="L").squeeze("session")
+    assert one.y.to_numpy()[[0, 10, 30, -1]] == pytest.approx([-2, -1, 1, 3])
+    assert table.region.tolist() == ["whole"]
+    sheet = sheet_of(out).thickness.to_numpy().reshape(41, 51)
+    np.testing.assert_array_equal(one.thickness.to_numpy(), sheet)
+    lines = [line.get_ydata()[0] for line in hb.plot_sheet(one).lines]
+    assert len(lines) == 2  # the ends of the body
+
+
+def test_interface_measures_head_and_body(maps: HemisphereMaps) -> None:
+    pytest.importorskip("xarray")
+    measured = Measurement(
+        side="L", protocol=load_protocol("cobralab"), settings=WHOLE, hemisphere=maps
+    )
+    assert dict(measured.dataset.sizes) == {"x": 41, "y": 51, "layer": 9, "ras": 3}
