@@ -218,8 +218,9 @@ def measure(
         ``"hippunfold"``, or a TOML file. A wrong one may give a plausible, wrong map.
     affine : array, optional
         (4, 4), voxel index to RAS mm; for arrays only.
-    region : {"body", "extended", "entorhinal"}
-        What to measure; the latter two need labels of the cortex beside it.
+    region : {"body", "extended", "entorhinal", "headbody", "whole"}
+        What to measure; the second and third need labels of the cortex beside it, the last two,
+        which are experimental, those of subfields in the head.
     settings : Settings, str or Path, optional
         Settings of the participant level, or a TOML file with some.
 
@@ -337,7 +338,7 @@ def load(out_dir: str | Path, *, protocol: str | None = None, region: str = "bod
         The output folder of ``hipsta-bids ... participant``.
     protocol : str, optional
         Name of the segmentation protocol, if the folder has results of several.
-    region : {"body", "extended", "entorhinal"}
+    region : {"body", "extended", "entorhinal", "headbody", "whole"}
         What was measured.
 
     Returns
@@ -345,9 +346,9 @@ def load(out_dir: str | Path, *, protocol: str | None = None, region: str = "bod
     Results
         ``maps``: every map of the sheet, ``subfield``, ``valid``, ``repaired`` and ``position``
         (RAS mm of the mid-surface), by participant (``sub-01``), session (``ses-1``; ``n/a`` in
-        datasets without), side (``L``, ``R``), x and y (-1 to 1), with units; NaN where there is
-        no map. ``status`` has no x and y. ``table``: one row per hemisphere, failed ones included,
-        whose ``participant_id`` is that of ``participants.tsv``.
+        datasets without), side (``L``, ``R``), x and y (-1 to 1 in the body), with units; NaN
+        where there is no map. ``status`` has no x and y. ``table``: one row per hemisphere, failed
+        ones included, whose ``participant_id`` is that of ``participants.tsv``.
 
     Raises
     ------

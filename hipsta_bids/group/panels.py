@@ -441,6 +441,7 @@ def _draw_row(
     title = row.title[: room - 1] + "\N{HORIZONTAL ELLIPSIS}" if long else row.title
     paper.text(_LEFT * MM, top - 3.2 * MM, title, fontsize=TITLE, ha="left")
     if columns[0].seen is not None or columns[0].one.maps.mesh is None:
+        words: list[tuple[str, float, str]]
         words = [(Y_ENDS[0], top + height, "bottom"), (Y_ENDS[1], top, "top")]
         if (parts := parts_of(cohort.y)) is not None:
             middle = {name: np.flatnonzero(parts == name).mean() for name in np.unique(parts)}
