@@ -4,6 +4,7 @@ The labels are drawn from HippUnfold's surfaces of the template OASIS30ANTs (MIT
 see docs/images/readme.LICENSE.txt), which the folder given holds::
 
     .venv/bin/python tools/readme_figure.py TEMPLATES docs/images/readme.png
+    .venv/bin/python tools/readme_figure.py TEMPLATES docs/images/regions-whole.png --region whole
 """
 
 import argparse
@@ -106,21 +107,25 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("templates", type=Path, help=f"the folder that holds {NAME}")
     parser.add_argument("picture", type=Path, help="the PNG file to write")
+    parser.add_argument("--region", default="body", help="with a head, its sheet alone is drawn")
     options = parser.parse_args()
     mpl.rcParams.update({"font.size": 10})
     codes, affine = draw_labels(options.templates, SIDE)
-    maps = hb.measure(codes, SIDE, "hippunfold", affine=affine)
+    maps = hb.measure(codes, SIDE, "hippunfold", affine=affine, region=options.region)
     print(maps.status, maps.message, maps.summary["thickness_mean"])  # noqa: T201
-    figure = Figure(figsize=(11, 3.6))
-    draw_slice(figure.add_axes((0.01, 0.02, 0.32, 0.84)), codes, affine, maps)
-    axis: Any = figure.add_axes((0.34, 0.02, 0.34, 0.84), projection="3d")
+    whole = options.region != "body"
+    figure = Figure(figsize=(7.5, 4.6) if whole else (11, 3.6))
+    if not whole:
+        draw_slice(figure.add_axes((0.01, 0.02, 0.32, 0.84)), codes, affine, maps)
+    box = (0.0, 0.02, 0.5, 0.94) if whole else (0.34, 0.02, 0.34, 0.84)
+    axis: Any = figure.add_axes(box, projection="3d")
     hb.plot_surface(maps, ax=axis, limits=LIMITS, colorbar=False, view=(40, -40))
     sizes = [np.ptp(limits) for limits in (axis.get_xlim(), axis.get_ylim(), axis.get_zlim())]
     axis.set_box_aspect(sizes, zoom=1.25)
-    axis = figure.add_axes((0.715, 0.14, 0.26, 0.72))
+    axis = figure.add_axes((0.5, 0.12, 0.46, 0.84) if whole else (0.715, 0.14, 0.26, 0.72))
     hb.plot_sheet(maps, ax=axis, limits=LIMITS)
     axis.set_title("")
-    for left, title in zip((0.16, 0.51, 0.845), TITLES, strict=True):
+    for left, title in () if whole else zip((0.16, 0.51, 0.845), TITLES, strict=True):
         figure.text(left, 0.93, title, ha="center", va="center", weight="bold", size=12)
     figure.savefig(options.picture, dpi=100)
 

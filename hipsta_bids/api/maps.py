@@ -22,6 +22,7 @@ from hipsta_bids.inputs.labels import MARGIN, label_volume
 from hipsta_bids.io.gifti import sheet_triangles
 from hipsta_bids.io.volumes import LabelImage, read_labels
 from hipsta_bids.participant.measure import measure_hemisphere
+from hipsta_bids.protocols import body_ends
 from hipsta_bids.protocols.load import for_region, load_protocol
 from hipsta_bids.protocols.protocol import Protocol
 from hipsta_bids.reports.results import SIDES, Hemisphere, SheetTable, find_results
@@ -131,6 +132,7 @@ class Measurement:
             valid=sheet.valid,
             repaired=self.hemisphere.repaired,
             points={"midthickness": sheet.points[:, :, sheet.middle]},
+            ends=body_ends(self.settings.body.region, sheet.valid.shape[1]),
         )
 
     @cached_property
@@ -146,7 +148,7 @@ class Measurement:
         from hipsta_bids.io.xarrays import make_dataset  # noqa: PLC0415  (an optional extra)
 
         sheet, layers = self.hemisphere.sheet, self.hemisphere.layers
-        nx, ny, nz = sheet.points.shape[:3]
+        nz = sheet.points.shape[2]
         grid = ("x", "y")
         state = {"subfield": self.subfield, "valid": sheet.valid, "repaired": self.table.repaired}
         variables: dict[str, Variable] = {
@@ -155,7 +157,7 @@ class Measurement:
         variables |= {name: (grid, values, attributes(name)) for name, values in state.items()}
         variables |= _three_dimensional(layers)
         coordinates = {
-            **node_axes(self.settings.sheet.model_dump(), (nx, ny)),
+            **node_axes(self.settings.sheet.model_dump(), self.settings.body.region),
             "layer": (["layer"], np.linspace(0, 1, nz), {"long_name": "interior to exterior"}),
             "ras": (["ras"], list(POSITION), {}),
         }
@@ -180,12 +182,10 @@ def attributes(name: str) -> dict[str, str]:
     return {"long_name": words, **({"units": unit} if unit else {})}
 
 
-def node_axes(grid: Mapping[str, Any], shape: tuple[int, int]) -> dict[str, Any]:
+def node_axes(grid: Mapping[str, Any], region: str) -> dict[str, Any]:
     """Coordinates of the nodes, by the settings of the sheet."""
-    return {
-        axis: ([axis], node_coordinates(float(grid[f"{axis}_extent"]), count), _NODES[axis])
-        for axis, count in zip("xy", shape, strict=True)
-    }
+    both = zip("xy", node_coordinates(grid, region), strict=True)
+    return {axis: ([axis], values, _NODES[axis]) for axis, values in both}
 
 
 def check_choice(name: str, value: object, choices: Mapping[str, object]) -> None:
@@ -218,8 +218,9 @@ def measure(
         ``"hippunfold"``, or a TOML file. A wrong one may give a plausible, wrong map.
     affine : array, optional
         (4, 4), voxel index to RAS mm; for arrays only.
-    region : {"body", "extended", "entorhinal"}
-        What to measure; the latter two need labels of the cortex beside it.
+    region : {"body", "extended", "entorhinal", "headbody", "whole"}
+        What to measure; the second and third need labels of the cortex beside it, the last two,
+        which are experimental, those of subfields in the head.
     settings : Settings, str or Path, optional
         Settings of the participant level, or a TOML file with some.
 
@@ -337,7 +338,7 @@ def load(out_dir: str | Path, *, protocol: str | None = None, region: str = "bod
         The output folder of ``hipsta-bids ... participant``.
     protocol : str, optional
         Name of the segmentation protocol, if the folder has results of several.
-    region : {"body", "extended", "entorhinal"}
+    region : {"body", "extended", "entorhinal", "headbody", "whole"}
         What was measured.
 
     Returns
@@ -345,9 +346,9 @@ def load(out_dir: str | Path, *, protocol: str | None = None, region: str = "bod
     Results
         ``maps``: every map of the sheet, ``subfield``, ``valid``, ``repaired`` and ``position``
         (RAS mm of the mid-surface), by participant (``sub-01``), session (``ses-1``; ``n/a`` in
-        datasets without), side (``L``, ``R``), x and y (-1 to 1), with units; NaN where there is
-        no map. ``status`` has no x and y. ``table``: one row per hemisphere, failed ones included,
-        whose ``participant_id`` is that of ``participants.tsv``.
+        datasets without), side (``L``, ``R``), x and y (-1 to 1 in the body), with units; NaN
+        where there is no map. ``status`` has no x and y. ``table``: one row per hemisphere, failed
+        ones included, whose ``participant_id`` is that of ``participants.tsv``.
 
     Raises
     ------
@@ -403,8 +404,9 @@ def _row(one: Hemisphere) -> dict[str, object]:
 def _lazy_dataset(root: Path, own: list[Hemisphere], table: pd.DataFrame) -> "xr.Dataset":
     from hipsta_bids.io.xarrays import make_dataset, read_later  # noqa: PLC0415  (optional)
 
-    grid = settings_of(root)["sheet"]
-    shape = (int(grid["x_nodes"]), int(grid["y_nodes"]))
+    axes_of_nodes = node_axes(settings_of(root)["sheet"], table["region"].iloc[0])
+    nx, ny = (len(values) for _, values, _ in axes_of_nodes.values())
+    shape = nx, ny
     labels = [sorted(table[column].unique()) for column in ("participant_id", "session_id", "hemi")]
     outer = tuple(len(names) for names in labels)
     axes = ("participant", "session", "side")
@@ -442,7 +444,7 @@ def _lazy_dataset(root: Path, own: list[Hemisphere], table: pd.DataFrame) -> "xr
     variables["status"] = (axes, status, {"long_name": "how the hemisphere ended; empty: none"})
     coordinates = {
         **{name: ([name], values, {}) for name, values in zip(axes, labels, strict=True)},
-        **node_axes(grid, shape),
+        **axes_of_nodes,
         "ras": (["ras"], list(POSITION), {}),
     }
     about = {"protocol": table["protocol"].iloc[0], "region": table["region"].iloc[0]}

@@ -19,6 +19,7 @@ from hipsta_bids.reports.display import (
     MapKind,
     effect_reach,
     kind_of,
+    parts_of,
     scale_of,
 )
 from hipsta_bids.reports.group_maps import EFFECT_NAMES
@@ -314,7 +315,16 @@ def _sheet(data: Any, columns: dict[str, Float]) -> SheetTable:  # noqa: ANN401
         valid=state.get("valid", np.ones(shape)).astype(np.bool_),
         repaired=state.get("repaired", np.zeros(shape)).astype(np.bool_),
         points={},
+        ends=_body_ends(data),
     )
+
+
+def _body_ends(data: Any) -> tuple[int, int] | None:  # noqa: ANN401
+    parts = parts_of(data.coords["y"].to_numpy()) if "y" in data.coords else None
+    if parts is None:
+        return None
+    rows = np.flatnonzero(parts == "body")
+    return int(rows[0]), int(rows[-1])
 
 
 def _points(data: Any, level: str) -> Float:  # noqa: ANN401

@@ -19,7 +19,6 @@ from hipsta_bids.cli.parser import (
 from hipsta_bids.cli.participant import REGIONS
 from hipsta_bids.cli.questions import add_questions, is_question, run_comparison, run_question
 from hipsta_bids.errors import ExitCode, NothingToDoError, UsageError
-from hipsta_bids.protocols import EXPERIMENTAL
 
 if TYPE_CHECKING:
     from hipsta_bids.group.run import GroupOptions
@@ -313,10 +312,6 @@ def run_group_level(arguments: Sequence[str]) -> ExitCode:
 
 
 def _run(parsed: argparse.Namespace, arguments: Sequence[str]) -> ExitCode:
-    if parsed.region in EXPERIMENTAL:
-        raise UsageError(
-            f"--region {parsed.region}: the group level does not take it yet", reason="usage"
-        )
     if parsed.model is not None and (parsed.formula or parsed.contrast):
         raise UsageError("give --model, or --formula and --contrast", reason="usage")
     if parsed.age_model is not None and (parsed.model or parsed.formula):

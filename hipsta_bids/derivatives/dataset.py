@@ -284,6 +284,11 @@ _LAYER_RULES = {
     "nearest-label": "was given to the nearest label, the dentate gyrus and CA4 included",
 }
 
+_FACES = (
+    " experimental: two faces and a rim were found on the surface of all labels, which was neither"
+    " cut nor closed, and thickness is the length of a line from face to face along the gradient of"
+    " a harmonic function. What follows is about the body."
+)
 _REGIONS = {
     "body": "",
     "extended": " For files with label-extended, the sheet goes on beyond the subiculum into the"
@@ -292,9 +297,9 @@ _REGIONS = {
     " between the same end planes; its interior side is the one that continues the hippocampal"
     " sheet's.",
     "headbody": " For files with label-headbody, head and body were laid out on one sheet, which is"
-    " experimental.",
+    + _FACES,
     "whole": " For files with label-whole, head, body and tail were laid out on one sheet, which is"
-    " experimental.",
+    + _FACES,
 }
 
 #: Works that the methods of the participant level rest on.

@@ -5,7 +5,7 @@ The grid of a sheet and a triangle mesh are both graphs, and differ in nothing b
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from hipsta_bids.group.data import Bool, Cohort, Float, Int, SideMaps
 from hipsta_bids.group.glm import FittedMaps, PointTest
 from hipsta_bids.group.settings import MultiplicitySettings
+from hipsta_bids.reports.display import parts_of
 
 if TYPE_CHECKING:
     from hipsta_bids.group.inference import Discoveries, MapKey
@@ -130,9 +131,10 @@ class Frame:
 
     number: Mapping[str, Int]
     """By column: ``node_x`` and ``node_y`` on the sheet, from 1; ``vertex`` on a mesh, from 0."""
-    position: Mapping[str, Float]
-    """By column: ``x`` (medial to lateral) and ``y`` (posterior to anterior) on the sheet, -1..1;
-    ``surface_x``, ``surface_y`` and ``surface_z`` on a mesh."""
+    position: Mapping[str, NDArray[Any]]
+    """By column: ``x`` (medial to lateral) and ``y`` (posterior to anterior) on the sheet, in the
+    body -1..1, and ``part`` where there is more than the body; ``surface_x``, ``surface_y`` and
+    ``surface_z`` on a mesh."""
     subfield: NDArray[np.str_]
     """(points,) names."""
 
@@ -140,7 +142,9 @@ class Frame:
     def of_sheet(cls, x: Float, y: Float, subfield: NDArray[np.str_]) -> "Frame":
         """Points of a grid; ``subfield`` (x, y)."""
         i, j = np.indices(subfield.shape).reshape(2, -1)
-        return cls({"node_x": i + 1, "node_y": j + 1}, {"x": x[i], "y": y[j]}, subfield.ravel())
+        parts = parts_of(y)
+        position = {"x": x[i], "y": y[j]} | ({} if parts is None else {"part": parts[j]})
+        return cls({"node_x": i + 1, "node_y": j + 1}, position, subfield.ravel())
 
 
 def frame_of(cohort: Cohort, one: FittedMaps) -> Frame:

@@ -20,7 +20,6 @@ from hipsta_bids.group.covariates import relocate
 from hipsta_bids.group.data import PARTICIPANT, SESSION
 from hipsta_bids.group.exclusions import SHOWN, Choices, QualityCondition, read_choices
 from hipsta_bids.io import files
-from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.protocols.toml import resolve, settings_hash
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Status
@@ -219,11 +218,7 @@ def _other_regions(everything: Sequence[ResultPlace], request: GroupRequest) -> 
     )
     return tuple(
         f"{count} hemispheres of region {region} are not in this analysis;"
-        + (
-            " the group level does not take it yet"
-            if region in EXPERIMENTAL
-            else f" --region {region} takes them"
-        )
+        f" --region {region} takes them"
         for region, count in sorted(counts.items())
         if region != request.region
     )

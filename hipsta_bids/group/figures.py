@@ -33,7 +33,7 @@ from hipsta_bids.group.panels import (
 )
 from hipsta_bids.group.shapes import AverageShape
 from hipsta_bids.io.files import MISSING
-from hipsta_bids.reports.display import COLORS, HEMISPHERE_COLORS, X_ENDS, kind_of
+from hipsta_bids.reports.display import COLORS, HEMISPHERE_COLORS, X_ENDS, kind_of, parts_of
 from hipsta_bids.reports.group_tables import SIDES, display_name, with_brackets
 from hipsta_bids.reports.maps import new_figure
 
@@ -261,10 +261,15 @@ def draw_sections(
     cohort: Cohort, analysis: Analysis, shapes: Mapping[str, AverageShape]
 ) -> "list[Figure]":
     """Draw the groups' mean walls at three places along the long axis, superior up."""
-    figure, axes = _panels(len(shapes), len(_SECTIONS), (TWO_COLUMNS, 55 * len(shapes)))
+    last = len(cohort.y) - 1
+    places = {name: round(share * last) for share, name in _SECTIONS.items()}
+    if (parts := parts_of(cohort.y)) is not None:
+        named = {name: np.flatnonzero(parts == name) for name in ("tail", "body", "head")}
+        places = {name: int(np.median(own)) for name, own in named.items() if len(own)}
+    figure, axes = _panels(len(shapes), len(places), (TWO_COLUMNS, 55 * len(shapes)))
     for i, (hemi, shape) in enumerate(shapes.items()):
-        for j, (share, name) in enumerate(_SECTIONS.items()):
-            axis, node = axes[i, j], round(share * (len(cohort.y) - 1))
+        for j, (name, node) in enumerate(places.items()):
+            axis = axes[i, j]
             plane = _plane(shape.mean[1], node, left=hemi == "L")
             center = np.nanmean(shape.mean[:, :, node], axis=(0, 1))
             for color, (group, layers) in zip(cycle(COLORS), shape.by_group.items(), strict=False):

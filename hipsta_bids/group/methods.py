@@ -13,13 +13,17 @@ from hipsta_bids.group.data import PARTICIPANT, Cohort
 from hipsta_bids.group.inference import PERMUTATIONS, control_fdr
 from hipsta_bids.group.normative import Scores
 from hipsta_bids.group.norms import LEVELS, NormsFile
+from hipsta_bids.group.read import LEAST_SHARE
 from hipsta_bids.group.settings import GroupSettings, MultiplicitySettings, NormSettings
+from hipsta_bids.protocols import EXPERIMENTAL
 
 #: What was measured, by region.
 _MEASURED = {
     "body": "the hippocampus",
     "extended": "the hippocampus and the neighboring cortex",
     "entorhinal": "the cortex beside the hippocampus",
+    "headbody": "the head and the body of the hippocampus on one sheet (experimental)",
+    "whole": "the whole hippocampus on one sheet (experimental)",
 }
 
 #: Procedures that hold false discovery rates.
@@ -67,6 +71,8 @@ def methods_text(
     paragraphs[0] += _rated(ratings)
     if analysis.sides or others:
         paragraphs.append(_alignment(analysis, settings, cite, others))
+    if region in EXPERIMENTAL and analysis.fitted:
+        paragraphs.append(_rims(analysis))
     paragraphs += _harmonization(analysis, cite)
     paragraphs.append(_models(analysis, settings, cite))
     paragraphs += [_joint(analysis, settings, cite)] if settings.joint.measures else []
@@ -164,6 +170,19 @@ def _registration(analysis: Analysis, settings: GroupSettings, cite: Callable[[s
         f" registered by {method}, and the warps were applied to all maps. The share of the"
         f" variance of the profiles that their mean explains went from {shares}.{moved}"
         f" Warps out of line with the others: {extreme}."
+    )
+
+
+def _rims(analysis: Analysis) -> str:
+    """Say how points are handled that some participants lack."""
+    fits = [fit for one in analysis.fitted.values() for fit in one.fits.values()]
+    n = np.concatenate([fit.n[np.isfinite(fit.tests[0].p)] for fit in fits])
+    span = f" ({n.min()} to {n.max()} per point)" if len(n) else ""
+    return (
+        "Sheets have no values within 1 mm of edges, ends and filled holes, which differ between"
+        f" participants; points that fewer than {LEAST_SHARE:.0%} have were left out. None was"
+        f" imputed: a point was tested by those who have a value{span}. Profiles for registration"
+        " are means of known values, interpolated where a whole position has none."
     )
 
 

@@ -18,7 +18,7 @@ from hipsta_bids.group.inference import Discoveries, MapKey
 from hipsta_bids.group.shapes import AverageShape
 from hipsta_bids.group.views import View, across, draw_mesh, laid_out, look
 from hipsta_bids.reports import display
-from hipsta_bids.reports.display import X_ENDS, Y_ENDS
+from hipsta_bids.reports.display import X_ENDS, Y_ENDS, parts_of
 from hipsta_bids.reports.group_maps import EFFECT_NAMES, map_id, signed_logarithm
 from hipsta_bids.reports.group_tables import BOTH, SIDES, display_name, with_brackets
 from hipsta_bids.reports.maps import new_figure
@@ -40,7 +40,7 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 9.0, 19.0, 9.5, 5.0  # margins, with the words in
 _HEAD = 6.0  # above a row, for its title
 _GAP, _BETWEEN = 1.5, 5.0  # between columns, and between sides
 _VIEW_WIDTH = 0.62  # of an unfolded map's, for each view of a surface
-_UPRIGHT = 1.15  # height of an unfolded map over its width
+_UPRIGHT, _LONG = 1.15, 1.7  # height of an unfolded map over its width; with head and tail
 _TALLEST = 235.0  # page
 _MOST_ROWS = 6
 _BAR, _BAR_WIDTH = 1.5, 2.6  # distance and width of a color bar
@@ -53,8 +53,8 @@ _LETTER_WIDTH = 0.57  # of type, over its size
 _UNKNOWN = 0.92  # brightness where there is no value
 _HALF = 0.5
 _HEAD_PIXELS = round(_HEAD * MM)
-_FAR_APART = 0.35  # of the most extreme ticks of p
-_EXTEND = {"significance": "neither", "heterogeneity": "neither", "agreement": "min"}  # color bars
+_EXTEND = dict.fromkeys(("significance", "heterogeneity", "count"), "neither")  # color bars
+_EXTEND["agreement"] = "min"
 
 
 Scale = Mapping[str, Any]
@@ -159,6 +159,16 @@ def _means(
             ),
             scale={"cmap": kind.colors, "vmin": low, "vmax": high},
             values=values,
+        )
+    if parts_of(cohort.y) is not None:  # rims and holes, which differ, have no values
+        known = {hemi: one.fits[measure].n for hemi, one in sides.items()}
+        yield Row(
+            kind="count",
+            index=0,
+            title="Sheets with a value at each point",
+            label="n",
+            scale={"cmap": "cividis", "vmin": 0, "vmax": max(n.max() for n in known.values())},
+            values={hemi: np.where(n > 0, n, np.nan) for hemi, n in known.items()},
         )
 
 
@@ -352,7 +362,8 @@ def draw_rows(
     unit = (space - _GAP * (n_flat + n_views - 1)) / (n_flat + _VIEW_WIDTH * n_views)
     most = (_TALLEST - _TOP - _BOTTOM) / len(rows) - _HEAD
     unit = min(unit, most)
-    height = round(min(unit * _UPRIGHT, most) * MM)
+    upright = _UPRIGHT if parts_of(cohort.y) is None else _LONG
+    height = round(min(unit * upright, most) * MM)
     size = height, round(_VIEW_WIDTH * unit * MM)
     scale = min((surface.fitting(size) for surface in surfaces.values()), default=1.0)
     columns: list[_Column] = []
@@ -435,7 +446,15 @@ def _draw_row(
     title = row.title[: room - 1] + "\N{HORIZONTAL ELLIPSIS}" if long else row.title
     paper.text(_LEFT * MM, top - 3.2 * MM, title, fontsize=TITLE, ha="left")
     if columns[0].seen is not None or columns[0].one.maps.mesh is None:
-        for word, y, va in ((Y_ENDS[0], top + height, "bottom"), (Y_ENDS[1], top, "top")):
+        words: list[tuple[str, float, str]]
+        words = [(Y_ENDS[0], top + height, "bottom"), (Y_ENDS[1], top, "top")]
+        if (parts := parts_of(cohort.y)) is not None:
+            middle = {name: np.flatnonzero(parts == name).mean() for name in np.unique(parts)}
+            words = [
+                (name, top + height * (1 - (float(at) + _HALF) / len(parts)), "center")
+                for name, at in middle.items()
+            ]
+        for word, y, va in words:
             paper.text((_LEFT - 2) * MM, y, word, rotation=90, va=va)
     for column in columns:
         axes = paper.axes(column.box[0], top, column.box[1], height)
@@ -469,6 +488,9 @@ def _draw_sheet(
         image, **scale, extent=extent, origin="lower", aspect="auto", interpolation="nearest"
     )
     line: Any = {"levels": [_HALF], "colors": "black", "linewidths": _FIELD_LINE}
+    for end in (-1.0, 1.0):  # of the body
+        if y[0] < end < y[-1]:
+            axes.axhline(end, color="black", linewidth=_FIELD_LINE, linestyle=(0, (4, 2)))
     width = axes.bbox.width * 72 / axes.figure.dpi  # points
     for number, name in enumerate(one.maps.names):
         own = fields == number
@@ -525,18 +547,7 @@ def _draw_bar(axes: "Axes", row: Row) -> None:
     if row.ticks:
         bar.set_ticks(list(row.ticks), labels=list(row.ticks.values()))
     if row.level is not None:
-        ticks = {sign * at: text for at, text in _p_ticks(row.level, high) for sign in signs}
+        ticks = {sign * at: text for at, text in display.p_ticks(row.level, high) for sign in signs}
         bar.set_ticks(list(ticks), labels=list(ticks.values()))
         for sign in signs:
             axes.axhline(-sign * np.log10(row.level), color="black", linewidth=_FOUND_LINE)
-
-
-def _p_ticks(level: float, top: float) -> list[tuple[float, str]]:
-    """Positions and texts of ticks of p: one, the level, and powers of ten well beyond it."""
-    last, far = -float(np.log10(level)), _FAR_APART * top / 2
-    ticks = [(last, f"{level:g}"), *([(0.0, "1")] if last > far else [])]
-    for power in range(1, int(top) + 1):
-        if power - last > far:
-            last = float(power)
-            ticks.append((last, f"{10.0**-power:g}"))
-    return ticks

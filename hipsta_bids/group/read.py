@@ -21,6 +21,7 @@ from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.group.collect import Exclusion, SheetRecord
 from hipsta_bids.group.data import MOST_KEPT, PARTICIPANT, SESSION, Float, Measures, SideMaps
 from hipsta_bids.group.settings import GroupSettings
+from hipsta_bids.protocols import EXPERIMENTAL, rows_beyond
 from hipsta_bids.types import VisitKey
 
 #: Map that registration rests on.
@@ -34,6 +35,8 @@ SHEET_MAPS = tuple(row.name for row in MAPS)
 VOLUME = "volume_"
 #: Unit of sampled maps whose own unit is not known.
 ARBITRARY = "arbitrary"
+#: Share of the sheets that need a value at a point, where sheets have rims without values.
+LEAST_SHARE = 0.5
 #: Number of measures that a message lists.
 _SHOWN = 12
 
@@ -121,8 +124,9 @@ def read_sheets(
     """
     if error_window:
         _check_errors(records, maps)
-    grid = settings["sheet"]
-    shape = (int(grid["x_nodes"]), int(grid["y_nodes"]))
+    region = records[0].place.name.region if records else "body"
+    x, y = node_coordinates(settings["sheet"], region)
+    shape = len(x), len(y)
     visits = visits_of(records) if visits is None else visits
     row_of = {visit: row for row, visit in enumerate(visits)}
     names = tuple(dict.fromkeys((*maps, CURVATURE)))
@@ -148,6 +152,8 @@ def read_sheets(
             damaged += found
             sides[hemi] = side.sheets(np.array([not text for text in why]))
             own = [r for r, text in zip(own, why, strict=True) if not text]
+            if region in EXPERIMENTAL:
+                _leave_rare(sides[hemi])
         if own and error_window:
             errors = _read_errors(own, shape, maps, error_window)
             sides[hemi] = replace(sides[hemi], errors=errors)
@@ -161,8 +167,8 @@ def read_sheets(
     return Measured(
         visits=table,
         sides=sides,
-        x=node_coordinates(grid["x_extent"], shape[0]),
-        y=node_coordinates(grid["y_extent"], shape[1]),
+        x=x,
+        y=y,
         units=(read_units(records[0].place) if records else {})
         | {n: ARBITRARY for n in names if n not in SHEET_MAPS},
         sources={
@@ -171,6 +177,14 @@ def read_sheets(
         },
         damaged=tuple(damaged),
     )
+
+
+def _leave_rare(side: SideMaps) -> None:
+    """Take out points that few sheets have: beside rims, which differ, those are a selection."""
+    for values in side.maps.values():
+        known = np.isfinite(values)
+        some = known.any(axis=(1, 2))  # other volumes may lack in a participant
+        values[:, known[some].sum(axis=0) < LEAST_SHARE * some.sum()] = np.nan
 
 
 def _damage(side: SideMaps, i: int, rules: GroupSettings) -> str | None:
@@ -234,9 +248,17 @@ def visits_of(records: Sequence[SheetRecord]) -> list[VisitKey]:
     return list(dict.fromkeys((r.place.name.subject, r.place.name.session) for r in records))
 
 
-def node_coordinates(extent: float, nodes: int) -> Float:
-    """Coordinates of the nodes, without the rounding errors that would show in tables."""
-    return np.asarray(np.linspace(-extent, extent, nodes).round(10) + 0.0, dtype=np.float64)
+def node_coordinates(grid: Mapping[str, Any], region: str) -> tuple[Float, Float]:
+    """Coordinates of the nodes along x and y, by the settings of the sheet.
+
+    They are without the rounding errors that would show in tables.
+    """
+    nodes, extent = int(grid["y_nodes"]), float(grid["y_extent"])
+    tail, head = rows_beyond(region, nodes)
+    step = 2 * extent / (nodes - 1)
+    x = np.linspace(-float(grid["x_extent"]), float(grid["x_extent"]), int(grid["x_nodes"]))
+    y = np.linspace(-extent - tail * step, extent + head * step, tail + nodes + head)
+    return x.round(10) + 0.0, y.round(10) + 0.0
 
 
 def visit_name(subject: str, session: str | None) -> str:

@@ -16,6 +16,7 @@ from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float
 from hipsta_bids.group.settings import GroupSettings, ShapeSettings
 from hipsta_bids.group.warps import warp_values
 from hipsta_bids.io import files, gifti
+from hipsta_bids.reports.display import parts_of
 from hipsta_bids.types import Mesh
 
 #: Surfaces of a sheet, in the order of the arrays here.
@@ -49,17 +50,21 @@ def average_shape(
     warps: Float,
     members: Mapping[str, NDArray[np.bool_]],
     settings: ShapeSettings,
+    *,
+    known: NDArray[np.bool_] | None = None,
 ) -> AverageShape:
     """Average surfaces at registered nodes, after rigid alignment (generalized Procrustes).
 
     Each middle surface is rotated and moved to the mean of all, iteratively (Gower 1975), and the
     walls with it; nothing is scaled or mirrored. ``layers`` (sheets, 3, x, y, 3) are the surfaces
-    in mm, NaN where missing.
+    in mm, NaN where missing; ``known`` (sheets, x, y) tells which registered nodes have a value.
     """
     n, _, nx, ny, _ = layers.shape
     # Along x, so that all other axes count as one.
     flat = np.moveaxis(layers, 2, 1).reshape(n, nx, -1)
     registered = np.moveaxis(warp_values(flat, warps).reshape(n, nx, len(LAYERS), ny, 3), 1, 2)
+    if known is not None:
+        registered = np.where(known[:, None, :, :, None], registered, np.nan)
     middle = registered[:, _MIDDLE].reshape(n, -1, 3)
     rotations, centers, center = align_rigidly(middle, settings)
     moved = registered.reshape(n, -1, 3) - centers[:, None]
@@ -144,7 +149,10 @@ def average_shapes(
         own = chosen[read]
         members = members_of(analysis, visits.iloc[own])
         warps = side.registration.warps[own]
-        shapes[hemi] = average_shape(layers, warps, members, settings.shapes)
+        known = None
+        if parts_of(cohort.y) is not None:  # nodes without values have positions for display alone
+            known = np.isfinite(next(iter(side.registered.maps.values()))[own])
+        shapes[hemi] = average_shape(layers, warps, members, settings.shapes, known=known)
     return shapes
 
 

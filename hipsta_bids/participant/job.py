@@ -12,6 +12,8 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import hemisphere
 from hipsta_bids.derivatives.dataset import source_address
@@ -345,7 +347,9 @@ def _write_more(
         files.write_bytes(place.path("distortion"), content)
     if spread is not None and spread.known:
         measured = spread.copies - spread.failed
-        hemisphere.write_spread(place, spread.maps, spread.summary, measured)
+        own = {name: np.isfinite(values) for name, values in maps.maps.items()}
+        sd = {name: np.where(own[name], sds, np.nan) for name, sds in spread.maps.items()}
+        hemisphere.write_spread(place, sd, spread.summary, measured)
 
 
 def has_spread(place: ResultPlace, record: Mapping[str, Any], copies: int) -> bool:

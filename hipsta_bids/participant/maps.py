@@ -185,13 +185,16 @@ def _sample(
 ) -> SampledMap:
     from hipsta_bids.io.volumes import read_scalars  # noqa: PLC0415  (nibabel, in workers only)
 
-    return sample_on_sheet(
+    sampled = sample_on_sheet(
         read_scalars(path, maps.sheet.points.reshape(-1, 3)),
         maps.layers if source.sampling == "depth" else maps.sheet,
         settings,
         sampling=source.sampling,
         interpolation=source.interpolation,
     )
+    # Rims and holes of a sheet with a head have positions, but no values.
+    known = np.isfinite(maps.thickness)[:, :, None]
+    return replace(sampled, values=np.where(known, sampled.values, np.nan))
 
 
 def write_signals(place: ResultPlace, maps: HemisphereMaps, mapped: Mapped) -> None:

@@ -28,6 +28,8 @@ from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.catalog import measure_maps, summarize
 from hipsta_bids.geometry.checks import check_thickness
 from hipsta_bids.participant.measure import unfold
+from hipsta_bids.participant.whole import measure_whole
+from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.protocols.load import for_region
 from hipsta_bids.settings import Settings, UncertaintySettings
 from hipsta_bids.types import EditedMask, Float, LabelVolume
@@ -120,6 +122,9 @@ def _measure(
 ) -> tuple[Mapping[str, Float], Mapping[str, float]]:
     """Measure maps and summary alone: no flags, cross-sections or layers."""
     grid = {"spacing": max(settings.grid.spacing, settings.uncertainty.spacing)}
+    if settings.body.region in EXPERIMENTAL:
+        whole = measure_whole(volume, hemi, settings.changed(grid=grid), _no_clock)
+        return whole.maps, whole.summary
     evidence, _ = unfold(volume, hemi, settings.changed(grid=grid), _no_clock)
     measured = evidence.measured
     check_thickness(measured.thickness, evidence.boundaries.sheet_thickness, settings.checks)
@@ -171,6 +176,7 @@ def perturb(volume: LabelVolume, settings: UncertaintySettings, number: int) -> 
         affine=affine,
         protocol=volume.protocol,
         edited_mask=None if mask is None else EditedMask(inside=found >= _MASK, voxel=mask.voxel),
+        given_ends=volume.given_ends,
     )
 
 
@@ -191,6 +197,7 @@ def _cropped(volume: LabelVolume) -> LabelVolume:
         affine=affine,
         protocol=volume.protocol,
         edited_mask=None if mask is None else replace(mask, inside=mask.inside[box]),
+        given_ends=volume.given_ends,
     )
 
 

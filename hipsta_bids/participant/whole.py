@@ -47,6 +47,7 @@ from hipsta_bids.geometry.lines import Lines
 from hipsta_bids.geometry.measures import column_area, labels_at, measure_thickness
 from hipsta_bids.geometry.mesh import tetra_quality, tetrahedralize
 from hipsta_bids.geometry.sheet import fill_points, label_sheet, sheet_levels
+from hipsta_bids.protocols import rows_beyond
 from hipsta_bids.protocols.protocol import CORE, LATERAL_END, MEDIAL_END, Tissue
 from hipsta_bids.settings import Settings, SheetSettings
 from hipsta_bids.types import (
@@ -202,8 +203,8 @@ def grid_levels(
     head, and half as many behind them for the tail.
     """
     x, y, z = sheet_levels(settings)
-    step, head = y[1] - y[0], len(y) - 1
-    tail = 0 if region == "headbody" else head // 2
+    step = y[1] - y[0]
+    tail, head = rows_beyond(region, len(y))
     y = y[0] + step * np.arange(-tail, len(y) + head)
     return (x, y, z), (float(y[0]), float(y[-1]))
 

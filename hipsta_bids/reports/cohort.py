@@ -230,6 +230,7 @@ def distances(cohort: Cohort, thickness: Mapping[str, Float]) -> dict[str, Dista
 
 def _departure(maps: Float) -> Float:
     """(N,) root mean square over the sheet of each map's difference from the median map, mm."""
+    maps = np.where(np.isfinite(maps).any(axis=0), maps, 0.0)  # none departs where none is known
     away = maps - np.nanmedian(maps, axis=0)
     return np.asarray(np.sqrt(np.nanmean(away**2, axis=(1, 2))), dtype=np.float64)
 

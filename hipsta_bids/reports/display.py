@@ -35,6 +35,13 @@ _EFFECTS = 99.0  # percentile of sizes that the colors of effects span
 _LEVEL = 0.05
 _SMALLEST = 1e-6  # reach of colors where all values are zero
 _LEAST_REACH = 3.0  # powers of ten of p that colors span at least
+_FAR_APART = 0.35  # of the most extreme ticks of p
+
+
+def parts_of(y: Float) -> NDArray[np.str_] | None:
+    """Name the part of rows at ``y``, whose body lies from -1 to 1; ``None`` if all are body."""
+    part = (y >= -1).astype(np.intp) + (y > 1)
+    return np.array(("tail", "body", "head"))[part] if (part != 1).any() else None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,6 +187,17 @@ def effect_colors(kind: str) -> tuple[float, str, str]:
 def significance_reach(values: Sequence[Float]) -> float:
     """Return the power of ten of p at the end of the colors."""
     return max(_LEAST_REACH, float(np.abs(known(values)).max(initial=0)))
+
+
+def p_ticks(level: float, top: float) -> list[tuple[float, str]]:
+    """Positions and texts of ticks of p: one, the level, and powers of ten well beyond it."""
+    last, far = -float(np.log10(level)), _FAR_APART * top / 2
+    ticks = [(last, f"{level:g}"), *([(0.0, "1")] if last > far else [])]
+    for power in range(1, int(top) + 1):
+        if power - last > far:
+            last = float(power)
+            ticks.append((last, f"{10.0**-power:g}"))
+    return ticks
 
 
 def colors_of(name: str, n: int = 64) -> NDArray[np.str_]:

@@ -17,6 +17,7 @@ from hipsta_bids.derivatives.names import DATASET_FILES, group_report
 from hipsta_bids.errors import HipstaError
 from hipsta_bids.io import files
 from hipsta_bids.io.files import hide_home
+from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.reports.display import DESIGN_COLORS, colors_of
 from hipsta_bids.reports.group_maps import embedded, map_scenes
 from hipsta_bids.reports.group_tables import (
@@ -142,6 +143,8 @@ def group_page(folder: Path) -> str:
         folder=folder.name,
         formula=record.get("formula"),
         n=record.get("participants"),
+        region=(record.get("inputs") or {}).get("region"),
+        experimental=EXPERIMENTAL,
         made_by=record.get("version"),
         cohort=(folder.parent.parent / DATASET_FILES["report"]).exists(),
         sections=build_sections(SECTIONS, results, _PREFIX),

@@ -289,12 +289,11 @@ def position_text(peak: Mapping[str, Any]) -> str:
     inside = f"{peak['subfield']}, " if isinstance(peak["subfield"], str) else ""
     if np.isfinite(peak.get("x", np.nan)):
         words = [
-            ends[1] if abs(peak[axis]) < _THIRD else ends[0 if peak[axis] < 0 else 2]
-            for axis, ends in (
-                ("x", ("medial", "middle", "lateral")),
-                ("y", ("posterior", "midway", "anterior")),
-            )
+            ends.split()[1 if abs(peak[axis]) < _THIRD else 0 if peak[axis] < 0 else 2]
+            for axis, ends in (("x", "medial middle lateral"), ("y", "posterior midway anterior"))
         ]
+        if isinstance(part := peak.get("part"), str):
+            words[1:] = [part] if part != "body" else ["body", words[1]]
         x, y = (f"{peak[axis]:.2f}".replace("-", MINUS) for axis in "xy")
         return f"{inside}{', '.join(words)} (x {x}, y {y})"
     return f"{inside}vertex {int(peak['vertex'])}"

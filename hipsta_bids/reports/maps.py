@@ -10,7 +10,7 @@ import shutil
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import cycle, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -102,7 +102,8 @@ class Picture:
 
 def draw_map(kind: MapKind, hemispheres: Sequence[Hemisphere]) -> Picture:
     """Draw one map of both hemispheres, unfolded, side by side on one color scale."""
-    figure, axes = _new_figure(1, len(hemispheres), (2.6 * len(hemispheres) + 0.9, 3.1))
+    height = 3.1 if hemispheres[0].sheet.ends is None else 4.6
+    figure, axes = _new_figure(1, len(hemispheres), (2.6 * len(hemispheres) + 0.9, height))
     low, high = scale_of(kind, [h.sheet.columns[kind.column] for h in hemispheres])
     image: Any = None
     for axis, hemisphere in zip(axes[0], hemispheres, strict=True):
@@ -214,20 +215,51 @@ def draw_sheet(
     known = bool(np.isfinite(extents).all())
     sizes = extents if known else [float(n) for n in sheet.shape]
     x, y = (np.linspace(0, size, n) for size, n in zip(sizes, sheet.shape, strict=True))
+    names, hatched = sheet.subfield, ~sheet.valid
+    if sheet.ends is not None:
+        names, hatched = np.where(sheet.valid, names, ""), np.zeros_like(hatched)
+        y = _row_positions(sheet) if known and sheet.points else y
     values = sheet.columns[kind.column].T
     axis.set_facecolor("0.85")
     image = axis.pcolormesh(
         x, y, values, cmap=kind.colors, vmin=scale[0], vmax=scale[1], shading="nearest",
         rasterized=True,
     )  # fmt: skip
-    for where, hatch in ((sheet.repaired, "////"), (~sheet.valid, "xxxx")):
+    for where, hatch in ((sheet.repaired, "////"), (hatched, "xxxx")):
         if where.any():
             _hatch(axis, where, x, y, hatch)
-    _draw_borders(axis, sheet.subfield, x, y)
+    _draw_borders(axis, names, x, y)
+    if sheet.ends is not None:
+        _draw_ends(axis, sheet, y)
     axis.set_aspect("equal")
     axis.set_title(SIDES.get(hemi, hemi))
     axis.set_xlabel(f"  ←  {'mm' if known else 'nodes'}  →  ".join(X_ENDS))
     return image
+
+
+def _row_positions(sheet: SheetTable) -> Float:
+    """Mean distance of rows from the first, mm: tail, body and head have steps of their own."""
+    middle, both = sheet.points["midthickness"], sheet.valid[:, 1:] & sheet.valid[:, :-1]
+    steps = np.linalg.norm(np.diff(middle, axis=1), axis=2)
+    some, rows = both.any(axis=0), np.arange(both.shape[1])
+    mean = np.where(both, steps, 0.0).sum(axis=0) / np.maximum(both.sum(axis=0), 1)
+    return np.append(0.0, np.cumsum(np.interp(rows, rows[some], mean[some])))
+
+
+def _draw_ends(axis: "Axes", sheet: SheetTable, y: Float) -> None:
+    """Mark the ends of the body, and name the parts of the sheet at the right."""
+    known = np.flatnonzero(sheet.valid.any(axis=0))
+    axis.set_ylim(*_edges(y)[[known[0], known[-1] + 1]])
+    for row in sheet.end_rows:
+        axis.axhline(y[row], color="black", linewidth=1, dashes=(4, 2))
+    for name, first, last in sheet.parts:
+        shown = known[(known >= first) & (known <= last)]
+        if not len(shown):
+            continue
+        axis.text(
+            1.02, (y[shown[0]] + y[shown[-1]]) / 2, name,
+            ha="left", va="center", rotation=90, fontsize=8, transform=axis.get_yaxis_transform(),
+        )  # fmt: skip
 
 
 def _hatch(axis: "Axes", where: NDArray[np.bool_], x: Float, y: Float, hatch: str) -> None:
@@ -246,8 +278,8 @@ def _hatch(axis: "Axes", where: NDArray[np.bool_], x: Float, y: Float, hatch: st
 
 def _edges(nodes: Float) -> Float:
     """Compute cell edges halfway between nodes."""
-    step = nodes[1] - nodes[0]
-    return np.append(nodes - step / 2, nodes[-1] + step / 2)
+    steps = np.diff(nodes) / 2
+    return np.concatenate([nodes - [steps[0], *steps], [nodes[-1] + steps[-1]]])
 
 
 def _draw_borders(axis: "Axes", names: NDArray[np.str_], x: Float, y: Float) -> None:
@@ -255,19 +287,22 @@ def _draw_borders(axis: "Axes", names: NDArray[np.str_], x: Float, y: Float) -> 
     from matplotlib.collections import LineCollection  # noqa: PLC0415  (slow to load)
 
     x_edges, y_edges = _edges(x), _edges(y)
-    across = np.argwhere(names[1:] != names[:-1])
-    along = np.argwhere(names[:, 1:] != names[:, :-1])
+    known = names != ""
+    across = np.argwhere((names[1:] != names[:-1]) & known[1:] & known[:-1])
+    along = np.argwhere((names[:, 1:] != names[:, :-1]) & known[:, 1:] & known[:, :-1])
     lines = [
         *(((x_edges[i + 1], y_edges[j]), (x_edges[i + 1], y_edges[j + 1])) for i, j in across),
         *(((x_edges[i], y_edges[j + 1]), (x_edges[i + 1], y_edges[j + 1])) for i, j in along),
     ]
     axis.add_collection(LineCollection(lines, colors="white", linewidths=2.2))
     axis.add_collection(LineCollection(lines, colors="black", linewidths=1.0))
-    for name in np.unique(names[names != ""]):
+    fields = np.unique(names[known])
+    staggered = 0.07 * (y[-1] - y[0]) if known.any() and not known.all() else 0.0
+    for name, side in zip(fields, cycle((-1, 1)), strict=False):
         i, j = np.nonzero(names == name)
         label = {"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 1.2}
         axis.text(
-            x[i].mean(), y[j].mean(), name,
+            x[i].mean(), y[j].mean() + side * staggered, name,
             ha="center", va="center", rotation=90, bbox=label, fontsize=9,
         )  # fmt: skip
 
@@ -330,12 +365,15 @@ def read_maps(hemisphere: Hemisphere) -> dict[str, Float]:
 
 
 def make_sprites(maps: Sequence[Mapping[str, Float]]) -> tuple[list[Sprites], Grid]:
-    """Draw the maps of all hemispheres; those that have none are empty."""
+    """Draw the maps of all hemispheres, on tiles for the longest; without one, a tile is empty."""
     shapes = [found[MAP_KINDS[0].column].shape for found in maps if found]
     usual = max(set(shapes), key=shapes.count) if shapes else (0, 0)
     shown = [
-        row for row, found in enumerate(maps) if found and next(iter(found.values())).shape == usual
+        row
+        for row, found in enumerate(maps)
+        if found and next(iter(found.values())).shape[0] == usual[0]
     ]
+    longest = max((shape[1] for shape in shapes if shape[0] == usual[0]), default=0)
     grid = Grid(
         columns=min(_COLUMNS, max(1, len(shown))),
         rows=max(1, -(-len(shown) // _COLUMNS)),
@@ -345,9 +383,14 @@ def make_sprites(maps: Sequence[Mapping[str, Float]]) -> tuple[list[Sprites], Gr
     sprites = []
     for kind in MAP_KINDS if shown else ():
         scale = scale_of(kind, [maps[row][kind.column] for row in shown])
-        tiles = [maps[row][kind.column][::step, ::step] for row in shown]
+        tiles = [_longer(maps[row][kind.column], longest)[::step, ::step] for row in shown]
         sprites.append(_sprites(kind, tiles, grid, scale))
     return sprites, grid
+
+
+def _longer(values: Float, rows: int) -> Float:
+    """Add rows without values at the anterior end, as regions differ in length."""
+    return np.pad(values, ((0, 0), (0, rows - values.shape[1])), constant_values=np.nan)
 
 
 def _sprites(

@@ -166,18 +166,24 @@ class Usual:
         return f"at most {self.text(self.high)}" if high else "any"
 
 
-def usual_ranges(thickness: float, settings: Mapping[str, Any]) -> list[Usual]:
-    """List the quality numbers that a page shows; some limits are relative to the thickness, mm."""
+def usual_ranges(
+    thickness: float, settings: Mapping[str, Any], *, whole: bool = False
+) -> list[Usual]:
+    """List the quality numbers that a page shows; some limits are relative to the thickness, mm.
+
+    ``whole`` are sheets with a head, which are folded where their map is.
+    """
     usual, ranges = Settings().model_dump(), []
-    for name, row in _table("usual.toml").items():
+    for name, about in _table("usual.toml").items():
+        row = about | about.get("whole", {}) if whole else about
         scale = thickness if row.get("relative") else 1.0
         limits = {}
-        for end in row.keys() & {"low", "high"}:
+        for end in (end for end in ("low", "high") if row.get(end)):
             stage, setting = row[end].removeprefix("-").split(".")
             value = scale * (usual[stage] | dict(settings.get(stage) or {}))[setting]
             limits[end] = -value if row[end].startswith("-") else value
-        about = {key: row[key] for key in row.keys() - {"low", "high", "relative"}}
-        ranges.append(Usual(name=name, **about, **limits))
+        rest = {key: row[key] for key in row.keys() - {"low", "high", "relative", "whole"}}
+        ranges.append(Usual(name=name, **rest, **limits))
     return ranges
 
 

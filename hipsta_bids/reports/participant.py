@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.reports.cohort import MEASURES, SMALLEST_COHORT, Cohort, Measure
 from hipsta_bids.reports.display import (
     MAP_KINDS,
@@ -98,6 +99,8 @@ def _sheet_scene(hemisphere: Hemisphere, names: Sequence[str]) -> dict[str, Any]
     ends = [hemisphere.metrics.get(f"{end}_plane") for end in ("posterior", "anterior")]
     return {
         "shape": sheet.shape,
+        "parts": sheet.parts,
+        "ends": sheet.end_rows,
         "extent": [hemisphere.summary.get(f"extent_{axis}", 1.0) for axis in "xy"],
         "surfaces": {name: _flat(sheet.points[name], 2) for name in SURFACES},
         "maps": {kind.column: _flat(sheet.columns[kind.column], 4) for kind in MAP_KINDS},
@@ -176,6 +179,11 @@ class Series:
         first = self.hemispheres[0]
         name = first.place.name
         return ", ".join(filter(None, (name.seg, name.region_title)))
+
+    @property
+    def whole(self) -> bool:
+        """Whether the head is on the sheet."""
+        return self.hemispheres[0].place.name.region in EXPERIMENTAL
 
     @cached_property
     def views(self) -> Mapping[str, Views | None]:
@@ -262,7 +270,7 @@ def _quality_numbers(series: Series) -> Mapping[str, Any] | None:
     rows = []
     lengths = np.array([number(h.metrics, "body_length_mm") for h in measured])
     others = lengths[::-1] if len(lengths) > 1 else np.full(1, np.nan)
-    for usual in usual_ranges(thickness, series.cohort.settings):
+    for usual in usual_ranges(thickness, series.cohort.settings, whole=series.whole):
         values = [number(h.metrics, usual.name) for h in measured]
         if usual.name == "length_difference_mm":
             values = (lengths - others).tolist()
@@ -285,6 +293,7 @@ def _quality_numbers(series: Series) -> Mapping[str, Any] | None:
     facts = [
         (title, [", ".join(str(h.metrics.get(key, "n/a")) for key in keys) for h in measured])
         for title, *keys in _FACTS
+        if not series.whole or any(key in h.metrics for key in keys for h in measured)
     ]
     return {"sides": [h.side for h in measured], "rows": rows, "facts": facts}
 
@@ -378,7 +387,7 @@ def _input(series: Series) -> Mapping[str, Any]:
                 "stack": stack_of(view) if panels and view else None,
             }
         )
-    return {"groups": groups, "legend": _legend(series)}
+    return {"groups": groups, "legend": _legend(series), "whole": series.whole}
 
 
 def _legend(series: Series) -> list[Mapping[str, str]]:
@@ -401,6 +410,7 @@ def _sheets(series: Series) -> Mapping[str, Any] | None:
     return {
         "pictures": pictures,
         "uncertainty": [_uncertainty(h) for h in uncertain],
+        "whole": series.whole,
         "repaired": any(h.sheet.repaired.any() for h in measured),
         "invalid": any(not h.sheet.valid.all() for h in measured),
     }

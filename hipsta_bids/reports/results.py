@@ -26,6 +26,7 @@ from hipsta_bids.geometry.sampling import ScalarVolume
 from hipsta_bids.inputs.anatomy import Candidate, find_anatomy
 from hipsta_bids.io import files, gifti
 from hipsta_bids.io.volumes import LabelImage, read_grid, read_labels, read_scalars
+from hipsta_bids.protocols import body_ends
 from hipsta_bids.protocols.load import load_protocol, protocol_names
 from hipsta_bids.protocols.protocol import Protocol
 from hipsta_bids.reports.display import palette
@@ -50,6 +51,7 @@ _COVERED = 0.99
 _SAME = 0.05
 #: Percentiles of the anatomical image that are black and white.
 _GRAYS = (1.0, 99.5)
+_HALF = 0.5
 #: Most voxels of an anatomical image that are read: those round a long hippocampus at 0.24 mm take
 #: some 500 MB meanwhile.
 _MOST_VOXELS = 25_000_000
@@ -84,6 +86,29 @@ class SheetTable:
     repaired: NDArray[np.bool_]
     points: Mapping[str, Float]
     """(Nx, Ny, 3) RAS mm, by name of the surface."""
+    ends: tuple[int, int] | None = None
+    """First and last row of the body, where head or tail are on the sheet."""
+
+    @property
+    def parts(self) -> list[tuple[str, int, int]]:
+        """Name, first and last row of tail, body and head, where not all is body."""
+        if self.ends is None:
+            return []
+        first, last = self.ends
+        end = self.shape[1] - 1
+        rows = (("tail", 0, first - 1), ("body", first, last), ("head", last + 1, end))
+        return [part for part in rows if part[1] <= part[2]]
+
+    @property
+    def end_rows(self) -> list[int]:
+        """Rows of the ends of the body that lie on the sheet, not at its edge."""
+        return [row for row in self.ends or () if 0 < row < self.shape[1] - 1]
+
+    @property
+    def shown_rows(self) -> NDArray[np.intp]:
+        """Rows that are worth a picture: on a sheet with a head those of which half has values."""
+        enough = self.valid.mean(axis=0) >= _HALF
+        return np.flatnonzero(enough | (self.ends is None))
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -187,6 +212,7 @@ class Hemisphere:
             valid=valid == "true",
             repaired=repaired == "true",
             points={name: _surface_points(self.place, name, valid.shape) for name in SURFACES},
+            ends=body_ends(self.place.name.region, valid.shape[1]),
         )
 
 

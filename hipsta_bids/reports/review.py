@@ -109,6 +109,7 @@ def correction_of(hemispheres: Sequence[Hemisphere]) -> Mapping[str, Any]:
     for hemisphere in hemispheres:
         name = hemisphere.place.name
         mask = hemisphere.place.path("body_mask")
+        by_mask = mask.exists() and name.region == "body"  # of other regions labels are corrected
         path = input_path(hemisphere)
         suffix = f"{name.stem}_{name.protocol}_desc-edited"
         choices.append(
@@ -116,11 +117,12 @@ def correction_of(hemispheres: Sequence[Hemisphere]) -> Mapping[str, Any]:
                 "side": hemisphere.side,
                 "labels": path.name if path else None,
                 "edited_labels": f"{suffix}_dseg.nii.gz",
-                "mask": output_name(name, "body_mask") if mask.exists() else None,
+                "mask": output_name(name, "body_mask") if by_mask else None,
                 "edited_mask": f"{suffix}_mask.nii.gz",
             }
         )
     command = ["hipsta-bids", "BIDS_DIR", "OUT_DIR", "participant", "--edited-dir", "EDITS"]
     command += ["--participant-label", first.subject]
+    command += ["--region", first.region] if first.region != "body" else []
     folder = f"EDITS/{first.folder}"
     return {"choices": choices, "folder": folder, "command": shlex.join(command)}

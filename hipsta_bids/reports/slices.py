@@ -225,7 +225,8 @@ def section_panels(
     ``scale`` is the thickness at both ends of the colors, mm.
     """
     sheet = hemisphere.sheet
-    rows = [round(share * (sheet.shape[1] - 1)) for share in POSITIONS]
+    shown = sheet.shown_rows
+    rows = [int(shown[round(share * (len(shown) - 1))]) for share in POSITIONS]
     return _same_windows(
         [
             _section(sheet, row, share, colors, scale)
@@ -237,8 +238,10 @@ def section_panels(
 def _centers(hemisphere: Hemisphere, views: Views) -> list[Float]:
     """Voxel indices of points inside the body at the positions that are shown; none without one."""
     if hemisphere.measured:
-        middle = views.to_index(hemisphere.sheet.points["midthickness"])
-        rows = [round(share * (middle.shape[1] - 1)) for share in POSITIONS]
+        sheet = hemisphere.sheet
+        middle = views.to_index(sheet.points["midthickness"])
+        shown = sheet.shown_rows
+        rows = [shown[round(share * (len(shown) - 1))] for share in POSITIONS]
         return [np.asarray(np.nanmean(middle[:, row], axis=0)) for row in rows]
     inside = views.mask if views.mask is not None else np.isin(views.labels, list(views.names))  # type: ignore[arg-type]  # one is there
     index = np.argwhere(inside)
@@ -351,7 +354,8 @@ def _plane_lines(hemisphere: Hemisphere, views: Views) -> Float:
     """Find the end planes in a sagittal slice: both ends (2, 2, 3) of each line, voxel indices."""
     lines = []
     middle = hemisphere.sheet.points["midthickness"]
-    for end, row in (("posterior_plane", 0), ("anterior_plane", -1)):
+    first, last = hemisphere.sheet.ends or (0, -1)
+    for end, row in (("posterior_plane", first), ("anterior_plane", last)):
         plane = hemisphere.metrics.get(end)
         if not plane:
             continue
@@ -396,10 +400,13 @@ def _section(
         name: np.stack([points[:, row] @ right, -(points[:, row] @ up)], axis=-1)
         for name, points in sheet.points.items()
     }
+    if sheet.ends is not None:  # positions without values are no measurement
+        flat = {n: np.where(sheet.valid[:, row, None], p, np.nan) for n, p in flat.items()}
     every = np.concatenate(list(flat.values()))
     corner, far = np.nanmin(every, axis=0) - 0.7, np.nanmax(every, axis=0) + 0.7
     flat = {name: points - corner for name, points in flat.items()}
     thickness = sheet.columns["thickness"][:, row]
+    part = "".join(f"{name}, " for name, a, b in sheet.parts if a <= row <= b)
     spread = (thickness - scale[0]) / max(scale[1] - scale[0], 1e-6)
     chosen = np.rint(np.clip(np.nan_to_num(spread), 0, 1) * (len(colors) - 1)).astype(int)
     ends = np.stack([flat["interior"], flat["exterior"]], axis=1)
@@ -410,9 +417,12 @@ def _section(
     )
     return Panel(
         window=(0.0, 0.0, float(far[0] - corner[0]), float(far[1] - corner[1])),
-        caption=f"{share:.0%} from posterior, mean {np.nanmean(thickness):.2f} mm",
+        caption=f"{part}{share:.0%} from posterior, mean {np.nanmean(thickness):.2f} mm",
         alt=f"cross-section at {share:.0%} of the body: interior, mid and exterior curve with"
         " thickness lines",
-        paths={name: path_data([points]) for name, points in flat.items()},
+        paths={
+            name: path_data([line] if sheet.ends is None else np.stack([line[:-1], line[1:]], 1))
+            for name, line in flat.items()
+        },
         lines=lines,
     )

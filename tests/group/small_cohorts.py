@@ -94,10 +94,13 @@ def write_sessions(folder, cohort, losses, *, noise, column, times, lacking=()):
     return data, out
 
 
-def write_dataset(folder, *, session=None, region="body"):
-    """A BIDS dataset and the participant level's output; the second group is thinner."""
+def write_dataset(folder, *, session=None, region="body", plan=PLAN, known=None):
+    """A BIDS dataset and the participant level's output; the second group is thinner.
+
+    ``known`` (subjects, x, y) tells which nodes have values.
+    """
     data, out = begin_dataset(folder)
-    cohorts = {hemi: simulate_cohort(PLAN, seed) for seed, hemi in enumerate("LR")}
+    cohorts = {hemi: simulate_cohort(plan, seed) for seed, hemi in enumerate("LR")}
     left = cohorts["L"]
     rows = []
     for i in range(len(left.age)):
@@ -105,7 +108,10 @@ def write_dataset(folder, *, session=None, region="body"):
         for hemi, cohort in cohorts.items():
             place = place_of(out, subject, hemi, session=session, region=region)
             volume = 500 + 10 * np.sin(i) - 5 * left.group[i]
-            write_hemisphere(place, cohort.thickness[i], cohort.curvature[i], volume=volume)
+            maps = cohort.thickness[i], cohort.curvature[i]
+            if known is not None:
+                maps = [np.where(known[i], one, np.nan) for one in maps]
+            write_hemisphere(place, *maps, volume=volume)
         sex = "F" if left.sex[i] else "M"
         rows.append([f"sub-{subject}", GROUPS[int(left.group[i])], f"{left.age[i]:.1f}", sex])
     write_participants(data, rows)

@@ -1,13 +1,19 @@
 """Head, body and tail on one sheet: a spiral wall along a hooked axis, whose thickness is known."""
 
+import io
 import json
-from contextlib import nullcontext
+import re
+from contextlib import nullcontext, redirect_stdout
 from dataclasses import replace
+from pathlib import Path
 
 import nibabel as nib
 import numpy as np
+import pandas as pd
 import pytest
 
+import hipsta_bids as hb
+from hipsta_bids.api.maps import Measurement
 from hipsta_bids.cli.main import main
 from hipsta_bids.derivatives.names import name_of_record
 from hipsta_bids.errors import GeometryError, ProtocolError
@@ -16,6 +22,8 @@ from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.phantom.head import RADIUS, HeadSpec, draw_head
 from hipsta_bids.protocols.load import for_region, load_protocol
 from hipsta_bids.protocols.protocol import Tissue
+from hipsta_bids.reports.cohort import read_cohort
+from hipsta_bids.reports.participant import participant_page
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Bool, Float, HemisphereMaps, LabelVolume, TetMesh
 
@@ -177,7 +185,10 @@ def test_edges_wrap_round_the_boundary() -> None:
         assert np.median(disk.vertices[found.anterior][:, 1]) == 1.0
 
 
-def test_command_writes_beside_the_body_and_says_experimental(tmp_path, capsys) -> None:
+@pytest.fixture(scope="module")
+def out(tmp_path_factory) -> Path:
+    """Output of the command with all that it can add to a hemisphere."""
+    tmp_path = tmp_path_factory.mktemp("whole")
     volume = hooked()
     derivative = tmp_path / "bids/derivatives/maget"
     folder = derivative / "sub-01/anat"
@@ -189,6 +200,9 @@ def test_command_writes_beside_the_body_and_says_experimental(tmp_path, capsys) 
         codes[volume.tissue == label.tissue] = 100 + label.code
     image = nib.Nifti1Image(codes, volume.affine)
     image.to_filename(folder / "sub-01_T1w_labels.nii.gz")
+    points = np.moveaxis(np.indices(codes.shape), 0, -1) @ volume.affine[:3, :3].T
+    height = (points + volume.affine[:3, 3])[..., 1].astype(np.float32)
+    nib.Nifti1Image(height, volume.affine).to_filename(tmp_path / "height.nii.gz")
     (tmp_path / "ends.tsv").write_text(
         "participant_id\themi\tend\tr\ta\ts\tnr\tna\tns\n"
         f"sub-01\tL\tposterior\t0\t{POSTERIOR}\t0\t0\t1\t0\n"
@@ -196,9 +210,21 @@ def test_command_writes_beside_the_body_and_says_experimental(tmp_path, capsys) 
     )
     places = [str(tmp_path / "bids"), str(tmp_path / "out"), "participant", "--n-procs", "1"]
     options = ["--ends", str(tmp_path / "ends.tsv"), "--hemi", "L", "--region", "whole"]
-    assert main([*places, *options]) == 0
-    assert "region whole is experimental" in capsys.readouterr().out
-    results = tmp_path / "out/sub-01/anat"
+    options += ["--map", f"height={tmp_path / 'height.nii.gz'}", "--map-sampling", "mid"]
+    options += ["--uncertainty", "2", "--write-meshes"]
+    with redirect_stdout(io.StringIO()) as said:
+        assert main([*places, *options]) == 0
+    assert "region whole is experimental" in said.getvalue()
+    return tmp_path / "out"
+
+
+def sheet_of(out: Path) -> pd.DataFrame:
+    (path,) = out.glob("sub-01/anat/*_label-whole_desc-sheet_morph.tsv")
+    return pd.read_csv(path, sep="\t")
+
+
+def test_command_writes_beside_the_body_and_says_experimental(out: Path) -> None:
+    results = out / "sub-01/anat"
     (path,) = results.glob("*_label-whole_desc-distortion_morph.shape.gii")
     assert nib.load(path).agg_data().shape == (41 * 51,)
     (record,) = results.glob("*_label-whole_desc-qc_metrics.json")
@@ -207,3 +233,63 @@ def test_command_writes_beside_the_body_and_says_experimental(tmp_path, capsys) 
     assert name.region_title == "whole region (experimental)"  # as pages have it
     (sidecar,) = results.glob("*_label-whole_desc-sheet_morph.json")
     assert "experimental" in json.loads(sidecar.read_text())["MeasuredRegion"]
+
+
+def test_other_volumes_have_values_where_the_sheet_has(out: Path) -> None:
+    (path,) = out.glob("sub-01/anat/*_label-whole_desc-height_map.tsv")
+    sheet, found = sheet_of(out), pd.read_csv(path, sep="\t").height
+    assert 0.1 < sheet.thickness.isna().mean() < 0.5
+    np.testing.assert_array_equal(found.isna(), sheet.thickness.isna())
+    np.testing.assert_allclose(found, sheet.a.where(found.notna()), atol=0.002)  # rounded
+
+
+def test_uncertainty_is_that_of_the_whole_sheet(out: Path) -> None:
+    (path,) = out.glob("sub-01/anat/*_label-whole_desc-uncertainty_morph.tsv")
+    sheet, sd = sheet_of(out), pd.read_csv(path, sep="\t").thickness_sd
+    assert sd[sheet.thickness.isna()].isna().all()
+    assert sd[sheet.thickness.notna()].notna().mean() > 0.9
+    assert 0 < sd.median() < 0.2
+    record = json.loads(next(out.glob("sub-01/anat/*_desc-qc_metrics.json")).read_text())
+    assert record["metrics"]["uncertainty_failed"] == 0
+
+
+def test_mesh_and_layers_are_written(out: Path) -> None:
+    (path,) = out.glob("sub-01/anat/*_label-whole_desc-tet_mesh.vtu")
+    assert path.stat().st_size > 100_000
+    (path,) = out.glob("sub-01/anat/*_label-whole_desc-layers_morph.tsv")
+    layers = pd.read_csv(path, sep="\t")
+    assert len(layers) == 41 * 51 * 9
+
+
+def test_page_names_the_parts_and_what_has_no_value(out: Path) -> None:
+    page = participant_page(out, "01", None, read_cohort(out)) or ""
+    assert "whole region (experimental)" in page
+    assert "Gray: no value, within 1 mm of edges, ends and holes." in page
+    (data,) = re.findall(r'<script type="application/json">(\{"scales".*?)</script>', page)
+    (scene,) = json.loads(data)["scenes"]
+    assert scene["parts"] == [["tail", 0, 9], ["body", 10, 30], ["head", 31, 50]]
+    assert scene["ends"] == [10, 30]
+    for part in ("tail", "body", "head"):
+        assert f"{part}, " in "".join(re.findall("<figcaption>(.*?)</figcaption>", page))
+    assert "participant --edited-dir EDITS --participant-label 01 --region whole" in page
+    assert "nan mm" not in page
+
+
+def test_interface_loads_the_whole_sheet(out: Path) -> None:
+    pytest.importorskip("xarray")
+    maps, table = hb.load(out, region="whole")
+    one = maps.sel(participant="sub-01", side="L").squeeze("session")
+    assert one.y.to_numpy()[[0, 10, 30, -1]] == pytest.approx([-2, -1, 1, 3])
+    assert table.region.tolist() == ["whole"]
+    sheet = sheet_of(out).thickness.to_numpy().reshape(41, 51)
+    np.testing.assert_array_equal(one.thickness.to_numpy(), sheet)
+    lines = [line.get_ydata()[0] for line in hb.plot_sheet(one).lines]
+    assert len(lines) == 2  # the ends of the body
+
+
+def test_interface_measures_head_and_body(maps: HemisphereMaps) -> None:
+    pytest.importorskip("xarray")
+    measured = Measurement(
+        side="L", protocol=load_protocol("cobralab"), settings=WHOLE, hemisphere=maps
+    )
+    assert dict(measured.dataset.sizes) == {"x": 41, "y": 51, "layer": 9, "ras": 3}

@@ -75,7 +75,8 @@ def test_bodies_of_both_sides_of_quite_different_length_are_marked(lengths, mark
     ]
 
     def row(*sides):
-        series = SimpleNamespace(measured=list(sides), cohort=SimpleNamespace(settings={}))
+        cohort = SimpleNamespace(settings={})
+        series = SimpleNamespace(measured=list(sides), cohort=cohort, whole=False)
         rows = _quality_numbers(series)["rows"]
         return {row["title"]: row for row in rows}.get("Difference of these distances")
 

@@ -278,6 +278,11 @@
             this.mesh(points, index, n ? [0.84, 0.37, 0.0] : [0.1, 0.12, 0.15]);
             this.label(line[Math.floor(line.length / 2)], text);
           });
+          for (const j of scene.ends) {
+            const line = Array.from({ length: scene.shape[0] }, (_, i) => this.row("midthickness", i)[j]);
+            const { points, index } = tube(line, 0.09);
+            this.mesh(points, index, [0.63, 0.07, 0.09]);
+          }
         }
         if (this.shows("planes")) scene.planes.forEach((plane) => this.drawPlane(plane));
       } else this.mesh(this.body, scene.body.triangles, GRAY, { opacity: 0.62 });
@@ -437,7 +442,7 @@
         ["Node", `x ${i + 1}, y ${j + 1}`], ["Thickness", word("thickness")], ["Mean curvature", word("curvature")],
         ["Subfield", scene.subfield[n] < 0 ? "n/a" : scene.subfields[scene.subfield[n]].name],
         ["RAS", `${place.map((v) => v.toFixed(1)).join(", ")} mm`],
-        ["Measured", (scene.valid[n] ? "directly" : "filled from neighbors") + (scene.repaired[n] ? ", repaired" : "")],
+        ["Measured", (scene.valid[n] ? "directly" : scene.parts.length ? "no value here" : "filled from neighbors") + (scene.repaired[n] ? ", repaired" : "")],
       ];
       const list = this.root.querySelector(".values");
       list.replaceChildren(...rows.flatMap(([name, text]) => [
@@ -446,7 +451,8 @@
 
     drawFlat() {
       const scene = this.scene, [nx, ny] = scene.shape, width = Math.min(330, this.root.clientWidth);
-      const tall = Math.round((width * scene.extent[1]) / scene.extent[0]), dpr = window.devicePixelRatio || 1;
+      const most = scene.parts.length ? 1.25 : Infinity; // with a head: fits beside the view
+      const tall = Math.round(width * Math.min(most, scene.extent[1] / scene.extent[0])), dpr = window.devicePixelRatio || 1;
       Object.assign(this.flat, { width: width * dpr, height: tall * dpr });
       Object.assign(this.flat.style, { width: `${width}px`, height: `${tall}px` });
       const context = this.flat.getContext("2d"), w = this.flat.width / nx, h = this.flat.height / ny;
@@ -462,11 +468,27 @@
       for (let i = 0; i < nx; i++) {
         for (let j = 0; j < ny; j++) {
           const own = scene.subfield[i * ny + j], x = i * w, y = (ny - 1 - j) * h;
-          if (i + 1 < nx && scene.subfield[(i + 1) * ny + j] !== own) { context.moveTo(x + w, y); context.lineTo(x + w, y + h); }
-          if (j + 1 < ny && scene.subfield[i * ny + j + 1] !== own) { context.moveTo(x, y); context.lineTo(x + w, y); }
+          const known = (n) => !scene.parts.length || (scene.valid[n] && scene.valid[i * ny + j]);
+          if (i + 1 < nx && known((i + 1) * ny + j) && scene.subfield[(i + 1) * ny + j] !== own) { context.moveTo(x + w, y); context.lineTo(x + w, y + h); }
+          if (j + 1 < ny && known(i * ny + j + 1) && scene.subfield[i * ny + j + 1] !== own) { context.moveTo(x, y); context.lineTo(x + w, y); }
         }
       }
       context.stroke();
+      context.setLineDash([6 * dpr, 3 * dpr]);
+      context.beginPath();
+      for (const j of scene.ends) { context.moveTo(0, (ny - 0.5 - j) * h); context.lineTo(nx * w, (ny - 0.5 - j) * h); }
+      context.stroke();
+      context.setLineDash([]);
+      context.font = `${12 * dpr}px sans-serif`;
+      for (const [name, first, last] of scene.parts) {
+        const at = [4 * dpr, (ny - 0.5 - (first + last) / 2) * h];
+        context.strokeStyle = "#fff";
+        context.lineWidth = 3 * dpr;
+        context.strokeText(name, ...at);
+        context.fillStyle = "#000";
+        context.fillText(name, ...at);
+        context.strokeStyle = "#000";
+      }
       if (this.node) {
         const [i, j] = this.node, x = (i + 0.5) * w, y = (ny - 0.5 - j) * h;
         for (const [size, style] of [[3 * dpr, "#fff"], [1.4 * dpr, "#000"]]) {

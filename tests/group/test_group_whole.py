@@ -1,0 +1,111 @@
+"""The group level on sheets with head and tail: more rows, and nodes without values."""
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from small_cohorts import NODES, PLAN, write_dataset
+
+from hipsta_bids.cli.main import main
+from hipsta_bids.group import figures, write
+from hipsta_bids.group.read import node_coordinates
+from hipsta_bids.participant.whole import grid_levels
+from hipsta_bids.protocols import rows_beyond
+from hipsta_bids.settings import SheetSettings
+
+REGION = "whole"
+TAIL, HEAD = rows_beyond(REGION, NODES[1])
+SHAPE = (NODES[0], TAIL + NODES[1] + HEAD)
+#: A difference in the head alone.
+IN_HEAD = replace(
+    PLAN, nodes=SHAPE, center=(12.0, TAIL + NODES[1] + 2.0), core=(1.5, 1.0), taper=1.0
+)
+N = sum(PLAN.sizes)
+QUICK = ["--measures", "thickness", "--formula", "group", "--contrast", "group[CN]-group[AD]"]
+HOLE = (slice(4, 7), slice(TAIL + 1, TAIL + 4))
+
+
+def known_nodes():
+    """Rims of all, wider in some; a hole in all but two of either group."""
+    known = np.ones((N, *SHAPE), dtype=bool)
+    known[:, [0, -1]] = False
+    known[::2, :, -1] = False
+    known[2 : N - 2, *HOLE] = False
+    return known
+
+
+@pytest.fixture(scope="module", autouse=True)
+def without_pages():
+    """Let runs make pages here."""
+
+
+def only_maps(*given):
+    return ((name, draw) for name, draw in figures.draw_figures(*given) if name.endswith("_maps"))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    root = tmp_path_factory.mktemp("whole")
+    data, out = write_dataset(root, region=REGION, plan=IN_HEAD, known=known_nodes())
+    with pytest.MonkeyPatch.context() as patch:  # figures as the page shows them alone
+        patch.setattr(figures, "_METADATA", {"svg": {"Date": None, "Creator": None}})
+        patch.setattr(write, "draw_figures", only_maps)
+        assert main([str(data), str(out), "group", "--region", REGION, *QUICK]) == 0
+    return out / "group" / f"thickness_group_{REGION}"
+
+
+@pytest.fixture(scope="module")
+def points(folder):
+    return {
+        hemi: pd.read_csv(path, sep="\t")
+        for hemi in "LR"
+        for path in folder.glob(f"hemi-{hemi}_*statmap.tsv")
+    }
+
+
+@pytest.mark.parametrize("region", ["body", "headbody", "whole"])
+def test_coordinates_are_those_of_the_participant_level(region):
+    sheet = SheetSettings(y_nodes=9)
+    (x, y, _), _ = grid_levels(sheet, region)
+    for own, expected in zip(node_coordinates(sheet.model_dump(), region), (x, y), strict=True):
+        np.testing.assert_allclose(own, expected, atol=1e-9)
+
+
+def test_difference_in_the_head_is_found_and_named(folder, points):
+    head = TAIL + NODES[1] + 2
+    for table in points.values():
+        found = (table.significant == True).to_numpy()  # noqa: E712  (may be missing)
+        assert found.reshape(SHAPE)[11:14, head - 1 : head + 2].all()
+        assert found[table.part != "head"].mean() < 0.05
+        assert set(table.part) == {"tail", "body", "head"}
+        assert ((table.y > 1) == (table.part == "head")).all()
+    peaks = pd.read_csv(folder / "peaks.tsv", sep="\t")
+    assert (peaks.groupby("hemi").first().part == "head").all()  # the largest clusters
+    assert "head (x" in (folder.parent / f"{folder.name}.html").read_text()
+
+
+def test_no_value_is_made_where_there_was_none(points):
+    for table in points.values():
+        n = table.n.to_numpy().reshape(SHAPE)
+        assert (n[[0, -1]] == 0).all()
+        assert n[:, -1].max() == N // 2
+        assert (n[5, TAIL + 1 : TAIL + 4] == 0).all()  # fewer than half have a value
+        p = table.p.to_numpy().reshape(SHAPE)
+        assert np.isnan(p[n < 2 + 3]).all()  # columns of the model, and degrees of freedom
+        assert np.isfinite(p[n > N / 2]).all()
+
+
+def test_what_is_experimental_is_said(folder):
+    page = (folder.parent / f"{folder.name}.html").read_text()
+    assert "Region whole is experimental." in page
+    text = (folder / "methods.md").read_text()
+    assert "the whole hippocampus on one sheet (experimental)" in text
+    assert "None was imputed" in text
+
+
+def test_figures_show_how_many_have_a_value(folder):
+    text = (folder / "figures" / "thickness_maps.svg").read_text()
+    assert "Sheets with a value at each point" in text
+    for word in ("tail", "body", "head"):
+        assert f">{word}<" in text
