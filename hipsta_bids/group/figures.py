@@ -105,12 +105,13 @@ def encode(name: str, draw: Drawing) -> list[tuple[str, bytes]]:
     encoded = []
     # Tables that shape text: it is shaped before it is embedded, and reading them takes longest.
     dropped = [*Options().drop_tables, "GSUB", "GPOS", "GDEF"]
-    with rc_context(_STYLE), patch.object(Options, "_drop_tables_default", dropped):
+    leaner = patch.object(Options, "_drop_tables_default", dropped, create=True)
+    with rc_context(_STYLE), leaner:
         for number, figure in enumerate(draw(), start=1):
             own = name if number == 1 else f"{name}_{number}"
             for kind, metadata in _METADATA.items():
                 buffer = io.BytesIO()
-                how = {"pil_kwargs": {"compress_level": 4}} if kind == "png" else {}
+                how: Any = {"pil_kwargs": {"compress_level": 4}} if kind == "png" else {}
                 figure.savefig(buffer, format=kind, dpi=DOTS_PER_INCH, metadata=metadata, **how)
                 encoded.append((f"{own}.{kind}", buffer.getvalue()))
                 figure.set_layout_engine(None)  # that of the first is for all: it takes long
