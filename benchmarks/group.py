@@ -4,7 +4,7 @@ Writes sheets, summaries and surfaces as the participant level leaves them: thos
 was measured, with simulated maps (``hipsta_bids/validation/group.py``) and scattered summary
 measures, for three groups. Then runs the command::
 
-    .venv/bin/python benchmarks/group.py [--sizes 40 1500 5000] [--json FILE]
+    .venv/bin/python benchmarks/group.py [--sizes 40 1500 10000 50000] [--json FILE]
 
 Each size has a process of its own, so that memory is its own. Beyond 1,000 participants files are
 links to those of the first 1,000, since reading them costs the same; covariates are each one's own.
@@ -148,7 +148,7 @@ def run(data: Path, out: Path, size: int) -> Run:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run from the command line."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--sizes", type=int, nargs="+", default=(40, 1500, 5000), metavar="N")
+    parser.add_argument("--sizes", type=int, nargs="+", default=(40, 1500, 10_000), metavar="N")
     parser.add_argument("--one", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--json", type=Path, metavar="FILE")
     options = parser.parse_args(arguments)

@@ -15,10 +15,12 @@ from hipsta_bids.cli.parser import (
     factor_level,
     from_namespace,
     named_pattern,
+    positive_int,
 )
 from hipsta_bids.cli.participant import REGIONS
 from hipsta_bids.cli.questions import add_questions, is_question, run_comparison, run_question
 from hipsta_bids.errors import ExitCode, NothingToDoError, UsageError
+from hipsta_bids.participant.pool import processors
 
 if TYPE_CHECKING:
     from hipsta_bids.group.run import GroupOptions
@@ -238,6 +240,13 @@ def _add_methods(parser: Parser) -> None:
         choices=["fdr2", "bh", "permutation-tfce", "permutation-max"],
     )
     add("--permutations", "N", "the data as they are included; default 5000", type=int)
+    add(
+        "--n-procs --nprocs --n-cpus --nthreads",
+        "N",
+        "processors that permute, which share memory (default: all); no result depends on it",
+        type=positive_int,
+        default=processors(),
+    )
     add("--blocks", "COLUMN", "permute inside its levels only, as those of site")
     add(
         "--fdr-scope",
@@ -329,6 +338,9 @@ def _run(parsed: argparse.Namespace, arguments: Sequence[str]) -> ExitCode:
     from hipsta_bids.io.files import check_scratch  # noqa: PLC0415  (heavy)
 
     check_scratch()
+    from hipsta_bids.group.inference import PROCESSORS  # noqa: PLC0415  (heavy)
+
+    PROCESSORS.set(parsed.n_procs)
     settings = _settings(parsed)
     with Progress(-1 if parsed.quiet else 0):
         answer = run_question if is_question(parsed) else run_comparison

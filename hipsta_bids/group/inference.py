@@ -1,6 +1,8 @@
 """What survives when many points are tested: false discovery rate, or permutations of residuals."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,8 +24,10 @@ from hipsta_bids.progress import tell
 BELOW_ALL = 0.1
 #: Methods that hold the family-wise error rate.
 PERMUTATIONS = ("permutation-tfce", "permutation-max")
-#: Permutations whose maps are in memory at once; does not change a result.
+#: Permutations whose maps a processor has in memory at once; does not change a result.
 _BATCH = 50
+#: Processors that permute; does not change a result.
+PROCESSORS: ContextVar[int] = ContextVar("processors", default=1)
 #: Sums in another order differ by less, relatively.
 _ROUNDING = 1e-9
 #: The method that does without cluster enhancement.
@@ -96,19 +100,27 @@ def permute(
     point by :func:`combine_evidence` (non-parametric combination; Winkler et al. 2016).
     """
     runs = [_Run.build(part, contrast, settings, blocks) for part in parts]
-    random = np.random.default_rng(settings.seed)
     n_subjects = 1 + max(int(one.part.subjects.max()) for run in runs for one in run.members)
-    for start in range(1, settings.permutations, _BATCH):
+
+    def reached(start: int) -> list[Float]:
+        """Count what reaches the observed statistics, with the keys of a batch by its number."""
+        bits = np.random.PCG64(settings.seed).advance((start - 1) * n_subjects)
         count = min(_BATCH, settings.permutations - start)
-        if family is not None:
-            done = family[0] * settings.permutations + start - 1
-            tell("permutations", done, family[1] * settings.permutations)
-        keys = random.random((count, n_subjects))
+        keys = np.random.Generator(bits).random((count, n_subjects))
         maps = [run.shuffled(keys) for run in runs]
         highest = np.max([_maximum(t) for t, _ in maps], axis=0)
         highest_enhanced = np.max([_maximum(enhanced) for _, enhanced in maps], axis=0)
-        for run, (t, _) in zip(runs, maps, strict=True):
-            run.count(t, highest, highest_enhanced)
+        pairs = zip(runs, maps, strict=True)
+        return [run.reached(t, highest, highest_enhanced) for run, (t, _) in pairs]
+
+    starts = range(1, settings.permutations, _BATCH)
+    with ThreadPoolExecutor(PROCESSORS.get()) as pool:
+        for start, counts in zip(starts, pool.map(reached, starts), strict=True):
+            if family is not None:
+                done = family[0] * settings.permutations + start - 1
+                tell("permutations", done, family[1] * settings.permutations)
+            for run, own in zip(runs, counts, strict=True):
+                run.counts[:] += own
     return [run.result() for run in runs]
 
 
@@ -196,11 +208,10 @@ class _Run:
         t = _together(self.members, bases, self.combine)
         return t, _enhanced(t, self.members[0].part.edges, self.settings)
 
-    def count(self, t: Float, highest: Float, highest_enhanced: Float) -> None:
-        """Count permutations that reach what was observed."""
-        self.counts[0] += _at_least(t, self.observed).sum(axis=0)
-        self.counts[1] += _at_least(highest, self.observed).sum(axis=0)
-        self.counts[2] += _at_least(highest_enhanced, self.enhanced).sum(axis=0)
+    def reached(self, t: Float, highest: Float, highest_enhanced: Float) -> Float:
+        """Count (3, points) permutations that reach what was observed."""
+        pairs = ((t, self.observed), (highest, self.observed), (highest_enhanced, self.enhanced))
+        return np.stack([_at_least(*pair).sum(axis=0, dtype=np.float64) for pair in pairs])
 
     def result(self) -> PermutationTest:
         """Turn counts into p-values."""

@@ -118,9 +118,10 @@ def maxima(basis: Float, case: Bool, kept: Float, start: Float | None = None) ->
     beta = np.tile(np.zeros(columns) if start is None else start, (len(kept), 1))
     settled = np.zeros(len(kept), dtype=bool)
     lost = np.zeros(len(kept), dtype=bool)
-    for _ in range(_NEWTON_STEPS):
-        chance = special.expit(beta @ basis.T)
-        information = ((kept * chance * (1 - chance)) @ products).reshape(-1, columns, columns)
+    for number in range(_NEWTON_STEPS):
+        # All sets begin at the same place.
+        chance = special.expit((beta if number else beta[:1]) @ basis.T)
+        information = ((kept * (chance * (1 - chance))) @ products).reshape(-1, columns, columns)
         size = np.linalg.eigvalsh(information)
         lost |= ~(size[:, 0] > RANK * size[:, -1])
         information[lost] = np.eye(columns)

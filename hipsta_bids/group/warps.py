@@ -39,6 +39,22 @@ def make_basis(knots: Float) -> BSpline[np.float64]:
     return BSpline(padded, np.eye(len(padded) - _DEGREE - 1), _DEGREE)
 
 
+def _along(knots: Float, coefficients: Float, places: Float) -> tuple[Float, Float]:
+    """Values and slopes (curves, places) of curves of coefficients (curves, splines).
+
+    By the cubic of each interval, which takes a third of the time of all splines.
+    """
+    ends, basis = np.concatenate([[0.0], knots]), make_basis(knots)
+    where = np.searchsorted(knots, places, side="right")
+    step = places - ends[where]
+    zero, one, two, three = (
+        np.take_along_axis(coefficients @ part(ends).T, where, axis=1)
+        for part in (basis, *(basis.derivative(order) for order in (1, 2, 3)))
+    )
+    slope = one + step * (two + step * three / 2)
+    return zero + step * (one + step * (two / 2 + step * three / 6)), slope
+
+
 @dataclass(frozen=True)
 class Template:
     """A mean profile and the directions in which single ones differ from it.
@@ -278,6 +294,8 @@ class _State:
     warps: Float
     slopes: Float
     residuals: Float
+    along: Float
+    """Slopes of the curves there."""
     loss: Float
 
 
@@ -300,7 +318,7 @@ class _Problem:
         for _ in range(self.settings.warp_steps):
             curves = coefficients[active]
             now = self._state(best[active], profiles[active], curves)
-            matrix, right = self._normal(now, curves)
+            matrix, right = self._normal(now)
             size = np.maximum(np.trace(matrix, axis1=1, axis2=2), _LEAST_DAMPING)
             ridge = size[:, None, None] * (level + damping[active, None, None] * np.eye(len(level)))
             step = np.linalg.solve(matrix + ridge, right[:, :, None])[:, :, 0]
@@ -315,24 +333,22 @@ class _Problem:
             if not len(active):
                 break
         last = self._state(best, profiles, coefficients)
-        matrix, _ = self._normal(last, coefficients)
+        matrix, _ = self._normal(last)
         spread = np.linalg.pinv(matrix, hermitian=True)
         uncertainty = np.trace(spread, axis1=1, axis2=2) / matrix.shape[1]
         return WarpFit(best, last.warps, np.asarray(uncertainty, dtype=np.float64))
 
     def _state(self, parameters: Float, profiles: Float, coefficients: Float) -> _State:
         warps, slopes = self.basis.evaluate(parameters)
-        expected = np.einsum("sdk,sk->sd", make_basis(self.knots)(warps), coefficients)
+        expected, along = _along(self.knots, coefficients, warps)
         residuals = profiles - expected
         loss = 0.5 * np.sum(residuals**2, axis=1)
         loss += 0.5 * self.penalty * np.sum(parameters**2, axis=1)
-        return _State(parameters, warps, slopes, residuals, loss)
+        return _State(parameters, warps, slopes, residuals, along, loss)
 
-    def _normal(self, now: _State, coefficients: Float) -> tuple[Float, Float]:
+    def _normal(self, now: _State) -> tuple[Float, Float]:
         """Matrix and right-hand side of a Gauss-Newton step."""
-        slope = make_basis(self.knots).derivative()
-        along = np.einsum("sdk,sk->sd", slope(now.warps), coefficients)
-        jacobian = along[:, :, None] * now.slopes
+        jacobian = now.along[:, :, None] * now.slopes
         matrix = np.swapaxes(jacobian, 1, 2) @ jacobian
         right = np.einsum("sdi,sd->si", jacobian, now.residuals) - self.penalty * now.parameters
         return matrix + self.penalty * np.eye(matrix.shape[1]), right

@@ -10,7 +10,7 @@ from hipsta_bids.errors import ModelError
 from hipsta_bids.group.clusters import sheet_edges
 from hipsta_bids.group.formula import Contrast
 from hipsta_bids.group.glm import fit_points
-from hipsta_bids.group.inference import PermutationPart
+from hipsta_bids.group.inference import PROCESSORS, PermutationPart
 from hipsta_bids.group.inference import permute as permute_parts
 from hipsta_bids.group.settings import GlmSettings, MultiplicitySettings
 
@@ -157,3 +157,16 @@ def test_signs_of_participants_keep_the_level_with_repeated_visits():
         found += test.p_max.min() <= 0.05
     # Six are expected, with an SD of 2.4.
     assert 0 < found <= 13
+
+
+def test_number_of_processors_changes_nothing():
+    _, matrix, maps = case()
+    one = permute(maps, matrix, GROUP, SHEET, settings=SETTINGS)
+    token = PROCESSORS.set(3)
+    try:
+        three = permute(maps, matrix, GROUP, SHEET, settings=SETTINGS)
+    finally:
+        PROCESSORS.reset(token)
+    for name in ("p_uncorrected", "p_max", "p_enhanced"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(three, name))
+    assert one.p_max.min() < 1
