@@ -133,6 +133,18 @@ def origin(results: GroupResults) -> Mapping[str, Any]:
     }
 
 
+def heading(record: Mapping[str, Any]) -> dict[str, Any]:
+    """List what the head of the page says of an analysis, or of several together."""
+    region = (record.get("inputs") or {}).get("region")
+    return {
+        "formula": record.get("formula"),
+        "n": record.get("participants"),
+        "made_by": record.get("version"),
+        "region": region,
+        "experimental": region in EXPERIMENTAL,
+    }
+
+
 def group_page(folder: Path) -> str:
     """Make the page about one analysis from its files."""
     results = read_group(folder)
@@ -141,11 +153,7 @@ def group_page(folder: Path) -> str:
         "group.html",
         title=results.name,
         folder=folder.name,
-        formula=record.get("formula"),
-        n=record.get("participants"),
-        region=(record.get("inputs") or {}).get("region"),
-        experimental=EXPERIMENTAL,
-        made_by=record.get("version"),
+        **heading(record),
         cohort=(folder.parent.parent / DATASET_FILES["report"]).exists(),
         sections=build_sections(SECTIONS, results, _PREFIX),
     )

@@ -10,7 +10,7 @@ from scipy import stats
 
 from hipsta_bids.derivatives.names import META, META_REPORT
 from hipsta_bids.io import files
-from hipsta_bids.reports.group import methods, origin
+from hipsta_bids.reports.group import heading, methods, origin
 from hipsta_bids.reports.group_maps import map_scenes
 from hipsta_bids.reports.group_tables import (
     SIDES,
@@ -251,9 +251,7 @@ def meta_page(folder: Path) -> str:
         "group.html",
         title=f"Meta-analysis of {len(record.get('sites') or ())} sites",
         folder=folder.name,
-        formula=record.get("formula"),
-        n=record.get("participants"),
-        made_by=record.get("version"),
+        **heading(record),
         cohort=False,
         sections=build_sections(SECTIONS, results, _PREFIX),
     )
