@@ -1,19 +1,20 @@
 """The whole hippocampus, or head and body, on one sheet (experimental): labels to maps.
 
 Head and tail bend and fold, so the solid has no ends to close and is not made a ball. It has two
-faces and a rim; edges and ends are found afterwards, on the boundary of the mid-surface. The
-body's rows of the grid are those of the body's own sheet: its end planes have the same y.
+faces and a rim; edges and ends are found afterwards, on the boundary of the mid-surface. In the
+body, the grid is that of the body's own sheet: the body is measured first.
 """
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry.body import Body, check_side, extract_body
+from hipsta_bids.geometry.body import Body, check_side
 from hipsta_bids.geometry.catalog import (
     Measured,
     average_profiles,
@@ -26,26 +27,22 @@ from hipsta_bids.geometry.digital import voxel_points
 from hipsta_bids.geometry.disk import (
     Disk,
     Edges,
-    Line,
     distance_from_rims,
     find_edges,
-    find_line,
     flipped_area,
     level_surface,
     locate_nodes,
     make_disk,
     map_to_rectangle,
     masked_area,
-    space_rows,
 )
-from hipsta_bids.geometry.ends import EndPlanes
 from hipsta_bids.geometry.faces import find_faces, whole_surface, whole_tissue
 from hipsta_bids.geometry.fem import volume_laplace
 from hipsta_bids.geometry.findings import flag_margins, raise_flags
 from hipsta_bids.geometry.lines import Lines
 from hipsta_bids.geometry.measures import column_area, labels_at
 from hipsta_bids.geometry.mesh import tetra_quality, tetrahedralize
-from hipsta_bids.geometry.sheet import fill_points, label_sheet, sheet_levels
+from hipsta_bids.geometry.sheet import coordinates_at, fill_points, label_sheet, sheet_levels
 from hipsta_bids.protocols.protocol import CORE, LATERAL_END, MEDIAL_END, Tissue
 from hipsta_bids.settings import Settings, SheetSettings
 from hipsta_bids.types import (
@@ -58,6 +55,7 @@ from hipsta_bids.types import (
     Int,
     LabelVolume,
     Sheet,
+    TetMesh,
 )
 
 Clock = Callable[[str], AbstractContextManager[None]]
@@ -78,34 +76,42 @@ LATERAL_REACH = 1.6
 """The lateral edge lies this near to dentate gyrus or CA4, mm."""
 CUT_REACH = 1.0
 """Without a tail the sheet ends at the posterior plane: what is this near to it is no edge, mm."""
-MAX_SHIFT = 5.0
-"""How far inside an end plane the line is sought that has its y, mm."""
 MAX_LENGTH = 8.0
 """Lines from the mid-surface to a wall that are longer than this are lost, mm."""
 _FAR = 500.0
 """End planes moved by this far have all of the hippocampus between them, mm."""
 _SAME = 0.005
 """mm; voxel edges that differ by less are the same."""
+_BODY = (1.0, 1.05)
+"""Greatest x and y of the body: it goes on a little beyond its end planes, so that the rows there
+lie between known values."""
 _RIM = 0.9999
 """Beside the edges themselves, where rounding does not choose the triangle."""
 
 
+class Own(NamedTuple):
+    """The body's own sheet, and what it was found in."""
+
+    body: Body
+    mesh: TetMesh
+    coordinates: Coordinates
+
+
 def measure_whole(
-    volume: LabelVolume, hemi: str, settings: Settings, clock: Clock
+    volume: LabelVolume, hemi: str, settings: Settings, clock: Clock, own: Own
 ) -> HemisphereMaps:
     """Measure head, body and, unless the region is ``headbody``, tail on one sheet.
 
-    Arguments, result and errors are those of `measure_hemisphere`.
+    ``own`` is the body measured alone. The other arguments, result and errors are those of
+    `measure_hemisphere`.
     """
     region = settings.body.region
     with clock("body"):
-        _check_voxel(volume)
-        body = extract_body(volume, settings.body.changed(region="body"))
-        side = check_side(body, hemi)
-        tissue = whole_tissue(volume)
-        ends = body.ends
+        side = check_side(own.body, hemi)
+        tissue = whole_tissue(volume, own.body.tissue)
+        ends = own.body.ends
         far = ends.beyond(_FAR)
-        body = replace(body, tissue=tissue, inside=tissue > 0, region=region, ends=far)
+        body = replace(own.body, tissue=tissue, inside=tissue > 0, region=region, ends=far)
     with clock("surface"):
         spacing = settings.grid.spacing
         surface, field, grid = whole_surface(tissue > 0, volume.affine, spacing, settings.surface)
@@ -120,9 +126,8 @@ def measure_whole(
         _check_pieces(disk)
         edges = _edges(disk, body, volume, ends.height, region)
         axes, limits = grid_levels(settings.sheet, region)
-        lines = _end_lines(disk, edges, ends, body, settings.sheet)
-        plane = map_to_rectangle(disk, edges, lines, limits)
-        plane = space_rows(disk, plane, settings.sheet.y_extent, limits)
+        within = _in_body(disk, own)
+        plane = map_to_rectangle(disk, edges, within, settings.sheet.y_extent, limits)
     with clock("sheet"):
         lines_of = Lines(mesh, laplace.gradient(u))
         sheet = _sample(disk, plane, lines_of, axes, MARGIN)
@@ -201,7 +206,8 @@ def grid_levels(
     return (x, y, z), (float(y[0]), float(y[-1]))
 
 
-def _check_voxel(volume: LabelVolume) -> None:
+def check_fine(volume: LabelVolume) -> None:
+    """Refuse voxels in which head and tail cannot be measured."""
     longest = float(np.linalg.norm(volume.affine[:3, :3], axis=0).max())
     if longest > MAX_VOXEL + _SAME:
         raise GeometryError(
@@ -246,32 +252,10 @@ def _edges(
     return edges
 
 
-def _end_lines(
-    disk: Disk, edges: Edges, ends: EndPlanes, body: Body, settings: SheetSettings
-) -> list[Line]:
-    """Find the body's ends on the sheet, each with its y.
-
-    The head turns back medially. Where an end plane therefore does not cross the sheet from edge to
-    edge, one a little farther inside does, and has the y that it has in the body.
-    """
-    length = ends.length(body.inside_points()[1])
-    lines = []
-    signs: tuple[tuple[End, float], ...] = (("posterior", 1.0), ("anterior", -1.0))
-    for end, sign in signs[1 if body.region == "headbody" else 0 :]:
-        height = ends.height(disk.vertices, end)
-        for inward in np.arange(0.0, MAX_SHIFT, 0.25):
-            y = sign * settings.y_extent * (2 * inward / length - 1)
-            line = find_line(disk, edges, height - sign * inward, y)
-            if line is not None:
-                lines.append(line)
-                break
-        else:
-            raise GeometryError(
-                f"the {end} end plane of the body does not cross the sheet from edge to edge: "
-                "check the labels of head and tail, or place the end by hand",
-                reason="whole-ends",
-            )
-    return lines
+def _in_body(disk: Disk, own: Own) -> Float:
+    """Coordinates (V, 2), x and y, of a disk's vertices in the body's own sheet; NaN outside."""
+    found = coordinates_at(own.mesh, own.coordinates, disk.vertices)[:, :2]
+    return np.where((np.abs(found) <= _BODY).all(axis=1, keepdims=True), found, np.nan)
 
 
 def _length(disk: Disk, arc: Int) -> float:
