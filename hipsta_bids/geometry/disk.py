@@ -16,7 +16,7 @@ _FLOOR, _CEILING = 0.05, 20.0
 """Bounds of the weights of edges: negative ones would fold the map."""
 NEAR = 0.75
 """Nearer than this to an edge, an end or a hole the body's coordinates are not taken over, mm."""
-_PULL = 10.0
+_PULL = 50.0
 """Ends have so many times their y at first, or where the body ends obliquely, y would not rise."""
 _PARTS = 60
 """Into so many parts head and tail are divided to space their rows."""

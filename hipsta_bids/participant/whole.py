@@ -41,7 +41,7 @@ from hipsta_bids.geometry.fem import volume_laplace
 from hipsta_bids.geometry.findings import flag_margins, raise_flags
 from hipsta_bids.geometry.lines import Lines
 from hipsta_bids.geometry.measures import column_area, labels_at
-from hipsta_bids.geometry.mesh import tetra_quality, tetrahedralize
+from hipsta_bids.geometry.mesh import tetra_quality, tetrahedralize, unique_edges
 from hipsta_bids.geometry.sheet import coordinates_at, fill_points, label_sheet, sheet_levels
 from hipsta_bids.protocols.protocol import CORE, LATERAL_END, MEDIAL_END, Tissue
 from hipsta_bids.settings import Settings, SheetSettings
@@ -82,9 +82,6 @@ _FAR = 500.0
 """End planes moved by this far have all of the hippocampus between them, mm."""
 _SAME = 0.005
 """mm; voxel edges that differ by less are the same."""
-_BODY = (1.0, 1.05)
-"""Greatest x and y of the body: it goes on a little beyond its end planes, so that the rows there
-lie between known values."""
 _RIM = 0.9999
 """Beside the edges themselves, where rounding does not choose the triangle."""
 
@@ -253,9 +250,16 @@ def _edges(
 
 
 def _in_body(disk: Disk, own: Own) -> Float:
-    """Coordinates (V, 2), x and y, of a disk's vertices in the body's own sheet; NaN outside."""
+    """Coordinates (V, 2), x and y, of a disk's vertices in the body's own sheet; NaN outside.
+
+    The body goes on beyond its end planes. One vertex there belongs to it, so that the rows at the
+    planes lie between known values.
+    """
     found = coordinates_at(own.mesh, own.coordinates, disk.vertices)[:, :2]
-    return np.where((np.abs(found) <= _BODY).all(axis=1, keepdims=True), found, np.nan)
+    inside = np.asarray((np.abs(found) <= 1).all(axis=1))
+    edges = unique_edges(disk.triangles)
+    inside[edges[inside[edges].any(axis=1)]] = True
+    return np.where(inside[:, None] & (np.abs(found[:, :1]) <= 1), found, np.nan)
 
 
 def _length(disk: Disk, arc: Int) -> float:

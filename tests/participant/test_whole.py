@@ -47,7 +47,8 @@ def hooked(thickness: float = THICKNESS) -> LabelVolume:
     codes[r < RADIUS] = 6
     codes[(r < 2) | ((r < RADIUS - 0.5) & (share > 1) & (share < 1.2))] = 4
     codes[wall] = np.select([share < 0.25, share < 0.7], [2, 1], 5)[wall]
-    protocol = load_protocol("cobralab")
+    # Without the layer, which the whole sheet never has: thickness is that of the body alone.
+    protocol = load_protocol("cobralab").model_copy(update={"layer": ()})
     tissue, part = translate(np.where(within, codes, 0), protocol)
     ends = (
         GivenEnd(end="posterior", point=(0, POSTERIOR, 0), normal=(0, 1, 0)),
@@ -79,10 +80,27 @@ def test_thickness_is_known_in_head_body_and_tail(maps: HemisphereMaps) -> None:
         assert values.std() <= 0.06
 
 
-def test_rows_of_the_body_lie_between_its_planes(maps: HemisphereMaps) -> None:
+def test_nodes_of_the_body_are_those_of_its_own_sheet(maps: HemisphereMaps) -> None:
+    alone = measure_hemisphere(hooked(), "L", Settings(), lambda _: nullcontext())
+    apart = np.linalg.norm(middle(maps)[:, 10:31] - middle(alone), axis=-1)
+    difference = maps.thickness[:, 10:31] - alone.thickness
+    told = np.isfinite(difference)
+    assert told.mean() > 0.9
+    assert np.median(apart[told]) < 0.02
+    assert np.quantile(apart[told], 0.95) < 0.15
+    assert np.abs(difference[told]).max() < 0.15
     inner, edge = middle(maps)[4:-4], WHOLE.grid.spacing  # mm, of the triangles that planes cross
     assert np.abs(inner[:, 10, 1] - POSTERIOR).max() < edge
     assert np.abs(inner[:, 30, 1] - ANTERIOR).max() < edge
+    assert maps.qc["folded_fraction"] < 0.01
+
+
+def test_what_refuses_the_body_refuses_the_whole() -> None:
+    near = GivenEnd(end="anterior", point=(0, POSTERIOR + 4, 0), normal=(0, 1, 0))
+    volume = hooked()
+    with pytest.raises(GeometryError) as error:
+        measure(replace(volume, given_ends=(volume.given_ends[0], near)))
+    assert error.value.reason == "body-too-short"
 
 
 def test_middle_lies_on_the_spiral_from_medial_to_lateral(maps: HemisphereMaps) -> None:
