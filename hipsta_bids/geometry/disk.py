@@ -344,10 +344,3 @@ def distance_from_rims(disk: Disk) -> Float:
         edge_graph(edges, lengths, len(disk.vertices)), directed=False, indices=rims, min_only=True
     )
     return found
-
-
-def masked_area(disk: Disk, margin: float) -> float:
-    """Share of a disk's area within ``margin``, mm, of its edges, ends and filled holes."""
-    area = triangle_areas(disk.vertices, disk.triangles)
-    near = distance_from_rims(disk)[disk.triangles].mean(axis=1) < margin
-    return float(area[near].sum() / area.sum())

@@ -34,14 +34,13 @@ from hipsta_bids.geometry.disk import (
     locate_nodes,
     make_disk,
     map_to_rectangle,
-    masked_area,
 )
 from hipsta_bids.geometry.faces import find_faces, whole_surface, whole_tissue
 from hipsta_bids.geometry.fem import volume_laplace
 from hipsta_bids.geometry.findings import flag_margins, raise_flags
 from hipsta_bids.geometry.lines import Lines
 from hipsta_bids.geometry.measures import column_area, labels_at
-from hipsta_bids.geometry.mesh import tetra_quality, tetrahedralize, unique_edges
+from hipsta_bids.geometry.mesh import tetra_quality, tetrahedralize, triangle_areas, unique_edges
 from hipsta_bids.geometry.sheet import coordinates_at, fill_points, label_sheet, sheet_levels
 from hipsta_bids.protocols.protocol import CORE, LATERAL_END, MEDIAL_END, Tissue
 from hipsta_bids.settings import Settings, SheetSettings
@@ -63,7 +62,8 @@ Clock = Callable[[str], AbstractContextManager[None]]
 MAX_VOXEL = 0.5
 """Refuse longer voxel edges, mm."""
 MARGIN = 1.0
-"""No value nearer than this to an edge, an end or a filled hole, mm."""
+"""No value nearer than this to an edge, an end or a filled hole, thicknesses of at least 1 mm: so
+far lines bend round the rim."""
 MAX_PIECE = 0.02
 """Refuse a piece beside the mid-surface with a larger share of its area."""
 MIN_EDGE = 30.0
@@ -145,7 +145,10 @@ def measure_whole(
         maps = {k: np.where(sheet.valid, v, np.nan) for k, v in everywhere.items()}
         maps["distortion"] = _distortion(sheet)
         folded = flipped_area(disk, plane)
-        findings = _findings(disk, edges, folded, region)
+        measured_area = float(column_area(sheet)[sheet.valid].sum())
+        area = float(triangle_areas(disk.vertices, disk.triangles).sum())
+        masked = max(0.0, 1 - measured_area / area)
+        findings = _findings(disk, edges, folded, masked, region)
         return HemisphereMaps(
             sheet=sheet,
             layers=sheet,
@@ -167,7 +170,7 @@ def measure_whole(
                 "holes_mm": [round(hole, 2) for hole in disk.holes],
                 "edge_lengths_mm": _lengths(disk, edges),
                 "folded_fraction": folded,
-                "masked_fraction": masked_area(disk, MARGIN),
+                "masked_fraction": masked,
                 "medial_offset_mm": side,
                 "posterior_end_rule": ends.posterior_rule,
                 "anterior_end_rule": ends.anterior_rule,
@@ -285,7 +288,8 @@ def _sample(
     points = np.full((len(x), len(y), len(z), 3), np.nan)
     points[known] = columns
     rims = distance_from_rims(disk)
-    far = np.einsum("xyk,xyk->xy", weights, rims[corner]) > margin
+    thickness = np.linalg.norm(np.diff(points, axis=2), axis=3).sum(axis=2)
+    far = np.einsum("xyk,xyk->xy", weights, rims[corner]) > margin * np.fmax(thickness, 1.0)
     valid = np.isfinite(points).all(axis=(2, 3)) & far
     if not valid.any():
         raise GeometryError(
@@ -300,7 +304,7 @@ def _distortion(sheet: Sheet) -> Float:
     return np.asarray(np.log2(area / np.nanmean(area)))
 
 
-def _findings(disk: Disk, edges: Edges, folded: float, region: str) -> list[Finding]:
+def _findings(disk: Disk, edges: Edges, folded: float, masked: float, region: str) -> list[Finding]:
     """List what was found on the whole sheet, within its limit or not."""
     found = [
         Finding(
@@ -327,7 +331,6 @@ def _findings(disk: Disk, edges: Edges, folded: float, region: str) -> list[Find
                 points=disk.vertices[arc],
             )
         )
-    masked = masked_area(disk, MARGIN)
     return [
         *found,
         Finding(
