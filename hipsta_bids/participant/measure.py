@@ -62,7 +62,7 @@ from hipsta_bids.geometry.sheet import (
     whole_body,
 )
 from hipsta_bids.geometry.topology import Repair, SolidField, repair_topology, repaired_columns
-from hipsta_bids.participant.whole import measure_whole
+from hipsta_bids.participant.whole import Own, check_fine, measure_whole
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.protocols.load import for_region
 from hipsta_bids.protocols.protocol import LATERAL_END, MEDIAL_END, Tissue
@@ -377,7 +377,11 @@ def measure_hemisphere(
         With the reason why this hemisphere cannot be measured.
     """
     if settings.body.region in EXPERIMENTAL:
-        return measure_whole(volume, hemi, settings, clock)
+        check_fine(volume)
+        only = settings.changed(body={"region": "body"})
+        evidence, coordinates = unfold(volume, hemi, only, clock)
+        own = Own(evidence.measured.body, evidence.measured.mesh, coordinates)
+        return measure_whole(volume, hemi, settings, clock, own)
     evidence, coordinates = unfold(volume, hemi, settings, clock)
     measured, solid, boundaries = evidence.measured, evidence.solid, evidence.boundaries
     body, sheet = measured.body, measured.sheet

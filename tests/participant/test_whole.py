@@ -25,7 +25,7 @@ from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.reports.cohort import read_cohort
 from hipsta_bids.reports.participant import participant_page
 from hipsta_bids.settings import Settings
-from hipsta_bids.types import Bool, Float, HemisphereMaps, LabelVolume, TetMesh
+from hipsta_bids.types import Bool, Float, GivenEnd, HemisphereMaps, LabelVolume, TetMesh
 
 WHOLE = Settings().changed(body={"region": "whole"})
 SHAPE = HeadSpec()
@@ -33,7 +33,9 @@ THICKNESS, (POSTERIOR, ANTERIOR) = SHAPE.thickness, SHAPE.ends
 
 
 def hooked() -> LabelVolume:
-    return draw_head(SHAPE)
+    """Without the layer, which the whole sheet never has: thickness is that of the body alone."""
+    volume = draw_head(SHAPE)
+    return replace(volume, protocol=volume.protocol.model_copy(update={"layer": ()}))
 
 
 def measure(volume: LabelVolume) -> HemisphereMaps:
@@ -59,10 +61,27 @@ def test_thickness_is_known_in_head_body_and_tail(maps: HemisphereMaps) -> None:
         assert values.std() <= 0.06
 
 
-def test_rows_of_the_body_lie_between_its_planes(maps: HemisphereMaps) -> None:
+def test_nodes_of_the_body_are_those_of_its_own_sheet(maps: HemisphereMaps) -> None:
+    alone = measure_hemisphere(hooked(), "L", Settings(), lambda _: nullcontext())
+    apart = np.linalg.norm(middle(maps)[:, 10:31] - middle(alone), axis=-1)
+    difference = maps.thickness[:, 10:31] - alone.thickness
+    told = np.isfinite(difference)
+    assert told.mean() > 0.9
+    assert np.median(apart[told]) < 0.02
+    assert np.quantile(apart[told], 0.95) < 0.15
+    assert np.abs(difference[told]).max() < 0.15
     inner, edge = middle(maps)[4:-4], WHOLE.grid.spacing  # mm, of the triangles that planes cross
     assert np.abs(inner[:, 10, 1] - POSTERIOR).max() < edge
     assert np.abs(inner[:, 30, 1] - ANTERIOR).max() < edge
+    assert maps.qc["folded_fraction"] < 0.01
+
+
+def test_what_refuses_the_body_refuses_the_whole() -> None:
+    near = GivenEnd(end="anterior", point=(0, POSTERIOR + 4, 0), normal=(0, 1, 0))
+    volume = hooked()
+    with pytest.raises(GeometryError) as error:
+        measure(replace(volume, given_ends=(volume.given_ends[0], near)))
+    assert error.value.reason == "body-too-short"
 
 
 def test_middle_lies_on_the_spiral_from_medial_to_lateral(maps: HemisphereMaps) -> None:
