@@ -7,6 +7,7 @@ tetrahedra, boundaries, coordinates, sheet, measures.
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -72,6 +73,7 @@ from hipsta_bids.types import (
     Bool,
     Coordinates,
     Finding,
+    Flag,
     Float,
     HemisphereMaps,
     LabelVolume,
@@ -380,7 +382,9 @@ def measure_hemisphere(
         check_fine(volume)
         only = settings.changed(body={"region": "body"})
         evidence, coordinates = unfold(volume, hemi, only, clock)
-        own = Own(evidence.measured.body, evidence.measured.mesh, coordinates)
+        repaired = repaired_columns(evidence.measured.sheet, evidence.solid, settings.measures)
+        flags = _flags(evidence, _find(volume, hemi, evidence, repaired))
+        own = Own(evidence.measured.body, evidence.measured.mesh, coordinates, flags)
         return measure_whole(volume, hemi, settings, clock, own)
     evidence, coordinates = unfold(volume, hemi, settings, clock)
     measured, solid, boundaries = evidence.measured, evidence.solid, evidence.boundaries
@@ -388,14 +392,7 @@ def measure_hemisphere(
     with clock("measures"):
         layers, folded_layers = _layers(sheet, settings)
         repaired = repaired_columns(sheet, solid, settings.measures)
-        findings = [
-            *check_end_labels(volume, body, settings.checks),
-            *check_thickness(measured.thickness, boundaries.sheet_thickness, settings.checks),
-            *([check_flipped(sheet, hemi)] if body.region == "extended" else []),
-            *_check_edited_mask(volume, body, settings),
-            *find_all(evidence, repaired),
-            *folded_layers,
-        ]
+        findings = [*_find(volume, hemi, evidence, repaired), *folded_layers]
         maps = measure_maps(measured)
         return HemisphereMaps(
             sheet=sheet,
@@ -412,14 +409,29 @@ def measure_hemisphere(
                 *(_told(repair, sheet, settings) for repair in solid.repairs),
                 *describe_uncus(body, settings.checks),
             ),
-            flags=tuple(
-                raise_flags(
-                    findings, sheet, lambda points: name_place(points, body), settings.checks
-                )
-            ),
+            flags=_flags(evidence, findings),
             mesh=measured.mesh,
             coordinates=coordinates,
         )
+
+
+def _find(volume: LabelVolume, hemi: str, evidence: Evidence, repaired: Bool) -> list[Finding]:
+    """List what the checks of a body found, within its limit or not."""
+    measured, settings = evidence.measured, evidence.measured.settings
+    body, checks = measured.body, settings.checks
+    return [
+        *check_end_labels(volume, body, checks),
+        *check_thickness(measured.thickness, evidence.boundaries.sheet_thickness, checks),
+        *([check_flipped(measured.sheet, hemi)] if body.region == "extended" else []),
+        *_check_edited_mask(volume, body, settings),
+        *find_all(evidence, repaired),
+    ]
+
+
+def _flags(evidence: Evidence, findings: list[Finding]) -> tuple[Flag, ...]:
+    measured = evidence.measured
+    place = partial(name_place, body=measured.body)
+    return tuple(raise_flags(findings, measured.sheet, place, measured.settings.checks))
 
 
 def find_body(volume: LabelVolume, settings: Settings) -> BodyMask | None:

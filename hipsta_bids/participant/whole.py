@@ -51,6 +51,7 @@ from hipsta_bids.types import (
     Coordinates,
     End,
     Finding,
+    Flag,
     Float,
     HemisphereMaps,
     Int,
@@ -99,6 +100,7 @@ class Own(NamedTuple):
     body: Body
     mesh: TetMesh
     coordinates: Coordinates
+    flags: tuple[Flag, ...]
 
 
 def measure_whole(
@@ -191,8 +193,9 @@ def measure_whole(
                 "anterior_plane": ends.entry("anterior"),
                 "flag_margins": flag_margins(findings),
             },
-            flags=tuple(
-                raise_flags(findings, sheet, lambda at: name_place(at, body), settings.checks)
+            flags=(
+                *raise_flags(findings, sheet, lambda at: name_place(at, body), settings.checks),
+                *(replace(f, message=f"the body alone: {f.message}") for f in own.flags),
             ),
             mesh=mesh,
             coordinates=Coordinates(values=np.column_stack([np.full((len(u), 2), np.nan), u])),
