@@ -71,7 +71,7 @@ MAX_PIECE = 0.02
 """Refuse a piece beside the mid-surface with a larger share of its area."""
 MIN_EDGE = 30.0
 """Refuse a shorter medial or lateral edge, mm."""
-FLAG_HOLE, FLAG_END = 10.0, 15.0
+FLAG_HOLE, FLAG_END = 10.0, 12.0
 """Flag holes of a longer perimeter, and longer ends, mm."""
 FLAG_FOLDED, FLAG_MASKED = 0.01, 0.25
 """Flag larger shares of the area that are turned over, and that have no values."""
