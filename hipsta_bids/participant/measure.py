@@ -387,7 +387,7 @@ def measure_hemisphere(
         own = Own(evidence.measured.body, evidence.measured.mesh, coordinates, flags)
         return measure_whole(volume, hemi, settings, clock, own)
     evidence, coordinates = unfold(volume, hemi, settings, clock)
-    measured, solid, boundaries = evidence.measured, evidence.solid, evidence.boundaries
+    measured, solid = evidence.measured, evidence.solid
     body, sheet = measured.body, measured.sheet
     with clock("measures"):
         layers, folded_layers = _layers(sheet, settings)

@@ -24,6 +24,7 @@ from hipsta_bids.protocols.load import for_region, load_protocol
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.reports.cohort import read_cohort
 from hipsta_bids.reports.participant import participant_page
+from hipsta_bids.reports.review import correction_of
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Bool, Float, GivenEnd, HemisphereMaps, LabelVolume, TetMesh
 
@@ -290,7 +291,8 @@ def test_page_names_the_parts_and_what_has_no_value(out: Path) -> None:
     assert scene["ends"] == [10, 30]
     for part in ("tail", "body", "head"):
         assert f"{part}, " in "".join(re.findall("<figcaption>(.*?)</figcaption>", page))
-    assert "participant --edited-dir EDITS --participant-label 01 --region whole" in page
+    command = correction_of(read_cohort(out).hemispheres)["command"]
+    assert "participant --edited-dir EDITS --participant-label 01 --region whole" in command
     assert "nan mm" not in page
 
 
