@@ -255,6 +255,15 @@ def map_to_rectangle(
     return np.column_stack([x, spaced])
 
 
+def proximodistal(disk: Disk, edges: Edges) -> Float:
+    """Harmonic function (V,) from -1 at the medial to 1 at the lateral edge, without the body's x.
+
+    HippUnfold's proximal-distal coordinate is one, too (DeKraker et al. 2022, eLife 11:e77945).
+    """
+    matrix = _stiffness(disk.vertices, disk.triangles)
+    return _harmonic(matrix, (edges.medial, -1.0), (edges.lateral, 1.0))
+
+
 def _stiffness(vertices: Float, triangles: Int) -> sparse.csr_array:
     """Stiffness of a surface, all edge weights at least a floor, so that triangles do not flip."""
     rows, weights = [], []
@@ -334,6 +343,13 @@ def locate_nodes(
     triangle[i[order], j[order]] = cell[order]
     weights[i[order], j[order]] = weight[order]
     return triangle, weights
+
+
+def at_nodes(disk: Disk, plane: Float, values: Float, x: Float, y: Float) -> Float:
+    """Values (V,) of a disk at the nodes (Nx, Ny) of a grid; NaN where there is none."""
+    triangle, weights = locate_nodes(disk.triangles, plane, x, y)
+    found: Float = (weights * values[disk.triangles[triangle]]).sum(axis=2)
+    return np.where(triangle < 0, np.nan, found)
 
 
 def distance_from_rims(disk: Disk) -> Float:

@@ -27,6 +27,7 @@ from hipsta_bids.geometry.digital import voxel_points
 from hipsta_bids.geometry.disk import (
     Disk,
     Edges,
+    at_nodes,
     distance_from_rims,
     find_edges,
     flipped_area,
@@ -34,6 +35,7 @@ from hipsta_bids.geometry.disk import (
     locate_nodes,
     make_disk,
     map_to_rectangle,
+    proximodistal,
 )
 from hipsta_bids.geometry.faces import find_faces, whole_surface, whole_tissue
 from hipsta_bids.geometry.fem import volume_laplace
@@ -156,6 +158,7 @@ def measure_whole(
         everywhere = measure_maps(measured)
         maps = {k: np.where(sheet.valid, v, np.nan) for k, v in everywhere.items()}
         maps["distortion"] = _distortion(sheet)
+        maps["proximodistal"] = at_nodes(disk, plane, proximodistal(disk, edges), *axes[:2])
         folded = flipped_area(disk, plane)
         measured_area = float(column_area(sheet)[sheet.valid].sum())
         area = float(triangle_areas(disk.vertices, disk.triangles).sum())

@@ -198,19 +198,20 @@ def measure_places(case: tuple[Source, Path]) -> Cells:
         folder, hemi = source.files[0].parent.parent / "surf", source.hemi
         volume = read_label_volume(source)
     settings = Settings().changed(body={"region": "whole"})
-    sheet = measure_body(volume, hemi, settings).sheet
+    maps = measure_body(volume, hemi, settings)
+    sheet = maps.sheet
     vertices = _values(
         str(folder / f"*_hemi-{hemi}_*_label-hipp_midthickness.surf.gii"), "pointset"
     )
-    between = Correspondence(read_mesh(flat), settings.sheet)
+    between = Correspondence(read_mesh(flat), settings.sheet, maps.maps["proximodistal"])
     points = sheet.points[:, :, sheet.middle]
     off = np.linalg.norm(between.to_nodes(vertices) - points, axis=-1)[sheet.valid]
     nearest = np.asarray(cKDTree(vertices).query(points[sheet.valid])[1], dtype=np.intp)
     cells: dict[str, Cell] = {}
     met = True
-    for name, axis, number in (("AP", between.y, 1), ("PD", between.x, 0)):
-        ours, theirs = axis[np.nonzero(sheet.valid)[number]], between.places[nearest, number]
-        extent = axis[-1] - axis[0] if name == "AP" else 2.0
+    for name, number in (("AP", 1), ("PD", 0)):
+        ours, theirs = between.nodes[sheet.valid][:, number], between.places[nearest, number]
+        extent = np.ptp(between.places[:, number])
         same = _two(ours, theirs)[1]
         away = float(np.abs(ours - theirs).mean() / extent)
         cells |= {f"{name}, r": same, f"{name}, mean difference": f"{away:.1%}"}
