@@ -84,6 +84,8 @@ THICK_NEAR, THICK = 4.0, 1.5
 part of it."""
 LATERAL_REACH = 1.6
 """The lateral edge lies this near to dentate gyrus or CA4, mm."""
+HATA_REACH = 1.0
+"""What is this near to the hippocampal-amygdaloid transition area, mm, is the anterior end."""
 CUT_REACH = 1.0
 """Without a tail the sheet ends at the posterior plane: what is this near to it is no edge, mm."""
 MAX_LENGTH = 8.0
@@ -254,6 +256,10 @@ def _edges(
     above = height(points, "posterior")
     if region == "headbody":
         medial[above < CUT_REACH] = lateral[above < CUT_REACH] = -1.0
+    hata = voxel_points(volume.tissue == Tissue.HATA, volume.affine)
+    if len(hata):
+        at_end = cKDTree(hata).query(points)[0] < HATA_REACH
+        medial[at_end] = lateral[at_end] = -len(points)  # no edge passes it
     edges = find_edges(disk, medial, lateral, above)
     for name in ("medial", "lateral"):
         length = _length(disk, getattr(edges, name))

@@ -11,6 +11,7 @@ import nibabel as nib
 import numpy as np
 import pandas as pd
 import pytest
+from scipy import ndimage
 
 import hipsta_bids as hb
 from hipsta_bids.api.maps import Measurement
@@ -127,6 +128,26 @@ def test_tail_without_subfields_is_refused() -> None:
         for_region(protocol, "whole")
     assert error.value.reason == "whole-subfields"
     assert for_region(protocol, "headbody") == protocol
+
+
+def test_sheet_ends_along_the_transition_to_the_amygdala(maps: HemisphereMaps) -> None:
+    """Labels of it lie before the front end, and beside the medial edge for 4 mm before that."""
+    volume = hooked()
+    points = np.moveaxis(np.indices(volume.tissue.shape), 0, -1) @ volume.affine[:3, :3].T
+    x, y, z = np.moveaxis(points + volume.affine[:3, 3], -1, 0)
+    turn = np.rad2deg(np.arctan2(y - SHAPE.straight, 9.0 - x))
+    wall = np.abs(np.hypot(9.0 - np.hypot(x - 9.0, y - SHAPE.straight), z) - RADIUS) < 1
+    front = wall & (turn > 100) & (turn < 115) & (y > SHAPE.straight)
+    ends = volume.tissue == Tissue.SUBICULUM
+    beside = ndimage.binary_dilation(ends, iterations=2) & ~ends & (volume.tissue == 0)
+    beside &= (turn > 75) & (turn < 100) & (y > SHAPE.straight)
+    tissue = np.where((front & (volume.tissue == 0)) | beside, Tissue.HATA, volume.tissue)
+    found = measure(replace(volume, tissue=tissue))
+    before, after = (one.qc["edge_lengths_mm"] for one in (maps, found))
+    front = np.deg2rad(240) * RADIUS  # mm, all of the last section
+    assert before["anterior"] < front / 2  # its subiculum and CA3 were taken for edges
+    assert front < after["anterior"] < front + 4
+    assert before["medial"] > after["medial"] + 2
 
 
 def test_hole_is_filled_and_told() -> None:
