@@ -187,6 +187,14 @@ def resample_parser() -> Parser:
         nargs="+",
         required=True,
     )
+    add(
+        "--sheet",
+        "FILE",
+        "the sheet's own desc-proximodistal_morph.shape.gii, which agrees better with HippUnfold's"
+        " coordinate than x does; one of each side",
+        nargs="+",
+        default=[],
+    )
     add("--column", "NAME", "of a table (default: thickness)", default="thickness")
     add("--settings", "FILE.toml", "those of the sheets, if not the defaults")
     return parser
@@ -388,7 +396,8 @@ def run_resample(arguments: Sequence[str]) -> ExitCode:
     from hipsta_bids.settings import load_settings  # noqa: PLC0415  (start-up time)
 
     sheet = load_settings(options.settings).sheet
-    echo(resample(options.maps, options.out, options.surface, sheet, options.column))
+    files = options.maps, options.out, options.surface
+    echo(resample(*files, sheet, column=options.column, sheets=options.sheet))
     return ExitCode.OK
 
 

@@ -211,6 +211,16 @@ _DISTORTION = Output(
     desc="distortion",
 )
 
+_PROXIMODISTAL = Output(
+    "proximodistal",
+    "morph",
+    ".shape.gii",
+    "harmonic function from the medial edge, -1, to the lateral edge, 1; per surface vertex"
+    " (`--region headbody` and `whole`, experimental)",
+    unit="1",
+    desc="proximodistal",
+)
+
 _SAMPLED = (
     ("table", ".tsv", "another volume at each sheet point, one column per volume (`--map`)"),
     ("sidecar", ".json", "its source, how it was sampled, and how much of it is missing"),
@@ -241,7 +251,8 @@ EXTRA_OUTPUTS: tuple[Output, ...] = (
     _SPREAD,
     *_sidecars([_SPREAD]),
     _DISTORTION,
-    *_sidecars([_DISTORTION]),
+    _PROXIMODISTAL,
+    *_sidecars([_DISTORTION, _PROXIMODISTAL]),
     *_table(
         "surrogate",
         "thickness from the medial axis of single slices (`hipsta-bids surrogate`)",

@@ -1,8 +1,6 @@
 """The mid-surface of the whole sheet as a disk, its edges and ends, and a map to a rectangle."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +14,10 @@ from hipsta_bids.types import Float, Int, TetMesh
 
 _FLOOR, _CEILING = 0.05, 20.0
 """Bounds of the weights of edges: negative ones would fold the map."""
-_STIFF = 1e3
-"""How much more a line of given values weighs than an edge that it crosses."""
+NEAR = 0.75
+"""Nearer than this to an edge, an end or a hole the body's coordinates are not taken over, mm."""
+_PULL = 50.0
+"""Ends have so many times their y at first, or where the body ends obliquely, y would not rise."""
 _PARTS = 60
 """Into so many parts head and tail are divided to space their rows."""
 _SLACK = 1e-6
@@ -166,16 +166,6 @@ class Edges:
     anterior: Int
 
 
-class Line(NamedTuple):
-    """A line across a disk on which a function has a given value."""
-
-    edges: Int
-    """(N, 2) edges of triangles that it crosses."""
-    share: Float
-    """(N,) where on the way from the first vertex to the second."""
-    value: float
-
-
 def find_edges(disk: Disk, medial: Float, lateral: Float, height: Float) -> Edges:
     """Divide the boundary by what speaks for (1) and against (-1) an edge at its vertices (B,).
 
@@ -225,68 +215,53 @@ def _best_arc(score: Float) -> NDArray[np.intp]:
 
 
 def map_to_rectangle(
-    disk: Disk, edges: Edges, lines: Sequence[Line], ends: tuple[float, float]
+    disk: Disk, edges: Edges, body: Float, extent: float, ends: tuple[float, float]
 ) -> Float:
-    """Two harmonic functions (V, 2): x from -1 to 1 between the edges, y between the ends.
+    """Two functions (V, 2): x from -1 to 1 between the edges, y between the two values of ``ends``.
 
-    y has the two values of ``ends`` at the posterior and the anterior end, and that of each line
-    along it.
+    Where ``body`` (V, 2) is a number, beyond ``NEAR`` of edges, ends and holes, both are those of
+    the body; elsewhere they go on as harmonic functions. Such a function changes most beside a
+    short end: there its lines would all lie. Beyond plus and minus ``extent``, y is therefore the
+    mean distance along the sheet, from the body, of what lies on a line.
     """
     matrix = _stiffness(disk.vertices, disk.triangles)
-    x = _harmonic(matrix, ((edges.medial, -1.0), (edges.lateral, 1.0)), ())
-    inner = (edges.posterior, ends[0]), (edges.anterior, ends[1])
-    y = _harmonic(matrix, inner, lines)
-    return np.column_stack([x, y])
-
-
-def space_rows(disk: Disk, plane: Float, extent: float, ends: tuple[float, float]) -> Float:
-    """Space lines of equal y beyond plus and minus ``extent`` evenly by distance from the body.
-
-    A harmonic function changes most beside a short end: there its lines would all lie. The mean
-    distance along the sheet of what lies on a line takes its place. Returns new values (V, 2).
-    """
-    edges = unique_edges(disk.triangles)
-    lengths = np.linalg.norm(np.diff(disk.vertices[edges], axis=1)[:, 0], axis=1)
-    result, y = plane.copy(), plane[:, 1]
-    inner = np.flatnonzero(np.abs(y) <= extent)
-    graph = edge_graph(edges, lengths, len(y))
-    far = sparse.csgraph.dijkstra(graph, directed=False, indices=inner, min_only=True)
+    inside = (distance_from_rims(disk) > NEAR) & np.isfinite(body).all(axis=1)
+    known = np.flatnonzero(inside)
+    x = _harmonic(matrix, (edges.medial, -1.0), (edges.lateral, 1.0), (known, body[known, 0]))
+    pulled = [end * _PULL if abs(end) > extent else end for end in ends]
+    sides = (edges.posterior, pulled[0]), (edges.anterior, pulled[1])
+    y = _harmonic(matrix, *sides, (known, body[known, 1]))
+    every = unique_edges(disk.triangles)
+    lengths = np.linalg.norm(np.diff(disk.vertices[every], axis=1)[:, 0], axis=1)
+    far = sparse.csgraph.dijkstra(
+        edge_graph(every, lengths, len(y)),
+        directed=False,
+        indices=np.flatnonzero(np.abs(y) <= extent),
+        min_only=True,
+    )
+    spaced = y.copy()
     for sign, end in ((-1.0, -ends[0]), (1.0, ends[1])):
         beyond = np.flatnonzero(sign * y > extent)
         if end <= extent or not len(beyond):
             continue
         order = beyond[np.argsort(sign * y[beyond], kind="stable")]
         parts = np.array_split(order, min(_PARTS, len(order)))
-        level = [extent, *(float(sign * y[part].mean()) for part in parts), end]
+        level = [extent, *(float(sign * y[part].mean()) for part in parts), end * _PULL]
         mean = [0.0, *(float(far[part].mean()) for part in parts)]
         depth = np.maximum.accumulate([*mean, float(far[order].max())])
         depth += _SLACK * np.arange(len(depth))  # lines must not merge
         reached = np.interp(sign * y[beyond], level, depth)
-        result[beyond, 1] = sign * (extent + (end - extent) * reached / depth[-1])
-    return result
+        spaced[beyond] = sign * (extent + (end - extent) * reached / depth[-1])
+    return np.column_stack([x, spaced])
 
 
-def find_line(disk: Disk, edges: Edges, height: Float, value: float) -> Line | None:
-    """Find where a plane, by heights (V,) above it, crosses from edge to edge, if it does."""
-    every = unique_edges(disk.triangles)
-    cut = every[(height[every[:, 0]] > 0) != (height[every[:, 1]] > 0)]
-    size = len(disk.vertices)
-    code = cut[:, 0].astype(np.int64) * size + cut[:, 1]
-    sides = np.sort(disk.triangles[:, [[0, 1], [1, 2], [2, 0]]], axis=2).astype(np.int64)
-    codes = sides[..., 0] * size + sides[..., 1]
-    rank = np.searchsorted(code, codes).clip(max=max(len(code) - 1, 0))
-    hit = code[rank] == codes if len(code) else np.zeros(codes.shape, dtype=bool)
-    links = rank[hit].reshape(-1, 2)  # a plane crosses two edges of a triangle
-    graph = edge_graph(links.astype(np.int32), np.ones(len(links)), len(cut))
-    piece = sparse.csgraph.connected_components(graph, directed=False)[1]
-    at = [np.isin(cut, side).all(axis=1) for side in (edges.medial, edges.lateral)]
-    through = np.intersect1d(piece[at[0]], piece[at[1]])
-    if not len(through):
-        return None
-    counts = np.bincount(piece)
-    chosen = cut[piece == through[counts[through].argmax()]]
-    first, second = height[chosen.T]
-    return Line(chosen, first / (first - second), value)
+def proximodistal(disk: Disk, edges: Edges) -> Float:
+    """Harmonic function (V,) from -1 at the medial to 1 at the lateral edge, without the body's x.
+
+    HippUnfold's proximal-distal coordinate is one, too (DeKraker et al. 2022, eLife 11:e77945).
+    """
+    matrix = _stiffness(disk.vertices, disk.triangles)
+    return _harmonic(matrix, (edges.medial, -1.0), (edges.lateral, 1.0))
 
 
 def _stiffness(vertices: Float, triangles: Int) -> sparse.csr_array:
@@ -307,31 +282,19 @@ def _stiffness(vertices: Float, triangles: Int) -> sparse.csr_array:
     return sparse.csr_array(sparse.diags_array(np.asarray(graph.sum(axis=1)).ravel()) - graph)
 
 
-def _harmonic(
-    matrix: sparse.csr_array,
-    fixed: tuple[tuple[Int, float], ...],
-    lines: Sequence[Line],
-) -> Float:
-    """Harmonic function (V,) with values at some vertices, and others along lines across edges."""
+def _harmonic(matrix: sparse.csr_array, *fixed: tuple[NDArray[np.integer], Float | float]) -> Float:
+    """Harmonic function (V,) with given values at some vertices."""
     count = matrix.shape[0]
     result, free = np.zeros(count), np.ones(count, dtype=bool)
     for where, value in fixed:
         result[where], free[where] = value, False
-    right = np.zeros(count)
-    for edges, share, value in lines:
-        row = np.arange(len(edges)).repeat(2)
-        weight = np.column_stack([1 - share, share]).ravel()
-        across = sparse.csr_array((weight, (row, edges.ravel())), shape=(len(edges), count))
-        matrix = matrix + _STIFF * (across.T @ across)
-        right += _STIFF * value * np.asarray(across.sum(axis=0)).ravel()
-    right -= matrix @ result
     factor = splu(
         sparse.csc_array(matrix[free][:, free]),
         permc_spec="MMD_AT_PLUS_A",
         diag_pivot_thresh=0.0,
         options={"SymmetricMode": True},
     )
-    result[free] = factor.solve(right[free])
+    result[free] = factor.solve(-(matrix @ result)[free])
     return result
 
 
@@ -382,6 +345,13 @@ def locate_nodes(
     return triangle, weights
 
 
+def at_nodes(disk: Disk, plane: Float, values: Float, x: Float, y: Float) -> Float:
+    """Values (V,) of a disk at the nodes (Nx, Ny) of a grid; NaN where there is none."""
+    triangle, weights = locate_nodes(disk.triangles, plane, x, y)
+    found: Float = (weights * values[disk.triangles[triangle]]).sum(axis=2)
+    return np.where(triangle < 0, np.nan, found)
+
+
 def distance_from_rims(disk: Disk) -> Float:
     """(V,) distance along the sheet from its edges, ends and filled holes, mm."""
     measured = disk.triangles[disk.cell >= 0]
@@ -392,10 +362,3 @@ def distance_from_rims(disk: Disk) -> Float:
         edge_graph(edges, lengths, len(disk.vertices)), directed=False, indices=rims, min_only=True
     )
     return found
-
-
-def masked_area(disk: Disk, margin: float) -> float:
-    """Share of a disk's area within ``margin``, mm, of its edges, ends and filled holes."""
-    area = triangle_areas(disk.vertices, disk.triangles)
-    near = distance_from_rims(disk)[disk.triangles].mean(axis=1) < margin
-    return float(area[near].sum() / area.sum())

@@ -69,9 +69,14 @@ class Faces:
         return np.flatnonzero(~self.free & (self.side <= 0)).astype(np.int32)
 
 
-def whole_tissue(volume: LabelVolume) -> NDArray[np.uint8]:
-    """(I, J, K) the largest piece of the sheet's subfields, cavities filled; 0 elsewhere."""
-    tissue = np.where(np.isin(volume.tissue, volume.protocol.sheet), volume.tissue, 0)
+def whole_tissue(volume: LabelVolume, body: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(I, J, K) the largest piece of the sheet's subfields, cavities filled; 0 elsewhere.
+
+    What has no label but a tissue in the ``body``, where gaps are mended, has it here, too.
+    """
+    mended = (volume.tissue == Tissue.BACKGROUND) & (body > 0)
+    sheet = np.isin(volume.tissue, volume.protocol.sheet)
+    tissue = np.where(sheet, volume.tissue, np.where(mended, body, 0))
     pieces, count = ndimage.label(tissue > 0, structure=FACES)
     if not count:
         raise GeometryError(

@@ -6,6 +6,7 @@ Layers of the sheet may be spaced evenly or by volume.
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
@@ -16,6 +17,9 @@ from hipsta_bids.geometry.measures import labels_at
 from hipsta_bids.geometry.mesh import cross, tetra_volumes
 from hipsta_bids.settings import SheetSettings
 from hipsta_bids.types import Bool, Coordinates, Finding, Float, Sheet, TetMesh
+
+_CANDIDATES = 24
+"""A point lies in one of so many tetrahedra, those whose middles are nearest."""
 
 
 def sample_sheet(mesh: TetMesh, coordinates: Coordinates, settings: SheetSettings) -> Sheet:
@@ -180,6 +184,19 @@ def _barycentric(corners: Float, points: Float) -> tuple[Float, Bool]:
     weights[1:] = np.einsum("ij,kij->ki", points - corners[0], faces) / np.where(known, det, 1.0)
     weights[0] = 1 - weights[1:].sum(axis=0)
     return weights, known
+
+
+def coordinates_at(mesh: TetMesh, coordinates: Coordinates, points: Float) -> Float:
+    """Coordinates (N, 3) of points (N, 3), RAS mm; NaN outside of the mesh."""
+    corners = mesh.vertices[mesh.tetrahedra.T]
+    near = np.asarray(cKDTree(corners.mean(axis=0)).query(points, k=_CANDIDATES)[1])
+    weights, known = _barycentric(corners[:, near.ravel()], points.repeat(_CANDIDATES, axis=0))
+    worst = np.where(known, weights.min(axis=0), -np.inf).reshape(near.shape)
+    best = np.arange(len(points)), worst.argmax(axis=1)
+    weights = weights.reshape(4, *near.shape)[:, *best]
+    values = coordinates.values[mesh.tetrahedra[near[best]]]
+    found: Float = np.einsum("in,nik->nk", weights, values)
+    return np.where((worst[best] > -1e-3)[:, None], found, np.nan)  # noqa: PLR2004 -- rounding
 
 
 def fill_points(points: Float) -> Float:

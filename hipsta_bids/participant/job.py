@@ -339,12 +339,12 @@ def _write_more(
 ) -> None:
     """Write what options asked for."""
     write_signals(place, maps, mapped)
-    if "distortion" in maps.maps:
+    for name in maps.maps.keys() & {"distortion", "proximodistal"}:
         from hipsta_bids.io import gifti  # noqa: PLC0415  (workers only)
 
-        values = maps.maps["distortion"].ravel()
-        content = gifti.shape_bytes(values, hemi=place.name.hemi, name="distortion", unit="1")
-        files.write_bytes(place.path("distortion"), content)
+        values = maps.maps[name].ravel()
+        content = gifti.shape_bytes(values, hemi=place.name.hemi, name=name, unit="1")
+        files.write_bytes(place.path(name), content)
     if spread is not None and spread.known:
         measured = spread.copies - spread.failed
         own = {name: np.isfinite(values) for name, values in maps.maps.items()}

@@ -7,6 +7,7 @@ tetrahedra, boundaries, coordinates, sheet, measures.
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -62,7 +63,7 @@ from hipsta_bids.geometry.sheet import (
     whole_body,
 )
 from hipsta_bids.geometry.topology import Repair, SolidField, repair_topology, repaired_columns
-from hipsta_bids.participant.whole import measure_whole
+from hipsta_bids.participant.whole import Own, check_fine, measure_whole
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.protocols.load import for_region
 from hipsta_bids.protocols.protocol import LATERAL_END, MEDIAL_END, Tissue
@@ -72,6 +73,7 @@ from hipsta_bids.types import (
     Bool,
     Coordinates,
     Finding,
+    Flag,
     Float,
     HemisphereMaps,
     LabelVolume,
@@ -377,21 +379,20 @@ def measure_hemisphere(
         With the reason why this hemisphere cannot be measured.
     """
     if settings.body.region in EXPERIMENTAL:
-        return measure_whole(volume, hemi, settings, clock)
+        check_fine(volume)
+        only = settings.changed(body={"region": "body"})
+        evidence, coordinates = unfold(volume, hemi, only, clock)
+        repaired = repaired_columns(evidence.measured.sheet, evidence.solid, settings.measures)
+        flags = _flags(evidence, _find(volume, hemi, evidence, repaired))
+        own = Own(evidence.measured.body, evidence.measured.mesh, coordinates, flags)
+        return measure_whole(volume, hemi, settings, clock, own)
     evidence, coordinates = unfold(volume, hemi, settings, clock)
-    measured, solid, boundaries = evidence.measured, evidence.solid, evidence.boundaries
+    measured, solid = evidence.measured, evidence.solid
     body, sheet = measured.body, measured.sheet
     with clock("measures"):
         layers, folded_layers = _layers(sheet, settings)
         repaired = repaired_columns(sheet, solid, settings.measures)
-        findings = [
-            *check_end_labels(volume, body, settings.checks),
-            *check_thickness(measured.thickness, boundaries.sheet_thickness, settings.checks),
-            *([check_flipped(sheet, hemi)] if body.region == "extended" else []),
-            *_check_edited_mask(volume, body, settings),
-            *find_all(evidence, repaired),
-            *folded_layers,
-        ]
+        findings = [*_find(volume, hemi, evidence, repaired), *folded_layers]
         maps = measure_maps(measured)
         return HemisphereMaps(
             sheet=sheet,
@@ -408,14 +409,29 @@ def measure_hemisphere(
                 *(_told(repair, sheet, settings) for repair in solid.repairs),
                 *describe_uncus(body, settings.checks),
             ),
-            flags=tuple(
-                raise_flags(
-                    findings, sheet, lambda points: name_place(points, body), settings.checks
-                )
-            ),
+            flags=_flags(evidence, findings),
             mesh=measured.mesh,
             coordinates=coordinates,
         )
+
+
+def _find(volume: LabelVolume, hemi: str, evidence: Evidence, repaired: Bool) -> list[Finding]:
+    """List what the checks of a body found, within its limit or not."""
+    measured, settings = evidence.measured, evidence.measured.settings
+    body, checks = measured.body, settings.checks
+    return [
+        *check_end_labels(volume, body, checks),
+        *check_thickness(measured.thickness, evidence.boundaries.sheet_thickness, checks),
+        *([check_flipped(measured.sheet, hemi)] if body.region == "extended" else []),
+        *_check_edited_mask(volume, body, settings),
+        *find_all(evidence, repaired),
+    ]
+
+
+def _flags(evidence: Evidence, findings: list[Finding]) -> tuple[Flag, ...]:
+    measured = evidence.measured
+    place = partial(name_place, body=measured.body)
+    return tuple(raise_flags(findings, measured.sheet, place, measured.settings.checks))
 
 
 def find_body(volume: LabelVolume, settings: Settings) -> BodyMask | None:

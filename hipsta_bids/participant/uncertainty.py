@@ -27,8 +27,7 @@ from scipy.spatial.transform import Rotation
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.catalog import measure_maps, summarize
 from hipsta_bids.geometry.checks import check_thickness
-from hipsta_bids.participant.measure import unfold
-from hipsta_bids.participant.whole import measure_whole
+from hipsta_bids.participant.measure import measure_hemisphere, unfold
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.protocols.load import for_region
 from hipsta_bids.settings import Settings, UncertaintySettings
@@ -123,7 +122,7 @@ def _measure(
     """Measure maps and summary alone: no flags, cross-sections or layers."""
     grid = {"spacing": max(settings.grid.spacing, settings.uncertainty.spacing)}
     if settings.body.region in EXPERIMENTAL:
-        whole = measure_whole(volume, hemi, settings.changed(grid=grid), _no_clock)
+        whole = measure_hemisphere(volume, hemi, settings.changed(grid=grid), _no_clock)
         return whole.maps, whole.summary
     evidence, _ = unfold(volume, hemi, settings.changed(grid=grid), _no_clock)
     measured = evidence.measured

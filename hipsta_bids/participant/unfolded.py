@@ -9,11 +9,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.interpolate import RegularGridInterpolator
+from scipy.interpolate import LinearNDInterpolator
 
 from hipsta_bids.errors import InputError, UsageError
 from hipsta_bids.geometry.catalog import MAPS
-from hipsta_bids.geometry.disk import locate_nodes
 from hipsta_bids.io import files, gifti
 from hipsta_bids.io.gifti import DENSE_SCALARS, PointMap
 from hipsta_bids.participant.whole import grid_levels
@@ -42,27 +41,35 @@ class SheetMap(PointMap):
 
 
 class Correspondence:
-    """Where HippUnfold's vertices lie on the grid of the whole sheet."""
+    """Where HippUnfold's vertices lie on the whole sheet."""
 
-    def __init__(self, flat: Mesh, settings: SheetSettings) -> None:
-        """Place the vertices of an unfolded surface, in mm as HippUnfold writes them."""
-        (self.x, self.y, _), (first, last) = grid_levels(settings, "whole")
+    def __init__(
+        self, flat: Mesh, settings: SheetSettings, proximodistal: Float | None = None
+    ) -> None:
+        """Place the vertices of an unfolded surface, in mm as HippUnfold writes them.
+
+        ``proximodistal`` (Nx, Ny) of the sheet takes the place of x, if it is given.
+        """
+        (x, y, _), (first, last) = grid_levels(settings, "whole")
         anterior, lateral = ((flat.points[:, :2] - _LOW) / _SIZE).T
-        #: (V, 2) x from -1 to 1 between the edges, y between the ends of the sheet.
+        #: (V, 2) from -1 to 1 between the edges, and y between the ends of the sheet.
         self.places: Float = np.column_stack([2 * lateral - 1, first + anterior * (last - first)])
-        self._triangles = flat.triangles.astype(np.int32)
+        along = np.broadcast_to(y, (len(x), len(y)))
+        across = (
+            np.broadcast_to(x[:, None], along.shape) if proximodistal is None else proximodistal
+        )
+        #: (Nx, Ny, 2) the same of the nodes; NaN where the sheet has none.
+        self.nodes: Float = np.stack([across, np.where(np.isnan(across), np.nan, along)], axis=-1)
 
     def to_vertices(self, values: Float) -> Float:
-        """Interpolate a map (Nx, Ny) at the vertices (V,); NaN beside NaN and beyond the grid."""
-        sample = RegularGridInterpolator((self.x, self.y), values, bounds_error=False)
+        """Interpolate a map (Nx, Ny) at the vertices (V,); NaN beside NaN and beyond the nodes."""
+        known = np.isfinite(self.nodes).all(axis=-1)
+        sample = LinearNDInterpolator(self.nodes[known], values[known])
         return np.asarray(sample(self.places), dtype=np.float64)
 
     def to_nodes(self, values: Float) -> Float:
         """Interpolate numbers (V, ...) at the nodes (Nx, Ny, ...), NaN beside NaN and beyond."""
-        triangle, weights = locate_nodes(self._triangles, self.places, self.x, self.y)
-        found: Float = np.einsum("xyk,xyk...->xy...", weights, values[self._triangles[triangle]])
-        found[triangle < 0] = np.nan
-        return found
+        return np.asarray(LinearNDInterpolator(self.places, values)(self.nodes), dtype=np.float64)
 
 
 def resample(
@@ -70,7 +77,9 @@ def resample(
     out: Path,
     surfaces: Sequence[Path],
     settings: SheetSettings,
-    column: str,
+    *,
+    column: str = "thickness",
+    sheets: Sequence[Path] = (),
 ) -> str:
     """Move maps of one or both sides to HippUnfold's vertices, or from there to the whole sheet.
 
@@ -86,6 +95,8 @@ def resample(
         Those that the sheets were measured with.
     column : str
         Column of a table that holds the map.
+    sheets : sequence of Path
+        ``desc-proximodistal`` maps of the sheets, one for each side.
 
     Returns
     -------
@@ -105,6 +116,7 @@ def resample(
     if out.resolve() in {path.resolve() for path in (*paths, *surfaces)}:
         raise UsageError(f"{out}: is an input; choose another name", reason="usage")
     known = {_hemi(path): _unfolded(path) for path in surfaces}
+    across = {one.hemi: one.values for path in sheets for one in _read(path, column)}
     moved: dict[str, SheetMap] = {}
     vertices = False
     for one in (one for path in paths for one in _read(path, column)):
@@ -116,8 +128,15 @@ def resample(
                 f"{one.path}: there is no unfolded surface of side {one.hemi}; add it to --surface",
                 reason="no-surface",
             )
-        between = Correspondence(flat, settings)
-        nodes = len(between.x), len(between.y)
+        nodes = Correspondence(flat, settings).nodes.shape[:2]
+        places = across.get(one.hemi)
+        if places is not None and places.size != nodes[0] * nodes[1]:
+            raise InputError(
+                f"--sheet: {places.size} points, but the whole sheet has {nodes[0]} x {nodes[1]};"
+                " give its desc-proximodistal map, or the --settings of the results",
+                reason="mixed-grids",
+            )
+        between = Correspondence(flat, settings, None if places is None else places.reshape(nodes))
         ours = len(one.values) == nodes[0] * nodes[1] and one.nodes in (None, nodes)
         if not ours and len(one.values) != len(flat.points):
             raise InputError(

@@ -1,19 +1,20 @@
 """The whole hippocampus, or head and body, on one sheet (experimental): labels to maps.
 
 Head and tail bend and fold, so the solid has no ends to close and is not made a ball. It has two
-faces and a rim; edges and ends are found afterwards, on the boundary of the mid-surface. The
-body's rows of the grid are those of the body's own sheet: its end planes have the same y.
+faces and a rim; edges and ends are found afterwards, on the boundary of the mid-surface. In the
+body, the grid is that of the body's own sheet: the body is measured first.
 """
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry.body import Body, check_side, extract_body
+from hipsta_bids.geometry.body import Body, check_side
 from hipsta_bids.geometry.catalog import (
     Measured,
     average_profiles,
@@ -26,27 +27,24 @@ from hipsta_bids.geometry.digital import voxel_points
 from hipsta_bids.geometry.disk import (
     Disk,
     Edges,
-    Line,
+    at_nodes,
     distance_from_rims,
     find_edges,
-    find_line,
     flipped_area,
     level_surface,
     locate_nodes,
     make_disk,
     map_to_rectangle,
-    masked_area,
-    space_rows,
+    proximodistal,
 )
-from hipsta_bids.geometry.ends import EndPlanes
 from hipsta_bids.geometry.faces import find_faces, whole_surface, whole_tissue
 from hipsta_bids.geometry.fem import volume_laplace
 from hipsta_bids.geometry.findings import columns_near, flag_margins, raise_flags
 from hipsta_bids.geometry.folds import TouchingBanks, find_touching_banks
 from hipsta_bids.geometry.lines import Lines
 from hipsta_bids.geometry.measures import column_area, labels_at, measure_thickness
-from hipsta_bids.geometry.mesh import tetra_quality, tetrahedralize
-from hipsta_bids.geometry.sheet import fill_points, label_sheet, sheet_levels
+from hipsta_bids.geometry.mesh import tetra_quality, tetrahedralize, triangle_areas, unique_edges
+from hipsta_bids.geometry.sheet import coordinates_at, fill_points, label_sheet, sheet_levels
 from hipsta_bids.protocols import rows_beyond
 from hipsta_bids.protocols.protocol import CORE, LATERAL_END, MEDIAL_END, Tissue
 from hipsta_bids.settings import Settings, SheetSettings
@@ -55,11 +53,13 @@ from hipsta_bids.types import (
     Coordinates,
     End,
     Finding,
+    Flag,
     Float,
     HemisphereMaps,
     Int,
     LabelVolume,
     Sheet,
+    TetMesh,
 )
 
 Clock = Callable[[str], AbstractContextManager[None]]
@@ -67,12 +67,13 @@ Clock = Callable[[str], AbstractContextManager[None]]
 MAX_VOXEL = 0.5
 """Refuse longer voxel edges, mm."""
 MARGIN = 1.0
-"""No value nearer than this to an edge, an end or a filled hole, mm."""
+"""No value nearer than this to an edge, an end or a filled hole, thicknesses of at least 1 mm: so
+far lines bend round the rim."""
 MAX_PIECE = 0.02
 """Refuse a piece beside the mid-surface with a larger share of its area."""
 MIN_EDGE = 30.0
 """Refuse a shorter medial or lateral edge, mm."""
-FLAG_HOLE, FLAG_END = 10.0, 15.0
+FLAG_HOLE, FLAG_END = 10.0, 12.0
 """Flag holes of a longer perimeter, and longer ends, mm."""
 FLAG_FOLDED, FLAG_MASKED = 0.01, 0.25
 """Flag larger shares of the area that are turned over, and that have no values."""
@@ -83,10 +84,10 @@ THICK_NEAR, THICK = 4.0, 1.5
 part of it."""
 LATERAL_REACH = 1.6
 """The lateral edge lies this near to dentate gyrus or CA4, mm."""
+HATA_REACH = 1.0
+"""What is this near to the hippocampal-amygdaloid transition area, mm, is the anterior end."""
 CUT_REACH = 1.0
 """Without a tail the sheet ends at the posterior plane: what is this near to it is no edge, mm."""
-MAX_SHIFT = 5.0
-"""How far inside an end plane the line is sought that has its y, mm."""
 MAX_LENGTH = 8.0
 """Lines from the mid-surface to a wall that are longer than this are lost, mm."""
 _FAR = 500.0
@@ -97,22 +98,30 @@ _RIM = 0.9999
 """Beside the edges themselves, where rounding does not choose the triangle."""
 
 
+class Own(NamedTuple):
+    """The body's own sheet, and what it was found in."""
+
+    body: Body
+    mesh: TetMesh
+    coordinates: Coordinates
+    flags: tuple[Flag, ...]
+
+
 def measure_whole(
-    volume: LabelVolume, hemi: str, settings: Settings, clock: Clock
+    volume: LabelVolume, hemi: str, settings: Settings, clock: Clock, own: Own
 ) -> HemisphereMaps:
     """Measure head, body and, unless the region is ``headbody``, tail on one sheet.
 
-    Arguments, result and errors are those of `measure_hemisphere`.
+    ``own`` is the body measured alone. The other arguments, result and errors are those of
+    `measure_hemisphere`.
     """
     region = settings.body.region
     with clock("body"):
-        _check_voxel(volume)
-        body = extract_body(volume, settings.body.changed(region="body"))
-        side = check_side(body, hemi)
-        tissue = whole_tissue(volume)
-        ends = body.ends
+        side = check_side(own.body, hemi)
+        tissue = whole_tissue(volume, own.body.tissue)
+        ends = own.body.ends
         far = ends.beyond(_FAR)
-        body = replace(body, tissue=tissue, inside=tissue > 0, region=region, ends=far)
+        body = replace(own.body, tissue=tissue, inside=tissue > 0, region=region, ends=far)
     with clock("surface"):
         spacing = settings.grid.spacing
         surface, field, grid = whole_surface(tissue > 0, volume.affine, spacing, settings.surface)
@@ -128,9 +137,8 @@ def measure_whole(
         _check_pieces(disk)
         edges = _edges(disk, body, volume, ends.height, region)
         axes, limits = grid_levels(settings.sheet, region)
-        lines = _end_lines(disk, edges, ends, body, settings.sheet)
-        plane = map_to_rectangle(disk, edges, lines, limits)
-        plane = space_rows(disk, plane, settings.sheet.y_extent, limits)
+        within = _in_body(disk, own)
+        plane = map_to_rectangle(disk, edges, within, settings.sheet.y_extent, limits)
     with clock("sheet"):
         lines_of = Lines(mesh, laplace.gradient(u))
         sheet = _sample(disk, plane, lines_of, axes, MARGIN)
@@ -152,9 +160,13 @@ def measure_whole(
         everywhere = measure_maps(measured)
         maps = {k: np.where(sheet.valid, v, np.nan) for k, v in everywhere.items()}
         maps["distortion"] = _distortion(sheet)
+        maps["proximodistal"] = at_nodes(disk, plane, proximodistal(disk, edges), *axes[:2])
         folded = flipped_area(disk, plane)
+        measured_area = float(column_area(sheet)[sheet.valid].sum())
+        area = float(triangle_areas(disk.vertices, disk.triangles).sum())
+        masked = max(0.0, 1 - measured_area / area)
         findings = [
-            *_findings(disk, edges, folded, region),
+            *_findings(disk, edges, folded, masked, region),
             *(_touching(*place) for place in zip(banks, touching, strict=True)),
         ]
         return HemisphereMaps(
@@ -178,7 +190,7 @@ def measure_whole(
                 "holes_mm": [round(hole, 2) for hole in disk.holes],
                 "edge_lengths_mm": _lengths(disk, edges),
                 "folded_fraction": folded,
-                "masked_fraction": masked_area(disk, MARGIN),
+                "masked_fraction": masked,
                 "medial_offset_mm": side,
                 "posterior_end_rule": ends.posterior_rule,
                 "anterior_end_rule": ends.anterior_rule,
@@ -186,8 +198,9 @@ def measure_whole(
                 "anterior_plane": ends.entry("anterior"),
                 "flag_margins": flag_margins(findings),
             },
-            flags=tuple(
-                raise_flags(findings, sheet, lambda at: name_place(at, body), settings.checks)
+            flags=(
+                *raise_flags(findings, sheet, lambda at: name_place(at, body), settings.checks),
+                *(replace(f, message=f"the body alone: {f.message}") for f in own.flags),
             ),
             mesh=mesh,
             coordinates=Coordinates(values=np.column_stack([np.full((len(u), 2), np.nan), u])),
@@ -209,7 +222,8 @@ def grid_levels(
     return (x, y, z), (float(y[0]), float(y[-1]))
 
 
-def _check_voxel(volume: LabelVolume) -> None:
+def check_fine(volume: LabelVolume) -> None:
+    """Refuse voxels in which head and tail cannot be measured."""
     longest = float(np.linalg.norm(volume.affine[:3, :3], axis=0).max())
     if longest > MAX_VOXEL + _SAME:
         raise GeometryError(
@@ -242,6 +256,10 @@ def _edges(
     above = height(points, "posterior")
     if region == "headbody":
         medial[above < CUT_REACH] = lateral[above < CUT_REACH] = -1.0
+    hata = voxel_points(volume.tissue == Tissue.HATA, volume.affine)
+    if len(hata):
+        at_end = cKDTree(hata).query(points)[0] < HATA_REACH
+        medial[at_end] = lateral[at_end] = -len(points)  # no edge passes it
     edges = find_edges(disk, medial, lateral, above)
     for name in ("medial", "lateral"):
         length = _length(disk, getattr(edges, name))
@@ -254,32 +272,17 @@ def _edges(
     return edges
 
 
-def _end_lines(
-    disk: Disk, edges: Edges, ends: EndPlanes, body: Body, settings: SheetSettings
-) -> list[Line]:
-    """Find the body's ends on the sheet, each with its y.
+def _in_body(disk: Disk, own: Own) -> Float:
+    """Coordinates (V, 2), x and y, of a disk's vertices in the body's own sheet; NaN outside.
 
-    The head turns back medially. Where an end plane therefore does not cross the sheet from edge to
-    edge, one a little farther inside does, and has the y that it has in the body.
+    The body goes on beyond its end planes. One vertex there belongs to it, so that the rows at the
+    planes lie between known values.
     """
-    length = ends.length(body.inside_points()[1])
-    lines = []
-    signs: tuple[tuple[End, float], ...] = (("posterior", 1.0), ("anterior", -1.0))
-    for end, sign in signs[1 if body.region == "headbody" else 0 :]:
-        height = ends.height(disk.vertices, end)
-        for inward in np.arange(0.0, MAX_SHIFT, 0.25):
-            y = sign * settings.y_extent * (2 * inward / length - 1)
-            line = find_line(disk, edges, height - sign * inward, y)
-            if line is not None:
-                lines.append(line)
-                break
-        else:
-            raise GeometryError(
-                f"the {end} end plane of the body does not cross the sheet from edge to edge: "
-                "check the labels of head and tail, or place the end by hand",
-                reason="whole-ends",
-            )
-    return lines
+    found = coordinates_at(own.mesh, own.coordinates, disk.vertices)[:, :2]
+    inside = np.asarray((np.abs(found) <= 1).all(axis=1))
+    edges = unique_edges(disk.triangles)
+    inside[edges[inside[edges].any(axis=1)]] = True
+    return np.where(inside[:, None] & (np.abs(found[:, :1]) <= 1), found, np.nan)
 
 
 def _length(disk: Disk, arc: Int) -> float:
@@ -305,7 +308,8 @@ def _sample(
     points = np.full((len(x), len(y), len(z), 3), np.nan)
     points[known] = columns
     rims = distance_from_rims(disk)
-    far = np.einsum("xyk,xyk->xy", weights, rims[corner]) > margin
+    thickness = np.linalg.norm(np.diff(points, axis=2), axis=3).sum(axis=2)
+    far = np.einsum("xyk,xyk->xy", weights, rims[corner]) > margin * np.fmax(thickness, 1.0)
     valid = np.isfinite(points).all(axis=(2, 3)) & far
     if not valid.any():
         raise GeometryError(
@@ -341,7 +345,7 @@ def _distortion(sheet: Sheet) -> Float:
     return np.asarray(np.log2(area / np.nanmean(area)))
 
 
-def _findings(disk: Disk, edges: Edges, folded: float, region: str) -> list[Finding]:
+def _findings(disk: Disk, edges: Edges, folded: float, masked: float, region: str) -> list[Finding]:
     """List what was found on the whole sheet, within its limit or not."""
     found = [
         Finding(
@@ -368,7 +372,6 @@ def _findings(disk: Disk, edges: Edges, folded: float, region: str) -> list[Find
                 points=disk.vertices[arc],
             )
         )
-    masked = masked_area(disk, MARGIN)
     return [
         *found,
         Finding(

@@ -25,8 +25,9 @@ _FOLDED, _RISE = (0.2, 0.8), 0.15
 """Shares of the spiral between which it has folds, and over which their banks rise."""
 _STEP = 0.04
 """Between points of the folded surface along the axis, mm."""
-_CORE, _GAP = 2.0, 0.5
-"""Of the dentate gyrus, mm: radius, and distance from the wall where it leaves the spiral."""
+_CORE, _LAYER, _LEAVES = 2.0, 0.5, 1.2
+"""Radius of the dentate gyrus and thickness of the molecular layer, mm; the share of the spiral up
+to which the gyrus lies beside CA3."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,9 +89,9 @@ def draw_head(spec: HeadSpec) -> LabelVolume:
             upright = np.abs(share - np.mean(_FOLDED)) < np.ptp(_FOLDED) / 2 - _RISE
             outward[near & half & (outward > 0) & between & upright] = 0
     wall = (np.abs(outward) < spec.thickness / 2) & (share < 1)
-    codes = np.where(outward < 0, 6, 0)
-    leaves = (radius < RADIUS - _GAP) & (share > 1) & (share < 1.2)  # noqa: PLR2004 -- beside CA3
-    codes[(radius < _CORE) | leaves] = 4
+    codes = np.where((outward < 0) & (share < _LEAVES), 4, 0)
+    codes[radius < _CORE] = 4
+    codes[(outward < 0) & (outward > -spec.thickness / 2 - _LAYER) & (share < 1)] = 6
     codes[wall] = np.select([share < 0.25, share < 0.7], [2, 1], 5)[wall]  # noqa: PLR2004
     protocol = load_protocol("cobralab")
     tissue, part = translate(np.where(within, codes, 0), protocol)

@@ -1,6 +1,6 @@
 """Thickness of HippUnfold's labels beside HippUnfold's own, and beside walls that it drew."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import nibabel as nib
@@ -14,11 +14,18 @@ from hipsta_bids.inputs.labels import read_label_volume
 from hipsta_bids.inputs.search import HemisphereInput, InputRequest, find_hemispheres
 from hipsta_bids.io.gifti import read_mesh
 from hipsta_bids.participant.unfolded import Correspondence
+from hipsta_bids.participant.whole import MAX_VOXEL
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import translate
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Float, HemisphereMaps, LabelVolume
-from hipsta_bids.validation.cases import Refusal, hippunfold_beside, measure_body, run_cases
+from hipsta_bids.validation.cases import (
+    Refusal,
+    fine_segmentations,
+    hippunfold_beside,
+    measure_body,
+    run_cases,
+)
 from hipsta_bids.validation.report import Cell, Cells, Suite, Table
 
 VOXEL = 0.4
@@ -42,6 +49,12 @@ _SAME_PLACE = 0.95
 """Least correlation of the coordinates of the two unfolded sheets."""
 _WHOLE_BIAS, _WHOLE_SD = 0.02, {"all": 0.1, "head": 0.1, "body": 0.06, "tail": 0.1}
 """mm; against known walls, from head to tail."""
+_WHOLE_R, _PERSON_R = 0.94, 0.9
+"""Correlation of all nodes with known walls, and with a person's thickness by HippUnfold."""
+_BESIDE = 1.0
+"""Nodes farther from HippUnfold's sheet than this have no counterpart there, mm."""
+
+Parts = dict[str, tuple[Float, Float]]
 
 
 Codes = NDArray[np.intp]
@@ -84,12 +97,19 @@ def run(full: bool, labels: Path | None = None) -> Suite:
         ),
     ]
     about = [Table(title="Thickness against HippUnfold's own, mm", rows=rows, notes=_NOTES)]
+    cases: list[HemisphereInput | tuple[Path, str]] = [*templates, *persons]
+    if templates and labels:
+        both = [*cases, *fine_segmentations(labels, MAX_VOXEL)]
+        alone = run_cases(measure_alone, both, timeout=120.0)
+        twice = [_alone_row(_name(c), r) for c, r in zip(both, alone, strict=True)]
+        title = "The body with the head on one sheet, against the body alone, mm"
+        about.append(Table(title=title, rows=twice, notes=_ALONE_NOTES))
     if templates:
-        results = run_cases(measure_whole_template, templates, timeout=120.0)
+        results = run_cases(measure_whole_sheet, cases, timeout=120.0)
         whole = [
-            {"hemisphere": f"{path.name.removeprefix('tpl-')} {hemi}", **row}
-            for (path, hemi), result in zip(templates, results, strict=True)
-            for row in _whole_rows(result)
+            {"hemisphere": _name(case), **row}
+            for case, result in zip(cases, results, strict=True)
+            for row in _whole_rows(result, known=isinstance(case, tuple))
         ]
         title = "Head to tail on one sheet (experimental), mm"
         about.append(Table(title=title, rows=whole, notes=_WHOLE_NOTES))
@@ -128,36 +148,40 @@ def measure_template(case: tuple[Path, str]) -> Pair:
     return _pair(measure_body(volume, case[1]), points, thickness)
 
 
-def measure_whole_template(case: tuple[Path, str]) -> dict[str, tuple[Float, Float]]:
-    """Measure a template from head to tail: by part, our thickness and the true one, (N,) mm.
+def measure_whole_sheet(case: HemisphereInput | tuple[Path, str]) -> Parts:
+    """Measure from head to tail: by part, our thickness and that of HippUnfold's walls, (N,) mm.
 
-    Corresponding vertices of the two walls may lie obliquely to each other, next to edges; where
-    they do by more than 26 degrees, their distance is not the thickness.
+    Corresponding vertices of a template's two walls may lie obliquely to each other, next to edges;
+    where they do by more than 26 degrees, their distance is not the thickness.
     """
-    folder, hemi = case
-    volume, _, _ = draw_template(folder, hemi)
+    volume, hemi = _volume(case)
     maps = measure_body(volume, hemi, Settings().changed(body={"region": "whole"}))
-    name = str(folder / f"*_hemi-{hemi}_*_label-hipp_")
-    inner, outer, middle = (
-        _values(f"{name}{wall}.surf.gii", "pointset") for wall in ("inner", "outer", "midthickness")
-    )
-    triangles = _values(f"{name}midthickness.surf.gii", "triangle").astype(np.int32)
-    across = outer - inner
-    true = np.linalg.norm(across, axis=1)
-    facing = np.abs((vertex_normals(middle, triangles) * across).sum(axis=1))
-    upright = facing > _UPRIGHT * true
+    if isinstance(case, tuple):
+        name = str(case[0] / f"*_hemi-{hemi}_*_label-hipp_")
+        inner, outer = (_values(f"{name}{w}.surf.gii", "pointset") for w in ("inner", "outer"))
+        across = outer - inner
+        theirs = np.linalg.norm(across, axis=1)
+    else:
+        name = str(case.files[0].parent.parent / f"surf/*_hemi-{hemi}_*_label-hipp_")
+        theirs = _values(f"{name}thickness.shape.gii")
+    points = _values(f"{name}midthickness.surf.gii", "pointset")
+    upright = np.ones(len(points), dtype=bool)
+    if isinstance(case, tuple):
+        triangles = _values(f"{name}midthickness.surf.gii", "triangle").astype(np.int32)
+        facing = np.abs((vertex_normals(points, triangles) * across).sum(axis=1))
+        upright = facing > _UPRIGHT * theirs
     valid = maps.sheet.valid
-    points = maps.sheet.points[:, :, maps.sheet.middle][valid]
-    nearest = np.asarray(cKDTree(middle).query(points)[1], dtype=np.intp)
+    away, nearest = cKDTree(points).query(maps.sheet.points[:, :, maps.sheet.middle][valid])
+    nearest = np.asarray(nearest, dtype=np.intp)
     row, ours = np.nonzero(valid)[1], maps.thickness[valid]
-    (tail, head), good = _BODY_ROWS, upright[nearest]
+    (tail, head), good = _BODY_ROWS, upright[nearest] & (away < _BESIDE)
     parts = {
         "all": good,
         "head": good & (row > head),
         "body": good & (row >= tail) & (row <= head),
         "tail": good & (row < tail),
     }
-    return {part: (ours[rows], true[nearest[rows]]) for part, rows in parts.items()}
+    return {part: (ours[rows], theirs[nearest[rows]]) for part, rows in parts.items()}
 
 
 def measure_places(case: tuple[Source, Path]) -> Cells:
@@ -174,19 +198,20 @@ def measure_places(case: tuple[Source, Path]) -> Cells:
         folder, hemi = source.files[0].parent.parent / "surf", source.hemi
         volume = read_label_volume(source)
     settings = Settings().changed(body={"region": "whole"})
-    sheet = measure_body(volume, hemi, settings).sheet
+    maps = measure_body(volume, hemi, settings)
+    sheet = maps.sheet
     vertices = _values(
         str(folder / f"*_hemi-{hemi}_*_label-hipp_midthickness.surf.gii"), "pointset"
     )
-    between = Correspondence(read_mesh(flat), settings.sheet)
+    between = Correspondence(read_mesh(flat), settings.sheet, maps.maps["proximodistal"])
     points = sheet.points[:, :, sheet.middle]
     off = np.linalg.norm(between.to_nodes(vertices) - points, axis=-1)[sheet.valid]
     nearest = np.asarray(cKDTree(vertices).query(points[sheet.valid])[1], dtype=np.intp)
     cells: dict[str, Cell] = {}
     met = True
-    for name, axis, number in (("AP", between.y, 1), ("PD", between.x, 0)):
-        ours, theirs = axis[np.nonzero(sheet.valid)[number]], between.places[nearest, number]
-        extent = axis[-1] - axis[0] if name == "AP" else 2.0
+    for name, number in (("AP", 1), ("PD", 0)):
+        ours, theirs = between.nodes[sheet.valid][:, number], between.places[nearest, number]
+        extent = np.ptp(between.places[:, number])
         same = _two(ours, theirs)[1]
         away = float(np.abs(ours - theirs).mean() / extent)
         cells |= {f"{name}, r": same, f"{name}, mean difference": f"{away:.1%}"}
@@ -196,8 +221,8 @@ def measure_places(case: tuple[Source, Path]) -> Cells:
     return {**cells, "target": f"r ≥ {_SAME_PLACE:g}", "met": met}
 
 
-def _whole_rows(result: dict[str, tuple[Float, Float]] | Refusal) -> list[Cells]:
-    """Compare the whole sheet's thickness with the true one, part by part."""
+def _whole_rows(result: Parts | Refusal, *, known: bool) -> list[Cells]:
+    """Compare the whole sheet's thickness with that of known walls, or a person's, part by part."""
     if isinstance(result, Refusal):
         return [{"part": "all", "target": str(result), "met": False}]
     rows: list[Cells] = []
@@ -206,9 +231,59 @@ def _whole_rows(result: dict[str, tuple[Float, Float]] | Refusal) -> list[Cells]
         limit = _WHOLE_SD[part]
         met = abs(bias) <= _WHOLE_BIAS and spread <= limit
         target = f"bias within {_WHOLE_BIAS:g}, SD ≤ {limit:g}"
+        if not known:
+            target, met = f"r ≥ {_PERSON_R:g}", same >= _PERSON_R
+        elif part == "all":
+            target, met = f"{target}, r ≥ {_WHOLE_R:g}", met and same >= _WHOLE_R
         cells: Cells = {"part": part, "bias": f"{bias:+.3f}", "SD": spread, "r": same}
         rows.append({**cells, "nodes": len(ours), "target": target, "met": met})
     return rows
+
+
+def measure_alone(case: HemisphereInput | tuple[Path, str]) -> tuple[Float, Float, Float]:
+    """Measure the body on the sheet with the head, and alone, both without the molecular layer.
+
+    Returns the two thicknesses of the nodes that have both, and their distances, (N,) mm.
+    """
+    volume, hemi = _volume(case)
+    volume = replace(volume, protocol=volume.protocol.model_copy(update={"layer": ()}))
+    with_tail = volume.protocol.name == "hippunfold"
+    maps, alone = (
+        measure_body(volume, hemi, Settings().changed(body={"region": region}))
+        for region in ("whole" if with_tail else "headbody", "body")
+    )
+    first = _BODY_ROWS[0] if with_tail else 0
+    rows = slice(first, first + alone.thickness.shape[1])
+    middle, own = (s.points[:, :, s.middle] for s in (maps.sheet, alone.sheet))
+    apart = np.linalg.norm(middle[:, rows] - own, axis=2)
+    told = maps.sheet.valid[:, rows]
+    return maps.thickness[:, rows][told], alone.thickness[told], apart[told]
+
+
+def _volume(case: HemisphereInput | tuple[Path, str]) -> tuple[LabelVolume, str]:
+    if isinstance(case, tuple):
+        return draw_template(*case)[0], case[1]
+    return read_label_volume(case), case.hemi
+
+
+def _name(case: HemisphereInput | tuple[Path, str]) -> str:
+    if isinstance(case, tuple):
+        return f"{case[0].name.removeprefix('tpl-')} {case[1]}"
+    return f"{case.subject} {case.hemi}"
+
+
+def _alone_row(name: str, result: tuple[Float, Float, Float] | Refusal) -> Cells:
+    """Compare the body on the whole sheet with the body alone, node by node."""
+    cells: dict[str, Cell] = {"hemisphere": name}
+    met = False
+    if isinstance(result, Refusal):
+        return {**cells, "target": str(result), "met": met}
+    ours, alone, apart = result
+    bias, (spread, same) = float((ours - alone).mean()), _two(ours, alone)
+    cells |= {"distance, median": float(np.median(apart)), "95 %": float(np.quantile(apart, 0.95))}
+    cells |= {"bias": f"{bias:+.3f}", "SD": spread, "r": same, "nodes": len(ours)}
+    cells["target"] = f"bias within {MAX_BIAS:g}, r ≥ {LEAST_CORRELATION:g}"
+    return {**cells, "met": abs(bias) <= MAX_BIAS and same >= LEAST_CORRELATION}
 
 
 def _values(pattern: str, kind: str | None = None) -> Float:
@@ -342,10 +417,16 @@ from the node to where HippUnfold's surface has the same coordinates.
 """
 
 _WHOLE_NOTES = """\
-Of each node with a value, which lies at least 1 mm from edges, ends and holes, and the nearest
-vertex of HippUnfold's. Nodes where HippUnfold's corresponding vertices lie obliquely to each other
-are left out: their distance is not a thickness. Labels beside the walls come from the walls
-themselves, which favors the method.
+Of each node with a value, which lies at least 1 mm, and one thickness, from edges, ends and holes,
+and the nearest vertex of HippUnfold's. Nodes where HippUnfold's corresponding vertices lie
+obliquely to each other are left out: their distance is not a thickness. Labels beside the walls
+come from the walls themselves, which favors the method. A person's bias is the distance of
+HippUnfold's walls from the borders of its labels.
+"""
+
+_ALONE_NOTES = """\
+Of nodes of the body with a value on both sheets; both without the molecular layer. The sheet with
+the head takes its coordinates over from the body alone, so that same nodes lie in the same place.
 """
 
 _NOTES = """\

@@ -67,6 +67,23 @@ def test_sides_meet_the_same_sides(flat, tmp_path):
         np.testing.assert_allclose(nodes[:, 1:-1], ours[:, 1:-1], atol=1e-6)
 
 
+def test_the_own_coordinate_of_a_sheet_takes_the_place_of_x(flat, tmp_path, capsys):
+    surface, points = flat
+    across = np.broadcast_to(np.sign(X) * np.abs(X) ** 1.5, (len(Y), len(X))).T
+    own = tmp_path / "sub-01_hemi-L_seg-hippunfold_label-whole_desc-proximodistal_morph.shape.gii"
+    write_map(own, across.ravel())
+    sheet, out = write_sheet(tmp_path, across), tmp_path / "vertices.shape.gii"
+    assert resample(sheet, out, "--sheet", own, surface=surface) == 0
+    found, lateral = nib.load(out).agg_data(), 2 * (points[:, 1] + 200) / 20 - 1
+    known = np.isfinite(found)
+    assert known[np.abs(lateral) < across.max() - 1e-6].all()
+    np.testing.assert_allclose(found[known], lateral[known], atol=1e-5)
+    write_map(own, across.ravel()[:-1])
+    capsys.readouterr()
+    assert resample(sheet, out, "--sheet", own, surface=surface) == 65
+    assert "give its desc-proximodistal map" in capsys.readouterr().err
+
+
 def test_a_map_comes_back_and_what_is_missing_stays_missing(flat, tmp_path, capsys):
     surface, _ = flat
     x, y = np.meshgrid(X, Y, indexing="ij")

@@ -11,6 +11,7 @@ import nibabel as nib
 import numpy as np
 import pandas as pd
 import pytest
+from scipy import ndimage
 
 import hipsta_bids as hb
 from hipsta_bids.api.maps import Measurement
@@ -24,8 +25,9 @@ from hipsta_bids.protocols.load import for_region, load_protocol
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.reports.cohort import read_cohort
 from hipsta_bids.reports.participant import participant_page
+from hipsta_bids.reports.review import correction_of
 from hipsta_bids.settings import Settings
-from hipsta_bids.types import Bool, Float, HemisphereMaps, LabelVolume, TetMesh
+from hipsta_bids.types import Bool, Float, GivenEnd, HemisphereMaps, LabelVolume, TetMesh
 
 WHOLE = Settings().changed(body={"region": "whole"})
 SHAPE = HeadSpec()
@@ -33,7 +35,9 @@ THICKNESS, (POSTERIOR, ANTERIOR) = SHAPE.thickness, SHAPE.ends
 
 
 def hooked() -> LabelVolume:
-    return draw_head(SHAPE)
+    """Without the layer, which the whole sheet never has: thickness is that of the body alone."""
+    volume = draw_head(SHAPE)
+    return replace(volume, protocol=volume.protocol.model_copy(update={"layer": ()}))
 
 
 def measure(volume: LabelVolume) -> HemisphereMaps:
@@ -59,10 +63,27 @@ def test_thickness_is_known_in_head_body_and_tail(maps: HemisphereMaps) -> None:
         assert values.std() <= 0.06
 
 
-def test_rows_of_the_body_lie_between_its_planes(maps: HemisphereMaps) -> None:
+def test_nodes_of_the_body_are_those_of_its_own_sheet(maps: HemisphereMaps) -> None:
+    alone = measure_hemisphere(hooked(), "L", Settings(), lambda _: nullcontext())
+    apart = np.linalg.norm(middle(maps)[:, 10:31] - middle(alone), axis=-1)
+    difference = maps.thickness[:, 10:31] - alone.thickness
+    told = np.isfinite(difference)
+    assert told.mean() > 0.9
+    assert np.median(apart[told]) < 0.02
+    assert np.quantile(apart[told], 0.95) < 0.15
+    assert np.abs(difference[told]).max() < 0.15
     inner, edge = middle(maps)[4:-4], WHOLE.grid.spacing  # mm, of the triangles that planes cross
     assert np.abs(inner[:, 10, 1] - POSTERIOR).max() < edge
     assert np.abs(inner[:, 30, 1] - ANTERIOR).max() < edge
+    assert maps.qc["folded_fraction"] < 0.01
+
+
+def test_what_refuses_the_body_refuses_the_whole() -> None:
+    near = GivenEnd(end="anterior", point=(0, POSTERIOR + 4, 0), normal=(0, 1, 0))
+    volume = hooked()
+    with pytest.raises(GeometryError) as error:
+        measure(replace(volume, given_ends=(volume.given_ends[0], near)))
+    assert error.value.reason == "body-too-short"
 
 
 def test_middle_lies_on_the_spiral_from_medial_to_lateral(maps: HemisphereMaps) -> None:
@@ -107,6 +128,26 @@ def test_tail_without_subfields_is_refused() -> None:
         for_region(protocol, "whole")
     assert error.value.reason == "whole-subfields"
     assert for_region(protocol, "headbody") == protocol
+
+
+def test_sheet_ends_along_the_transition_to_the_amygdala(maps: HemisphereMaps) -> None:
+    """Labels of it lie before the front end, and beside the medial edge for 4 mm before that."""
+    volume = hooked()
+    points = np.moveaxis(np.indices(volume.tissue.shape), 0, -1) @ volume.affine[:3, :3].T
+    x, y, z = np.moveaxis(points + volume.affine[:3, 3], -1, 0)
+    turn = np.rad2deg(np.arctan2(y - SHAPE.straight, 9.0 - x))
+    wall = np.abs(np.hypot(9.0 - np.hypot(x - 9.0, y - SHAPE.straight), z) - RADIUS) < 1
+    front = wall & (turn > 100) & (turn < 115) & (y > SHAPE.straight)
+    ends = volume.tissue == Tissue.SUBICULUM
+    beside = ndimage.binary_dilation(ends, iterations=2) & ~ends & (volume.tissue == 0)
+    beside &= (turn > 75) & (turn < 100) & (y > SHAPE.straight)
+    tissue = np.where((front & (volume.tissue == 0)) | beside, Tissue.HATA, volume.tissue)
+    found = measure(replace(volume, tissue=tissue))
+    before, after = (one.qc["edge_lengths_mm"] for one in (maps, found))
+    front = np.deg2rad(240) * RADIUS  # mm, all of the last section
+    assert before["anterior"] < front / 2  # its subiculum and CA3 were taken for edges
+    assert front < after["anterior"] < front + 4
+    assert before["medial"] > after["medial"] + 2
 
 
 def test_hole_is_filled_and_told() -> None:
@@ -271,7 +312,8 @@ def test_page_names_the_parts_and_what_has_no_value(out: Path) -> None:
     assert scene["ends"] == [10, 30]
     for part in ("tail", "body", "head"):
         assert f"{part}, " in "".join(re.findall("<figcaption>(.*?)</figcaption>", page))
-    assert "participant --edited-dir EDITS --participant-label 01 --region whole" in page
+    command = correction_of(read_cohort(out).hemispheres)["command"]
+    assert "participant --edited-dir EDITS --participant-label 01 --region whole" in command
     assert "nan mm" not in page
 
 

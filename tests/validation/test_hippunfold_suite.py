@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 
 from hipsta_bids.validation.cases import Refusal
-from hipsta_bids.validation.hippunfold import DRAWN, OWN, Pair, _fill, _row, run
+from hipsta_bids.validation.hippunfold import (
+    DRAWN,
+    OWN,
+    Pair,
+    _alone_row,
+    _fill,
+    _row,
+    _whole_rows,
+    run,
+)
 from hipsta_bids.validation.report import page
 
 RANDOM = np.random.default_rng(3)
@@ -41,6 +50,23 @@ def test_what_is_off_at_the_edges_is_told_apart():
     assert row["SD, inner nodes"] == pytest.approx(0.03, abs=0.01)
     assert row["r, inner nodes"] > 0.98
     assert row["variance in outer nodes"] > "60%"
+
+
+@pytest.mark.parametrize(
+    ("noise", "bias", "met"), [(0.03, 0.02, True), (0.2, 0, False), (0, 0.04, False)]
+)
+def test_the_body_with_the_head_is_judged_beside_the_body_alone(noise, bias, met):
+    theirs = THEIRS.ravel()
+    ours = theirs + bias + noise * RANDOM.normal(size=theirs.size)
+    row = _alone_row("01 L", (ours, theirs, np.full(theirs.size, 0.5)))
+    assert row["met"] is met
+    assert row["distance, median"] == 0.5
+
+
+def test_a_person_is_judged_by_correlation_and_known_walls_by_bias_too():
+    part = {"all": (THEIRS.ravel() + 0.2, THEIRS.ravel())}
+    assert _whole_rows(part, known=False)[0]["met"] is True
+    assert _whole_rows(part, known=True)[0]["met"] is False
 
 
 def test_voxels_in_a_tetrahedron_are_filled():
