@@ -9,13 +9,14 @@ import pandas as pd
 from hipsta_bids import __version__
 from hipsta_bids.group.analysis import Analysis
 from hipsta_bids.group.data import PARTICIPANT, Cohort
+from hipsta_bids.group.exchangeability import exchange_text
 from hipsta_bids.group.inference import PERMUTATIONS, control_fdr
 from hipsta_bids.group.normative import Scores
 from hipsta_bids.group.norms import LEVELS, NormsFile
 from hipsta_bids.group.settings import GroupSettings, MultiplicitySettings, NormSettings
 
-# Works that methods of the group level rest on.
-
+#: Level at which slopes are said to differ.
+_LEVEL = 0.05
 
 #: Key and entry of each work that the methods rest on.
 REFERENCES: Mapping[str, str] = {
@@ -48,6 +49,8 @@ REFERENCES: Mapping[str, str] = {
     "mixed": "Kuznetsova A, Brockhoff PB, Christensen RHB. lmerTest package: tests in linear mixed"
     " effects models. Journal of Statistical Software 2017;82(13):1-26."
     " doi:10.18637/jss.v082.i13",
+    "mixture": "Stram DO, Lee JW. Variance components testing in the longitudinal mixed effects"
+    " model. Biometrics 1994;50(4):1171-1177. doi:10.2307/2533455",
     "join": "Becker BJ, Wu MJ. The synthesis of regression slopes in meta-analysis. Statistical"
     " Science 2007;22(3):414-429. doi:10.1214/07-STS243",
     "reml": "Viechtbauer W. Bias and efficiency of meta-analytic variance estimators in the"
@@ -164,7 +167,7 @@ def methods_text(
         paragraphs.append(_alignment(analysis, settings, cite, others))
     paragraphs += _harmonization(analysis, cite)
     paragraphs.append(_models(analysis, settings, cite))
-    paragraphs += [_joint(analysis, settings, cite)] if settings.joint.measures else []
+    paragraphs += [_joint(settings, cite)] if settings.joint.measures else []
     if analysis.comparison.asymmetry:
         paragraphs.append(_asymmetry(settings, cite("asymmetry")))
     if analysis.scores is not None:
@@ -319,16 +322,15 @@ def _models(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], s
         first, second = analysis.comparison.pair
         what = f" to the change from {first} to {second}, with the covariates of {first}"
     if analysis.comparison.longitudinal:
-        slopes = getattr(analysis.row_model, "times", None) is not None
-        own = "intercepts and slopes" if slopes else "intercepts"
+        visits = analysis.row_model.visits
+        own = "intercepts and slopes" if visits is not None and visits.slopes else "intercepts"
         kind = f"linear mixed model with {own} of participants"
         errors = (
             " by restricted maximum likelihood, with Satterthwaite's degrees of freedom"
-            f" {cite('mixed')}"
+            f" {cite('mixed')}{_slopes(analysis, cite)}"
         )
         d = "estimate over the standard deviation of single visits"
-    repeated = analysis.comparison.longitudinal
-    corrected = _correction(settings.multiplicity, cite, repeated=repeated)
+    corrected = _correction(settings.multiplicity, cite, analysis)
     return (
         f"At each point of the sheet a {kind} `{analysis.model.formula}` was fitted{what}{errors}"
         f" (reference levels: {levels or 'none'}); contrasts: {names}."
@@ -338,6 +340,21 @@ def _models(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], s
         " measures were tested in the same model, volumes also with intracranial volume; their"
         " false discovery rate was held over all measures, sides and models of a contrast."
         f"{_nonlinear(analysis, settings)}"
+    )
+
+
+def _slopes(analysis: Analysis, cite: Callable[[str], str]) -> str:
+    """Say at how many points slopes vary, and where they could not be told from none."""
+    fits = [fit for one in analysis.fitted.values() for fit in one.fits.values()]
+    p = np.concatenate([fit.slopes_p for fit in fits if fit.slopes_p is not None] or [np.empty(0)])
+    tested = int(np.isfinite(p).sum())
+    if not tested:
+        return ""
+    return (
+        f". Slopes differed between participants at {np.sum(p < _LEVEL) / tested:.0%} of the points"
+        f" (p < {_LEVEL:g}, uncorrected; ratio of restricted likelihoods against an equal mixture"
+        f" of chi squared with 1 and 2 degrees of freedom {cite('mixture')}), and were left out of"
+        f" the model at {np.sum(p == 1) / tested:.0%}, where their variance was zero"
     )
 
 
@@ -358,7 +375,7 @@ def _nonlinear(analysis: Analysis, settings: GroupSettings) -> str:
     )
 
 
-def _correction(how: MultiplicitySettings, cite: Callable[[str], str], *, repeated: bool) -> str:
+def _correction(how: MultiplicitySettings, cite: Callable[[str], str], analysis: Analysis) -> str:
     family = "each map" if how.scope == "map" else "both hemispheres together"
     if how.method in PERMUTATIONS:
         statistic = "the largest absolute statistic"
@@ -372,15 +389,18 @@ def _correction(how: MultiplicitySettings, cite: Callable[[str], str], *, repeat
             "the residuals of the model without the contrast (Freedman and Lane's; of signs, where"
             " a mean was tested"
         )
-        if repeated:
+        visits, end = analysis.row_model.visits, ""
+        if visits is not None:
             shuffled = (
-                "the signs of each participant's residuals, of all visits together, of the linear"
-                f" model without the contrast {cite('repeated')} ("
+                "the residuals of the linear model without the contrast (Freedman and Lane's;"
+                f" repeated visits {cite('repeated')}"
             )
+            design = analysis.design
+            end = exchange_text(design.matrix, design.contrasts, visits, how.visits)
         return (
             f"The family-wise error rate was held at {how.alpha:g} by {statistic} in"
-            f" {how.permutations} permutations{inside} of {shuffled}{'' if repeated else '; '}seed"
-            f" {how.seed}) {cite('permutation')}, for {family}."
+            f" {how.permutations} permutations{inside} of {shuffled}; seed"
+            f" {how.seed}) {cite('permutation')}, for {family}.{end}"
         )
     kind = (
         "the procedure of Benjamini and Hochberg"
@@ -393,16 +413,13 @@ def _correction(how: MultiplicitySettings, cite: Callable[[str], str], *, repeat
     )
 
 
-def _joint(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], str]) -> str:
+def _joint(settings: GroupSettings, cite: Callable[[str], str]) -> str:
     how, joint = settings.multiplicity, settings.joint
     by = (
         "minus twice the sum of the logarithms of their two-sided p-values (Fisher)"
         if joint.combine == "fisher"
         else "the smallest of their two-sided p-values (Tippett)"
     )
-    shuffled = "permutations of residuals (Freedman and Lane's"
-    if analysis.comparison.longitudinal:
-        shuffled = "flips of the signs of each participant's residuals (of the linear model"
     statistic = "the combined evidence"
     if how.method == "permutation-tfce":
         statistic = f"its threshold-free cluster enhancement {cite('tfce')}"
@@ -412,9 +429,9 @@ def _joint(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], st
         f"Maps of {names}{', of the left and the right side,' if joint.sides else ''} were also"
         f" tested together by non-parametric combination {cite('joint')}. At each point the"
         f" evidence is {by}, as the normal quantile of its two-sided p-value for independent maps."
-        f" In each of {how.permutations} {shuffled}; seed {how.seed}) {cite('permutation')} all"
-        f" maps were shuffled alike, so that their dependence is kept. The largest value of"
-        f" {statistic} in each holds the family-wise error rate at {how.alpha:g} over the"
+        f" In each of {how.permutations} permutations of residuals (Freedman and Lane's; seed"
+        f" {how.seed}) {cite('permutation')} all maps were shuffled alike, so that their"
+        f" dependence is kept. The largest value of {statistic} in each holds the family-wise error rate at {how.alpha:g} over the"
         f" points{family}. The null hypothesis of a point is that none of the maps has an effect"
         " there; the effect sizes of each map say where a finding comes from."
     )

@@ -8,6 +8,7 @@ from scipy import stats
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.clusters import sheet_edges
+from hipsta_bids.group.exchangeability import Visits
 from hipsta_bids.group.formula import Contrast
 from hipsta_bids.group.glm import fit_points
 from hipsta_bids.group.inference import PermutationPart
@@ -150,7 +151,7 @@ def test_signs_of_participants_keep_the_level_with_repeated_visits():
             matrix=matrix,
             subjects=np.arange(len(who)),
             edges=np.empty((0, 2), dtype=np.int64),
-            people=who,
+            visits=Visits(who, time),
         )
         contrast = Contrast("difference of changes", np.array([0.0, 0, 0, 1]))
         (test,) = permute_parts([part], contrast, settings=how.changed(seed=seed))
