@@ -431,9 +431,10 @@ def _joint(settings: GroupSettings, cite: Callable[[str], str]) -> str:
         f" evidence is {by}, as the normal quantile of its two-sided p-value for independent maps."
         f" In each of {how.permutations} permutations of residuals (Freedman and Lane's; seed"
         f" {how.seed}) {cite('permutation')} all maps were shuffled alike, so that their"
-        f" dependence is kept. The largest value of {statistic} in each holds the family-wise error rate at {how.alpha:g} over the"
-        f" points{family}. The null hypothesis of a point is that none of the maps has an effect"
-        " there; the effect sizes of each map say where a finding comes from."
+        f" dependence is kept. The largest value of {statistic} in each holds the"
+        f" family-wise error rate at {how.alpha:g} over the points{family}. The null hypothesis of"
+        " a point is that none of the maps has an effect there; the effect sizes of each map say"
+        " where a finding comes from."
     )
 
 

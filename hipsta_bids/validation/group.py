@@ -17,6 +17,7 @@ from hipsta_bids.group.registration import mean_profiles, register
 from hipsta_bids.group.settings import CORRECTIONS, GroupSettings, MultiplicitySettings
 from hipsta_bids.group.warps import warp_values
 from hipsta_bids.types import Bool, Float
+from hipsta_bids.validation.repeated import repeated_visits
 from hipsta_bids.validation.report import Cells, Suite, Table
 
 COHORTS, FEW_COHORTS = 40, 4
@@ -281,6 +282,7 @@ def run_simulation(
 def run(full: bool) -> Suite:
     """Analyze cohorts with a thinner region and a shift, and with the shift alone."""
     plan, seeds = SimulationPlan(), range(COHORTS if full else FEW_COHORTS)
+    nulls = NULL_COHORTS if full else FEW_NULL_COHORTS
     settings = GroupSettings()
     rows = []
     for align, title in _METHODS.items():
@@ -304,8 +306,9 @@ def run(full: bool) -> Suite:
                 f" {MIN_FALSE_UNREGISTERED:g} is expected: the analysis must fail there.",
             ),
             _amplitudes(BIAS_COHORTS if full else FEW_BIAS_COHORTS),
-            _corrections(NULL_COHORTS if full else FEW_NULL_COHORTS),
+            _corrections(nulls),
             _together(JOINT_COHORTS if full else FEW_JOINT_COHORTS),
+            repeated_visits(*_limits(nulls), range(nulls)),
         ),
     )
 
@@ -380,8 +383,9 @@ def _amplitudes(cohorts: int) -> Table:
 
 def _limits(cohorts: int) -> tuple[float, float]:
     """Shares of null cohorts with findings that are as intended; of few, within three SDs."""
-    most = max(LEVEL_RANGE[1], LEVEL + 3 * (LEVEL * (1 - LEVEL) / cohorts) ** 0.5)
-    return LEVEL_RANGE[0] if cohorts >= NULL_COHORTS else 0.0, most
+    if cohorts >= NULL_COHORTS:
+        return LEVEL_RANGE
+    return 0.0, LEVEL + 3 * (LEVEL * (1 - LEVEL) / cohorts) ** 0.5
 
 
 def _corrections(cohorts: int) -> Table:
