@@ -84,6 +84,6 @@ def repeated_visits(least: float, most: float, seeds: Sequence[int]) -> Table:
         " effect; intercepts have an SD of 1 between subjects, visits one of 0.5. Shares of tests"
         f" at {_POINTS} points with p of at most {_LEVEL:g} by mixed models; of cohorts in which"
         f" any point survives, by {_PERMUTATIONS} permutations. Where slopes differ, intercepts"
-        " alone, and visits permuted within participants, find too much; the defaults do neither. Target"
-        f" of the defaults: {least:.2g} to {most:.2g}.",
+        " alone, and visits permuted within participants, find too much. Target of the"
+        f" defaults: {least:.2g} to {most:.2g}.",
     )

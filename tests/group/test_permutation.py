@@ -180,7 +180,8 @@ def test_what_repeated_visits_exchange():
         for slopes, wanted in ((False, alike), (True, differ)):
             assert choose_exchange(matrix, contrast, Visits(who, time, slopes), "auto") == wanted
     # Without times nobody knows what is common; few with as many visits cannot change places.
-    assert choose_exchange(matrix, single[3], Visits(who), "auto") == "flip"
+    assert choose_exchange(matrix, single[3], Visits(who), "auto") == "within"
+    assert choose_exchange(matrix, single[1], Visits(who), "auto") == "flip"
     few = who < 6
     alone = Visits(who[few], time[few])
     assert choose_exchange(matrix[few], single[1], alone, "auto") == "flip"
