@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from hipsta_bids.group.data import Bool, Cohort, Float, Int, SideMaps
 from hipsta_bids.group.glm import FittedMaps, PointTest
 from hipsta_bids.group.settings import MultiplicitySettings
+from hipsta_bids.io.files import MISSING
 from hipsta_bids.reports.display import parts_of
 
 if TYPE_CHECKING:
@@ -119,7 +120,8 @@ def find_clusters(
         for number in range(1, count + 1):
             members = np.flatnonzero(labels == number)
             peak = int(members[np.argmax(np.abs(statistic[members]))])
-            names, counts = np.unique(subfield[members], return_counts=True)
+            own = subfield[members]
+            names, counts = np.unique(own[own != MISSING], return_counts=True)
             shares = dict(zip(names.tolist(), (counts / len(members)).tolist(), strict=True))
             clusters.append(Cluster(len(members), peak, shares))
     return sorted(clusters, key=lambda cluster: -cluster.extent)
@@ -149,7 +151,7 @@ class Frame:
 
 def frame_of(cohort: Cohort, one: FittedMaps) -> Frame:
     """Locate points, and name the subfield in which most participants have them."""
-    subfield = np.array([*one.maps.names, "n/a"])[one.subfield]
+    subfield = np.array([*one.maps.names, MISSING])[one.subfield]
     if (mesh := one.maps.mesh) is None:
         return Frame.of_sheet(cohort.x, cohort.y, subfield)
     position = {f"surface_{axis}": mesh.points[:, i] for i, axis in enumerate("xyz")}

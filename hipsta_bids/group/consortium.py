@@ -30,7 +30,14 @@ from hipsta_bids.group.sites import (
     point_test,
 )
 from hipsta_bids.group.tables import META_COLUMNS
-from hipsta_bids.group.write import whole_folder, write_figures, write_table
+from hipsta_bids.group.write import (
+    stats_of,
+    whole_folder,
+    write_figures,
+    write_stats,
+    write_surface,
+    write_table,
+)
 from hipsta_bids.io import files
 from hipsta_bids.protocols.toml import resolve
 from hipsta_bids.reports.meta import write_meta_report
@@ -71,6 +78,7 @@ def run_meta(options: MetaOptions, settings: GroupSettings) -> tuple[Path, list[
     with whole_folder(folder) as aside:
         for name, table in meta_tables(meta):
             write_table(aside, name, table, described=name != "sites", meaning=META_COLUMNS)
+        _write_maps(aside, meta)
         notes += write_figures(aside, _figures(meta))
         files.write_text(aside / "methods.md", _methods(meta))
         files.write_json(aside / "meta.json", _record(meta, options, notes))
@@ -103,12 +111,36 @@ def _read(given: Sequence[tuple[str | None, Path]]) -> list[SiteSummary]:
     return sites
 
 
-def _figures(meta: Meta) -> Iterator[tuple[str, Drawing]]:
-    """List figures of maps, one per measure, for :func:`write_figures`."""
-    first, maps = meta.sites[0], list(meta.of("map"))
-    cohort = Cohort(
+def _write_maps(folder: Path, meta: Meta) -> None:
+    """Write maps of both models as GIFTI and CIFTI, and the sheets to draw them on."""
+    cohort, confidence = _cohort(meta), meta.settings.meta.confidence
+    write_stats(
+        folder,
+        stats_of(
+            (
+                item.key(effects),
+                point_test(item, effects, confidence),
+                meta.found[item.key(effects)],
+            )
+            for item in meta.of("map")
+            for effects in item.result.models
+        ),
+    )
+    for hemi in dict.fromkeys(item.model.hemi for item in meta.of("map")):
+        write_surface(folder, cohort, _place(meta, hemi, cohort), hemi)
+
+
+def _cohort(meta: Meta) -> Cohort:
+    """Coordinates of the sheet, without anybody."""
+    first = meta.sites[0]
+    return Cohort(
         table=pd.DataFrame(), sides={}, x=np.array(first.x), y=np.array(first.y), units={}
     )
+
+
+def _figures(meta: Meta) -> Iterator[tuple[str, Drawing]]:
+    """List figures of maps, one per measure, for :func:`write_figures`."""
+    maps, cohort = list(meta.of("map")), _cohort(meta)
     tests: dict[str, dict[str, list[PointTest]]] = {}
     for item in maps:
         measures = tests.setdefault(item.model.hemi, {})

@@ -484,6 +484,19 @@ def _levels(
     counts = {str(level): int(count) for level, count in values.value_counts().items()}
     check_spelling(counts, name)
     levels = sorted(counts, key=in_order)
+    numbers = pd.to_numeric(pd.Series(levels), errors="coerce")
+    codes = [
+        level
+        for level, number in zip(levels, numbers, strict=True)
+        if number in settings.missing_codes
+    ]
+    if codes and numbers.isna().any():
+        raise ModelError(
+            f"model: column {name!r} has {', '.join(f'{code} ({counts[code]})' for code in codes)}"
+            " among words: a code for missing values? mark them n/a (or change the setting"
+            " design.missing_codes)",
+            reason="implausible-value",
+        )
     first = levels[0] if reference is None else reference
     if first not in levels:
         raise ModelError(

@@ -11,6 +11,7 @@ from statsmodels.regression.linear_model import OLS
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.data import Bool, Float, Int, SideMaps
+from hipsta_bids.group.exchangeability import Visits
 from hipsta_bids.group.formula import Contrast
 from hipsta_bids.group.model import Design
 from hipsta_bids.group.settings import GlmSettings, GroupSettings
@@ -127,6 +128,8 @@ class PointwiseFit:
     variances: Mapping[str, Float] = field(default_factory=dict)
     """(points,) components of a mixed model: ``residual`` within participants, ``participant``
     between them (with random slopes, at the mean time), and ``slope`` per squared unit of time."""
+    slopes_p: Float | None = None
+    """(points,) p-value of random slopes, where they are fitted."""
 
 
 @dataclass(frozen=True)
@@ -426,8 +429,8 @@ class RowModel:
     design: Design
 
     @property
-    def people(self) -> Int | None:
-        """(rows,) number of each row's participant, where participants have several."""
+    def visits(self) -> Visits | None:
+        """Whose each row is, where participants have several."""
         return None
 
     def fit(

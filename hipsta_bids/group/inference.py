@@ -9,12 +9,20 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 from scipy import special
-from scipy.linalg import null_space
 from statsmodels.stats.multitest import multipletests
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.clusters import edges_of, enhance
 from hipsta_bids.group.data import Bool, Float, Int
+from hipsta_bids.group.exchangeability import (
+    Exchange,
+    Visits,
+    choose_exchange,
+    flip,
+    spans,
+    split,
+    varies_inside,
+)
 from hipsta_bids.group.formula import Contrast, check_names, listed
 from hipsta_bids.group.glm import FittedMaps, RowModel, fit_points
 from hipsta_bids.group.settings import GlmSettings, GroupSettings, MultiplicitySettings
@@ -32,8 +40,6 @@ PROCESSORS: ContextVar[int] = ContextVar("processors", default=1)
 _ROUNDING = 1e-9
 #: The method that does without cluster enhancement.
 _MAXIMUM = "permutation-max"
-#: Length left of the constant vector, of length 1, if it is not among the columns.
-_CONSTANT = 1e-6
 
 
 @dataclass(frozen=True)
@@ -63,8 +69,8 @@ class PermutationPart:
     same way in all parts."""
     edges: Int
     """(edges, 2) neighbors among the points."""
-    people: Int | None = None
-    """(subjects,) whose each is, if they are visits of which people have several."""
+    visits: Visits | None = None
+    """Whose each row is, where they are visits of which participants have several."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +95,9 @@ def permute(
     What the covariates explain is subtracted, the residuals are shuffled between subjects, and
     the whole model is fitted to them again (Winkler et al. 2014). If the contrast tests what
     all subjects have in common (an intercept), signs are flipped instead of subjects shuffled.
-    Of repeated visits the signs of all visits of a person are flipped together, whatever is tested:
-    that keeps their covariance, and asks only that errors are symmetric (Winkler et al. 2015).
+    Of repeated visits participants change places with all their visits, or visits with each other,
+    or the signs of all visits of a participant are flipped, as the contrast allows
+    (:func:`hipsta_bids.group.exchangeability.choose_exchange`; Winkler et al. 2015).
 
     Missing values count as what the covariates predict, which shrinks an effect; degrees of
     freedom are those of the subjects present. ``family`` is the number of this one, from 0, and of
@@ -100,7 +107,10 @@ def permute(
     point by :func:`combine_evidence` (non-parametric combination; Winkler et al. 2016).
     """
     runs = [_Run.build(part, contrast, settings, blocks) for part in parts]
-    n_subjects = 1 + max(int(one.part.subjects.max()) for run in runs for one in run.members)
+    parts_alone = [one.part for run in runs for one in run.members]
+    who = [one.subjects for one in parts_alone]
+    who += [one.visits.people for one in parts_alone if one.visits]
+    n_subjects = 1 + max(int(numbers.max()) for numbers in who)
 
     def reached(start: int) -> list[Float]:
         """Count what reaches the observed statistics, with the keys of a batch by its number."""
@@ -147,9 +157,17 @@ class _Member:
     part: PermutationPart
     model: "_Model"
     blocks: Int | None
+    exchange: Exchange | None
+    """Of visits."""
 
     @classmethod
-    def build(cls, part: PermutationPart, contrast: Contrast, blocks: Int | None) -> "_Member":
+    def build(
+        cls,
+        part: PermutationPart,
+        contrast: Contrast,
+        settings: MultiplicitySettings,
+        blocks: Int | None,
+    ) -> "_Member":
         maps, matrix = part.maps, part.matrix
         if part.edges.max(initial=-1) >= maps.shape[1] or maps.shape[0] != matrix.shape[0]:
             raise ModelError(
@@ -161,15 +179,22 @@ class _Member:
         own = None if blocks is None else blocks[part.subjects]
         if own is not None and not model.tests_common_part():
             _check_blocks(matrix @ np.linalg.pinv(contrast.weights), own, contrast)
-        return cls(part, model, own)
+        exchange = None
+        if part.visits is not None:
+            exchange = choose_exchange(matrix, contrast, part.visits, settings.visits)
+        return cls(part, model, own, exchange)
 
     def shuffled(self, keys: Float) -> Float:
         """Permuted designs that are given by keys of subjects."""
-        people = self.part.people
-        flip = people is not None or self.model.tests_common_part()
-        own = self.part.subjects if people is None else people
-        bases = [_shuffle(self.model.basis, self.blocks, key[own], flip=flip).T for key in keys]
-        return np.stack(bases)
+        basis, own, visits = self.model.basis, keys[:, self.part.subjects], self.part.visits
+        if visits is not None and self.exchange is not None:
+            pairs = zip(keys, own, strict=True)
+            bases = [visits.shuffle(basis, self.exchange, *pair) for pair in pairs]
+        elif self.model.tests_common_part():
+            bases = [flip(basis, key) for key in own]
+        else:
+            bases = [_shuffle(basis, self.blocks, key) for key in own]
+        return np.stack([one.T for one in bases])
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +221,7 @@ class _Run:
     ) -> "_Run":
         own = part.parts if isinstance(part, JointPart) else [part]
         combine = part.combine if isinstance(part, JointPart) else None
-        members = [_Member.build(one, contrast, blocks) for one in own]
+        members = [_Member.build(one, contrast, settings, blocks) for one in own]
         observed = _together(members, [m.model.basis.T[None] for m in members], combine)
         enhanced = _enhanced(observed, own[0].edges, settings)
         counts = np.ones((3, observed.shape[1]))
@@ -234,10 +259,7 @@ def _together(members: Sequence[_Member], bases: Sequence[Float], how: str | Non
 
 def _check_blocks(tested: Float, blocks: Int, contrast: Contrast) -> None:
     """Refuse blocks inside which what is tested does not vary: shuffling cannot break it up."""
-    numbers = np.unique(blocks, return_inverse=True)[1]
-    sizes = np.bincount(numbers)
-    means = np.stack([np.bincount(numbers, column) for column in tested.T], axis=1) / sizes[:, None]
-    if np.abs(tested - means[numbers]).max() < _CONSTANT * np.abs(tested).max():
+    if not varies_inside(tested, blocks):
         raise ModelError(
             f"permutation: {contrast.name} does not vary inside the blocks, so that shuffling there"
             " says nothing about it; leave --blocks out, or choose larger blocks",
@@ -266,10 +288,7 @@ class _Model:
     @classmethod
     def build(cls, maps: Float, matrix: Float, contrast: Contrast) -> "_Model":
         rows = contrast.n_rows
-        # Orthogonal to the rest; its product with the data is the estimated contrast.
-        tested = matrix @ np.linalg.solve(matrix.T @ matrix, contrast.weights.T)
-        tested = tested / np.linalg.norm(tested) if rows == 1 else np.linalg.qr(tested)[0]
-        rest = np.linalg.qr(matrix @ null_space(contrast.weights))[0]
+        tested, rest = split(matrix, contrast)
         present = np.isfinite(maps)
         residuals = np.where(present, maps, 0.0)
         if rest.shape[1]:
@@ -283,9 +302,7 @@ class _Model:
 
     def tests_common_part(self) -> bool:
         """Whether the columns not tested cannot make a constant: then it is tested."""
-        ones = np.full(len(self.basis), 1 / np.sqrt(len(self.basis)))
-        rest = self.basis[:, self.rows :]
-        return bool(np.linalg.norm(ones - rest @ (rest.T @ ones)) > _CONSTANT)
+        return not spans(self.basis[:, self.rows :], np.ones(len(self.basis)))
 
     def statistics(self, bases: Float) -> Float:
         """Signed t, or square root of F, (batch, points) of bases (batch, columns, subjects)."""
@@ -305,14 +322,11 @@ class _Model:
         return np.asarray(special.fdtrc(self.rows, self.df, t**2), dtype=np.float64)
 
 
-def _shuffle(basis: Float, blocks: Int | None, key: Float, *, flip: bool) -> Float:
+def _shuffle(basis: Float, blocks: Int | None, key: Float) -> Float:
     """Shuffle subjects, within blocks; the same as shuffling residuals the other way round.
 
-    Keys are uniform between 0 and 1: their order is the permutation, their halves are signs.
+    Keys are uniform between 0 and 1: their order is the permutation.
     """
-    if flip:
-        signs: Float = np.where(key < 0.5, -1.0, 1.0)[:, None]  # noqa: PLR2004 -- half of them
-        return basis * signs
     if blocks is None:
         return basis[np.argsort(key)]
     result = basis.copy()
@@ -440,7 +454,7 @@ def _part(
         matrix=model.design.matrix[one.rows],
         subjects=one.rows,
         edges=edges_of(one.maps, how.neighbors),
-        people=None if model.people is None else model.people[one.rows],
+        visits=None if model.visits is None else model.visits.take(one.rows),
     )
 
 
@@ -479,10 +493,9 @@ def check_permutations(model: RowModel, settings: GroupSettings) -> None:
     """Refuse permutations where rows cannot be exchanged."""
     if settings.multiplicity.method not in PERMUTATIONS and not settings.joint.measures:
         return
-    if model.people is not None and settings.multiplicity.blocks:
+    if model.visits is not None and settings.multiplicity.blocks:
         raise ModelError(
-            "permutations: of repeated visits the signs of participants are flipped, which no"
-            " blocks restrict; leave --blocks out",
+            "permutations: repeated visits are themselves the blocks; leave --blocks out",
             reason="permutation-model",
         )
     if settings.glm.covariance != "ordinary":

@@ -10,12 +10,16 @@ from hipsta_bids import __version__
 from hipsta_bids.derivatives.dataset import references
 from hipsta_bids.group.analysis import Analysis
 from hipsta_bids.group.data import PARTICIPANT, Cohort
+from hipsta_bids.group.exchangeability import exchange_text
 from hipsta_bids.group.inference import PERMUTATIONS, control_fdr
 from hipsta_bids.group.normative import Scores
 from hipsta_bids.group.norms import LEVELS, NormsFile
 from hipsta_bids.group.read import LEAST_SHARE
 from hipsta_bids.group.settings import GroupSettings, MultiplicitySettings, NormSettings
 from hipsta_bids.protocols import EXPERIMENTAL
+
+#: Level at which slopes are said to differ.
+_LEVEL = 0.05
 
 #: What was measured, by region.
 _MEASURED = {
@@ -75,7 +79,7 @@ def methods_text(
         paragraphs.append(_rims(analysis))
     paragraphs += _harmonization(analysis, cite)
     paragraphs.append(_models(analysis, settings, cite))
-    paragraphs += [_joint(analysis, settings, cite)] if settings.joint.measures else []
+    paragraphs += [_joint(settings, cite)] if settings.joint.measures else []
     if analysis.comparison.asymmetry:
         paragraphs.append(_asymmetry(settings, cite("asymmetry")))
     if analysis.scores is not None:
@@ -243,16 +247,15 @@ def _models(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], s
         first, second = analysis.comparison.pair
         what = f" to the change from {first} to {second}, with the covariates of {first}"
     if analysis.comparison.longitudinal:
-        slopes = getattr(analysis.row_model, "times", None) is not None
-        own = "intercepts and slopes" if slopes else "intercepts"
+        visits = analysis.row_model.visits
+        own = "intercepts and slopes" if visits is not None and visits.slopes else "intercepts"
         kind = f"linear mixed model with {own} of participants"
         errors = (
             " by restricted maximum likelihood, with Satterthwaite's degrees of freedom"
-            f" {cite('mixed')}"
+            f" {cite('mixed')}{_slopes(analysis, cite)}"
         )
         d = "estimate over the standard deviation of single visits"
-    repeated = analysis.comparison.longitudinal
-    corrected = _correction(settings.multiplicity, cite, repeated=repeated)
+    corrected = _correction(settings.multiplicity, cite, analysis)
     return (
         f"At each point of the sheet a {kind} `{analysis.model.formula}` was fitted{what}{errors}"
         f" (reference levels: {levels or 'none'}); contrasts: {names}."
@@ -262,6 +265,21 @@ def _models(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], s
         " measures were tested in the same model, volumes also with intracranial volume; their"
         " false discovery rate was held over all measures, sides and models of a contrast."
         f"{_nonlinear(analysis, settings)}"
+    )
+
+
+def _slopes(analysis: Analysis, cite: Callable[[str], str]) -> str:
+    """Say at how many points slopes vary, and where they could not be told from none."""
+    fits = [fit for one in analysis.fitted.values() for fit in one.fits.values()]
+    p = np.concatenate([fit.slopes_p for fit in fits if fit.slopes_p is not None] or [np.empty(0)])
+    tested = int(np.isfinite(p).sum())
+    if not tested:
+        return ""
+    return (
+        f". Slopes differed between participants at {np.sum(p < _LEVEL) / tested:.0%} of the points"
+        f" (p < {_LEVEL:g}, uncorrected; ratio of restricted likelihoods against an equal mixture"
+        f" of chi squared with 1 and 2 degrees of freedom {cite('mixture')}), and were left out of"
+        f" the model at {np.sum(p == 1) / tested:.0%}, where their variance was zero"
     )
 
 
@@ -282,7 +300,7 @@ def _nonlinear(analysis: Analysis, settings: GroupSettings) -> str:
     )
 
 
-def _correction(how: MultiplicitySettings, cite: Callable[[str], str], *, repeated: bool) -> str:
+def _correction(how: MultiplicitySettings, cite: Callable[[str], str], analysis: Analysis) -> str:
     family = "each map" if how.scope == "map" else "both hemispheres together"
     if how.method in PERMUTATIONS:
         statistic = "the largest absolute statistic"
@@ -296,15 +314,18 @@ def _correction(how: MultiplicitySettings, cite: Callable[[str], str], *, repeat
             "the residuals of the model without the contrast (Freedman and Lane's; of signs, where"
             " a mean was tested"
         )
-        if repeated:
+        visits, end = analysis.row_model.visits, ""
+        if visits is not None:
             shuffled = (
-                "the signs of each participant's residuals, of all visits together, of the linear"
-                f" model without the contrast {cite('repeated')} ("
+                "the residuals of the linear model without the contrast (Freedman and Lane's;"
+                f" repeated visits {cite('repeated')}"
             )
+            design = analysis.design
+            end = exchange_text(design.matrix, design.contrasts, visits, how.visits)
         return (
             f"The family-wise error rate was held at {how.alpha:g} by {statistic} in"
-            f" {how.permutations} permutations{inside} of {shuffled}{'' if repeated else '; '}seed"
-            f" {how.seed}) {cite('permutation')}, for {family}."
+            f" {how.permutations} permutations{inside} of {shuffled}; seed"
+            f" {how.seed}) {cite('permutation')}, for {family}.{end}"
         )
     return (
         f"The false discovery rate was held at {how.alpha:g} by {PROCEDURES[how.method]}"
@@ -313,16 +334,13 @@ def _correction(how: MultiplicitySettings, cite: Callable[[str], str], *, repeat
     )
 
 
-def _joint(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], str]) -> str:
+def _joint(settings: GroupSettings, cite: Callable[[str], str]) -> str:
     how, joint = settings.multiplicity, settings.joint
     by = (
         "minus twice the sum of the logarithms of their two-sided p-values (Fisher)"
         if joint.combine == "fisher"
         else "the smallest of their two-sided p-values (Tippett)"
     )
-    shuffled = "permutations of residuals (Freedman and Lane's"
-    if analysis.comparison.longitudinal:
-        shuffled = "flips of the signs of each participant's residuals (of the linear model"
     statistic = "the combined evidence"
     if how.method == "permutation-tfce":
         statistic = f"its threshold-free cluster enhancement {cite('tfce')}"
@@ -332,11 +350,12 @@ def _joint(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], st
         f"Maps of {names}{', of the left and the right side,' if joint.sides else ''} were also"
         f" tested together by non-parametric combination {cite('joint')}. At each point the"
         f" evidence is {by}, as the normal quantile of its two-sided p-value for independent maps."
-        f" In each of {how.permutations} {shuffled}; seed {how.seed}) {cite('permutation')} all"
-        f" maps were shuffled alike, so that their dependence is kept. The largest value of"
-        f" {statistic} in each holds the family-wise error rate at {how.alpha:g} over the"
-        f" points{family}. The null hypothesis of a point is that none of the maps has an effect"
-        " there; the effect sizes of each map say where a finding comes from."
+        f" In each of {how.permutations} permutations of residuals (Freedman and Lane's; seed"
+        f" {how.seed}) {cite('permutation')} all maps were shuffled alike, so that their"
+        f" dependence is kept. The largest value of {statistic} in each holds the"
+        f" family-wise error rate at {how.alpha:g} over the points{family}. The null hypothesis of"
+        " a point is that none of the maps has an effect there; the effect sizes of each map say"
+        " where a finding comes from."
     )
 
 

@@ -10,6 +10,7 @@ from scipy import special
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.data import PARTICIPANT, Bool, Float, Int
+from hipsta_bids.group.exchangeability import Visits
 from hipsta_bids.group.formula import Contrast
 from hipsta_bids.group.glm import PointTest, PointwiseFit, RowModel, chunks, t_test, with_effects
 from hipsta_bids.group.model import Design
@@ -24,6 +25,8 @@ from hipsta_bids.group.settings import GroupSettings, LongitudinalSettings
 
 #: Sessions of one participant that tell a slope from noise.
 _SLOPE_SESSIONS = 3
+#: A gain in minus twice the restricted likelihood by slopes that is none.
+_NO_GAIN = 1e-6
 #: Degrees of freedom of t statistics that differ by less are the same.
 _SAME_DF = 1e-8
 
@@ -119,7 +122,7 @@ def collect_sums(maps: Float, basis: Float, participants: Int) -> Sums:
     columns[..., :-1] = present[:, :, None] * basis[:, None, :]
     columns[..., -1] = np.where(present, maps, 0.0)
     own = np.add.reduceat(columns[order], starts, axis=0)
-    sizes = np.unique(counts[counts > 0])
+    sizes = np.unique(np.maximum(counts, 1.0))
     chosen = [np.where(counts == size, 1.0, 0.0) for size in sizes]
 
     def squares(rows: Float, weight: Float) -> Float:
@@ -174,7 +177,10 @@ def fit_mixed(
 ) -> PointwiseFit:
     """Fit ``value = matrix @ coefficients + participant + residual`` at each point.
 
-    With times, participants also have a slope of their own, correlated with the intercept.
+    With times, participants also have a slope of their own, correlated with the intercept, except
+    at points whose restricted likelihood slopes do not raise: there intercepts alone are fitted.
+    Whether slopes vary is tested by the ratio of restricted likelihoods, whose distribution is an
+    equal mixture of chi squared with 1 and 2 degrees of freedom (Stram and Lee 1994).
 
     By restricted maximum likelihood, which for one random intercept depends on one number: the
     ratio of the two variances. It is found for all points at once. Degrees of freedom are
@@ -197,10 +203,11 @@ def fit_mixed(
     parts = []
     for points in chunks(maps.shape, matrix.shape[1]):
         values = np.asarray(maps[:, points], dtype=np.float64)
-        if times is None:
-            parts.append(_fit(values, basis, numbers, rotated, settings))
-        else:
-            parts.append(_fit_slopes(values, basis, numbers, rotated, settings, times=times))
+        part = _fit(values, basis, numbers, rotated, settings)
+        if times is not None:
+            full = _fit_slopes(values, basis, numbers, rotated, settings, times=times)
+            part = _larger_where_better(part, full)
+        parts.append(part)
     whole = {name: np.concatenate([part[name] for part in parts], axis=-1) for name in parts[0]}
     # The standard deviation of single visits: effect sizes are those of independent rows.
     sigma = np.sqrt(whole["residual"] + whole["participant"])
@@ -210,7 +217,21 @@ def fit_mixed(
         n=whole["n"].astype(np.int64),
         tests=tuple(_tests(contrasts, whole, sigma, settings.confidence)),
         variances={name: whole[name] for name in ("residual", "participant", "slope")},
+        slopes_p=whole.get("slopes_p"),
     )
+
+
+def _larger_where_better(
+    intercepts: dict[str, Float], slopes: dict[str, Float]
+) -> dict[str, Float]:
+    """Join the fits of some points: with slopes, except where the likelihood gains nothing."""
+    gain = intercepts["loss"] - slopes["loss"]
+    none = gain < _NO_GAIN
+    found = {name: np.where(none, intercepts[name], own) for name, own in slopes.items()}
+    found["slope"] = np.where(none, 0.0, slopes["slope"])
+    gain = np.where(gain < 0, 0.0, gain)
+    found["slopes_p"] = (special.chdtrc(1, gain) + special.chdtrc(2, gain)) / 2
+    return found
 
 
 def _tests(
@@ -318,6 +339,7 @@ def _fit(
         "se": np.sqrt(forms(state.inverse, given) * variance) * blank,
         "t": np.einsum("cpj,pj->cp", turned, state.scores) / np.sqrt(form * variance) * blank,
         "df": df * blank,
+        "loss": (freedom * np.log(state.residual[0]) + state.penalty[0]) * blank,
     }
 
 
@@ -359,6 +381,7 @@ def _fit_slopes(
         "se": spread(se),
         "t": spread(np.einsum("cpj,pj->cp", turned, state.scores) / root),
         "df": spread(slope_freedom(kept, triangles, turned)),
+        "loss": spread((kept.n - basis.shape[1]) * np.log(state.residual) + state.penalty),
     }
 
 
@@ -386,12 +409,15 @@ class RepeatedRows(RowModel):
     participants: NDArray[np.str_]
     """(rows,)"""
     times: Float | None
-    """(rows,) of each visit, for random slopes; else random intercepts."""
+    """(rows,) of each visit, if known."""
+    slopes: bool
+    """Whether participants have slopes over time, or intercepts only."""
 
     @property
-    def people(self) -> Int | None:
-        """(rows,) number of each row's participant."""
-        return np.asarray(np.unique(self.participants, return_inverse=True)[1], dtype=np.int64)
+    def visits(self) -> Visits | None:
+        """Whose each row is, and when."""
+        people = np.unique(self.participants, return_inverse=True)[1]
+        return Visits(np.asarray(people, dtype=np.int64), self.times, self.slopes)
 
     def fit(
         self, values: Float, rows: Int, contrasts: tuple[Contrast, ...], settings: GroupSettings
@@ -403,7 +429,7 @@ class RepeatedRows(RowModel):
             self.participants[rows],
             contrasts,
             settings.longitudinal,
-            times=None if self.times is None else self.times[rows],
+            times=self.times[rows] if self.times is not None and self.slopes else None,
         )
 
     def fit_measures(
@@ -423,20 +449,21 @@ def longitudinal_model(
             reason="longitudinal-covariance",
         )
     own = table.iloc[design.rows]
-    times = None
+    times = None if time is None else own[time].to_numpy(dtype=np.float64)
     visits = own[PARTICIPANT].value_counts()
     several = int((visits >= _SLOPE_SESSIONS).sum())
-    enough = time is not None and several >= settings.longitudinal.slope_participants
+    enough = times is not None and several >= settings.longitudinal.slope_participants
     random = settings.longitudinal.random
-    if random == "slope" or (random == "auto" and enough):
-        if time is None:
-            raise ModelError(
-                "longitudinal model: random slopes need the time of each session; give a column"
-                f" {settings.longitudinal.time_columns[0]} or acq_time in sessions.tsv",
-                reason="no-time",
-            )
-        times = own[time].to_numpy(dtype=np.float64)
-        if not np.isfinite(times).all():
+    slopes = random == "slope" or (random == "auto" and enough)
+    if slopes and times is None:
+        raise ModelError(
+            "longitudinal model: random slopes need the time of each session; give a column"
+            f" {settings.longitudinal.time_columns[0]} or acq_time in sessions.tsv",
+            reason="no-time",
+        )
+    if times is not None and not np.isfinite(times).all():
+        if slopes:
             lacking = ", ".join(map(str, own.index[~np.isfinite(times)][:8]))
             raise ModelError(f"longitudinal model: no {time} of {lacking}", reason="no-time")
-    return RepeatedRows(design, own[PARTICIPANT].to_numpy(dtype=np.str_), times)
+        times = None
+    return RepeatedRows(design, own[PARTICIPANT].to_numpy(dtype=np.str_), times, slopes)

@@ -212,6 +212,10 @@ class MultiplicitySettings(SettingsTable):
     """Of the permutations."""
     blocks: str = ""
     """Column whose levels participants are permuted within, as of sites; empty is all."""
+    visits: Literal["auto", "whole", "within", "flip"] = "auto"
+    """What is permuted of repeated visits: ``whole`` participants with all their visits, where they
+    have as many; visits ``within`` participants; or signs that ``flip``, of all visits of a
+    participant together. ``auto`` chooses by the contrast."""
     tfce_extent: NonNegativeFloat = 0.5
     """Exponent of a cluster's extent (Smith and Nichols 2009)."""
     tfce_height: NonNegativeFloat = 2.0

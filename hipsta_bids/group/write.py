@@ -20,9 +20,9 @@ from hipsta_bids.group.analysis import Analysis, templates_of, tested_maps
 from hipsta_bids.group.collect import Exclusion
 from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float, Int, SideMaps, some_sheets
 from hipsta_bids.group.figures import Drawing, draw_figures, encode
-from hipsta_bids.group.glm import FittedMaps
+from hipsta_bids.group.glm import FittedMaps, PointTest
 from hipsta_bids.group.harmonize import digests, effects_of
-from hipsta_bids.group.inference import MapKey
+from hipsta_bids.group.inference import Discoveries, MapKey
 from hipsta_bids.group.joint import (
     JOINT_COLUMNS,
     JointMap,
@@ -139,7 +139,7 @@ def write_results(
             files.write_json(folder / "harmonization.json", effects.model_dump(by_alias=True))
     for own, one in ((cohort, analysis), *others.values()):
         _write_surfaces(folder, own, one)
-        _write_stats(folder, _stats(one))
+        write_stats(folder, stats_of(tested_maps(one)))
         found = {} if one.scores is None else one.scores.sides
         write_scores(folder, own, one.compared.table, found, letter="w", sheets=bool(one.sides))
     _write_joint(folder, joint, settings)
@@ -370,7 +370,9 @@ def _write_surfaces(folder: Path, cohort: Cohort, analysis: Analysis) -> None:
 _Stats = dict[str, Float]
 
 
-def _stats(analysis: Analysis) -> dict[MapKey, _Stats]:
+def stats_of(
+    tested: Iterable[tuple[MapKey, PointTest, Discoveries]],
+) -> dict[MapKey, _Stats]:
     """Collect statistics, effect sizes and corrected p-values."""
     return {
         key: {
@@ -378,11 +380,11 @@ def _stats(analysis: Analysis) -> dict[MapKey, _Stats]:
             **({"d": test.cohen_d} if test.kind == "t" else {"eta2": test.eta_squared}),
             "pcorrected": found.adjusted,
         }
-        for key, test, found in tested_maps(analysis)
+        for key, test, found in tested
     }
 
 
-def _write_stats(folder: Path, maps: Mapping[MapKey, _Stats]) -> None:
+def write_stats(folder: Path, maps: Mapping[MapKey, _Stats]) -> None:
     """Write maps of statistics as GIFTI, and those of both sides as one CIFTI file."""
     together: dict[str, dict[str, _Stats]] = {}
     for key, stats in maps.items():
@@ -415,7 +417,7 @@ def _write_joint(folder: Path, joint: Sequence[JointMap], settings: GroupSetting
             for title in one.parts
         }
         write_table(folder, name, joint_points(one), meaning={**meaning, **parts})
-    _write_stats(
+    write_stats(
         folder,
         {one.key: {"z": one.test.statistic, "pcorrected": one.found.adjusted} for one in joint},
     )

@@ -189,7 +189,7 @@ def findings(results: GroupResults) -> Mapping[str, Any] | None:
     multiplicity = settings.get("multiplicity") or {}
     return {
         "cards": cards,
-        "n_found": sum(card["found"] for card in cards),
+        "tested": len(results.table("measures")) > 0,
         "summaries": list(_summaries(results)),
         "classification": list(_classification(results)),
         "method": multiplicity.get("method"),

@@ -1,6 +1,7 @@
 """Permutations, sessions and sides of the group level, from files to files."""
 
 import json
+import re
 
 import nibabel as nib
 import numpy as np
@@ -219,7 +220,13 @@ def test_permutations_of_repeated_visits_flip_signs_of_participants(sessions, qu
     # The loss of .1 mm per session is in all: none of the other signs gives as much.
     np.testing.assert_allclose(found.p_corrected * 20, (found.p_corrected * 20).round(), atol=1e-6)
     assert found.significant.mean() > 0.9
-    assert "signs of each participant's residuals" in (folder / "methods.md").read_text()
+    text = (folder / "methods.md").read_text()
+    assert "for CN-AD, time in CN-AD, participants with as many visits changed places" in text
+    assert "for time in CN, time in AD, the signs of all visits of a participant" in text
+    share = re.search(r"Slopes differed between participants at (\d+)% of the points", text)
+    assert share is not None
+    assert int(share[1]) < 50
+    assert "Stram DO, Lee JW" in text
 
 
 def test_first_session_is_the_default_and_says_so(sessions, quick, capsys):

@@ -3,6 +3,7 @@
 import json
 import re
 
+import nibabel as nib
 import numpy as np
 import pandas as pd
 import pytest
@@ -374,6 +375,21 @@ def test_the_page_has_the_maps_of_both_models_and_of_heterogeneity(combined):
     assert "not drawn" not in page
     assert "What was found" in page
     assert re.search(r"\d+ of 147 points survive", page)
+
+
+def test_maps_are_written_for_viewers_of_surfaces(combined):
+    folder = combined / "meta"
+    stem = "contrast-CNADRandomEffects_desc-thickness_statmap"
+    sheet = nib.load(folder / "hemi-L_space-unfold_midthickness.surf.gii")
+    points = table(folder / f"hemi-L_{stem}.tsv")
+    assert len(sheet.darrays[0].data) == len(points)
+    names = {"t": "statistic", "d": "cohen_d", "pcorrected": "p_corrected"}
+    for stat, column in names.items():
+        name = f"hemi-L_{stem}.shape.gii".replace("_desc-", f"_stat-{stat}_desc-")
+        values = nib.load(folder / name).darrays[0].data
+        np.testing.assert_allclose(values, points[column], rtol=1e-4)  # digits of the table
+    maps = nib.load(folder / f"{stem}.dscalar.nii")
+    assert maps.shape == (3, 2 * len(points))
 
 
 def test_tables_say_what_their_columns_are(combined):

@@ -268,6 +268,29 @@ def test_slopes_that_differ_are_not_taken_for_a_change_of_all():
     assert (intercepts.p < 0.05).mean() > 0.15
 
 
+def test_slopes_are_tested_by_the_ratio_of_restricted_likelihoods():
+    """Half chi squared with 1, half with 2 degrees of freedom."""
+    who, time, matrix, maps = slope_case(4, slope_sd=0.0, points=300)
+    none = fit_mixed(maps, matrix, who, single(4), SETTINGS, times=time)
+    # Binomial SD .0126; three of them.
+    assert (none.slopes_p < 0.05).mean() == pytest.approx(0.05, abs=0.038)
+    some = fit_mixed(slope_case(4)[3], matrix, who, single(4), SETTINGS, times=time)
+    assert (some.slopes_p < 0.001).all()
+    plain = fit_mixed(maps, matrix, who, single(4), SETTINGS)
+    assert plain.slopes_p is None
+    # statsmodels' likelihoods of both models.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        both = np.column_stack([np.ones(len(time)), time])
+        fits = [
+            MixedLM(maps[:, 0], matrix, who, exog_re=own).fit(reml=True, method="lbfgs", gtol=1e-9)
+            for own in (both[:, :1], both)
+        ]
+    ratio = max(2 * (fits[1].llf - fits[0].llf), 0.0)
+    expected = (stats.chi2.sf(ratio, 1) + stats.chi2.sf(ratio, 2)) / 2
+    assert none.slopes_p[0] == pytest.approx(expected, abs=2e-3)  # of that optimizer
+
+
 def test_slopes_without_enough_sessions():
     who, time, matrix, maps = slope_case(3)
     two = time < 1.5

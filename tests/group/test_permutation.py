@@ -8,6 +8,7 @@ from scipy import stats
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.clusters import sheet_edges
+from hipsta_bids.group.exchangeability import Visits, choose_exchange
 from hipsta_bids.group.formula import Contrast
 from hipsta_bids.group.glm import fit_points
 from hipsta_bids.group.inference import PROCESSORS, PermutationPart
@@ -133,26 +134,30 @@ def test_seed_repeats_and_missing_points_stay_missing():
         permute(maps, matrix, GROUP, (9, 8), settings=SETTINGS)
 
 
-def test_signs_of_participants_keep_the_level_with_repeated_visits():
-    """Changes differ between participants, who have two to four visits; no group effect."""
+def repeated(random, slope_sd=0.3, people=30):
+    """Three or four visits, with a group of every third; nothing differs but people."""
+    who = np.repeat(np.arange(people), random.integers(3, 5, people))
+    time = np.arange(len(who)) - np.searchsorted(who, who)
+    group = (who % 3 == 0).astype(float)
+    own, change = random.normal(0, 1, (2, people, 10))
+    maps = own[who] + slope_sd * change[who] * time[:, None]
+    maps += random.normal(0, 0.5, maps.shape)
+    return who, time, np.column_stack([np.ones(len(who)), group, time, group * time]), maps
+
+
+@pytest.mark.parametrize(("column", "slope_sd"), [(3, 0.3), (2, 0.3), (2, 0.0)])
+def test_repeated_visits_keep_the_level(column, slope_sd):
+    """Blocks change places for the difference of changes; for the change of the others, signs flip
+    where changes differ, and visits change places where they do not."""
     random = np.random.default_rng(3)
     how = MultiplicitySettings(method="permutation-max", permutations=100)
     cohorts, found = 120, 0
     for seed in range(cohorts):
-        who = np.repeat(np.arange(30), random.integers(2, 5, 30))
-        time = np.arange(len(who)) - np.searchsorted(who, who)
-        group = (who % 3 == 0).astype(float)
-        own, change = random.normal(0, 1, (2, 30, 10))
-        maps = own[who] + 0.3 * change[who] * time[:, None] + random.normal(0, 0.5, (len(who), 10))
-        matrix = np.column_stack([np.ones(len(who)), group, time, group * time])
-        part = PermutationPart(
-            maps=maps,
-            matrix=matrix,
-            subjects=np.arange(len(who)),
-            edges=np.empty((0, 2), dtype=np.int64),
-            people=who,
-        )
-        contrast = Contrast("difference of changes", np.array([0.0, 0, 0, 1]))
+        who, time, matrix, maps = repeated(random, slope_sd)
+        visits = Visits(who, time, slopes=slope_sd > 0)
+        none = np.empty((0, 2), dtype=np.int64)
+        part = PermutationPart(maps, matrix, np.arange(len(who)), none, visits)
+        contrast = Contrast("change", np.eye(4)[column])
         (test,) = permute_parts([part], contrast, settings=how.changed(seed=seed))
         found += test.p_max.min() <= 0.05
     # Six are expected, with an SD of 2.4.
@@ -170,3 +175,51 @@ def test_number_of_processors_changes_nothing():
     for name in ("p_uncorrected", "p_max", "p_enhanced"):
         np.testing.assert_array_equal(getattr(one, name), getattr(three, name))
     assert one.p_max.min() < 1
+
+
+def test_what_repeated_visits_exchange():
+    random = np.random.default_rng(1)
+    who, time, matrix, _ = repeated(random)
+    single = [Contrast(name, np.eye(4)[i]) for i, name in enumerate(("0", "group", "time", "both"))]
+    either = Contrast("either", np.eye(4)[[1, 3]])
+    expected = [
+        (single[0], "flip", "flip"),  # of all
+        (single[1], "whole", "whole"),
+        (single[2], "within", "flip"),  # of all, if changes are alike, and if not
+        (single[3], "whole", "whole"),
+        (either, "whole", "whole"),
+    ]
+    for contrast, alike, differ in expected:
+        for slopes, wanted in ((False, alike), (True, differ)):
+            assert choose_exchange(matrix, contrast, Visits(who, time, slopes), "auto") == wanted
+    # Without times nobody knows what is common; few with as many visits cannot change places.
+    assert choose_exchange(matrix, single[3], Visits(who), "auto") == "within"
+    assert choose_exchange(matrix, single[1], Visits(who), "auto") == "flip"
+    few = who < 6
+    alone = Visits(who[few], time[few])
+    assert choose_exchange(matrix[few], single[1], alone, "auto") == "flip"
+    for wanted, contrast in (("whole", single[2]), ("within", single[1])):
+        with pytest.raises(ModelError, match=f"multiplicity.visits {wanted} does not") as caught:
+            choose_exchange(matrix, contrast, Visits(who, time), wanted)
+        assert caught.value.reason == "permutation-blocks"
+
+
+@pytest.mark.parametrize("order", ["sorted", "mixed"])
+def test_blocks_move_whole_and_visits_stay_at_home(order):
+    random = np.random.default_rng(2)
+    who, time, _, _ = repeated(random)
+    rows = random.permutation(len(who)) if order == "mixed" else np.arange(len(who))
+    visits = Visits(who, time).take(rows)
+    basis = np.column_stack([who, time])[rows].astype(float)
+    keys, own = random.random(len(who)), random.random(len(who))
+    moved = visits.shuffle(basis, "whole", keys, own)
+    np.testing.assert_array_equal(moved[:, 1], visits.times)  # each visit to the same visit
+    pairs = np.unique(np.column_stack([visits.people, moved[:, 0]]), axis=0)
+    assert len(pairs) == len(np.unique(who))  # all visits of one go to one
+    assert (pairs[:, 0] != pairs[:, 1]).sum() > 15
+    sizes = np.bincount(who)
+    np.testing.assert_array_equal(*(sizes[pairs[:, i].astype(int)] for i in range(2)))
+    inside = visits.shuffle(basis, "within", keys, own)
+    np.testing.assert_array_equal(inside[:, 0], visits.people)
+    assert (inside[:, 1] != visits.times).sum() > 20
+    assert sorted(map(tuple, inside)) == sorted(map(tuple, basis))

@@ -27,6 +27,7 @@ def test_registered_must_pass_and_unregistered_must_fail(monkeypatch, unregister
     monkeypatch.setattr(group, "_corrections", lambda _cohorts: None)
     monkeypatch.setattr(group, "_amplitudes", lambda _cohorts: None)
     monkeypatch.setattr(group, "_together", lambda _cohorts: None)
+    monkeypatch.setattr(group, "repeated_visits", lambda *_limits: None)
     table, *_ = group.run(full=False).tables
     assert table.targets == 3
     assert table.missed == missed
