@@ -105,10 +105,7 @@ def draw_measure(
     """
     sides = {hemi: one for hemi, one in analysis.fitted.items() if measure in one.fits}
     blocks = [[row] for row in _means(cohort, analysis, sides, measure)]
-    tests = {
-        hemi: {name: fit.tests for name, fit in one.fits.items()}
-        for hemi, one in analysis.fitted.items()
-    }
+    tests = {h: {m: fit.tests for m, fit in a.fits.items()} for h, a in analysis.fitted.items()}
     blocks += contrasts(tests, analysis.found, measure)
     return draw_pages(cohort, sides, shapes, views, blocks)
 
