@@ -195,8 +195,6 @@ def _damage(side: SideMaps, i: int, rules: GroupSettings) -> str | None:
         return f"{gap:.0%} of the curvature profile has no value"
     if THICKNESS in side.maps and not np.isfinite(side.maps[THICKNESS][i]).any():
         return "no point of the thickness map has a value"
-    if THICKNESS in side.maps and (least := float(np.nanmin(side.maps[THICKNESS][i]))) < 0:
-        return f"thickness falls to {least:.3g} mm, below zero"
     for name, most, unit in (
         (CURVATURE, rules.design.largest_curvature, "1/mm"),
         (THICKNESS, rules.design.largest_thickness, "mm"),

@@ -260,3 +260,11 @@ def test_families_are_maps_or_both_hemispheres():
     single = discover(maps, MultiplicitySettings(method="bh"))
     expected = control_fdr(maps[left], 0.05, "bh")
     np.testing.assert_array_equal(single[left].adjusted, expected.adjusted)
+
+
+def test_shares_leave_out_points_without_a_subfield():
+    significant = np.ones(4, dtype=bool)
+    edges = sheet_edges(4, 1)
+    for words, shares in ((["n/a"] * 4, {}), (["SUB", "n/a", "n/a", "SUB"], {"SUB": 0.5})):
+        (cluster,) = find_clusters(significant, np.ones(4), np.array(words), edges)
+        assert (cluster.extent, cluster.shares) == (4, shares)

@@ -227,6 +227,16 @@ def test_areas_below_chance_are_explained(copy, area, said):
     assert ("means that nothing was learned" in text) == said
 
 
+@pytest.mark.parametrize("tested", [True, False])
+def test_only_summary_measures_that_were_tested_are_said_not_to_differ(copy, tested):
+    path = copy / "group" / MODEL / "measures.tsv"
+    change_table(path, "p_fdr", lambda content: ["0.5"] * len(content))
+    if not tested:
+        path.unlink()
+    text = group_page(copy / "group" / MODEL)
+    assert ("No summary measure has a corrected p below" in text) == tested
+
+
 def test_effects_of_two_models_name_their_model(copy):
     path = copy / "group" / MODEL / "measures.tsv"
     models = ["a + b", "a + b + icv"]
