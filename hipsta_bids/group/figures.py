@@ -10,7 +10,6 @@ from dataclasses import replace
 from functools import partial
 from itertools import cycle
 from typing import TYPE_CHECKING, Any
-from unittest.mock import patch
 
 import numpy as np
 import pandas as pd
@@ -99,14 +98,10 @@ Drawing = Callable[[], "list[Figure]"]
 def encode(name: str, draw: Drawing) -> list[tuple[str, bytes]]:
     """Draw figures and encode each as PDF, PNG and SVG; the same results give the same bytes."""
     new_figure((1.0, 1.0), None)  # loads the library with settings of its own
-    from fontTools.subset import Options  # noqa: PLC0415  (slow to load)
     from matplotlib import rc_context  # noqa: PLC0415
 
     encoded = []
-    # Tables that shape text: it is shaped before it is embedded, and reading them takes longest.
-    dropped = [*Options().drop_tables, "GSUB", "GPOS", "GDEF"]
-    leaner = patch.object(Options, "_drop_tables_default", dropped, create=True)
-    with rc_context(_STYLE), leaner:
+    with rc_context(_STYLE):
         for number, figure in enumerate(draw(), start=1):
             own = name if number == 1 else f"{name}_{number}"
             for kind, metadata in _METADATA.items():

@@ -11,6 +11,7 @@ import nibabel as nib
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.figure import Figure
 from scipy import ndimage
 
 import hipsta_bids as hb
@@ -325,8 +326,8 @@ def test_interface_loads_the_whole_sheet(out: Path) -> None:
     assert table.region.tolist() == ["whole"]
     sheet = sheet_of(out).thickness.to_numpy().reshape(41, 51)
     np.testing.assert_array_equal(one.thickness.to_numpy(), sheet)
-    lines = [line.get_ydata()[0] for line in hb.plot_sheet(one).lines]
-    assert len(lines) == 2  # the ends of the body
+    axes = hb.plot_sheet(one, ax=Figure().subplots())
+    assert len(axes.lines) == 2  # the ends of the body
 
 
 def test_interface_measures_head_and_body(maps: HemisphereMaps) -> None:
