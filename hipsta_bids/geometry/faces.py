@@ -41,6 +41,8 @@ PROBES = (0.25, 0.4, 0.55, 0.7)
 """Where labels are looked for, mm outside the surface."""
 REACH = 3.5
 """How far the opposite wall may be, mm."""
+FAR_REACH = 6.0
+"""The same across two walls that touch."""
 STRIP = 0.75
 """The rim strip reaches this far to both sides, multiples of the median distance across."""
 ISLAND = 5.0
@@ -132,7 +134,7 @@ def find_faces(
     count = len(points)
     edges = unique_edges(triangles)
     normals = vertex_normals(points, triangles)
-    across, opposite = _opposite(points, normals, field, grid)
+    across, opposite = _opposite(points, normals, field, grid, REACH)
     step, turn = (
         points[edges[:, 1]] - points[edges[:, 0]],
         normals[edges[:, 1]] - normals[edges[:, 0]],
@@ -162,18 +164,16 @@ def find_faces(
     near = sparse.csgraph.dijkstra(
         edge_graph(edges, lengths, count), directed=False, indices=rim, limit=reach, min_only=True
     )
-    return Faces(side=side, free=np.isfinite(near), opposite=opposite)
+    far = _opposite(points, normals, field, grid, FAR_REACH)[1]
+    return Faces(side=side, free=np.isfinite(near), opposite=far)
 
 
 def _opposite(
-    points: Float,
-    normals: Float,
-    field: NDArray[np.float32],
-    grid: Float,
+    points: Float, normals: Float, field: NDArray[np.float32], grid: Float, reach: float
 ) -> tuple[Float, NDArray[np.intp]]:
     """Distance across the sheet, mm, and the vertex there; NaN and -1 unless both face so."""
     step = 0.1
-    depth = np.arange(2 * step, REACH, step)
+    depth = np.arange(2 * step, reach, step)
     inverse = np.linalg.inv(grid)
     start, way = to_ras(points, inverse), -normals @ inverse[:3, :3].T
     inside = np.empty((len(depth), len(points)), dtype=bool)

@@ -20,18 +20,24 @@ _HEAD = 30
 """The last row of the body."""
 
 _FOLDS = HeadSpec(thickness=1.2, straight=36.0, ends=(5.0, 18.0), digitations=3)
-_OPEN = tuple(replace(_FOLDS, digitations=count) for count in range(5))
+_THICK = replace(_FOLDS, thickness=2.0, digitations=2)
+_OPEN = (*(replace(_FOLDS, digitations=count) for count in range(5)), _THICK)
 _NARROW = tuple(replace(_FOLDS, exterior=width) for width in (0.6, 0.4, 0.3, 0.2))
 _TOUCHING = (
     *(replace(_FOLDS, digitations=count, exterior=0.0) for count in (2, 3, 4)),
     *(replace(_FOLDS, digitations=count, interior=0.0, exterior=1.2) for count in (1, 2, 3, 4)),
     replace(_FOLDS, filled="deep"),
     replace(_FOLDS, filled="shallow"),
+    replace(_THICK, exterior=0.0),
+    replace(_THICK, interior=0.0, exterior=1.2),
+    replace(_THICK, filled="deep"),
+    replace(_THICK, filled="shallow"),
     replace(_FOLDS, bank=1.0, exterior=0.0),
+    replace(_FOLDS, bank=0.5, exterior=0.0),
 )
 
 _TEXT = """\
-Phantoms with a head (experimental regions): a spiral wall, 1.2 mm thick, along an axis that is \
+Phantoms with a head (experimental regions): a spiral wall of 1.2 or 2 mm along an axis that is \
 straight and then hooked, with none to four digitations before the hook. Banks are upright, and \
 1.5 mm high without their arcs unless a row says another height. Errors are those \
 of the head's columns with values, mm."""
@@ -91,6 +97,7 @@ def _row(spec: HeadSpec, result: _Head | Refusal) -> Cells:
         clefts += f", banks of {spec.bank:g}"
     what: Cells = {
         "voxels": f"{spec.voxel:g}",
+        "thickness": f"{spec.thickness:g}",
         "digitations": spec.digitations,
         "clefts, interior / exterior": clefts,
     }
