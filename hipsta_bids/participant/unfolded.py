@@ -28,6 +28,8 @@ As in surfaces of `space-unfold` (DeKraker et al. 2022, eLife 11:e77945).
 """
 _ROOM = 0.5
 """mm; vertices lie no farther outside the rectangle."""
+_LARGEST = 1 + 1e-4
+"""Of a proximal-distal coordinate, with room for rounding."""
 _COVERED = 0.9
 """A surface covers this share of the rectangle along both axes, at least."""
 
@@ -130,10 +132,12 @@ def resample(
             )
         nodes = Correspondence(flat, settings).nodes.shape[:2]
         places = across.get(one.hemi)
-        if places is not None and places.size != nodes[0] * nodes[1]:
+        if places is not None and (
+            places.size != nodes[0] * nodes[1] or np.nanmax(np.abs(places)) > _LARGEST
+        ):
             raise InputError(
-                f"--sheet: {places.size} points, but the whole sheet has {nodes[0]} x {nodes[1]};"
-                " give its desc-proximodistal map, or the --settings of the results",
+                f"--sheet: has to have {nodes[0]} x {nodes[1]} points from -1 to 1; give the"
+                " sheet's desc-proximodistal map, or the --settings of the results",
                 reason="mixed-grids",
             )
         between = Correspondence(flat, settings, None if places is None else places.reshape(nodes))

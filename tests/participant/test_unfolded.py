@@ -78,10 +78,11 @@ def test_the_own_coordinate_of_a_sheet_takes_the_place_of_x(flat, tmp_path, caps
     known = np.isfinite(found)
     assert known[np.abs(lateral) < across.max() - 1e-6].all()
     np.testing.assert_allclose(found[known], lateral[known], atol=1e-5)
-    write_map(own, across.ravel()[:-1])
-    capsys.readouterr()
-    assert resample(sheet, out, "--sheet", own, surface=surface) == 65
-    assert "give its desc-proximodistal map" in capsys.readouterr().err
+    for wrong in (across.ravel()[:-1], across.ravel() + 1):  # the latter may be thickness
+        write_map(own, wrong)
+        capsys.readouterr()
+        assert resample(sheet, out, "--sheet", own, surface=surface) == 65
+        assert "give the sheet's desc-proximodistal map" in capsys.readouterr().err
 
 
 def test_a_map_comes_back_and_what_is_missing_stays_missing(flat, tmp_path, capsys):
