@@ -134,7 +134,7 @@ def find_faces(
     count = len(points)
     edges = unique_edges(triangles)
     normals = vertex_normals(points, triangles)
-    across, opposite = _opposite(points, normals, field, grid, REACH)
+    across, opposite, touching = _opposite(points, normals, field, grid)
     step, turn = (
         points[edges[:, 1]] - points[edges[:, 0]],
         normals[edges[:, 1]] - normals[edges[:, 0]],
@@ -164,16 +164,18 @@ def find_faces(
     near = sparse.csgraph.dijkstra(
         edge_graph(edges, lengths, count), directed=False, indices=rim, limit=reach, min_only=True
     )
-    far = _opposite(points, normals, field, grid, FAR_REACH)[1]
-    return Faces(side=side, free=np.isfinite(near), opposite=far)
+    return Faces(side=side, free=np.isfinite(near), opposite=touching)
 
 
 def _opposite(
-    points: Float, normals: Float, field: NDArray[np.float32], grid: Float, reach: float
-) -> tuple[Float, NDArray[np.intp]]:
-    """Distance across the sheet, mm, and the vertex there; NaN and -1 unless both face so."""
+    points: Float, normals: Float, field: NDArray[np.float32], grid: Float
+) -> tuple[Float, NDArray[np.intp], NDArray[np.intp]]:
+    """Distance across the sheet, mm, and the vertex there; NaN and -1 unless both face so.
+
+    Also that vertex up to ``FAR_REACH``, across two sheets that touch.
+    """
     step = 0.1
-    depth = np.arange(2 * step, reach, step)
+    depth = np.arange(2 * step, FAR_REACH, step)
     inverse = np.linalg.inv(grid)
     start, way = to_ras(points, inverse), -normals @ inverse[:3, :3].T
     inside = np.empty((len(depth), len(points)), dtype=bool)
@@ -188,7 +190,8 @@ def _opposite(
     facing = (normals * normals[mate]).sum(axis=1) < -0.5  # noqa: PLR2004 -- 60 degrees
     mutual = np.abs(back - across) < 0.5 * np.fmin(across, back)
     mutual &= facing & found
-    return np.where(mutual, across, np.nan), np.where(mutual, mate, -1)
+    near = mutual & (np.fmax(across, back) < REACH - step)
+    return np.where(near, across, np.nan), np.where(near, mate, -1), np.where(mutual, mate, -1)
 
 
 def _label_evidence(

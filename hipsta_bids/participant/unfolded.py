@@ -119,6 +119,8 @@ def resample(
         raise UsageError(f"{out}: is an input; choose another name", reason="usage")
     known = {_hemi(path): _unfolded(path) for path in surfaces}
     across = {one.hemi: one.values for path in sheets for one in _read(path, column)}
+    (x, y, _), _ = grid_levels(settings, "whole")
+    nodes = len(x), len(y)
     moved: dict[str, SheetMap] = {}
     vertices = False
     for one in (one for path in paths for one in _read(path, column)):
@@ -130,7 +132,6 @@ def resample(
                 f"{one.path}: there is no unfolded surface of side {one.hemi}; add it to --surface",
                 reason="no-surface",
             )
-        nodes = Correspondence(flat, settings).nodes.shape[:2]
         places = across.get(one.hemi)
         if places is not None and (
             places.size != nodes[0] * nodes[1] or np.nanmax(np.abs(places)) > _LARGEST
