@@ -17,8 +17,9 @@ from hipsta_bids.types import Bool, Float, Sheet, Surface
 
 LINK = 1.0
 """Parts of banks that touch are one place up to this distance, mm."""
-RIDGE, AROUND = 1.35, 4.0
-"""A ridge is thicker than this multiple of the median up to this distance, mm."""
+RIDGE, SLOPE, AROUND = 1.35, 1.25, 4.0
+"""A ridge is thicker than this multiple of the median up to this distance, mm, and its slopes than
+the second."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -60,15 +61,16 @@ def find_touching_banks(surface: Surface, faces: Faces) -> list[TouchingBanks]:
 
 
 def find_ridges(sheet: Sheet, among: Bool) -> list[tuple[Bool, float]]:
-    """Find narrow places where the sheet is thick: their columns (Nx, Ny) and area, mm2.
+    """Find narrow places where the sheet is thick: columns (Nx, Ny), and area without slopes, mm2.
 
     Only columns ``among`` (Nx, Ny) belong to them; all that have a value are what is round them.
     """
     thickness, middle = measure_thickness(sheet), sheet.points[:, :, sheet.middle][sheet.valid]
     known = thickness[sheet.valid]
-    usual = np.full(thickness.shape, np.inf)
     near = cKDTree(middle).query_ball_point(middle, AROUND)
-    usual[sheet.valid] = [np.median(known[own]) for own in near]
-    places, count = ndimage.label(among & (thickness > RIDGE * usual))
-    areas = ndimage.sum_labels(column_area(sheet), places, np.arange(count) + 1)
+    ratio = np.zeros(thickness.shape)
+    ratio[sheet.valid] = known / [np.median(known[own]) for own in near]
+    places, count = ndimage.label(among & (ratio > SLOPE))
+    share = np.where(ratio > RIDGE, column_area(sheet), 0.0)
+    areas = ndimage.sum_labels(share, places, np.arange(count) + 1)
     return [(places == number, float(area)) for number, area in enumerate(areas, start=1)]
