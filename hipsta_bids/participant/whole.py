@@ -28,7 +28,6 @@ from hipsta_bids.geometry.disk import (
     Disk,
     Edges,
     at_nodes,
-    distance_from_rims,
     find_edges,
     flipped_area,
     level_surface,
@@ -296,7 +295,7 @@ def _sample(
 ) -> Sheet:
     """Follow the lines through the nodes of a grid; without values near rims, and where lost."""
     x, y, z = axes
-    triangle, weights = locate_nodes(disk.triangles, plane, x, y)
+    triangle, weights = locate_nodes(disk, plane, x, y)
     corner = disk.triangles[triangle]
     middle = np.einsum("xyk,xykd->xyd", weights, disk.vertices[corner])
     known = (triangle >= 0) & (disk.cell[triangle] >= 0)
@@ -305,9 +304,10 @@ def _sample(
     columns[~arrived] = np.nan
     points = np.full((len(x), len(y), len(z), 3), np.nan)
     points[known] = columns
-    rims = distance_from_rims(disk)
     thickness = np.linalg.norm(np.diff(points, axis=2), axis=3).sum(axis=2)
-    far = np.einsum("xyk,xyk->xy", weights, rims[corner]) > margin * np.fmax(thickness, 1.0)
+    far = np.einsum("xyk,xyk->xy", weights, disk.from_rims[corner]) > margin * np.fmax(
+        thickness, 1.0
+    )
     valid = np.isfinite(points).all(axis=(2, 3)) & far
     if not valid.any():
         raise GeometryError(

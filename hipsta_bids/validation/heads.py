@@ -114,8 +114,8 @@ def _row(spec: HeadSpec, result: _Head | Refusal) -> Cells:
     if isinstance(result, Refusal):
         return {**what, "target": str(result), "met": False}
     if spec.uneven:
-        what["uneven"] = f"{spec.uneven:+.0%}"
-        return {**what, "found": result.places, "target": "none", "met": not result.places}
+        found: Cells = {"found": result.places, "target": "none", "met": not result.places}
+        return {**what, "uneven": f"{spec.uneven:+.0%}", **found}
     off = float(np.mean(np.abs(result.error) > WRONG))
     bias = float(result.error.mean())
     if not spec.interior * spec.exterior or spec.filled:
