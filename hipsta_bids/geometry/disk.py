@@ -1,6 +1,7 @@
 """The mid-surface of the whole sheet as a disk, its edges and ends, and a map to a rectangle."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +43,34 @@ class Disk:
     """(B,) vertices of the boundary, in order."""
     cell: NDArray[np.intp]
     """(F,) tetrahedron in which each triangle lies; -1 where it fills a hole."""
+
+    @cached_property
+    def from_rims(self) -> Float:
+        """(V,) distance along the sheet from its edges, ends and filled holes, mm."""
+        edges = unique_edges(self.triangles[self.cell >= 0])
+        lengths = np.linalg.norm(np.diff(self.vertices[edges], axis=1)[:, 0], axis=1)
+        rims = np.union1d(self.loop, self.triangles[self.cell < 0])
+        graph = edge_graph(edges, lengths, len(self.vertices))
+        found: Float = sparse.csgraph.dijkstra(graph, directed=False, indices=rims, min_only=True)
+        return found
+
+    @cached_property
+    def stiffness(self) -> sparse.csr_array:
+        """Its stiffness, all edge weights at least a floor, so that triangles do not flip."""
+        rows, weights = [], []
+        for k in range(3):
+            corner, i, j = (self.triangles[:, (k + n) % 3] for n in range(3))
+            u, v = (self.vertices[end] - self.vertices[corner] for end in (i, j))
+            sine = np.linalg.norm(np.cross(u, v), axis=1)
+            weights.append(0.5 * (u * v).sum(axis=1) / np.maximum(sine, 1e-9))
+            rows.append(np.sort(np.column_stack([i, j]), axis=1))
+        size = len(self.vertices)
+        pair = np.concatenate(rows).astype(np.int64)
+        code, index = np.unique(pair[:, 0] * size + pair[:, 1], return_inverse=True)
+        total: Float = np.bincount(index, np.concatenate(weights)).astype(np.float64)
+        ends = np.column_stack([code // size, code % size]).astype(np.int32)
+        graph = edge_graph(ends, np.clip(total, _FLOOR, _CEILING), size)
+        return sparse.csr_array(sparse.diags_array(np.asarray(graph.sum(axis=1)).ravel()) - graph)
 
 
 def level_surface(
@@ -224,8 +253,8 @@ def map_to_rectangle(
     short end: there its lines would all lie. Beyond plus and minus ``extent``, y is therefore the
     mean distance along the sheet, from the body, of what lies on a line.
     """
-    matrix = _stiffness(disk.vertices, disk.triangles)
-    inside = (distance_from_rims(disk) > NEAR) & np.isfinite(body).all(axis=1)
+    matrix = disk.stiffness
+    inside = (disk.from_rims > NEAR) & np.isfinite(body).all(axis=1)
     known = np.flatnonzero(inside)
     x = _harmonic(matrix, (edges.medial, -1.0), (edges.lateral, 1.0), (known, body[known, 0]))
     pulled = [end * _PULL if abs(end) > extent else end for end in ends]
@@ -260,26 +289,7 @@ def proximodistal(disk: Disk, edges: Edges) -> Float:
 
     HippUnfold's proximal-distal coordinate is one, too (DeKraker et al. 2022, eLife 11:e77945).
     """
-    matrix = _stiffness(disk.vertices, disk.triangles)
-    return _harmonic(matrix, (edges.medial, -1.0), (edges.lateral, 1.0))
-
-
-def _stiffness(vertices: Float, triangles: Int) -> sparse.csr_array:
-    """Stiffness of a surface, all edge weights at least a floor, so that triangles do not flip."""
-    rows, weights = [], []
-    for k in range(3):
-        corner, i, j = (triangles[:, (k + n) % 3] for n in range(3))
-        u, v = vertices[i] - vertices[corner], vertices[j] - vertices[corner]
-        sine = np.linalg.norm(np.cross(u, v), axis=1)
-        weights.append(0.5 * (u * v).sum(axis=1) / np.maximum(sine, 1e-9))
-        rows.append(np.sort(np.column_stack([i, j]), axis=1))
-    size = len(vertices)
-    pair = np.concatenate(rows).astype(np.int64)
-    code, index = np.unique(pair[:, 0] * size + pair[:, 1], return_inverse=True)
-    total: Float = np.bincount(index, np.concatenate(weights)).astype(np.float64)
-    weight = np.clip(total, _FLOOR, _CEILING)
-    graph = edge_graph(np.column_stack([code // size, code % size]).astype(np.int32), weight, size)
-    return sparse.csr_array(sparse.diags_array(np.asarray(graph.sum(axis=1)).ravel()) - graph)
+    return _harmonic(disk.stiffness, (edges.medial, -1.0), (edges.lateral, 1.0))
 
 
 def _harmonic(matrix: sparse.csr_array, *fixed: tuple[NDArray[np.integer], Float | float]) -> Float:
@@ -308,15 +318,13 @@ def flipped_area(disk: Disk, plane: Float) -> float:
     return wrong / float(area.sum())
 
 
-def locate_nodes(
-    triangles: Int, plane: Float, x: Float, y: Float
-) -> tuple[NDArray[np.intp], Float]:
-    """Triangle (Nx, Ny) of a plane (V, 2) that holds each node of a grid, and weights (Nx, Ny, 3).
+def locate_nodes(disk: Disk, plane: Float, x: Float, y: Float) -> tuple[NDArray[np.intp], Float]:
+    """Triangle (Nx, Ny) of a map (V, 2) that holds each node of a grid, and weights (Nx, Ny, 3).
 
     -1 where there is none. Where a fold makes two triangles claim a node, the one that holds it
     most centrally wins.
     """
-    corner = plane[triangles]
+    corner = plane[disk.triangles]
     low = [
         np.searchsorted(axis, corner[..., k].min(axis=1) - _SLACK) for k, axis in enumerate((x, y))
     ]
@@ -347,18 +355,6 @@ def locate_nodes(
 
 def at_nodes(disk: Disk, plane: Float, values: Float, x: Float, y: Float) -> Float:
     """Values (V,) of a disk at the nodes (Nx, Ny) of a grid; NaN where there is none."""
-    triangle, weights = locate_nodes(disk.triangles, plane, x, y)
+    triangle, weights = locate_nodes(disk, plane, x, y)
     found: Float = (weights * values[disk.triangles[triangle]]).sum(axis=2)
     return np.where(triangle < 0, np.nan, found)
-
-
-def distance_from_rims(disk: Disk) -> Float:
-    """(V,) distance along the sheet from its edges, ends and filled holes, mm."""
-    measured = disk.triangles[disk.cell >= 0]
-    edges = unique_edges(measured)
-    lengths = np.linalg.norm(np.diff(disk.vertices[edges], axis=1)[:, 0], axis=1)
-    rims = np.union1d(disk.loop, disk.triangles[disk.cell < 0])
-    found: Float = sparse.csgraph.dijkstra(
-        edge_graph(edges, lengths, len(disk.vertices)), directed=False, indices=rims, min_only=True
-    )
-    return found

@@ -1,20 +1,25 @@
 """Folds of the head that touch: two banks that the labels do not tell apart.
 
-Where the cleft between two banks is lost, the wall there has the same face on both sides.
+Where the cleft between two banks is lost, the wall there has the same face on both sides. Banks of
+low folds hardly face each other: what is left of such a fold is a narrow ridge of a thick wall.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import sparse
+from scipy import ndimage, sparse
 from scipy.spatial import cKDTree
 
 from hipsta_bids.geometry.faces import Faces
+from hipsta_bids.geometry.measures import column_area, measure_thickness
 from hipsta_bids.geometry.mesh import vertex_areas
-from hipsta_bids.types import Float, Surface
+from hipsta_bids.types import Bool, Float, Sheet, Surface
 
 LINK = 1.0
 """Parts of banks that touch are one place up to this distance, mm."""
+RIDGE, SLOPE, AROUND = 1.35, 1.25, 4.0
+"""A ridge is thicker than this multiple of the median up to this distance, mm, and its slopes than
+the second."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -53,3 +58,19 @@ def find_touching_banks(surface: Surface, faces: Faces) -> list[TouchingBanks]:
         for number in range(count)
     ]
     return sorted(found, key=lambda banks: -banks.area)
+
+
+def find_ridges(sheet: Sheet, among: Bool) -> list[tuple[Bool, float]]:
+    """Find narrow places where the sheet is thick: columns (Nx, Ny), and area without slopes, mm2.
+
+    Only columns ``among`` (Nx, Ny) belong to them; all that have a value are what is round them.
+    """
+    thickness, middle = measure_thickness(sheet), sheet.points[:, :, sheet.middle][sheet.valid]
+    known = thickness[sheet.valid]
+    near = cKDTree(middle).query_ball_point(middle, AROUND)
+    ratio = np.zeros(thickness.shape)
+    ratio[sheet.valid] = known / [np.median(known[own]) for own in near]
+    places, count = ndimage.label(among & (ratio > SLOPE))
+    share = np.where(ratio > RIDGE, column_area(sheet), 0.0)
+    areas = ndimage.sum_labels(share, places, np.arange(count) + 1)
+    return [(places == number, float(area)) for number, area in enumerate(areas, start=1)]

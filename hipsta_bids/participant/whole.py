@@ -28,7 +28,6 @@ from hipsta_bids.geometry.disk import (
     Disk,
     Edges,
     at_nodes,
-    distance_from_rims,
     find_edges,
     flipped_area,
     level_surface,
@@ -37,10 +36,10 @@ from hipsta_bids.geometry.disk import (
     map_to_rectangle,
     proximodistal,
 )
-from hipsta_bids.geometry.faces import find_faces, whole_surface, whole_tissue
+from hipsta_bids.geometry.faces import Faces, find_faces, whole_surface, whole_tissue
 from hipsta_bids.geometry.fem import volume_laplace
 from hipsta_bids.geometry.findings import columns_near, flag_margins, raise_flags
-from hipsta_bids.geometry.folds import TouchingBanks, find_touching_banks
+from hipsta_bids.geometry.folds import find_ridges, find_touching_banks
 from hipsta_bids.geometry.lines import Lines
 from hipsta_bids.geometry.measures import column_area, labels_at, measure_thickness
 from hipsta_bids.geometry.mesh import tetra_quality, tetrahedralize, triangle_areas, unique_edges
@@ -59,6 +58,7 @@ from hipsta_bids.types import (
     Int,
     LabelVolume,
     Sheet,
+    Surface,
     TetMesh,
 )
 
@@ -79,6 +79,8 @@ FLAG_FOLDED, FLAG_MASKED = 0.01, 0.25
 """Flag larger shares of the area that are turned over, and that have no values."""
 FLAG_TOUCHING = 2.0
 """Flag places where two banks of a fold touch over more than this, mm2 of one bank."""
+FLAG_RIDGE = 5.0
+"""Flag larger ridges of the head, which low folds are whose banks touch, mm2."""
 THICK_NEAR, THICK = 4.0, 1.5
 """Beside such a place, up to this far, mm, columns thicker than this multiple of the median are
 part of it."""
@@ -129,7 +131,6 @@ def measure_whole(
         mesh = tetrahedralize(surface, settings.tetra)
     with clock("boundaries"):
         faces = find_faces(surface, volume, field, grid)
-        banks = [b for b in find_touching_banks(surface, faces) if b.area > FLAG_TOUCHING]
     with clock("coordinates"):
         laplace = volume_laplace(mesh, settings.boundaries.solver)
         u = laplace.between(faces.interior, faces.exterior)
@@ -142,8 +143,7 @@ def measure_whole(
     with clock("sheet"):
         lines_of = Lines(mesh, laplace.gradient(u))
         sheet = _sample(disk, plane, lines_of, axes, MARGIN)
-        touching = [_columns_of(place, sheet) for place in banks]
-        sheet = replace(sheet, valid=~np.any([~sheet.valid, *touching], axis=0))
+        sheet, folds = _lost_clefts(surface, faces, sheet, axes[1] > 1)
         edge_to_edge = (np.linspace(-_RIM, _RIM, len(axes[0])), axes[1], axes[2][::2])
         whole = _sample(disk, plane, lines_of, edge_to_edge, 0.0)
         subfield = label_sheet(sheet, body)
@@ -165,10 +165,7 @@ def measure_whole(
         measured_area = float(column_area(sheet)[sheet.valid].sum())
         area = float(triangle_areas(disk.vertices, disk.triangles).sum())
         masked = max(0.0, 1 - measured_area / area)
-        findings = [
-            *_findings(disk, edges, folded, masked, region),
-            *(_touching(*place) for place in zip(banks, touching, strict=True)),
-        ]
+        findings = [*_findings(disk, edges, folded, masked, region), *folds]
         return HemisphereMaps(
             sheet=sheet,
             layers=sheet,
@@ -298,7 +295,7 @@ def _sample(
 ) -> Sheet:
     """Follow the lines through the nodes of a grid; without values near rims, and where lost."""
     x, y, z = axes
-    triangle, weights = locate_nodes(disk.triangles, plane, x, y)
+    triangle, weights = locate_nodes(disk, plane, x, y)
     corner = disk.triangles[triangle]
     middle = np.einsum("xyk,xykd->xyd", weights, disk.vertices[corner])
     known = (triangle >= 0) & (disk.cell[triangle] >= 0)
@@ -307,9 +304,10 @@ def _sample(
     columns[~arrived] = np.nan
     points = np.full((len(x), len(y), len(z), 3), np.nan)
     points[known] = columns
-    rims = distance_from_rims(disk)
     thickness = np.linalg.norm(np.diff(points, axis=2), axis=3).sum(axis=2)
-    far = np.einsum("xyk,xyk->xy", weights, rims[corner]) > margin * np.fmax(thickness, 1.0)
+    far = np.einsum("xyk,xyk->xy", weights, disk.from_rims[corner]) > margin * np.fmax(
+        thickness, 1.0
+    )
     valid = np.isfinite(points).all(axis=(2, 3)) & far
     if not valid.any():
         raise GeometryError(
@@ -318,23 +316,43 @@ def _sample(
     return Sheet(points=fill_points(points), valid=valid)
 
 
-def _columns_of(banks: TouchingBanks, sheet: Sheet) -> Bool:
-    """Columns (Nx, Ny) with a value that lie where banks touch, and thick ones beside them."""
-    thickness = measure_thickness(sheet)
+def _lost_clefts(
+    surface: Surface, faces: Faces, sheet: Sheet, head: Bool
+) -> tuple[Sheet, list[Finding]]:
+    """Find clefts that the labels do not have, and take the values there from the sheet.
+
+    ``head`` (Ny,) tells its rows.
+    """
+    thickness, found = measure_thickness(sheet), []
     thick = thickness > THICK * np.median(thickness[sheet.valid])
-    beside = thick & columns_near(sheet, banks.points, THICK_NEAR)
-    return sheet.valid & (beside | columns_near(sheet, banks.points, MARGIN))
+    without = ~sheet.valid
+    for banks in find_touching_banks(surface, faces):
+        if banks.area > FLAG_TOUCHING:
+            beside = thick & columns_near(sheet, banks.points, THICK_NEAR)
+            columns = sheet.valid & (beside | columns_near(sheet, banks.points, MARGIN))
+            what = f"two banks of a fold touch over {banks.area:.0f} mm2: the cleft between them"
+            what += f" on the {banks.lost} side is not in the labels"
+            found.append(_lost(what, banks.area, FLAG_TOUCHING, banks.points, columns))
+            without |= columns
+    sheet = replace(sheet, valid=~without)
+    for columns, area in find_ridges(sheet, np.broadcast_to(head, without.shape)):
+        if area > FLAG_RIDGE:
+            what = f"a ridge of {area:.0f} mm2 in the head is thicker than what lies round it: the"
+            what += " cleft of a low fold may not be in the labels"
+            middle = sheet.points[columns, sheet.middle]
+            found.append(_lost(what, area, FLAG_RIDGE, middle, columns))
+            without |= columns
+    return replace(sheet, valid=~without), found
 
 
-def _touching(banks: TouchingBanks, columns: Bool) -> Finding:
+def _lost(what: str, area: float, limit: float, points: Float, columns: Bool) -> Finding:
     return Finding(
         reason="fused-digitation",
-        value=banks.area if columns.any() else 0.0,
-        limit=FLAG_TOUCHING,
-        what=f"two banks of a fold touch over {banks.area:.0f} mm2: the cleft between them on the"
-        f" {banks.lost} side is not in the labels",
+        value=area if columns.any() else 0.0,
+        limit=limit,
+        what=what,
         remedy="correct the labels there; the sheet has no values there",
-        points=banks.points,
+        points=points,
         share=float(columns.mean()),
     )
 

@@ -35,6 +35,8 @@ class HeadSpec:
     """Shape of a phantom with a head; lengths in mm."""
 
     thickness: float = 1.5
+    uneven: float = 0.0
+    """Share by which the wall is thicker at its edges, and thinner midway between them."""
     straight: float = 22.0
     """Length of the axis up to the hook."""
     ends: tuple[float, float] = (5.0, 20.0)
@@ -88,10 +90,11 @@ def draw_head(spec: HeadSpec) -> LabelVolume:
             between = np.abs(y - _middle(spec)) < crests
             upright = np.abs(share - np.mean(_FOLDED)) < np.ptp(_FOLDED) / 2 - _RISE
             outward[near & half & (outward > 0) & between & upright] = 0
-    wall = (np.abs(outward) < spec.thickness / 2) & (share < 1)
+    half = spec.thickness / 2 * (1 + spec.uneven * np.cos(2 * np.pi * share))
+    wall = (np.abs(outward) < half) & (share < 1)
     codes = np.where((outward < 0) & (share < _LEAVES), 4, 0)
     codes[radius < _CORE] = 4
-    codes[(outward < 0) & (outward > -spec.thickness / 2 - _LAYER) & (share < 1)] = 6
+    codes[(outward < 0) & (outward > -half - _LAYER) & (share < 1)] = 6
     codes[wall] = np.select([share < 0.25, share < 0.7], [2, 1], 5)[wall]  # noqa: PLR2004
     protocol = load_protocol("cobralab")
     tissue, part = translate(np.where(within, codes, 0), protocol)

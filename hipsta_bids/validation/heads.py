@@ -32,8 +32,15 @@ _TOUCHING = (
     replace(_THICK, interior=0.0, exterior=1.2),
     replace(_THICK, filled="deep"),
     replace(_THICK, filled="shallow"),
-    replace(_FOLDS, bank=1.0, exterior=0.0),
-    replace(_FOLDS, bank=0.5, exterior=0.0),
+    *(replace(_FOLDS, bank=bank, exterior=0.0) for bank in (1.0, 0.75, 0.5, 0.25, 0.0)),
+    *(replace(_FOLDS, bank=bank, interior=0.0) for bank in (0.75, 0.5, 0.25, 0.0)),
+    replace(_THICK, bank=0.5, exterior=0.0),
+    replace(_THICK, bank=0.5, interior=0.0),
+)
+_UNEVEN = tuple(
+    replace(_FOLDS, uneven=uneven, digitations=count)
+    for uneven in (0.3, -0.3, 0.4)
+    for count in (0, 2)
 )
 
 _TEXT = """\
@@ -48,8 +55,11 @@ _NARROW_NOTES = """\
 Three digitations; exterior clefts of a given width. In clefts about a voxel wide banks touch here \
 and there: found or not, no column may be off."""
 _TOUCHING_NOTES = """\
-Found: places where banks touch (`fused-digitation`), of those that were closed. Off: columns that \
-still have values and are off by more than 0.5 mm."""
+Found: places where banks touch, or ridges of low folds (`fused-digitation`), of those that were \
+closed. Off: columns that still have values and are off by more than 0.5 mm."""
+_UNEVEN_NOTES = """\
+Walls that are thicker at their edges by a share and thinner midway, or the other way round; \
+clefts are open."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -61,14 +71,14 @@ class _Head:
 
 
 def run(full: bool) -> Suite:
-    """Measure heads with open clefts, with narrow ones, and with banks that touch."""
-    groups = (_OPEN, _NARROW, _TOUCHING) if full else (_OPEN[3:4], (), _TOUCHING[1:2])
+    """Measure heads with open clefts, with narrow ones, with banks that touch, and uneven walls."""
+    groups = (_OPEN, _NARROW, _TOUCHING, _UNEVEN) if full else (_OPEN[3:4], (), _TOUCHING[1:2], ())
     voxels = VOXELS if full else VOXELS[1:]
     specs = [[replace(s, voxel=v) for v in voxels for s in group] for group in groups]
     results = iter(run_cases(_measure, [s for group in specs for s in group], timeout=120.0))
     rows = [[_row(spec, next(results)) for spec in group] for group in specs]
-    titles = ("Open clefts", "Narrow clefts", "Banks that touch")
-    notes = (_OPEN_NOTES, _NARROW_NOTES, _TOUCHING_NOTES)
+    titles = ("Open clefts", "Narrow clefts", "Banks that touch", "Uneven walls")
+    notes = (_OPEN_NOTES, _NARROW_NOTES, _TOUCHING_NOTES, _UNEVEN_NOTES)
     tables = tuple(
         Table(title=title, rows=found, notes=note)
         for title, found, note in zip(titles, rows, notes, strict=True)
@@ -103,6 +113,9 @@ def _row(spec: HeadSpec, result: _Head | Refusal) -> Cells:
     }
     if isinstance(result, Refusal):
         return {**what, "target": str(result), "met": False}
+    if spec.uneven:
+        found: Cells = {"found": result.places, "target": "none", "met": not result.places}
+        return {**what, "uneven": f"{spec.uneven:+.0%}", **found}
     off = float(np.mean(np.abs(result.error) > WRONG))
     bias = float(result.error.mean())
     if not spec.interior * spec.exterior or spec.filled:

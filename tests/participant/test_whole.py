@@ -20,6 +20,7 @@ from hipsta_bids.cli.main import main
 from hipsta_bids.derivatives.names import name_of_record
 from hipsta_bids.errors import GeometryError, ProtocolError
 from hipsta_bids.geometry.disk import find_edges, level_surface, make_disk
+from hipsta_bids.geometry.folds import find_ridges
 from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.phantom.head import RADIUS, HeadSpec, draw_head
 from hipsta_bids.protocols.load import for_region, load_protocol
@@ -28,7 +29,7 @@ from hipsta_bids.reports.cohort import read_cohort
 from hipsta_bids.reports.participant import participant_page
 from hipsta_bids.reports.review import correction_of
 from hipsta_bids.settings import Settings
-from hipsta_bids.types import Bool, Float, GivenEnd, HemisphereMaps, LabelVolume, TetMesh
+from hipsta_bids.types import Bool, Float, GivenEnd, HemisphereMaps, LabelVolume, Sheet, TetMesh
 
 WHOLE = Settings().changed(body={"region": "whole"})
 SHAPE = HeadSpec()
@@ -180,6 +181,27 @@ def test_banks_that_touch_are_found_and_have_no_values() -> None:
     assert 0 < flag.share < 0.1
     assert np.nanmax(touching.thickness) < 2.0  # two walls have 2.4
     assert np.isfinite(touching.thickness).sum() > 0.95 * np.isfinite(open_.thickness).sum()
+
+
+def test_low_folds_that_touch_are_ridges_without_values() -> None:
+    """Their banks do not face each other; without the search columns are up to 1 mm too thick."""
+    shape = replace(SHAPE, thickness=1.2, straight=30.0, digitations=2, bank=0.25, interior=0.0)
+    maps = measure(draw_head(shape))
+    (flag,) = (flag for flag in maps.flags if flag.reason == "fused-digitation")
+    assert "ridge" in flag.message
+    thick = np.abs(maps.thickness - 1.2) > 0.5
+    assert thick.sum() < 0.03 * np.isfinite(maps.thickness[:, 31:]).sum()
+
+
+def test_a_ridge_is_narrow() -> None:
+    """A wide place of the same thickness is none, nor is one outside of the columns asked for."""
+    x, y, z = np.meshgrid(np.arange(20.0), np.arange(30.0), [-0.5, 0.0, 0.5], indexing="ij")
+    half = np.where((np.abs(y - 8) < 2) | (y > 18), 2.0, 1.0)
+    sheet = Sheet(points=np.stack([x, y, half * z], axis=-1), valid=np.ones(x.shape[:2], bool))
+    ((columns, area),) = find_ridges(sheet, np.arange(30) < 14)
+    assert area == pytest.approx(19 * 3)
+    assert set(np.nonzero(columns)[1]) == {7, 8, 9}
+    assert find_ridges(sheet, np.arange(30) > 14) == []
 
 
 def cube(count: int) -> TetMesh:
