@@ -18,10 +18,12 @@ from hipsta_bids.derivatives.hemisphere import (
 )
 from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.catalog import MAPS
+from hipsta_bids.geometry.sheet import sheet_levels
 from hipsta_bids.group.collect import Exclusion, SheetRecord
 from hipsta_bids.group.data import MOST_KEPT, PARTICIPANT, SESSION, Float, Measures, SideMaps
 from hipsta_bids.group.settings import GroupSettings
-from hipsta_bids.protocols import EXPERIMENTAL, rows_beyond
+from hipsta_bids.protocols import EXPERIMENTAL
+from hipsta_bids.settings import SheetSettings
 from hipsta_bids.types import VisitKey
 
 #: Map that registration rests on.
@@ -253,11 +255,7 @@ def node_coordinates(grid: Mapping[str, Any], region: str) -> tuple[Float, Float
 
     They are without the rounding errors that would show in tables.
     """
-    nodes, extent = int(grid["y_nodes"]), float(grid["y_extent"])
-    tail, head = rows_beyond(region, nodes)
-    step = 2 * extent / (nodes - 1)
-    x = np.linspace(-float(grid["x_extent"]), float(grid["x_extent"]), int(grid["x_nodes"]))
-    y = np.linspace(-extent - tail * step, extent + head * step, tail + nodes + head)
+    x, y, _ = sheet_levels(SheetSettings.model_construct(**grid), region)
     return x.round(10) + 0.0, y.round(10) + 0.0
 
 

@@ -74,7 +74,7 @@ class HeadSpec:
 
     def __post_init__(self) -> None:
         low, high = _WALLS
-        if not low <= self.thickness - max(0.0, self.thinning) <= self.thickness <= high:
+        if not all(low <= self.thickness - less <= high for less in (0.0, self.thinning)):
             raise SettingsError(
                 f"phantom: a wall of {self.thickness:g} mm, {self.thinning:g} mm thinner in the "
                 f"head, is outside of {low:g} to {high:g} mm; choose others",

@@ -8,10 +8,10 @@ import pytest
 from small_cohorts import NODES, PLAN, write_dataset
 
 from hipsta_bids.cli.main import main
+from hipsta_bids.geometry.sheet import sheet_levels
 from hipsta_bids.group import figures, write
-from hipsta_bids.group.read import node_coordinates
-from hipsta_bids.participant.whole import grid_levels
-from hipsta_bids.protocols import rows_beyond
+from hipsta_bids.protocols import body_ends, rows_beyond
+from hipsta_bids.reports.display import parts_of
 from hipsta_bids.settings import SheetSettings
 
 REGION = "whole"
@@ -64,12 +64,14 @@ def points(folder):
     }
 
 
-@pytest.mark.parametrize("region", ["body", "headbody", "whole"])
-def test_coordinates_are_those_of_the_participant_level(region):
-    sheet = SheetSettings(y_nodes=9)
-    (x, y, _), _ = grid_levels(sheet, region)
-    for own, expected in zip(node_coordinates(sheet.model_dump(), region), (x, y), strict=True):
-        np.testing.assert_allclose(own, expected, atol=1e-9)
+@pytest.mark.parametrize("region", ["headbody", "whole"])
+@pytest.mark.parametrize("nodes", [9, 12, 21])
+def test_rows_are_of_the_part_that_the_participant_level_says(region, nodes):
+    _, y, _ = sheet_levels(SheetSettings(y_nodes=nodes), region)
+    parts = parts_of(y)
+    assert parts is not None
+    body = np.flatnonzero(parts == "body")
+    assert (body[0], body[-1]) == body_ends(region, len(y))
 
 
 def test_difference_in_the_head_is_found_and_named(folder, points):
