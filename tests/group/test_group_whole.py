@@ -111,3 +111,13 @@ def test_figures_show_how_many_have_a_value(folder):
     assert "Sheets with a value at each point" in text
     for word in ("tail", "body", "head"):
         assert f">{word}<" in text
+
+
+def test_trials_say_what_was_measured(folder):
+    out = folder.parents[1]
+    power = [*QUICK[:2], "--power", "thinning=5%", "--name", "power"]
+    assert main([str(out.parent / "bids"), str(out), "group", "--region", REGION, *power]) == 0
+    text = (out / "group/power/methods.md").read_text()
+    assert "Measures of the whole hippocampus on one sheet (experimental) [1]" in text
+    points = pd.read_csv(out / "group/power/power_points.tsv", sep="\t")
+    assert set(points.part) == {"tail", "body", "head"}
