@@ -155,7 +155,8 @@ def read_sheets(
             sides[hemi] = side.sheets(np.array([not text for text in why]))
             own = [r for r, text in zip(own, why, strict=True) if not text]
             if region in EXPERIMENTAL:
-                _leave_rare(sides[hemi])
+                for values in sides[hemi].maps.values():
+                    leave_rare(values)
         if own and error_window:
             errors = _read_errors(own, shape, maps, error_window)
             sides[hemi] = replace(sides[hemi], errors=errors)
@@ -181,12 +182,11 @@ def read_sheets(
     )
 
 
-def _leave_rare(side: SideMaps) -> None:
-    """Take out points that few sheets have: beside rims, which differ, those are a selection."""
-    for values in side.maps.values():
-        known = np.isfinite(values)
-        some = known.any(axis=(1, 2))  # other volumes may lack in a participant
-        values[:, known[some].sum(axis=0) < LEAST_SHARE * some.sum()] = np.nan
+def leave_rare(values: Float) -> None:
+    """Take points that few sheets have out of a map (sheets, x, y): beside rims, a selection."""
+    known = np.isfinite(values)
+    some = known.any(axis=(1, 2))  # other volumes may lack in a participant
+    values[:, known[some].sum(axis=0) < LEAST_SHARE * some.sum()] = np.nan
 
 
 def _damage(side: SideMaps, i: int, rules: GroupSettings) -> str | None:

@@ -1,5 +1,6 @@
 """The group level on sheets with head and tail: more rows, and nodes without values."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from hipsta_bids.geometry.sheet import sheet_levels
 from hipsta_bids.group import figures, write
 from hipsta_bids.protocols import body_ends, rows_beyond
 from hipsta_bids.reports.display import parts_of
+from hipsta_bids.reports.group import group_page
 from hipsta_bids.settings import SheetSettings
 
 REGION = "whole"
@@ -23,6 +25,7 @@ IN_HEAD = replace(
 )
 N = sum(PLAN.sizes)
 QUICK = ["--measures", "thickness", "--formula", "group", "--contrast", "group[CN]-group[AD]"]
+EXPORT = ["--export-summary", "one"]
 HOLE = (slice(4, 7), slice(TAIL + 1, TAIL + 4))
 
 
@@ -51,7 +54,7 @@ def folder(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:  # figures as the page shows them alone
         patch.setattr(figures, "_METADATA", {"svg": {"Date": None, "Creator": None}})
         patch.setattr(write, "draw_figures", only_maps)
-        assert main([str(data), str(out), "group", "--region", REGION, *QUICK]) == 0
+        assert main([str(data), str(out), "group", "--region", REGION, *QUICK, *EXPORT]) == 0
     return out / "group" / f"thickness_group_{REGION}"
 
 
@@ -93,9 +96,8 @@ def test_no_value_is_made_where_there_was_none(points):
         assert (n[[0, -1]] == 0).all()
         assert n[:, -1].max() == N // 2
         assert (n[5, TAIL + 1 : TAIL + 4] == 0).all()  # fewer than half have a value
-        p = table.p.to_numpy().reshape(SHAPE)
-        assert np.isnan(p[n < 2 + 3]).all()  # columns of the model, and degrees of freedom
-        assert np.isfinite(p[n > N / 2]).all()
+        assert ((n == 0) | (n >= N / 2)).all()
+        assert (np.isfinite(table.p) == (table.n > 0)).all()
 
 
 def test_what_is_experimental_is_said(folder):
@@ -121,3 +123,22 @@ def test_trials_say_what_was_measured(folder):
     assert "Measures of the whole hippocampus on one sheet (experimental) [1]" in text
     points = pd.read_csv(out / "group/power/power_points.tsv", sep="\t")
     assert set(points.part) == {"tail", "body", "head"}
+    known = int((points[points.hemi == "L"].n > 0).sum())
+    page = group_page(out / "group/power")
+    assert re.search(rf"<td>left</td>\s*<td[^>]*>{known}</td>", page)
+
+
+def test_sites_are_combined_and_plots_name_the_part(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(write, "draw_figures", lambda *_: iter(()))
+    out = folder.parents[1]
+    one = folder / "summary.json"
+    bids, half = str(out.parent / "bids"), [f"{i:02d}" for i in range(3, N - 1)]
+    run = [bids, str(out), "group", "--region", REGION, *QUICK, "--name", "two"]
+    more = ["--export-summary", "two", "--template", str(one), "--participant-label", *half]
+    assert main([*run, *more, "--no-classification"]) == 0
+    assert main(["meta", str(one), str(out / "group/two/summary.json"), str(tmp_path)]) == 0
+    forest = pd.read_csv(tmp_path / "meta/forest.tsv", sep="\t")
+    peaks = forest[forest.x.notna()]
+    assert "head" in set(peaks.part)
+    assert ((peaks.part == "head") == (peaks.y > 1)).all()
+    assert "whole hippocampus on one sheet" in (tmp_path / "meta/methods.md").read_text()
