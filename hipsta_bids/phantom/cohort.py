@@ -372,15 +372,21 @@ def _write_effect(out: Path, plan: CohortPlan) -> None:
 
 def _write_head_effect(out: Path, plan: CohortPlan) -> None:
     """Write the plan, and by how much a group's wall differs in each part."""
-    shapes = (_head(plan, thickness=plan.thickness, scale=1.0, dose=dose) for dose in (0, 1))
-    without, planted = (HeadPhantom(shape) for shape in shapes)
+    without, planted = (
+        HeadPhantom(_head(plan, thickness=plan.thickness, scale=1.0, dose=dose))
+        for dose in (0, min(1, len(plan.groups) - 1))
+    )
     rows = []
     for part in ("tail", "body", "head"):
         a, b = (one.region_summary(part)["thickness_mean"] for one in (without, planted))
         rows.append([part, str(int(part == "head")), f"{b - a:.5f}"])
     files.write_tsv(out / EFFECT_TABLE, ["part", "in_region", "difference"], rows)
     difference = "mean thickness of the second group minus that of the first"
-    content = {"difference": {"Description": difference, "Units": "mm"}, "Plan": asdict(plan)}
+    content = {
+        "in_region": {"Description": "1 where the effect was planted"},
+        "difference": {"Description": difference, "Units": "mm"},
+        "Plan": asdict(plan),
+    }
     files.write_json((out / EFFECT_TABLE).with_suffix(".json"), content)
 
 
