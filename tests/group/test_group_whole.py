@@ -135,7 +135,7 @@ def test_sites_are_combined_and_plots_name_the_part(folder, tmp_path, monkeypatc
     bids, half = str(out.parent / "bids"), [f"{i:02d}" for i in range(3, N - 1)]
     run = [bids, str(out), "group", "--region", REGION, *QUICK, "--name", "two"]
     more = ["--export-summary", "two", "--template", str(one), "--participant-label", *half]
-    assert main([*run, *more, "--no-classification"]) == 0
+    assert main([*run, *more, "--no-classification", "--no-reports"]) == 0
     assert main(["meta", str(one), str(out / "group/two/summary.json"), str(tmp_path)]) == 0
     forest = pd.read_csv(tmp_path / "meta/forest.tsv", sep="\t")
     peaks = forest[forest.x.notna()]
