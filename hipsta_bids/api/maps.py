@@ -366,17 +366,19 @@ def load(out_dir: str | Path, *, protocol: str | None = None, region: str = "bod
         hb.plot_sheet(maps.sel(participant="sub-01", side="L").squeeze("session"))
     """
     root = Path(out_dir)
-    found = [one for one in find_results(root) if one.place.name.region == region]
-    seg = _one_protocol(root, found, protocol)
-    own = [one for one in found if one.place.name.seg == seg]
+    found = list(find_results(root))
+    seg = _one_protocol(root, found, protocol, region)
+    own = [one for one in found if (one.place.name.seg, one.place.name.region) == (seg, region)]
     table = pd.DataFrame([_row(one) for one in own])
     return Results(maps=_lazy_dataset(root, own, table), table=table)
 
 
-def _one_protocol(root: Path, found: list[Hemisphere], wanted: str | None) -> str:
-    names = sorted({one.place.name.seg for one in found})
+def _one_protocol(root: Path, found: list[Hemisphere], wanted: str | None, region: str) -> str:
+    every = sorted({(one.place.name.seg, one.place.name.region) for one in found})
+    names = [seg for seg, own in every if own == region]
     if not names or wanted not in {None, *names}:
-        there = f"there is {', '.join(names)}" if names else "run the participant level first"
+        there = ", ".join(f"{seg} (region {own})" for seg, own in every)
+        there = f"there is {there}" if there else "run the participant level first"
         raise NothingToDoError(f"{root}: no such hemisphere; {there}", reason="no-hemisphere")
     if wanted is None and len(names) > 1:
         raise InputError(

@@ -28,7 +28,8 @@ what is written:
   participants.tsv          group, age, sex, intracranial volume, site
   phantom_truth.tsv         true thickness, extents, areas and volume of each hemisphere
                             and region
-  phantom_maps/             true maps of each hemisphere
+  phantom_maps/             true maps of each hemisphere (without --head)
+  phantom_ends.tsv          ends of the body, for --ends (with --head)
   phantom_effect.tsv        where the effect was planted, and how large it is
 """
 
@@ -37,7 +38,7 @@ def phantom_parser() -> Parser:
     """Describe ``hipsta-bids phantom``."""
     parser = Parser(
         prog="hipsta-bids phantom",
-        description="write a synthetic BIDS dataset of hippocampal bodies with known truth",
+        description="write a synthetic BIDS dataset of hippocampi with known truth",
         epilog=PHANTOM_EPILOG,
     )
     add = adder(parser)
@@ -47,7 +48,7 @@ def phantom_parser() -> Parser:
     add(
         "--layout",
         "NAME",
-        "freesurfer (default), ashs (the atlas ABC-3T) or ashsPMC",
+        "freesurfer (default), hippunfold, ashs (the atlas ABC-3T) or ashsPMC",
         default="freesurfer",
     )
     add("--n-subjects", "N", "in all groups (default: 20)", default=20)
@@ -65,7 +66,7 @@ def phantom_parser() -> Parser:
         "planted effect: by how much the wall is thinner in the region (default: 0.3)",
         default=0.3,
     )
-    add("--region", "NAME", "where (default: CA1-anterior), see below", default="CA1-anterior")
+    add("--region", "NAME", "where (default: CA1-anterior, of a head: head), see below")
     add(
         "--shift",
         "MM",
@@ -80,6 +81,13 @@ def phantom_parser() -> Parser:
         "neighboring cortex beside the subiculum, for --region extended and entorhinal"
         " of the participant level; needs a layout of ASHS (default: 0)",
         default=0.0,
+    )
+    add(
+        "--head",
+        "N",
+        "hippocampi with a tail and a head, which has N digitations (0 to 4), for --region headbody"
+        " of the participant level; with --layout hippunfold for --region whole",
+        type=int,
     )
     add("--thickness", "MM", "cohort mean (default: 1.8)", default=1.8)
     add(
@@ -318,6 +326,7 @@ def write_phantoms(arguments: Sequence[str]) -> ExitCode:
     options = phantom_parser().parse_args(arguments)
     from hipsta_bids.phantom.cohort import CohortPlan, write_cohort  # noqa: PLC0415  (heavy)
 
+    options.region = options.region or ("CA1-anterior" if options.head is None else "head")
     plan = from_namespace(CohortPlan, options)
     write_cohort(options.out, plan, layout=options.layout, voxel_size=tuple(options.voxel_size))
     echo(f"synthetic dataset of {plan.n_subjects} subjects: {options.out}")

@@ -298,12 +298,6 @@ def _merge_layer(volume: LabelVolume, settings: BodySettings) -> tuple[Tissues, 
 def join_cortex(volume: LabelVolume, hippocampal: Tissues, region: str) -> Tissues:
     """Add the neighboring cortex to the hippocampal sheet, or return it alone."""
     kinds = [t for t in for_region(volume.protocol, region).sheet if t in volume.protocol.neighbors]
-    if volume.edited_mask is not None:
-        raise GeometryError(
-            f"region {region}: an edited mask is about the body, not about the cortex beside it; "
-            "edit the labels instead (desc-edited_dseg)",
-            reason="edited-mask-region",
-        )
     cortex = np.isin(volume.tissue, kinds)
     if not cortex.any():
         raise GeometryError(

@@ -15,6 +15,7 @@ from hipsta_bids.geometry.ends import EndPlanes
 from hipsta_bids.geometry.fem import Laplace
 from hipsta_bids.geometry.measures import labels_at
 from hipsta_bids.geometry.mesh import cross, tetra_volumes
+from hipsta_bids.protocols import rows_beyond
 from hipsta_bids.settings import SheetSettings
 from hipsta_bids.types import Bool, Coordinates, Finding, Float, Sheet, TetMesh
 
@@ -41,11 +42,18 @@ def sample_sheet(mesh: TetMesh, coordinates: Coordinates, settings: SheetSetting
     return Sheet(points=_evenly(fill_points(points)), valid=~missing)
 
 
-def sheet_levels(settings: SheetSettings) -> tuple[Float, Float, Float]:
-    """Coordinates of the grid's nodes along x, y and z."""
+def sheet_levels(settings: SheetSettings, region: str = "body") -> tuple[Float, Float, Float]:
+    """Coordinates of the grid's nodes along x, y and z.
+
+    The body's rows are those of its own sheet. Where the region has a head, as many again, less
+    one, lie before them, and with a tail half as many behind them.
+    """
+    tail, head = rows_beyond(region, settings.y_nodes)
+    extent, step = settings.y_extent, 2 * settings.y_extent / (settings.y_nodes - 1)
+    rows = tail + settings.y_nodes + head
     return (
         np.linspace(-settings.x_extent, settings.x_extent, settings.x_nodes),
-        np.linspace(-settings.y_extent, settings.y_extent, settings.y_nodes),
+        np.linspace(-extent - tail * step, extent + head * step, rows),
         np.linspace(-settings.z_extent, settings.z_extent, settings.z_nodes),
     )
 

@@ -48,6 +48,7 @@ from hipsta_bids.group.inference import (
 from hipsta_bids.group.mixed import longitudinal_model
 from hipsta_bids.group.model import Design, Groups, build_design
 from hipsta_bids.group.normative import Scores, score_cohort
+from hipsta_bids.group.read import leave_rare
 from hipsta_bids.group.registration import (
     GroupShift,
     Registration,
@@ -62,6 +63,7 @@ from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.summaries import MeasureFit, classify_groups, fit_summaries
 from hipsta_bids.group.warps import Template, templates_to_json, warp_labels, warp_values
 from hipsta_bids.progress import each, tell
+from hipsta_bids.reports.display import parts_of
 
 #: Group of all, where there are no groups.
 ALL = "all"
@@ -392,18 +394,22 @@ def register_side(
     return SideResult(
         profiles=profiles,
         registration=registration,
-        registered=_register_maps(side, registration.warps),
+        registered=_register_maps(side, registration.warps, parts_of(cohort.y) is not None),
         shifts=shifts,
         difference=difference,
     )
 
 
-def _register_maps(side: SideMaps, warps: Float) -> SideMaps:
+def _register_maps(side: SideMaps, warps: Float, rims: bool) -> SideMaps:
+    """Carry all maps of sheets; a point beside ``rims`` that came to be known of few is none."""
     kept = len(warps) <= MOST_KEPT
     maps, errors = (WarpedMaps(one, warps, warp_values) for one in (side.maps, side.errors))
+    registered = dict(maps) if kept or rims else maps
+    for values in registered.values() if rims else ():
+        leave_rare(values)
     return replace(
         side,
-        maps=dict(maps) if kept else maps,
+        maps=registered,
         errors=dict(errors) if kept else errors,
         subfield=warp_labels(side.subfield, warps),
     )

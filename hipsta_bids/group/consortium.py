@@ -285,4 +285,4 @@ def _methods(meta: Meta) -> str:
     ]
     if survivors:
         paragraphs.append(f"Points that survive: {'; '.join(survivors)}.")
-    return cite.page(paragraphs)
+    return cite.page(paragraphs, sites[0].region)

@@ -49,12 +49,14 @@ class Citations:
             self._keys.append(key)
         return f"[{self._keys.index(key) + 1}]"
 
-    def page(self, paragraphs: Sequence[str]) -> str:
-        """Return the text with its references."""
+    def page(self, paragraphs: Sequence[str], region: str = "body") -> str:
+        """Return the text with its references; the first paragraph says what was measured."""
+        what = _MEASURED["body"]
+        first = paragraphs[0].replace(what, _MEASURED.get(region, what), 1)
         known = references()
         works = "\n".join(f"{i}. {known[key]}" for i, key in enumerate(self._keys, start=1))
         use = "This text may be used freely, as it stands or changed."
-        parts = ["# Methods and findings", use, *paragraphs, "# References", works]
+        parts = ["# Methods and findings", use, first, *paragraphs[1:], "# References", works]
         return "\n\n".join(parts) + "\n"
 
 
@@ -71,7 +73,6 @@ def methods_text(
     """Word what was done and what came out."""
     cite = Citations()
     paragraphs = [_sample(cohort, analysis, n_out, cite("method"), others)]
-    paragraphs[0] = paragraphs[0].replace("the hippocampus", _MEASURED[region], 1)
     paragraphs[0] += _rated(ratings)
     if analysis.sides or others:
         paragraphs.append(_alignment(analysis, settings, cite, others))
@@ -92,7 +93,7 @@ def methods_text(
         paragraphs.append(_findings(analysis))
     if analysis.skipped:
         paragraphs.append("\n".join(["Left out:", "", *(f"- {one}" for one in analysis.skipped)]))
-    return cite.page(paragraphs)
+    return cite.page(paragraphs, region)
 
 
 def _sample(
@@ -415,7 +416,7 @@ def norms_text(
             "Shift and scale of sites without norms were estimated from their controls"
             f" {'='.join(controls or ())}: {counts}. All else was kept."
         )
-    return cite.page(paragraphs)
+    return cite.page(paragraphs, file.region)
 
 
 def _asymmetry(settings: GroupSettings, source: str) -> str:

@@ -18,10 +18,12 @@ from hipsta_bids.derivatives.hemisphere import (
 )
 from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.catalog import MAPS
+from hipsta_bids.geometry.sheet import sheet_levels
 from hipsta_bids.group.collect import Exclusion, SheetRecord
 from hipsta_bids.group.data import MOST_KEPT, PARTICIPANT, SESSION, Float, Measures, SideMaps
 from hipsta_bids.group.settings import GroupSettings
-from hipsta_bids.protocols import EXPERIMENTAL, rows_beyond
+from hipsta_bids.protocols import EXPERIMENTAL
+from hipsta_bids.settings import SheetSettings
 from hipsta_bids.types import VisitKey
 
 #: Map that registration rests on.
@@ -153,7 +155,8 @@ def read_sheets(
             sides[hemi] = side.sheets(np.array([not text for text in why]))
             own = [r for r, text in zip(own, why, strict=True) if not text]
             if region in EXPERIMENTAL:
-                _leave_rare(sides[hemi])
+                for values in sides[hemi].maps.values():
+                    leave_rare(values)
         if own and error_window:
             errors = _read_errors(own, shape, maps, error_window)
             sides[hemi] = replace(sides[hemi], errors=errors)
@@ -179,12 +182,11 @@ def read_sheets(
     )
 
 
-def _leave_rare(side: SideMaps) -> None:
-    """Take out points that few sheets have: beside rims, which differ, those are a selection."""
-    for values in side.maps.values():
-        known = np.isfinite(values)
-        some = known.any(axis=(1, 2))  # other volumes may lack in a participant
-        values[:, known[some].sum(axis=0) < LEAST_SHARE * some.sum()] = np.nan
+def leave_rare(values: Float) -> None:
+    """Take points that few sheets have out of a map (sheets, x, y): beside rims, a selection."""
+    known = np.isfinite(values)
+    some = known.any(axis=(1, 2))  # other volumes may lack in a participant
+    values[:, known[some].sum(axis=0) < LEAST_SHARE * some.sum()] = np.nan
 
 
 def _damage(side: SideMaps, i: int, rules: GroupSettings) -> str | None:
@@ -253,11 +255,7 @@ def node_coordinates(grid: Mapping[str, Any], region: str) -> tuple[Float, Float
 
     They are without the rounding errors that would show in tables.
     """
-    nodes, extent = int(grid["y_nodes"]), float(grid["y_extent"])
-    tail, head = rows_beyond(region, nodes)
-    step = 2 * extent / (nodes - 1)
-    x = np.linspace(-float(grid["x_extent"]), float(grid["x_extent"]), int(grid["x_nodes"]))
-    y = np.linspace(-extent - tail * step, extent + head * step, tail + nodes + head)
+    x, y, _ = sheet_levels(SheetSettings.model_construct(**grid), region)
     return x.round(10) + 0.0, y.round(10) + 0.0
 
 

@@ -345,7 +345,7 @@ def _forest(meta: Meta, item: Item, point: int) -> pd.DataFrame:
     }
     if is_map:
         frame = meta.frame[item.model.hemi]
-        what |= {"x": frame.position["x"][point], "y": frame.position["y"][point]}
+        what |= {name: own[point] for name, own in frame.position.items()}
         what["subfield"] = frame.subfield[point]
     rows: list[dict[str, Any]] = []
     for number, site in enumerate(meta.sites):

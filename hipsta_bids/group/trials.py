@@ -180,7 +180,8 @@ def run_trial(options: GroupOptions, request: TrialRequest, settings: GroupSetti
             _write_maps(folder, surface, cohorts[surface], found)
         if templates := templates_of(sides):
             files.write_json(folder / "template.json", templates)
-        files.write_text(folder / "methods.md", _methods(asked, modeled, maps))
+        text = _methods(asked, modeled, maps, options.sheets.region)
+        files.write_text(folder / "methods.md", text)
         figures = (figure for key, own in maps.items() for figure in _figures(cohorts[key], own))
         return write.write_figures(folder, figures)
 
@@ -349,7 +350,9 @@ def _notes(
         yield f"{later} later sessions are not in it; --visits takes all"
 
 
-def _methods(asked: _Question, visits: pd.DataFrame, maps: Mapping[str, Sequence[MapFound]]) -> str:
+def _methods(
+    asked: _Question, visits: pd.DataFrame, maps: Mapping[str, Sequence[MapFound]], region: str
+) -> str:
     """Word what was done, with the works it rests on."""
     source, request, settings = asked.source, asked.request, asked.settings
     cite = Citations()
@@ -377,7 +380,7 @@ def _methods(asked: _Question, visits: pd.DataFrame, maps: Mapping[str, Sequence
         paragraphs.append(retest_text(source.retest, settings.retest, cite))
     if request.effect is not None:
         paragraphs.append(power_text(request.effect, settings, source.words, cite))
-    return cite.page(paragraphs)
+    return cite.page(paragraphs, region)
 
 
 def _write_measures(folder: Path, cohort: Cohort, found: Sequence[Found]) -> None:

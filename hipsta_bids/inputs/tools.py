@@ -193,7 +193,7 @@ def is_hippunfold(name: str, source: Source) -> bool:
     """Check whether a file is HippUnfold's segmentation of hippocampal subfields."""
     if "desc-subfields" not in name or "_hemi-" not in name:
         return False
-    if source.generators and "hippunfold" not in source.generators:
+    if source.generators and not any(_HIPPUNFOLD in name for name in source.generators):
         return False
     pairs = entities(name)
     return (

@@ -378,7 +378,14 @@ def measure_hemisphere(
     GeometryError
         With the reason why this hemisphere cannot be measured.
     """
-    if settings.body.region in EXPERIMENTAL:
+    region = settings.body.region
+    if volume.edited_mask is not None and region != "body":
+        raise GeometryError(
+            f"region {region}: an edited mask is about the body alone; edit the labels instead "
+            "(desc-edited_dseg)",
+            reason="edited-mask-region",
+        )
+    if region in EXPERIMENTAL:
         check_fine(volume)
         only = settings.changed(body={"region": "body"})
         evidence, coordinates = unfold(volume, hemi, only, clock)

@@ -13,9 +13,9 @@ from scipy.interpolate import LinearNDInterpolator
 
 from hipsta_bids.errors import InputError, UsageError
 from hipsta_bids.geometry.catalog import MAPS
+from hipsta_bids.geometry.sheet import sheet_levels
 from hipsta_bids.io import files, gifti
 from hipsta_bids.io.gifti import DENSE_SCALARS, PointMap
-from hipsta_bids.participant.whole import grid_levels
 from hipsta_bids.settings import SheetSettings
 from hipsta_bids.types import Float, Mesh
 
@@ -52,10 +52,10 @@ class Correspondence:
 
         ``proximodistal`` (Nx, Ny) of the sheet takes the place of x, if it is given.
         """
-        (x, y, _), (first, last) = grid_levels(settings, "whole")
+        x, y, _ = sheet_levels(settings, "whole")
         anterior, lateral = ((flat.points[:, :2] - _LOW) / _SIZE).T
         #: (V, 2) from -1 to 1 between the edges, and y between the ends of the sheet.
-        self.places: Float = np.column_stack([2 * lateral - 1, first + anterior * (last - first)])
+        self.places: Float = np.column_stack([2 * lateral - 1, y[0] + anterior * (y[-1] - y[0])])
         along = np.broadcast_to(y, (len(x), len(y)))
         across = (
             np.broadcast_to(x[:, None], along.shape) if proximodistal is None else proximodistal
@@ -119,7 +119,7 @@ def resample(
         raise UsageError(f"{out}: is an input; choose another name", reason="usage")
     known = {_hemi(path): _unfolded(path) for path in surfaces}
     across = {one.hemi: one.values for path in sheets for one in _read(path, column)}
-    (x, y, _), _ = grid_levels(settings, "whole")
+    x, y, _ = sheet_levels(settings, "whole")
     nodes = len(x), len(y)
     moved: dict[str, SheetMap] = {}
     vertices = False

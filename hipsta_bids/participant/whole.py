@@ -44,9 +44,8 @@ from hipsta_bids.geometry.lines import Lines
 from hipsta_bids.geometry.measures import column_area, labels_at, measure_thickness
 from hipsta_bids.geometry.mesh import tetra_quality, tetrahedralize, triangle_areas, unique_edges
 from hipsta_bids.geometry.sheet import coordinates_at, fill_points, label_sheet, sheet_levels
-from hipsta_bids.protocols import rows_beyond
 from hipsta_bids.protocols.protocol import CORE, LATERAL_END, MEDIAL_END, Tissue
-from hipsta_bids.settings import Settings, SheetSettings
+from hipsta_bids.settings import Settings
 from hipsta_bids.types import (
     Bool,
     Coordinates,
@@ -137,7 +136,8 @@ def measure_whole(
         disk = make_disk(*level_surface(mesh, u, 0.0))
         _check_pieces(disk)
         edges = _edges(disk, body, volume, ends.height, region)
-        axes, limits = grid_levels(settings.sheet, region)
+        axes = sheet_levels(settings.sheet, region)
+        limits = float(axes[1][0]), float(axes[1][-1])
         within = _in_body(disk, own)
         plane = map_to_rectangle(disk, edges, within, settings.sheet.y_extent, limits)
     with clock("sheet"):
@@ -202,21 +202,6 @@ def measure_whole(
             mesh=mesh,
             coordinates=Coordinates(values=np.column_stack([np.full((len(u), 2), np.nan), u])),
         )
-
-
-def grid_levels(
-    settings: SheetSettings, region: str
-) -> tuple[tuple[Float, Float, Float], tuple[float, float]]:
-    """Levels of the grid's nodes along x, y and z, and y at the two ends.
-
-    The body's rows are those of its own sheet. Before them lie as many again, less one, for the
-    head, and half as many behind them for the tail.
-    """
-    x, y, z = sheet_levels(settings)
-    step = y[1] - y[0]
-    tail, head = rows_beyond(region, len(y))
-    y = y[0] + step * np.arange(-tail, len(y) + head)
-    return (x, y, z), (float(y[0]), float(y[-1]))
 
 
 def check_fine(volume: LabelVolume) -> None:

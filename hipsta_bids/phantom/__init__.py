@@ -1,4 +1,4 @@
-"""Analytic hippocampal bodies with known truth, and synthetic datasets of them."""
+"""Analytic hippocampi with known truth, and synthetic datasets of them."""
 
 from hipsta_bids.phantom.dataset import (
     TRUTH_TABLE,

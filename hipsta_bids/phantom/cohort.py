@@ -17,6 +17,7 @@ from hipsta_bids.phantom.dataset import (
     rigid_motion,
     write_dataset,
 )
+from hipsta_bids.phantom.head import HeadPhantom, HeadSpec
 from hipsta_bids.phantom.labels import SUBFIELD_STARTS
 from hipsta_bids.phantom.phantom import Phantom
 from hipsta_bids.phantom.shape import KINDS, PhantomSpec, Thinning
@@ -57,6 +58,10 @@ EFFECT_TABLE = "phantom_effect.tsv"
 #: Nodes of the true maps along x and y: as many as the default sheet has.
 NODES = (41, 21)
 
+#: Of a phantom with a head: digitations at most, and mm of a mean subject: radius of the spiral,
+#: tail, body, and what lies between the body and the hook beside the digitations.
+_MOST_DIGITATIONS, _RADIUS, _TAIL, _BODY, _BEFORE_HOOK = 4, 5.0, 8.0, 15.0, 10.0
+
 _ROUNDING = 1e-9  # nodes on the border of a region belong to it
 
 
@@ -76,7 +81,7 @@ class CohortPlan:
     thinning: float = 0.3
     """mm, off the wall inside the region."""
     region: str = "CA1-anterior"
-    """One of ``REGIONS``."""
+    """One of ``REGIONS``, or ``head`` of a phantom with a head."""
     shift: float = 0.0
     """mm, by which the pattern of the wall and the subfields' borders lie more lateral in the
     other groups; a method has to tell this from thinning."""
@@ -101,9 +106,12 @@ class CohortPlan:
     """Name of the one site of all, which labels begin with; the thickness is that of its mean."""
     cortex: float = 0.0
     """mm of neighboring cortex, by which the mid-curve extends beyond the subiculum."""
+    head: int | None = None
+    """Number of digitations of a head, up to 4; without it there are bodies alone."""
 
     def __post_init__(self) -> None:
-        for name, value, known in (("region", self.region, REGIONS), ("kind", self.kind, KINDS)):
+        regions = REGIONS if self.head is None else ("head",)
+        for name, value, known in (("region", self.region, regions), ("kind", self.kind, KINDS)):
             if value not in known:
                 raise UsageError(
                     f"phantom: {name} {value!r} is unknown; choose from {', '.join(known)}"
@@ -113,6 +121,10 @@ class CohortPlan:
         problem = None
         if self.cortex and KINDS[self.kind].power != 1:
             problem = f"the shape {self.kind} cannot extend into cortex; choose another kind"
+        if self.head is not None and (self.shift or self.cortex or self.kind != CohortPlan.kind):
+            problem = "a head has a shape of its own; leave out shift, cortex and kind"
+        if self.head is not None and not 0 <= self.head <= _MOST_DIGITATIONS:
+            problem = f"a head has 0 to {_MOST_DIGITATIONS} digitations, not {self.head}"
         if self.n_subjects < 1 or not self.groups or len(set(self.groups)) < len(self.groups):
             problem = "give at least one subject, and groups with different names"
         if self.site and not (self.site.isascii() and self.site.isalnum()):
@@ -142,7 +154,7 @@ def make_cohort(plan: CohortPlan) -> list[Subject]:
 
 
 def typical_shape(plan: CohortPlan, dose: int) -> PhantomSpec:
-    """Shape of a mean subject, with ``dose`` times the planted effect."""
+    """Shape of a mean subject's body, with ``dose`` times the planted effect."""
     return _spec(plan, thickness=plan.thickness, scale=1.0, offset=plan.shift * dose, dose=dose)
 
 
@@ -170,7 +182,11 @@ def _make_subject(plan: CohortPlan, number: int) -> Subject:
     hemispheres = []
     for hemi in "LR":
         own = wall + plan.hemisphere_sd * float(random.standard_normal())
-        spec = _spec(plan, thickness=own, scale=scale, offset=offset, dose=dose)
+        spec: PhantomSpec | HeadSpec
+        if plan.head is None:
+            spec = _spec(plan, thickness=own, scale=scale, offset=offset, dose=dose)
+        else:
+            spec = _head(plan, thickness=own, scale=scale, dose=dose)
         hemispheres.append(Hemisphere(subject=label, hemi=hemi, spec=spec, pose=pose))
     return Subject(
         label=label,
@@ -212,6 +228,21 @@ def _spec(
     )
 
 
+def _head(plan: CohortPlan, *, thickness: float, scale: float, dose: int) -> HeadSpec:
+    """Shape of one hemisphere with a head; a larger one is longer."""
+    count = plan.head or 0
+    plain = HeadSpec(
+        thickness=thickness,
+        thinning=plan.thinning * dose,
+        digitations=count,
+        radius=scale * _RADIUS,
+        ends=(scale * _TAIL, scale * (_TAIL + _BODY)),
+        taper=scale * _TAIL,
+    )
+    folds = count * (2 * thickness + plain.interior + plain.exterior)
+    return replace(plain, straight=plain.ends[1] + scale * _BEFORE_HOOK + folds)
+
+
 def _three(random: np.random.Generator, sd: float) -> tuple[float, float, float]:
     x, y, z = random.normal(0.0, sd, 3)
     return float(x), float(y), float(z)
@@ -239,8 +270,9 @@ def write_cohort(
         participants=_participants(plan, subjects),
     )
     for item in hemispheres:
-        _write_maps(out, item)
-    _write_effect(out, plan)
+        if isinstance(item.spec, PhantomSpec):
+            _write_maps(out, item, Phantom(item.spec))
+    (_write_effect if plan.head is None else _write_head_effect)(out, plan)
 
 
 def _participants(plan: CohortPlan, subjects: Sequence[Subject]) -> Participants:
@@ -280,9 +312,8 @@ def _grid() -> tuple[Float, Float]:
     return u, v
 
 
-def _write_maps(out: Path, item: Hemisphere) -> None:
+def _write_maps(out: Path, item: Hemisphere, phantom: Phantom) -> None:
     """Write the true map of one hemisphere."""
-    phantom = Phantom(item.spec)
     u, v = _grid()
     truth = phantom.truth(u, v, hemi=item.hemi, pose=item.pose)
     columns = {
@@ -337,6 +368,26 @@ def _write_effect(out: Path, plan: CohortPlan) -> None:
             "Plan": asdict(plan),
         },
     )
+
+
+def _write_head_effect(out: Path, plan: CohortPlan) -> None:
+    """Write the plan, and by how much a group's wall differs in each part."""
+    without, planted = (
+        HeadPhantom(_head(plan, thickness=plan.thickness, scale=1.0, dose=dose))
+        for dose in (0, min(1, len(plan.groups) - 1))
+    )
+    rows = []
+    for part in ("tail", "body", "head"):
+        a, b = (one.region_summary(part)["thickness_mean"] for one in (without, planted))
+        rows.append([part, str(int(part == "head")), f"{b - a:.5f}"])
+    files.write_tsv(out / EFFECT_TABLE, ["part", "in_region", "difference"], rows)
+    difference = "mean thickness of the second group minus that of the first"
+    content = {
+        "in_region": {"Description": "1 where the effect was planted"},
+        "difference": {"Description": difference, "Units": "mm"},
+        "Plan": asdict(plan),
+    }
+    files.write_json((out / EFFECT_TABLE).with_suffix(".json"), content)
 
 
 def _write_nodes(path: Path, columns: Mapping[str, NDArray[np.generic]]) -> None:

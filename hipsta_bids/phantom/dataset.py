@@ -1,7 +1,7 @@
 """Synthetic BIDS datasets: segmentations of phantoms, laid out as other tools do, and the truth."""
 
 import gzip
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -14,14 +14,19 @@ from scipy.spatial.transform import Rotation
 from hipsta_bids import __version__
 from hipsta_bids.errors import SettingsError, UsageError, did_you_mean
 from hipsta_bids.io import files
+from hipsta_bids.phantom.head import HeadPhantom, HeadSpec
 from hipsta_bids.phantom.labels import encode
 from hipsta_bids.phantom.phantom import Phantom
 from hipsta_bids.phantom.shape import PhantomSpec
 from hipsta_bids.protocols.load import load_protocol
+from hipsta_bids.protocols.protocol import Part, Protocol, Tissue
 from hipsta_bids.types import Float, LabelVolume
 
 #: Name of the table of true values, at the top of the dataset.
 TRUTH_TABLE = "phantom_truth.tsv"
+
+#: Where bodies of phantoms with a head end, for ``--ends``.
+ENDS_TABLE = "phantom_ends.tsv"
 
 BIDS_VERSION = "1.11.0"
 
@@ -30,7 +35,10 @@ TRUTH_COLUMNS: Mapping[str, tuple[str, str | None]] = MappingProxyType(
     {
         "subject": ("subject, with its sub- prefix", None),
         "hemi": ("L or R", None),
-        "region": ("body, or with cortex also extended and entorhinal, see --region", None),
+        "region": (
+            "body; with cortex also extended and entorhinal, with a head headbody and whole",
+            None,
+        ),
         "kind": ("shape of the cross-section", None),
         "thickness_mean": ("mean thickness over the area of the mid-surface", "mm"),
         "extent_x": ("arc length of the mid-curve, medial to lateral", "mm"),
@@ -74,6 +82,12 @@ LAYOUTS: Mapping[str, Layout] = MappingProxyType(
             path="{subject}/final/{subject}_{side}_lfseg_corr_usegray.nii.gz",
             sides={"L": "left", "R": "right"},
         ),
+        "hippunfold": Layout(
+            protocol="hippunfold",
+            path="{subject}/anat/{subject}_hemi-{side}_space-cropT1w_desc-subfields_atlas-multihist7"
+            "_dseg.nii.gz",
+            sides={"L": "L", "R": "R"},
+        ),
     }
 )
 
@@ -86,7 +100,7 @@ class Hemisphere:
     """Label without ``sub-``."""
     hemi: str
     """``L`` or ``R``."""
-    spec: PhantomSpec
+    spec: PhantomSpec | HeadSpec
     pose: Float | None = None
     """(4, 4) rigid motion in RAS mm."""
 
@@ -108,7 +122,6 @@ def write_dataset(
     layouts: Sequence[str] = ("freesurfer",),
     voxel_size: tuple[float, float, float] = (0.4, 0.4, 0.4),
     axes: str = "LIA",
-    supersample: int | tuple[int, int, int] = 1,
     participants: Participants | None = None,
 ) -> None:
     """Write phantoms as a BIDS dataset with derivatives and a table of the truth.
@@ -123,11 +136,18 @@ def write_dataset(
             reason="phantom-setting",
         )
     if any(item.spec.cortex for item in hemispheres):
-        _refuse_without_cortex(layouts)
-    truth = []
+        _refuse(layouts, "labels for cortex", lambda protocol: protocol.neighbors != ())
+    if any(isinstance(item.spec, HeadSpec) for item in hemispheres):
+        _refuse(layouts, "subfields in the head", _has_head)
+    truth: list[dict[str, str]] = []
+    ends: list[list[str]] = []
     for item in hemispheres:
-        phantom = Phantom(item.spec)
+        spec = item.spec
+        phantom = HeadPhantom(spec) if isinstance(spec, HeadSpec) else Phantom(spec)
         truth += _truth_rows(item, phantom)
+        if isinstance(phantom, HeadPhantom):
+            for end, plane in phantom.ends(item.hemi, item.pose).items():
+                ends.append([f"sub-{item.subject}", item.hemi, end, *(f"{x:.4f}" for x in plane)])
         for name in layouts:
             layout = LAYOUTS[name]
             volume = phantom.label_volume(
@@ -136,10 +156,12 @@ def write_dataset(
                 pose=item.pose,
                 voxel_size=voxel_size,
                 axes=axes,
-                supersample=supersample,
             )
             path = layout.path.format(subject=f"sub-{item.subject}", side=layout.sides[item.hemi])
             _write_image(out / "derivatives" / name / path, volume)
+    if ends:
+        header = ["participant_id", "hemi", "end", "r", "a", "s", "nr", "na", "ns"]
+        files.write_tsv(out / ENDS_TABLE, header, ends)
     _write_truth(out, hemispheres, truth)
     _write_participants(out, hemispheres, participants or Participants(columns={}, rows={}))
     _write_descriptions(out, layouts)
@@ -188,19 +210,25 @@ def rigid_motion(degrees: tuple[float, float, float], shift: tuple[float, float,
     return motion
 
 
-def _refuse_without_cortex(layouts: Sequence[str]) -> None:
+def _refuse(layouts: Sequence[str], what: str, able: Callable[[Protocol], bool]) -> None:
+    """Refuse a layout whose protocol lacks something, and name those that have it."""
+    have = [key for key, row in LAYOUTS.items() if able(load_protocol(row.protocol))]
     for name in layouts:
-        if not load_protocol(LAYOUTS[name].protocol).neighbors:
-            able = [key for key, row in LAYOUTS.items() if load_protocol(row.protocol).neighbors]
+        if name not in have:
             raise SettingsError(
-                f"phantom: the protocol of layout {name} has no labels for cortex; choose from"
-                f" {', '.join(able)}",
+                f"phantom: the protocol of layout {name} has no {what}; choose from"
+                f" {', '.join(have)}",
                 reason="phantom-setting",
             )
 
 
-def _truth_rows(item: Hemisphere, phantom: Phantom) -> list[dict[str, str]]:
-    """One row, or with cortex one per region."""
+def _has_head(protocol: Protocol) -> bool:
+    whole = (label.part for label in protocol.labels if label.tissue is Tissue.HIPPOCAMPUS)
+    return Part.HEAD not in whole
+
+
+def _truth_rows(item: Hemisphere, phantom: Phantom | HeadPhantom) -> list[dict[str, str]]:
+    """One row per region."""
     row = {"subject": f"sub-{item.subject}", "hemi": item.hemi, "kind": item.spec.kind}
     return [
         row
@@ -261,7 +289,7 @@ def _write_descriptions(out: Path, layouts: Sequence[str]) -> None:
     files.write_json(
         out / "dataset_description.json",
         {
-            "Name": "Synthetic hippocampal bodies with known thickness",
+            "Name": "Synthetic hippocampi with known thickness",
             "BIDSVersion": BIDS_VERSION,
             "DatasetType": "raw",
         },
@@ -270,7 +298,7 @@ def _write_descriptions(out: Path, layouts: Sequence[str]) -> None:
         # Not made by us as far as finding inputs goes, which passes over its own outputs.
         folder = out / "derivatives" / name
         maker = {
-            "Name": "phantom",
+            "Name": f"phantom ({name})",
             "Version": __version__,
             "Description": f"Analytic shapes in the labels and folders of {name}",
         }
@@ -296,7 +324,7 @@ _IGNORED = """\
 """
 
 _README = """\
-Synthetic hippocampal bodies: analytic shapes drawn as segmentations, nobody's brain.
+Synthetic hippocampi: analytic shapes drawn as segmentations, nobody's brain.
 The exact thickness, extents, areas and volume of each are in phantom_truth.tsv.
 The segmentations are in derivatives/. There are no images: the subjects' scans.tsv list none.
 """

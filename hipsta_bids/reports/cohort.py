@@ -285,7 +285,7 @@ def cohort_page(cohort: Cohort) -> str | None:
 
 
 def _columns(hemispheres: Sequence[Hemisphere], *, compared: bool) -> list[Mapping[str, Any]]:
-    """Columns of the table; those of one value throughout are left out."""
+    """Columns of the table; those of one protocol, or of bodies alone, are left out."""
     names = [h.place.name for h in hemispheres]
     measures = {measure.name: measure for measure in MEASURES}
     columns: list[Mapping[str, Any]] = [{"key": "participant", "title": "Participant"}]
@@ -294,7 +294,7 @@ def _columns(hemispheres: Sequence[Hemisphere], *, compared: bool) -> list[Mappi
     columns.append({"key": "hemi", "title": "Side"})
     if len({name.seg for name in names}) > 1:
         columns.append({"key": "seg", "title": "Protocol"})
-    if len({name.region for name in names}) > 1:
+    if any(name.region != "body" for name in names):
         columns.append({"key": "region", "title": "Region"})
     columns += [
         {

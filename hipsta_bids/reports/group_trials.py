@@ -158,9 +158,10 @@ def _tables(results: GroupResults, question: str) -> tuple[pd.DataFrame, pd.Data
 
 
 def _maps(points: pd.DataFrame) -> Iterator[tuple[str, str, pd.DataFrame]]:
-    """Points of each map of each side, with the titles of both."""
+    """Points with values of each map of each side, with the titles of both."""
     if len(points):
-        for (measure, hemi), own in points.groupby(["measure", "hemi"], sort=False):
+        known = points[points["n"] > 0]
+        for (measure, hemi), own in known.groupby(["measure", "hemi"], sort=False):
             title = with_brackets(display_name(str(measure)), str(own["unit"].iloc[0]))
             yield title, SIDES[str(hemi)], own
 

@@ -309,3 +309,4 @@ def test_maps_of_other_programs_without_sheets_or_sites(tmp_path, capsys):
     whole = found[found.region == "all"]
     assert whole.participant_id.tolist() == ["sub-116", "sub-117"]
     assert (whole.z < -3).all()
+    assert "2 low, 0 high of 2</td>" in group_page(out / "group" / "scores_AD")

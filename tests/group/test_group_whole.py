@@ -1,5 +1,6 @@
 """The group level on sheets with head and tail: more rows, and nodes without values."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -8,10 +9,11 @@ import pytest
 from small_cohorts import NODES, PLAN, write_dataset
 
 from hipsta_bids.cli.main import main
+from hipsta_bids.geometry.sheet import sheet_levels
 from hipsta_bids.group import figures, write
-from hipsta_bids.group.read import node_coordinates
-from hipsta_bids.participant.whole import grid_levels
-from hipsta_bids.protocols import rows_beyond
+from hipsta_bids.protocols import body_ends, rows_beyond
+from hipsta_bids.reports.display import parts_of
+from hipsta_bids.reports.group import group_page
 from hipsta_bids.settings import SheetSettings
 
 REGION = "whole"
@@ -23,6 +25,7 @@ IN_HEAD = replace(
 )
 N = sum(PLAN.sizes)
 QUICK = ["--measures", "thickness", "--formula", "group", "--contrast", "group[CN]-group[AD]"]
+EXPORT = ["--export-summary", "one"]
 HOLE = (slice(4, 7), slice(TAIL + 1, TAIL + 4))
 
 
@@ -51,7 +54,7 @@ def folder(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:  # figures as the page shows them alone
         patch.setattr(figures, "_METADATA", {"svg": {"Date": None, "Creator": None}})
         patch.setattr(write, "draw_figures", only_maps)
-        assert main([str(data), str(out), "group", "--region", REGION, *QUICK]) == 0
+        assert main([str(data), str(out), "group", "--region", REGION, *QUICK, *EXPORT]) == 0
     return out / "group" / f"thickness_group_{REGION}"
 
 
@@ -64,12 +67,14 @@ def points(folder):
     }
 
 
-@pytest.mark.parametrize("region", ["body", "headbody", "whole"])
-def test_coordinates_are_those_of_the_participant_level(region):
-    sheet = SheetSettings(y_nodes=9)
-    (x, y, _), _ = grid_levels(sheet, region)
-    for own, expected in zip(node_coordinates(sheet.model_dump(), region), (x, y), strict=True):
-        np.testing.assert_allclose(own, expected, atol=1e-9)
+@pytest.mark.parametrize("region", ["headbody", "whole"])
+@pytest.mark.parametrize("nodes", [9, 12, 21])
+def test_rows_are_of_the_part_that_the_participant_level_says(region, nodes):
+    _, y, _ = sheet_levels(SheetSettings(y_nodes=nodes), region)
+    parts = parts_of(y)
+    assert parts is not None
+    body = np.flatnonzero(parts == "body")
+    assert (body[0], body[-1]) == body_ends(region, len(y))
 
 
 def test_difference_in_the_head_is_found_and_named(folder, points):
@@ -91,9 +96,8 @@ def test_no_value_is_made_where_there_was_none(points):
         assert (n[[0, -1]] == 0).all()
         assert n[:, -1].max() == N // 2
         assert (n[5, TAIL + 1 : TAIL + 4] == 0).all()  # fewer than half have a value
-        p = table.p.to_numpy().reshape(SHAPE)
-        assert np.isnan(p[n < 2 + 3]).all()  # columns of the model, and degrees of freedom
-        assert np.isfinite(p[n > N / 2]).all()
+        assert ((n == 0) | (n >= N / 2)).all()
+        assert (np.isfinite(table.p) == (table.n > 0)).all()
 
 
 def test_what_is_experimental_is_said(folder):
@@ -109,3 +113,32 @@ def test_figures_show_how_many_have_a_value(folder):
     assert "Sheets with a value at each point" in text
     for word in ("tail", "body", "head"):
         assert f">{word}<" in text
+
+
+def test_trials_say_what_was_measured(folder):
+    out = folder.parents[1]
+    power = [*QUICK[:2], "--power", "thinning=5%", "--name", "power"]
+    assert main([str(out.parent / "bids"), str(out), "group", "--region", REGION, *power]) == 0
+    text = (out / "group/power/methods.md").read_text()
+    assert "Measures of the whole hippocampus on one sheet (experimental) [1]" in text
+    points = pd.read_csv(out / "group/power/power_points.tsv", sep="\t")
+    assert set(points.part) == {"tail", "body", "head"}
+    known = int((points[points.hemi == "L"].n > 0).sum())
+    page = group_page(out / "group/power")
+    assert re.search(rf"<td>left</td>\s*<td[^>]*>{known}</td>", page)
+
+
+def test_sites_are_combined_and_plots_name_the_part(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(write, "draw_figures", lambda *_: iter(()))
+    out = folder.parents[1]
+    one = folder / "summary.json"
+    bids, half = str(out.parent / "bids"), [f"{i:02d}" for i in range(3, N - 1)]
+    run = [bids, str(out), "group", "--region", REGION, *QUICK, "--name", "two"]
+    more = ["--export-summary", "two", "--template", str(one), "--participant-label", *half]
+    assert main([*run, *more, "--no-classification", "--no-reports"]) == 0
+    assert main(["meta", str(one), str(out / "group/two/summary.json"), str(tmp_path)]) == 0
+    forest = pd.read_csv(tmp_path / "meta/forest.tsv", sep="\t")
+    peaks = forest[forest.x.notna()]
+    assert "head" in set(peaks.part)
+    assert ((peaks.part == "head") == (peaks.y > 1)).all()
+    assert "whole hippocampus on one sheet" in (tmp_path / "meta/methods.md").read_text()

@@ -283,9 +283,10 @@ def test_cortex_has_to_reach_from_end_to_end():
 def test_edited_masks_are_about_the_body():
     volume = draw(S_SHAPE)
     mask = EditedMask(inside=np.isin(volume.tissue, volume.protocol.sheet), voxel=0.4)
-    with pytest.raises(GeometryError, match="edit the labels instead") as caught:
-        measure(replace(volume, edited_mask=mask), "L", in_region("extended"))
-    assert caught.value.reason == "edited-mask-region"
+    for region in ("extended", "whole"):
+        with pytest.raises(GeometryError, match="edit the labels instead") as caught:
+            measure(replace(volume, edited_mask=mask), "L", in_region(region))
+        assert caught.value.reason == "edited-mask-region"
 
 
 @pytest.mark.long

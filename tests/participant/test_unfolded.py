@@ -9,10 +9,10 @@ from scipy.ndimage import binary_dilation
 from scipy.spatial import Delaunay
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.participant.whole import grid_levels
+from hipsta_bids.geometry.sheet import sheet_levels
 from hipsta_bids.settings import Settings
 
-X, Y, _ = grid_levels(Settings().sheet, "whole")[0]
+X, Y, _ = sheet_levels(Settings().sheet, "whole")
 SHEET = "sub-01_hemi-{}_seg-hippunfold_label-whole_desc-sheet_morph.tsv"
 STEM = "sub-01_hemi-{}_space-T1w_den-1mm_label-hipp"
 

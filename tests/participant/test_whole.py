@@ -18,14 +18,14 @@ import hipsta_bids as hb
 from hipsta_bids.api.maps import Measurement
 from hipsta_bids.cli.main import main
 from hipsta_bids.derivatives.names import name_of_record
-from hipsta_bids.errors import GeometryError, ProtocolError
+from hipsta_bids.errors import GeometryError, NothingToDoError, ProtocolError
 from hipsta_bids.geometry.disk import find_edges, level_surface, make_disk
 from hipsta_bids.geometry.folds import find_ridges
 from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.phantom.head import RADIUS, HeadSpec, draw_head
 from hipsta_bids.protocols.load import for_region, load_protocol
 from hipsta_bids.protocols.protocol import Tissue
-from hipsta_bids.reports.cohort import read_cohort
+from hipsta_bids.reports.cohort import cohort_page, read_cohort
 from hipsta_bids.reports.participant import participant_page
 from hipsta_bids.reports.review import correction_of
 from hipsta_bids.settings import Settings
@@ -326,7 +326,8 @@ def test_mesh_and_layers_are_written(out: Path) -> None:
 
 
 def test_page_names_the_parts_and_what_has_no_value(out: Path) -> None:
-    page = participant_page(out, "01", None, read_cohort(out)) or ""
+    cohort = read_cohort(out)
+    page = participant_page(out, "01", None, cohort) or ""
     assert "whole region (experimental)" in page
     assert "Gray: no value, within 1 mm of edges, ends and holes." in page
     (data,) = re.findall(r'<script type="application/json">(\{"scales".*?)</script>', page)
@@ -335,9 +336,10 @@ def test_page_names_the_parts_and_what_has_no_value(out: Path) -> None:
     assert scene["ends"] == [10, 30]
     for part in ("tail", "body", "head"):
         assert f"{part}, " in "".join(re.findall("<figcaption>(.*?)</figcaption>", page))
-    command = correction_of(read_cohort(out).hemispheres)["command"]
+    command = correction_of(cohort.hemispheres)["command"]
     assert "participant --edited-dir EDITS --participant-label 01 --region whole" in command
     assert "nan mm" not in page
+    assert '"title": "Region"' in (cohort_page(cohort) or "")
 
 
 def test_interface_loads_the_whole_sheet(out: Path) -> None:
@@ -350,6 +352,8 @@ def test_interface_loads_the_whole_sheet(out: Path) -> None:
     np.testing.assert_array_equal(one.thickness.to_numpy(), sheet)
     axes = hb.plot_sheet(one, ax=Figure().subplots())
     assert len(axes.lines) == 2  # the ends of the body
+    with pytest.raises(NothingToDoError, match=r"there is cobralab \(region whole\)"):
+        hb.load(out)
 
 
 def test_interface_measures_head_and_body(maps: HemisphereMaps) -> None:
