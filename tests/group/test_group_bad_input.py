@@ -316,6 +316,32 @@ def test_exclusions_of_nobody_are_told(study, quick, tmp_path, capsys):
 
 
 @pytest.mark.usefixtures("without_figures")
+def test_sheets_that_no_hippocampus_has_are_left_out_by_participant_and_measure(study, capsys):
+    wrong = {
+        "01": ("thickness", "-1", "thickness reaches -1 mm"),
+        "02": ("thickness", "0", "thickness reaches 0 mm"),
+        "03": ("thickness", "10", "thickness reaches 10 mm"),
+        "04": ("thickness", "1.8", "thickness is 1.8 mm at all points"),
+        "05": ("curvature", "1e6", "curvature reaches 1e+06 1/mm"),
+        "06": ("curvature", "0", "curvature is 0 1/mm at all points"),
+    }
+    for subject, (column, value, _) in wrong.items():
+        path = place_of(study.out, subject, "L").path("sheet")
+        rows = files.read_tsv(path)
+        files.write_tsv(path, list(rows[0]), [(row | {column: value}).values() for row in rows])
+    assert main([str(study.data), str(study.out), "group", *FAST, "--name", "few"]) == 0
+    excluded = files.read_tsv(study.out / "group" / "few" / "excluded.tsv")
+    assert [(row["participant_id"], row["hemi"]) for row in excluded] == [
+        (f"sub-{subject}", "L") for subject in wrong
+    ]
+    said = capsys.readouterr().out
+    for (*_, text), row in zip(wrong.values(), excluded, strict=True):
+        assert row["reason"] == "damaged-map"
+        assert row["message"].startswith(text)
+    assert f"sub-01, hemisphere L, is left out: {wrong['01'][-1]}" in said
+
+
+@pytest.mark.usefixtures("without_figures")
 def test_damaged_hemispheres_are_left_out_by_name_and_other_versions_told(study, capsys):
     path = place_of(study.out, "05", "L").path("sheet")
     lines = [line.split("\t") for line in path.read_text().splitlines()]
