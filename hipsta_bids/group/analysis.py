@@ -342,7 +342,9 @@ def _fit_sides(
         for hemi, side in each("models", list(compared.sides.items()) if maps else [])
     }
     if comparison.asymmetry and maps:
-        both = asymmetry_maps(compared, maps, settings.asymmetry.relative)
+        # A change may be zero or of any sign: nothing to divide by.
+        relative = () if comparison.pair else settings.asymmetry.relative
+        both = asymmetry_maps(compared, maps, relative)
         contrasts = with_mean(rows.design)
         fitted[BOTH] = fit_maps(BOTH, both, rows, settings, contrasts=contrasts)
     return fitted

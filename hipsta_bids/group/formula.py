@@ -125,6 +125,12 @@ def parse_model(document: Mapping[str, Any]) -> ModelSpec:
     names = [spec.name for spec in specs]
     if twice := sorted({one for one in names if names.count(one) > 1}):
         raise _refusal(f"has contrasts of the same name: {', '.join(twice)}")
+    labels = [file_label(one) for one in names]
+    if same := [one for one in names if labels.count(file_label(one)) > 1]:
+        raise _refusal(
+            f"has contrasts whose files would have one name: {listed(same)}; leave one out, or name"
+            " them in a file for --model"
+        )
     return ModelSpec(
         name=name,
         formula=_formula(model),
@@ -226,6 +232,12 @@ def _formula(model: Mapping[str, Any]) -> str:
 
 def _refusal(what: str) -> ModelError:
     return ModelError(f"model file {what} (BIDS Stats Models {_VERSION})", reason="model-file")
+
+
+def file_label(text: str) -> str:
+    """Write a name with letters and digits only, as entities of file names require."""
+    words = "".join(c if c.isalnum() else " " for c in text.replace("+", " plus ")).split()
+    return "".join(word[:1].upper() + word[1:] for word in words)
 
 
 def check_names(names: Iterable[str], columns: pd.Index) -> None:

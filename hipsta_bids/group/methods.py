@@ -81,7 +81,7 @@ def methods_text(
     paragraphs.append(_models(analysis, settings, cite))
     paragraphs += [_joint(settings, cite)] if settings.joint.measures else []
     if analysis.comparison.asymmetry:
-        paragraphs.append(_asymmetry(settings, cite("asymmetry")))
+        paragraphs.append(_asymmetry(analysis, settings, cite))
     if analysis.scores is not None:
         paragraphs.append(_normative(analysis.scores, settings, cite("normative")))
     if analysis.pairs:
@@ -418,12 +418,14 @@ def norms_text(
     return cite.page(paragraphs)
 
 
-def _asymmetry(settings: GroupSettings, source: str) -> str:
-    relative = " and ".join(settings.asymmetry.relative) or "no map"
+def _asymmetry(analysis: Analysis, settings: GroupSettings, cite: Citations) -> str:
+    unit = "their own unit"
+    if (relative := settings.asymmetry.relative) and not analysis.comparison.pair:
+        ratio = f"{' and '.join(relative)} as (L - R) / ((L + R) / 2) {cite('asymmetry')}"
+        unit = f"{unit}, but of {ratio}"
     return (
         "Left minus right was taken at each point of the registered sheets, which are numbered"
-        f" alike on both sides; of {relative} as (L - R) / ((L + R) / 2) {source}, of other maps in"
-        " their own unit. The contrast `mean` tests it over all participants."
+        f" alike on both sides, in {unit}. The contrast `mean` tests it over all participants."
     )
 
 

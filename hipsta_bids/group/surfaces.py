@@ -147,7 +147,7 @@ def read_maps(
         maps = [read_map(path, name, hemi) for path in paths]
         _refuse_mixed(name, hemi, paths, maps)
         # The curvature of other programs may be huge at single vertices of good maps.
-        why = [why_impossible(name, m.values) if name == THICKNESS else None for m in maps]  # noqa: PD011  (no table)
+        why = [why_impossible(name, m.values) if name == THICKNESS else None for m in maps]
         lost = [(path, text) for path, text in zip(paths, why, strict=True) if text]
         notes += [f"{path}: {text}; left out" for path, text in lost]
         if len(lost) == len(maps):

@@ -237,6 +237,7 @@ def no_values(study):
         (None, ["--participant-label", "01", "02", "20", "21"], 65, "too few"),
         (None, ["--formula", "group + aeg", "--contrast", "age"], 65, "did you mean age?"),
         (None, ["--contrast", "group[XX]-group[CN]"], 65, "group[XX]"),
+        (None, ["--contrast", "age-sex[M]", "age:sex[M]"], 65, "whose files would have one name"),
         (None, ["--reference", "group=XX"], 65, "XX"),
         (None, ["--formula", "group + age + I(2*age)"], 65, "combination"),
         (None, ["--base", "volum"], 65, "did you mean volume?"),
@@ -263,6 +264,23 @@ def test_refused_in_one_line(study, capsys, spoil, options, code, words):  # noq
     assert words in error
     assert not list(out.glob("group/*"))
     assert not list(out.glob("group/.*"))
+
+
+def test_who_alone_determines_a_coefficient_leaves_no_variance(study, capsys):
+    """Rounding must not let a residual of zero pass for one that is known."""
+    rows = [
+        [*row[:3], "MF"[row[0] == "sub-30" or (row[1] == "CN" and i % 2)]]
+        for i, row in enumerate(read_participants(study.data))
+    ]
+    write_participants(study.data, rows)
+    settings = study.data / "hc3.toml"
+    settings.write_text('[glm]\ncovariance = "hc3"\n')
+    model = ["--formula", "group * sex", "--contrast", "group[T.AD]:sex[T.M]"]
+    call = [str(study.data), str(study.out), "group", *FAST, *model, "--settings", str(settings)]
+    assert main(call) == 65
+    error = capsys.readouterr().err
+    assert "a participant who alone determines a coefficient" in error
+    assert error.count("\n") == 1
 
 
 def test_failing_run_leaves_earlier_results(study):

@@ -121,18 +121,28 @@ def test_blocks_are_a_column_inside_which_the_contrast_varies(dataset, quick, ca
 
 
 def test_two_sessions_give_the_paired_t_test(sessions, quick):
-    options = [*quick, *PLAIN, "--paired", "1", "ses-3", "--formula", "1"]
+    options = [*quick, *PLAIN, "--paired", "1", "ses-3", "--formula", "1", "--asymmetry"]
     folder = run(sessions, *options)
     found = table(folder / "hemi-R_contrast-Mean_desc-thickness_statmap.tsv")
     _, out = sessions
-    maps = [
-        [
-            table(place_of(out, f"{i + 1:02d}", "R", session=session).path("sheet")).thickness
-            for i in range(sum(PLAN.sizes))
+    maps = {
+        hemi: [
+            [
+                table(place_of(out, f"{i + 1:02d}", hemi, session=session).path("sheet")).thickness
+                for i in range(sum(PLAN.sizes))
+            ]
+            for session in "13"
         ]
-        for session in "13"
-    ]
-    expected = stats.ttest_rel(maps[1], maps[0])
+        for hemi in "LR"
+    }
+    expected = stats.ttest_rel(maps["R"][1], maps["R"][0])
+    # Changes may be zero: their asymmetry is a difference, not a share.
+    change = {hemi: np.subtract(own[1], own[0]) for hemi, own in maps.items()}
+    both = table(folder / "contrast-Mean_desc-thicknessAsymmetry_statmap.tsv")
+    np.testing.assert_allclose(
+        both.statistic, stats.ttest_rel(change["L"], change["R"]).statistic, rtol=1e-6
+    )
+    assert "in their own unit. The contrast" in (folder / "methods.md").read_text()
     # Ten digits are written.
     np.testing.assert_allclose(found.statistic, expected.statistic, rtol=1e-8)
     np.testing.assert_allclose(found.p, expected.pvalue, rtol=1e-8)
