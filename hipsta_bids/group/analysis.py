@@ -195,7 +195,7 @@ def analyze_cohort(
     if comparison.longitudinal:
         rows_of = partial(longitudinal_model, table=table, time=time, settings=settings)
     rows = rows_of(design)
-    check_permutations(rows, settings)
+    check_permutations(settings)
     _check_weights(comparison, settings)
     sides = {
         hemi: register_side(cohort, hemi, groups=groups, settings=settings, templates=templates)

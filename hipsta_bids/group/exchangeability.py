@@ -21,7 +21,7 @@ _TEXT: Mapping[Exchange, str] = {
 }
 #: Length left of a vector of length 1 that is not in the span of some columns.
 _OUTSIDE = 1e-6
-#: Participants per number of visits below which too few can change places.
+#: Participants per number of visits, and block, below which too few can change places.
 _CLASS = 5
 #: Largest share of what is tested between participants where visits are exchanged within them.
 _BETWEEN = 0.1
@@ -39,19 +39,27 @@ class Visits:
     """(rows,) of each visit, any unit, if it is known."""
     slopes: bool = False
     """Whether changes over time differ between participants."""
+    blocks: Int | None = None
+    """(rows,) number of each participant's block, as of sites, in which participants stay."""
 
     def take(self, rows: Int) -> "Visits":
         """Keep some rows."""
         times = None if self.times is None else self.times[rows]
-        return replace(self, people=self.people[rows], times=times)
+        blocks = None if self.blocks is None else self.blocks[rows]
+        return replace(self, people=self.people[rows], times=times, blocks=blocks)
+
+    def classes(self) -> Int:
+        """(2, rows) number of visits of each row's participant, and the block."""
+        own = np.unique(self.people, return_inverse=True, return_counts=True)
+        blocks = np.zeros_like(self.people) if self.blocks is None else self.blocks
+        return np.stack([own[2][own[1]], blocks])
 
     def order(self, key: Float | None = None) -> Int:
-        """Rows by number of visits, participant and time; participants by keys where given."""
-        people = np.unique(self.people, return_inverse=True)[1]
-        visits = np.bincount(people)[people]
+        """Rows by class, participant and time; participants by keys where given."""
         who = self.people if key is None else key[self.people]
-        times = np.arange(len(people)) if self.times is None else self.times
-        return np.asarray(np.lexsort((times, people, who, visits)), dtype=np.int64)
+        times = np.arange(len(who)) if self.times is None else self.times
+        order = np.lexsort((times, self.people, who, *self.classes()))
+        return np.asarray(order, dtype=np.int64)
 
     def shuffle(self, basis: Float, how: Exchange, keys: Float, own: Float) -> Float:
         """Shuffle rows of a basis by uniform keys: of participants, and of single rows."""
@@ -116,7 +124,8 @@ def choose_exchange(
     inside = np.max(np.sum(means**2, axis=0) / np.sum(tested**2, axis=0)) <= _BETWEEN
     whole = _between(tested, rest, visits, changes=changes)
     if wanted == "auto":
-        counts = np.unique(np.unique(visits.people, return_counts=True)[1], return_counts=True)[1]
+        people = np.unique(visits.people, return_index=True)[1]
+        counts = np.unique(visits.classes()[:, people], axis=1, return_counts=True)[1]
         if whole and counts.mean() >= _CLASS:
             return "whole"
         return "within" if inside and not (whole or visits.slopes) else "flip"

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -11,7 +12,7 @@ from hipsta_bids.derivatives.dataset import references
 from hipsta_bids.group.analysis import Analysis
 from hipsta_bids.group.data import PARTICIPANT, Cohort
 from hipsta_bids.group.exchangeability import exchange_text
-from hipsta_bids.group.inference import PERMUTATIONS, control_fdr
+from hipsta_bids.group.inference import PERMUTATIONS, control_fdr, row_blocks
 from hipsta_bids.group.normative import Scores
 from hipsta_bids.group.norms import LEVELS, NormsFile
 from hipsta_bids.group.read import LEAST_SHARE
@@ -321,6 +322,8 @@ def _correction(how: MultiplicitySettings, cite: Callable[[str], str], analysis:
                 f" repeated visits {cite('repeated')}"
             )
             design = analysis.design
+            blocks = row_blocks(analysis.row_model, analysis.compared.table, how)
+            visits = replace(visits, blocks=blocks)
             end = exchange_text(design.matrix, design.contrasts, visits, how.visits)
         return (
             f"The family-wise error rate was held at {how.alpha:g} by {statistic} in"

@@ -231,12 +231,12 @@ def _write(chosen: _Chosen, made: _Made, notes: Iterable[str]) -> GroupResult:
         made.tables["centiles"] = table[[*first, *table.columns.drop(first)]]
     among = f" ({' '.join(request.among)})" if request.among else ""
     visits = cohort.table[people.known]
-    first = ~visits[PARTICIPANT].duplicated().to_numpy()
-    who = f"{first.sum()} participants{among}"
+    once = ~visits[PARTICIPANT].duplicated().to_numpy()
+    who = f"{once.sum()} participants{among}"
     text = norms_text(
         file,
         settings.norms,
-        who=who if first.all() else f"{who}, at {len(first)} visits,",
+        who=who if once.all() else f"{who}, at {len(once)} visits,",
         coverage=made.tables.get("coverage"),
         new=list(file.sites)[made.known :],
         controls=request.controls,
@@ -253,7 +253,7 @@ def _write(chosen: _Chosen, made: _Made, notes: Iterable[str]) -> GroupResult:
         files.write_text(folder / "methods.md", text)
         return write.write_figures(folder, _figures(made))
 
-    counts = np.bincount(people.site[people.known][first], minlength=len(file.sites)).tolist()
+    counts = np.bincount(people.site[people.known][once], minlength=len(file.sites)).tolist()
     record = {
         "hemispheres": {hemi: len(side.rows) for hemi, side in cohort.sides.items()},
         "norms": {

@@ -224,13 +224,14 @@ def test_default_model_with_a_curve_of_age_tests_it(sessions, quick):
 
 
 def test_permutations_of_repeated_visits_flip_signs_of_participants(sessions, quick):
-    options = ("--correction", "permutation-max", "--permutations", "20")
+    options = ("--correction", "permutation-max", "--permutations", "20", "--blocks", "sex")
     folder = run(sessions, *quick, *PLAIN, *options, "--longitudinal", "--measures", "thickness")
     found = table(folder / "hemi-L_contrast-TimeInAD_desc-thickness_statmap.tsv")
     # The loss of .1 mm per session is in all: none of the other signs gives as much.
     np.testing.assert_allclose(found.p_corrected * 20, (found.p_corrected * 20).round(), atol=1e-6)
     assert found.significant.mean() > 0.9
     text = (folder / "methods.md").read_text()
+    assert "permutations within levels of sex of the residuals" in text
     assert "for CN-AD, time in CN-AD, participants with as many visits changed places" in text
     assert "for time in CN, time in AD, the signs of all visits of a participant" in text
     share = re.search(r"Slopes differed between participants at (\d+)% of the points", text)
@@ -274,9 +275,9 @@ def test_asymmetry_is_left_minus_right_in_the_same_model(dataset, quick):
         (["--paired", "1", "9"], 65, "there is no session ses-9"),
         (["--paired", "1", "2", "--longitudinal"], 64, "not both"),
         (
-            ["--longitudinal", "--correction", "permutation-tfce", "--blocks", "sex"],
+            ["--longitudinal", "--correction", "permutation-tfce", "--blocks", "session_id"],
             65,
-            "leave --blocks out",
+            "changes between visits of a participant",
         ),
         (["--correction", "permutation-max", "--permutations", "1"], 64, "at least 2"),
         (["--longitudinal", "--formula", "age", "--contrast", "age,age"], 65, "rows"),
