@@ -17,10 +17,11 @@ from hipsta_bids.group.grammar import CONTEXT, closed_formula
 from hipsta_bids.group.settings import DesignSettings, GroupSettings
 
 _VERSION = "1.0.0"
-#: A weight and a name such as ``age``, ``group[CU]`` or ``group[T.CU]:age``.
+#: A weight and a name such as ``age``, ``group[CU]`` or ``group[T.CU]:age``; with blanks, columns
+#: are in backticks.
 _TERM = re.compile(
     r"\s*(?P<sign>[+-])?\s*(?:(?P<weight>\d+\.?\d*|\.\d+)\s*\*?\s*)?"
-    r"(?P<name>[^\W\d](?:[\w.:]|\[[^\]]*\]|\([^)]*\))*)"
+    r"(?P<name>(?:[^\W\d]|`[^`]+`)(?:[\w.:]|`[^`]+`|\[[^\]]*\]|\([^)]*\))*)"
 )
 
 
@@ -128,8 +129,8 @@ def parse_model(document: Mapping[str, Any]) -> ModelSpec:
     labels = [file_label(one) for one in names]
     if same := [one for one in names if labels.count(file_label(one)) > 1]:
         raise _refusal(
-            f"has contrasts whose files would have one name: {listed(same)}; leave one out, or name"
-            " them in a file for --model"
+            f"has contrasts whose files would have one name: {listed(same)}; give one"
+            " a name, as other=group[A]:age"
         )
     return ModelSpec(
         name=name,
@@ -164,11 +165,12 @@ def parse_expression(text: str) -> dict[str, float]:
         if found is None or (position and found["sign"] is None):
             raise ModelError(
                 f"contrast {text!r}: cannot read {text[position:].strip()!r}; write it as"
-                " group[A]-group[B] or 0.5*age",
+                " group[A]-group[B] or 0.5*age, and names with blanks in backticks",
                 reason="contrast-syntax",
             )
         weight = float(found["weight"] or 1) * (-1 if found["sign"] == "-" else 1)
-        weights[found["name"]] = weights.get(found["name"], 0.0) + weight
+        name = found["name"].replace("`", "")
+        weights[name] = weights.get(name, 0.0) + weight
         position = found.end()
     if not weights:
         raise ModelError("contrast: empty; name what to compare", reason="contrast-syntax")

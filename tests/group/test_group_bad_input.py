@@ -313,6 +313,18 @@ def test_table_of_a_spreadsheet_is_read(study, quick):
     assert left_out.count("\n") == 1
 
 
+def test_contrasts_name_columns_with_blanks_in_backticks(study):
+    columns = ("participant_id", "Dx group", "Alter-1", "sex")
+    write_participants(study.data, read_participants(study.data), columns)
+    model = ["--formula", "`Dx group` + `Alter-1`", "--name", "blanks", "--contrast"]
+    contrasts = ["`Dx group`[CN]-`Dx group`[AD]", "`Alter-1`"]
+    call = [str(study.data), str(study.out), "group", *FAST, *model, *contrasts]
+    assert main(call) == 0
+    maps = files.read_tsv(study.out / "group" / "blanks" / "maps.tsv")
+    assert [row["contrast"] for row in maps[:2]] == contrasts
+    assert int(maps[0]["n_significant"]) > 0  # the walls of patients are thinner
+
+
 def test_exclusions_name_one_protocol_and_region():
     name = HemisphereName(subject="01", session=None, hemi="L", seg="fs", region="extended")
     row = {"participant_id": "sub-01", "session_id": "n/a", "hemi": "L"}
