@@ -34,7 +34,8 @@ if TYPE_CHECKING:
 
 #: Meaning of the columns that no other table has.
 JOINT_COLUMNS: Mapping[str, str] = {
-    "hemi": "hemisphere, L or R; both where left and right are tested together",
+    "hemi": "hemisphere, L or R; both where left and right are tested together; LR of left"
+    " minus right",
     "statistic": "combined evidence: the normal quantile of the combined two-sided p-value, if"
     " measures were independent",
     "p": "p-value of the point by permutation, not corrected",
