@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.linalg import null_space
+from scipy.linalg import null_space, orth
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.data import Bool, Float, Int
@@ -101,6 +101,23 @@ def varies_inside(tested: Float, blocks: Int) -> bool:
     return bool(inside >= _OUTSIDE * np.abs(tested).max())
 
 
+def varies_between(tested: Float, visits: Visits) -> bool:
+    """Whether any column (rows, columns) differs between participants of a block.
+
+    What is the same curve of time in all of them does not.
+    """
+    member = visits.classes()[1][:, None] == np.unique(visits.classes()[1])
+    curves = orth(np.hstack([member * one[:, None] for one in _powers(visits, _POWERS)]))
+    return not all(spans(curves, column) for column in tested.T)
+
+
+def _powers(visits: Visits, count: int) -> list[Float]:
+    """Powers of time, from 0, (rows,) each."""
+    times = np.zeros(len(visits.people)) if visits.times is None else visits.times
+    standard = (times - times.mean()) / (float(times.std()) or 1.0)
+    return [standard**power for power in range(count)]
+
+
 def _block_means(columns: Float, blocks: Int) -> Float:
     """Mean of the block that each row is in."""
     numbers = np.unique(blocks, return_inverse=True)[1]
@@ -161,10 +178,7 @@ def _between(tested: Float, rest: Float, visits: Visits, *, changes: bool) -> bo
     """Whether what is tested differs between participants, by more than time does in all."""
     if changes and visits.times is None:
         return False
-    times = np.zeros(len(tested)) if visits.times is None else visits.times
-    spread = float(times.std()) or 1.0
-    standard = (times - times.mean()) / spread
-    common = [standard**power for power in range(_POWERS if changes else 1)]
+    common = _powers(visits, _POWERS if changes else 1)
     model = np.column_stack([tested, rest])
     kept: list[Bool | bool] = [spans(rest, one) or not spans(model, one) for one in common]
     return all(kept)

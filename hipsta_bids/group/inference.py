@@ -21,6 +21,7 @@ from hipsta_bids.group.exchangeability import (
     flip,
     spans,
     split,
+    varies_between,
     varies_inside,
 )
 from hipsta_bids.group.formula import Contrast, check_names, listed
@@ -184,7 +185,11 @@ class _Member:
             exchange = choose_exchange(matrix, contrast, visits, settings.visits)
         flips = model.tests_common_part() if exchange is None else exchange == "flip"
         if own is not None and not flips:
-            _check_blocks(matrix @ np.linalg.pinv(contrast.weights), own, contrast)
+            tested = matrix @ np.linalg.pinv(contrast.weights)
+            varies = varies_inside(tested, own)
+            if part.visits is not None and exchange == "whole":
+                varies = varies_between(tested, part.visits)
+            _check_blocks(contrast, varies=varies)
         return cls(part, model, own, exchange)
 
     def shuffled(self, keys: Float) -> Float:
@@ -260,9 +265,9 @@ def _together(members: Sequence[_Member], bases: Sequence[Float], how: str | Non
     return combine_evidence(np.stack([model.p_values(t) for model, t in own]), how)
 
 
-def _check_blocks(tested: Float, blocks: Int, contrast: Contrast) -> None:
+def _check_blocks(contrast: Contrast, *, varies: bool) -> None:
     """Refuse blocks inside which what is tested does not vary: shuffling cannot break it up."""
-    if not varies_inside(tested, blocks):
+    if not varies:
         raise ModelError(
             f"permutation: {contrast.name} does not vary inside the blocks, so that shuffling there"
             " says nothing about it; leave --blocks out, or choose larger blocks",

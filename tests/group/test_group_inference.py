@@ -279,6 +279,15 @@ def test_asymmetry_is_left_minus_right_in_the_same_model(dataset, quick):
             65,
             "changes between visits of a participant",
         ),
+        (
+            [
+                *("--longitudinal", "intercept", "--correction", "permutation-max"),
+                *("--blocks", "group", "--measures", "thickness"),
+                *("--formula", "group*time", "--contrast", "group[T.AD]:time"),
+            ],
+            65,
+            "group[T.AD]:time does not vary inside the blocks",
+        ),
         (["--correction", "permutation-max", "--permutations", "1"], 64, "at least 2"),
         (["--longitudinal", "--formula", "age", "--contrast", "age,age"], 65, "rows"),
         (["--formula", "group + age", "--age-model", "spline"], 64, "of the default model"),
