@@ -19,6 +19,7 @@ from hipsta_bids.geometry.sheet import is_left_handed, layer_depth
 from hipsta_bids.group.collect import settings_of
 from hipsta_bids.group.read import node_coordinates
 from hipsta_bids.inputs.labels import MARGIN, label_volume
+from hipsta_bids.io import files
 from hipsta_bids.io.gifti import sheet_triangles
 from hipsta_bids.io.volumes import LabelImage, read_labels
 from hipsta_bids.participant.measure import measure_hemisphere
@@ -345,10 +346,12 @@ def load(out_dir: str | Path, *, protocol: str | None = None, region: str = "bod
     -------
     Results
         ``maps``: every map of the sheet, ``subfield``, ``valid``, ``repaired`` and ``position``
-        (RAS mm of the mid-surface), by participant (``sub-01``), session (``ses-1``; ``n/a`` in
-        datasets without), side (``L``, ``R``), x and y (-1 to 1 in the body), with units; NaN
-        where there is no map. ``status`` has no x and y. ``table``: one row per hemisphere, failed
-        ones included, whose ``participant_id`` is that of ``participants.tsv``.
+        (RAS mm of the mid-surface); where they were made, SDs of ``--uncertainty``
+        (``thickness_sd``) and what ``--map`` sampled, by its name; by participant
+        (``sub-01``), session (``ses-1``; ``n/a`` in datasets without), side (``L``, ``R``), x and
+        y (-1 to 1 in the body), with units; NaN where there is no map. ``status`` has no
+        x and y. ``table``: one row per hemisphere, failed ones included, whose
+        ``participant_id`` is that of ``participants.tsv``.
 
     Raises
     ------
@@ -421,10 +424,12 @@ def _lazy_dataset(root: Path, own: list[Hemisphere], table: pd.DataFrame) -> "xr
         status[at] = word
     measured = {at: one for at, one in zip(index, own, strict=True) if one.measured}
 
+    more = _beside_sheets(list(measured.values()))
+
     def read(name: str, at: tuple[int, ...]) -> NDArray[Any] | None:
-        if at not in measured:
+        key, _ = more.get(name, (("sheet",), {}))
+        if at not in measured or not (path := measured[at].place.path(*key)).is_file():
             return None
-        path = measured[at].place.path("sheet")
         if name == "position":
             columns = read_sheet(path, tuple(POSITION), shape=shape)
             return np.stack([columns[axis] for axis in POSITION], axis=-1)
@@ -438,11 +443,11 @@ def _lazy_dataset(root: Path, own: list[Hemisphere], table: pd.DataFrame) -> "xr
         last = ("ras",) if name == "position" else ()
         inner = (*shape, *(len(POSITION) for _ in last))
         values = read_later(outer, inner, kind.get(name, np.float64), partial(read, name))
-        return (*axes, "x", "y", *last), values, attributes(name)
+        about = more[name][1] if name in more else attributes(name)
+        return (*axes, "x", "y", *last), values, about
 
-    variables: dict[str, Any] = {
-        name: variable(name) for name in (*(row.name for row in MAPS), *STATE, "position")
-    }
+    names = (*(row.name for row in MAPS), *STATE, "position", *more)
+    variables: dict[str, Any] = {name: variable(name) for name in names}
     variables["status"] = (axes, status, {"long_name": "how the hemisphere ended; empty: none"})
     coordinates = {
         **{name: ([name], values, {}) for name, values in zip(axes, labels, strict=True)},
@@ -451,3 +456,17 @@ def _lazy_dataset(root: Path, own: list[Hemisphere], table: pd.DataFrame) -> "xr
     }
     about = {"protocol": table["protocol"].iloc[0], "region": table["region"].iloc[0]}
     return make_dataset(variables, coordinates, about)
+
+
+def _beside_sheets(measured: list[Hemisphere]) -> dict[str, tuple[tuple[str, ...], dict[str, str]]]:
+    """Columns of tables of SDs and of sampled maps: their table, and what they are."""
+    maps = {entry["name"] for one in measured for entry in one.record.get("maps") or ()}
+    found = {}
+    for key in (("uncertainty",), *(("map_table", name) for name in sorted(maps))):
+        paths = (one.place.path(*key).with_suffix(".json") for one in measured)
+        path = next((path for path in paths if path.is_file()), None)
+        for name, about in files.read_json(path).items() if path else ():
+            if name.endswith("_sd") if key == ("uncertainty",) else name.partition("_")[0] in maps:
+                unit = {"units": about["Units"]} if "Units" in about else {}
+                found[name] = key, {"long_name": about["Description"], **unit}
+    return found

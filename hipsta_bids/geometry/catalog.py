@@ -147,6 +147,8 @@ class MapMeasure(Column):
     """Suffix of the GIFTI file's name."""
     desc: str | None = field(default=None, kw_only=True)
     """Description in the GIFTI file's name."""
+    possible: tuple[float, float] = field(default=(0.0, np.inf), kw_only=True)
+    """Values of any hippocampus lie between these, both excluded."""
 
 
 @dataclass(frozen=True)
@@ -173,6 +175,10 @@ class SubfieldMeasure(Column):
     """Function that returns the number; NaN for a subfield that is absent."""
 
 
+#: Curvature that no sheet reaches, 1/mm: its radius would be a hundredth of a millimeter.
+_SHARPEST = 100.0
+
+
 def _curvature(surface: str, ending: str, level: int | None) -> MapMeasure:
     """Describe the mean curvature of a level of the sheet; None is the mid-surface."""
     return MapMeasure(
@@ -184,6 +190,7 @@ def _curvature(surface: str, ending: str, level: int | None) -> MapMeasure:
         digits=5,
         suffix="curv",
         desc=ending.removeprefix("_") or None,
+        possible=(-_SHARPEST, _SHARPEST),
     )
 
 
@@ -199,6 +206,7 @@ def _gaussian_curvature(surface: str, ending: str, level: int | None) -> MapMeas
         digits=6,
         suffix="curv",
         desc="gaussian" + ending.removeprefix("_").capitalize(),
+        possible=(-(_SHARPEST**2), _SHARPEST**2),
     )
 
 
@@ -215,6 +223,7 @@ MAPS: tuple[MapMeasure, ...] = (
         "length of the line from the interior to the exterior wall",
         lambda m: m.thickness,
         suffix="thickness",
+        possible=(0.0, 10.0),
     ),
     *(_curvature(*surface) for surface in _SURFACES),
     *(_gaussian_curvature(*surface) for surface in _SURFACES),
@@ -233,6 +242,25 @@ MAPS: tuple[MapMeasure, ...] = (
         desc="extentY",
     ),
 )
+
+
+def why_impossible(name: str, values: Float) -> str | None:
+    """Say what no hippocampus has in a map of some measure, any shape; maps of others may be all.
+
+    A measure has the same value at every point only if it was not measured.
+    """
+    measure = next((row for row in MAPS if row.name == name), None)
+    known = values[np.isfinite(values)]
+    if measure is None or not known.size:
+        return None
+    least, most = float(known.min()), float(known.max())
+    worst = least if least <= measure.possible[0] else most
+    if least <= measure.possible[0] or most >= measure.possible[1]:
+        return f"{name} reaches {worst:.3g} {measure.unit}, which no sheet does"
+    if least == most and known.size > 1:
+        return f"{name} is {least:.3g} {measure.unit} at all points"
+    return None
+
 
 SECTIONS: tuple[SectionMeasure, ...] = (
     SectionMeasure(

@@ -197,7 +197,7 @@ def analyze_cohort(
     if comparison.longitudinal:
         rows_of = partial(longitudinal_model, table=table, time=time, settings=settings)
     rows = rows_of(design)
-    check_permutations(rows, settings)
+    check_permutations(settings)
     _check_weights(comparison, settings)
     sides = {
         hemi: register_side(cohort, hemi, groups=groups, settings=settings, templates=templates)
@@ -344,7 +344,9 @@ def _fit_sides(
         for hemi, side in each("models", list(compared.sides.items()) if maps else [])
     }
     if comparison.asymmetry and maps:
-        both = asymmetry_maps(compared, maps, settings.asymmetry.relative)
+        # A change may be zero or of any sign: nothing to divide by.
+        relative = () if comparison.pair else settings.asymmetry.relative
+        both = asymmetry_maps(compared, maps, relative)
         contrasts = with_mean(rows.design)
         fitted[BOTH] = fit_maps(BOTH, both, rows, settings, contrasts=contrasts)
     return fitted

@@ -305,7 +305,7 @@ def summarize(
         "axes": _AXES,
         "x": cohort.x.tolist(),
         "y": cohort.y.tolist(),
-        "asymmetry": list(settings.asymmetry.relative),
+        "asymmetry": [] if analysis.comparison.pair else list(settings.asymmetry.relative),
         "change": analysis.comparison.pair is not None,
         "align": settings.registration.align,
         "template": files.plain(templates_of(analysis.sides)),

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.linalg import null_space
+from scipy.linalg import null_space, orth
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.data import Bool, Float, Int
@@ -21,7 +21,7 @@ _TEXT: Mapping[Exchange, str] = {
 }
 #: Length left of a vector of length 1 that is not in the span of some columns.
 _OUTSIDE = 1e-6
-#: Participants per number of visits below which too few can change places.
+#: Participants per number of visits, and block, below which too few can change places.
 _CLASS = 5
 #: Largest share of what is tested between participants where visits are exchanged within them.
 _BETWEEN = 0.1
@@ -39,19 +39,27 @@ class Visits:
     """(rows,) of each visit, any unit, if it is known."""
     slopes: bool = False
     """Whether changes over time differ between participants."""
+    blocks: Int | None = None
+    """(rows,) number of each participant's block, as of sites, in which participants stay."""
 
     def take(self, rows: Int) -> "Visits":
         """Keep some rows."""
         times = None if self.times is None else self.times[rows]
-        return replace(self, people=self.people[rows], times=times)
+        blocks = None if self.blocks is None else self.blocks[rows]
+        return replace(self, people=self.people[rows], times=times, blocks=blocks)
+
+    def classes(self) -> Int:
+        """(2, rows) number of visits of each row's participant, and the block."""
+        own = np.unique(self.people, return_inverse=True, return_counts=True)
+        blocks = np.zeros_like(self.people) if self.blocks is None else self.blocks
+        return np.stack([own[2][own[1]], blocks])
 
     def order(self, key: Float | None = None) -> Int:
-        """Rows by number of visits, participant and time; participants by keys where given."""
-        people = np.unique(self.people, return_inverse=True)[1]
-        visits = np.bincount(people)[people]
+        """Rows by class, participant and time; participants by keys where given."""
         who = self.people if key is None else key[self.people]
-        times = np.arange(len(people)) if self.times is None else self.times
-        return np.asarray(np.lexsort((times, people, who, visits)), dtype=np.int64)
+        times = np.arange(len(who)) if self.times is None else self.times
+        order = np.lexsort((times, self.people, who, *self.classes()))
+        return np.asarray(order, dtype=np.int64)
 
     def shuffle(self, basis: Float, how: Exchange, keys: Float, own: Float) -> Float:
         """Shuffle rows of a basis by uniform keys: of participants, and of single rows."""
@@ -93,6 +101,23 @@ def varies_inside(tested: Float, blocks: Int) -> bool:
     return bool(inside >= _OUTSIDE * np.abs(tested).max())
 
 
+def varies_between(tested: Float, visits: Visits) -> bool:
+    """Whether any column (rows, columns) differs between participants of a block.
+
+    What is the same curve of time in all of them does not.
+    """
+    member = visits.classes()[1][:, None] == np.unique(visits.classes()[1])
+    curves = orth(np.hstack([member * one[:, None] for one in _powers(visits, _POWERS)]))
+    return not all(spans(curves, column) for column in tested.T)
+
+
+def _powers(visits: Visits, count: int) -> list[Float]:
+    """Powers of time, from 0, (rows,) each."""
+    times = np.zeros(len(visits.people)) if visits.times is None else visits.times
+    standard = (times - times.mean()) / (float(times.std()) or 1.0)
+    return [standard**power for power in range(count)]
+
+
 def _block_means(columns: Float, blocks: Int) -> Float:
     """Mean of the block that each row is in."""
     numbers = np.unique(blocks, return_inverse=True)[1]
@@ -116,7 +141,8 @@ def choose_exchange(
     inside = np.max(np.sum(means**2, axis=0) / np.sum(tested**2, axis=0)) <= _BETWEEN
     whole = _between(tested, rest, visits, changes=changes)
     if wanted == "auto":
-        counts = np.unique(np.unique(visits.people, return_counts=True)[1], return_counts=True)[1]
+        people = np.unique(visits.people, return_index=True)[1]
+        counts = np.unique(visits.classes()[:, people], axis=1, return_counts=True)[1]
         if whole and counts.mean() >= _CLASS:
             return "whole"
         return "within" if inside and not (whole or visits.slopes) else "flip"
@@ -152,10 +178,7 @@ def _between(tested: Float, rest: Float, visits: Visits, *, changes: bool) -> bo
     """Whether what is tested differs between participants, by more than time does in all."""
     if changes and visits.times is None:
         return False
-    times = np.zeros(len(tested)) if visits.times is None else visits.times
-    spread = float(times.std()) or 1.0
-    standard = (times - times.mean()) / spread
-    common = [standard**power for power in range(_POWERS if changes else 1)]
+    common = _powers(visits, _POWERS if changes else 1)
     model = np.column_stack([tested, rest])
     kept: list[Bool | bool] = [spans(rest, one) or not spans(model, one) for one in common]
     return all(kept)

@@ -17,10 +17,11 @@ from hipsta_bids.group.grammar import CONTEXT, closed_formula
 from hipsta_bids.group.settings import DesignSettings, GroupSettings
 
 _VERSION = "1.0.0"
-#: A weight and a name such as ``age``, ``group[CU]`` or ``group[T.CU]:age``.
+#: A weight and a name such as ``age``, ``group[CU]`` or ``group[T.CU]:age``; with blanks, columns
+#: are in backticks.
 _TERM = re.compile(
     r"\s*(?P<sign>[+-])?\s*(?:(?P<weight>\d+\.?\d*|\.\d+)\s*\*?\s*)?"
-    r"(?P<name>[^\W\d](?:[\w.:]|\[[^\]]*\]|\([^)]*\))*)"
+    r"(?P<name>(?:[^\W\d]|`[^`]+`)(?:[\w.:]|`[^`]+`|\[[^\]]*\]|\([^)]*\))*)"
 )
 
 
@@ -125,6 +126,12 @@ def parse_model(document: Mapping[str, Any]) -> ModelSpec:
     names = [spec.name for spec in specs]
     if twice := sorted({one for one in names if names.count(one) > 1}):
         raise _refusal(f"has contrasts of the same name: {', '.join(twice)}")
+    labels = [file_label(one) for one in names]
+    if same := [one for one in names if labels.count(file_label(one)) > 1]:
+        raise _refusal(
+            f"has contrasts whose files would have one name: {listed(same)}; give one"
+            " a name, as other=group[A]:age"
+        )
     return ModelSpec(
         name=name,
         formula=_formula(model),
@@ -158,11 +165,12 @@ def parse_expression(text: str) -> dict[str, float]:
         if found is None or (position and found["sign"] is None):
             raise ModelError(
                 f"contrast {text!r}: cannot read {text[position:].strip()!r}; write it as"
-                " group[A]-group[B] or 0.5*age",
+                " group[A]-group[B] or 0.5*age, and names with blanks in backticks",
                 reason="contrast-syntax",
             )
         weight = float(found["weight"] or 1) * (-1 if found["sign"] == "-" else 1)
-        weights[found["name"]] = weights.get(found["name"], 0.0) + weight
+        name = found["name"].replace("`", "")
+        weights[name] = weights.get(name, 0.0) + weight
         position = found.end()
     if not weights:
         raise ModelError("contrast: empty; name what to compare", reason="contrast-syntax")
@@ -226,6 +234,12 @@ def _formula(model: Mapping[str, Any]) -> str:
 
 def _refusal(what: str) -> ModelError:
     return ModelError(f"model file {what} (BIDS Stats Models {_VERSION})", reason="model-file")
+
+
+def file_label(text: str) -> str:
+    """Write a name with letters and digits only, as entities of file names require."""
+    words = "".join(c if c.isalnum() else " " for c in text.replace("+", " plus ")).split()
+    return "".join(word[:1].upper() + word[1:] for word in words)
 
 
 def check_names(names: Iterable[str], columns: pd.Index) -> None:

@@ -280,7 +280,7 @@ def fit_block(
     sigma = np.sqrt(squares / np.where(usable, n - columns, 1))
     sigma[~usable] = np.nan
     if settings.covariance == "hc3" or weights is not None:
-        covariance = _hc3(residuals, basis, inverse, weights)
+        covariance = _hc3(residuals, basis, inverse, present, weights)
     else:
         covariance = inverse * (sigma**2)[:, None, None]
     return PointBlock(
@@ -291,7 +291,9 @@ def fit_block(
     )
 
 
-def _hc3(residuals: Float, basis: Float, inverse: Float, weights: Float | None) -> Float:
+def _hc3(
+    residuals: Float, basis: Float, inverse: Float, present: Bool, weights: Float | None
+) -> Float:
     """Sandwich covariance with residuals over (1 - leverage) (MacKinnon and White 1985).
 
     NaN where one subject alone determines a coefficient.
@@ -299,7 +301,7 @@ def _hc3(residuals: Float, basis: Float, inverse: Float, weights: Float | None) 
     leverage = np.einsum("psi,si->sp", basis @ inverse, basis)
     if weights is not None:
         leverage, residuals = weights * leverage, weights * residuals
-    alone = (1 - leverage < np.sqrt(np.finfo(np.float64).eps)) & (residuals != 0)
+    alone = (1 - leverage < np.sqrt(np.finfo(np.float64).eps)) & present
     weights = np.where(alone, np.nan, residuals / np.where(alone, 1.0, 1 - leverage)) ** 2
     products = (basis[:, :, None] * basis[:, None, :]).reshape(len(basis), -1)
     meat = (weights.T @ products).reshape(inverse.shape)
@@ -510,6 +512,13 @@ def fit_maps(
             raise ModelError(
                 f"hemisphere {hemi}: no point of the {name} maps has enough values for the model;"
                 " look at the sheets, or use a smaller model",
+                reason="all-points-invalid",
+            )
+        if fit.tests and not any(np.isfinite(test.se).any() for test in fit.tests):
+            raise ModelError(
+                f"hemisphere {hemi}: a participant who alone determines a coefficient of the model"
+                f" leaves no HC3 standard error at any point of the {name} maps; use a smaller"
+                " model, or leave glm.covariance or the weights out",
                 reason="all-points-invalid",
             )
     return FittedMaps(

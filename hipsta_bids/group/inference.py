@@ -21,6 +21,7 @@ from hipsta_bids.group.exchangeability import (
     flip,
     spans,
     split,
+    varies_between,
     varies_inside,
 )
 from hipsta_bids.group.formula import Contrast, check_names, listed
@@ -177,11 +178,18 @@ class _Member:
             )
         model = _Model.build(maps, matrix, contrast)
         own = None if blocks is None else blocks[part.subjects]
-        if own is not None and not model.tests_common_part():
-            _check_blocks(matrix @ np.linalg.pinv(contrast.weights), own, contrast)
         exchange = None
         if part.visits is not None:
-            exchange = choose_exchange(matrix, contrast, part.visits, settings.visits)
+            visits = replace(part.visits, blocks=own)
+            part = replace(part, visits=visits)
+            exchange = choose_exchange(matrix, contrast, visits, settings.visits)
+        flips = model.tests_common_part() if exchange is None else exchange == "flip"
+        if own is not None and not flips:
+            tested = matrix @ np.linalg.pinv(contrast.weights)
+            varies = varies_inside(tested, own)
+            if part.visits is not None and exchange == "whole":
+                varies = varies_between(tested, part.visits)
+            _check_blocks(contrast, varies=varies)
         return cls(part, model, own, exchange)
 
     def shuffled(self, keys: Float) -> Float:
@@ -257,9 +265,9 @@ def _together(members: Sequence[_Member], bases: Sequence[Float], how: str | Non
     return combine_evidence(np.stack([model.p_values(t) for model, t in own]), how)
 
 
-def _check_blocks(tested: Float, blocks: Int, contrast: Contrast) -> None:
+def _check_blocks(contrast: Contrast, *, varies: bool) -> None:
     """Refuse blocks inside which what is tested does not vary: shuffling cannot break it up."""
-    if not varies_inside(tested, blocks):
+    if not varies:
         raise ModelError(
             f"permutation: {contrast.name} does not vary inside the blocks, so that shuffling there"
             " says nothing about it; leave --blocks out, or choose larger blocks",
@@ -426,7 +434,7 @@ def correct_joint(
     how = settings.multiplicity
     if how.method not in PERMUTATIONS:
         how = how.changed(method=_MAXIMUM)
-    blocks = _blocks(model, table, how)
+    blocks = row_blocks(model, table, how)
     found: dict[MapKey, tuple[PermutationTest, Discoveries]] = {}
     together = families(groups, how.scope)
     for number, keys in enumerate(together):
@@ -471,8 +479,8 @@ def correct(
     }
     if how.method not in PERMUTATIONS:
         return discover({key: test.p for key, test in tests.items()}, how)
-    check_permutations(model, settings)
-    blocks = _blocks(model, table, how)
+    check_permutations(settings)
+    blocks = row_blocks(model, table, how)
     found: dict[MapKey, Discoveries] = {}
     together = families(tests, how.scope)
     for number, keys in enumerate(together):
@@ -489,15 +497,10 @@ def correct(
     return {key: found[key] for key in tests}
 
 
-def check_permutations(model: RowModel, settings: GroupSettings) -> None:
+def check_permutations(settings: GroupSettings) -> None:
     """Refuse permutations where rows cannot be exchanged."""
     if settings.multiplicity.method not in PERMUTATIONS and not settings.joint.measures:
         return
-    if model.visits is not None and settings.multiplicity.blocks:
-        raise ModelError(
-            "permutations: repeated visits are themselves the blocks; leave --blocks out",
-            reason="permutation-model",
-        )
     if settings.glm.covariance != "ordinary":
         raise ModelError(
             "permutations assume equal variances; set glm.covariance to ordinary",
@@ -505,7 +508,7 @@ def check_permutations(model: RowModel, settings: GroupSettings) -> None:
         )
 
 
-def _blocks(model: RowModel, table: pd.DataFrame, how: MultiplicitySettings) -> Int | None:
+def row_blocks(model: RowModel, table: pd.DataFrame, how: MultiplicitySettings) -> Int | None:
     """Return the number of each row's block, or None without blocks."""
     if not how.blocks:
         return None
@@ -517,7 +520,15 @@ def _blocks(model: RowModel, table: pd.DataFrame, how: MultiplicitySettings) -> 
             f" {listed(own.index[own.isna()])}",
             reason="permutation-blocks",
         )
-    return np.asarray(np.unique(own.astype(str), return_inverse=True)[1], dtype=np.int64)
+    blocks = np.unique(own.astype(str), return_inverse=True)[1]
+    people = None if model.visits is None else model.visits.people
+    if people is not None and len(np.unique([people, blocks], axis=1).T) > len(np.unique(people)):
+        raise ModelError(
+            f"permutations: {how.blocks!r} of --blocks changes between visits of a participant;"
+            " choose a column that does not",
+            reason="permutation-blocks",
+        )
+    return np.asarray(blocks, dtype=np.int64)
 
 
 def _permuted_discoveries(

@@ -11,6 +11,7 @@ import pandas as pd
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.analysis import Analysis
 from hipsta_bids.group.clusters import Cluster, edges_of, find_clusters, frame_of
+from hipsta_bids.group.comparison import BOTH, Comparison, asymmetry_name
 from hipsta_bids.group.data import Cohort
 from hipsta_bids.group.glm import FittedMaps, PointTest
 from hipsta_bids.group.inference import Discoveries, MapKey, PermutationTest, correct_joint
@@ -33,7 +34,8 @@ if TYPE_CHECKING:
 
 #: Meaning of the columns that no other table has.
 JOINT_COLUMNS: Mapping[str, str] = {
-    "hemi": "hemisphere, L or R; both where left and right are tested together",
+    "hemi": "hemisphere, L or R; both where left and right are tested together; LR of left"
+    " minus right",
     "statistic": "combined evidence: the normal quantile of the combined two-sided p-value, if"
     " measures were independent",
     "p": "p-value of the point by permutation, not corrected",
@@ -74,8 +76,9 @@ class JointMap:
         }
 
 
-def check_joint(known: Sequence[str], settings: GroupSettings) -> None:
+def check_joint(known: Sequence[str], comparison: Comparison, settings: GroupSettings) -> None:
     """Refuse measures that cannot be tested together, before anything is fitted."""
+    known = [*known, *(asymmetry_name(name) for name in known if comparison.asymmetry)]
     names, sides = settings.joint.measures, settings.joint.sides
     what = None
     if unknown := [name for name in names if name not in known]:
@@ -101,11 +104,15 @@ def combine_maps(analyses: Sequence[Analysis], settings: GroupSettings) -> dict[
     fits = {
         (m, hemi): one for each in analyses for hemi, one in each.fitted.items() for m in one.fits
     }
-    cohort = next(each.compared for each in analyses if names[0] in each.measured.maps)
+    cohort = next(
+        each.compared
+        for each in analyses
+        if any(names[0] in one.fits for one in each.fitted.values())
+    )
     groups: dict[MapKey, list[tuple[FittedMaps, str]]] = {}
     titles: dict[MapKey, list[str]] = {}
     contrasts = {}
-    for hemis in [("L", "R")] if sides else [("L",), ("R",)]:
+    for hemis in [("L", "R")] if sides else [("L",), ("R",), (BOTH,)]:
         own = [(fits.get((name, hemi)), name, hemi) for hemi, name in product(hemis, names)]
         parts = [(one, name) for one, name, _ in own if one is not None]
         if len(parts) < len(own):

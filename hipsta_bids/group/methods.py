@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -11,7 +12,7 @@ from hipsta_bids.derivatives.dataset import references
 from hipsta_bids.group.analysis import Analysis
 from hipsta_bids.group.data import PARTICIPANT, Cohort
 from hipsta_bids.group.exchangeability import exchange_text
-from hipsta_bids.group.inference import PERMUTATIONS, control_fdr
+from hipsta_bids.group.inference import PERMUTATIONS, control_fdr, row_blocks
 from hipsta_bids.group.normative import Scores
 from hipsta_bids.group.norms import LEVELS, NormsFile
 from hipsta_bids.group.read import LEAST_SHARE
@@ -82,7 +83,7 @@ def methods_text(
     paragraphs.append(_models(analysis, settings, cite))
     paragraphs += [_joint(settings, cite)] if settings.joint.measures else []
     if analysis.comparison.asymmetry:
-        paragraphs.append(_asymmetry(settings, cite("asymmetry")))
+        paragraphs.append(_asymmetry(analysis, settings, cite))
     if analysis.scores is not None:
         paragraphs.append(_normative(analysis.scores, settings, cite("normative")))
     if analysis.pairs:
@@ -322,6 +323,8 @@ def _correction(how: MultiplicitySettings, cite: Callable[[str], str], analysis:
                 f" repeated visits {cite('repeated')}"
             )
             design = analysis.design
+            blocks = row_blocks(analysis.row_model, analysis.compared.table, how)
+            visits = replace(visits, blocks=blocks)
             end = exchange_text(design.matrix, design.contrasts, visits, how.visits)
         return (
             f"The family-wise error rate was held at {how.alpha:g} by {statistic} in"
@@ -419,12 +422,14 @@ def norms_text(
     return cite.page(paragraphs, file.region)
 
 
-def _asymmetry(settings: GroupSettings, source: str) -> str:
-    relative = " and ".join(settings.asymmetry.relative) or "no map"
+def _asymmetry(analysis: Analysis, settings: GroupSettings, cite: Citations) -> str:
+    unit = "their own unit"
+    if (relative := settings.asymmetry.relative) and not analysis.comparison.pair:
+        ratio = f"{' and '.join(relative)} as (L - R) / ((L + R) / 2) {cite('asymmetry')}"
+        unit = f"{unit}, but of {ratio}"
     return (
         "Left minus right was taken at each point of the registered sheets, which are numbered"
-        f" alike on both sides; of {relative} as (L - R) / ((L + R) / 2) {source}, of other maps in"
-        " their own unit. The contrast `mean` tests it over all participants."
+        f" alike on both sides, in {unit}. The contrast `mean` tests it over all participants."
     )
 
 

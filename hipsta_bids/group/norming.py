@@ -14,8 +14,9 @@ from hipsta_bids.derivatives import dataset
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group import write
 from hipsta_bids.group.analysis import SideResult, templates_of
-from hipsta_bids.group.comparison import BOTH
-from hipsta_bids.group.data import Bool, Cohort, Float, Int, Key
+from hipsta_bids.group.comparison import BOTH, Comparison
+from hipsta_bids.group.covariates import FIRST_AGE
+from hipsta_bids.group.data import PARTICIPANT, Bool, Cohort, Float, Int, Key
 from hipsta_bids.group.figures import Drawing, deviation_rows, draw_norms, norm_rows
 from hipsta_bids.group.formula import check_names, level_labels, listed, typed
 from hipsta_bids.group.glm import most_frequent
@@ -136,16 +137,24 @@ def _score_people(
     """Score people by the norms of a file."""
     file, norms = load_norms(path)
     known = len(file.sites)
-    options = replace(options, measures=options.measures or tuple({m: 0 for _, m in norms}))
+    measures = options.measures or tuple({m: 0 for _, m in norms})
+    every = Comparison(longitudinal=True)  # each visit has a score
+    options = replace(options, measures=measures, comparison=every)
     settings = settings.changed(registration=file.registration)
     chosen = _choose(options, request, settings)
-    notes = _check(file, path, chosen.inputs)
+    notes, table = _check(file, path, chosen.inputs), chosen.cohort.table
+    again = table.duplicated([PARTICIPANT, *({file.site} & set(table.columns))])
+    if again.any() and FIRST_AGE not in table:
+        notes.append(
+            f"{file.age} is the same in all sessions of a participant; give that of each session in"
+            " sessions.tsv, as later visits are scored for too young an age"
+        )
     people = _people(chosen, file)
     if not people.known.any():
         why = "; ".join(dict.fromkeys(message for _, message in chosen.left_out.values()))
         raise ModelError(f"{path}: nobody here can be scored: {why}", reason="norms-differ")
-    everyone = members(chosen.cohort.table, request.controls, "--controls")
-    controls = everyone & (request.controls is not None)
+    everyone = members(table, request.controls, "--controls")
+    controls = everyone & (request.controls is not None) & ~again.to_numpy()
     file = _with_new_sites(chosen, file, people, controls)
     templates = None if file.template is None else templates_from_json(file.template, str(path))
     sides, cohorts, found = _registered(chosen, templates)
@@ -221,10 +230,13 @@ def _write(chosen: _Chosen, made: _Made, notes: Iterable[str]) -> GroupResult:
         first = ["hemi", "measure", "unit"]
         made.tables["centiles"] = table[[*first, *table.columns.drop(first)]]
     among = f" ({' '.join(request.among)})" if request.among else ""
+    visits = cohort.table[people.known]
+    once = ~visits[PARTICIPANT].duplicated().to_numpy()
+    who = f"{once.sum()} participants{among}"
     text = norms_text(
         file,
         settings.norms,
-        who=f"{people.known.sum()} participants{among}",
+        who=who if once.all() else f"{who}, at {len(once)} visits,",
         coverage=made.tables.get("coverage"),
         new=list(file.sites)[made.known :],
         controls=request.controls,
@@ -241,7 +253,7 @@ def _write(chosen: _Chosen, made: _Made, notes: Iterable[str]) -> GroupResult:
         files.write_text(folder / "methods.md", text)
         return write.write_figures(folder, _figures(made))
 
-    counts = np.bincount(people.site[people.known], minlength=len(file.sites)).tolist()
+    counts = np.bincount(people.site[people.known][once], minlength=len(file.sites)).tolist()
     record = {
         "hemispheres": {hemi: len(side.rows) for hemi, side in cohort.sides.items()},
         "norms": {
@@ -258,11 +270,13 @@ def _write(chosen: _Chosen, made: _Made, notes: Iterable[str]) -> GroupResult:
     }
     name = folder_of(["norms" if request.file is None else "scores"], request.among)
     notes = [*chosen.inputs.notes, *notes]
+    if later := sum(one.reason == "later-session" for one in chosen.inputs.exclusions):
+        notes.append(f"{later} later sessions are not in the norms, which take first ones")
     if file.site not in cohort.table:
         notes.append(f"no column {file.site!r}: all are taken to be at one, {_NO_SITE!r}")
     return write_answer(
         chosen.options, name, chosen.inputs, settings, left_out=chosen.left_out, notes=notes,
-        visits=cohort.table[people.known], tables=made.tables, record=record, fill=fill,
+        visits=visits, tables=made.tables, record=record, fill=fill,
     )  # fmt: skip
 
 

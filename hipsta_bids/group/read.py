@@ -17,7 +17,7 @@ from hipsta_bids.derivatives.hemisphere import (
     spread_name,
 )
 from hipsta_bids.errors import InputError
-from hipsta_bids.geometry.catalog import MAPS
+from hipsta_bids.geometry.catalog import MAPS, why_impossible
 from hipsta_bids.geometry.sheet import sheet_levels
 from hipsta_bids.group.collect import Exclusion, SheetRecord
 from hipsta_bids.group.data import MOST_KEPT, PARTICIPANT, SESSION, Float, Measures, SideMaps
@@ -197,14 +197,8 @@ def _damage(side: SideMaps, i: int, rules: GroupSettings) -> str | None:
         return f"{gap:.0%} of the curvature profile has no value"
     if THICKNESS in side.maps and not np.isfinite(side.maps[THICKNESS][i]).any():
         return "no point of the thickness map has a value"
-    for name, most, unit in (
-        (CURVATURE, rules.design.largest_curvature, "1/mm"),
-        (THICKNESS, rules.design.largest_thickness, "mm"),
-    ):
-        worst = float(np.nanmax(np.abs(side.maps[name][i]))) if name in side.maps else 0.0
-        if worst > most:
-            return f"{name} reaches {worst:.3g} {unit}, which no sheet does"
-    return None
+    found = (why_impossible(name, values[i]) for name, values in side.maps.items())
+    return next((text for text in found if text), None)
 
 
 def _check_errors(records: Sequence[SheetRecord], maps: Sequence[str]) -> None:

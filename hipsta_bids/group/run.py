@@ -161,7 +161,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
     dataset.check_own_dataset(options.out_dir)
     tell("reading")
     inputs = read_inputs(options, settings)
-    check_joint([*inputs.measures.maps, *inputs.others], settings)
+    check_joint([*inputs.measures.maps, *inputs.others], options.comparison, settings)
     cohort = inputs.cohort
     references, groups = choose_references(options.model, cohort.table, settings)
     document = model_document(

@@ -114,11 +114,6 @@ class DesignSettings(SettingsTable):
     )
     """Numbers that often stand for missing ones; refused where they are farther from all other
     values than these are from each other."""
-    largest_thickness: PositiveFloat = 20.0
-    """Hemispheres with a thickness beyond this, mm, are left out: no wall of a hippocampus is a
-    third as thick, so that the file is damaged."""
-    largest_curvature: PositiveFloat = 100.0
-    """Likewise mean curvature, 1/mm, of either sign."""
     farthest: PositiveFloat = 1e4
     """Numbers farther than this from the median, in ranges between quartiles, are refused."""
 

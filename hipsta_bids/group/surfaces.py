@@ -10,9 +10,9 @@ import numpy as np
 import pandas as pd
 
 from hipsta_bids.errors import InputError, NothingToDoError, UsageError
-from hipsta_bids.geometry.catalog import MAPS
+from hipsta_bids.geometry.catalog import MAPS, why_impossible
 from hipsta_bids.group.data import Cohort, Int, SideMaps
-from hipsta_bids.group.read import CURVATURE, Measured
+from hipsta_bids.group.read import CURVATURE, THICKNESS, Measured
 from hipsta_bids.inputs.maps import Found, check_pattern, fields_of, fill, find, scan
 from hipsta_bids.io.files import entities
 from hipsta_bids.io.gifti import DENSE_SCALARS, PointMap, cifti_sides, read_map, read_mesh
@@ -134,18 +134,26 @@ def _sessions(one: Found, known: Mapping[str, Sequence[str | None]]) -> Sequence
 
 def read_maps(
     found: ExternalFiles, visits: Sequence[VisitKey], grid: tuple[int, int], *, with_sheets: bool
-) -> tuple[dict[str, SideMaps], str]:
-    """Read one map of all hemispheres, by rows of visits, and its unit.
+) -> tuple[dict[str, SideMaps], str, list[str]]:
+    """Read one map of all hemispheres, by rows of visits, its unit, and notes of impossible ones.
 
     On the regular grid of sheets there is no mesh; without sheets, files may have their own grid.
     """
     row_of = {visit: row for row, visit in enumerate(visits)}
-    name, sides, units = found.request.name, {}, []
+    name, sides, units, notes = found.request.name, {}, [], list[str]()
     for hemi, path_of in found.files.items():
         own = sorted(path_of, key=row_of.__getitem__)
         paths = [path_of[visit] for visit in own]
         maps = [read_map(path, name, hemi) for path in paths]
         _refuse_mixed(name, hemi, paths, maps)
+        # The curvature of other programs may be huge at single vertices of good maps.
+        why = [why_impossible(name, m.values) if name == THICKNESS else None for m in maps]
+        lost = [(path, text) for path, text in zip(paths, why, strict=True) if text]
+        notes += [f"{path}: {text}; left out" for path, text in lost]
+        if len(lost) == len(maps):
+            raise InputError(f"--maps {name}: {notes[-1]}, as are all", reason="all-points-invalid")
+        own = [visit for visit, text in zip(own, why, strict=True) if not text]
+        maps = [one for one, text in zip(maps, why, strict=True) if not text]
         first, points = maps[0], len(maps[0].values)
         nodes = first.nodes if first.nodes is not None and not with_sheets else grid
         mesh = None if first.nodes == nodes else _mesh(found, hemi, points)
@@ -161,7 +169,7 @@ def read_maps(
         side = _empty(np.array([row_of[visit] for visit in own], dtype=np.int64), shape)
         sides[hemi] = replace(side, maps={name: values}, mesh=mesh)
         units.append(first.unit)
-    return sides, units[0]
+    return sides, units[0], notes
 
 
 def _empty(rows: Int, shape: tuple[int, int]) -> SideMaps:
@@ -273,7 +281,8 @@ def add_external(
     maps, units, notes = {}, dict(measured.units), []
     for one in found:
         name = one.request.name
-        maps[name], units[name] = read_maps(one, visits, grid, with_sheets=with_sheets)
+        maps[name], units[name], left_out = read_maps(one, visits, grid, with_sheets=with_sheets)
+        notes += left_out
         counts = ", ".join(f"{len(side.rows)} {hemi}" for hemi, side in maps[name].items())
         points = ", ".join(str(np.prod(side.shape)) for side in maps[name].values())
         notes.append(f"maps {name}: {counts} of {len(visits)} visits, {points} points")

@@ -29,6 +29,7 @@ from hipsta_bids.group.clusters import (
     test_columns,
 )
 from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float
+from hipsta_bids.group.formula import file_label
 from hipsta_bids.group.harmonize import Harmonization
 from hipsta_bids.group.inference import control_fdr
 from hipsta_bids.group.registration import ShiftDifference
@@ -95,7 +96,7 @@ def design_table(analysis: Analysis) -> pd.DataFrame:
 
 def map_name(hemi: str, measure: str, contrast: str) -> str:
     """Name the files of one map of statistics, without suffix and extension."""
-    label = _label(contrast) or "contrast"
+    label = file_label(contrast) or "contrast"
     # BIDS knows L and R only: what is made of both has no hemisphere in its name.
     side = f"hemi-{hemi}_" if hemi in {"L", "R"} else ""
     return f"{side}contrast-{label}_desc-{entity_label(measure)}_statmap"
@@ -103,13 +104,7 @@ def map_name(hemi: str, measure: str, contrast: str) -> str:
 
 def entity_label(measure: str) -> str:
     """Write a measure as the value of an entity: ``mean_x`` as ``meanX``."""
-    return measure[:1] + _label(measure)[1:]
-
-
-def _label(text: str) -> str:
-    """Write a name with letters and digits only, as entities require."""
-    words = "".join(c if c.isalnum() else " " for c in text).split()
-    return "".join(word[:1].upper() + word[1:] for word in words)
+    return measure[:1] + file_label(measure)[1:]
 
 
 def _stacked(blocks: Iterable[Columns]) -> pd.DataFrame:

@@ -10,15 +10,25 @@ from measured_phantoms import measured, spiral
 import hipsta_bids as hb
 from hipsta_bids.api import maps as api_maps
 from hipsta_bids.derivatives import dataset
-from hipsta_bids.derivatives.hemisphere import ResultPlace, write_failure, write_results
+from hipsta_bids.derivatives.hemisphere import (
+    ResultPlace,
+    write_failure,
+    write_results,
+    write_spread,
+)
 from hipsta_bids.derivatives.names import HemisphereName
 from hipsta_bids.errors import GeometryError, HipstaError, InputError, ProtocolError
+from hipsta_bids.geometry.sampling import SampledMap
+from hipsta_bids.inputs.scan import MapSource
+from hipsta_bids.io import files
+from hipsta_bids.participant.maps import write_map
 from hipsta_bids.phantom import encode
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.settings import Settings
 
 CASES = {side: measured(spiral(), hemi=side, voxel=0.5) for side in "LR"}
 LEFT = CASES["L"]
+SECOND = HemisphereName(subject="02", session=None, hemi="L", seg="freesurfer")
 
 
 @pytest.fixture(scope="module")
@@ -160,6 +170,26 @@ class TestLoad:
             assert row["volume"].item() == pytest.approx(case.maps.summary["volume"], abs=1e-3)
         assert maps.thickness.attrs["units"] == "mm"
         assert maps.x.to_numpy()[-1] == 0.9
+
+    def test_uncertainty_and_sampled_maps_are_beside_them(self, tmp_path):
+        dataset.settle_settings(tmp_path, Settings())
+        write(tmp_path, "01", "L")
+        write(tmp_path, "02", "L")
+        maps = CASES["L"].maps
+        place = ResultPlace(root=tmp_path, name=SECOND)
+        write_spread(place, {n: 0.1 + 0 * m for n, m in maps.maps.items()}, {}, 8)
+        values = np.stack([maps.thickness, -maps.thickness], axis=2)
+        source = MapSource(name="bold", sampling="mid", interpolation="linear", path=None)
+        write_map(place, source, SampledMap(values=values, outside=0, unknown=0), {"Name": "bold"})
+        record = files.read_json(place.path("qc"))
+        files.write_json(place.path("qc"), record | {"maps": [{"name": "bold"}]})
+        found = hb.load(tmp_path).maps.sel(side="L").squeeze("session")
+        known = found.sel(participant="sub-02")
+        np.testing.assert_allclose(known.bold_2, -maps.thickness, rtol=1e-6)
+        np.testing.assert_allclose(known.thickness_sd, 0.1 + 0 * maps.thickness, atol=1e-9)
+        assert found.thickness_sd.attrs["units"] == "mm"
+        assert "volume 2 of the source" in found.bold_2.attrs["long_name"]
+        assert np.isnan(found.bold_1.sel(participant="sub-01")).all()
 
     def test_what_failed_or_is_not_there_is_missing(self, out):
         maps, table = hb.load(out)

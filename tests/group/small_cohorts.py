@@ -84,6 +84,7 @@ def write_sessions(folder, cohort, losses, *, noise, column, times, lacking=()):
                 continue
             for hemi in "LR":
                 wall = cohort.thickness[i] - loss * year + noise * random.standard_normal(NODES)
+                wall = np.maximum(wall, 0.1)
                 bend = cohort.curvature[i] + 0.01 * random.standard_normal(NODES)
                 place = place_of(out, subject, hemi, session=session)
                 volume = 500 + 3 * i - 5 * year + random.random()

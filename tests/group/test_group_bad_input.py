@@ -237,6 +237,7 @@ def no_values(study):
         (None, ["--participant-label", "01", "02", "20", "21"], 65, "too few"),
         (None, ["--formula", "group + aeg", "--contrast", "age"], 65, "did you mean age?"),
         (None, ["--contrast", "group[XX]-group[CN]"], 65, "group[XX]"),
+        (None, ["--contrast", "age-sex[M]", "age:sex[M]"], 65, "whose files would have one name"),
         (None, ["--reference", "group=XX"], 65, "XX"),
         (None, ["--formula", "group + age + I(2*age)"], 65, "combination"),
         (None, ["--base", "volum"], 65, "did you mean volume?"),
@@ -263,6 +264,23 @@ def test_refused_in_one_line(study, capsys, spoil, options, code, words):  # noq
     assert words in error
     assert not list(out.glob("group/*"))
     assert not list(out.glob("group/.*"))
+
+
+def test_who_alone_determines_a_coefficient_leaves_no_variance(study, capsys):
+    """Rounding must not let a residual of zero pass for one that is known."""
+    rows = [
+        [*row[:3], "MF"[row[0] == "sub-30" or (row[1] == "CN" and i % 2)]]
+        for i, row in enumerate(read_participants(study.data))
+    ]
+    write_participants(study.data, rows)
+    settings = study.data / "hc3.toml"
+    settings.write_text('[glm]\ncovariance = "hc3"\n')
+    model = ["--formula", "group * sex", "--contrast", "group[T.AD]:sex[T.M]"]
+    call = [str(study.data), str(study.out), "group", *FAST, *model, "--settings", str(settings)]
+    assert main(call) == 65
+    error = capsys.readouterr().err
+    assert "a participant who alone determines a coefficient" in error
+    assert error.count("\n") == 1
 
 
 def test_failing_run_leaves_earlier_results(study):
@@ -295,6 +313,18 @@ def test_table_of_a_spreadsheet_is_read(study, quick):
     assert left_out.count("\n") == 1
 
 
+def test_contrasts_name_columns_with_blanks_in_backticks(study):
+    columns = ("participant_id", "Dx group", "Alter-1", "sex")
+    write_participants(study.data, read_participants(study.data), columns)
+    model = ["--formula", "`Dx group` + `Alter-1`", "--name", "blanks", "--contrast"]
+    contrasts = ["`Dx group`[CN]-`Dx group`[AD]", "`Alter-1`"]
+    call = [str(study.data), str(study.out), "group", *FAST, *model, *contrasts]
+    assert main(call) == 0
+    maps = files.read_tsv(study.out / "group" / "blanks" / "maps.tsv")
+    assert [row["contrast"] for row in maps[:2]] == contrasts
+    assert int(maps[0]["n_significant"]) > 0  # the walls of patients are thinner
+
+
 def test_exclusions_name_one_protocol_and_region():
     name = HemisphereName(subject="01", session=None, hemi="L", seg="fs", region="extended")
     row = {"participant_id": "sub-01", "session_id": "n/a", "hemi": "L"}
@@ -313,6 +343,32 @@ def test_exclusions_of_nobody_are_told(study, quick, tmp_path, capsys):
     options = [*quick, "--align", "none", "--measures", "thickness", "--exclude", str(listed)]
     assert main([str(study.data), str(study.out), "group", *options]) == 0
     assert "matches no hemisphere here: sub-77" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_sheets_that_no_hippocampus_has_are_left_out_by_participant_and_measure(study, capsys):
+    wrong = {
+        "01": ("thickness", "-1", "thickness reaches -1 mm"),
+        "02": ("thickness", "0", "thickness reaches 0 mm"),
+        "03": ("thickness", "10", "thickness reaches 10 mm"),
+        "04": ("thickness", "1.8", "thickness is 1.8 mm at all points"),
+        "05": ("curvature", "1e6", "curvature reaches 1e+06 1/mm"),
+        "06": ("curvature", "0", "curvature is 0 1/mm at all points"),
+    }
+    for subject, (column, value, _) in wrong.items():
+        path = place_of(study.out, subject, "L").path("sheet")
+        rows = files.read_tsv(path)
+        files.write_tsv(path, list(rows[0]), [(row | {column: value}).values() for row in rows])
+    assert main([str(study.data), str(study.out), "group", *FAST, "--name", "few"]) == 0
+    excluded = files.read_tsv(study.out / "group" / "few" / "excluded.tsv")
+    assert [(row["participant_id"], row["hemi"]) for row in excluded] == [
+        (f"sub-{subject}", "L") for subject in wrong
+    ]
+    said = capsys.readouterr().out
+    for (*_, text), row in zip(wrong.values(), excluded, strict=True):
+        assert row["reason"] == "damaged-map"
+        assert row["message"].startswith(text)
+    assert f"sub-01, hemisphere L, is left out: {wrong['01'][-1]}" in said
 
 
 @pytest.mark.usefixtures("without_figures")

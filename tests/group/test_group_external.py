@@ -351,6 +351,16 @@ def test_refused_without_sheets_too(study, capsys):
     assert not (study / "new").exists()
 
 
+def test_thickness_that_nobody_has_is_left_out_by_file(study, capsys):
+    path, _ = names(study / "bids" / "hippunfold", "07", "L", version=1)
+    write_map(path, np.full(len(SURFACES["L"][0]), -1.0))
+    options = ["--maps", f"thickness={PATTERNS[1]}", "--no-reports", "--name", "few"]
+    assert run(study, *options, out="alone") == 0
+    said = capsys.readouterr().out
+    assert f"note: {path}: thickness reaches -1 mm, which no sheet does; left out" in said
+    assert statmap(study / "alone" / "group" / "few", "L", "thickness").n.max() == COUNT - 1
+
+
 def test_maps_of_others_are_scored_against_a_reference_group(written):
     options = ["--maps", f"hipp={PATTERNS[1]}", "--normative", "group=CN", "--name", "scored"]
     assert run(written, *options, out="alone") == 0

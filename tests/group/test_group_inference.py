@@ -121,18 +121,28 @@ def test_blocks_are_a_column_inside_which_the_contrast_varies(dataset, quick, ca
 
 
 def test_two_sessions_give_the_paired_t_test(sessions, quick):
-    options = [*quick, *PLAIN, "--paired", "1", "ses-3", "--formula", "1"]
+    options = [*quick, *PLAIN, "--paired", "1", "ses-3", "--formula", "1", "--asymmetry"]
     folder = run(sessions, *options)
     found = table(folder / "hemi-R_contrast-Mean_desc-thickness_statmap.tsv")
     _, out = sessions
-    maps = [
-        [
-            table(place_of(out, f"{i + 1:02d}", "R", session=session).path("sheet")).thickness
-            for i in range(sum(PLAN.sizes))
+    maps = {
+        hemi: [
+            [
+                table(place_of(out, f"{i + 1:02d}", hemi, session=session).path("sheet")).thickness
+                for i in range(sum(PLAN.sizes))
+            ]
+            for session in "13"
         ]
-        for session in "13"
-    ]
-    expected = stats.ttest_rel(maps[1], maps[0])
+        for hemi in "LR"
+    }
+    expected = stats.ttest_rel(maps["R"][1], maps["R"][0])
+    # Changes may be zero: their asymmetry is a difference, not a share.
+    change = {hemi: np.subtract(own[1], own[0]) for hemi, own in maps.items()}
+    both = table(folder / "contrast-Mean_desc-thicknessAsymmetry_statmap.tsv")
+    np.testing.assert_allclose(
+        both.statistic, stats.ttest_rel(change["L"], change["R"]).statistic, rtol=1e-6
+    )
+    assert "in their own unit. The contrast" in (folder / "methods.md").read_text()
     # Ten digits are written.
     np.testing.assert_allclose(found.statistic, expected.statistic, rtol=1e-8)
     np.testing.assert_allclose(found.p, expected.pvalue, rtol=1e-8)
@@ -214,13 +224,14 @@ def test_default_model_with_a_curve_of_age_tests_it(sessions, quick):
 
 
 def test_permutations_of_repeated_visits_flip_signs_of_participants(sessions, quick):
-    options = ("--correction", "permutation-max", "--permutations", "20")
+    options = ("--correction", "permutation-max", "--permutations", "20", "--blocks", "sex")
     folder = run(sessions, *quick, *PLAIN, *options, "--longitudinal", "--measures", "thickness")
     found = table(folder / "hemi-L_contrast-TimeInAD_desc-thickness_statmap.tsv")
     # The loss of .1 mm per session is in all: none of the other signs gives as much.
     np.testing.assert_allclose(found.p_corrected * 20, (found.p_corrected * 20).round(), atol=1e-6)
     assert found.significant.mean() > 0.9
     text = (folder / "methods.md").read_text()
+    assert "permutations within levels of sex of the residuals" in text
     assert "for CN-AD, time in CN-AD, participants with as many visits changed places" in text
     assert "for time in CN, time in AD, the signs of all visits of a participant" in text
     share = re.search(r"Slopes differed between participants at (\d+)% of the points", text)
@@ -264,9 +275,18 @@ def test_asymmetry_is_left_minus_right_in_the_same_model(dataset, quick):
         (["--paired", "1", "9"], 65, "there is no session ses-9"),
         (["--paired", "1", "2", "--longitudinal"], 64, "not both"),
         (
-            ["--longitudinal", "--correction", "permutation-tfce", "--blocks", "sex"],
+            ["--longitudinal", "--correction", "permutation-tfce", "--blocks", "session_id"],
             65,
-            "leave --blocks out",
+            "changes between visits of a participant",
+        ),
+        (
+            [
+                *("--longitudinal", "intercept", "--correction", "permutation-max"),
+                *("--blocks", "group", "--measures", "thickness"),
+                *("--formula", "group*time", "--contrast", "group[T.AD]:time"),
+            ],
+            65,
+            "group[T.AD]:time does not vary inside the blocks",
         ),
         (["--correction", "permutation-max", "--permutations", "1"], 64, "at least 2"),
         (["--longitudinal", "--formula", "age", "--contrast", "age,age"], 65, "rows"),

@@ -20,6 +20,7 @@ from hipsta_bids.group.registration import mean_profiles, register_to
 from hipsta_bids.group.settings import RegistrationSettings
 from hipsta_bids.group.tables import COLUMNS
 from hipsta_bids.group.warps import templates_from_json
+from hipsta_bids.io import files
 from hipsta_bids.reports.group import group_page
 
 TABLE = ("participant_id", "group", "age", "sex", "site")
@@ -199,6 +200,36 @@ def test_norms_with_a_new_site_score_it_without_controls(scores, people, capsys)
     np.testing.assert_allclose(after.z, before.z, atol=1e-6)
     assert not after.adapted.any()
     assert "were added" not in capsys.readouterr().out
+
+
+def test_every_visit_is_scored_and_norms_take_first_ones(norms, tmp_path, capsys):
+    data, out = write_people(tmp_path, {"A": 1, "D": 62}, 3, sessions=2)
+    few = tmp_path / "group.toml"
+    few.write_text("[norms]\nleast_participants = 50\n")
+    call = [str(data), str(out), "group", "--measures", "volume", "--no-reports"]
+    fit = ["--fit-norms", "--among", "site=D", "--settings", str(few), "--name", "few"]
+    assert main([*call, *fit]) == 0
+    assert "63 later sessions are not in the norms" in capsys.readouterr().out
+    people = table(out / "group" / "few" / "covariates.tsv")
+    assert load_norms(out / "group" / "few" / "norms.json")[0].sites == {"D": len(people)}
+    score = [*call, "--norms", str(norms), *CONTROLS]
+    assert main([*score, "--name", "same"]) == 0
+    assert "age is the same in all sessions" in capsys.readouterr().out
+    scores = table(out / "group" / "same" / "zscores.tsv")
+    count = len(set(scores.participant_id))
+    assert scores.groupby(["hemi", "session_id"]).size().unique().tolist() == [count]
+    assert scores[scores.adapted].session_id.unique().tolist() == ["ses-1"]
+    for name in table(data / "participants.tsv").participant_id:
+        path = data / name / f"{name}_sessions.tsv"
+        files.write_tsv(path, ["session_id", "age"], [["ses-1", "50"], ["ses-2", "70"]])
+    assert main([*score, "--name", "aged"]) == 0
+    assert "age is the same" not in capsys.readouterr().out
+    gains = {}
+    for name in ("same", "aged"):
+        z = table(out / "group" / name / "zscores.tsv").query("hemi == 'L'")
+        gains[name] = z[z.session_id == "ses-2"].z.mean() - z[z.session_id == "ses-1"].z.mean()
+    # A volume is lower by 1 mm³ a year; controls who were all said to be 50 vary by 31 mm³.
+    assert gains["aged"] == pytest.approx(gains["same"] + 20 / 31, abs=0.15)
 
 
 def test_sites_need_controls(people, norms, capsys, tmp_path):

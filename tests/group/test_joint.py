@@ -133,6 +133,18 @@ def test_both_sides_of_a_measure_together(dataset, quick, monkeypatch):
     assert "Both sides:" in group_page(folder)
 
 
+def test_maps_of_left_minus_right_together(dataset, quick):
+    names = ["thickness_asymmetry", "curvature_asymmetry"]
+    folder = run(dataset, quick, "--asymmetry", "--align", "none", "--joint", *names)
+    maps = table(folder / "maps.tsv").set_index(["measure", "hemi", "contrast"])
+    rows = table(folder / f"{maps.file['joint', 'LR', 'mean']}.tsv")
+    p = [table(folder / f"{maps.file[name, 'LR', 'mean']}.tsv").p for name in names]
+    np.testing.assert_allclose(rows.statistic, combine_evidence(np.array(p), "fisher"), rtol=1e-6)
+    assert set(table(folder / "joint_peaks.tsv").contrast) == {"CN-AD", "mean"}
+    assert "left minus right" in group_page(folder)
+    assert list((folder / "figures").glob("joint_maps.*"))
+
+
 def test_statistics_of_both_sides_are_one_cifti_file(dataset, quick):
     folder = run(dataset, quick, "--measures", "thickness", "--align", "none")
     image = nib.load(folder / "contrast-CNAD_desc-thickness_statmap.dscalar.nii")

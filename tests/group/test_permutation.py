@@ -1,5 +1,6 @@
 """Permutation tests: statistics of the model, exact counts, family-wise error, power."""
 
+from dataclasses import replace
 from itertools import permutations
 
 import numpy as np
@@ -217,6 +218,10 @@ def test_blocks_move_whole_and_visits_stay_at_home(order):
     pairs = np.unique(np.column_stack([visits.people, moved[:, 0]]), axis=0)
     assert len(pairs) == len(np.unique(who))  # all visits of one go to one
     assert (pairs[:, 0] != pairs[:, 1]).sum() > 15
+    inside = replace(visits, blocks=visits.people % 2).shuffle(basis, "whole", keys, own)
+    np.testing.assert_array_equal(inside[:, 0] % 2, visits.people % 2)
+    np.testing.assert_array_equal(inside[:, 1], visits.times)
+    assert (inside[:, 0] != visits.people).sum() > 40
     sizes = np.bincount(who)
     np.testing.assert_array_equal(*(sizes[pairs[:, i].astype(int)] for i in range(2)))
     inside = visits.shuffle(basis, "within", keys, own)

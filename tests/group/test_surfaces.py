@@ -41,7 +41,7 @@ def find_and_read(root, pattern, *, surfaces=(), known=(), wanted=anybody):
     (request,) = map_patterns([("hipp", pattern)], surfaces, ())
     found = find_maps(request, root, known, wanted)
     visits = sorted(found.visits, key=lambda visit: (visit[0], visit[1] or ""))
-    return *read_maps(found, visits, GRID, with_sheets=True), visits
+    return *read_maps(found, visits, GRID, with_sheets=True)[:2], visits
 
 
 def visits_of(side, visits):
