@@ -391,6 +391,7 @@ def draw_rows(
         round((_TOP + _BOTTOM) * MM) + len(rows) * (height + _HEAD_PIXELS),
     )
     figure = new_figure((pixels[0] / DOTS_PER_INCH, pixels[1] / DOTS_PER_INCH), layout=None)
+    figure.set_dpi(DOTS_PER_INCH)
     paper = _Paper(figure, *pixels)
     _write_heads(paper, columns)
     for number, row in enumerate(rows):
@@ -454,12 +455,12 @@ def _draw_row(
         for word, y, va in words:
             paper.text((_LEFT - 2) * MM, y, word, rotation=90, va=va)
     for column in columns:
-        axes = paper.axes(column.box[0], top, column.box[1], height)
         values, survive = row.values[column.hemi], row.survive.get(column.hemi)
         if column.seen is not None:
-            axes.set_axis_off()
-            axes.imshow(column.seen.picture(values, row.scale, survive), interpolation="none")
+            picture = column.seen.picture(values, row.scale, survive)
+            paper.figure.figimage(picture, column.box[0], paper.height - top - height)
             continue
+        axes = paper.axes(column.box[0], top, column.box[1], height)
         axes.set_gid(map_id(row.kind, row.index, column.hemi))
         axes.set_facecolor(str(_UNKNOWN))
         if column.one.maps.mesh is None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
@@ -53,15 +54,19 @@ class View:
     outline: Bool
     """(rows, columns) where the surface ends or passes in front of itself."""
 
-    @property
+    @cached_property
     def seen(self) -> Bool:
         """(rows, columns) where the surface is."""
         return np.asarray(self.triangle >= 0)
 
+    @cached_property
+    def _corners(self) -> Int:
+        """(pixels, 3) points round each pixel of the surface."""
+        return self.mesh.triangles[self.triangle[self.seen]].astype(np.int32)
+
     def spread(self, values: Float) -> Float:
         """Interpolate values (points,) to the pixels (pixels,) of the surface."""
-        corners = values[self.mesh.triangles[self.triangle[self.seen]]]
-        return np.asarray(np.einsum("pc,pc->p", corners, self.weights))
+        return np.asarray(np.einsum("pc,pc->p", values[self._corners], self.weights))
 
     def region(self, labels: Int, label: int) -> Bool:
         """(rows, columns) where a label of the points (points,) is the closest one."""
