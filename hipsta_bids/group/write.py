@@ -1,6 +1,7 @@
 """Writes the results of one model, all or none: tables, maps, surfaces, figures and text."""
 
 import contextlib
+import gc
 import logging
 import os
 import re
@@ -183,6 +184,7 @@ def write_figures(folder: Path, drawings: Iterable[tuple[str, Drawing]]) -> list
     """Draw figures by name, and say which are missing or lack letters; one line each."""
     tell("figures")
     problems, missing = [], set()
+    gc.freeze()  # what is there need not be looked at whenever a figure's memory is taken back
     for number, (name, drawing) in enumerate(drawings, start=1):
         tell("figures", number)
         try:
@@ -197,6 +199,8 @@ def write_figures(folder: Path, drawings: Iterable[tuple[str, Drawing]]) -> list
             missing |= set(re.findall(r"^Glyph (\d+) ", str(warning.message)))
         for title, content in encoded:
             files.write_bytes(folder / "figures" / title, content)
+        gc.collect()
+    gc.unfreeze()
     if missing:
         letters = "".join(sorted(chr(int(number)) for number in missing))
         problems.append(f"figures: PDF and PNG show boxes for {letters}; SVG has them as text")
