@@ -451,5 +451,5 @@ def spread_of_known(values: Float) -> Float:
     """Take the standard deviation over the first axis of what is known; NaN below two values."""
     count = np.isfinite(values).sum(axis=0)
     deviations = values - mean_of_known(values, 0).astype(values.dtype)
-    variance = mean_of_known(deviations**2, 0)
+    variance = mean_of_known(np.square(deviations, out=deviations), 0)
     return np.where(count > 1, np.sqrt(variance * count / np.maximum(count - 1, 1)), np.nan)

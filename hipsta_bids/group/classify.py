@@ -146,17 +146,19 @@ def compare_models(
     full = np.column_stack([base, added])
     _check(full, case)
     separated = not overlaps(full, case) and is_separated(full, case)
-    whole = fit_logistic(full, case, settings, firth=separated)
     free = np.arange(full.shape[1]) < base.shape[1]
+    models = [
+        _classified(one.tobytes(), one.shape[1], case.tobytes(), settings, firth=separated)
+        for one in (full[:, free], full)
+    ]
+    fits = [model.fit for model in models]
     if separated:
-        nested = fit_logistic(full, case, settings, firth=True, free=free)
-    else:
-        nested = fit_logistic(base, case, settings, firth=False)
-    ratio = 2 * (whole.log_likelihood - nested.log_likelihood)
+        fits[0] = fit_logistic(full, case, settings, firth=True, free=free)
+    ratio = 2 * (fits[1].log_likelihood - fits[0].log_likelihood)
     df = int((~free).sum())
     return ModelComparison(
-        base=classify(base, case, settings, firth=separated),
-        full=classify(full, case, settings, firth=separated),
+        base=models[0],
+        full=models[1],
         separated=separated,
         likelihood_ratio=ratio,
         df=df,
@@ -166,11 +168,12 @@ def compare_models(
     )
 
 
-def classify(
-    matrix: Float, case: Bool, settings: ClassificationSettings, *, firth: bool
+@lru_cache(maxsize=32)
+def _classified(
+    values: bytes, columns: int, cases: bytes, settings: ClassificationSettings, *, firth: bool
 ) -> ClassifierResult:
-    """Fit one model and tell how well it classifies; see :func:`compare_models`."""
-    _check(matrix, case)
+    """Fit one model and tell how well it classifies; the base is the same for each measure."""
+    matrix, case = np.frombuffer(values).reshape(-1, columns), np.frombuffer(cases, dtype=bool)
     fit = fit_logistic(matrix, case, settings, firth=firth)
     score = matrix @ fit.coefficients
     validation = cross_validate(matrix, case, settings)
@@ -206,19 +209,10 @@ def cross_validate(matrix: Float, case: Bool, settings: ClassificationSettings) 
 
     In each training set separation is looked for, and answered by Firth's method.
     """
-    return _cross_validated(matrix.tobytes(), matrix.shape[1], case.tobytes(), settings)
-
-
-@lru_cache(maxsize=32)
-def _cross_validated(
-    values: bytes, columns: int, cases: bytes, settings: ClassificationSettings
-) -> CrossValidation:
-    """Keep results: the base model is the same for each measure that is added."""
-    matrix, case = np.frombuffer(values).reshape(-1, columns), np.frombuffer(cases, dtype=bool)
     folds = min(settings.folds, int(case.sum()), int((~case).sum()))
     basis = orthonormal(matrix)
     total, means = np.zeros(len(case)), []
-    fold_of = _folds(cases, folds, settings.repeats, settings.seed)
+    fold_of = _folds(case.tobytes(), folds, settings.repeats, settings.seed)
     # What all subjects give is near what training sets do.
     every, settled = maxima(basis, case, np.ones((1, len(case))))
     start = every[0] if settled[0] else None
@@ -269,7 +263,7 @@ def _folds(cases: bytes, folds: int, repeats: int, seed: int) -> Int:
 
 def _area(cases: Float, controls: Float) -> float:
     """Chance that a case scores higher than a control, ties counted half."""
-    ordered = np.sort(controls)
+    cases, ordered = np.sort(cases), np.sort(controls)  # sorted ones are looked up faster
     below = np.searchsorted(ordered, cases, "left") + np.searchsorted(ordered, cases, "right")
     return float(below.mean()) / (2 * len(controls))
 

@@ -68,6 +68,13 @@ def some_sheets(maps: Mapping[str, Float], own: slice | Bool) -> Mapping[str, Fl
     return {name: values[own] for name, values in maps.items()}
 
 
+def sheets_of(maps: Mapping[str, Float], name: str, own: Bool | Int) -> Float:
+    """Take some sheets of one map; only these are registered, if need be."""
+    if isinstance(maps, WarpedMaps):
+        return maps.carry(maps.source[name][own], maps.warps[own])
+    return maps[name][own]
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SideMaps:
     """Sheets of one hemisphere of all visits that have it."""

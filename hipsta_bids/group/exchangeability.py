@@ -27,6 +27,8 @@ _CLASS = 5
 _BETWEEN = 0.1
 #: Powers of time, from 0, that may be common to all participants.
 _POWERS = 4
+#: Keys that are worth several passes.
+_MANY = 5000
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +78,30 @@ def flip(basis: Float, key: Float) -> Float:
     """Change the signs of rows whose key, uniform between 0 and 1, is in the lower half."""
     signs: Float = np.where(key < 0.5, -1.0, 1.0)[:, None]  # noqa: PLR2004 -- half of them
     return np.asarray(basis * signs, dtype=np.float64)
+
+
+def shuffle(basis: Float, blocks: Int | None, key: Float) -> Float:
+    """Shuffle rows, within blocks; the same as shuffling residuals the other way round.
+
+    Keys are uniform between 0 and 1: their order is the permutation.
+    """
+    if blocks is None:
+        return basis.take(_order(key), axis=0)  # several times as fast as an index
+    result = basis.copy()
+    result[np.argsort(blocks, kind="stable")] = basis[np.lexsort((key, blocks))]
+    return result
+
+
+def _order(key: Float) -> Int:
+    """Sort keys; many by 16 of 48 bits at a time, which takes a third of the time."""
+    if len(key) < _MANY:
+        return np.argsort(key)
+    bits = (key * 2.0**48).astype(np.int64)
+    order = np.argsort(bits.astype(np.uint16), kind="stable")
+    for passed in (16, 32):
+        part = (bits >> passed).astype(np.uint16).take(order)
+        order = order.take(np.argsort(part, kind="stable"))
+    return order
 
 
 def split(matrix: Float, contrast: Contrast) -> tuple[Float, Float]:

@@ -7,7 +7,7 @@ import atexit
 import io
 import re
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from itertools import cycle
@@ -19,7 +19,7 @@ import pandas as pd
 
 from hipsta_bids.group.analysis import Analysis, mean_of_known, members_of, spread_of_known
 from hipsta_bids.group.classify import ClassifierResult, PairComparison, roc_curve
-from hipsta_bids.group.data import Cohort, Float
+from hipsta_bids.group.data import Cohort, Float, sheets_of
 from hipsta_bids.group.glm import FittedMaps
 from hipsta_bids.group.normative import ScoredMaps
 from hipsta_bids.group.panels import (
@@ -262,7 +262,8 @@ def draw_registration(cohort: Cohort, analysis: Analysis) -> "list[Figure]":
             (before, cohort.sides[hemi], "before"),
             (after, side.registered, "after"),
         ):
-            _curves(axis, cohort.x, mean_of_known(source.maps["curvature"], 2), members)
+            maps = (sheets_of(source.maps, "curvature", own) for own in members.values())
+            _curves(axis, cohort.x, members, (mean_of_known(own, 2) for own in maps))
             axis.set_title(f"{SIDES[hemi]}, {when} registration")
             axis.set_ylabel(label)
         after.sharey(before)
@@ -271,7 +272,7 @@ def draw_registration(cohort: Cohort, analysis: Analysis) -> "list[Figure]":
         every = -(-len(moved) // _MOST_LINES)
         for color, own in zip(cycle(COLORS), members.values(), strict=False):
             shifts.plot(cohort.x, moved[own][::every].T, color=color, alpha=0.25, linewidth=0.4)
-        _curves(shifts, cohort.x, moved, members)
+        _curves(shifts, cohort.x, members, (moved[own] for own in members.values()))
         shifts.axhline(0, color="black", linewidth=0.5)
         shifts.set_title(f"{SIDES[hemi]}, warps" + (f" (1 of {every} drawn)" if every > 1 else ""))
         shifts.set_ylabel("shift to lateral [nodes]")
@@ -282,13 +283,13 @@ def draw_registration(cohort: Cohort, analysis: Analysis) -> "list[Figure]":
     return [figure]
 
 
-def _curves(axis: "Axes", x: Float, values: Float, members: Mapping[str, Any]) -> None:
+def _curves(axis: "Axes", x: Float, names: Iterable[str], groups: Iterable[Float]) -> None:
     """Draw the mean of each group and twice its standard error to both sides."""
-    for color, (name, own) in zip(cycle(COLORS), members.items(), strict=False):
-        count = np.isfinite(values[own]).sum(axis=0)
-        mean = mean_of_known(values[own], 0)
-        error = 2 * spread_of_known(values[own]) / np.sqrt(np.maximum(count, 1))
-        axis.plot(x, mean, color=color, label=f"{name} (n = {len(values[own])})", linewidth=1.2)
+    for color, name, values in zip(cycle(COLORS), names, groups, strict=False):
+        mean = mean_of_known(values, 0)
+        count = np.isfinite(values).sum(axis=0)
+        error = 2 * spread_of_known(values) / np.sqrt(np.maximum(count, 1))
+        axis.plot(x, mean, color=color, label=f"{name} (n = {len(values)})", linewidth=1.2)
         axis.fill_between(x, mean - error, mean + error, color=color, alpha=0.25, linewidth=0)
 
 

@@ -19,6 +19,7 @@ from hipsta_bids.group.exchangeability import (
     Visits,
     choose_exchange,
     flip,
+    shuffle,
     spans,
     split,
     varies_between,
@@ -195,14 +196,16 @@ class _Member:
     def shuffled(self, keys: Float) -> Float:
         """Permuted designs that are given by keys of subjects."""
         basis, own, visits = self.model.basis, keys[:, self.part.subjects], self.part.visits
+        bases: Iterable[Float] = (shuffle(basis, self.blocks, key) for key in own)
         if visits is not None and self.exchange is not None:
             pairs = zip(keys, own, strict=True)
-            bases = [visits.shuffle(basis, self.exchange, *pair) for pair in pairs]
+            bases = (visits.shuffle(basis, self.exchange, *pair) for pair in pairs)
         elif self.model.tests_common_part():
-            bases = [flip(basis, key) for key in own]
-        else:
-            bases = [_shuffle(basis, self.blocks, key) for key in own]
-        return np.stack([one.T for one in bases])
+            bases = (flip(basis, key) for key in own)
+        designs = np.empty((len(keys), *basis.T.shape))
+        for design, one in zip(designs, bases, strict=True):
+            design[:] = one.T
+        return designs
 
 
 @dataclass(frozen=True, eq=False)
@@ -328,18 +331,6 @@ class _Model:
         if self.rows == 1:
             return np.asarray(2 * special.stdtr(self.df, -np.abs(t)), dtype=np.float64)
         return np.asarray(special.fdtrc(self.rows, self.df, t**2), dtype=np.float64)
-
-
-def _shuffle(basis: Float, blocks: Int | None, key: Float) -> Float:
-    """Shuffle subjects, within blocks; the same as shuffling residuals the other way round.
-
-    Keys are uniform between 0 and 1: their order is the permutation.
-    """
-    if blocks is None:
-        return basis[np.argsort(key)]
-    result = basis.copy()
-    result[np.argsort(blocks, kind="stable")] = basis[np.lexsort((key, blocks))]
-    return result
 
 
 def _maximum(values: Float) -> Float:

@@ -133,9 +133,8 @@ def _means(
     means: dict[str, dict[str, Float]] = {}
     counts: dict[str, dict[str, int]] = {}
     for hemi, one in sides.items():
-        maps = one.values(measure)
         for group, own in members_of(analysis, rows_of(analysis, one)).items():
-            means.setdefault(group, {})[hemi] = mean_of_known(maps[own], 0)
+            means.setdefault(group, {})[hemi] = mean_of_known(one.values(measure, own), 0)
             counts.setdefault(group, {})[hemi] = int(own.sum())
     pair = bool(analysis.comparison.pair)
     kind = display.kind_of(measure, change=pair or set(sides) == {BOTH})

@@ -113,12 +113,12 @@ def _fit(  # noqa: PLR0917
 
 def participants_with(values: Float, who: NDArray[np.object_]) -> Int:
     """Count those (columns,) who have a value in any of their rows."""
-    _, numbers = np.unique(who.astype(str), return_inverse=True)
+    names, numbers = np.unique(who.astype(str), return_inverse=True)
+    if len(names) == len(who):
+        return np.asarray(np.isfinite(values).sum(axis=0), dtype=np.int64)
     order = np.argsort(numbers, kind="stable")
-    starts = np.searchsorted(numbers[order], np.arange(numbers.max(initial=-1) + 1))
+    starts = np.searchsorted(numbers[order], np.arange(len(names)))
     known = np.isfinite(values)[order]
-    if not len(starts):
-        return np.zeros(values.shape[1], dtype=np.int64)
     return np.asarray(np.logical_or.reduceat(known, starts, axis=0).sum(axis=0), dtype=np.int64)
 
 

@@ -28,7 +28,7 @@ from hipsta_bids.group.clusters import (
     point_columns,
     test_columns,
 )
-from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float
+from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float, sheets_of
 from hipsta_bids.group.formula import file_label
 from hipsta_bids.group.harmonize import Harmonization
 from hipsta_bids.group.inference import control_fdr
@@ -135,8 +135,8 @@ def _means(cohort: Cohort, analysis: Analysis) -> Iterator[Columns]:
         people = rows[PARTICIPANT].to_numpy()
         members = members_of(analysis, rows)
         for measure in one.fits:
-            values = one.values(measure)
             for group, own in members.items():
+                values = one.values(measure, own)
                 yield {
                     "measure": measure,
                     "unit": cohort.units.get(measure, "1"),
@@ -144,9 +144,9 @@ def _means(cohort: Cohort, analysis: Analysis) -> Iterator[Columns]:
                     "group": group,
                     **frame.number,
                     **frame.position,
-                    "n": participants_with(values[own], people[own]),
-                    "mean": mean_of_known(values[own], 0),
-                    "sd": spread_of_known(values[own]),
+                    "n": participants_with(values, people[own]),
+                    "mean": mean_of_known(values, 0),
+                    "sd": spread_of_known(values),
                 }
 
 
@@ -154,10 +154,10 @@ def _profiles(cohort: Cohort, analysis: Analysis) -> Iterator[Columns]:
     for hemi, side in analysis.sides.items():
         for registered, source in ((False, cohort.sides[hemi]), (True, side.registered)):
             members = members_of(analysis, cohort.table.iloc[source.rows])
-            for measure, maps in source.maps.items():
-                values = mean_of_known(maps, 2)
+            for measure in source.maps:
                 for group, own in members.items():
-                    count = np.isfinite(values[own]).sum(axis=0)
+                    values = mean_of_known(sheets_of(source.maps, measure, own), 2)
+                    count = np.isfinite(values).sum(axis=0)
                     yield {
                         "measure": measure,
                         "unit": cohort.units.get(measure, "1"),
@@ -166,8 +166,8 @@ def _profiles(cohort: Cohort, analysis: Analysis) -> Iterator[Columns]:
                         "group": group,
                         "node_x": np.arange(len(cohort.x)) + 1,
                         "n": count,
-                        "mean": mean_of_known(values[own], 0),
-                        "mean_se": spread_of_known(values[own]) / np.sqrt(np.maximum(count, 1)),
+                        "mean": mean_of_known(values, 0),
+                        "mean_se": spread_of_known(values) / np.sqrt(np.maximum(count, 1)),
                     }
 
 

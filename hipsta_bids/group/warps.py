@@ -20,8 +20,8 @@ from hipsta_bids.group.settings import RegistrationSettings
 _DEGREE = 3
 #: Damping of the first step, its factor when a step fails or succeeds, and its limits.
 _DAMPING, _FACTOR, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 5.0, 1e-9, 1e9
-#: Subjects in memory at once; does not change a result.
-_BLOCK = 2000
+#: Subjects in memory at once, of curves and of maps; does not change a result.
+_BLOCK, _MAPS = 2000, 250
 #: Fields of a template that are arrays, and the one that JSON has no infinity for.
 _ARRAYS, _INFINITE = ("knots", "mean", "components", "center"), "warp_variance"
 
@@ -47,8 +47,9 @@ def _along(knots: Float, coefficients: Float, places: Float) -> tuple[Float, Flo
     ends, basis = np.concatenate([[0.0], knots]), make_basis(knots)
     where = np.searchsorted(knots, places, side="right")
     step = places - ends[where]
+    where += np.arange(len(places))[:, None] * len(ends)
     zero, one, two, three = (
-        np.take_along_axis(coefficients @ part(ends).T, where, axis=1)
+        (coefficients @ part(ends).T).take(where)
         for part in (basis, *(basis.derivative(order) for order in (1, 2, 3)))
     )
     slope = one + step * (two + step * three / 2)
@@ -384,7 +385,7 @@ def fit_warps(
 def warp_values(maps: Float, warps: Float) -> Float:
     """Carry maps of values to registered coordinates, linearly; NaN where a value lacks."""
     carried = np.empty(maps.shape, np.result_type(maps, np.float32))
-    for block in _blocks(len(maps)):
+    for block in _blocks(len(maps), _MAPS):
         left, weight = _sources(warps[block])
         rows = np.arange(len(left))[:, None]
         share = weight[:, :, None]
@@ -398,7 +399,7 @@ def warp_values(maps: Float, warps: Float) -> Float:
 def warp_labels(labels: NDArray[np.int8], warps: Float) -> NDArray[np.int8]:
     """Carry maps of labels to registered coordinates, from the nearest node."""
     carried = np.empty_like(labels)
-    for block in _blocks(len(labels)):
+    for block in _blocks(len(labels), _MAPS):
         left, weight = _sources(warps[block])
         rows = np.arange(len(left))[:, None]
         carried[block] = labels[block][rows, left + (weight >= 0.5)]  # noqa: PLR2004 -- nearest
@@ -417,6 +418,6 @@ def _sources(warps: Float) -> tuple[Int, Float]:
     return left, np.clip(weight, 0.0, 1.0)
 
 
-def _blocks(subjects: int) -> list[slice]:
+def _blocks(subjects: int, size: int = _BLOCK) -> list[slice]:
     """Subjects that are worked on together, to bound memory."""
-    return [slice(start, start + _BLOCK) for start in range(0, max(subjects, 1), _BLOCK)]
+    return [slice(start, start + size) for start in range(0, max(subjects, 1), size)]

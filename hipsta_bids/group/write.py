@@ -1,6 +1,7 @@
 """Writes the results of one model, all or none: tables, maps, surfaces, figures and text."""
 
 import contextlib
+import gc
 import logging
 import os
 import re
@@ -183,6 +184,7 @@ def write_figures(folder: Path, drawings: Iterable[tuple[str, Drawing]]) -> list
     """Draw figures by name, and say which are missing or lack letters; one line each."""
     tell("figures")
     problems, missing = [], set()
+    gc.freeze()  # what is there need not be looked at whenever a figure's memory is taken back
     for number, (name, drawing) in enumerate(drawings, start=1):
         tell("figures", number)
         try:
@@ -197,6 +199,8 @@ def write_figures(folder: Path, drawings: Iterable[tuple[str, Drawing]]) -> list
             missing |= set(re.findall(r"^Glyph (\d+) ", str(warning.message)))
         for title, content in encoded:
             files.write_bytes(folder / "figures" / title, content)
+        gc.collect()
+    gc.unfreeze()
     if missing:
         letters = "".join(sorted(chr(int(number)) for number in missing))
         problems.append(f"figures: PDF and PNG show boxes for {letters}; SVG has them as text")
@@ -213,13 +217,11 @@ def write_table(
 ) -> None:
     """Write a table, with a sidecar unless the columns are the user's or the model's."""
     columns = [str(column) for column in table.columns]
-    parts = (table.iloc[part] for part in _parts(len(table), _ROWS))
-    rows = (
-        row
-        for part in parts
-        for row in zip(*(map(_cell, part[c].tolist()) for c in table.columns), strict=True)
-    )
-    files.write_tsv(folder / f"{name}.tsv", columns, rows)
+    lines = ["\t".join(columns)]
+    for part in _parts(len(table), _ROWS):
+        rows = zip(*(_cells(values.iloc[part]) for _, values in table.items()), strict=True)
+        lines += map("\t".join, rows)
+    files.write_text(folder / f"{name}.tsv", "\n".join(lines) + "\n")
     if described:
         meanings = {
             column: meaning.get(column)
@@ -230,7 +232,18 @@ def write_table(
         files.write_json(folder / f"{name}.json", sidecar)
 
 
+def _cells(values: pd.Series) -> list[str]:
+    """Spell a column, numbers all at once."""
+    numbers = values.to_numpy()
+    if numbers.dtype.kind == "f" and len(numbers):
+        text = "\t".join(["%.10g"] * len(numbers)) % tuple(numbers.tolist())
+        return text.replace("nan", files.MISSING).split("\t")
+    return [_cell(value) for value in values.tolist()]
+
+
 def _cell(value: object) -> str:
+    if isinstance(value, str):
+        return " ".join(value.split()) or files.MISSING
     if isinstance(value, (bool, np.bool_)):
         return "true" if value else "false"
     if value is None or value is pd.NA or value != value:  # noqa: PLR0124 -- NaN is not itself
@@ -277,9 +290,15 @@ def _number(column: str, cohort: Cohort, measure: str, text: str) -> pa.Field:
 
 
 def _write_parquet(path: Path, schema: pa.Schema, blocks: Iterable[Columns]) -> None:
-    """Write blocks of columns; those that a block lacks are empty."""
+    """Write blocks of columns; those that a block lacks are empty.
+
+    Measured values hardly repeat: a dictionary of them takes longer than it saves.
+    """
+    repeated = [one.name for one in schema if one.name in "xy" or not pa.types.is_float32(one.type)]
     try:
-        with parquet.ParquetWriter(path, schema, compression="zstd") as writer:
+        with parquet.ParquetWriter(
+            path, schema, compression="zstd", use_dictionary=repeated
+        ) as writer:
             for columns in blocks:
                 count = len(columns["hemi"])
                 arrays = [

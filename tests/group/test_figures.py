@@ -152,7 +152,7 @@ def measured(survive, sides="LR", *, kind="t", mesh=None, groups=("CN", "AD"), c
         maps=SimpleNamespace(shape=shape, mesh=mesh, names=names, rows=np.arange(4)),
         used=np.arange(4),
         subfield=fields.astype(np.int64),
-        values=lambda _: random.normal(2, 0.1, (4, points)),
+        values=lambda _, own: random.normal(2, 0.1, (int(own.sum()), points)),
     )
     found = {
         MapKey("thickness", test.contrast.name, hemi): Discoveries(
