@@ -16,8 +16,8 @@ from hipsta_bids.settings import CheckSettings, GridSettings, SliceSettings
 from hipsta_bids.types import Bool, Float, LabelVolume
 
 _MAX_REPEATS = 1.3
-"""Median number of equal slices in a row, along two axes, of labels that were resampled: 1 in labels
-of four brains as their programs wrote them, 2 if each voxel was divided."""
+"""Median number of equal slices in a row, along two axes, of labels that were resampled: 1 in
+labels of four brains as their programs wrote them, 2 if each voxel was divided."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
