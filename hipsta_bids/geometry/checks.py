@@ -45,18 +45,6 @@ _INWARD = 7
 """The way into the sheet goes from an edge to this part of the columns beside it."""
 
 
-def check_voxel(volume: LabelVolume, settings: CheckSettings) -> None:
-    """Refuse labels that are too coarse for any sheet, before anything goes wrong in them."""
-    voxel = in_plane_voxel(volume.affine)
-    if voxel > settings.max_voxel:
-        raise GeometryError(
-            f"voxels of {voxel:.2f} mm in plane are too coarse for a sheet of one to two "
-            f"millimeters, {settings.max_voxel:g} mm is the limit: use a finer segmentation "
-            "(HippUnfold's file in space-crop*, FreeSurfer's without .FSvoxelSpace)",
-            reason="sheet-too-thin",
-        )
-
-
 def check_voxels_across(surface: Surface, body: Body, settings: CheckSettings) -> float:
     """Refuse a sheet that is too thin for its voxels; return its thickness in voxels."""
     thickness, voxel = mean_wall_thickness(surface), _voxel_across(body, settings)

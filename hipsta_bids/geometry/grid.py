@@ -12,8 +12,12 @@ from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.completion import Index
 from hipsta_bids.geometry.slices import has_thick_slices, points_of_ends, sample_slices
-from hipsta_bids.settings import GridSettings, SliceSettings
-from hipsta_bids.types import Bool, Float
+from hipsta_bids.settings import CheckSettings, GridSettings, SliceSettings
+from hipsta_bids.types import Bool, Float, LabelVolume
+
+_MAX_REPEATS = 1.3
+"""Median number of equal slices in a row, along two axes, of labels that were resampled: 1 in
+labels of four brains as their programs wrote them, 2 if each voxel was divided."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -224,6 +228,36 @@ def in_plane_voxel(affine: Float) -> float:
     """Geometric mean of the two smaller voxel edges, mm."""
     edges = np.sort(np.linalg.norm(affine[:3, :3], axis=0))
     return float(np.sqrt(edges[0] * edges[1]))
+
+
+def check_voxel(volume: LabelVolume, settings: CheckSettings) -> None:
+    """Refuse labels that are too coarse for any sheet, before anything goes wrong in them."""
+    voxel = in_plane_voxel(volume.affine)
+    if voxel > settings.max_voxel:
+        raise GeometryError(
+            f"voxels of {voxel:.2f} mm in plane are too coarse for a sheet of one to two "
+            f"millimeters, {settings.max_voxel:g} mm is the limit: use a finer segmentation "
+            "(HippUnfold's file in space-crop*, FreeSurfer's without .FSvoxelSpace)",
+            reason="sheet-too-thin",
+        )
+    steps = np.array([_repeats(np.moveaxis(volume.tissue, axis, 0)) for axis in range(3)])
+    if np.sum(steps > _MAX_REPEATS) > 1:
+        larger = np.max(np.linalg.norm(volume.affine[:3, :3], axis=0) * steps)
+        raise GeometryError(
+            f"voxels of {voxel:.2f} mm in plane repeat their neighbors, as if larger ones of about "
+            f"{larger:.2f} mm had been resampled: use the labels before that",
+            reason="sheet-too-thin",
+        )
+
+
+def _repeats(slices: NDArray[np.uint8]) -> float:
+    """Median number of equal slices in a row, of labels (I, J, K), along the first axis.
+
+    It is 1 where some are much longer than the median: these are straight, not resampled.
+    """
+    runs = np.diff(np.flatnonzero((slices[1:] != slices[:-1]).any(axis=(1, 2))))
+    median = float(np.median(runs)) if len(runs) else 1.0
+    return median if median <= 4 and runs.max(initial=0) <= 3 * median else 1.0  # noqa: PLR2004 -- 1.2 mm in 0.3
 
 
 def _fit_grid(body: Body, hemi: str, settings: GridSettings) -> WedgeGrid:

@@ -145,7 +145,7 @@ def _rules(path: Path) -> dict[str, _Wanted]:
             f"{path}: cannot read the filter file ({error.strerror}); check the path",
             reason="unreadable-filter",
         ) from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(
             f"{path}: the filter file is not JSON ({error})", reason="unreadable-filter"
         ) from error

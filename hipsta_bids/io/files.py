@@ -225,7 +225,7 @@ def read_json(path: Path) -> dict[str, Any]:
         raise InputError(
             f"{path}: no such file; check its name", reason="unreadable-json"
         ) from error
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(
             f"{path}: not readable as JSON ({error}); restore or delete it",
             reason="unreadable-json",

@@ -33,6 +33,7 @@ _READ_ERRORS = (
     EOFError,
     ValueError,
     KeyError,
+    TypeError,  # nibabel's, of an .mgz file without a byte
     OverflowError,
     MemoryError,
     zlib.error,
@@ -309,6 +310,8 @@ def read_scalars(path: Path, points: Float) -> ScalarVolume:
 def _opened(path: Path) -> Iterator[Any]:
     """Open an image for as long as its voxels are read; errors meanwhile name the file."""
     try:
+        if path.exists() and not path.is_file():
+            raise OSError("no regular file")  # a pipe would be waited for
         # nibabel leaves files open on some of its paths; a stream that is closed here is not.
         with ImageOpener(str(path)) as stream:
             kind = _format(path, stream.read(4))

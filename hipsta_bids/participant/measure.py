@@ -33,7 +33,6 @@ from hipsta_bids.geometry.checks import (
     check_ridges,
     check_rows,
     check_thickness,
-    check_voxel,
     check_voxels_across,
     describe_uncus,
     find_contacts,
@@ -47,7 +46,7 @@ from hipsta_bids.geometry.findings import (
     flag_margins,
     raise_flags,
 )
-from hipsta_bids.geometry.grid import in_plane_voxel, resample_body
+from hipsta_bids.geometry.grid import check_voxel, in_plane_voxel, resample_body
 from hipsta_bids.geometry.measures import bending_angle
 from hipsta_bids.geometry.mesh import extract_surface, tetra_quality, tetrahedralize
 from hipsta_bids.geometry.sheet import (

@@ -143,7 +143,7 @@ def _load_file(path: Path) -> Protocol:
             f"{path}: cannot read the protocol ({error.strerror}); check the path",
             reason="unreadable-scheme",
         ) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ProtocolError(
             f"{path}: not a TOML file ({error}); start from a bundled protocol",
             reason="unreadable-scheme",

@@ -142,7 +142,7 @@ def read_settings(path: Path | None, kind: type[Table]) -> Table:
             f"{path}: settings cannot be read ({error.strerror}); check the path",
             reason="settings-unreadable",
         ) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise SettingsError(
             f"{path}: not a TOML file ({error}); start from `hipsta-bids settings`",
             reason="settings-not-toml",

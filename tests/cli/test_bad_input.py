@@ -242,6 +242,15 @@ def test_unusable_folders_get_one_line(tmp_path, prepare, options, code, message
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("option", ["--settings", "--scheme", "--bids-filter-file"])
+def test_endless_nesting_is_bad_input(tmp_path, capsys, option):
+    path = tmp_path / "deep.txt"
+    path.write_text(("" if option == "--bids-filter-file" else "a = ") + "[" * 100_000)
+    code = main.main([str(tmp_path), str(tmp_path / "out"), "participant", option, str(path)])
+    assert code in {ExitCode.USAGE, ExitCode.BAD_DATA}
+    assert f"{path}: " in capsys.readouterr().err
+
+
 def obey_permissions():
     """Take from root what lets it ignore permissions (linux/prctl.h, linux/capability.h)."""
     drop, override, search = 24, 1, 2

@@ -1,4 +1,5 @@
 import gzip
+import os
 import subprocess
 import sys
 from contextvars import ContextVar
@@ -233,6 +234,8 @@ BROKEN = {
     "text.nii": lambda path: path.write_text("not an image " * 100, encoding="utf-8"),
     "text.mgh": lambda path: path.write_text("not an image " * 100, encoding="utf-8"),
     "nothing.nii": lambda path: path.touch(),
+    "nothing.mgz": lambda path: path.touch(),
+    "pipe.nii": os.mkfifo,
     "absent.nii": lambda _: None,
     "folder.nii": lambda path: path.mkdir(),
     "truncated.nii.gz": lambda path: truncated(path, 500),
@@ -253,7 +256,7 @@ BROKEN = {
 @pytest.mark.parametrize(
     ("name", "reason", "message"),
     [
-        *((name, "unreadable-image", "copy or make the file again") for name in list(BROKEN)[:11]),
+        *((name, "unreadable-image", "copy or make the file again") for name in list(BROKEN)[:13]),
         ("4d.nii", "not-3d", "60 x 50 x 40 x 2"),
         ("2d.nii", "not-3d", "50 x 40"),
         ("interpolated.nii", "non-integer-labels", "nearest neighbor"),
