@@ -33,6 +33,8 @@ _COLORS = {
     "warning:": "33",
     "note:": "36",
 }
+#: What names of files may do to a terminal: move its cursor, or change its title.
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 _WORD = re.compile(
     r"^(hipsta-bids:|warning:|note:)|(?<![^\s(])(ok|repaired|flagged|failed)(?=[,\s)]|$)"
 )
@@ -58,6 +60,7 @@ def has_color(stream: TextIO) -> bool:
 
 
 def _print(text: str, stream: TextIO) -> None:
+    text = _CONTROL.sub("\N{REPLACEMENT CHARACTER}", text)
     if has_color(stream):
         text = _WORD.sub(lambda word: f"\033[{_COLORS[word[0]]}m{word[0]}\033[0m", text)
     stream.write(f"{text}\n")

@@ -23,7 +23,8 @@ _TERM = re.compile(
     r"\s*(?P<sign>[+-])?\s*(?:(?P<weight>\d+\.?\d*|\.\d+)\s*\*?\s*)?"
     r"(?P<name>(?:[^\W\d]|`[^`]+`)(?:[\w.:]|`[^`]+`|\[[^\]]*\]|\([^)]*\))*)"
 )
-
+#: Outside of brackets, where it belongs to a level such as ``group[>=24]``.
+_EQUALS = re.compile(r"=(?![^\[]*\])")
 
 #: Texts that mean a missing value, besides what pandas takes for one.
 _MISSING = ("n/a", "NA", "N/A", "nan", "NaN", "")
@@ -178,12 +179,12 @@ def parse_expression(text: str) -> dict[str, float]:
 
 
 def _contrast_json(text: str) -> dict[str, Any]:
-    given, _, body = text.rpartition("=")
+    *given, body = _EQUALS.split(text)
     rows = [parse_expression(row) for row in re.split(r",(?![^\[(]*[\])])", body)]
     names = list(dict.fromkeys(name for row in rows for name in row))
     weights = [[row.get(name, 0.0) for name in names] for row in rows]
     return {
-        "Name": given.strip() or body.strip(),
+        "Name": "=".join(given).strip() or body.strip(),
         "ConditionList": names,
         "Weights": weights[0] if len(rows) == 1 else weights,
         "Test": "t" if len(rows) == 1 else "F",

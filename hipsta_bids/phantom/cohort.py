@@ -61,6 +61,7 @@ NODES = (41, 21)
 #: Of a phantom with a head: digitations at most, and mm of a mean subject: radius of the spiral,
 #: tail, body, and what lies between the body and the hook beside the digitations.
 _MOST_DIGITATIONS, _RADIUS, _TAIL, _BODY, _BEFORE_HOOK = 4, 5.0, 8.0, 15.0, 10.0
+_MOST_SUBJECTS = 10_000
 
 _ROUNDING = 1e-9  # nodes on the border of a region belong to it
 
@@ -125,8 +126,10 @@ class CohortPlan:
             problem = "a head has a shape of its own; leave out shift, cortex and kind"
         if self.head is not None and not 0 <= self.head <= _MOST_DIGITATIONS:
             problem = f"a head has 0 to {_MOST_DIGITATIONS} digitations, not {self.head}"
-        if self.n_subjects < 1 or not self.groups or len(set(self.groups)) < len(self.groups):
-            problem = "give at least one subject, and groups with different names"
+        if not 1 <= self.n_subjects <= _MOST_SUBJECTS:
+            problem = f"{self.n_subjects} subjects; give 1 to {_MOST_SUBJECTS:,}"
+        if not self.groups or len(set(self.groups)) < len(self.groups):
+            problem = "give at least one group, and groups with different names"
         if self.site and not (self.site.isascii() and self.site.isalnum()):
             problem = f"site {self.site!r}: labels have letters and digits only"
         if problem is not None:

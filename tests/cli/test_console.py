@@ -77,6 +77,11 @@ def test_a_pipe_gets_colors_only_if_it_is_told(environment, colored):
     assert (RED in through_pipe("demo", **environment).stderr) is colored
 
 
+def test_names_of_files_do_not_reach_into_the_terminal(capsys):
+    echo("label \x1b]0;title\x07 \x9b2J\u00e4\u6d77\tof a name")
+    assert capsys.readouterr().out == "label \ufffd]0;title\ufffd \ufffd2J\u00e4\u6d77\tof a name\n"
+
+
 def test_tables_fit_the_terminal_and_are_whole_in_a_pipe():
     whole = through_pipe("protocols").stdout
     assert max(map(len, whole.splitlines())) > 300

@@ -325,6 +325,17 @@ def test_contrasts_name_columns_with_blanks_in_backticks(study):
     assert int(maps[0]["n_significant"]) > 0  # the walls of patients are thinner
 
 
+@pytest.mark.usefixtures("without_figures")
+def test_names_of_groups_may_have_equals_signs(study):
+    path = study.data / "participants.tsv"
+    text = path.read_text()
+    path.write_text(text.replace("\tCN", "\tMMSE>=24").replace("\tAD", "\t=low()"))
+    call = [str(study.data), str(study.out), "group", *FAST, "--name", "signs"]
+    assert main(call) == 0
+    maps = files.read_tsv(study.out / "group" / "signs" / "maps.tsv")
+    assert {row["contrast"] for row in maps} == {"MMSE>=24-=low()"}
+
+
 def test_exclusions_name_one_protocol_and_region():
     name = HemisphereName(subject="01", session=None, hemi="L", seg="fs", region="extended")
     row = {"participant_id": "sub-01", "session_id": "n/a", "hemi": "L"}
