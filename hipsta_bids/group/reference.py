@@ -234,7 +234,7 @@ class Reference:
 def place_of(side: SideMaps) -> FittedMaps:
     """Locate the points of maps of one hemisphere, to which nothing was fitted."""
     every = np.arange(len(side.rows))
-    subfield = most_frequent(side.subfield, len(side.names))
+    subfield = most_frequent(side.subfield[:], len(side.names))
     return FittedMaps(maps=side, used=every, rows=every, subfield=subfield, fits={})
 
 

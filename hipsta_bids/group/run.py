@@ -133,7 +133,7 @@ class GroupResult:
     """What to know, one line each."""
     warnings: tuple[str, ...]
     """What may make results wrong, one line each."""
-    page: Path | None
+    page: Path | None = None
     """To look at; ``None`` if there is none."""
     problem: str | None = None
     """Why the page could not be made."""
@@ -159,6 +159,13 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         If inputs, model or output folder do not allow it.
     """
     dataset.check_own_dataset(options.out_dir)
+    result = _analyze(options, settings)
+    page, problem = make_page(options, result.folder.name)
+    return replace(result, page=page, problem=problem)
+
+
+def _analyze(options: GroupOptions, settings: GroupSettings) -> GroupResult:
+    """Analyze and write all but the page, for which the memory that it takes is free again."""
     tell("reading")
     inputs = read_inputs(options, settings)
     check_joint([*inputs.measures.maps, *inputs.others], options.comparison, settings)
@@ -206,6 +213,8 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
     summary = _summary(options, inputs, analysis, settings, notes)
     tell("average surfaces")
     shapes = average_shapes(inputs.found.records, cohort, analysis, settings)
+    # One is enough from here on, and all may take much memory.
+    inputs = replace(inputs, found=replace(inputs.found, records=inputs.found.records[:1]))
     describe_dataset(options)
     with write.model_folder(options.out_dir, name) as folder:
         tell("tables and maps")
@@ -230,11 +239,8 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         told = [*inputs.found.warnings, *notes]
         record = _record(options, inputs.found, settings, analysis, told)
         files.write_json(folder / "analysis.json", record)
-    page, problem = make_page(options, name)
     return GroupResult(
         folder=options.out_dir / write.GROUP_FOLDER / name,
-        page=page,
-        problem=problem,
         n_participants=analysis.n_participants,
         n_excluded=len(exclusions),
         notes=tuple(notes),

@@ -8,9 +8,9 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.classify import PairComparison, compare_pairs
+from hipsta_bids.group.classify import PairComparison, compare_pairs, forget_models
 from hipsta_bids.group.comparison import BOTH
-from hipsta_bids.group.data import PARTICIPANT, Cohort, Float, Int
+from hipsta_bids.group.data import PARTICIPANT, Bool, Cohort, Float, Int
 from hipsta_bids.group.formula import Contrast, ModelSpec, check_names, typed
 from hipsta_bids.group.glm import MEAN, PointwiseFit, RowModel, with_mean
 from hipsta_bids.group.grammar import closed_formula
@@ -107,19 +107,20 @@ def _fit(  # noqa: PLR0917
     maps: Float = own[list(varying)].to_numpy(dtype=np.float64)[present]
     fit = model.fit_measures(maps, present, model.design.contrasts, settings)
     who = cohort.table[PARTICIPANT].iloc[model.design.rows[present]].to_numpy()
-    people = participants_with(maps, who)
+    people = participants_with(np.isfinite(maps), who)
     return [MeasureFit(hemi=hemi, measures=varying, formula=formula, fit=fit, participants=people)]
 
 
-def participants_with(values: Float, who: NDArray[np.object_]) -> Int:
-    """Count those (columns,) who have a value in any of their rows."""
+def participants_with(known: Bool, who: NDArray[np.object_]) -> Int:
+    """Count those (columns,) of whom any row (rows, columns) is known."""
     names, numbers = np.unique(who.astype(str), return_inverse=True)
     if len(names) == len(who):
-        return np.asarray(np.isfinite(values).sum(axis=0), dtype=np.int64)
+        return np.asarray(known.sum(axis=0), dtype=np.int64)
     order = np.argsort(numbers, kind="stable")
     starts = np.searchsorted(numbers[order], np.arange(len(names)))
-    known = np.isfinite(values)[order]
-    return np.asarray(np.logical_or.reduceat(known, starts, axis=0).sum(axis=0), dtype=np.int64)
+    return np.asarray(
+        np.logical_or.reduceat(known[order], starts, axis=0).sum(axis=0), dtype=np.int64
+    )
 
 
 def _same_names(larger: Design, design: Design) -> tuple[Contrast, ...]:
@@ -160,6 +161,7 @@ def classify_groups(
                 notes.append(f"classification by {measure}, hemisphere {hemi}: {error}")
                 continue
             results += [(hemi, measure, pair) for pair in pairs]
+    forget_models()
     return results, notes
 
 
