@@ -22,6 +22,9 @@ from hipsta_bids.types import Bool, Float, LabelVolume, Sheet
 Position = tuple[float, float]
 """Sheet coordinates (u, v), each from 0 to 1: medial to lateral, posterior to anterior."""
 
+Injury = tuple[str, float, Position]
+"""Kind of damage, its size (see the kind's description) and position."""
+
 #: Refinement of the sheet's grid along x, y and z, so that its points lie closer than voxels.
 _FINER = (3, 3, 2)
 

@@ -3,13 +3,15 @@
 import platform
 import re
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import wraps
 from importlib import import_module, resources
 from importlib.metadata import version
+from inspect import signature
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ParamSpec
 
 from hipsta_bids import __version__
 from hipsta_bids.errors import UsageError, did_you_mean
@@ -139,6 +141,69 @@ class Suite:
     def missed(self) -> int:
         """Number of targets that were missed."""
         return sum(table.missed for table in self.tables)
+
+
+Given = ParamSpec("Given")
+
+Content = Table | Picture | str | Mapping[str, object]
+"""What suites are made of: tables, figures, more text, and numbers for the text."""
+
+
+def table(
+    name: str,
+) -> Callable[[Callable[Given, Iterable[Cells | str]]], Callable[Given, Table]]:
+    """Make a table of the rows that a function yields; texts that it yields follow the notes.
+
+    ``name`` is ``suite.table`` in ``suites.toml``, which has title and notes. What these name in
+    braces are constants of the function's module, or its arguments.
+    """
+    suite_name, _, key = name.partition(".")
+    texts = _TABLE[suite_name]["tables"][key]
+
+    def decorate(rows: Callable[Given, Iterable[Cells | str]]) -> Callable[Given, Table]:
+        @wraps(rows)
+        def make(*args: Given.args, **kwargs: Given.kwargs) -> Table:
+            values = rows.__globals__ | signature(rows).bind(*args, **kwargs).arguments
+            found = list(rows(*args, **kwargs))
+            return Table(
+                title=texts["title"].format_map(values),
+                rows=[row for row in found if not isinstance(row, str)],
+                notes=texts.get("notes", "").format_map(values)
+                + "".join(text for text in found if isinstance(text, str)),
+                digits=texts.get("digits", 3),
+            )
+
+        return make
+
+    return decorate
+
+
+def suite(name: str) -> Callable[[Callable[Given, Iterable[Content]]], Callable[Given, Suite]]:
+    """Make a suite of the tables, figures, texts and numbers that a function yields.
+
+    Title and text are those of ``suites.toml``; texts that are yielded follow. What the text names
+    in braces are constants of the function's module, or numbers that are yielded.
+    """
+    texts = _TABLE[name]
+
+    def decorate(run: Callable[Given, Iterable[Content]]) -> Callable[Given, Suite]:
+        @wraps(run)
+        def make(*args: Given.args, **kwargs: Given.kwargs) -> Suite:
+            found, values = list(run(*args, **kwargs)), dict(run.__globals__)
+            for numbers in found:
+                values |= numbers if isinstance(numbers, Mapping) else {}
+            return Suite(
+                name=name,
+                title=texts["title"],
+                text=texts["text"].format_map(values)
+                + "".join(text for text in found if isinstance(text, str)),
+                tables=tuple(one for one in found if isinstance(one, Table)),
+                pictures=tuple(one for one in found if isinstance(one, Picture)),
+            )
+
+        return make
+
+    return decorate
 
 
 def run_suite(name: str, *, full: bool, labels: Path | None = None) -> Suite:

@@ -41,7 +41,7 @@ from hipsta_bids.validation.cases import (
     run_cases,
     truth_at,
 )
-from hipsta_bids.validation.report import Cell, Cells, Picture, Suite, Table
+from hipsta_bids.validation.report import Cell, Cells, Content, Picture, suite, table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -194,7 +194,8 @@ class Compared:
     """Of slices that the surrogate refused."""
 
 
-def run(full: bool, labels: Path | None = None) -> Suite:
+@suite("surrogate")
+def run(full: bool, labels: Path | None = None) -> Iterator[Content]:
     """Compare on phantoms and, where there are any, on real segmentations."""
     bodies: list[ValidationBody] = list(PHANTOMS if full else PHANTOMS[:1])
     n_phantoms = len(bodies)
@@ -205,13 +206,10 @@ def run(full: bool, labels: Path | None = None) -> Suite:
     results = run_cases(compare_body, bodies)
     shown = [(_name(b), r) for b, r in zip(bodies, results, strict=True) if isinstance(r, Compared)]
     pictured = [*shown[:2], *shown[n_phantoms:][:2]]
-    return Suite(
-        name="surrogate",
-        title="Thickness without a mesh",
-        text=_TEXT.format(slices=", ".join(f"{p:.0%}" for p in POSITIONS)),
-        tables=(_table(bodies, results),),
-        pictures=(_picture(pictured),) if pictured else (),
-    )
+    yield _table(bodies, results)
+    if pictured:
+        yield _picture(pictured)
+    yield {"slices": ", ".join(f"{p:.0%}" for p in POSITIONS)}
 
 
 def compare_body(body: ValidationBody) -> Compared:
@@ -258,8 +256,10 @@ def _name(body: ValidationBody) -> str:
     return f"sub-{body.subject} {body.hemi} ({body.protocol.name})"
 
 
-def _table(bodies: Sequence[ValidationBody], results: Sequence[Compared | Refusal]) -> Table:
-    rows: list[Cells] = []
+@table("surrogate.mesh")
+def _table(
+    bodies: Sequence[ValidationBody], results: Sequence[Compared | Refusal]
+) -> Iterator[Cells]:
     for body, result in zip(bodies, results, strict=True):
         is_phantom = isinstance(body, PhantomSpec)
         cells: dict[str, Cell] = {"body": _name(body)}
@@ -280,8 +280,7 @@ def _table(bodies: Sequence[ValidationBody], results: Sequence[Compared | Refusa
                 "slope on truth": true.slope if is_phantom else None,
             }
         cells["target"] = f"r ≥ {LEAST_CORRELATION}" if is_phantom else "n/a"
-        rows.append({**cells, "met": met if is_phantom else None})
-    return Table(title="Surrogate against mesh", rows=rows, notes=_NOTES)
+        yield {**cells, "met": met if is_phantom else None}
 
 
 def _picture(shown: Sequence[tuple[str, Compared]]) -> Picture:
@@ -309,19 +308,3 @@ def _picture(shown: Sequence[tuple[str, Compared]]) -> Picture:
         draw=draw,
         size=(3.0 * max(len(shown), 2), 3.2),
     )
-
-
-_TEXT = """\
-`hipsta-bids surrogate` measures thickness in single slices from the medial axis of the labels and
-the closest points of their outline on both sides, without a mesh (here at {slices} of the body's
-length). It shares the labels with the mesh and nothing else: a thickening that both show lies in
-the labels, one that the mesh alone shows does not.
-"""
-
-_NOTES = """\
-Phantoms in voxels of 0.4 mm. At each point of the proportional sampling, the mesh's thickness is
-that of the mid-surface nearby. Slope: of the surrogate on the other, by least squares over all
-slices. The surrogate is measured in the plane of the slice: where the wall is oblique to it, as in
-real bodies, it reads more than a line straight through the wall. It repairs nothing: where labels
-touch across a fold it reads the sum of both walls, or finds a loop and refuses the slice.
-"""

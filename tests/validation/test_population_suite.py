@@ -83,8 +83,8 @@ def test_a_specimen_has_its_voxels_and_all_of_the_labels(voxel):
     np.testing.assert_allclose(np.linalg.norm(volume.affine[:3, :3], axis=0), voxel)
     assert hemi == ("L" if np.linalg.det(volume.affine[:3, :3]) > 0 else "R")
     size = np.count_nonzero(volume.tissue) * abs(np.linalg.det(volume.affine[:3, :3]))
-    before = labeled_volume(population.PHANTOM_VOXEL)
-    wanted = np.count_nonzero(before.tissue) * population.PHANTOM_VOXEL**3
+    before = labeled_volume(population.FULL_VOXEL)
+    wanted = np.count_nonzero(before.tissue) * population.FULL_VOXEL**3
     assert size == pytest.approx(wanted, rel=0.1)  # warps change sizes
     again, _ = make_labels(specimen)
     np.testing.assert_array_equal(again.tissue, volume.tissue)
@@ -92,7 +92,7 @@ def test_a_specimen_has_its_voxels_and_all_of_the_labels(voxel):
 
 def test_the_first_specimen_of_a_body_is_as_it_is():
     volume, _ = make_labels(Specimen(body=SPEC, number=0, voxel=None))
-    np.testing.assert_array_equal(volume.tissue, labeled_volume(population.PHANTOM_VOXEL).tissue)
+    np.testing.assert_array_equal(volume.tissue, labeled_volume(population.FULL_VOXEL).tissue)
 
 
 def test_the_plan_takes_all_damages_in_turn():
