@@ -200,7 +200,7 @@ class MidCurve:
 
     def __init__(self, bend: Bend, width: float) -> None:
         self.width = width
-        self._bend = bend
+        self._bend, self._rise = bend, bend.lateral - bend.medial
         self._step = width / _PANELS
         edges = np.linspace(0.0, width, _PANELS + 1)
         steps = self._integrate(edges[:-1], np.full(_PANELS, self._step))
@@ -212,20 +212,17 @@ class MidCurve:
 
     def curvature(self, s: Float) -> Float:
         """Signed curvature at arc lengths ``s`` (mm), 1/mm."""
-        rise = self._bend.lateral - self._bend.medial
-        return np.asarray(self._bend.medial + rise * (s / self.width) ** self._bend.power)
+        return np.asarray(self._bend.medial + self._rise * (s / self.width) ** self._bend.power)
 
     def curvature_slope(self, s: Float) -> Float:
         """Differentiate curvature along the curve, 1/mm2."""
         power = self._bend.power
-        rise = self._bend.lateral - self._bend.medial
-        return np.asarray(rise * power / self.width * (s / self.width) ** (power - 1))
+        return np.asarray(self._rise * power / self.width * (s / self.width) ** (power - 1))
 
     def angle(self, s: Float) -> Float:
         """Tangent angle in rad, from lateral towards superior."""
         power = self._bend.power
-        rise = self._bend.lateral - self._bend.medial
-        turned = self._bend.medial * s + rise * s / (power + 1) * (s / self.width) ** power
+        turned = self._bend.medial * s + self._rise * s / (power + 1) * (s / self.width) ** power
         return np.asarray(START_ANGLE + turned)
 
     def tangent(self, s: Float) -> Float:

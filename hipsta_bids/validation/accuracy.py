@@ -1,7 +1,7 @@
 """Thickness, curvature, volume, areas and extents of phantoms against the truth."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -27,7 +27,7 @@ from hipsta_bids.validation.cases import (
     run_groups,
     without_edges,
 )
-from hipsta_bids.validation.report import Cell, Cells, Content, Picture, show_map, suite, table
+from hipsta_bids.validation.report import Cell, Cells, Content, picture, show_map, suite, table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -84,31 +84,25 @@ class Row:
 
 
 def _rows() -> tuple[Row, ...]:
-    iso = (0.4, 0.4, 0.4)
+    iso, slices = (0.4, 0.4, 0.4), (0.4, 0.4, 2.0)
     thin = PhantomSpec(kind="spiral", thickness=1.2)
-    fine = [
-        *(
-            Row(spec=PhantomSpec(kind=kind, thickness=2.0), voxel_size=iso, bias=0.015, sd=0.04)
-            for kind in ("arc", "spiral", "tight")
-        ),
-        Row(spec=thin, voxel_size=iso, bias=0.02, sd=0.05),
-    ]
-    varied = PhantomSpec(kind="spiral", thickness=2.0, variation=0.3)
-    tight = PhantomSpec(kind="tight", thickness=1.6)
+    arc, spiral, tight = (PhantomSpec(kind=k, thickness=2.0) for k in ("arc", "spiral", "tight"))
+    fine = [Row(spec=s, voxel_size=iso, bias=0.015, sd=0.04) for s in (arc, spiral, tight)]
+    fine.append(Row(spec=thin, voxel_size=iso, bias=0.02, sd=0.05))
+    varied, narrow = replace(spiral, variation=0.3), replace(tight, thickness=1.6)
     thick = [
         row
         for tilt in (0.0, TILT)
         for row in (
-            Row(spec=varied, voxel_size=(0.4, 0.4, 2.0), bias=0.015, sd=0.065, tilt=tilt),
-            Row(spec=thin, voxel_size=(0.4, 0.4, 2.0), bias=0.02, sd=0.05, tilt=tilt),
-            Row(spec=tight, voxel_size=(0.5, 0.5, 1.5), bias=0.03, sd=0.09, tilt=tilt),
+            Row(spec=varied, voxel_size=slices, bias=0.015, sd=0.065, tilt=tilt),
+            Row(spec=thin, voxel_size=slices, bias=0.02, sd=0.05, tilt=tilt),
+            Row(spec=narrow, voxel_size=(0.5, 0.5, 1.5), bias=0.03, sd=0.09, tilt=tilt),
         )
     ]
     return (*fine, *thick)
 
 
 ROWS = _rows()
-
 
 Results = Mapping[Row, Sequence[Measured | Refusal]]
 
@@ -132,11 +126,10 @@ def _poses(number: int, row: Row, count: int) -> list[Case]:
     generator = np.random.default_rng((SEED, number))
     cases = []
     for _ in range(count):
-        pose, turn = (
-            (any_pose(generator), None)
-            if row.tilt is None
-            else along_slices(generator, tilt=row.tilt)
-        )
+        if row.tilt is None:
+            pose, turn = any_pose(generator), None
+        else:
+            pose, turn = along_slices(generator, tilt=row.tilt)
         cases.append(Case(spec=row.spec, voxel_size=row.voxel_size, pose=pose, grid_rotation=turn))
     return cases
 
@@ -168,8 +161,7 @@ def _thickness_table(results: Results) -> Iterator[Cells | str]:
                 "SD of the mean map": float(np.nanstd(np.mean(errors, axis=0))),
             }
         yield {**cells, "refused": refused, "met": good}
-    refusals = refusal_notes({f"{row.name}, {row.voxels}": g for row, g in results.items()})
-    yield refusals
+    yield refusal_notes({f"{row.name}, {row.voxels}": g for row, g in results.items()})
 
 
 @table("accuracy.curvature")
@@ -234,30 +226,19 @@ def _size_table(results: Results, title: str) -> Iterator[Cells]:
         }
 
 
-def _error_picture(results: Results) -> Picture:
-    maps = {
-        row: np.mean([m.error for m in group], axis=0) for row, group in _measured(results).items()
-    }
-
-    def draw(figure: "Figure") -> None:
-        columns = 5
-        axes = figure.subplots(-(-len(maps) // columns), columns, squeeze=False)
-        for axis in axes.flat[len(maps) :]:
-            axis.set_axis_off()
-        for axis, (row, error) in zip(axes.flat, maps.items(), strict=False):
-            title = row.name.replace(", tilted", "\ntilted") + f"\n{row.voxels}"
-            style = {"cmap": "RdBu_r", "vmin": -0.15, "vmax": 0.15}
-            image = show_map(axis, error, title, ends=("post.", "ant."), **style)
-            axis.title.set_fontsize("small")
-        figure.colorbar(image, ax=axes, label="error of thickness, mm", shrink=0.8)
-
-    return Picture(
-        name="accuracy",
-        caption="Error of thickness, averaged over the poses: what stays where the luck of the"
-        " voxels averages out. Mm, red is too thick.",
-        draw=draw,
-        size=(12.0, 5.6),
-    )
+@picture("accuracy")
+def _error_picture(figure: "Figure", results: Results) -> None:
+    maps = {row: np.mean([m.error for m in g], axis=0) for row, g in _measured(results).items()}
+    columns = 5
+    axes = figure.subplots(-(-len(maps) // columns), columns, squeeze=False)
+    for axis in axes.flat[len(maps) :]:
+        axis.set_axis_off()
+    for axis, (row, error) in zip(axes.flat, maps.items(), strict=False):
+        title = row.name.replace(", tilted", "\ntilted") + f"\n{row.voxels}"
+        style = {"cmap": "RdBu_r", "vmin": -0.15, "vmax": 0.15}
+        image = show_map(axis, error, title, ends=("post.", "ant."), **style)
+        axis.title.set_fontsize("small")
+    figure.colorbar(image, ax=axes, label="error of thickness, mm", shrink=0.8)
 
 
 def _middle(values: Float) -> Float:
@@ -367,32 +348,24 @@ def _table(errors: Mapping[Key, Sequence[Mapping[str, float]]]) -> Iterator[Cell
             }
 
 
-def _picture(errors: Mapping[Key, Sequence[Mapping[str, float]]]) -> Picture:
-    def draw(figure: "Figure") -> None:
-        axis = figure.subplots()
-        colors = {name: f"C{number}" for number, name in enumerate(SPECS)}
-        for (name, grid), values in errors.items():
-            style = "o-" if GRIDS[grid] is None else "s--"
-            for zone, alpha in zip(ZONES, (1.0, 0.45), strict=True):
-                rms, label = [v[zone] for v in values], f"{name}, {grid}, {zone}"
-                axis.loglog(VOXEL_SIZES, rms, style, color=colors[name], alpha=alpha, label=label)
-        reach = np.array([min(VOXEL_SIZES), max(VOXEL_SIZES)])
-        start = min(v[zone] for values in errors.values() for v in values for zone in ZONES)
-        axis.loglog(reach, 0.8 * start * reach / reach[0], color="0.6", label="rate 1")
-        axis.set_xticks(VOXEL_SIZES, [f"{size:g}" for size in VOXEL_SIZES])
-        axis.minorticks_off()
-        axis.set_yticks(ticks := [0.03, 0.04, 0.06, 0.08, 0.12], [f"{t:g}" for t in ticks])
-        axis.set_xlabel("voxel size, mm")
-        axis.set_ylabel("RMS error of thickness, mm")
-        axis.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.02, 0.5))
-
-    return Picture(
-        name="convergence",
-        caption="Root mean square error of thickness over the whole grid against voxel size;"
-        " the gray line falls in proportion. Pale: without edges.",
-        draw=draw,
-        size=(9.0, 4.2),
-    )
+@picture("convergence")
+def _picture(figure: "Figure", errors: Mapping[Key, Sequence[Mapping[str, float]]]) -> None:
+    axis = figure.subplots()
+    colors = {name: f"C{number}" for number, name in enumerate(SPECS)}
+    for (name, grid), values in errors.items():
+        style = "o-" if GRIDS[grid] is None else "s--"
+        for zone, alpha in zip(ZONES, (1.0, 0.45), strict=True):
+            rms, label = [v[zone] for v in values], f"{name}, {grid}, {zone}"
+            axis.loglog(VOXEL_SIZES, rms, style, color=colors[name], alpha=alpha, label=label)
+    reach = np.array([min(VOXEL_SIZES), max(VOXEL_SIZES)])
+    start = min(v[zone] for values in errors.values() for v in values for zone in ZONES)
+    axis.loglog(reach, 0.8 * start * reach / reach[0], color="0.6", label="rate 1")
+    axis.set_xticks(VOXEL_SIZES, [f"{size:g}" for size in VOXEL_SIZES])
+    axis.minorticks_off()
+    axis.set_yticks(ticks := [0.03, 0.04, 0.06, 0.08, 0.12], [f"{t:g}" for t in ticks])
+    axis.set_xlabel("voxel size, mm")
+    axis.set_ylabel("RMS error of thickness, mm")
+    axis.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.02, 0.5))
 
 
 @suite("limits")

@@ -23,10 +23,11 @@ from hipsta_bids.validation.cases import (
     measure_case,
     random_motion,
     refusal_notes,
+    rms,
     run_cases,
     run_groups,
 )
-from hipsta_bids.validation.report import Cell, Cells, Content, Picture, show_map, suite, table
+from hipsta_bids.validation.report import Cell, Cells, Content, picture, show_map, suite, table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -102,7 +103,7 @@ def measure_forms(item: HemisphereInput) -> tuple[float, float]:
     reference = measure_body(volume, item.hemi).thickness
     other = "LR"[item.hemi == "L"]
     maps = measure_body(mirrored, other).thickness, measure_body(stored, item.hemi).thickness
-    first, second = (float(np.sqrt(((map_ - reference) ** 2).mean())) for map_ in maps)
+    first, second = (rms(map_ - reference) for map_ in maps)
     return first, second
 
 
@@ -139,7 +140,7 @@ def _motion_table(motions: Mapping[str, Sequence[Measured | Refusal]]) -> Iterat
         if maps is not None:
             of_mean = float(maps.mean(axis=(1, 2)).std(ddof=1))
             at_points = maps.std(axis=0, ddof=1)
-            overall = float(np.sqrt((at_points**2).mean()))
+            overall = rms(at_points)
             good = of_mean <= MAX_SD_OF_MEAN and overall <= MAX_POINTWISE_SD and not refused
             cells |= {
                 "SD of the mean": of_mean,
@@ -154,37 +155,33 @@ def _motion_table(motions: Mapping[str, Sequence[Measured | Refusal]]) -> Iterat
 @table("invariance.forms")
 def _pair_table(pairs: Sequence[Sequence[Measured | Refusal]]) -> Iterator[Cells | str]:
     for column, name in enumerate(("mirror image", *(f"voxel axes {axes}" for axes in AXES)), 1):
+        cells: dict[str, Cell] = {
+            "form": name,
+            "mean": None,
+            "mean absolute": None,
+            "largest": None,
+        }
+        both = [(pair[0], pair[column]) for pair in pairs]
         changes = [
             b.thickness - a.thickness
-            for a, b in ((pair[0], pair[column]) for pair in pairs)
+            for a, b in both
             if isinstance(a, Measured) and isinstance(b, Measured)
         ]
-        absolute = np.abs(changes)
-        complete = len(changes) == len(pairs)
-        yield {
-            "form": name,
-            "mean": f"{np.mean(changes):+.5f}" if complete else None,
-            "mean absolute": f"{absolute.mean():.5f}" if complete else None,
-            "largest": f"{absolute.max():.5f}" if complete else None,
-            "target, mean absolute": f"≤ {MAX_CHANGE:g}",
-            "met": complete and bool(absolute.mean() <= MAX_CHANGE),
-        }
+        met = False
+        if len(changes) == len(pairs):
+            size = np.abs(changes)
+            met = bool(size.mean() <= MAX_CHANGE)
+            cells |= {"mean": f"{np.mean(changes):+.5f}", "mean absolute": f"{size.mean():.5f}"}
+            cells["largest"] = f"{size.max():.5f}"
+        yield {**cells, "target, mean absolute": f"≤ {MAX_CHANGE:g}", "met": met}
     yield f"Number of poses: {len(pairs)}."
 
 
-def _picture(motions: Mapping[str, Sequence[Measured | Refusal]]) -> Picture:
+@picture("invariance")
+def _picture(figure: "Figure", motions: Mapping[str, Sequence[Measured | Refusal]]) -> None:
     found = {name: maps for name, group in motions.items() if (maps := _maps(group)) is not None}
-
-    def draw(figure: "Figure") -> None:
-        axes = figure.subplots(1, max(1, len(found)), squeeze=False)[0]
-        for axis, (name, maps) in zip(axes, found.items(), strict=False):
-            spread = maps.std(axis=0, ddof=1)
-            image = show_map(axis, spread, name, cmap="viridis", vmin=0, vmax=0.1)
-            figure.colorbar(image, ax=axis, label="SD, mm")
-
-    return Picture(
-        name="invariance",
-        caption="SD of thickness over the motions at each point of the sheet, mm.",
-        draw=draw,
-        size=(9.0, 3.2),
-    )
+    axes = figure.subplots(1, max(1, len(found)), squeeze=False)[0]
+    for axis, (name, maps) in zip(axes, found.items(), strict=False):
+        spread = maps.std(axis=0, ddof=1)
+        image = show_map(axis, spread, name, cmap="viridis", vmin=0, vmax=0.1)
+        figure.colorbar(image, ax=axis, label="SD, mm")

@@ -155,21 +155,20 @@ def _truth(trial: Trial, reference: HemisphereMaps) -> HemisphereMaps:
     return replace(reference, maps={**reference.maps, "thickness": thickness})
 
 
-Case = tuple[dict[str, Cell], Trial, Outcome | Refusal]
-"""The first cells of a row, what was measured, and its result."""
+def _empty(result: Outcome | Refusal) -> bool:
+    """Whether there was nothing to be planted, such as a layer that a protocol lacks."""
+    return isinstance(result, Refusal) and result.reason == "defect-empty"
 
 
-def _cases(trials: Sequence[Trial], results: Sequence[Outcome | Refusal]) -> Iterator[Case]:
-    """Leave out what some labels have no room for, such as a layer that a protocol lacks."""
-    for trial, result in zip(trials, results, strict=True):
-        if not (isinstance(result, Refusal) and result.reason == "defect-empty"):
-            kind, size, _ = trial.injury
-            yield {"body": trial.name, "planted": kind, "size, mm": f"{size:g}"}, trial, result
+def _name(trial: Trial) -> dict[str, Cell]:
+    kind, size, _ = trial.injury
+    return {"body": trial.name, "planted": kind, "size, mm": f"{size:g}"}
 
 
 def _lost(trials: Sequence[Trial], results: Sequence[Outcome | Refusal]) -> str:
-    cases = _cases(trials, results)
-    return refusal_notes({f"{t.name}, {t.injury[0]}": [found] for _, t, found in cases})
+    """List refusals, but for what some labels have no room for."""
+    pairs = zip(trials, results, strict=True)
+    return refusal_notes({f"{t.name}, {t.injury[0]}": [r] for t, r in pairs if not _empty(r)})
 
 
 @table("mending.cavities")
@@ -177,9 +176,10 @@ def _cavities(
     trials: Sequence[Trial], results: Sequence[Outcome | Refusal]
 ) -> Iterator[Cells | str]:
     """Trials come in pairs, mended and not."""
-    pairs = _cases(trials, results)
-    for (cells, _, mended), (_, _, hollow) in zip(pairs, pairs, strict=True):
-        met = False
+    for trial, mended, hollow in zip(trials[::2], results[::2], results[1::2], strict=True):
+        if _empty(mended):
+            continue
+        cells, met = _name(trial), False
         if isinstance(mended, Outcome):
             met = mended.off <= MAX_WRONG and abs(mended.damage.mean) <= MAX_MEAN
             met &= mended.damage.status == Status.REPAIRED
@@ -203,8 +203,8 @@ def _cavities(
 
 @table("mending.ragged")
 def _ragged(trials: Sequence[Trial], results: Sequence[Outcome | Refusal]) -> Iterator[Cells | str]:
-    for cells, _, result in _cases(trials, results):
-        met = False
+    for trial, result in zip(trials, results, strict=True):
+        cells, met = _name(trial), False
         if isinstance(result, Outcome):
             met = result.off <= MAX_WRONG and result.found > 0
             cells |= {
@@ -222,8 +222,8 @@ def _ragged(trials: Sequence[Trial], results: Sequence[Outcome | Refusal]) -> It
 
 @table("mending.uncus")
 def _uncus(trials: Sequence[Trial], results: Sequence[Outcome | Refusal]) -> Iterator[Cells | str]:
-    for cells, trial, result in _cases(trials, results):
-        met = False
+    for trial, result in zip(trials, results, strict=True):
+        cells, met = _name(trial), False
         if isinstance(result, Outcome):
             damage = result.damage
             met = result.found > 0 and damage.status == Status.REPAIRED and not damage.changed

@@ -144,7 +144,6 @@ class Member:
     """Longest edge of the voxels, mm."""
     margins: Mapping[str, float]
     """Statistic over limit by reason of the undamaged one."""
-    injuries: tuple[Injury, ...]
     damages: tuple[Damage, ...]
 
     @property
@@ -188,14 +187,13 @@ def measure_specimen(specimen: Specimen) -> Member:
     volume, hemi = make_labels(specimen)
     maps = measure_body(volume, hemi)
     site = Site(volume, maps.sheet)
-    damages, done = [], []
+    damages = []
     for injury in specimen.injuries:
         try:
             defect = make_defect(site, *injury)
         except SettingsError:  # too small for these voxels, or nothing there to damage
             continue
         found = attempt(lambda labels: measure_body(labels, hemi), defect.volume)
-        done.append(injury)
         damages.append(
             refused(found) if isinstance(found, Refusal) else compare(found, maps, defect.changed)
         )
@@ -205,7 +203,6 @@ def measure_specimen(specimen: Specimen) -> Member:
         mean=float(np.nanmean(maps.thickness)),
         spacing=longest_edge(volume),
         margins=maps.qc["flag_margins"],
-        injuries=tuple(done),
         damages=tuple(damages),
     )
 
