@@ -1,5 +1,6 @@
 """Phantoms with a head and digitations: thickness, and whether folds that touch are found."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,7 +9,7 @@ from hipsta_bids.phantom.head import HeadSpec, draw_head
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Float
 from hipsta_bids.validation.cases import Refusal, measure_body, run_cases
-from hipsta_bids.validation.report import Cells, Suite, Table
+from hipsta_bids.validation.report import Cells, Content, suite, table
 
 MAX_BIAS = 0.03
 """mm, of the head's mean thickness."""
@@ -43,24 +44,6 @@ _UNEVEN = tuple(
     for count in (0, 2)
 )
 
-_TEXT = """\
-Phantoms with a head (experimental regions): a spiral wall of 1.2 or 2 mm along an axis that is \
-straight and then hooked, with none to four digitations before the hook. Banks are upright, and \
-1.5 mm high without their arcs unless a row says another height. Errors are those \
-of the head's columns with values, mm."""
-_OPEN_NOTES = """\
-Clefts are 0.8 mm wide on both sides. The bias grows with the digitations: their arcs have a \
-radius of 0.4 mm on the inner side, about a voxel."""
-_NARROW_NOTES = """\
-Three digitations; exterior clefts of a given width. In clefts about a voxel wide banks touch here \
-and there: found or not, no column may be off."""
-_TOUCHING_NOTES = """\
-Found: places where banks touch, or ridges of low folds (`fused-digitation`), of those that were \
-closed. Off: columns that still have values and are off by more than 0.5 mm."""
-_UNEVEN_NOTES = """\
-Walls that are thicker at their edges by a share and thinner midway, or the other way round; \
-clefts are open."""
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Head:
@@ -70,21 +53,20 @@ class _Head:
     """Where banks were found to touch."""
 
 
-def run(full: bool) -> Suite:
+@suite("heads")
+def run(full: bool) -> Iterator[Content]:
     """Measure heads with open clefts, with narrow ones, with banks that touch, and uneven walls."""
     groups = (_OPEN, _NARROW, _TOUCHING, _UNEVEN) if full else (_OPEN[3:4], (), _TOUCHING[1:2], ())
     voxels = VOXELS if full else VOXELS[1:]
     specs = [[replace(s, voxel=v) for v in voxels for s in group] for group in groups]
     results = iter(run_cases(_measure, [s for group in specs for s in group], timeout=120.0))
-    rows = [[_row(spec, next(results)) for spec in group] for group in specs]
-    titles = ("Open clefts", "Narrow clefts", "Banks that touch", "Uneven walls")
-    notes = (_OPEN_NOTES, _NARROW_NOTES, _TOUCHING_NOTES, _UNEVEN_NOTES)
-    tables = tuple(
-        Table(title=title, rows=found, notes=note)
-        for title, found, note in zip(titles, rows, notes, strict=True)
-        if found
-    )
-    return Suite(name="heads", title="Heads with digitations", text=_TEXT, tables=tables)
+    for name, group in zip(("open", "narrow", "touching", "uneven"), specs, strict=True):
+        if group:
+            yield table(f"heads.{name}")(_rows)(group, results)
+
+
+def _rows(group: Sequence[HeadSpec], results: Iterator[_Head | Refusal]) -> Iterator[Cells]:
+    yield from (_row(spec, next(results)) for spec in group)
 
 
 def _measure(spec: HeadSpec) -> _Head:

@@ -1,5 +1,6 @@
 """Thickness of HippUnfold's labels beside HippUnfold's own, and beside walls that it drew."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -26,7 +27,7 @@ from hipsta_bids.validation.cases import (
     measure_body,
     run_cases,
 )
-from hipsta_bids.validation.report import Cell, Cells, Suite, Table
+from hipsta_bids.validation.report import Cell, Cells, Content, suite, table
 
 VOXEL = 0.4
 """mm, of labels that are drawn from surfaces: fine enough for walls of 1.5 mm."""
@@ -75,7 +76,8 @@ class Pair:
     """(Nx, Ny) HippUnfold's thickness where our mid-surface is, mm."""
 
 
-def run(full: bool, labels: Path | None = None) -> Suite:
+@suite("hippunfold")
+def run(full: bool, labels: Path | None = None) -> Iterator[Content]:
     """Measure HippUnfold's labels, and labels that are drawn between its surfaces."""
     folders = hippunfold_beside(labels) if labels else []
     persons: list[HemisphereInput] = []
@@ -86,51 +88,51 @@ def run(full: bool, labels: Path | None = None) -> Suite:
         templates += [(path, h) for path in sorted(folder.glob("templates/tpl-*")) for h in "LR"]
     persons, templates = (persons, templates) if full else (persons[:1], [])
     if not persons:
-        return Suite(name="hippunfold", title="HippUnfold", text=_LEFT_OUT)
-    known = run_cases(measure_template, templates, timeout=120.0)
-    own = run_cases(measure_person, persons)
-    rows = [
-        *(_row(f"{p.subject} {p.hemi}", OWN, r) for p, r in zip(persons, own, strict=True)),
-        *(
-            _row(f"{path.name.removeprefix('tpl-')} {hemi}", DRAWN, r)
-            for (path, hemi), r in zip(templates, known, strict=True)
-        ),
-    ]
-    about = [Table(title="Thickness against HippUnfold's own, mm", rows=rows, notes=_NOTES)]
-    cases: list[HemisphereInput | tuple[Path, str]] = [*templates, *persons]
+        yield _LEFT_OUT
+        return
+    yield _thickness_table(persons, templates)
+    cases: list[Source] = [*templates, *persons]
     if templates and labels:
-        both = [*cases, *fine_segmentations(labels, MAX_VOXEL)]
-        alone = run_cases(measure_alone, both, timeout=120.0)
-        twice = [_alone_row(_name(c), r) for c, r in zip(both, alone, strict=True)]
-        title = "The body with the head on one sheet, against the body alone, mm"
-        about.append(Table(title=title, rows=twice, notes=_ALONE_NOTES))
+        yield _alone_table([*cases, *fine_segmentations(labels, MAX_VOXEL)])
     if templates:
-        results = run_cases(measure_whole_sheet, cases, timeout=120.0)
-        whole = [
-            {"hemisphere": _name(case), **row}
-            for case, result in zip(cases, results, strict=True)
-            for row in _whole_rows(result, known=isinstance(case, tuple))
-        ]
-        title = "Head to tail on one sheet (experimental), mm"
-        about.append(Table(title=title, rows=whole, notes=_WHOLE_NOTES))
+        yield _whole_table(cases)
     flat = [path for folder in folders for path in sorted(folder.rglob(_UNFOLDED))][:1]
     if flat and templates:
-        sources: dict[str, Source] = {
-            **{
-                f"{path.name.removeprefix('tpl-')} {hemi}": (path, hemi) for path, hemi in templates
-            },
-            **{f"{item.subject} {item.hemi}": item for item in persons},
-        }
-        places = run_cases(measure_places, [(s, flat[0]) for s in sources.values()], timeout=120.0)
-        rows = [
-            {"hemisphere": name, "target": str(row), "met": False}
-            if isinstance(row, Refusal)
-            else {"hemisphere": name, **row}
-            for name, row in zip(sources, places, strict=True)
-        ]
-        title = "Coordinates against HippUnfold's"
-        about.append(Table(title=title, rows=rows, notes=_PLACE_NOTES))
-    return Suite(name="hippunfold", title="HippUnfold", text=_TEXT, tables=tuple(about))
+        yield _places_table(cases, flat[0])
+
+
+@table("hippunfold.thickness")
+def _thickness_table(
+    persons: Sequence[HemisphereInput], templates: Sequence[tuple[Path, str]]
+) -> Iterator[Cells]:
+    known = run_cases(measure_template, templates, timeout=120.0)
+    own = run_cases(measure_person, persons)
+    for person, result in zip(persons, own, strict=True):
+        yield _row(_name(person), OWN, result)
+    for template, result in zip(templates, known, strict=True):
+        yield _row(_name(template), DRAWN, result)
+
+
+@table("hippunfold.alone")
+def _alone_table(cases: Sequence[Source]) -> Iterator[Cells]:
+    results = run_cases(measure_alone, cases, timeout=120.0)
+    yield from (_alone_row(_name(c), r) for c, r in zip(cases, results, strict=True))
+
+
+@table("hippunfold.whole")
+def _whole_table(cases: Sequence[Source]) -> Iterator[Cells]:
+    results = run_cases(measure_whole_sheet, cases, timeout=120.0)
+    for case, result in zip(cases, results, strict=True):
+        for row in _whole_rows(result, known=isinstance(case, tuple)):
+            yield {"hemisphere": _name(case), **row}
+
+
+@table("hippunfold.places")
+def _places_table(cases: Sequence[Source], flat: Path) -> Iterator[Cells]:
+    results = run_cases(measure_places, [(case, flat) for case in cases], timeout=120.0)
+    for case, row in zip(cases, results, strict=True):
+        refused: Cells = {"target": str(row), "met": False}
+        yield {"hemisphere": _name(case), **(refused if isinstance(row, Refusal) else row)}
 
 
 def measure_person(item: HemisphereInput) -> Pair:
@@ -148,7 +150,7 @@ def measure_template(case: tuple[Path, str]) -> Pair:
     return _pair(measure_body(volume, case[1]), points, thickness)
 
 
-def measure_whole_sheet(case: HemisphereInput | tuple[Path, str]) -> Parts:
+def measure_whole_sheet(case: Source) -> Parts:
     """Measure from head to tail: by part, our thickness and that of HippUnfold's walls, (N,) mm.
 
     Corresponding vertices of a template's two walls may lie obliquely to each other, next to edges;
@@ -240,7 +242,7 @@ def _whole_rows(result: Parts | Refusal, *, known: bool) -> list[Cells]:
     return rows
 
 
-def measure_alone(case: HemisphereInput | tuple[Path, str]) -> tuple[Float, Float, Float]:
+def measure_alone(case: Source) -> tuple[Float, Float, Float]:
     """Measure the body on the sheet with the head, and alone, both without the molecular layer.
 
     Returns the two thicknesses of the nodes that have both, and their distances, (N,) mm.
@@ -260,13 +262,13 @@ def measure_alone(case: HemisphereInput | tuple[Path, str]) -> tuple[Float, Floa
     return maps.thickness[:, rows][told], alone.thickness[told], apart[told]
 
 
-def _volume(case: HemisphereInput | tuple[Path, str]) -> tuple[LabelVolume, str]:
+def _volume(case: Source) -> tuple[LabelVolume, str]:
     if isinstance(case, tuple):
         return draw_template(*case)[0], case[1]
     return read_label_volume(case), case.hemi
 
 
-def _name(case: HemisphereInput | tuple[Path, str]) -> str:
+def _name(case: Source) -> str:
     if isinstance(case, tuple):
         return f"{case[0].name.removeprefix('tpl-')} {case[1]}"
     return f"{case.subject} {case.hemi}"
@@ -400,42 +402,4 @@ _LEFT_OUT = """\
 Left out: it needs `--labels DIR` and, beside DIR, a folder `hippunfold` with outputs of that
 program (its labels, and its surfaces in `surf`). Coordinates are compared if an unfolded surface
 (`space-unfold`, 0.5 mm) is there.
-"""
-
-_TEXT = """\
-HippUnfold (DeKraker et al. 2022) has a thickness of its own: the distance of its inner and its
-outer surface. A person's labels are measured, and compared with it node by node. Of templates,
-whose two surfaces are known, labels are drawn between these in voxels of 0.4 mm: then the walls
-are the same.
-"""
-
-_PLACE_NOTES = """\
-x and y of the whole sheet against HippUnfold's coordinates (PD, proximal to distal; AP, anterior to
-posterior), which `hipsta-bids resample` takes for the same. Of each node with a value, and the
-nearest vertex of HippUnfold's; mean differences in percent of the way between the sides. In mm:
-from the node to where HippUnfold's surface has the same coordinates.
-"""
-
-_WHOLE_NOTES = """\
-Of each node with a value, which lies at least 1 mm, and one thickness, from edges, ends and holes,
-and the nearest vertex of HippUnfold's. Nodes where HippUnfold's corresponding vertices lie
-obliquely to each other are left out: their distance is not a thickness. Labels beside the walls
-come from the walls themselves, which favors the method. A person's bias is the distance of
-HippUnfold's walls from the borders of its labels.
-"""
-
-_ALONE_NOTES = """\
-Of nodes of the body with a value on both sheets; both without the molecular layer. The sheet with
-the head takes its coordinates over from the body alone, so that same nodes lie in the same place.
-"""
-
-_NOTES = """\
-Of each node of our mid-surface and the nearest vertex of HippUnfold's. Inner nodes: without the
-outer 4 on each side along x and the outer 2 along y, 65 % of all; what the other 35 % have of the
-variance of the difference is told beside it. A person's labels are thicker than HippUnfold's
-thickness, since its walls lie inside its labels: between walls that are known, the bias is gone. So
-the two must not be pooled. SD and correlation of a person miss their targets at the edges: most of
-the variance is there, and among inner nodes the correlation comes near to its target or meets it.
-Between HippUnfold's own walls they miss them at the edges as well, where the nearest vertex is not
-on the same line across the wall.
 """
