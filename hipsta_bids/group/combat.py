@@ -19,7 +19,7 @@ from hipsta_bids import __version__
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.data import Bool, Float, Int, Key, Nested, read_foreign
 from hipsta_bids.group.formula import Contrast
-from hipsta_bids.group.glm import chunks
+from hipsta_bids.group.glm import chunks, sum_by
 from hipsta_bids.group.grammar import closed_formula
 from hipsta_bids.group.mixed import fit_mixed
 from hipsta_bids.group.settings import GroupSettings, HarmonizationSettings
@@ -268,11 +268,9 @@ def _residuals(
 def _intercepts(rest: Float, participant: Int, ratio: Float) -> Float:
     """(visits, points) predicted random intercepts."""
     _, numbers = np.unique(participant, return_inverse=True)
-    order = np.argsort(numbers, kind="stable")
-    starts = np.searchsorted(numbers[order], np.arange(numbers.max() + 1))
     known = np.isfinite(rest)
-    total = np.add.reduceat(np.where(known, rest, 0.0)[order], starts, axis=0)
-    count = np.add.reduceat(known[order].astype(np.float64), starts, axis=0)
+    total = sum_by(numbers, np.where(known, rest, 0.0))
+    count = sum_by(numbers, known.astype(np.float64))
     return np.asarray((total * ratio / (1 + count * ratio))[numbers])
 
 

@@ -9,6 +9,7 @@ from statsmodels.discrete.discrete_model import Logit
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.data import Bool, Float
+from hipsta_bids.group.glm import products_of
 from hipsta_bids.group.settings import ClassificationSettings
 
 #: Largest sum of margins, per subject, that still counts as rounding of the linear program.
@@ -116,7 +117,7 @@ def maxima(basis: Float, case: Bool, kept: Float, start: Float | None = None) ->
     sets the steps converged: with separated groups each step is about as long as the one before.
     """
     columns = basis.shape[1]
-    products = _products(basis)
+    products = products_of(basis)
     beta = np.tile(np.zeros(columns) if start is None else start, (len(kept), 1))
     settled = np.zeros(len(kept), dtype=bool)
     lost = np.zeros(len(kept), dtype=bool)
@@ -244,7 +245,7 @@ class _Sets:
 
     @classmethod
     def of(cls, matrix: Float, case: Bool, kept: Float) -> "_Sets":
-        return cls(matrix, _products(matrix), case, kept)
+        return cls(matrix, products_of(matrix), case, kept)
 
     def information(self, beta: Float) -> Float:
         chance = special.expit(beta @ self.matrix.T)
@@ -289,8 +290,3 @@ class _Sets:
         longest = np.maximum(np.abs(step).max(axis=1), 1e-300)
         share = np.minimum(1.0, _LONGEST_STEP / longest)
         return step * share[:, None], np.sum(gradient * along, axis=1) * share
-
-
-def _products(matrix: Float) -> Float:
-    """(subjects, columns * columns) products of each subject's values."""
-    return (matrix[:, :, None] * matrix[:, None, :]).reshape(len(matrix), -1)

@@ -12,7 +12,16 @@ from hipsta_bids.errors import ModelError
 from hipsta_bids.group.data import PARTICIPANT, Bool, Float, Int
 from hipsta_bids.group.exchangeability import Visits
 from hipsta_bids.group.formula import Contrast
-from hipsta_bids.group.glm import PointTest, PointwiseFit, RowModel, chunks, t_test, with_effects
+from hipsta_bids.group.glm import (
+    PointTest,
+    PointwiseFit,
+    RowModel,
+    check_design,
+    chunks,
+    sum_by,
+    t_test,
+    with_effects,
+)
 from hipsta_bids.group.model import Design
 from hipsta_bids.group.random_slope import (
     best_triangles,
@@ -115,13 +124,11 @@ class Sums:
 def collect_sums(maps: Float, basis: Float, participants: Int) -> Sums:
     """Sum over sessions and participants."""
     present = np.isfinite(maps)
-    order = np.argsort(participants, kind="stable")
-    starts = np.searchsorted(participants[order], np.arange(participants.max() + 1))
-    counts = np.add.reduceat(present[order].astype(np.float64), starts, axis=0)
+    counts = sum_by(participants, present.astype(np.float64))
     columns = np.empty((*maps.shape, basis.shape[1] + 1))
     columns[..., :-1] = present[:, :, None] * basis[:, None, :]
     columns[..., -1] = np.where(present, maps, 0.0)
-    own = np.add.reduceat(columns[order], starts, axis=0)
+    own = sum_by(participants, columns)
     sizes = np.unique(np.maximum(counts, 1.0))
     chosen = [np.where(counts == size, 1.0, 0.0) for size in sizes]
 
@@ -190,8 +197,16 @@ def fit_mixed(
     are independent, with the degrees of freedom that give F its expectation (Fai and Cornelius
     1996).
     """
-    numbers = _check(maps, matrix, participants)
-    if times is not None and np.bincount(numbers).max() < _SLOPE_SESSIONS:
+    check_design(maps, matrix, contrasts)
+    _, numbers, counts = np.unique(
+        np.asarray(participants), return_inverse=True, return_counts=True
+    )
+    if counts.max() == 1:
+        raise ModelError(
+            "longitudinal model: no participant has two sessions; use a linear model",
+            reason="one-session",
+        )
+    if times is not None and counts.max() < _SLOPE_SESSIONS:
         raise ModelError(
             "longitudinal model: no participant has three sessions, so that slopes cannot be"
             " separated from noise; use random intercepts",
@@ -276,35 +291,6 @@ def _independent(rotated: Sequence[Float], inverse: Float) -> tuple[Float, Float
             own = np.einsum("pjk,ji->kpi", axes, rows)
         turned.append(own)
     return np.concatenate(given), np.concatenate(turned)
-
-
-def _check(
-    maps: Float,
-    matrix: Float,
-    participants: Sequence[str] | NDArray[np.str_],
-) -> Int:
-    """Refuse what cannot be fitted; participants as numbers otherwise."""
-    if not len(maps) == len(matrix) == len(participants):
-        raise ModelError(
-            f"longitudinal model: {len(maps)} maps, {len(matrix)} rows of the design and"
-            f" {len(participants)} participants; all need one per session",
-            reason="design-shape",
-        )
-    if np.linalg.matrix_rank(matrix) < matrix.shape[1]:
-        raise ModelError(
-            f"longitudinal model: the design's {matrix.shape[1]} columns are not independent;"
-            " leave one out",
-            reason="design-rank",
-        )
-    _, numbers, counts = np.unique(
-        np.asarray(participants), return_inverse=True, return_counts=True
-    )
-    if counts.max() == 1:
-        raise ModelError(
-            "longitudinal model: no participant has two sessions; use a linear model",
-            reason="one-session",
-        )
-    return np.asarray(numbers, dtype=np.int64)
 
 
 def _fit(

@@ -22,7 +22,7 @@ from hipsta_bids.errors import ModelError
 from hipsta_bids.group.combat import solve_points
 from hipsta_bids.group.data import Bool, Float, Int, Key, as_nested, read_foreign
 from hipsta_bids.group.exchange import Known, Number, Text
-from hipsta_bids.group.glm import chunks
+from hipsta_bids.group.glm import chunks, products_of
 from hipsta_bids.group.settings import NormSettings
 from hipsta_bids.io import files
 from hipsta_bids.protocols.toml import TomlTable
@@ -278,8 +278,7 @@ def _weighted(values: Float, weight: Float, design: Float) -> Float:
     columns = design.shape[1]
     grams = np.zeros((values.shape[1], columns**2))
     for rows in chunks((columns**2, len(design)), 1):
-        products = (design[rows, :, None] * design[rows, None, :]).reshape(-1, columns**2)
-        grams += weight[rows].T @ products
+        grams += weight[rows].T @ products_of(design[rows])
     return solve_points(grams.reshape(-1, columns, columns), (weight * values).T @ design, 0.0)
 
 

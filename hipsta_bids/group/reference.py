@@ -18,7 +18,12 @@ from hipsta_bids.group.glm import FittedMaps, PointwiseFit, RowModel, fit_maps, 
 from hipsta_bids.group.mixed import longitudinal_model
 from hipsta_bids.group.model import ModelRequest, build_design, default_formula
 from hipsta_bids.group.settings import GroupSettings, RetestSettings
-from hipsta_bids.group.summaries import fit_summaries, hemispheres, summary_values
+from hipsta_bids.group.summaries import (
+    fit_summaries,
+    hemispheres,
+    participants_with,
+    summary_values,
+)
 
 #: Months per unit of columns of time with these names.
 _MONTHS = {"years": 12.0, "months": 1.0, "days": 12 / 365.25}
@@ -368,10 +373,7 @@ class Modeled:
 
     def _reference(self, rows: Int, values: Float, fit: PointwiseFit) -> Reference:
         """At one visit with the residual variance; over time with changes and both variances."""
-        numbers, names = pd.factorize(self._table[PARTICIPANT].iloc[rows])
-        seen = np.zeros((len(names), values.shape[1]), dtype=bool)
-        np.logical_or.at(seen, numbers, np.isfinite(values))
-        n = seen.sum(axis=0)
+        n = participants_with(values, self._table[PARTICIPANT].iloc[rows].to_numpy())
         plain = Reference(
             n=n,
             mean=mean_of_known(values, 0),

@@ -12,7 +12,7 @@ from hipsta_bids.group.classify import PairComparison, compare_pairs
 from hipsta_bids.group.comparison import BOTH
 from hipsta_bids.group.data import PARTICIPANT, Cohort, Float, Int
 from hipsta_bids.group.formula import Contrast, ModelSpec, check_names, typed
-from hipsta_bids.group.glm import MEAN, PointwiseFit, RowModel, with_mean
+from hipsta_bids.group.glm import MEAN, PointwiseFit, RowModel, sum_by, with_mean
 from hipsta_bids.group.grammar import closed_formula
 from hipsta_bids.group.model import Design, Groups, build_design
 from hipsta_bids.group.settings import GroupSettings
@@ -113,13 +113,9 @@ def _fit(  # noqa: PLR0917
 
 def participants_with(values: Float, who: NDArray[np.object_]) -> Int:
     """Count those (columns,) who have a value in any of their rows."""
-    names, numbers = np.unique(who.astype(str), return_inverse=True)
-    if len(names) == len(who):
-        return np.asarray(np.isfinite(values).sum(axis=0), dtype=np.int64)
-    order = np.argsort(numbers, kind="stable")
-    starts = np.searchsorted(numbers[order], np.arange(len(names)))
-    known = np.isfinite(values)[order]
-    return np.asarray(np.logical_or.reduceat(known, starts, axis=0).sum(axis=0), dtype=np.int64)
+    numbers = np.unique(who.astype(str), return_inverse=True)[1]
+    counts = sum_by(numbers, np.isfinite(values).astype(np.int64))
+    return np.asarray((counts > 0).sum(axis=0), dtype=np.int64)
 
 
 def _same_names(larger: Design, design: Design) -> tuple[Contrast, ...]:
