@@ -33,7 +33,6 @@ from hipsta_bids.group.glm import FittedMaps, PointTest, RowModel, fit_maps, wit
 from hipsta_bids.group.grammar import closed_formula
 from hipsta_bids.group.harmonize import (
     Harmonization,
-    SitePlan,
     check_in_model,
     harmonize_cohort,
     plan_sites,
@@ -213,23 +212,24 @@ def analyze_cohort(
     fitted = _fit_sides(compared, measures.maps, rows, comparison, settings)
     found = correct(fitted, rows, table, settings)
     unregistered: Mapping[MapKey, Discoveries] = {}
-    if settings.registration.align != "none" and settings.multiplicity.method not in PERMUTATIONS:
-        plain = _as_measured(cohort, plan, settings, measures)
-        if plain is not None:
-            again = compare_sessions(plain, comparison)
-            refitted = _fit_sides(again, measures.maps, rows, comparison, settings)
-            unregistered = correct(refitted, rows, table, settings)
-    scores = None
-    if comparison.normative is not None:
-        tell("w-scores")
-        scores = score_cohort(
-            compared,
-            model,
-            comparison.normative,
-            settings,
-            measures=measures,
-            references=references,
-        )
+    again = settings.registration.align != "none" and not (
+        plan and plan.saved
+    )  # its nodes are registered
+    if again and settings.multiplicity.method not in PERMUTATIONS:
+        plain = cohort
+        if plan is not None:
+            plain = harmonize_cohort(cohort, plan, settings, measures, {}).cohort
+        plain = compare_sessions(plain, comparison)
+        refitted = _fit_sides(plain, measures.maps, rows, comparison, settings)
+        unregistered = correct(refitted, rows, table, settings)
+    scores = score_cohort(
+        compared,
+        model,
+        comparison.normative,
+        settings,
+        measures=measures,
+        references=references,
+    )
     tell("summary measures")
     summaries, notes = fit_summaries(
         compared,
@@ -266,17 +266,6 @@ def analyze_cohort(
     )
 
 
-def _as_measured(
-    cohort: Cohort, plan: SitePlan | None, settings: GroupSettings, measures: Measures
-) -> Cohort | None:
-    """Harmonize maps without registration; a file's effects are those of registered nodes."""
-    if plan is None:
-        return cohort
-    if plan.saved is not None:
-        return None
-    return harmonize_cohort(cohort, plan, settings, measures, {}).cohort
-
-
 def analyze_points(cohort: Cohort, analysis: Analysis, settings: GroupSettings) -> Analysis:
     """Fit the model of an analysis to further maps, which are not registered."""
     maps = tuple(dict.fromkeys(name for side in cohort.sides.values() for name in side.maps))
@@ -285,17 +274,14 @@ def analyze_points(cohort: Cohort, analysis: Analysis, settings: GroupSettings) 
         done = harmonize_cohort(cohort, analysis.harmonization.plan, settings, measured, {})
     compared = compare_sessions(cohort if done is None else done.cohort, analysis.comparison)
     fitted = _fit_sides(compared, maps, analysis.row_model, analysis.comparison, settings)
-    scores = None
-    if analysis.comparison.normative is not None:
-        tell("w-scores")
-        scores = score_cohort(
-            compared,
-            analysis.model,
-            analysis.comparison.normative,
-            settings,
-            measures=measured,
-            references=analysis.design.references,
-        )
+    scores = score_cohort(
+        compared,
+        analysis.model,
+        analysis.comparison.normative,
+        settings,
+        measures=measured,
+        references=analysis.design.references,
+    )
     return replace(
         analysis,
         sides={},

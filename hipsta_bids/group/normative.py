@@ -17,6 +17,7 @@ from hipsta_bids.group.grammar import closed_formula
 from hipsta_bids.group.model import build_design
 from hipsta_bids.group.settings import GlmSettings, GroupSettings
 from hipsta_bids.group.summaries import hemispheres, summary_values
+from hipsta_bids.progress import tell
 
 #: Region of a score that is the mean over the whole sheet.
 WHOLE = "all"
@@ -48,11 +49,6 @@ def w_scores(maps: Float, matrix: Float, reference: Bool, settings: GlmSettings)
             reason="normative-covariance",
         )
     own = matrix[reference]
-    if not np.isfinite(matrix).all():
-        raise ModelError(
-            "normative scores: covariates are missing; keep complete rows only",
-            reason="design-missing",
-        )
     if len(own) - matrix.shape[1] <= settings.min_residual_df:
         raise ModelError(
             f"normative scores: {len(own)} reference subjects are too few for"
@@ -141,13 +137,16 @@ class Scores:
 def score_cohort(
     cohort: Cohort,
     model: ModelSpec,
-    normative: tuple[str, str],
+    normative: tuple[str, str] | None,
     settings: GroupSettings,
     *,
     measures: Measures,
     references: Mapping[str, str],
-) -> Scores:
+) -> Scores | None:
     """Score all participants who have the covariates of a model, whatever their group."""
+    if normative is None:
+        return None
+    tell("w-scores")
     factor, level = normative
     formula = without_variable(model.formula, factor)
     known = closed_formula(formula).names
