@@ -46,18 +46,15 @@ from hipsta_bids.group.run import (
     GroupInputs,
     GroupOptions,
     GroupResult,
-    describe_dataset,
-    make_page,
     read_inputs,
     read_templates,
-    record_inputs,
+    write_folder,
 )
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.tables import entity_label, registration_tables
 from hipsta_bids.group.warps import Template
 from hipsta_bids.io import files, gifti
 from hipsta_bids.progress import each, tell
-from hipsta_bids.protocols.toml import resolve
 from hipsta_bids.reports.group_tables import display_name, with_brackets
 
 if TYPE_CHECKING:
@@ -228,42 +225,23 @@ def write_answer(
     record: Mapping[str, Any],
     fill: Callable[[Path], list[str]],
 ) -> GroupResult:
-    """Write what all questions other than comparisons have in common, and make the page.
+    """Write what all questions other than comparisons have in common.
 
     ``fill`` writes all else into the folder, and returns notes.
     """
     excluded = [*inputs.exclusions, *exclude_visits(inputs.cohort.table, left_out)]
-    region, people = options.sheets.region, int(visits[PARTICIPANT].nunique())
-    name = options.model.name or name + ("" if region == "body" else f"_{region}")
-    describe_dataset(options)
-    with write.model_folder(options.out_dir, name) as folder:
-        tell("tables and maps")
+    told, people = [*notes], int(visits[PARTICIPANT].nunique())
+
+    def everything(folder: Path) -> dict[str, Any]:
         for title, table in tables.items():
             write.write_table(folder, title, table)
         write.write_exclusions(folder, excluded)
         write.write_table(folder, "covariates", visits, described=False)
-        notes = [*notes, *fill(folder)]
-        every = {
-            "command": list(options.command),
-            "version": __version__,
-            "inputs": record_inputs(options, inputs.found),
-            "participants": people,
-            "rows": len(visits),
-            **record,
-            "notes": [*inputs.found.warnings, *notes],
-            "settings": resolve(settings),
-        }
-        files.write_json(folder / "analysis.json", every)
-    page, problem = make_page(options, name)
-    return GroupResult(
-        folder=options.out_dir / write.GROUP_FOLDER / name,
-        page=page,
-        problem=problem,
-        n_participants=people,
-        n_excluded=len(excluded),
-        notes=tuple(notes),
-        warnings=inputs.found.warnings,
-    )
+        told.extend(fill(folder))
+        return {"participants": people, "rows": len(visits), **record}
+
+    counts = people, len(excluded)
+    return write_folder(options, name, inputs, settings, notes=told, counts=counts, fill=everything)
 
 
 def _choose(
@@ -413,14 +391,11 @@ def _write_maps(folder: Path, surface: str, cohort: Cohort, found: Sequence[MapF
         blocks = []
         for one in found:
             if question in one.tables:
-                frame = frame_of(cohort, one.place)
                 columns = {
                     "hemi": one.hemi,
                     "measure": one.measures[0],
                     "unit": cohort.units.get(one.measures[0], "1"),
-                    **frame.number,
-                    **frame.position,
-                    "subfield": frame.subfield,
+                    **frame_of(cohort, one.place).columns,
                     **one.tables[question],
                 }
                 blocks.append(pd.DataFrame(columns))
