@@ -27,7 +27,6 @@ from hipsta_bids.group.sites import (
     analyze_sites,
     check_agreement,
     meta_tables,
-    point_test,
 )
 from hipsta_bids.group.tables import META_COLUMNS
 from hipsta_bids.group.write import (
@@ -113,19 +112,9 @@ def _read(given: Sequence[tuple[str | None, Path]]) -> list[SiteSummary]:
 
 def _write_maps(folder: Path, meta: Meta) -> None:
     """Write maps of both models as GIFTI and CIFTI, and the sheets to draw them on."""
-    cohort, confidence = _cohort(meta), meta.settings.meta.confidence
-    write_stats(
-        folder,
-        stats_of(
-            (
-                item.key(effects),
-                point_test(item, effects, confidence),
-                meta.found[item.key(effects)],
-            )
-            for item in meta.of("map")
-            for effects in item.result.models
-        ),
-    )
+    tests = (one for item in meta.of("map") for one in meta.tests(item))
+    write_stats(folder, stats_of((key, test, meta.found[key]) for key, test, _ in tests))
+    cohort = _cohort(meta)
     for hemi in dict.fromkeys(item.model.hemi for item in meta.of("map")):
         write_surface(folder, cohort, _place(meta, hemi, cohort), hemi)
 
@@ -145,8 +134,7 @@ def _figures(meta: Meta) -> Iterator[tuple[str, Drawing]]:
     for item in maps:
         measures = tests.setdefault(item.model.hemi, {})
         measures.setdefault(item.model.measures[0], []).extend(
-            point_test(item, effects, meta.settings.meta.confidence)
-            for effects in item.result.models
+            test for _, test, _ in meta.tests(item)
         )
     places = {hemi: _place(meta, hemi, cohort) for hemi in tests}
     like = {item.label(RANDOM): item.label(FIXED) for item in maps}

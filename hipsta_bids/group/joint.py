@@ -10,7 +10,7 @@ import pandas as pd
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.analysis import Analysis
-from hipsta_bids.group.clusters import Cluster, edges_of, find_clusters, frame_of
+from hipsta_bids.group.clusters import edges_of, find_clusters, frame_of
 from hipsta_bids.group.comparison import BOTH, Comparison, asymmetry_name
 from hipsta_bids.group.data import Cohort
 from hipsta_bids.group.glm import FittedMaps, PointTest
@@ -161,9 +161,7 @@ def joint_points(one: JointMap) -> pd.DataFrame:
     """List all points of a map, with the p-value of each measure by itself."""
     frame = frame_of(one.cohort, one.place)
     columns = {
-        **frame.number,
-        **frame.position,
-        "subfield": frame.subfield,
+        **frame.columns,
         "n": np.min([fit.fits[measure].n for fit, measure in one.parts.values()], axis=0),
         "statistic": one.test.statistic,
         "p": one.test.p_uncorrected,
@@ -180,31 +178,24 @@ def joint_peaks(joint: Sequence[JointMap], settings: GroupSettings) -> pd.DataFr
     for one in joint:
         frame, tests, z = frame_of(one.cohort, one.place), one.tests, one.test.statistic
         edges = edges_of(one.place.maps, settings.multiplicity.neighbors)
-        clusters = find_clusters(one.found.rejected, z, frame.subfield, edges)
-        if not clusters and np.isfinite(z).any():
-            clusters = [Cluster(0, int(np.nanargmax(z)), {})]
-        where = {**(frame.number if "vertex" in frame.number else {}), **frame.position}
-        for cluster in clusters:
+        for cluster in find_clusters(one.found.rejected, z, frame.subfield, edges):
             at = cluster.peak
             words = [
                 f"{title} {effect_name(_EFFECTS[test.kind])} {number_text(test.effect[at])},"
                 f" p {p_text(test.p[at])}"
                 for title, test in tests.items()
             ]
-            shares = (f"{name} {share:.0%}" for name, share in cluster.shares.items())
             rows.append(
                 {
                     "measure": JOINT,
                     "contrast": one.key.contrast,
                     "hemi": one.key.hemi,
-                    **{name: values[at] for name, values in where.items()},
-                    "subfield": frame.subfield[at],
+                    **frame.at(at),
                     "test": "z",
                     "statistic": z[at],
                     "p": one.test.p_uncorrected[at],
                     "p_corrected": one.found.adjusted[at],
-                    "extent": cluster.extent,
-                    "shares": "; ".join(shares),
+                    **cluster.columns,
                     "measures": "; ".join(words),
                 }
             )

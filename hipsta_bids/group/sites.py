@@ -69,6 +69,25 @@ class Meta:
     """Points by hemisphere."""
     settings: GroupSettings
 
+    def tests(self, item: Item) -> Iterator[tuple[MapKey, PointTest, Combined]]:
+        """A combined estimate as tests; Cohen's d is over the residual SD within sites."""
+        sd, none = item.result.sd, np.full(len(item.result.sd), np.nan)
+        for effects, one in item.result.models.items():
+            limits = one.limits(self.settings.meta.confidence)
+            test = PointTest(
+                contrast=Contrast(item.label(effects), np.ones(1)),
+                statistic=one.statistic,
+                p=one.p,
+                df=one.df,
+                estimate=one.estimate[None],
+                se=one.se[None],
+                cohen_d=one.estimate / sd,
+                cohen_d_limits=np.stack(limits) / sd,
+                eta_squared=none,
+                eta_squared_limits=np.stack([none, none]),
+            )
+            yield item.key(effects), test, one
+
     def of(self, kind: str) -> Iterator[Item]:
         """Contrasts of maps, or of summary measures."""
         return (item for item in self.items if item.model.kind == kind)
@@ -214,24 +233,6 @@ def _frame(sites: Sequence[SiteSummary], number: int) -> Frame:
     return Frame.of_sheet(np.array(first.x), np.array(first.y), np.array(names).reshape(shape))
 
 
-def point_test(item: Item, effects: str, confidence: float) -> PointTest:
-    """Write a combined estimate as a test; Cohen's d is over the residual SD within sites."""
-    one, sd = item.result.models[effects], item.result.sd
-    none = np.full(len(sd), np.nan)
-    return PointTest(
-        contrast=Contrast(item.label(effects), np.ones(1)),
-        statistic=one.statistic,
-        p=one.p,
-        df=one.df,
-        estimate=one.estimate[None],
-        se=one.se[None],
-        cohen_d=one.estimate / sd,
-        cohen_d_limits=np.stack(one.limits(confidence)) / sd,
-        eta_squared=none,
-        eta_squared_limits=np.stack([none, none]),
-    )
-
-
 def meta_tables(meta: Meta) -> Iterator[tuple[str, pd.DataFrame]]:
     """Make all tables."""
     confidence = meta.settings.meta.confidence
@@ -243,12 +244,11 @@ def meta_tables(meta: Meta) -> Iterator[tuple[str, pd.DataFrame]]:
     for item in meta.of("map"):
         frame = meta.frame[item.model.hemi]
         own = []
-        for effects in item.result.models:
-            key, test = item.key(effects), point_test(item, effects, confidence)
+        for key, test, one in meta.tests(item):
             found = meta.found[key]
             stem = tables.map_name(key.hemi, key.measure, key.contrast)
             rows.append(overview_row(stem, key, found))
-            low, high = item.result.models[effects].limits(confidence)
+            low, high = one.limits(confidence)
             columns = {
                 **point_columns(test, found, frame, meta.counts(item).astype(int)),
                 "n_sites": item.result.random.sites.astype(int),
@@ -385,8 +385,7 @@ def _summaries(meta: Meta) -> pd.DataFrame:
     parts = []
     for item in meta.of("summary"):
         other = combine(item.result.estimates, item.result.ses**2, "dl", least=least)
-        for effects, one in item.result.models.items():
-            test = point_test(item, effects, confidence)
+        for key, test, one in meta.tests(item):
             low, high = one.limits(confidence)
             parts.append(
                 pd.DataFrame(
@@ -395,7 +394,7 @@ def _summaries(meta: Meta) -> pd.DataFrame:
                         "measure": item.model.measures,
                         "unit": item.model.units,
                         "model": item.model.formula,
-                        "contrast": item.label(effects),
+                        "contrast": key.contrast,
                         "test": "t",
                         "n": meta.counts(item).astype(int),
                         "visits": meta.counts(item).astype(int),
