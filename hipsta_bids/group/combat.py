@@ -87,29 +87,16 @@ class SiteMoments:
 def fit_effects(
     values: Float, visits: Visits, n_sites: int, settings: GroupSettings, *, pooled: bool
 ) -> tuple[SiteEffects, SiteMoments]:
-    """Estimate the effects of sites.
+    """Estimate the effects of sites on values (visits, points), NaN where missing.
 
-    Parameters
-    ----------
-    values : array
-        (visits, points), NaN where missing.
-    visits : Visits
-        Participants with several of them get random intercepts, and the residual SD is the root
-        mean square of the conditional residuals, as the variant MSR of Beer et al. (2020): without
-        effects of sites it leaves the values as they are.
-    n_sites : int
-        Every site has visits.
-    settings : GroupSettings
-        ``harmonization``, and ``longitudinal`` for random intercepts.
-    pooled : bool
-        Whether points inform each other (empirical Bayes), as those of one map do. Otherwise each
-        site's own mean and variance are taken out.
+    Participants with several visits get random intercepts, and the residual SD is the root mean
+    square of the conditional residuals, as the variant MSR of Beer et al. (2020): without effects
+    of sites it leaves the values as they are. Every one of the ``n_sites`` has visits. Where
+    effects are ``pooled``, points inform each other (empirical Bayes), as those of one map do;
+    else each site's own mean and variance are taken out.
 
-    Returns
-    -------
-    SiteEffects, SiteMoments
-        Parameters, NaN at points where missing values leave sites and columns inseparable; and the
-        residuals of sites before harmonization.
+    Parameters are NaN at points where missing values leave sites and columns inseparable; moments
+    are those of residuals before harmonization.
     """
     used = np.flatnonzero(visits.site >= 0)
     values, visits = values[used], visits.take(used)
@@ -222,19 +209,10 @@ def _least_squares(values: Float, design: Float) -> Float:
 
 
 def solve_points(grams: Float, right: Float, least: float) -> Float:
-    """Solve the normal equations of each point.
+    """Solve the normal equations of each point: (columns, points), NaN where none is unique.
 
-    Parameters
-    ----------
-    grams, right : array
-        (points, columns, columns) and (points, columns); ``grams`` is overwritten.
-    least : float
-        A column with no more than this on the diagonal has no values: its coefficient is 0.
-
-    Returns
-    -------
-    array
-        (columns, points), NaN where the coefficients are not unique.
+    ``grams`` (points, columns, columns) is overwritten; ``right`` is (points, columns). A column
+    with no more than ``least`` on the diagonal has no values: its coefficient is 0.
     """
     diagonal = np.arange(grams.shape[1])
     size = grams[:, diagonal, diagonal]
@@ -417,10 +395,7 @@ class SavedEffects(TomlTable):
 def load_effects(path: Path) -> SavedEffects:
     """Read ``harmonization.json``; nothing in it is run.
 
-    Raises
-    ------
-    ModelError
-        If the file is too large, of another format, or its parts do not fit each other.
+    ModelError if it is too large, of another format, or its parts do not fit each other.
     """
     try:
         return read_foreign(path, SavedEffects, most=_LARGEST).model_copy(

@@ -53,13 +53,7 @@ class MetaOptions:
 
 
 def run_meta(options: MetaOptions, settings: GroupSettings) -> tuple[Path, list[str]]:
-    """Combine the summaries of sites; returns the page and what should be known.
-
-    Raises
-    ------
-    HipstaError
-        If a summary cannot be read, or sites do not agree.
-    """
+    """Combine the summaries of sites; returns the page and what should be known."""
     if settings.multiplicity.method in PERMUTATIONS:
         raise UsageError(
             "meta: there is nobody to permute in summaries; use --correction fdr2 or bh",

@@ -227,14 +227,10 @@ def uncertainty_weights(maps: Float, errors: Float, basis: Float, settings: GlmS
     """Weights 1 / (t2 + s2), mean 1, of values (subjects, points) with error variances s2.
 
     t2 is the variance between subjects at a point: the residual variance of the unweighted fit,
-    less what the errors explain of it,
-
-        t2 = (sum of squared residuals - sum s2 (1 - leverage)) / (n - columns),
-
-    by the method of moments (Hedges and Olkin 1985, Statistical Methods for Meta-Analysis, chapter
-    9; with covariates Raudenbush 2009). SDs from a few copies are rough and may all be too large or
-    too small; tests have HC3 standard errors, which do not take them at their word. 0 where a value
-    or SD is missing.
+    less what the errors explain of it, (sum of squared residuals - sum s2 (1 - leverage)) /
+    (n - columns), by the method of moments (Hedges and Olkin 1985, Statistical Methods for
+    Meta-Analysis, chapter 9; with covariates Raudenbush 2009). Rough SDs are no matter, since tests
+    have HC3 standard errors. 0 where a value or SD is missing.
     """
     present = np.isfinite(maps) & np.isfinite(errors)
     ordinary = settings.changed(covariance="ordinary")

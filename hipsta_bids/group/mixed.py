@@ -277,10 +277,13 @@ def _denominator(df: Float) -> Float:
     return np.where(np.isfinite(df).all(axis=0) & np.isnan(found), least, found)
 
 
-def _independent(rotated: Sequence[Float], inverse: Float) -> tuple[Float, Float]:
-    """Rows of weights at each point, and those that make the rows of a contrast independent.
+def _tested(
+    rotated: Sequence[Float], scores: Float, inverse: Float, variance: Float
+) -> tuple[Float, dict[str, Float]]:
+    """Rows that make those of each contrast independent, and estimates of these; points last.
 
-    ``inverse`` is (points, columns, columns); both results are (rows, points, columns).
+    Rows are (rows, points, columns), scores (points, columns), the inverse (points, columns,
+    columns).
     """
     given, turned = [], []
     for rows in rotated:
@@ -290,7 +293,13 @@ def _independent(rotated: Sequence[Float], inverse: Float) -> tuple[Float, Float
             axes = np.linalg.eigh(rows @ inverse @ rows.T)[1]
             own = np.einsum("pjk,ji->kpi", axes, rows)
         turned.append(own)
-    return np.concatenate(given), np.concatenate(turned)
+    both = np.concatenate(given), np.concatenate(turned)
+    (estimate, se), (other, root) = (
+        (np.einsum("cpj,pj->cp", rows, scores), np.sqrt(forms(inverse, rows) * variance))
+        for rows in both
+    )
+    found = {"scores": scores.T, "residual": variance, "estimate": estimate, "se": se}
+    return both[1], found | {"t": other / root}
 
 
 def _fit(
@@ -310,23 +319,18 @@ def _fit(
     state = sums.at(ratio)
     freedom = sums.n - columns
     variance = state.residual[0] / freedom
-    given, turned = _independent(rotated, state.inverse)
+    turned, found = _tested(rotated, state.scores, state.inverse, variance)
     form = forms(state.inverse, turned)
     slope = -forms(state.inverse @ state.information_first @ state.inverse, turned)
     df = _satterthwaite(form, slope, freedom, ratio, state)
     blank = np.where(usable, 1.0, np.nan)
-    return {
-        "scores": state.scores.T * blank,
-        "residual": variance * blank,
-        "participant": variance * ratio * blank,
-        "slope": np.full(len(blank), np.nan),
-        "n": sums.n.astype(np.float64),
-        "estimate": np.einsum("cpj,pj->cp", given, state.scores) * blank,
-        "se": np.sqrt(forms(state.inverse, given) * variance) * blank,
-        "t": np.einsum("cpj,pj->cp", turned, state.scores) / np.sqrt(form * variance) * blank,
-        "df": df * blank,
-        "loss": (freedom * np.log(state.residual[0]) + state.penalty[0]) * blank,
+    found |= {
+        "participant": variance * ratio,
+        "df": df,
+        "loss": freedom * np.log(state.residual[0]) + state.penalty[0],
     }
+    found = {name: values * blank for name, values in found.items()}
+    return found | {"slope": np.full(len(blank), np.nan), "n": sums.n.astype(np.float64)}
 
 
 def _fit_slopes(
@@ -349,26 +353,21 @@ def _fit_slopes(
     triangles = best_triangles(kept, settings)
     state = solve_slopes(kept, triangles)
     variance = state.residual / (kept.n - basis.shape[1])
-    given, turned = _independent(rotated, state.inverse)
-    se, root = (np.sqrt(forms(state.inverse, rows) * variance) for rows in (given, turned))
+    turned, found = _tested(rotated, state.scores, state.inverse, variance)
+    found |= {
+        "participant": variance * triangles[:, 0] ** 2,
+        "slope": variance * np.sum(triangles[:, 1:] ** 2, axis=1) / unit**2,
+        "df": slope_freedom(kept, triangles, turned),
+        "loss": (kept.n - basis.shape[1]) * np.log(state.residual) + state.penalty,
+    }
 
     def spread(values: Float) -> Float:
         full = np.full((*values.shape[:-1], len(usable)), np.nan)
         full[..., usable] = values
         return full
 
-    return {
-        "scores": spread(state.scores.T),
-        "residual": spread(variance),
-        "participant": spread(variance * triangles[:, 0] ** 2),
-        "slope": spread(variance * np.sum(triangles[:, 1:] ** 2, axis=1) / unit**2),
-        "n": sums.n.astype(np.float64),
-        "estimate": spread(np.einsum("cpj,pj->cp", given, state.scores)),
-        "se": spread(se),
-        "t": spread(np.einsum("cpj,pj->cp", turned, state.scores) / root),
-        "df": spread(slope_freedom(kept, triangles, turned)),
-        "loss": spread((kept.n - basis.shape[1]) * np.log(state.residual) + state.penalty),
-    }
+    spaced = {name: spread(values) for name, values in found.items()}
+    return spaced | {"n": sums.n.astype(np.float64)}
 
 
 def _satterthwaite(form: Float, slope: Float, freedom: Int, ratio: Float, state: State) -> Float:

@@ -18,6 +18,7 @@ from hipsta_bids.group.comparison import Comparison
 from hipsta_bids.group.covariates import FIRST_AGE, VisitTime
 from hipsta_bids.group.data import PARTICIPANT, SESSION, Float, Int
 from hipsta_bids.group.formula import (
+    INTERCEPT,
     Contrast,
     ContrastSpec,
     ModelSpec,
@@ -373,8 +374,7 @@ class _Terms:
 
     def _row(self, name: str, contrast: str) -> Float:
         if name in self.columns:
-            unit = np.arange(len(self.columns)) == self.columns.index(name)
-            return np.asarray(unit, dtype=np.float64)
+            return np.asarray(np.eye(len(self.columns))[self.columns.index(name)])
         factor, level = self._split(name)
         if factor is None:
             known = [
@@ -390,10 +390,8 @@ class _Terms:
         # The mean of the model over all rows if every one had this level.
         moved = self.table.copy()
         moved[factor] = pd.Categorical([level] * len(moved), categories=self.levels[factor])
-        matrix = np.asarray(
-            self.spec.get_model_matrix(moved, context=dict(CONTEXT)), dtype=np.float64
-        )
-        return np.asarray(np.asarray(matrix, dtype=np.float64).mean(axis=0), dtype=np.float64)
+        matrix = self.spec.get_model_matrix(moved, context=dict(CONTEXT))
+        return np.asarray(np.asarray(matrix, dtype=np.float64).mean(axis=0))
 
     def _split(self, name: str) -> tuple[str | None, str]:
         """Factor and level of ``factor[level]`` or ``factor.level``."""
@@ -407,11 +405,7 @@ class _Terms:
 def _dummies(columns: tuple[str, ...], test: str | None) -> list[ContrastSpec]:
     if test is None:
         return []
-    return [
-        ContrastSpec(column, (column,), ((1.0,),), test)
-        for column in columns
-        if column != "Intercept"
-    ]
+    return [ContrastSpec(one, (one,), ((1.0,),), test) for one in columns if one != INTERCEPT]
 
 
 def _read_formula(text: str) -> Formula:

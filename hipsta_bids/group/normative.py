@@ -67,11 +67,8 @@ def w_scores(maps: Float, matrix: Float, reference: Bool, settings: GlmSettings)
         _score(np.asarray(maps[:, part], dtype=np.float64), rotated, basis, reference, settings)
         for part in chunks(maps.shape, matrix.shape[1])
     ]
-    return NormativeScores(
-        w=np.hstack([part.w for part in parts]),
-        p=np.hstack([part.p for part in parts]),
-        n_reference=np.concatenate([part.n_reference for part in parts]),
-    )
+    names = ("w", "p", "n_reference")
+    return NormativeScores(*(np.hstack([getattr(one, name) for one in parts]) for name in names))
 
 
 def _score(

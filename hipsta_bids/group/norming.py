@@ -108,13 +108,7 @@ class _Made:
 
 
 def run_norms(options: GroupOptions, request: NormsRequest, settings: GroupSettings) -> GroupResult:
-    """Fit norms, or score people by them, and write all results or none.
-
-    Raises
-    ------
-    HipstaError
-        If inputs, file or output folder do not allow it.
-    """
+    """Fit norms, or score people by them, and write all results or none."""
     dataset.check_own_dataset(options.out_dir)
     if request.file is not None:
         return _score_people(options, request, request.file, settings)

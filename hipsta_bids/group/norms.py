@@ -135,16 +135,8 @@ class Norms:
     def extended(self, values: Float, people: People, n_sites: int, least: int) -> "Norms":
         """Add sites beyond those that are known: their shift and scale, all else as it is.
 
-        Parameters
-        ----------
-        values : array
-            (visits, points) of controls, NaN where missing.
-        people : People
-            The controls; sites from ``len(self.n)`` on are new.
-        n_sites : int
-            Sites with the new ones.
-        least : int
-            Controls with a value that a point needs at a site.
+        ``values`` (visits, points) are of controls, NaN where missing; sites of ``people`` from
+        ``len(self.n)`` on are new, up to ``n_sites``. A point needs ``least`` values at a site.
         """
         blocks: list[list[Any]] = [[self.shift], [self.scale], [self.n]]
         for site in range(len(self.n), n_sites):
@@ -470,10 +462,7 @@ def _digest(content: Mapping[str, Any]) -> str:
 def load_norms(path: Path) -> tuple[NormsFile, dict[Key, Norms]]:
     """Read what :func:`save_norms` wrote; nothing in it is run.
 
-    Raises
-    ------
-    ModelError
-        If the file is too large, changed, of another format, or its parts do not fit each other.
+    ModelError if it is too large, changed, of another format, or its parts do not fit each other.
     """
     try:
         file = read_foreign(path, NormsFile, most=_LARGEST)

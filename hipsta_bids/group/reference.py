@@ -66,24 +66,13 @@ class Repeatability:
 
 
 def repeatability(values: Float, *, confidence: float = 0.95, least: int = 3) -> Repeatability:
-    """Split the variance of repeated measurements into that between and that within participants.
+    """Split the variance of values (participants, sessions, points) between and within people.
 
-    Parameters
-    ----------
-    values : array
-        (participants, sessions, points); where one session is missing, the participant is left out
-        at that point.
-    confidence : float, optional
-        Coverage of the limits.
-    least : int, optional
-        Points with fewer complete participants are NaN.
-
-    Returns
-    -------
-    Repeatability
-        The within-subject SD is the root of the mean variance of a participant's values (Bland and
-        Altman 1996), its limits those of chi squared. ICC(2,1) is that of Shrout and Fleiss (1979),
-        with the limits of McGraw and Wong (1996, table 7, ICC(A,1)).
+    Where one session is missing, the participant is left out at that point; points with fewer
+    complete participants than ``least`` are NaN. The within-subject SD is the root of the mean
+    variance of a participant's values (Bland and Altman 1996), its limits those of chi squared.
+    ICC(2,1) is that of Shrout and Fleiss (1979), with the limits of McGraw and Wong (1996, table 7,
+    ICC(A,1)).
     """
     k = values.shape[1]
     complete: Bool = np.asarray(np.isfinite(values).all(axis=1))

@@ -106,10 +106,7 @@ class Meta:
 def check_agreement(sites: Sequence[SiteSummary]) -> list[str]:
     """Refuse summaries that are not about the same; note what may differ but should be known.
 
-    Raises
-    ------
-    ModelError
-        One line that names the site that differs from most, and the item.
+    ModelError in one line that names the site that differs from most, and the item.
     """
     items: dict[str, Callable[[SiteSummary], object]] = {
         "segmentation protocol": lambda site: site.seg,

@@ -11,7 +11,7 @@ import pandas as pd
 
 from hipsta_bids.errors import InputError, NothingToDoError, UsageError
 from hipsta_bids.geometry.catalog import MAPS, why_impossible
-from hipsta_bids.group.data import Cohort, Int, SideMaps
+from hipsta_bids.group.data import Cohort, SideMaps
 from hipsta_bids.group.read import CURVATURE, THICKNESS, Measured
 from hipsta_bids.inputs.maps import Found, check_pattern, fields_of, fill, find, scan
 from hipsta_bids.io.files import entities
@@ -166,20 +166,16 @@ def read_maps(
             )
         shape = nodes if mesh is None else (points, 1)
         values = np.stack([one.values.reshape(shape) for one in maps])  # noqa: PD011  (no table)
-        side = _empty(np.array([row_of[visit] for visit in own], dtype=np.int64), shape)
-        sides[hemi] = replace(side, maps={name: values}, mesh=mesh)
+        sides[hemi] = SideMaps(
+            rows=np.array([row_of[visit] for visit in own], dtype=np.int64),
+            maps={name: values},
+            subfield=np.full(values.shape, -1, dtype=np.int8),
+            names=(),
+            summary=pd.DataFrame(index=range(len(own))),
+            mesh=mesh,
+        )
         units.append(first.unit)
     return sides, units[0], notes
-
-
-def _empty(rows: Int, shape: tuple[int, int]) -> SideMaps:
-    return SideMaps(
-        rows=rows,
-        maps={},
-        subfield=np.full((len(rows), *shape), -1, dtype=np.int8),
-        names=(),
-        summary=pd.DataFrame(index=range(len(rows))),
-    )
 
 
 def _refuse_mixed(name: str, hemi: str, paths: Sequence[Path], maps: Sequence[PointMap]) -> None:

@@ -129,13 +129,7 @@ class MapFound(Found):
 
 
 def run_trial(options: GroupOptions, request: TrialRequest, settings: GroupSettings) -> GroupResult:
-    """Measure the agreement of sessions, or sample sizes, and write all results or none.
-
-    Raises
-    ------
-    HipstaError
-        If inputs, sessions or output folder do not allow it.
-    """
+    """Measure the agreement of sessions, or sample sizes, and write all results or none."""
     dataset.check_own_dataset(options.out_dir)
     effect = request.effect
     if effect is not None:
