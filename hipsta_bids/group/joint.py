@@ -32,18 +32,6 @@ from hipsta_bids.reports.group_tables import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Meaning of the columns that no other table has.
-JOINT_COLUMNS: Mapping[str, str] = {
-    "hemi": "hemisphere, L or R; both where left and right are tested together; LR of left"
-    " minus right",
-    "statistic": "combined evidence: the normal quantile of the combined two-sided p-value, if"
-    " measures were independent",
-    "p": "p-value of the point by permutation, not corrected",
-    "p_corrected": "p-value corrected for all points of the family by permutation",
-    "n": "participants with a value, of the measure that has fewest",
-    "test": "z",
-    "measures": "effect size and p-value of each measure at the peak, not corrected",
-}
 _EFFECTS = {"t": "cohen_d", "F": "partial_eta_squared"}
 _LEAST_Z = 4.0  # at the end of the colors
 
