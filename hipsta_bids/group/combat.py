@@ -19,7 +19,7 @@ from hipsta_bids import __version__
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.data import Bool, Float, Int, Key, Nested, read_foreign
 from hipsta_bids.group.formula import Contrast
-from hipsta_bids.group.glm import chunks, sum_by
+from hipsta_bids.group.glm import chunks, products_of, sum_by
 from hipsta_bids.group.grammar import closed_formula
 from hipsta_bids.group.mixed import fit_mixed
 from hipsta_bids.group.settings import GroupSettings, HarmonizationSettings
@@ -112,7 +112,10 @@ def fit_effects(
     if visits.participant is None:
         for part in chunks((len(values), len(varies)), design.shape[1]):
             points = varies[part]
-            found[:, points] = _least_squares(values[:, points], design)
+            own = values[:, points]
+            present = np.isfinite(own).astype(np.float64)
+            # On the diagonal are numbers of values, but for rounding.
+            found[:, points] = solve_weighted(np.nan_to_num(own), present, design, 0.5)
     elif len(varies):
         there = np.flatnonzero(design.any(axis=0))
         any_contrast = Contrast("", np.eye(len(there))[:1])
@@ -192,23 +195,16 @@ def _varies(values: Float) -> Bool:
     return np.asarray(low < values.max(axis=0, where=known, initial=-np.inf))
 
 
-def _least_squares(values: Float, design: Float) -> Float:
-    """(columns, points) coefficients with values missing anywhere; NaN where none are unique.
-
-    A site without values at a point has the coefficient 0 there.
-    """
-    present = np.isfinite(values)
-    grams = np.repeat((design.T @ design)[None], values.shape[1], axis=0)
-    for point in np.flatnonzero(~present.all(axis=0)):
-        lost = design[~present[:, point]]
-        grams[point] -= lost.T @ lost
-    right = (design.T @ np.where(present, values, 0.0)).T
-    return solve_points(
-        grams, right, 0.5
-    )  # on the diagonal are numbers of values, but for rounding
+def solve_weighted(values: Float, weight: Float, design: Float, least: float = 0.0) -> Float:
+    """(columns, points) weighted least squares, with weights (rows, points) of each point."""
+    columns = design.shape[1]
+    grams = np.zeros((values.shape[1], columns**2))
+    for rows in chunks((columns**2, len(design)), 1):
+        grams += weight[rows].T @ products_of(design[rows])
+    return _solve_points(grams.reshape(-1, columns, columns), (weight * values).T @ design, least)
 
 
-def solve_points(grams: Float, right: Float, least: float) -> Float:
+def _solve_points(grams: Float, right: Float, least: float) -> Float:
     """Solve the normal equations of each point: (columns, points), NaN where none is unique.
 
     ``grams`` (points, columns, columns) is overwritten; ``right`` is (points, columns). A column

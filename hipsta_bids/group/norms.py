@@ -19,10 +19,10 @@ from pydantic import Field
 from scipy import special
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.combat import solve_points
+from hipsta_bids.group.combat import solve_weighted
 from hipsta_bids.group.data import Bool, Float, Int, Key, as_nested, read_foreign
 from hipsta_bids.group.exchange import Known, Number, Text
-from hipsta_bids.group.glm import chunks, products_of
+from hipsta_bids.group.glm import chunks
 from hipsta_bids.group.settings import NormSettings
 from hipsta_bids.io import files
 from hipsta_bids.protocols.toml import TomlTable
@@ -234,7 +234,7 @@ def _fit(
     coefficients = np.full((design.shape[1], values.shape[1]), np.nan)
     for _ in range(_STEPS):
         weight = there * np.exp(-2 * (spread @ log_sd))
-        coefficients = _weighted(filled, weight, design)
+        coefficients = solve_weighted(filled, weight, design)
         square = (filled - design @ coefficients) ** 2 * weight / kept
         step = back @ np.where(there, square - 1, 0.0)
         log_sd += np.clip(np.nan_to_num(step), -_LARGEST_STEP, _LARGEST_STEP)
@@ -263,15 +263,6 @@ def _spread_of(filled: Float, there: Bool) -> Float:
     count = np.maximum(there.sum(axis=0), 1)
     mean = filled.sum(axis=0) / count
     return np.asarray(np.sqrt((there * (filled - mean) ** 2).sum(axis=0) / count))
-
-
-def _weighted(values: Float, weight: Float, design: Float) -> Float:
-    """(columns, points) weighted least squares with weights of each point."""
-    columns = design.shape[1]
-    grams = np.zeros((values.shape[1], columns**2))
-    for rows in chunks((columns**2, len(design)), 1):
-        grams += weight[rows].T @ products_of(design[rows])
-    return solve_points(grams.reshape(-1, columns, columns), (weight * values).T @ design, 0.0)
 
 
 def _power(order: Float) -> Float:
