@@ -33,6 +33,7 @@ from hipsta_bids.group.glm import FittedMaps, PointTest, RowModel, fit_maps, wit
 from hipsta_bids.group.grammar import closed_formula
 from hipsta_bids.group.harmonize import (
     Harmonization,
+    SitePlan,
     check_in_model,
     harmonize_cohort,
     plan_sites,
@@ -204,24 +205,21 @@ def analyze_cohort(
     }
     registered = {hemi: side.registered for hemi, side in sides.items()} or cohort.sides
     measured = replace(cohort, sides=registered)
-    done = None
-    if plan is not None:
-        how = {hemi: side.registration for hemi, side in sides.items()}
-        done = harmonize_cohort(measured, plan, settings, measures, how)
-    compared = compare_sessions(measured if done is None else done.cohort, comparison)
-    fitted = _fit_sides(compared, measures.maps, rows, comparison, settings)
-    found = correct(fitted, rows, table, settings)
+    fit = partial(
+        _fit_cohort,
+        plan=plan,
+        measures=measures,
+        rows=rows,
+        comparison=comparison,
+        settings=settings,
+    )
+    how = {hemi: side.registration for hemi, side in sides.items()}
+    done, compared, fitted, found = fit(measured, registrations=how)
     unregistered: Mapping[MapKey, Discoveries] = {}
-    again = settings.registration.align != "none" and not (
-        plan and plan.saved
-    )  # its nodes are registered
+    # Effects of sites from a file are those of registered nodes.
+    again = settings.registration.align != "none" and (plan is None or plan.saved is None)
     if again and settings.multiplicity.method not in PERMUTATIONS:
-        plain = cohort
-        if plan is not None:
-            plain = harmonize_cohort(cohort, plan, settings, measures, {}).cohort
-        plain = compare_sessions(plain, comparison)
-        refitted = _fit_sides(plain, measures.maps, rows, comparison, settings)
-        unregistered = correct(refitted, rows, table, settings)
+        unregistered = fit(cohort)[3]
     scores = score_cohort(
         compared,
         model,
@@ -269,11 +267,15 @@ def analyze_cohort(
 def analyze_points(cohort: Cohort, analysis: Analysis, settings: GroupSettings) -> Analysis:
     """Fit the model of an analysis to further maps, which are not registered."""
     maps = tuple(dict.fromkeys(name for side in cohort.sides.values() for name in side.maps))
-    done, measured = None, Measures(maps=maps, summaries=())
-    if analysis.harmonization is not None:
-        done = harmonize_cohort(cohort, analysis.harmonization.plan, settings, measured, {})
-    compared = compare_sessions(cohort if done is None else done.cohort, analysis.comparison)
-    fitted = _fit_sides(compared, maps, analysis.row_model, analysis.comparison, settings)
+    measured, done = Measures(maps=maps, summaries=()), analysis.harmonization
+    done, compared, fitted, found = _fit_cohort(
+        cohort,
+        plan=None if done is None else done.plan,
+        measures=measured,
+        rows=analysis.row_model,
+        comparison=analysis.comparison,
+        settings=settings,
+    )
     scores = score_cohort(
         compared,
         analysis.model,
@@ -289,7 +291,7 @@ def analyze_points(cohort: Cohort, analysis: Analysis, settings: GroupSettings) 
         measured=measured,
         compared=compared,
         fitted=fitted,
-        found=correct(fitted, analysis.row_model, compared.table, settings),
+        found=found,
         unregistered={},
         measures=(),
         pairs=(),
@@ -317,14 +319,21 @@ def _check_weights(comparison: Comparison, settings: GroupSettings) -> None:
         )
 
 
-def _fit_sides(
-    compared: Cohort,
-    maps: tuple[str, ...],
+def _fit_cohort(
+    cohort: Cohort,
+    *,
+    plan: SitePlan | None,
+    measures: Measures,
     rows: RowModel,
     comparison: Comparison,
     settings: GroupSettings,
-) -> dict[str, FittedMaps]:
-    """Fit each hemisphere, and left minus right if that is asked for."""
+    registrations: Mapping[str, Registration] | None = None,
+) -> tuple[Harmonization | None, Cohort, dict[str, FittedMaps], dict[MapKey, Discoveries]]:
+    """Harmonize, compare sessions, and fit each hemisphere, and left minus right if asked for."""
+    done, maps = None, measures.maps
+    if plan is not None:
+        done = harmonize_cohort(cohort, plan, settings, measures, registrations or {})
+    compared = compare_sessions(cohort if done is None else done.cohort, comparison)
     fitted = {
         hemi: fit_maps(hemi, side.only(maps), rows, settings)
         for hemi, side in each("models", list(compared.sides.items()) if maps else [])
@@ -335,7 +344,7 @@ def _fit_sides(
         both = asymmetry_maps(compared, maps, relative)
         contrasts = with_mean(rows.design)
         fitted[BOTH] = fit_maps(BOTH, both, rows, settings, contrasts=contrasts)
-    return fitted
+    return done, compared, fitted, correct(fitted, rows, compared.table, settings)
 
 
 def _references(

@@ -32,8 +32,6 @@ class NormativeScores:
     group (Jack et al. 1997)."""
     p: Float
     """(subjects, points) two-sided, with the uncertainty of the expectation."""
-    n_reference: NDArray[np.int64]
-    """(points,) reference subjects with a value."""
 
 
 def w_scores(maps: Float, matrix: Float, reference: Bool, settings: GlmSettings) -> NormativeScores:
@@ -67,8 +65,7 @@ def w_scores(maps: Float, matrix: Float, reference: Bool, settings: GlmSettings)
         _score(np.asarray(maps[:, part], dtype=np.float64), rotated, basis, reference, settings)
         for part in chunks(maps.shape, matrix.shape[1])
     ]
-    names = ("w", "p", "n_reference")
-    return NormativeScores(*(np.hstack([getattr(one, name) for one in parts]) for name in names))
+    return NormativeScores(*map(np.hstack, zip(*parts, strict=True)))
 
 
 def _score(
@@ -77,7 +74,7 @@ def _score(
     basis: Float,
     reference: Bool,
     settings: GlmSettings,
-) -> NormativeScores:
+) -> tuple[Float, Float]:
     fit = fit_block(maps[reference], basis, settings)
     inverse = fit.covariance / (fit.sigma**2)[:, None, None]
     leverage = np.einsum("psi,si->sp", rotated @ inverse, rotated)
@@ -98,7 +95,7 @@ def _score(
     spread = np.where(member, leverage / kept, leverage)
     freedom = np.where(member, df - 1, df)
     p = 2 * special.stdtr(freedom, -np.abs(w) / np.sqrt(1 + spread))
-    return NormativeScores(w, np.asarray(p, dtype=np.float64), fit.n)
+    return w, np.asarray(p, dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -175,12 +172,19 @@ def score_cohort(
             subfield=most_frequent(side.subfield[used], len(side.names)),
             names=side.names,
         )
-    parts = [
-        *map_rows(cohort, sides, settings),
-        *_summary_rows(
-            cohort, design.rows, design.matrix, reference, measures=measures, settings=settings
-        ),
-    ]
+    parts = list(map_rows(cohort, sides, settings))
+    for hemi in hemispheres(cohort):
+        values = summary_values(cohort, hemi, measures.summaries).iloc[design.rows]
+        among = values[reference]
+        values = values.loc[:, (among.max() > among.min()).to_numpy()]
+        if values.columns.empty:
+            continue
+        numbers = values.to_numpy(dtype=np.float64)
+        found = w_scores(numbers, design.matrix, reference, settings.glm)
+        for i, measure in enumerate(map(str, values.columns)):
+            what = {"hemi": hemi, "measure": measure, "region": None, "reference": reference}
+            numbers_of = {"w": found.w[:, i], "p": found.p[:, i], "low": np.nan, "high": np.nan}
+            parts.append(score_rows(cohort, design.rows, **what, **numbers_of))
     return Scores(
         factor=factor,
         level=level,
@@ -230,39 +234,6 @@ def map_rows(
                     low=(out[:, points] & (w < 0)).sum(axis=1) / count,
                     high=(out[:, points] & (w > 0)).sum(axis=1) / count,
                 )
-
-
-def _summary_rows(
-    cohort: Cohort,
-    rows: Int,
-    matrix: Float,
-    reference: NDArray[np.bool_],
-    *,
-    measures: Measures,
-    settings: GroupSettings,
-) -> Iterator[pd.DataFrame]:
-    for hemi in hemispheres(cohort):
-        values = summary_values(cohort, hemi, measures.summaries).iloc[rows]
-        own = values[reference]
-        varying = values.columns[(own.max() > own.min()).to_numpy()]
-        if not len(varying):
-            continue
-        found = w_scores(
-            values[varying].to_numpy(dtype=np.float64), matrix, reference, settings.glm
-        )
-        for i, measure in enumerate(varying):
-            yield score_rows(
-                cohort,
-                rows,
-                hemi=hemi,
-                measure=str(measure),
-                region=None,
-                reference=reference,
-                w=found.w[:, i],
-                p=found.p[:, i],
-                low=np.nan,
-                high=np.nan,
-            )
 
 
 def score_rows(cohort: Cohort, rows: Int, **columns: object) -> pd.DataFrame:

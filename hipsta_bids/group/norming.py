@@ -482,7 +482,7 @@ def _score_maps(
                 continue
             one = norms[hemi, measure]
             z = one.score(values[hemi, measure][1], people.take(side.rows))
-            scores[measure] = NormativeScores(z, 2 * special.ndtr(-np.abs(z)), one.n.sum(axis=0))
+            scores[measure] = NormativeScores(z, 2 * special.ndtr(-np.abs(z)))
         if scores:
             scored[hemi] = ScoredMaps(
                 rows=side.rows,

@@ -279,25 +279,13 @@ def meta_tables(meta: Meta) -> Iterator[tuple[str, pd.DataFrame]]:
 def _sites(meta: Meta) -> pd.DataFrame:
     rows = []
     for site in meta.sites:
+        levels = {f"{k}_{level}": n for k, own in site.factors.items() for level, n in own.items()}
         numbers = {
-            f"{name}_{what}": value
-            for name, own in site.covariates.items()
-            for what, value in own.items()
+            f"{k}_{what}": v for k, own in site.covariates.items() for what, v in own.items()
         }
-        levels = {
-            f"{name}_{level}": n for name, own in site.factors.items() for level, n in own.items()
-        }
-        rows.append(
-            {
-                "site": site.site,
-                "n": site.participants,
-                **levels,
-                **numbers,
-                "df": site.models[0].df,
-                "version": site.version,
-                "template": site.template_hash,
-            }
-        )
+        people = {"site": site.site, "n": site.participants, **levels, **numbers}
+        about = {"version": site.version, "template": site.template_hash}
+        rows.append({**people, "df": site.models[0].df, **about})
     return pd.DataFrame(rows)
 
 
@@ -313,12 +301,8 @@ def _points(peaks: Sequence[pd.DataFrame], frame: Frame) -> list[int]:
         return []
     own = table[table["extent"] > 0] if (table["extent"] > 0).any() else table.tail(1)
     own = own.reindex(own["statistic"].abs().sort_values(ascending=False, kind="stable").index)
-    at = {
-        (x, y): point
-        for point, (x, y) in enumerate(
-            zip(frame.position["x"].tolist(), frame.position["y"].tolist(), strict=True)
-        )
-    }
+    x, y = (frame.position[axis].tolist() for axis in "xy")
+    at = {place: point for point, place in enumerate(zip(x, y, strict=True))}
     nodes = np.stack([frame.number["node_x"], frame.number["node_y"]])
     kept: list[int] = []
     for place in zip(own["x"].tolist(), own["y"].tolist(), strict=True):
