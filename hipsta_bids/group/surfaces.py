@@ -192,15 +192,11 @@ def _refuse_mixed(name: str, hemi: str, paths: Sequence[Path], maps: Sequence[Po
 
 def _mesh(found: ExternalFiles, hemi: str, points: int) -> Mesh | None:
     """Read the surface that the user named, or else that beside the first map that has one."""
-    paths = found.files[hemi]
     if found.request.surface is not None:
         return _named_surface(found, hemi, points)
-    for path in paths.values():
-        for candidate in _surfaces_beside(path, hemi):
-            mesh = read_mesh(candidate)
-            if len(mesh.points) == points:
-                return mesh
-    return None
+    paths = found.files[hemi].values()
+    meshes = (read_mesh(one) for path in paths for one in _surfaces_beside(path, hemi))
+    return next((mesh for mesh in meshes if len(mesh.points) == points), None)
 
 
 def _named_surface(found: ExternalFiles, hemi: str, points: int) -> Mesh:
@@ -228,19 +224,16 @@ def _named_surface(found: ExternalFiles, hemi: str, points: int) -> Mesh:
 def _surfaces_beside(path: Path, hemi: str) -> list[Path]:
     """HippUnfold's unfolded surface: beside the map, or in version 2 in ``surf/``."""
     own = {**entities(path.name), "hemi": hemi}
-    folders = [path.parent, path.parent.parent / "surf"]
-    return [
-        candidate
-        for folder in folders
-        for candidate in sorted(folder.glob("*space-unfold*_midthickness.surf.gii"))
-        if _belongs(own, entities(candidate.name))
-    ]
-
-
-def _belongs(own: Mapping[str, str], surface: Mapping[str, str]) -> bool:
     keys = ("sub", "ses", "hemi", "den", "label")
+    folders = path.parent, path.parent.parent / "surf"
+    pattern = "*space-unfold*_midthickness.surf.gii"
+    found = {one: entities(one.name) for folder in folders for one in sorted(folder.glob(pattern))}
     # Sheets of this program have an unfolded surface too, but their maps have their grid.
-    return "seg" not in surface and all(own.get(key) == surface.get(key) for key in keys)
+    return [
+        one
+        for one, other in found.items()
+        if "seg" not in other and all(own.get(key) == other.get(key) for key in keys)
+    ]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
