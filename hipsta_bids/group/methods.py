@@ -74,9 +74,20 @@ def methods_text(
     """Word what was done and what came out."""
     cite = Citations()
     paragraphs = [_sample(cohort, analysis, n_out, cite("method"), others)]
-    paragraphs[0] += _rated(ratings)
-    if analysis.sides or others:
-        paragraphs.append(_alignment(analysis, settings, cite, others))
+    if ratings is not None:
+        counts = ", ".join(f"{n} {rating}" for rating, n in ratings.items())
+        paragraphs[0] += (
+            f" Hemispheres were rated on their report pages ({counts}); those rated exclude were"
+            " left out."
+        )
+    aligned = [_registration(analysis, settings, cite)] if analysis.sides else []
+    if others:
+        aligned.append(
+            f"Maps of other programs ({', '.join(others)}) were taken as they are, point by point,"
+            " without registration."
+        )
+    if aligned:
+        paragraphs.append(" ".join(aligned))
     if region in EXPERIMENTAL and analysis.fitted:
         paragraphs.append(_rims(analysis))
     paragraphs += _harmonization(analysis, cite)
@@ -104,45 +115,20 @@ def _sample(
     table = analysis.compared.table.iloc[rows]
     people = cohort.table[PARTICIPANT].nunique()
     visits = f" ({len(cohort.table)} visits)" if len(cohort.table) > people else ""
-    maps = _words([*analysis.measured.maps, *others]) or "summaries"
+    names = [name.replace("_", " ") for name in (*analysis.measured.maps, *others)]
+    maps = ", ".join(f"map of {name}" for name in names) or "summaries"
     text = (
         f"Measures of the hippocampus {method} ({maps}) of"
         f" {people} participants{visits} were analyzed with hipsta_bids {__version__};"
         f" {analysis.n_participants} had all variables of the model"
     )
     if analysis.groups is not None:
-        names = table[analysis.groups.column][~table[PARTICIPANT].duplicated()]
-        counts = Counter(names.dropna().astype(str))
+        members = table[analysis.groups.column][~table[PARTICIPANT].duplicated()]
+        counts = Counter(members.dropna().astype(str))
         text += f" ({', '.join(f'{counts[g]} {g}' for g in analysis.groups.levels)})"
     if sheets := ", ".join(f"{len(one.used)} {hemi}" for hemi, one in analysis.fitted.items()):
         text += f", with hemispheres {sheets}"
     return f"{text}. {n_out} hemispheres or visits were left out; the table of exclusions says why."
-
-
-def _rated(ratings: Mapping[str, int] | None) -> str:
-    if ratings is None:
-        return ""
-    counts = ", ".join(f"{n} {rating}" for rating, n in ratings.items())
-    return (
-        f" Hemispheres were rated on their report pages ({counts}); those rated exclude were left"
-        " out."
-    )
-
-
-def _words(names: Sequence[str]) -> str:
-    return ", ".join(f"map of {name.replace('_', ' ')}" for name in names)
-
-
-def _alignment(
-    analysis: Analysis, settings: GroupSettings, cite: Callable[[str], str], others: Sequence[str]
-) -> str:
-    parts = [_registration(analysis, settings, cite)] if analysis.sides else []
-    if others:
-        parts.append(
-            f"Maps of other programs ({', '.join(others)}) were taken as they are, point by point,"
-            " without registration."
-        )
-    return " ".join(parts)
 
 
 def _registration(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], str]) -> str:

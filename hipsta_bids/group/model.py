@@ -113,15 +113,15 @@ def default_formula(
     """Spell the right-hand side: the groups, and each covariate that varies."""
     first = " * ".join(name for name in (groups.column if groups else None, time) if name)
     names = settings.model.covariates if covariates is None else covariates
-    found = _varying(table, names, settings)
-    return " + ".join([first or "1", *(_shaped(name, settings) for name in found)])
-
-
-def _shaped(name: str, settings: GroupSettings) -> str:
-    """Write a covariate; age as the settings say."""
-    shape = settings.model.age if name.casefold() in _AGES else "linear"
-    forms = {"quadratic": f"poly({name}, 2)", "spline": f'cr({name}, df=3, constraints="center")'}
-    return forms.get(shape, name)
+    by_name = {str(column).casefold(): str(column) for column in table.columns}
+    terms = [first or "1"]
+    for name in (by_name[name.casefold()] for name in names if name.casefold() in by_name):
+        if len(typed(table[name], settings.design).dropna().unique()) > 1:
+            shape = settings.model.age if name.casefold() in _AGES else "linear"
+            bent = {"quadratic": f"poly({name}, 2)"}
+            bent["spline"] = f'cr({name}, df=3, constraints="center")'
+            terms.append(bent.get(shape, name))
+    return " + ".join(terms)
 
 
 def default_contrasts(
@@ -150,13 +150,6 @@ def empty_covariates(table: pd.DataFrame, settings: GroupSettings) -> list[str]:
     wanted = {name.casefold() for name in settings.model.covariates}
     named = [str(name) for name in table.columns if str(name).casefold() in wanted]
     return [name for name in named if typed(table[name], settings.design).isna().all()]
-
-
-def _varying(table: pd.DataFrame, names: Sequence[str], settings: GroupSettings) -> list[str]:
-    by_name = {str(column).casefold(): str(column) for column in table.columns}
-    found = [by_name[name.casefold()] for name in names if name.casefold() in by_name]
-    levels = {name: typed(table[name], settings.design).dropna().unique() for name in found}
-    return [name for name in found if len(levels[name]) > 1]
 
 
 @dataclass(frozen=True, kw_only=True)

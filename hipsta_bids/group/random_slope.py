@@ -198,9 +198,12 @@ def slope_freedom(sums: SlopeSums, triangles: Float, rows: Float) -> Float:
         hessian[:, 0, i + 1] = -(up.residual - down.residual) / (2 * _STEP) / variance
         hessian[:, i + 1, 0] = hessian[:, 0, i + 1]
         slopes.append((forms(up.inverse, rows) - forms(down.inverse, rows)) / (2 * _STEP))
-    hessian[:, 1:, 1:] = _second(
-        lambda at: _fixed_variance(solve_slopes(sums, at), variance), triangles
-    )
+
+    def fixed_variance(at: Float) -> Float:
+        state = solve_slopes(sums, at)
+        return np.asarray(state.penalty + state.residual / variance)
+
+    hessian[:, 1:, 1:] = _second(fixed_variance, triangles)
     form = forms(base.inverse, rows)
     gradient = np.stack([np.ones_like(form), *(slope / form for slope in slopes)], axis=-1)
     size, axes = np.linalg.eigh(hessian)
@@ -208,10 +211,6 @@ def slope_freedom(sums: SlopeSums, triangles: Float, rows: Float) -> Float:
     inverse = np.where(valid, 1 / np.where(valid, size, 1.0), 0.0)
     turned = np.einsum("cpi,pij->cpj", gradient, axes)
     return np.asarray(1 / np.einsum("cpj,pj->cp", turned**2, inverse), dtype=np.float64)
-
-
-def _fixed_variance(state: SlopeState, variance: Float) -> Float:
-    return np.asarray(state.penalty + state.residual / variance)
 
 
 def forms(inverse: Float, rows: Float) -> Float:
