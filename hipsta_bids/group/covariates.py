@@ -4,6 +4,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -237,7 +238,7 @@ def add_time(table: pd.DataFrame, settings: GroupSettings) -> VisitTime:
     """
     covariates = tuple(settings.model.covariates)
     by_name = {str(column).casefold(): str(column) for column in table.columns}
-    people, made = table[PARTICIPANT], dict[str, object]()
+    people, made = table[PARTICIPANT], dict[str, Any]()
     times, unit = None, 1.0
     if "age" in by_name:
         ages = typed(table[by_name["age"]], settings.design)

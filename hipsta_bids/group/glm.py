@@ -319,44 +319,31 @@ def _test(
     estimate = fit.scores @ rotated.T
     spread = rotated @ fit.covariance @ rotated.T
     se = np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
-    if contrast.n_rows == 1:
-        return t_test(
-            contrast, estimate[:, 0], se[:, 0], df=df, sigma=fit.sigma, confidence=confidence
-        )
-    f = _wald(estimate, spread)
-    p = np.asarray(special.fdtrc(float(contrast.n_rows), df, f), dtype=np.float64)
+    statistic = estimate[:, 0] / se[:, 0] if contrast.n_rows == 1 else _wald(estimate, spread)
     where = {"df": df, "estimate": estimate.T, "se": se.T, "sigma": fit.sigma}
-    return with_effects(contrast, f, p, **where, confidence=confidence)
-
-
-def t_test(
-    contrast: Contrast, estimate: Float, se: Float, *, df: Float, sigma: Float, confidence: float
-) -> PointTest:
-    """Test one row of weights, by estimates and standard errors at each point."""
-    t = estimate / se
-    p = np.asarray(2 * special.stdtr(df, -np.abs(t)), dtype=np.float64)
-    where = {"df": df, "estimate": estimate[None], "se": se[None], "sigma": sigma}
-    return with_effects(contrast, t, p, **where, confidence=confidence)
+    return with_effects(contrast, statistic, **where, confidence=confidence)
 
 
 def with_effects(
     contrast: Contrast,
     statistic: Float,
-    p: Float,
     *,
     df: Float,
     estimate: Float,
     se: Float,
     sigma: Float,
     confidence: float,
+    p: Float | None = None,
 ) -> PointTest:
-    """Add Cohen's d (of t) and partial eta squared, with limits, to tests at each point."""
+    """Add p-values, Cohen's d (of t) and partial eta squared, with limits, to t or F."""
     rows = contrast.n_rows
     if rows == 1:
+        tail = 2 * special.stdtr(df, -np.abs(statistic))
         squared = statistic**2
         cohen_d = estimate[0] / sigma
         d_limits = np.stack(t_limits(statistic, df, confidence)) * (se[0] / sigma)
     else:
+        tail = special.fdtrc(float(rows), df, statistic)
         squared = statistic
         cohen_d = np.full(len(df), np.nan)
         d_limits = np.full((2, len(df)), np.nan)
@@ -364,7 +351,7 @@ def with_effects(
     return PointTest(
         contrast=contrast,
         statistic=statistic,
-        p=p,
+        p=np.asarray(tail if p is None else p, dtype=np.float64),
         df=df,
         estimate=estimate,
         se=se,
@@ -415,7 +402,7 @@ def fit_measures(
         with_effects(
             contrast,
             table[0],
-            table[1],
+            p=table[1],
             df=df,
             estimate=table[2 : 2 + contrast.n_rows],
             se=table[2 + contrast.n_rows :],

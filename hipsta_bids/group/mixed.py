@@ -19,7 +19,6 @@ from hipsta_bids.group.glm import (
     check_design,
     chunks,
     sum_by,
-    t_test,
     with_effects,
 )
 from hipsta_bids.group.model import Design
@@ -258,14 +257,10 @@ def _tests(
         rows = slice(start, start + contrast.n_rows)
         start = rows.stop
         estimate, se, t, df = (whole[name][rows] for name in ("estimate", "se", "t", "df"))
-        if contrast.n_rows == 1:
-            yield t_test(contrast, estimate[0], se[0], df=df[0], sigma=sigma, confidence=confidence)
-            continue
-        f = np.mean(t**2, axis=0)
-        freedom = _denominator(df)
-        p = np.asarray(special.fdtrc(float(contrast.n_rows), freedom, f), dtype=np.float64)
-        where = {"df": freedom, "estimate": estimate, "se": se, "sigma": sigma}
-        yield with_effects(contrast, f, p, **where, confidence=confidence)
+        single = contrast.n_rows == 1
+        where = {"df": df[0] if single else _denominator(df), "estimate": estimate, "se": se}
+        statistic = t[0] if single else np.mean(t**2, axis=0)
+        yield with_effects(contrast, statistic, **where, sigma=sigma, confidence=confidence)
 
 
 def _denominator(df: Float) -> Float:
