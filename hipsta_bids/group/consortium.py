@@ -19,7 +19,7 @@ from hipsta_bids.group.figures import Drawing
 from hipsta_bids.group.glm import FittedMaps, PointTest
 from hipsta_bids.group.inference import PERMUTATIONS
 from hipsta_bids.group.meta import FIXED, RANDOM
-from hipsta_bids.group.methods import PROCEDURES, Citations
+from hipsta_bids.group.methods import Citations, discovery_text
 from hipsta_bids.group.panels import Row, contrasts, draw_pages
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.sites import (
@@ -237,8 +237,6 @@ def _methods(meta: Meta) -> str:
             f" Hartung {cite('knapp-hartung')}, with standard errors not smaller than without their"
             f" correction {cite('modified')}"
         )
-    correction = meta.settings.multiplicity
-    family = "each map" if correction.scope == "map" else "both hemispheres together"
     what = (
         f"Measures of the hippocampus {cite('method')} of {meta.people} participants{groups} at"
         f" {len(sites)} sites were combined with hipsta_bids {__version__}; no values of"
@@ -253,9 +251,8 @@ def _methods(meta: Meta) -> str:
     if meta.items[0].result.without:
         effects += " All was repeated without each of the sites."
     errors = (
-        f"The false discovery rate was held at {correction.alpha:g} by"
-        f" {PROCEDURES[correction.method]} {cite(correction.method)}, for {family}, and for all"
-        " summary measures of a contrast together. Effect sizes are Cohen's d: the estimate over"
+        f"{discovery_text(meta.settings.multiplicity, cite)}, and for all summary measures of a"
+        " contrast together. Effect sizes are Cohen's d: the estimate over"
         f" the residual standard deviation within sites, with {how.confidence:.0%} confidence"
         " limits."
     )

@@ -31,6 +31,7 @@ _MEASURED = {
     "whole": "the whole hippocampus on one sheet (experimental)",
 }
 
+_FAMILIES = {"map": "each map", "hemispheres": "both hemispheres together"}
 #: Procedures that hold false discovery rates.
 PROCEDURES: Mapping[str, str] = {
     "bh": "the procedure of Benjamini and Hochberg",
@@ -98,9 +99,7 @@ def methods_text(
     if analysis.scores is not None:
         paragraphs.append(_normative(analysis.scores, settings, cite("normative")))
     if analysis.pairs:
-        paragraphs.append(
-            _classification(analysis, settings, cite("delong"), cite("firth"), cite("snell"))
-        )
+        paragraphs.append(_classification(analysis, settings, cite))
     if analysis.found:
         paragraphs.append(_findings(analysis))
     if analysis.skipped:
@@ -289,7 +288,7 @@ def _nonlinear(analysis: Analysis, settings: GroupSettings) -> str:
 
 
 def _correction(how: MultiplicitySettings, cite: Callable[[str], str], analysis: Analysis) -> str:
-    family = "each map" if how.scope == "map" else "both hemispheres together"
+    family = _FAMILIES[how.scope]
     if how.method in PERMUTATIONS:
         statistic = "the largest absolute statistic"
         if how.method == "permutation-tfce":
@@ -317,10 +316,14 @@ def _correction(how: MultiplicitySettings, cite: Callable[[str], str], analysis:
             f" {how.permutations} permutations{inside} of {shuffled}; seed"
             f" {how.seed}) {cite('permutation')}, for {family}.{end}"
         )
+    return f"{discovery_text(how, cite)}."
+
+
+def discovery_text(how: MultiplicitySettings, cite: Callable[[str], str]) -> str:
+    """Word how the false discovery rate was held."""
     return (
         f"The false discovery rate was held at {how.alpha:g} by {PROCEDURES[how.method]}"
-        f" {cite(how.method)}, for"
-        f" {family}."
+        f" {cite(how.method)}, for {_FAMILIES[how.scope]}"
     )
 
 
@@ -430,10 +433,9 @@ def _normative(scores: Scores, settings: GroupSettings, source: str) -> str:
     )
 
 
-def _classification(
-    analysis: Analysis, settings: GroupSettings, delong: str, firth: str, snell: str
-) -> str:
+def _classification(analysis: Analysis, settings: GroupSettings, cite: Citations) -> str:
     how = settings.classification
+    delong, firth, snell = map(cite, ("delong", "firth", "snell"))
     separated = sum(pair.comparison.separated for _, _, pair in analysis.pairs)
     by_firth = (
         f" {separated} comparisons were separated and fitted by Firth's method {firth}."

@@ -182,6 +182,7 @@ def _few(values: Sequence[float]) -> str:
     return f"{len(values)} nodes from {values[0]:.4g} to {values[-1]:.4g}" if values else "none"
 
 
+@np.errstate(over="ignore", divide="ignore", invalid="ignore")  # of numbers as others sent them
 def analyze_sites(sites: list[SiteSummary], settings: GroupSettings) -> Meta:
     """Combine each contrast of each model, and tell which points survive."""
     items = [
@@ -189,7 +190,12 @@ def analyze_sites(sites: list[SiteSummary], settings: GroupSettings) -> Meta:
             number=number,
             model=model,
             contrast=contrast,
-            result=_combined(sites, number, contrast, settings),
+            result=meta_analyze(
+                [site.models[number].fit for site in sites],
+                [np.array(site.models[number].contrasts[contrast]) for site in sites],
+                model.intercept,
+                settings.meta,
+            ),
         )
         for number, model in enumerate(sites[0].models)
         for contrast in model.contrasts
@@ -203,19 +209,6 @@ def analyze_sites(sites: list[SiteSummary], settings: GroupSettings) -> Meta:
         item.model.hemi: _frame(sites, item.number) for item in reversed(maps)
     }
     return Meta(sites=sites, items=items, found=found, frame=frames, settings=settings)
-
-
-@np.errstate(over="ignore", divide="ignore", invalid="ignore")  # of numbers as others sent them
-def _combined(
-    sites: Sequence[SiteSummary], number: int, contrast: str, settings: GroupSettings
-) -> MetaResult:
-    models = [site.models[number] for site in sites]
-    return meta_analyze(
-        [model.fit for model in models],
-        [np.array(model.contrasts[contrast]) for model in models],
-        models[0].intercept,
-        settings.meta,
-    )
 
 
 def _frame(sites: Sequence[SiteSummary], number: int) -> Frame:
