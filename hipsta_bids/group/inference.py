@@ -400,19 +400,20 @@ def discover(
 
 
 def correct_joint(
-    groups: Mapping[MapKey, Sequence[tuple[FittedMaps, str]]],
+    groups: Mapping[MapKey, Mapping[str, tuple[FittedMaps, str]]],
     contrasts: Mapping[str, Contrast],
     model: RowModel,
     table: pd.DataFrame,
     settings: GroupSettings,
 ) -> dict[MapKey, tuple[PermutationTest, Discoveries]]:
-    """Test maps together that have the same points: fits and measures by the key of the result."""
+    """Test maps together that have the same points: fits and measures by title, by result."""
     how = settings.multiplicity
     if how.method not in PERMUTATIONS:
         how = how.changed(method=_MAXIMUM)
 
     def part(key: MapKey) -> JointPart:
-        return JointPart([_part(*one, model, how) for one in groups[key]], settings.joint.combine)
+        own = [_part(*one, model, how) for one in groups[key].values()]
+        return JointPart(own, settings.joint.combine)
 
     tested = {key: contrasts[key.contrast] for key in groups}
     return _permuted(tested, part, row_blocks(model, table, how), how)

@@ -97,19 +97,19 @@ def combine_maps(analyses: Sequence[Analysis], settings: GroupSettings) -> dict[
         for each in analyses
         if any(names[0] in one.fits for one in each.fitted.values())
     )
-    groups: dict[MapKey, list[tuple[FittedMaps, str]]] = {}
-    titles: dict[MapKey, list[str]] = {}
+    groups: dict[MapKey, dict[str, tuple[FittedMaps, str]]] = {}
     contrasts = {}
     for hemis in [("L", "R")] if sides else [("L",), ("R",), (BOTH,)]:
-        own = [(fits.get((name, hemi)), name, hemi) for hemi, name in product(hemis, names)]
-        parts = [(one, name) for one, name, _ in own if one is not None]
-        if len(parts) < len(own):
+        if not all((name, hemi) in fits for hemi, name in product(hemis, names)):
             continue
-        _check_points(names, [one for one, _ in parts])
-        for test in parts[0][0].fits[names[0]].tests:
+        parts = {
+            name if len(hemis) == 1 else f"{name} {SIDES[hemi]}": (fits[name, hemi], name)
+            for hemi, name in product(hemis, names)
+        }
+        _check_points(names, [one for one, _ in parts.values()])
+        for test in fits[names[0], hemis[0]].fits[names[0]].tests:
             key = MapKey(JOINT, test.contrast.name, BOTH_SIDES if len(hemis) > 1 else hemis[0])
             groups[key], contrasts[test.contrast.name] = parts, test.contrast
-            titles[key] = [n if len(hemis) == 1 else f"{n} {SIDES[h]}" for _, n, h in own]
     if not groups:
         raise ModelError(
             f"--joint {' '.join(names)}: no side has them all; leave one out", reason="joint-maps"
@@ -117,13 +117,7 @@ def combine_maps(analyses: Sequence[Analysis], settings: GroupSettings) -> dict[
     model = analyses[0].row_model
     found = correct_joint(groups, contrasts, model, analyses[0].compared.table, settings)
     return {
-        key: JointMap(
-            key=key,
-            parts=dict(zip(titles[key], groups[key], strict=True)),
-            cohort=cohort,
-            test=test,
-            found=own,
-        )
+        key: JointMap(key=key, parts=groups[key], cohort=cohort, test=test, found=own)
         for key, (test, own) in found.items()
     }
 
