@@ -73,7 +73,7 @@ class BodyMask:
         _set(self, "affine", np.float64, (4, 4))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, slots=True)
 class Visit:
     """A participant, in one session where the dataset has sessions."""
 
@@ -87,7 +87,7 @@ VisitKey = tuple[str, str | None]
 """Labels of subject and session, as a key of tables and sets."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, slots=True)
 class Hemisphere(Visit):
     """One side of a visit."""
 

@@ -75,7 +75,7 @@ _MILLIMETER_DIGITS = 4
 _SECONDARY = {"interior": None, "midthickness": "MidThickness", "exterior": None}
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, slots=True)
 class ResultPlace:
     """Where the results of one hemisphere are."""
 

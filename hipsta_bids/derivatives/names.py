@@ -15,7 +15,7 @@ from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.types import Hemisphere
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, slots=True)
 class HemisphereName(Hemisphere):
     """The BIDS identity of one result."""
 

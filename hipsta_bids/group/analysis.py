@@ -1,6 +1,6 @@
 """The group level from sheets and covariates to results."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -22,11 +22,15 @@ from hipsta_bids.group.comparison import (
 from hipsta_bids.group.data import (
     MOST_KEPT,
     PARTICIPANT,
+    Bool,
     Cohort,
     Float,
     Measures,
     SideMaps,
+    WarpedLabels,
     WarpedMaps,
+    parts_of_sheets,
+    return_memory,
 )
 from hipsta_bids.group.formula import ModelSpec
 from hipsta_bids.group.glm import FittedMaps, PointTest, RowModel, fit_maps, with_mean
@@ -73,8 +77,6 @@ ALL = "all"
 class SideResult:
     """Sheets of one hemisphere, registered."""
 
-    profiles: Float
-    """(sheets, x) curvature before registration, 1/mm."""
     registration: Registration
     registered: SideMaps
     """Maps of all visits that were chosen."""
@@ -388,8 +390,8 @@ def register_side(
                 permutations=settings.registration.group_permutations,
                 seed=settings.multiplicity.seed,
             )
+    return_memory()
     return SideResult(
-        profiles=profiles,
         registration=registration,
         registered=_register_maps(side, registration.warps, parts_of(cohort.y) is not None),
         shifts=shifts,
@@ -401,6 +403,7 @@ def _register_maps(side: SideMaps, warps: Float, rims: bool) -> SideMaps:
     """Carry all maps of sheets; a point beside ``rims`` that came to be known of few is none."""
     kept = len(warps) <= MOST_KEPT
     maps, errors = (WarpedMaps(one, warps, warp_values) for one in (side.maps, side.errors))
+    labels = WarpedLabels(side.subfield[:], warps, warp_labels)
     registered = dict(maps) if kept or rims else maps
     for values in registered.values() if rims else ():
         leave_rare(values)
@@ -408,7 +411,7 @@ def _register_maps(side: SideMaps, warps: Float, rims: bool) -> SideMaps:
         side,
         maps=registered,
         errors=dict(errors) if kept else errors,
-        subfield=warp_labels(side.subfield, warps),
+        subfield=labels[:] if kept else labels,
     )
 
 
@@ -442,9 +445,29 @@ def mean_of_known(values: Float, axis: int) -> Float:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def spread_of_known(values: Float) -> Float:
-    """Take the standard deviation over the first axis of what is known; NaN below two values."""
-    count = np.isfinite(values).sum(axis=0)
-    deviations = values - mean_of_known(values, 0).astype(values.dtype)
-    variance = mean_of_known(np.square(deviations, out=deviations), 0)
-    return np.where(count > 1, np.sqrt(variance * count / np.maximum(count - 1, 1)), np.nan)
+def describe_known(parts: Iterable[Float]) -> tuple[Bool, Float, Float]:
+    """Tell what is known of a table in parts, (rows, columns), and mean and SD of its columns.
+
+    Means and sums of squares of parts are put together as by Chan et al. (1983).
+    """
+    known, count, mean, squares = [], np.zeros(1, np.int64), np.zeros(1), np.zeros(1)
+    for values in parts:
+        known.append(np.isfinite(values))
+        n = known[-1].sum(axis=0)
+        both = np.maximum(count + n, 1)
+        own = np.nan_to_num(mean_of_known(values, 0))
+        squares = squares + np.sum((values - own) ** 2, axis=0, dtype=np.float64, where=known[-1])
+        squares += (own - mean) ** 2 * count * n / both
+        mean = mean + (own - mean) * n / both
+        count = count + n
+    spread = np.sqrt(squares / np.maximum(count - 1, 1))
+    return (
+        np.concatenate(known),
+        np.where(count > 0, mean, np.nan),
+        np.where(count > 1, spread, np.nan),
+    )
+
+
+def profiles_of(maps: Mapping[str, Float], name: str, own: Bool) -> Float:
+    """(sheets, x) means over y of some sheets of a map."""
+    return np.concatenate([mean_of_known(part, 2) for part in parts_of_sheets(maps, name, own)])

@@ -12,7 +12,7 @@ from sklearn import metrics
 from sklearn.model_selection import RepeatedStratifiedKFold
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.data import Bool, Float, Int
+from hipsta_bids.group.data import Bool, Float
 from hipsta_bids.group.logistic import (
     RANK,
     LogisticFit,
@@ -111,8 +111,8 @@ class ClassifierResult:
     """One logistic model as a classifier."""
 
     fit: LogisticFit
-    score: Float
-    """(subjects,) fitted log odds."""
+    curve: tuple[Float, Float]
+    """(points,) shares of controls and of cases at or above each of the fitted scores."""
     auc: Area
     """Of the subjects fitted: optimistic."""
     cross_validation: CrossValidation
@@ -179,11 +179,17 @@ def _classified(
     validation = cross_validate(matrix, case, settings)
     return ClassifierResult(
         fit=fit,
-        score=score,
+        curve=roc_curve(score, case),
         auc=delong(score, case, settings.confidence),
         cross_validation=validation,
         calibration=calibrate(validation.score, case, settings),
     )
+
+
+def forget_models() -> None:
+    """Free the memory of models that several comparisons share."""
+    _classified.cache_clear()
+    _folds.cache_clear()
 
 
 def _check(matrix: Float, case: Bool) -> None:
@@ -251,11 +257,11 @@ def _coefficients(
 
 
 @lru_cache(maxsize=16)
-def _folds(cases: bytes, folds: int, repeats: int, seed: int) -> Int:
+def _folds(cases: bytes, folds: int, repeats: int, seed: int) -> NDArray[np.int16]:
     """(repeats, subjects) fold of each subject, the same for all measures."""
     case = np.frombuffer(cases, dtype=bool)
     splits = RepeatedStratifiedKFold(n_splits=folds, n_repeats=repeats, random_state=seed)
-    numbers = np.empty((repeats, len(case)), dtype=np.int64)
+    numbers = np.empty((repeats, len(case)), dtype=np.int16)
     for i, (_, test) in enumerate(splits.split(case, case)):
         numbers[i // folds, test] = i % folds
     return numbers
@@ -316,8 +322,6 @@ class PairComparison:
     control: str
     case: str
     comparison: ModelComparison
-    is_case: NDArray[np.bool_]
-    """(subjects,) in the order of the models' scores."""
     n_incomplete: int
     """Subjects of the two groups left out of both models, as they lack a value."""
 
@@ -352,7 +356,6 @@ def compare_pairs(
                 control=control,
                 case=case,
                 comparison=found,
-                is_case=groups[used] == case,
                 n_incomplete=int((both & ~complete).sum()),
             )
         )

@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from sys import intern
 from typing import Any
 
 import pandas as pd
@@ -59,7 +60,7 @@ class GroupRequest:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, slots=True)
 class SheetRecord:
     """One complete hemisphere."""
 
@@ -279,8 +280,8 @@ def _judge(place: ResultPlace, request: GroupRequest, choices: Choices) -> Sheet
         inputs = record.get("inputs") or [{}]
         return SheetRecord(
             place=place,
-            settings_hash=str(record.get("settings_hash")),
-            version=str(record.get("version")),
+            settings_hash=intern(str(record.get("settings_hash"))),
+            version=intern(str(record.get("version"))),
             source=relocate(str(inputs[0].get("file", "")), request.segmentations),
             flagged=status == Status.FLAGGED,
         )

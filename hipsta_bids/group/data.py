@@ -1,5 +1,7 @@
 """Values passed between reading, analyzing and writing at the group level."""
 
+import contextlib
+import ctypes
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -31,6 +33,7 @@ PARTICIPANT, SESSION = "participant_id", "session_id"
 #: More sheets of a side are kept in single precision, whose rounding is less than a hundredth of
 #: that of the tables, and registered whenever they are asked for, to save memory.
 MOST_KEPT = 10_000
+_SHEETS = 4000  # in memory at once, where each counts on its own
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,6 +64,23 @@ class WarpedMaps(Mapping[str, Float]):
         return len(self.source)
 
 
+@dataclass(frozen=True, eq=False)
+class WarpedLabels:
+    """Labels (sheets, x, y) that are registered whenever some are asked for."""
+
+    source: NDArray[np.int8]
+    warps: Float
+    carry: Callable[[NDArray[np.int8], Float], NDArray[np.int8]]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Sheets, x, y."""
+        return self.source.shape
+
+    def __getitem__(self, own: slice | Bool | Int) -> NDArray[np.int8]:
+        return self.carry(self.source[own], self.warps[own])
+
+
 def some_sheets(maps: Mapping[str, Float], own: slice | Bool) -> Mapping[str, Float]:
     """Keep some sheets of maps."""
     if isinstance(maps, WarpedMaps):
@@ -75,6 +95,17 @@ def sheets_of(maps: Mapping[str, Float], name: str, own: Bool | Int) -> Float:
     return maps[name][own]
 
 
+def parts_of_sheets(maps: Mapping[str, Float], name: str, own: Bool | Int) -> Iterator[Float]:
+    """Take sheets of one map, some at a time; the order is kept."""
+    rows = np.flatnonzero(own) if own.dtype == np.bool_ else own
+    return (sheets_of(maps, name, rows[part]) for part in blocks(len(rows), _SHEETS))
+
+
+def blocks(count: int, size: int) -> Iterator[slice]:
+    """Cut rows into blocks, one at least, to bound memory."""
+    return (slice(start, start + size) for start in range(0, max(count, 1), size))
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SideMaps:
     """Sheets of one hemisphere of all visits that have it."""
@@ -83,7 +114,7 @@ class SideMaps:
     """(sheets,) row of each in the cohort's table, ascending."""
     maps: Mapping[str, Float]
     """(sheets, x, y) per measure; NaN is missing."""
-    subfield: NDArray[np.int8]
+    subfield: NDArray[np.int8] | WarpedLabels
     """(sheets, x, y) index into ``names``; -1 is missing."""
     names: tuple[str, ...]
     """Abbreviations of subfields."""
@@ -151,6 +182,12 @@ class Cohort:
             table=self.table[keep],
             sides={hemi: side.take(keep) for hemi, side in self.sides.items()},
         )
+
+
+def return_memory() -> None:
+    """Give memory that is free back to the system: glibc keeps what lies between pieces in use."""
+    with contextlib.suppress(AttributeError):  # other C libraries have no such function
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def read_foreign(path: Path, kind: type[Table], *, most: float) -> Table:

@@ -17,9 +17,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from hipsta_bids.group.analysis import Analysis, mean_of_known, members_of, spread_of_known
-from hipsta_bids.group.classify import ClassifierResult, PairComparison, roc_curve
-from hipsta_bids.group.data import Cohort, Float, sheets_of
+from hipsta_bids.group.analysis import (
+    Analysis,
+    describe_known,
+    mean_of_known,
+    members_of,
+    profiles_of,
+)
+from hipsta_bids.group.classify import ClassifierResult, PairComparison
+from hipsta_bids.group.data import Cohort, Float
 from hipsta_bids.group.glm import FittedMaps
 from hipsta_bids.group.normative import ScoredMaps
 from hipsta_bids.group.panels import (
@@ -178,8 +184,8 @@ def mark_medial(axis: "Axes", cohort: Cohort) -> None:
 def draw_roc(analysis: Analysis) -> "list[Figure]":
     """Draw the curves of the first added measure."""
 
-    def line(axis: "Axes", result: ClassifierResult, is_case: Any, color: str) -> str:  # noqa: ANN401
-        axis.plot(*roc_curve(result.score, is_case), color=color)
+    def line(axis: "Axes", result: ClassifierResult, color: str) -> str:
+        axis.plot(*result.curve, color=color)
         area, left_out = result.auc, result.cross_validation.auc
         return f"{area.area:.2f} ({area.low:.2f} to {area.high:.2f}),\n   left out {left_out:.2f}"
 
@@ -190,7 +196,7 @@ def draw_roc(analysis: Analysis) -> "list[Figure]":
 def draw_calibration(analysis: Analysis) -> "list[Figure]":
     """Draw predicted chances, cross-validated, against what happened; of large groups only."""
 
-    def line(axis: "Axes", result: ClassifierResult, _: Any, color: str) -> str:  # noqa: ANN401
+    def line(axis: "Axes", result: ClassifierResult, color: str) -> str:
         found = result.calibration
         axis.plot(found.predicted, found.observed, "o-", color=color, markersize=3)
         return f"{found.slope:.2f}, {found.brier:.2f}"
@@ -204,7 +210,7 @@ def _draw_pairs(
     analysis: Analysis,
     labels: tuple[str, str],
     what: str,
-    line: "Callable[[Axes, ClassifierResult, Any, str], str]",
+    line: "Callable[[Axes, ClassifierResult, str], str]",
 ) -> "list[Figure]":
     """Draw a row for each pair of groups, with its legend beside it: the first added measure."""
     first: dict[tuple[str, str], dict[str, tuple[str, PairComparison]]] = {}
@@ -220,7 +226,7 @@ def _draw_pairs(
             where = {"L": "left", "R": "right"}.get(hemi, "both sides")
             axis.plot([0, 1], [0, 1], color="0.6", linewidth=0.5)
             for color, name, result in _models(measure, pair):
-                text = line(axis, result, pair.is_case, color)
+                text = line(axis, result, color)
                 texts.setdefault(name, []).append(f"{where}: {text}")
             axis.set_title(where)
             axis.set(xlabel=labels[0], aspect="equal")
@@ -262,8 +268,8 @@ def draw_registration(cohort: Cohort, analysis: Analysis) -> "list[Figure]":
             (before, cohort.sides[hemi], "before"),
             (after, side.registered, "after"),
         ):
-            maps = (sheets_of(source.maps, "curvature", own) for own in members.values())
-            _curves(axis, cohort.x, members, (mean_of_known(own, 2) for own in maps))
+            curves = (profiles_of(source.maps, "curvature", own) for own in members.values())
+            _curves(axis, cohort.x, members, curves)
             axis.set_title(f"{SIDES[hemi]}, {when} registration")
             axis.set_ylabel(label)
         after.sharey(before)
@@ -286,9 +292,8 @@ def draw_registration(cohort: Cohort, analysis: Analysis) -> "list[Figure]":
 def _curves(axis: "Axes", x: Float, names: Iterable[str], groups: Iterable[Float]) -> None:
     """Draw the mean of each group and twice its standard error to both sides."""
     for color, name, values in zip(cycle(COLORS), names, groups, strict=False):
-        mean = mean_of_known(values, 0)
-        count = np.isfinite(values).sum(axis=0)
-        error = 2 * spread_of_known(values) / np.sqrt(np.maximum(count, 1))
+        known, mean, sd = describe_known([values])
+        error = 2 * sd / np.sqrt(np.maximum(known.sum(axis=0), 1))
         axis.plot(x, mean, color=color, label=f"{name} (n = {len(values)})", linewidth=1.2)
         axis.fill_between(x, mean - error, mean + error, color=color, alpha=0.25, linewidth=0)
 

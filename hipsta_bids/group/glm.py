@@ -10,7 +10,7 @@ from scipy.optimize import elementwise
 from statsmodels.regression.linear_model import OLS
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.data import Bool, Float, Int, SideMaps, sheets_of
+from hipsta_bids.group.data import Bool, Float, Int, SideMaps, parts_of_sheets, sheets_of
 from hipsta_bids.group.exchangeability import Visits
 from hipsta_bids.group.formula import Contrast
 from hipsta_bids.group.model import Design
@@ -464,12 +464,16 @@ class FittedMaps:
     fits: Mapping[str, PointwiseFit]
     """By measure."""
 
-    def values(self, measure: str, own: Bool | slice = slice(None)) -> Float:
-        """(sheets, points) of one measure, of all sheets used or of some of them."""
-        used = self.used[own]
-        if len(used) == len(self.maps.rows):
-            return _values(self.maps.maps[measure], used)
-        return sheets_of(self.maps.maps, measure, used).reshape(len(used), -1)
+    def values(self, measure: str) -> Float:
+        """(sheets, points) of one measure, of all sheets used."""
+        if len(self.used) == len(self.maps.rows):
+            return _values(self.maps.maps[measure], self.used)
+        return sheets_of(self.maps.maps, measure, self.used).reshape(len(self.used), -1)
+
+    def parts(self, measure: str, own: Bool) -> Iterator[Float]:
+        """(sheets, points) of one measure, of some of the sheets used, a part at a time."""
+        for part in parts_of_sheets(self.maps.maps, measure, self.used[own]):
+            yield part.reshape(len(part), -1)
 
 
 def fit_maps(

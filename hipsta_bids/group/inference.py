@@ -34,8 +34,9 @@ from hipsta_bids.progress import tell
 BELOW_ALL = 0.1
 #: Methods that hold the family-wise error rate.
 PERMUTATIONS = ("permutation-tfce", "permutation-max")
-#: Permutations whose maps a processor has in memory at once; does not change a result.
-_BATCH = 50
+#: Permutations whose maps a processor has in memory at once, and random numbers for them, if these
+#: are more; does not change a result.
+_BATCH, _KEYS = 50, 1_000_000
 #: Processors that permute; does not change a result.
 PROCESSORS: ContextVar[int] = ContextVar("processors", default=1)
 #: Sums in another order differ by less, relatively.
@@ -113,11 +114,12 @@ def permute(
     who = [one.subjects for one in parts_alone]
     who += [one.visits.people for one in parts_alone if one.visits]
     n_subjects = 1 + max(int(numbers.max()) for numbers in who)
+    batch = min(_BATCH, max(_KEYS // n_subjects, 1))
 
     def reached(start: int) -> list[Float]:
         """Count what reaches the observed statistics, with the keys of a batch by its number."""
         bits = np.random.PCG64(settings.seed).advance((start - 1) * n_subjects)
-        count = min(_BATCH, settings.permutations - start)
+        count = min(batch, settings.permutations - start)
         keys = np.random.Generator(bits).random((count, n_subjects))
         maps = [run.shuffled(keys) for run in runs]
         highest = np.max([_maximum(t) for t, _ in maps], axis=0)
@@ -125,7 +127,7 @@ def permute(
         pairs = zip(runs, maps, strict=True)
         return [run.reached(t, highest, highest_enhanced) for run, (t, _) in pairs]
 
-    starts = range(1, settings.permutations, _BATCH)
+    starts = range(1, settings.permutations, batch)
     with ThreadPoolExecutor(PROCESSORS.get()) as pool:
         for start, counts in zip(starts, pool.map(reached, starts), strict=True):
             if family is not None:

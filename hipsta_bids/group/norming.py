@@ -449,7 +449,7 @@ def _score_maps(
                 rows=side.rows,
                 reference=adapted[side.rows],
                 scores=scores,
-                subfield=most_frequent(side.subfield, len(side.names)),
+                subfield=most_frequent(side.subfield[:], len(side.names)),
                 names=side.names,
             )
     return scored

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hipsta_bids.group.analysis import Analysis, mean_of_known, members_of, rows_of
+from hipsta_bids.group.analysis import Analysis, describe_known, members_of, rows_of
 from hipsta_bids.group.data import Bool, Cohort, Float
 from hipsta_bids.group.glm import FittedMaps, PointTest
 from hipsta_bids.group.inference import Discoveries, MapKey
@@ -134,7 +134,7 @@ def _means(
     counts: dict[str, dict[str, int]] = {}
     for hemi, one in sides.items():
         for group, own in members_of(analysis, rows_of(analysis, one)).items():
-            means.setdefault(group, {})[hemi] = mean_of_known(one.values(measure, own), 0)
+            _, means.setdefault(group, {})[hemi], _ = describe_known(one.parts(measure, own))
             counts.setdefault(group, {})[hemi] = int(own.sum())
     pair = bool(analysis.comparison.pair)
     kind = display.kind_of(measure, change=pair or set(sides) == {BOTH})

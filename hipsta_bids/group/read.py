@@ -20,7 +20,15 @@ from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.catalog import MAPS, why_impossible
 from hipsta_bids.geometry.sheet import sheet_levels
 from hipsta_bids.group.collect import Exclusion, SheetRecord
-from hipsta_bids.group.data import MOST_KEPT, PARTICIPANT, SESSION, Float, Measures, SideMaps
+from hipsta_bids.group.data import (
+    MOST_KEPT,
+    PARTICIPANT,
+    SESSION,
+    Float,
+    Measures,
+    SideMaps,
+    blocks,
+)
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.settings import SheetSettings
@@ -41,6 +49,7 @@ ARBITRARY = "arbitrary"
 LEAST_SHARE = 0.5
 #: Number of measures that a message lists.
 _SHOWN = 12
+_ROWS = 1000  # of summaries that are words at once
 
 
 def choose_measures(
@@ -270,7 +279,6 @@ def _read_side(
     sampled = [name for name in names if name not in SHEET_MAPS]
     subfield = np.empty((len(records), *shape), dtype=np.int8)
     codes: dict[str, int] = {}
-    summaries = []
     for i, record in enumerate(records):
         columns = read_sheet(record.place.path("sheet"), measured, ["subfield"], shape)
         for name in sampled:
@@ -280,8 +288,13 @@ def _read_side(
         for name in maps.keys() & columns.keys():
             maps[name][i] = columns[name]
         subfield[i] = _encode(columns["subfield"], codes)
-        summaries.append(read_summary(record.place))
-    summary = pd.DataFrame(summaries).astype(np.float64)
+    summary = pd.concat(
+        [
+            pd.DataFrame([read_summary(record.place) for record in records[part]], dtype=np.float64)
+            for part in blocks(len(records), _ROWS)
+        ],
+        ignore_index=True,
+    )
     return SideMaps(rows=rows, maps=maps, subfield=subfield, names=tuple(codes), summary=summary)
 
 

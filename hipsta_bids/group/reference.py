@@ -228,7 +228,7 @@ class Reference:
 def place_of(side: SideMaps) -> FittedMaps:
     """Locate the points of maps of one hemisphere, to which nothing was fitted."""
     every = np.arange(len(side.rows))
-    subfield = most_frequent(side.subfield, len(side.names))
+    subfield = most_frequent(side.subfield[:], len(side.names))
     return FittedMaps(maps=side, used=every, rows=every, subfield=subfield, fits={})
 
 
@@ -362,7 +362,8 @@ class Modeled:
 
     def _reference(self, rows: Int, values: Float, fit: PointwiseFit) -> Reference:
         """At one visit with the residual variance; over time with changes and both variances."""
-        n = participants_with(values, self._table[PARTICIPANT].iloc[rows].to_numpy())
+        who = self._table[PARTICIPANT].iloc[rows].to_numpy()
+        n = participants_with(np.isfinite(values), who)
         plain = Reference(
             n=n,
             mean=mean_of_known(values, 0),

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.data import Bool, Float
+from hipsta_bids.group.data import Bool, Float, blocks
 from hipsta_bids.group.formula import Contrast
 from hipsta_bids.group.inference import PermutationPart, permute
 from hipsta_bids.group.settings import MultiplicitySettings, RegistrationSettings
@@ -26,6 +26,7 @@ from hipsta_bids.group.warps import (
 
 #: Displacements that vary less, as a share of the largest variance, are those of fixed ends.
 _ROUNDING = 1e-12
+_SHEETS = 4000  # in memory at once
 
 
 @dataclass(frozen=True)
@@ -244,10 +245,12 @@ class GroupShift:
 
 def mean_profiles(maps: Float, settings: RegistrationSettings) -> Float:
     """Profiles of curvature along x: means over y, with gaps filled linearly."""
-    present = np.isfinite(maps)
-    counts = present.sum(axis=2)
-    sums = np.where(present, maps, 0.0).sum(axis=2, dtype=np.float64)
-    profiles = sums / np.maximum(counts, 1)
+    counts, profiles = np.empty(maps.shape[:2], dtype=np.int64), np.empty(maps.shape[:2])
+    for part in blocks(len(maps), _SHEETS):
+        present = np.isfinite(maps[part])
+        counts[part] = present.sum(axis=2)
+        sums = np.where(present, maps[part], 0.0).sum(axis=2, dtype=np.float64)
+        profiles[part] = sums / np.maximum(counts[part], 1)
     empty = counts == 0
     bad = np.flatnonzero(empty.mean(axis=1) > settings.max_gap)
     if len(bad):
@@ -260,7 +263,7 @@ def mean_profiles(maps: Float, settings: RegistrationSettings) -> Float:
     for row in np.flatnonzero(empty.any(axis=1)):  # few
         gaps = empty[row]
         profiles[row, gaps] = np.interp(nodes[gaps], nodes[~gaps], profiles[row, ~gaps])
-    return np.asarray(profiles, dtype=np.float64)
+    return profiles
 
 
 @dataclass(frozen=True)

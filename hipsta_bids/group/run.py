@@ -133,7 +133,7 @@ class GroupResult:
     """What to know, one line each."""
     warnings: tuple[str, ...]
     """What may make results wrong, one line each."""
-    page: Path | None
+    page: Path | None = None
     """To look at; ``None`` if there is none."""
     problem: str | None = None
     """Why the page could not be made."""
@@ -159,6 +159,11 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         If inputs, model or output folder do not allow it.
     """
     dataset.check_own_dataset(options.out_dir)
+    return with_page(options, _analyze(options, settings))
+
+
+def _analyze(options: GroupOptions, settings: GroupSettings) -> GroupResult:
+    """Analyze and write all but the page, for which the memory that it takes is free again."""
     tell("reading")
     inputs = read_inputs(options, settings)
     check_joint([*inputs.measures.maps, *inputs.others], options.comparison, settings)
@@ -196,6 +201,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         found |= other.found
     joint = combine_maps([analysis, *(other for _, other in others.values())], settings)
     found |= {key: one.found for key, one in joint.items()}
+    tested = tuple(joint.values())
     analysis = replace(analysis, found=found)
     exclusions = [*inputs.exclusions, *_incomplete(analysis)]
     wanted = wanted_measures(options.model, options.measures)
@@ -203,6 +209,8 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
     summary = _summary(options, inputs, analysis, settings, notes)
     tell("average surfaces")
     shapes = average_shapes(inputs.found.records, cohort, analysis, settings)
+    # One is enough from here on, and all may take much memory.
+    inputs = replace(inputs, found=replace(inputs.found, records=inputs.found.records[:1]))
 
     def fill(folder: Path) -> dict[str, Any]:
         write_results(
@@ -212,7 +220,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
             settings,
             exclusions,
             others=others,
-            joint=tuple(joint.values()),
+            joint=tested,
             region=options.sheets.region,
             ratings=inputs.found.ratings,
         )
@@ -222,9 +230,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         write_shapes(folder, shapes)
         if analysis.sides and inputs.found.records and not shapes:
             notes.append("no average surfaces: those of the participant level are missing")
-        notes.extend(
-            draw(folder, cohort, analysis, shapes, others=others, joint=tuple(joint.values()))
-        )
+        notes.extend(draw(folder, cohort, analysis, shapes, others=others, joint=tested))
         return _record(analysis, inputs.found.ratings)
 
     return write_folder(
@@ -248,12 +254,12 @@ def write_folder(
     counts: tuple[int, int],
     fill: Callable[[Path], Mapping[str, Any]],
 ) -> GroupResult:
-    """Write all results or none, and make the page.
+    """Write all results or none.
 
     ``fill`` writes into the folder, adds to the notes, and returns what is recorded; ``counts`` are
     of participants and of what is left out.
     """
-    region = options.sheets.region
+    found, region = inputs.found, options.sheets.region
     name = options.model.name or (name if region == "body" else f"{name}_{region}")
     _describe_dataset(options)
     with write.model_folder(options.out_dir, name) as folder:
@@ -261,21 +267,29 @@ def write_folder(
         record = {
             "command": list(options.command),
             "version": __version__,
-            "inputs": _record_inputs(options, inputs.found),
+            "inputs": {
+                "datasets": [str(root.resolve()) for root in options.sheets.roots],
+                "settings_hash": found.settings_hash,
+                "versions": found.versions,
+                "seg": found.records[0].place.name.seg if found.records else None,
+                "region": region,
+                "maps": dict(options.maps),
+                "volumes": dict(options.volumes),
+                "covariates": [str(path) for path in options.covariates],
+                "template": options.template and str(options.template),
+                "harmonization": options.harmonize_model and str(options.harmonize_model),
+            },
             **fill(folder),
-            "notes": [*inputs.found.warnings, *notes],
+            "notes": [*found.warnings, *notes],
             "settings": resolve(settings),
         }
         files.write_json(folder / "analysis.json", record)
-    page, problem = make_page(options, name)
     return GroupResult(
         folder=options.out_dir / write.GROUP_FOLDER / name,
-        page=page,
-        problem=problem,
         n_participants=counts[0],
         n_excluded=counts[1],
         notes=tuple(notes),
-        warnings=inputs.found.warnings,
+        warnings=found.warnings,
     )
 
 
@@ -482,20 +496,10 @@ def _record(analysis: Analysis, ratings: Mapping[str, int] | None) -> dict[str, 
     }
 
 
-def _record_inputs(options: GroupOptions, found: Collection) -> dict[str, Any]:
-    """Record what was read."""
-    return {
-        "datasets": [str(root.resolve()) for root in options.sheets.roots],
-        "settings_hash": found.settings_hash,
-        "versions": found.versions,
-        "seg": found.records[0].place.name.seg if found.records else None,
-        "region": options.sheets.region,
-        "maps": dict(options.maps),
-        "volumes": dict(options.volumes),
-        "covariates": [str(path) for path in options.covariates],
-        "template": None if options.template is None else str(options.template),
-        "harmonization": None if options.harmonize_model is None else str(options.harmonize_model),
-    }
+def with_page(options: GroupOptions, result: GroupResult) -> GroupResult:
+    """Add the page to results that were written."""
+    page, problem = make_page(options, result.folder.name)
+    return replace(result, page=page, problem=problem)
 
 
 def make_page(options: GroupOptions, name: str) -> tuple[Path | None, str | None]:

@@ -8,11 +8,11 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.classify import PairComparison, compare_pairs
+from hipsta_bids.group.classify import PairComparison, compare_pairs, forget_models
 from hipsta_bids.group.comparison import BOTH
-from hipsta_bids.group.data import PARTICIPANT, Cohort, Float, Int
+from hipsta_bids.group.data import PARTICIPANT, Bool, Cohort, Float, Int
 from hipsta_bids.group.formula import Contrast, ModelSpec, check_names, typed
-from hipsta_bids.group.glm import MEAN, PointwiseFit, RowModel, sum_by, with_mean
+from hipsta_bids.group.glm import MEAN, PointwiseFit, RowModel, with_mean
 from hipsta_bids.group.grammar import closed_formula
 from hipsta_bids.group.model import Design, Groups, build_design
 from hipsta_bids.group.settings import GroupSettings
@@ -83,7 +83,7 @@ def fit_summaries(
                     measures=tuple(values.columns),
                     formula=formula,
                     fit=model.fit_measures(maps, present, model.design.contrasts, settings),
-                    participants=participants_with(maps, who),
+                    participants=participants_with(np.isfinite(maps), who),
                 )
             )
 
@@ -104,11 +104,16 @@ def fit_summaries(
     return fits, []
 
 
-def participants_with(values: Float, who: NDArray[np.object_]) -> Int:
-    """Count those (columns,) who have a value in any of their rows."""
-    numbers = np.unique(who.astype(str), return_inverse=True)[1]
-    counts = sum_by(numbers, np.isfinite(values).astype(np.int64))
-    return np.asarray((counts > 0).sum(axis=0), dtype=np.int64)
+def participants_with(known: Bool, who: NDArray[np.object_]) -> Int:
+    """Count those (columns,) of whom any row (rows, columns) is known."""
+    names, numbers = np.unique(who.astype(str), return_inverse=True)
+    if len(names) == len(who):
+        return np.asarray(known.sum(axis=0), dtype=np.int64)
+    order = np.argsort(numbers, kind="stable")
+    starts = np.searchsorted(numbers[order], np.arange(len(names)))
+    return np.asarray(
+        np.logical_or.reduceat(known[order], starts, axis=0).sum(axis=0), dtype=np.int64
+    )
 
 
 def _same_names(larger: Design, design: Design) -> tuple[Contrast, ...]:
@@ -149,6 +154,7 @@ def classify_groups(
                 notes.append(f"classification by {measure}, hemisphere {hemi}: {error}")
                 continue
             results += [(hemi, measure, pair) for pair in pairs]
+    forget_models()
     return results, notes
 
 

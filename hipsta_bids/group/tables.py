@@ -7,18 +7,18 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from hipsta_bids.group.analysis import (
     Analysis,
     SideResult,
+    describe_known,
     mean_of_known,
     members_of,
+    profiles_of,
     rows_of,
-    spread_of_known,
     tested_maps,
 )
-from hipsta_bids.group.classify import ClassifierResult, roc_curve
+from hipsta_bids.group.classify import ClassifierResult
 from hipsta_bids.group.clusters import (
     edges_of,
     effect_columns,
@@ -28,7 +28,7 @@ from hipsta_bids.group.clusters import (
     point_columns,
     test_columns,
 )
-from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float, sheets_of
+from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float
 from hipsta_bids.group.formula import file_label
 from hipsta_bids.group.harmonize import Harmonization
 from hipsta_bids.group.inference import control_fdr
@@ -39,7 +39,7 @@ from hipsta_bids.group.summaries import hemispheres, participants_with, summary_
 Named = tuple[str, pd.DataFrame]
 """File name without extension, and table."""
 Columns = Mapping[str, Any]
-CurveOf = Callable[[ClassifierResult, NDArray[np.bool_]], Columns]
+CurveOf = Callable[[ClassifierResult], Columns]
 
 _MEANINGS = tomllib.loads((files("hipsta_bids.group") / "columns.toml").read_text("utf-8"))
 #: Meaning of every column; the unit is that of the measure unless said.
@@ -138,7 +138,7 @@ def _means(cohort: Cohort, analysis: Analysis) -> Iterator[Columns]:
         members = members_of(analysis, rows)
         for measure in one.fits:
             for group, own in members.items():
-                values = one.values(measure, own)
+                known, mean, sd = describe_known(one.parts(measure, own))
                 yield {
                     "measure": measure,
                     "unit": cohort.units.get(measure, "1"),
@@ -146,9 +146,9 @@ def _means(cohort: Cohort, analysis: Analysis) -> Iterator[Columns]:
                     "group": group,
                     **frame.number,
                     **frame.position,
-                    "n": participants_with(values, people[own]),
-                    "mean": mean_of_known(values, 0),
-                    "sd": spread_of_known(values),
+                    "n": participants_with(known, people[own]),
+                    "mean": mean,
+                    "sd": sd,
                 }
 
 
@@ -158,8 +158,9 @@ def _profiles(cohort: Cohort, analysis: Analysis) -> Iterator[Columns]:
             members = members_of(analysis, cohort.table.iloc[source.rows])
             for measure in source.maps:
                 for group, own in members.items():
-                    values = mean_of_known(sheets_of(source.maps, measure, own), 2)
-                    count = np.isfinite(values).sum(axis=0)
+                    values = profiles_of(source.maps, measure, own)
+                    known, mean, sd = describe_known([values])
+                    count = known.sum(axis=0)
                     yield {
                         "measure": measure,
                         "unit": cohort.units.get(measure, "1"),
@@ -168,8 +169,8 @@ def _profiles(cohort: Cohort, analysis: Analysis) -> Iterator[Columns]:
                         "group": group,
                         "node_x": np.arange(len(cohort.x)) + 1,
                         "n": count,
-                        "mean": mean_of_known(values, 0),
-                        "mean_se": spread_of_known(values) / np.sqrt(np.maximum(count, 1)),
+                        "mean": mean,
+                        "mean_se": sd / np.sqrt(np.maximum(count, 1)),
                     }
 
 
@@ -357,15 +358,14 @@ def _curves(analysis: Analysis, curve: CurveOf) -> Iterator[Columns]:
     for hemi, measure, pair in analysis.pairs:
         what = {"hemi": hemi, "control": pair.control, "case": pair.case, "added": measure}
         for classifier, result in (("base", pair.comparison.base), ("full", pair.comparison.full)):
-            yield {**what, "classifier": classifier, **curve(result, pair.is_case)}
+            yield {**what, "classifier": classifier, **curve(result)}
 
 
-def _roc(result: ClassifierResult, is_case: NDArray[np.bool_]) -> Columns:
-    wrong, right = roc_curve(result.score, is_case)
-    return {"false_positives": wrong, "true_positives": right}
+def _roc(result: ClassifierResult) -> Columns:
+    return dict(zip(("false_positives", "true_positives"), result.curve, strict=True))
 
 
-def _calibration(result: ClassifierResult, _: NDArray[np.bool_]) -> Columns:
+def _calibration(result: ClassifierResult) -> Columns:
     found = result.calibration
     return {"predicted": found.predicted, "observed": found.observed}
 

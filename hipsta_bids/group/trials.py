@@ -47,6 +47,7 @@ from hipsta_bids.group.run import (
     GroupResult,
     read_inputs,
     read_templates,
+    with_page,
     write_folder,
 )
 from hipsta_bids.group.settings import GroupSettings
@@ -187,7 +188,7 @@ class Asked:
         record: Mapping[str, Any],
         fill: Callable[[Path], list[str]],
     ) -> GroupResult:
-        """Write what these questions have in common; ``fill`` writes all else, and adds notes."""
+        """Write what these questions share, and a page; ``fill`` writes all else, and notes."""
         excluded = exclude_visits(self.inputs.cohort.table, self.left_out)
         excluded = [*self.inputs.exclusions, *excluded]
         told, people = [*self.inputs.notes, *notes], int(visits[PARTICIPANT].nunique())
@@ -200,7 +201,7 @@ class Asked:
             told.extend(fill(folder))
             return {"participants": people, "rows": len(visits), **record}
 
-        return write_folder(
+        result = write_folder(
             self.options,
             name,
             self.inputs,
@@ -209,6 +210,7 @@ class Asked:
             counts=(people, len(excluded)),
             fill=everything,
         )
+        return with_page(self.options, result)
 
 
 def run_trial(options: GroupOptions, request: TrialRequest, settings: GroupSettings) -> GroupResult:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.data import Float, Int
+from hipsta_bids.group.data import Float, Int, blocks
 from hipsta_bids.group.settings import RegistrationSettings
 
 #: Cubic B-splines on the unit interval, clamped at its ends.
@@ -89,20 +89,27 @@ class Template:
 class _Moments:
     """What the steps need to know of the profiles at their registered coordinates."""
 
-    basis: Float
-    """(subjects, nodes, splines)"""
     squares: Float
-    """(subjects, splines, splines)"""
+    """(subjects, splines, splines) of the splines there."""
     products: Float
-    """(subjects, splines)"""
-    profiles: Float
+    """(subjects, splines) of splines and profiles."""
+    grid: Float
+    """(nodes, splines) mean of the splines."""
+    power: float
+    """Sum of the squared profiles."""
 
     @classmethod
     def collect(cls, profiles: Float, warps: Float, knots: Float) -> "_Moments":
-        basis = np.asarray(make_basis(knots)(warps), dtype=np.float64)
-        squares = np.swapaxes(basis, 1, 2) @ basis
-        products = np.einsum("sdk,sd->sk", basis, profiles)
-        return cls(basis, squares, products, profiles)
+        splines = make_basis(knots)
+        size = splines.c.shape[1]
+        squares, products = np.empty((len(warps), size, size)), np.empty((len(warps), size))
+        grid = np.zeros((warps.shape[1], size))
+        for part in blocks(len(warps), _BLOCK):
+            basis = splines(warps[part])
+            squares[part] = np.swapaxes(basis, 1, 2) @ basis
+            products[part] = np.einsum("sdk,sd->sk", basis, profiles[part])
+            grid += basis.sum(axis=0)
+        return cls(squares, products, grid / len(warps), float(np.sum(profiles**2)))
 
 
 @dataclass(frozen=True)
@@ -132,7 +139,8 @@ def fit_template(
     knots = inner_knots(warps, splines)
     moments = _Moments.collect(profiles, warps, knots)
     mean = np.linalg.solve(moments.squares.sum(axis=0), moments.products.sum(axis=0))
-    parts = _start(moments, mean, components)
+    expected = BSpline(make_basis(knots).t, mean, _DEGREE)(warps)
+    parts = _start(profiles - expected, moments.grid, components)
     noise = 1.0
     scores = _expect(moments, mean, parts, noise)  # the answer if there are no steps
     for _ in range(settings.em_iterations - 1):
@@ -156,11 +164,9 @@ def subject_curves(template: Template, profiles: Float, warps: Float) -> Float:
     return template.mean + scores.mean @ template.components.T
 
 
-def _start(moments: _Moments, mean: Float, components: int) -> Float:
+def _start(residuals: Float, grid: Float, components: int) -> Float:
     """Principal components of the residuals on the grid; the steps do not depend on the start."""
-    residuals = moments.profiles - moments.basis @ mean
     _, size, axes = np.linalg.svd(residuals, full_matrices=False)
-    grid = moments.basis.mean(axis=0)
     parts = np.linalg.lstsq(grid, axes[:components].T, rcond=None)[0]
     return np.asarray(parts * size[:components] / np.sqrt(len(residuals)), dtype=np.float64)
 
@@ -176,11 +182,12 @@ def _expect(moments: _Moments, mean: Float, parts: Float, noise: float) -> _Scor
 
 def _noise(moments: _Moments, mean: Float, scores: _Scores) -> float:
     """Mean square, as expected, of what the subjects' templates leave."""
-    total = float(np.sum((moments.profiles - moments.basis @ mean) ** 2))
+    total = moments.power - 2 * float(moments.products.sum(axis=0) @ mean)
+    total += float(mean @ moments.squares.sum(axis=0) @ mean)
     total -= 2 * float(np.sum(scores.mean * scores.projection))
     second = scores.covariance + scores.mean[:, :, None] * scores.mean[:, None, :]
     total += float(np.sum(scores.squares * second))
-    return total / moments.profiles.size
+    return total / (len(moments.products) * len(moments.grid))
 
 
 def _maximize(moments: _Moments, scores: _Scores) -> tuple[Float, Float]:
@@ -373,7 +380,7 @@ def fit_warps(
     problem = _Problem(knots, basis, penalty, settings)
     fits = [
         problem.solve(profiles[block], coefficients[block], parameters[block])
-        for block in _blocks(len(profiles))
+        for block in blocks(len(profiles), _BLOCK)
     ]
     return WarpFit(
         parameters=np.concatenate([fit.parameters for fit in fits]),
@@ -385,7 +392,7 @@ def fit_warps(
 def warp_values(maps: Float, warps: Float) -> Float:
     """Carry maps of values to registered coordinates, linearly; NaN where a value lacks."""
     carried = np.empty(maps.shape, np.result_type(maps, np.float32))
-    for block in _blocks(len(maps), _MAPS):
+    for block in blocks(len(maps), _MAPS):
         left, weight = _sources(warps[block])
         rows = np.arange(len(left))[:, None]
         share = weight[:, :, None]
@@ -399,7 +406,7 @@ def warp_values(maps: Float, warps: Float) -> Float:
 def warp_labels(labels: NDArray[np.int8], warps: Float) -> NDArray[np.int8]:
     """Carry maps of labels to registered coordinates, from the nearest node."""
     carried = np.empty_like(labels)
-    for block in _blocks(len(labels), _MAPS):
+    for block in blocks(len(labels), _MAPS):
         left, weight = _sources(warps[block])
         rows = np.arange(len(left))[:, None]
         carried[block] = labels[block][rows, left + (weight >= 0.5)]  # noqa: PLR2004 -- nearest
@@ -416,8 +423,3 @@ def _sources(warps: Float) -> tuple[Int, Float]:
     gap = np.take_along_axis(warps, left + 1, axis=1) - start
     weight = np.where(gap > 0, (grid - start) / np.where(gap > 0, gap, 1.0), 0.0)
     return left, np.clip(weight, 0.0, 1.0)
-
-
-def _blocks(subjects: int, size: int = _BLOCK) -> list[slice]:
-    """Subjects that are worked on together, to bound memory."""
-    return [slice(start, start + size) for start in range(0, max(subjects, 1), size)]

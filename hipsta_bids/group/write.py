@@ -19,7 +19,17 @@ from pyarrow import parquet
 from hipsta_bids.derivatives.names import DATASET_FILES
 from hipsta_bids.group.analysis import Analysis, templates_of, tested_maps
 from hipsta_bids.group.collect import Exclusion
-from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float, Int, SideMaps, some_sheets
+from hipsta_bids.group.data import (
+    PARTICIPANT,
+    SESSION,
+    Cohort,
+    Float,
+    Int,
+    SideMaps,
+    blocks,
+    return_memory,
+    some_sheets,
+)
 from hipsta_bids.group.figures import Drawing, draw_figures, encode
 from hipsta_bids.group.glm import FittedMaps, PointTest
 from hipsta_bids.group.harmonize import digests, effects_of
@@ -178,6 +188,7 @@ def draw(
 def write_figures(folder: Path, drawings: Iterable[tuple[str, Drawing]]) -> list[str]:
     """Draw figures by name, and say which are missing or lack letters; one line each."""
     tell("figures")
+    return_memory()
     problems, missing = [], set()
     gc.freeze()  # what is there need not be looked at whenever a figure's memory is taken back
     for number, (name, drawing) in enumerate(drawings, start=1):
@@ -213,7 +224,7 @@ def write_table(
     """Write a table, with a sidecar unless the columns are the user's or the model's."""
     columns = [str(column) for column in table.columns]
     lines = ["\t".join(columns)]
-    for part in _parts(len(table), _ROWS):
+    for part in blocks(len(table), _ROWS):
         rows = zip(*(_cells(values.iloc[part]) for _, values in table.items()), strict=True)
         lines += map("\t".join, rows)
     files.write_text(folder / f"{name}.tsv", "\n".join(lines) + "\n")
@@ -275,8 +286,8 @@ def _write_maps(
         "description": "one row per visit, hemisphere and point; x from medial to lateral, y"
         " from posterior to anterior; a column is empty where the surface lacks the measure"
     }
-    blocks = _map_blocks(cohort, states, others)
-    _write_parquet(path, pa.schema(fields, metadata=about), blocks)
+    rows = _map_blocks(cohort, states, others)
+    _write_parquet(path, pa.schema(fields, metadata=about), rows)
 
 
 def _number(column: str, cohort: Cohort, measure: str, text: str) -> pa.Field:
@@ -284,7 +295,7 @@ def _number(column: str, cohort: Cohort, measure: str, text: str) -> pa.Field:
     return pa.field(column, pa.float32(), metadata=about)
 
 
-def _write_parquet(path: Path, schema: pa.Schema, blocks: Iterable[Columns]) -> None:
+def _write_parquet(path: Path, schema: pa.Schema, rows: Iterable[Columns]) -> None:
     """Write blocks of columns; those that a block lacks are empty.
 
     Measured values hardly repeat: a dictionary of them takes longer than it saves.
@@ -294,7 +305,7 @@ def _write_parquet(path: Path, schema: pa.Schema, blocks: Iterable[Columns]) -> 
         with parquet.ParquetWriter(
             path, schema, compression="zstd", use_dictionary=repeated
         ) as writer:
-            for columns in blocks:
+            for columns in rows:
                 count = len(columns["hemi"])
                 arrays = [
                     columns[field.name] if field.name in columns else pa.nulls(count, field.type)
@@ -313,7 +324,7 @@ def _map_blocks(
     for surface, own, sides in surfaces:
         for hemi, side in sides.items():
             points = int(np.prod(side.shape))
-            for part in _parts(len(side.rows), max(_BLOCK // points, 1)):
+            for part in blocks(len(side.rows), max(_BLOCK // points, 1)):
                 rows = side.rows[part]
                 columns = _visit_columns(own.table, rows, points, hemi=hemi, surface=surface)
                 vertices = np.tile(np.arange(points, dtype=np.int32), len(rows))
@@ -328,10 +339,6 @@ def _map_blocks(
                 else:
                     columns |= _value_columns(side.maps, part)
                 yield columns
-
-
-def _parts(n: int, step: int) -> Iterator[slice]:
-    return (slice(start, start + step) for start in range(0, n, step))
 
 
 def _visit_columns(table: pd.DataFrame, rows: Int, points: int, **words: str) -> Columns:
@@ -480,13 +487,13 @@ def write_scores(
         "description": f"{letter}-scores, one row per participant, hemisphere and node of the"
         " registered sheet; nodes along x from medial to lateral, y from posterior to anterior"
     }
-    blocks = (
+    rows = (
         {
             **_visit_columns(table, side.rows[part], shape[0] * shape[1], hemi=hemi),
             **_node_columns(cohort, shape, len(side.rows[part])),
             **_value_columns({n: one.w for n, one in side.scores.items()}, part, f"_{letter}"),
         }
         for hemi, side in sides.items()
-        for part in _parts(len(side.rows), _ROWS_OF_SCORES)
+        for part in blocks(len(side.rows), _ROWS_OF_SCORES)
     )
-    _write_parquet(folder / f"{letter}scores.parquet", pa.schema(fields, metadata=about), blocks)
+    _write_parquet(folder / f"{letter}scores.parquet", pa.schema(fields, metadata=about), rows)

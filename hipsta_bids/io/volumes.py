@@ -27,6 +27,9 @@ VOXEL_SIZES = (0.05, 5.0)
 #: ... and of other images, such as those of PET.
 MAP_VOXEL_SIZES = (0.05, 30.0)
 
+#: Difference between two statements of a voxel's edges in one header, as a share.
+_SAME_SIZE = 0.01
+
 #: All that nibabel and its decompressors raise on damaged files.
 _READ_ERRORS = (
     OSError,
@@ -414,10 +417,23 @@ def _check_affine(
         )
     if sizes.min() < limits[0] or sizes.max() > limits[1]:
         raise InputError(
-            f"{path}: voxels of {' x '.join(f'{size:.3g}' for size in sizes)} mm are outside of "
+            f"{path}: voxels of {_times(sizes)} mm are outside of "
             f"{limits[0]} to {limits[1]} mm; check the header's units",
             reason="bad-voxel-size",
         )
+    if isinstance(image, nib.Nifti1Pair):
+        spacing = np.asarray(image.header.get_zooms()[:_SPACE], dtype=np.float64)
+        stated = spacing.min() > 0 and np.any(spacing != 1)  # some programs leave it as it was
+        if stated and np.abs(sizes / spacing - 1).max() > _SAME_SIZE:
+            raise InputError(
+                f"{path}: voxels are {_times(sizes)} mm by the sform, but {_times(spacing)} mm by"
+                " pixdim, and all lengths follow from them; set right the one that is wrong",
+                reason="bad-affine",
+            )
+
+
+def _times(sizes: Float) -> str:
+    return " x ".join(f"{size:.3g}" for size in sizes)
 
 
 def mask_bytes(mask: BodyMask) -> bytes:

@@ -311,7 +311,7 @@ def test_each_pair_is_the_comparison_of_its_subjects():
     alone = compare_models(base, thickness[used], groups[used] == "DAT", PAIRS)
     assert found[1].comparison.likelihood_ratio == alone.likelihood_ratio
     assert found[1].comparison.n == used.sum()
-    np.testing.assert_array_equal(found[1].is_case, groups[used] == "DAT")
+    assert found[1].comparison.n_cases == (groups[used] == "DAT").sum()
     # Groups two steps apart are easier to tell than neighbors.
     areas = [pair.comparison.full.auc.area for pair in found]
     assert areas[1] > max(areas[0], areas[2])

@@ -15,7 +15,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from hipsta_bids.group.analysis import Analysis
-from hipsta_bids.group.classify import Area, calibrate
+from hipsta_bids.group.classify import Area, calibrate, roc_curve
 from hipsta_bids.group.figures import draw_calibration, draw_roc, draw_sections, encode
 from hipsta_bids.group.inference import Discoveries, MapKey
 from hipsta_bids.group.panels import Seen, draw_measure
@@ -152,7 +152,7 @@ def measured(survive, sides="LR", *, kind="t", mesh=None, groups=("CN", "AD"), c
         maps=SimpleNamespace(shape=shape, mesh=mesh, names=names, rows=np.arange(4)),
         used=np.arange(4),
         subfield=fields.astype(np.int64),
-        values=lambda _, own: random.normal(2, 0.1, (int(own.sum()), points)),
+        parts=lambda _, own: [random.normal(2, 0.1, (int(own.sum()), points))],
     )
     found = {
         MapKey("thickness", test.contrast.name, hemi): Discoveries(
@@ -341,14 +341,14 @@ def test_legends_of_curves_are_beside_them_and_small_groups_have_no_calibration(
     one = SimpleNamespace(
         auc=Area(0.6, 0.1, 0.4, 0.8),
         cross_validation=SimpleNamespace(auc=0.07),
-        score=score,
+        curve=roc_curve(score, score > 0),
         calibration=calibration,
     )
     small = SimpleNamespace(calibration=calibrate(score, score > 0, ClassificationSettings()))
     cases = []
     for hemi, full in (("L", one), ("R", one), ("LR", small)):
         model = SimpleNamespace(base=one, full=full, separated=False)
-        pair = SimpleNamespace(control="CN", case="AD", comparison=model, is_case=score > 0)
+        pair = SimpleNamespace(control="CN", case="AD", comparison=model)
         cases.append((hemi, "thickness_mean", pair))
     fields = dict.fromkeys(Analysis.__dataclass_fields__)
     analysis = Analysis(**{**fields, "pairs": cases[:2]})

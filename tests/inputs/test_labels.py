@@ -321,6 +321,20 @@ def test_impossible_affines_are_refused(tmp_path, change, reason, message):
     assert caught.value.reason == reason
 
 
+def test_two_sizes_of_voxels_in_one_header_are_refused(tmp_path):
+    path = save(tmp_path / "a.nii", make_labels())
+    content = bytearray(path.read_bytes())
+    pixdim = np.frombuffer(content, dtype="<f4", count=8, offset=76)
+    pixdim[3] = 0.504
+    path.write_bytes(content)
+    read_label_volume(make_item(path))
+    pixdim[3] = 0.6
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"0.5 mm by the sform, but 0.5 x 0.5 x 0.6 mm") as caught:
+        read_label_volume(make_item(path))
+    assert caught.value.reason == "bad-affine"
+
+
 def test_nifti_without_orientation_is_refused(tmp_path):
     image = nib.Nifti1Image(make_labels(), AFFINE)
     image.set_sform(AFFINE, code=0)
