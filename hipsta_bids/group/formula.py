@@ -2,6 +2,7 @@
 
 import difflib
 import re
+import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -121,7 +122,6 @@ def parse_model(document: Mapping[str, Any]) -> ModelSpec:
     model = node.get("Model")
     if not isinstance(model, Mapping) or str(model.get("Type", "glm")).lower() != "glm":
         raise _refusal("needs a Model of Type glm")
-    name = str(node.get("Name") or document.get("Name") or "model")
     dummy = node.get("DummyContrasts")
     specs = tuple(_parse_contrast(one) for one in node.get("Contrasts", ()))
     names = [spec.name for spec in specs]
@@ -134,7 +134,7 @@ def parse_model(document: Mapping[str, Any]) -> ModelSpec:
             " a name, as other=group[A]:age"
         )
     return ModelSpec(
-        name=name,
+        name=str(node.get("Name") or document.get("Name") or "model"),
         formula=_formula(model),
         measures=left_side(str(model.get("Formula") or "")),
         contrasts=specs,
@@ -227,8 +227,7 @@ def _formula(model: Mapping[str, Any]) -> str:
     if not isinstance(terms, list) or not terms:
         raise _refusal("needs Model.X or Model.Formula")
     names = [str(term) for term in terms if str(term) != "1"]
-    plain = re.compile(r"[\w.*: ]+")
-    if bad := [name for name in names if not plain.fullmatch(name)]:
+    if bad := [name for name in names if not re.fullmatch(r"[\w.*: ]+", name)]:
         raise _refusal(f"has {bad[0]!r} in X; use names of columns, or a Formula")
     return " + ".join(["1" if len(names) < len(terms) else "0", *names])
 
@@ -238,8 +237,10 @@ def _refusal(what: str) -> ModelError:
 
 
 def file_label(text: str) -> str:
-    """Write a name with letters and digits only, as entities of file names require."""
-    words = "".join(c if c.isalnum() else " " for c in text.replace("+", " plus ")).split()
+    """Write a name in ASCII letters and digits, as BIDS has it; other scripts as ``u5973``."""
+    letters = unicodedata.normalize("NFKD", text.replace("+", " plus "))
+    plain = "".join(c if c.isascii() else f"u{ord(c):x}" * c.isalpha() for c in letters)
+    words = "".join(c if c.isalnum() else " " for c in plain).split()
     return "".join(word[:1].upper() + word[1:] for word in words)
 
 

@@ -16,6 +16,7 @@ from hipsta_bids.phantom.dataset import (
     refuse_taken,
     rigid_motion,
     write_dataset,
+    write_sidecar,
 )
 from hipsta_bids.phantom.head import HeadPhantom, HeadSpec
 from hipsta_bids.phantom.labels import SUBFIELD_STARTS
@@ -280,14 +281,8 @@ def write_cohort(
 
 def _participants(plan: CohortPlan, subjects: Sequence[Subject]) -> Participants:
     rows = {
-        subject.label: (
-            subject.group,
-            f"{subject.age:.1f}",
-            subject.sex,
-            f"{subject.icv:.1f}",
-            subject.site,
-        )
-        for subject in subjects
+        one.label: (one.group, f"{one.age:.1f}", one.sex, f"{one.icv:.1f}", one.site)
+        for one in subjects
     }
     groups = {
         name: "no effect" if not dose else f"effect planted {dose} time(s)"
@@ -310,8 +305,7 @@ def _participants(plan: CohortPlan, subjects: Sequence[Subject]) -> Participants
 
 def _grid() -> tuple[Float, Float]:
     """Sheet coordinates u and v of the nodes of the true maps."""
-    u, v = (np.linspace(0.0, 1.0, nodes) for nodes in NODES)
-    u, v = np.meshgrid(u, v, indexing="ij")
+    u, v = np.meshgrid(*(np.linspace(0.0, 1.0, nodes) for nodes in NODES), indexing="ij")
     return u, v
 
 
@@ -319,15 +313,10 @@ def _write_maps(out: Path, item: Hemisphere, phantom: Phantom) -> None:
     """Write the true map of one hemisphere."""
     u, v = _grid()
     truth = phantom.truth(u, v, hemi=item.hemi, pose=item.pose)
-    columns = {
-        **{name: truth.points[..., axis] for axis, name in enumerate("ras")},
-        "thickness": truth.thickness,
-        "curvature": truth.curvature,
-        "curvature_interior": truth.curvature_interior,
-        "curvature_exterior": truth.curvature_exterior,
-    }
+    names = ("thickness", "curvature", "curvature_interior", "curvature_exterior")
     path = out / MAPS_FOLDER / f"sub-{item.subject}_hemi-{item.hemi}_truth.tsv"
-    _write_nodes(path, columns)
+    points = {name: truth.points[..., axis] for axis, name in enumerate("ras")}
+    _write_nodes(path, points | {name: getattr(truth, name) for name in names})
 
 
 def _write_effect(out: Path, plan: CohortPlan) -> None:
@@ -345,32 +334,18 @@ def _write_effect(out: Path, plan: CohortPlan) -> None:
             for at, (low, high) in zip((u, v), limits, strict=True)
         ]
     )
-    _write_nodes(
-        out / EFFECT_TABLE,
-        {
-            "in_region": inside.astype(int),
-            "difference": thinning,
-            "difference_unregistered": observed,
-        },
-    )
-    files.write_json(
-        (out / EFFECT_TABLE).with_suffix(".json"),
-        {
-            "in_region": {
-                "Description": "1 within the limits of the region; at them, half of the effect"
-            },
-            "difference": {
-                "Description": "thickness of the second group minus that of the first, at the same"
-                " anatomical place",
-                "Units": "mm",
-            },
-            "difference_unregistered": {
-                "Description": "the same at equal u, where the planted shift counts too",
-                "Units": "mm",
-            },
-            "Plan": asdict(plan),
-        },
-    )
+    differences = {"difference": thinning, "difference_unregistered": observed}
+    _write_nodes(out / EFFECT_TABLE, {"in_region": inside.astype(int), **differences})
+    difference = "thickness of the second group minus that of the first, at the same"
+    columns = {
+        "in_region": ("1 within the limits of the region; at them, half of the effect", None),
+        "difference": (f"{difference} anatomical place", "mm"),
+        "difference_unregistered": (
+            "the same at equal u, where the planted shift counts too",
+            "mm",
+        ),
+    }
+    write_sidecar(out / EFFECT_TABLE, columns, Plan=asdict(plan))
 
 
 def _write_head_effect(out: Path, plan: CohortPlan) -> None:
@@ -384,13 +359,11 @@ def _write_head_effect(out: Path, plan: CohortPlan) -> None:
         a, b = (one.region_summary(part)["thickness_mean"] for one in (without, planted))
         rows.append([part, str(int(part == "head")), f"{b - a:.5f}"])
     files.write_tsv(out / EFFECT_TABLE, ["part", "in_region", "difference"], rows)
-    difference = "mean thickness of the second group minus that of the first"
-    content = {
-        "in_region": {"Description": "1 where the effect was planted"},
-        "difference": {"Description": difference, "Units": "mm"},
-        "Plan": asdict(plan),
+    columns = {
+        "in_region": ("1 where the effect was planted", None),
+        "difference": ("mean thickness of the second group minus that of the first", "mm"),
     }
-    files.write_json((out / EFFECT_TABLE).with_suffix(".json"), content)
+    write_sidecar(out / EFFECT_TABLE, columns, Plan=asdict(plan))
 
 
 def _write_nodes(path: Path, columns: Mapping[str, NDArray[np.generic]]) -> None:

@@ -5,19 +5,20 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import nibabel as nib
 import numpy as np
+from nibabel.affines import from_matvec
 from scipy.spatial.transform import Rotation
 
 from hipsta_bids import __version__
-from hipsta_bids.errors import SettingsError, UsageError, did_you_mean
+from hipsta_bids.errors import UsageError, did_you_mean
 from hipsta_bids.io import files
 from hipsta_bids.phantom.head import HeadPhantom, HeadSpec
 from hipsta_bids.phantom.labels import encode
 from hipsta_bids.phantom.phantom import Phantom
-from hipsta_bids.phantom.shape import PhantomSpec
+from hipsta_bids.phantom.shape import PhantomSpec, bad
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Part, Protocol, Tissue
 from hipsta_bids.types import Float, LabelVolume
@@ -52,41 +53,30 @@ TRUTH_COLUMNS: Mapping[str, tuple[str, str | None]] = MappingProxyType(
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Layout:
+class Layout(NamedTuple):
     """How a tool names and encodes its segmentations."""
 
     protocol: str
     """Bundled protocol."""
     path: str
     """Of one hemisphere, below the tool's folder."""
-    sides: Mapping[str, str]
+    sides: tuple[str, str]
     """How the tool names L and R."""
 
+
+_ASHS = "{subject}/final/{subject}_{side}_lfseg_corr_usegray.nii.gz"
+_HIPPUNFOLD = "{subject}/anat/{subject}_hemi-{side}_space-cropT1w_desc-subfields_"
 
 #: Tools whose folders can be imitated; the name is that of the folder in ``derivatives``.
 LAYOUTS: Mapping[str, Layout] = MappingProxyType(
     {
         "freesurfer": Layout(
-            protocol="freesurfer",
-            path="{subject}/mri/{side}.hippoAmygLabels-T1.v22.mgz",
-            sides={"L": "lh", "R": "rh"},
+            "freesurfer", "{subject}/mri/{side}.hippoAmygLabels-T1.v22.mgz", ("lh", "rh")
         ),
-        "ashs": Layout(
-            protocol="ashsABC3T",
-            path="{subject}/final/{subject}_{side}_lfseg_corr_usegray.nii.gz",
-            sides={"L": "left", "R": "right"},
-        ),
-        "ashsPMC": Layout(
-            protocol="ashsPMC",
-            path="{subject}/final/{subject}_{side}_lfseg_corr_usegray.nii.gz",
-            sides={"L": "left", "R": "right"},
-        ),
+        "ashs": Layout("ashsABC3T", _ASHS, ("left", "right")),
+        "ashsPMC": Layout("ashsPMC", _ASHS, ("left", "right")),
         "hippunfold": Layout(
-            protocol="hippunfold",
-            path="{subject}/anat/{subject}_hemi-{side}_space-cropT1w_desc-subfields_atlas-multihist7"
-            "_dseg.nii.gz",
-            sides={"L": "L", "R": "R"},
+            "hippunfold", f"{_HIPPUNFOLD}atlas-multihist7_dseg.nii.gz", ("L", "R")
         ),
     }
 )
@@ -130,10 +120,9 @@ def write_dataset(
     """
     unknown = [name for name in layouts if name not in LAYOUTS]
     if unknown:
-        raise SettingsError(
-            f"phantom: layout {unknown[0]!r} is unknown; choose from {', '.join(LAYOUTS)}"
-            f"{did_you_mean(unknown, LAYOUTS)}",
-            reason="phantom-setting",
+        raise bad(
+            f"layout {unknown[0]!r} is unknown; choose from {', '.join(LAYOUTS)}"
+            f"{did_you_mean(unknown, LAYOUTS)}"
         )
     if any(item.spec.cortex for item in hemispheres):
         _refuse(layouts, "labels for cortex", lambda protocol: protocol.neighbors != ())
@@ -157,7 +146,9 @@ def write_dataset(
                 voxel_size=voxel_size,
                 axes=axes,
             )
-            path = layout.path.format(subject=f"sub-{item.subject}", side=layout.sides[item.hemi])
+            path = layout.path.format(
+                subject=f"sub-{item.subject}", side=layout.sides["LR".index(item.hemi)]
+            )
             _write_image(out / "derivatives" / name / path, volume)
     if ends:
         header = ["participant_id", "hemi", "end", "r", "a", "s", "nr", "na", "ns"]
@@ -204,10 +195,8 @@ def refuse_taken(out: Path, what: str = "phantoms") -> None:
 
 def rigid_motion(degrees: tuple[float, float, float], shift: tuple[float, float, float]) -> Float:
     """Make a (4, 4) rigid motion: rotations about R, A and S in this order, then a shift, mm."""
-    motion = np.eye(4)
-    motion[:3, :3] = Rotation.from_euler("xyz", degrees, degrees=True).as_matrix()
-    motion[:3, 3] = shift
-    return motion
+    turn = Rotation.from_euler("xyz", degrees, degrees=True).as_matrix()
+    return np.asarray(from_matvec(turn, shift))
 
 
 def _refuse(layouts: Sequence[str], what: str, able: Callable[[Protocol], bool]) -> None:
@@ -215,11 +204,7 @@ def _refuse(layouts: Sequence[str], what: str, able: Callable[[Protocol], bool])
     have = [key for key, row in LAYOUTS.items() if able(load_protocol(row.protocol))]
     for name in layouts:
         if name not in have:
-            raise SettingsError(
-                f"phantom: the protocol of layout {name} has no {what}; choose from"
-                f" {', '.join(have)}",
-                reason="phantom-setting",
-            )
+            raise bad(f"the protocol of layout {name} has no {what}; choose from {', '.join(have)}")
 
 
 def _has_head(protocol: Protocol) -> bool:
@@ -257,14 +242,19 @@ def _write_truth(
     files.write_tsv(
         out / TRUTH_TABLE, list(TRUTH_COLUMNS), [[row[c] for c in TRUTH_COLUMNS] for row in truth]
     )
-    sidecar: dict[str, Any] = {
+    specs = {f"sub-{item.subject}_hemi-{item.hemi}": asdict(item.spec) for item in hemispheres}
+    write_sidecar(out / TRUTH_TABLE, TRUTH_COLUMNS, Specifications=specs)
+
+
+def write_sidecar(
+    table: Path, columns: Mapping[str, tuple[str, str | None]], **more: Mapping[str, Any]
+) -> None:
+    """Write definitions and units of a table's columns beside it."""
+    described = {
         name: {"Description": text} | ({"Units": unit} if unit else {})
-        for name, (text, unit) in TRUTH_COLUMNS.items()
+        for name, (text, unit) in columns.items()
     }
-    sidecar["Specifications"] = {
-        f"sub-{item.subject}_hemi-{item.hemi}": asdict(item.spec) for item in hemispheres
-    }
-    files.write_json((out / TRUTH_TABLE).with_suffix(".json"), sidecar)
+    files.write_json(table.with_suffix(".json"), described | more)
 
 
 def _write_participants(

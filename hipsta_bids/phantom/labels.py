@@ -5,11 +5,12 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
+from nibabel.affines import from_matvec
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from hipsta_bids.errors import ProtocolError, SettingsError
-from hipsta_bids.phantom.shape import Body, PhantomSpec, check_rotation
+from hipsta_bids.errors import ProtocolError
+from hipsta_bids.phantom.shape import Body, PhantomSpec, bad, check_rotation
 from hipsta_bids.protocols.protocol import CORE, LATERAL_END, Label, Part, Protocol, Tissue
 from hipsta_bids.types import Bool, Float, Int, LabelVolume
 
@@ -36,9 +37,7 @@ def make_grid(
     phantom by part of a voxel changes its voxels.
     """
     if not all(size > 0.0 for size in voxel_size):
-        raise SettingsError(
-            f"phantom: voxel size {voxel_size} must be positive", reason="phantom-setting"
-        )
+        raise bad(f"voxel size {voxel_size} must be positive")
     directions = _axis_directions(axes)
     if rotation is not None:
         rotation = np.asarray(rotation, dtype=np.float64)
@@ -49,20 +48,15 @@ def make_grid(
     pad = border / np.asarray(voxel_size)
     low = np.floor(index.min(axis=0) - pad)
     count = (np.ceil(index.max(axis=0) + pad) - low).astype(int) + 1
-    affine = np.eye(4)
-    affine[:3, :3] = matrix
-    affine[:3, 3] = matrix @ low
-    return Grid(shape=(int(count[0]), int(count[1]), int(count[2])), affine=affine)
+    shape = (int(count[0]), int(count[1]), int(count[2]))
+    return Grid(shape=shape, affine=from_matvec(matrix, matrix @ low))
 
 
 def _axis_directions(axes: str) -> Float:
     """Matrix (3, 3) whose columns are the unit directions of the voxel axes in RAS."""
     names = {"R": 0, "L": 0, "A": 1, "P": 1, "S": 2, "I": 2}
     if sorted(names.get(letter, -1) for letter in axes) != [0, 1, 2]:
-        raise SettingsError(
-            f"phantom: axes {axes!r} must name each direction once, such as RAS or LIA",
-            reason="phantom-setting",
-        )
+        raise bad(f"axes {axes!r} must name each direction once, such as RAS or LIA")
     directions = np.zeros((3, 3))
     for column, letter in enumerate(axes):
         directions[names[letter], column] = 1.0 if letter in "RAS" else -1.0
@@ -115,9 +109,7 @@ def draw(
     """Label every voxel."""
     counts = np.broadcast_to(np.asarray(supersample, dtype=int), 3)
     if (counts < 1).any():
-        raise SettingsError(
-            f"phantom: supersample must be 1 or more, not {supersample}", reason="phantom-setting"
-        )
+        raise bad(f"supersample must be 1 or more, not {supersample}")
     table = _label_table(protocol)
     index = np.indices(grid.shape).reshape(3, -1).T.astype(np.float64)
     codes = np.concatenate(

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -51,8 +52,7 @@ class PhantomTruth:
     """The whole wall, see :func:`summarize`."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Jet:
+class _Jet(NamedTuple):
     """First and second derivatives (..., 3) of a surface by arc length s and long axis w.
 
     Components are (tangent and normal of the cross-section, long axis).
@@ -78,8 +78,9 @@ def curvatures(body: Body, u: Float, v: Float, *, at: float) -> tuple[Float, Flo
     normal = np.cross(jet.s, jet.w)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     normal *= -np.sign(normal[..., 1:2])  # to the interior: the section's normal points away
-    first_ss, first_sw, first_ww = _dot(jet.s, jet.s), _dot(jet.s, jet.w), _dot(jet.w, jet.w)
-    ss, sw, ww = _dot(jet.ss, normal), _dot(jet.sw, normal), _dot(jet.ww, normal)
+    pairs = ((jet.s, jet.s), (jet.s, jet.w), (jet.w, jet.w))
+    first_ss, first_sw, first_ww = ((a * b).sum(axis=-1) for a, b in pairs)
+    ss, sw, ww = ((second * normal).sum(axis=-1) for second in (jet.ss, jet.sw, jet.ww))
     det = first_ss * first_ww - first_sw**2
     mean = (ss * first_ww - 2.0 * sw * first_sw + ww * first_ss) / (2.0 * det)
     return np.asarray(mean), np.asarray((ss * ww - sw**2) / det)
@@ -129,9 +130,10 @@ def summarize(body: Body, *, span: tuple[float, float] = (0.0, 1.0)) -> dict[str
     # Integral of (1 + n k) (stretch + n axis) over n from -T/2 to T/2; odd powers cancel.
     column = stretch * thickness + section * axis * thickness**3 / 12.0
     mean = float((area * thickness).sum() / area.sum())
+    jets = {name: _surface_jet(body, u, v, at) for name, at in SURFACES.items()}
     areas = {
-        f"area_{name}": float((cell * _area_element(body, u, v, at)).sum())
-        for name, at in SURFACES.items()
+        f"area_{name}": float((cell * np.linalg.norm(np.cross(jet.s, jet.w), axis=-1)).sum())
+        for name, jet in jets.items()
     }
     summary = {
         "thickness_mean": mean,
@@ -172,8 +174,7 @@ def _surface_jet(body: Body, u: Float, v: Float, at: float) -> _Jet:
     s = u * body.spec.width
     bend = body.spec.bend
     wall = body.thickness_jet(u, v)
-    n, n_s, n_w = at * wall.value, at * wall.s, at * wall.w
-    n_ss, n_sw, n_ww = at * wall.ss, at * wall.sw, at * wall.ww
+    n, n_s, n_w, n_ss, n_sw, n_ww = (at * own for own in wall)
     k, k_s = body.curve.curvature(s), body.curve.curvature_slope(s)
     mid_stretch, by_n = _axis_stretch(body, u)
     stretch = mid_stretch + n * by_n
@@ -203,17 +204,8 @@ def _axis_stretch(body: Body, u: Float) -> tuple[Float, Float]:
     return 1.0 - body.spec.bend * medial, -body.spec.bend * by_n
 
 
-def _area_element(body: Body, u: Float, v: Float, at: float) -> Float:
-    jet = _surface_jet(body, u, v, at)
-    return np.asarray(np.linalg.norm(np.cross(jet.s, jet.w), axis=-1))
-
-
 def _stack(*components: Float) -> Float:
     return np.stack(np.broadcast_arrays(*components), axis=-1)
-
-
-def _dot(a: Float, b: Float) -> Float:
-    return np.asarray((a * b).sum(axis=-1))
 
 
 class Phantom:
@@ -271,17 +263,17 @@ class Phantom:
     ) -> PhantomTruth:
         """Return what a perfect method would measure at positions (u, v)."""
         x, y = np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64))
-        curved = {name: curvatures(self.body, x, y, at=at) for name, at in SURFACES.items()}
         extent_x, extent_y = line_lengths(self.body, x, y)
+        interior, mid, exterior = (curvatures(self.body, x, y, at=at) for at in SURFACES.values())
         return PhantomTruth(
             thickness=self.body.thickness(x, y),
             points=self.body.place(x, y, 0.0, hemi=hemi, pose=pose),
-            curvature_interior=curved["interior"][0],
-            curvature=curved["mid"][0],
-            curvature_exterior=curved["exterior"][0],
-            gaussian_curvature=curved["mid"][1],
-            gaussian_curvature_interior=curved["interior"][1],
-            gaussian_curvature_exterior=curved["exterior"][1],
+            curvature_interior=interior[0],
+            curvature=mid[0],
+            curvature_exterior=exterior[0],
+            gaussian_curvature=mid[1],
+            gaussian_curvature_interior=interior[1],
+            gaussian_curvature_exterior=exterior[1],
             extent_x=extent_x,
             extent_y=extent_y,
             subfield=tissue_at(self.spec, x, y),

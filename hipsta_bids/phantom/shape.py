@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
-from typing import Annotated, get_type_hints
+from typing import Annotated, NamedTuple, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -142,22 +142,19 @@ class PhantomSpec:
         depth = sum(max(0.0, thinning.depth) for thinning in self.thinnings)
         thinnest = self.thickness * (1.0 - self.variation) - depth
         if thinnest <= 0.0:
-            raise SettingsError(
-                f"phantom: thinning by {depth:g} mm leaves no wall of {self.thickness:g} mm; "
-                "thin it less",
-                reason="phantom-setting",
+            raise bad(
+                f"thinning by {depth:g} mm leaves no wall of {self.thickness:g} mm; thin it less"
             )
         if self.cortex > 0.8 * self.width:
-            raise SettingsError(
-                f"phantom: cortex of {self.cortex:g} mm leaves less than a fifth of the sheet's "
-                f"{self.width:g} mm to the hippocampus; make it shorter",
-                reason="phantom-setting",
+            raise bad(
+                f"cortex of {self.cortex:g} mm leaves less than a fifth of the sheet's "
+                f"{self.width:g} mm to the hippocampus; make it shorter"
             )
         if self.layer_thickness >= thinnest:
-            raise SettingsError(
-                f"phantom: layer_thickness {self.layer_thickness:g} mm fills the wall, which is "
+            raise bad(
+                f"layer_thickness {self.layer_thickness:g} mm fills the wall, which is "
                 f"{thinnest:g} mm at its thinnest; make the layer thinner",
-                reason="phantom-layer",
+                "phantom-layer",
             )
 
     @property
@@ -175,20 +172,22 @@ class PhantomSpec:
         return Bend(medial=medial, lateral=lateral, power=preset.power)
 
 
+def bad(problem: str, reason: str = "phantom-setting") -> SettingsError:
+    """Error for a phantom that cannot be."""
+    return SettingsError(f"phantom: {problem}", reason=reason)
+
+
 def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
     if value not in choices:
-        raise SettingsError(
-            f"phantom: {name} {value!r} is unknown; choose one of {', '.join(choices)}"
-            f"{did_you_mean([value], choices)}",
-            reason="phantom-setting",
+        raise bad(
+            f"{name} {value!r} is unknown; choose one of {', '.join(choices)}"
+            f"{did_you_mean([value], choices)}"
         )
 
 
 def _check_range(name: str, value: float, low: float, high: float) -> None:
     if not low <= value <= high:  # also catches NaN
-        raise SettingsError(
-            f"phantom: {name} {value:g} is outside {low:g} to {high:g}", reason="phantom-setting"
-        )
+        raise bad(f"{name} {value:g} is outside {low:g} to {high:g}")
 
 
 class MidCurve:
@@ -201,7 +200,7 @@ class MidCurve:
 
     def __init__(self, bend: Bend, width: float) -> None:
         self.width = width
-        self._bend = bend
+        self._bend, self._rise = bend, bend.lateral - bend.medial
         self._step = width / _PANELS
         edges = np.linspace(0.0, width, _PANELS + 1)
         steps = self._integrate(edges[:-1], np.full(_PANELS, self._step))
@@ -213,20 +212,17 @@ class MidCurve:
 
     def curvature(self, s: Float) -> Float:
         """Signed curvature at arc lengths ``s`` (mm), 1/mm."""
-        rise = self._bend.lateral - self._bend.medial
-        return np.asarray(self._bend.medial + rise * (s / self.width) ** self._bend.power)
+        return np.asarray(self._bend.medial + self._rise * (s / self.width) ** self._bend.power)
 
     def curvature_slope(self, s: Float) -> Float:
         """Differentiate curvature along the curve, 1/mm2."""
         power = self._bend.power
-        rise = self._bend.lateral - self._bend.medial
-        return np.asarray(rise * power / self.width * (s / self.width) ** (power - 1))
+        return np.asarray(self._rise * power / self.width * (s / self.width) ** (power - 1))
 
     def angle(self, s: Float) -> Float:
         """Tangent angle in rad, from lateral towards superior."""
         power = self._bend.power
-        rise = self._bend.lateral - self._bend.medial
-        turned = self._bend.medial * s + rise * s / (power + 1) * (s / self.width) ** power
+        turned = self._bend.medial * s + self._rise * s / (power + 1) * (s / self.width) ** power
         return np.asarray(START_ANGLE + turned)
 
     def tangent(self, s: Float) -> Float:
@@ -300,8 +296,7 @@ def gauss_panels(low: float, high: float, panels: int) -> tuple[Float, Float]:
     return nodes.ravel(), (half * _WEIGHTS).ravel()
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ThicknessJet:
+class ThicknessJet(NamedTuple):
     """Thickness of the wall and its derivatives by arc length s and long axis w; mm, 1, 1/mm."""
 
     value: Float
@@ -313,14 +308,9 @@ class ThicknessJet:
 
     def thinned(self, depth: float, across: "Window", along: "Window") -> "ThicknessJet":
         """Take off ``depth`` mm times the product of two windows."""
-        return ThicknessJet(
-            value=self.value - depth * across[0] * along[0],
-            s=self.s - depth * across[1] * along[0],
-            w=self.w - depth * across[0] * along[1],
-            ss=self.ss - depth * across[2] * along[0],
-            sw=self.sw - depth * across[1] * along[1],
-            ww=self.ww - depth * across[0] * along[2],
-        )
+        orders = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
+        windows = (depth * across[i] * along[j] for i, j in orders)
+        return ThicknessJet(*(own - window for own, window in zip(self, windows, strict=True)))
 
 
 #: Value, first and second derivative of a window.
@@ -459,20 +449,20 @@ class Body:
         s = np.linspace(0.0, spec.width, 1001)
         sharpest = np.abs(self.curve.curvature(s)).max()
         if sharpest * self.thickest / 2.0 >= 1.0:
-            raise SettingsError(
-                f"phantom: the wall folds: half its thickness of up to {self.thickest:g} mm "
+            raise bad(
+                f"the wall folds: half its thickness of up to {self.thickest:g} mm "
                 f"reaches the smallest radius of curvature, {1.0 / sharpest:.2f} mm; "
                 "make it thinner or bend it less",
-                reason="phantom-folds",
+                "phantom-folds",
             )
         inward = np.max(-np.sign(spec.bend) * self.curve.position(s)[:, 0]) + self.thickest / 2.0
         turned = abs(spec.bend) * (spec.length + 2.0 * spec.end_length)
         if abs(spec.bend) * inward >= 1.0 or turned >= np.pi:
-            raise SettingsError(
-                f"phantom: the long axis bends too sharply ({spec.bend:g} 1/mm) for a cross-"
+            raise bad(
+                f"the long axis bends too sharply ({spec.bend:g} 1/mm) for a cross-"
                 f"section that reaches {inward:.1f} mm towards its center and a length of "
                 f"{spec.length + 2.0 * spec.end_length:g} mm with head and tail; bend it less",
-                reason="phantom-folds",
+                "phantom-folds",
             )
 
     def _refuse_overlap(self) -> None:
@@ -488,19 +478,17 @@ class Body:
             boundary = self.curve.position(s) + side * half[:, None] * self.curve.normal(s)
             astray = np.abs(self.curve.foot(boundary) - s) > _SAME_POINT
             if astray.any():
-                raise SettingsError(
-                    f"phantom: turns of the wall overlap near u = {u.ravel()[astray][0]:.2f}; "
+                raise bad(
+                    f"turns of the wall overlap near u = {u.ravel()[astray][0]:.2f}; "
                     "make it thinner, narrower or bend it less",
-                    reason="phantom-overlap",
+                    "phantom-overlap",
                 )
 
 
 def placement(hemi: str, pose: Float | None) -> tuple[Float, Float]:
     """Body to scanner: an orthogonal (3, 3) matrix and a shift (3,) in RAS mm."""
     if hemi not in ("L", "R"):
-        raise SettingsError(
-            f"phantom: hemi {hemi!r} is unknown; choose L or R", reason="phantom-hemi"
-        )
+        raise bad(f"hemi {hemi!r} is unknown; choose L or R", "phantom-hemi")
     cos, sin = np.cos(PITCH), np.sin(PITCH)
     mirror = np.diag([1.0 if hemi == "L" else -1.0, 1.0, 1.0])
     # Columns: where lateral, superior and anterior point in a left hemisphere.
@@ -517,8 +505,8 @@ def check_rotation(matrix: Float) -> None:
     """Refuse what is not a proper rotation (3, 3) with a SettingsError."""
     error = np.abs(matrix @ matrix.T - np.eye(3)).max()
     if not error < _RIGID_TOLERANCE or np.linalg.det(matrix) < 0.0:
-        raise SettingsError(
-            "phantom: the pose or grid rotation is not rigid; give a rotation matrix without "
+        raise bad(
+            "the pose or grid rotation is not rigid; give a rotation matrix without "
             "scaling or mirroring",
-            reason="phantom-pose",
+            "phantom-pose",
         )

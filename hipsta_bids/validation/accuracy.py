@@ -1,12 +1,11 @@
 """Thickness, curvature, volume, areas and extents of phantoms against the truth."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.stats import linregress
 
 from hipsta_bids.phantom import PhantomSpec
@@ -14,7 +13,7 @@ from hipsta_bids.settings import GridSettings
 from hipsta_bids.types import Float
 from hipsta_bids.validation.cases import (
     CURVATURES,
-    EDGE,
+    EDGE,  # noqa: F401  (in texts)
     GAUSSIAN_CURVATURES,
     Case,
     Measured,
@@ -23,11 +22,12 @@ from hipsta_bids.validation.cases import (
     any_pose,
     measure_case,
     refusal_notes,
+    rms,
     run_cases,
     run_groups,
     without_edges,
 )
-from hipsta_bids.validation.report import Cell, Cells, Picture, Suite, Table, show_map
+from hipsta_bids.validation.report import Cell, Cells, Content, picture, show_map, suite, table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -43,15 +43,16 @@ MAX_CURVATURE_ERROR = 5.0
 """Percent, of mean curvature in the middle of an arc."""
 MAX_GAUSSIAN_ERROR = 0.005
 """1/mm2, root mean square over the middle of the sheet, on straight extrusions."""
-SIZES = ("volume", "area_interior", "area_mid", "area_exterior", "extent_x", "extent_y")
-SECTION_SIZES = (
-    "circumference_mean",
-    "interior_exterior_ratio_mean",
-    "section_area_mean",
-    "shape_index_mean",
-    "area_ratio",
-    "surface_volume_ratio",
-)
+#: Summary measures by the title of their table.
+SIZES = {
+    "Volume, areas and extents": (
+        *("volume", "area_interior", "area_mid", "area_exterior", "extent_x", "extent_y"),
+    ),
+    "Cross-sections and ratios": (
+        *("circumference_mean", "interior_exterior_ratio_mean", "section_area_mean"),
+        *("shape_index_mean", "area_ratio", "surface_volume_ratio"),
+    ),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,24 +84,19 @@ class Row:
 
 
 def _rows() -> tuple[Row, ...]:
-    iso = (0.4, 0.4, 0.4)
+    iso, slices = (0.4, 0.4, 0.4), (0.4, 0.4, 2.0)
     thin = PhantomSpec(kind="spiral", thickness=1.2)
-    fine = [
-        *(
-            Row(spec=PhantomSpec(kind=kind, thickness=2.0), voxel_size=iso, bias=0.015, sd=0.04)
-            for kind in ("arc", "spiral", "tight")
-        ),
-        Row(spec=thin, voxel_size=iso, bias=0.02, sd=0.05),
-    ]
-    varied = PhantomSpec(kind="spiral", thickness=2.0, variation=0.3)
-    tight = PhantomSpec(kind="tight", thickness=1.6)
+    arc, spiral, tight = (PhantomSpec(kind=k, thickness=2.0) for k in ("arc", "spiral", "tight"))
+    fine = [Row(spec=s, voxel_size=iso, bias=0.015, sd=0.04) for s in (arc, spiral, tight)]
+    fine.append(Row(spec=thin, voxel_size=iso, bias=0.02, sd=0.05))
+    varied, narrow = replace(spiral, variation=0.3), replace(tight, thickness=1.6)
     thick = [
         row
         for tilt in (0.0, TILT)
         for row in (
-            Row(spec=varied, voxel_size=(0.4, 0.4, 2.0), bias=0.015, sd=0.065, tilt=tilt),
-            Row(spec=thin, voxel_size=(0.4, 0.4, 2.0), bias=0.02, sd=0.05, tilt=tilt),
-            Row(spec=tight, voxel_size=(0.5, 0.5, 1.5), bias=0.03, sd=0.09, tilt=tilt),
+            Row(spec=varied, voxel_size=slices, bias=0.015, sd=0.065, tilt=tilt),
+            Row(spec=thin, voxel_size=slices, bias=0.02, sd=0.05, tilt=tilt),
+            Row(spec=narrow, voxel_size=(0.5, 0.5, 1.5), bias=0.03, sd=0.09, tilt=tilt),
         )
     ]
     return (*fine, *thick)
@@ -108,27 +104,21 @@ def _rows() -> tuple[Row, ...]:
 
 ROWS = _rows()
 
-
 Results = Mapping[Row, Sequence[Measured | Refusal]]
 
 
-def run(full: bool) -> Suite:
+@suite("accuracy")
+def run(full: bool) -> Iterator[Content]:
     """Measure every row in several poses."""
     poses = POSES_FULL if full else POSES_QUICK
     results = run_groups(measure_case, {r: _poses(n, r, poses) for n, r in enumerate(ROWS)})
-    return Suite(
-        name="accuracy",
-        title="Accuracy on phantoms",
-        text=_TEXT.format(poses=poses),
-        tables=(
-            _thickness_table(results),
-            _curvature_table(results),
-            _gaussian_table(results),
-            _size_table(results, "Volume, areas and extents, error in percent", SIZES),
-            _size_table(results, "Cross-sections and ratios, error in percent", SECTION_SIZES),
-        ),
-        pictures=(_error_picture(results),),
-    )
+    yield _thickness_table(results)
+    yield _curvature_table(results)
+    yield _gaussian_table(results)
+    for title in SIZES:
+        yield _size_table(results, title)
+    yield _error_picture(results)
+    yield {"poses": poses}
 
 
 def _poses(number: int, row: Row, count: int) -> list[Case]:
@@ -136,11 +126,10 @@ def _poses(number: int, row: Row, count: int) -> list[Case]:
     generator = np.random.default_rng((SEED, number))
     cases = []
     for _ in range(count):
-        pose, turn = (
-            (any_pose(generator), None)
-            if row.tilt is None
-            else along_slices(generator, tilt=row.tilt)
-        )
+        if row.tilt is None:
+            pose, turn = any_pose(generator), None
+        else:
+            pose, turn = along_slices(generator, tilt=row.tilt)
         cases.append(Case(spec=row.spec, voxel_size=row.voxel_size, pose=pose, grid_rotation=turn))
     return cases
 
@@ -151,8 +140,8 @@ def _measured(results: Results) -> dict[Row, list[Measured]]:
     return {row: group for row, group in kept.items() if group}
 
 
-def _thickness_table(results: Results) -> Table:
-    rows: list[Cells] = []
+@table("accuracy.thickness")
+def _thickness_table(results: Results) -> Iterator[Cells | str]:
     measured = _measured(results)
     for row, group in results.items():
         errors = [m.error for m in measured.get(row, ())]
@@ -161,63 +150,52 @@ def _thickness_table(results: Results) -> Table:
         good = False
         if errors:
             bias = np.array([np.nanmean(error) for error in errors])
-            sd = _rms([np.nanstd(error) for error in errors])
+            sd = rms([np.nanstd(error) for error in errors])
             good = bool(abs(bias.mean()) <= row.bias and sd <= row.sd and refused == 0)
             cells |= {"bias": f"{bias.mean():+.3f}", "SD": sd}
         cells |= {"target |bias|": f"≤ {row.bias:g}", "target SD": f"≤ {row.sd:g}"}
         if errors:
             cells |= {
                 "bias, pose by pose": f"{bias.min():+.3f} to {bias.max():+.3f}",
-                "SD without edges": _rms([np.nanstd(without_edges(error)) for error in errors]),
+                "SD without edges": rms([np.nanstd(without_edges(error)) for error in errors]),
                 "SD of the mean map": float(np.nanstd(np.mean(errors, axis=0))),
             }
-        rows.append({**cells, "refused": refused, "met": good})
-    refusals = refusal_notes({f"{row.name}, {row.voxels}": g for row, g in results.items()})
-    return Table(
-        title="Thickness over the whole grid, mm",
-        rows=rows,
-        notes=_THICKNESS_NOTES.format(edge=EDGE) + refusals,
-    )
+        yield {**cells, "refused": refused, "met": good}
+    yield refusal_notes({f"{row.name}, {row.voxels}": g for row, g in results.items()})
 
 
-def _curvature_table(results: Results) -> Table:
+@table("accuracy.curvature")
+def _curvature_table(results: Results) -> Iterator[Cells]:
     """Compare the middle half of each row's sheet; only the arc has a target."""
-    rows: list[Cells] = []
     for row, surface, true, found in _middles(results, CURVATURES):
         percent = 100.0 * (np.nanmean(found) / np.nanmean(true) - 1.0)
         target = row.spec.kind == "arc"
-        rows.append(
-            {
-                "phantom, 0.4 mm voxels": row.name,
-                "surface": surface,
-                "true mean": float(np.nanmean(true)),
-                "measured mean": float(np.nanmean(found)),
-                "error of the mean": f"{percent:+.1f} %",
-                "RMS error of points": _rms(found - true),
-                "target": f"≤ {MAX_CURVATURE_ERROR:g} %" if target else None,
-                "met": bool(abs(percent) <= MAX_CURVATURE_ERROR) if target else None,
-            }
-        )
-    return Table(title="Mean curvature in the middle half of the sheet, 1/mm", rows=rows)
+        yield {
+            "phantom, 0.4 mm voxels": row.name,
+            "surface": surface,
+            "true mean": float(np.nanmean(true)),
+            "measured mean": float(np.nanmean(found)),
+            "error of the mean": f"{percent:+.1f} %",
+            "RMS error of points": rms(found - true),
+            "target": f"≤ {MAX_CURVATURE_ERROR:g} %" if target else None,
+            "met": bool(abs(percent) <= MAX_CURVATURE_ERROR) if target else None,
+        }
 
 
-def _gaussian_table(results: Results) -> Table:
+@table("accuracy.gaussian")
+def _gaussian_table(results: Results) -> Iterator[Cells]:
     """Compare the middle half of each row's sheet, over all poses."""
-    rows: list[Cells] = []
     for row, surface, true, found in _middles(results, GAUSSIAN_CURVATURES):
-        error = _rms(found - true)
-        rows.append(
-            {
-                "phantom, 0.4 mm voxels": row.name,
-                "surface": surface,
-                "true mean": f"{np.nanmean(true):.4f}",
-                "measured mean": f"{np.nanmean(found):.4f}",
-                "RMS error of points": f"{error:.4f}",
-                "target": f"≤ {MAX_GAUSSIAN_ERROR:g}",
-                "met": bool(error <= MAX_GAUSSIAN_ERROR),
-            }
-        )
-    return Table(title="Gaussian curvature in the middle half of the sheet, 1/mm²", rows=rows)
+        error = rms(found - true)
+        yield {
+            "phantom, 0.4 mm voxels": row.name,
+            "surface": surface,
+            "true mean": f"{np.nanmean(true):.4f}",
+            "measured mean": f"{np.nanmean(found):.4f}",
+            "RMS error of points": f"{error:.4f}",
+            "target": f"≤ {MAX_GAUSSIAN_ERROR:g}",
+            "met": bool(error <= MAX_GAUSSIAN_ERROR),
+        }
 
 
 def _middles(results: Results, names: Sequence[str]) -> Iterator[tuple[Row, str, Float, Float]]:
@@ -231,84 +209,42 @@ def _middles(results: Results, names: Sequence[str]) -> Iterator[tuple[Row, str,
                 yield row, surface, true, found
 
 
-def _size_table(results: Results, title: str, names: Sequence[str]) -> Table:
-    rows: list[Cells] = []
+@table("accuracy.sizes")
+def _size_table(results: Results, title: str) -> Iterator[Cells]:
     for row, group in _measured(results).items():
         errors = {
             name.removesuffix("_mean").replace("_", " "): 100.0
             * float(np.mean([m.summary[name] / m.true_summary[name] - 1.0 for m in group]))
-            for name in names
+            for name in SIZES[title]
         }
-        rows.append(
-            {
-                "phantom": row.name,
-                "voxels, mm": row.voxels,
-                **{heading: f"{error:+.1f}" for heading, error in errors.items()},
-                "target": f"≤ {MAX_SIZE_ERROR:g}",
-                "met": max(map(abs, errors.values())) <= MAX_SIZE_ERROR,
-            }
-        )
-    return Table(
-        title=title,
-        rows=rows,
-        notes="Mean over the poses. Extents are arc lengths of the mid-surface; cross-sections are"
-        " averaged over the length of the body.",
-    )
+        yield {
+            "phantom": row.name,
+            "voxels, mm": row.voxels,
+            **{heading: f"{error:+.1f}" for heading, error in errors.items()},
+            "target": f"≤ {MAX_SIZE_ERROR:g}",
+            "met": max(map(abs, errors.values())) <= MAX_SIZE_ERROR,
+        }
 
 
-def _error_picture(results: Results) -> Picture:
-    maps = {
-        row: np.mean([m.error for m in group], axis=0) for row, group in _measured(results).items()
-    }
-
-    def draw(figure: "Figure") -> None:
-        columns = 5
-        axes = figure.subplots(-(-len(maps) // columns), columns, squeeze=False)
-        for axis in axes.flat[len(maps) :]:
-            axis.set_axis_off()
-        for axis, (row, error) in zip(axes.flat, maps.items(), strict=False):
-            title = row.name.replace(", tilted", "\ntilted") + f"\n{row.voxels}"
-            style = {"cmap": "RdBu_r", "vmin": -0.15, "vmax": 0.15}
-            image = show_map(axis, error, title, ends=("post.", "ant."), **style)
-            axis.title.set_fontsize("small")
-        figure.colorbar(image, ax=axes, label="error of thickness, mm", shrink=0.8)
-
-    return Picture(
-        name="accuracy",
-        caption="Error of thickness, averaged over the poses: what stays where the luck of the"
-        " voxels averages out. Mm, red is too thick.",
-        draw=draw,
-        size=(12.0, 5.6),
-    )
+@picture("accuracy")
+def _error_picture(figure: "Figure", results: Results) -> None:
+    maps = {row: np.mean([m.error for m in g], axis=0) for row, g in _measured(results).items()}
+    columns = 5
+    axes = figure.subplots(-(-len(maps) // columns), columns, squeeze=False)
+    for axis in axes.flat[len(maps) :]:
+        axis.set_axis_off()
+    for axis, (row, error) in zip(axes.flat, maps.items(), strict=False):
+        title = row.name.replace(", tilted", "\ntilted") + f"\n{row.voxels}"
+        style = {"cmap": "RdBu_r", "vmin": -0.15, "vmax": 0.15}
+        image = show_map(axis, error, title, ends=("post.", "ant."), **style)
+        axis.title.set_fontsize("small")
+    figure.colorbar(image, ax=axes, label="error of thickness, mm", shrink=0.8)
 
 
 def _middle(values: Float) -> Float:
     """Return the middle half along both axes."""
     x, y = (n // 4 for n in values.shape)
     return values[x:-x, y:-y]
-
-
-def _rms(values: ArrayLike) -> float:
-    return float(np.sqrt(np.nanmean(np.square(values))))
-
-
-_TEXT = """\
-Phantoms are analytic shapes whose thickness, curvature, areas and volume are known at every point
-(`hipsta_bids/phantom`). Each is drawn as a segmentation in {poses} random poses, since one pose is
-luck: a voxel gets the label at its center (no partial volume, no smoothing), as harsh as a manual
-segmentation. Isotropic voxels meet the phantom turned by up to 25° about each axis and shifted by
-up to 2 mm. Thick slices are perpendicular to the long axis, as they are scanned, and in further
-rows tilted by 10° from there; within the slices, the grid is turned by up to 25°. Settings are the
-defaults.
-"""
-
-_THICKNESS_NOTES = """\
-Bias is the mean over the grid, averaged over the poses; SD is over the grid, its root mean square
-over the poses. Both take the whole default grid, edges included. The truth is that of the phantom
-at the point where the mid-surface was found. Without edges: without the {edge} outer nodes on each
-side. The SD of the mean map is what remains when the error is averaged over the poses at each grid
-point: errors that stay in one position, near edges and bends.
-"""
 
 
 # How fast the error falls with the voxel size, and sheets too thin for their voxels.
@@ -345,7 +281,8 @@ ZONES: Mapping[str, Callable[[Float], Float]] = {
 Key = tuple[str, str]
 
 
-def run_convergence(full: bool) -> Suite:
+@suite("convergence")
+def run_convergence(full: bool) -> Iterator[Content]:
     """Measure the same phantoms in ever smaller voxels."""
     poses = CONVERGENCE_FULL if full else CONVERGENCE_QUICK
     names = list(SPECS) if full else list(SPECS)[:1]
@@ -357,13 +294,9 @@ def run_convergence(full: bool) -> Suite:
     }
     results = run_groups(measure_case, cases)
     errors = {key: [_errors(results[key, size]) for size in VOXEL_SIZES] for key in keys}
-    return Suite(
-        name="convergence",
-        title="Convergence with voxel size",
-        text=_CONVERGENCE_TEXT.format(poses=poses),
-        tables=(_table(errors),),
-        pictures=(_picture(errors),),
-    )
+    yield _table(errors)
+    yield _picture(errors)
+    yield {"poses": poses}
 
 
 def rate(sizes: Sequence[float], errors: Sequence[float]) -> tuple[float, float]:
@@ -396,78 +329,47 @@ def _errors(group: Sequence[Measured | Refusal]) -> dict[str, float]:
     }
 
 
-def _table(errors: Mapping[Key, Sequence[Mapping[str, float]]]) -> Table:
-    rows: list[Cells] = []
+@table("convergence.falls")
+def _table(errors: Mapping[Key, Sequence[Mapping[str, float]]]) -> Iterator[Cells]:
     for (name, grid), values in errors.items():
         for zone in ZONES:
             rms = [value[zone] for value in values]
             slope, standard_error = rate(VOXEL_SIZES, rms)
             bias = [f"{v['bias']:+.3f} / " if zone == WHOLE else "" for v in values]
             sizes = [f"{size:g} mm" for size in VOXEL_SIZES]
-            rows.append(
-                {
-                    "phantom": name,
-                    "working grid": grid,
-                    "part": zone,
-                    **{s: f"{b}{r:.3f}" for s, b, r in zip(sizes, bias, rms, strict=True)},
-                    "rate": f"{slope:.2f} ± {standard_error:.2f}",
-                    "target": "falls",
-                    "met": all(finer < coarser for coarser, finer in pairwise(rms)),
-                }
-            )
-    return Table(
-        title="Bias / root mean square error of thickness, mm, by voxel size",
-        rows=rows,
-        notes=_NOTES.format(edge=EDGE),
-    )
+            yield {
+                "phantom": name,
+                "working grid": grid,
+                "part": zone,
+                **{s: f"{b}{r:.3f}" for s, b, r in zip(sizes, bias, rms, strict=True)},
+                "rate": f"{slope:.2f} ± {standard_error:.2f}",
+                "target": "falls",
+                "met": all(finer < coarser for coarser, finer in pairwise(rms)),
+            }
 
 
-def _picture(errors: Mapping[Key, Sequence[Mapping[str, float]]]) -> Picture:
-    def draw(figure: "Figure") -> None:
-        axis = figure.subplots()
-        colors = {name: f"C{number}" for number, name in enumerate(SPECS)}
-        for (name, grid), values in errors.items():
-            style = "o-" if GRIDS[grid] is None else "s--"
-            for zone, alpha in zip(ZONES, (1.0, 0.45), strict=True):
-                rms, label = [v[zone] for v in values], f"{name}, {grid}, {zone}"
-                axis.loglog(VOXEL_SIZES, rms, style, color=colors[name], alpha=alpha, label=label)
-        reach = np.array([min(VOXEL_SIZES), max(VOXEL_SIZES)])
-        start = min(v[zone] for values in errors.values() for v in values for zone in ZONES)
-        axis.loglog(reach, 0.8 * start * reach / reach[0], color="0.6", label="rate 1")
-        axis.set_xticks(VOXEL_SIZES, [f"{size:g}" for size in VOXEL_SIZES])
-        axis.minorticks_off()
-        axis.set_yticks(ticks := [0.03, 0.04, 0.06, 0.08, 0.12], [f"{t:g}" for t in ticks])
-        axis.set_xlabel("voxel size, mm")
-        axis.set_ylabel("RMS error of thickness, mm")
-        axis.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.02, 0.5))
-
-    return Picture(
-        name="convergence",
-        caption="Root mean square error of thickness over the whole grid against voxel size;"
-        " the gray line falls in proportion. Pale: without edges.",
-        draw=draw,
-        size=(9.0, 4.2),
-    )
+@picture("convergence")
+def _picture(figure: "Figure", errors: Mapping[Key, Sequence[Mapping[str, float]]]) -> None:
+    axis = figure.subplots()
+    colors = {name: f"C{number}" for number, name in enumerate(SPECS)}
+    for (name, grid), values in errors.items():
+        style = "o-" if GRIDS[grid] is None else "s--"
+        for zone, alpha in zip(ZONES, (1.0, 0.45), strict=True):
+            rms, label = [v[zone] for v in values], f"{name}, {grid}, {zone}"
+            axis.loglog(VOXEL_SIZES, rms, style, color=colors[name], alpha=alpha, label=label)
+    reach = np.array([min(VOXEL_SIZES), max(VOXEL_SIZES)])
+    start = min(v[zone] for values in errors.values() for v in values for zone in ZONES)
+    axis.loglog(reach, 0.8 * start * reach / reach[0], color="0.6", label="rate 1")
+    axis.set_xticks(VOXEL_SIZES, [f"{size:g}" for size in VOXEL_SIZES])
+    axis.minorticks_off()
+    axis.set_yticks(ticks := [0.03, 0.04, 0.06, 0.08, 0.12], [f"{t:g}" for t in ticks])
+    axis.set_xlabel("voxel size, mm")
+    axis.set_ylabel("RMS error of thickness, mm")
+    axis.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.02, 0.5))
 
 
-_CONVERGENCE_TEXT = """\
-The same phantoms in voxels of 0.6 to 0.3 mm, averaged over poses (here {poses}) that are the
-same at every size. Once with the default working grid, which does not follow the voxels, and once
-with a grid in proportion to them.
-"""
-
-_NOTES = """\
-The rate is the slope of log error against log voxel size by least squares, ± its standard error.
-Labels drawn at voxel centers put the wall off by up to half a voxel at random; where smoothing and
-grid are proportional to the voxels, this averages out alike at every size, so the rate to expect is
-about 1. Bias may pass through zero and has no rate. Without edges: without the {edge} outer nodes
-on each side. Single poses differ by half: where a wall is almost parallel to a layer of voxels, its
-steps lie too far apart for the smoothing to remove them, and show as waves of up to 0.2 mm.
-The target is that each smaller voxel size has a smaller error.
-"""
-
-
-def run_limits(full: bool) -> Suite:
+@suite("limits")
+def run_limits(full: bool) -> Iterator[Content]:
     """Measure sheets that are too thin for their voxels: refused or flagged, not silently wrong."""
     sizes = (0.4, 0.6, 0.8, 1.0) if full else (0.5, 1.0)
     walls = (0.8, 1.2, 1.6, 3.0) if full else (0.8, 1.6)
@@ -480,16 +382,11 @@ def run_limits(full: bool) -> Suite:
         for i, wall in enumerate(walls)
         for j, size in enumerate(sizes)
     ]
-    return Suite(
-        name="limits",
-        title="Limits",
-        text="Spirals, isotropic voxels, one pose each.",
-        tables=(_limits_table(cases, run_cases(measure_case, cases)),),
-    )
+    yield _limits_table(cases, run_cases(measure_case, cases))
 
 
-def _limits_table(cases: Sequence[Case], results: Sequence[Measured | Refusal]) -> Table:
-    rows: list[Cells] = []
+@table("limits.thin")
+def _limits_table(cases: Sequence[Case], results: Sequence[Measured | Refusal]) -> Iterator[Cells]:
     for case, result in zip(cases, results, strict=True):
         cells: dict[str, Cell] = {
             "thickness, mm": f"{case.spec.thickness:g}",
@@ -507,10 +404,4 @@ def _limits_table(cases: Sequence[Case], results: Sequence[Measured | Refusal]) 
                 "bias": f"{bias:+.3f}",
                 "SD": float(np.nanstd(result.error)),
             }
-        rows.append({**cells, "met": met})
-    return Table(
-        title="Sheets too thin for their voxels",
-        rows=rows,
-        notes="Met: the map is refused or flagged, or its mean is within"
-        f" {MAX_SILENT_ERROR:g} mm of the truth.",
-    )
+        yield {**cells, "met": met}

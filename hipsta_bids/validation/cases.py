@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from nibabel.affines import from_matvec
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from hipsta_bids.errors import HipstaError
@@ -140,8 +142,13 @@ def truth_at(
 
 def any_pose(generator: np.random.Generator, *, degrees: float = 25.0) -> Float:
     """Rotate by up to ``degrees`` about each axis, shift by up to 2 mm along each: (4, 4)."""
-    turn = Rotation.from_euler("xyz", generator.uniform(-degrees, degrees, 3), degrees=True)
-    return _motion(turn.as_matrix(), generator.uniform(-2.0, 2.0, 3))
+    return np.asarray(from_matvec(turned(generator, degrees), generator.uniform(-2.0, 2.0, 3)))
+
+
+def turned(generator: np.random.Generator, degrees: float) -> Float:
+    """Choose a rotation (3, 3) by up to ``degrees`` about each axis."""
+    angles = generator.uniform(-degrees, degrees, 3)
+    return Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
 
 
 def along_slices(
@@ -157,19 +164,18 @@ def along_slices(
     axis = np.array([np.cos(about), 0.0, np.sin(about)])
     lean = Rotation.from_rotvec(np.deg2rad(tilt) * axis)
     turn = (to_body * lean * within).as_matrix()
-    return _motion(np.eye(3), generator.uniform(-2.0, 2.0, 3)), turn
+    return from_matvec(np.eye(3), generator.uniform(-2.0, 2.0, 3)), turn
 
 
 def random_motion(generator: np.random.Generator) -> Float:
     """Rotate by any angle (uniform over all rotations), shift by up to 20 mm along each axis."""
     turn = Rotation.from_quat(generator.normal(size=4))  # normalized: uniform
-    return _motion(turn.as_matrix(), generator.uniform(-20.0, 20.0, 3))
+    return np.asarray(from_matvec(turn.as_matrix(), generator.uniform(-20.0, 20.0, 3)))
 
 
-def _motion(turn: Float, shift: Float) -> Float:
-    motion = np.eye(4)
-    motion[:3, :3], motion[:3, 3] = turn, shift
-    return motion
+def rms(values: ArrayLike) -> float:
+    """Root mean square of what is known."""
+    return float(np.sqrt(np.nanmean(np.square(values))))
 
 
 def hippunfold_beside(labels: Path) -> list[Path]:
@@ -178,14 +184,21 @@ def hippunfold_beside(labels: Path) -> list[Path]:
     return [folder] if folder.is_dir() else []
 
 
-def fine_segmentations(labels: Path, largest: float) -> list[HemisphereInput]:
+def segmentations(*folders: Path) -> list[HemisphereInput]:
+    """Find the usable segmentations of datasets."""
+    found = [item for path in folders for item in find_hemispheres(InputRequest(bids_dir=path))]
+    return [item for item in found if item.problem is None]
+
+
+def longest_edge(volume: LabelVolume) -> float:
+    """Longest edge of the voxels, mm."""
+    return float(np.linalg.norm(volume.affine[:3, :3], axis=0).max())
+
+
+def fine_segmentations(labels: Path | None, largest: float) -> list[HemisphereInput]:
     """Find the usable segmentations of a dataset with voxels of at most ``largest`` mm."""
-    return [
-        item
-        for item in find_hemispheres(InputRequest(bids_dir=labels))
-        if item.problem is None
-        and np.linalg.norm(read_label_volume(item).affine[:3, :3], axis=0).max() <= largest
-    ]
+    found = segmentations(labels) if labels else []
+    return [item for item in found if longest_edge(read_label_volume(item)) <= largest]
 
 
 def left_out(labels: Path | None) -> str:

@@ -15,12 +15,15 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from hipsta_bids.errors import SettingsError
-from hipsta_bids.geometry.digital import ALL
+from hipsta_bids.geometry.digital import ALL, to_ras
 from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.types import Bool, Float, LabelVolume, Sheet
 
 Position = tuple[float, float]
 """Sheet coordinates (u, v), each from 0 to 1: medial to lateral, posterior to anterior."""
+
+Injury = tuple[str, float, Position]
+"""Kind of damage, its size (see the kind's description) and position."""
 
 #: Refinement of the sheet's grid along x, y and z, so that its points lie closer than voxels.
 _FINER = (3, 3, 2)
@@ -45,18 +48,17 @@ class Site:
         self.volume = volume
         self.columns = _refined(sheet.points)
         index = np.indices(volume.tissue.shape).reshape(3, -1).T
-        points = index @ volume.affine[:3, :3].T + volume.affine[:3, 3]
+        points = to_ras(index, volume.affine)
         self.points: Float = points.reshape(*volume.tissue.shape, 3)
         owners = (*volume.protocol.sheet, *volume.protocol.layer)
         self.wall: Bool = np.isin(volume.tissue, owners)
         """(I, J, K) voxels that become the ribbon, anywhere along the hippocampus."""
-        ends = sheet.points[:, [0, -1]].mean(axis=(0, 2))
-        self.axis: Float = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
-        """(3,) unit vector from posterior to anterior."""
-        self.length = float(np.linalg.norm(ends[1] - ends[0]))
+        first, last = sheet.points[:, [0, -1]].mean(axis=(0, 2))
+        self.length = float(np.linalg.norm(last - first))
         """mm between the middles of the two end planes."""
-        along = (self.points - ends[0]) @ self.axis
-        self.v: Float = along / self.length
+        self.axis: Float = (last - first) / self.length
+        """(3,) unit vector from posterior to anterior."""
+        self.v: Float = (self.points - first) @ self.axis / self.length
         """(I, J, K) share of the way from the posterior to the anterior end."""
         body = self.wall & (self.v > -0.2) & (self.v < 1.2)  # noqa: PLR2004 -- oblique ends too
         self.voxels = np.argwhere(body)
@@ -164,13 +166,8 @@ def make_defect(site: Site, kind: str, size: float, position: Position = (0.5, 0
 def _hole(site: Site, size: float, position: Position) -> Defect:
     """Open a round hole through the wall; size is its radius."""
     column, normal = site.column(position), site.normal(position)
-    line = np.vstack(
-        [
-            column,
-            column[-1] + np.linspace(0, _THROUGH, 5)[:, None] * normal,
-            column[0] - np.linspace(0, _THROUGH, 5)[:, None] * normal,
-        ]
-    )
+    beyond = np.linspace(0, _THROUGH, 5)[:, None] * normal
+    line = np.vstack([column, column[-1] + beyond, column[0] - beyond])
     return site.erased(site.wall & site.within(line, size))
 
 
@@ -234,9 +231,8 @@ def _gap_voxels(site: Site, width: float, u: float) -> Bool:
     return site.wall & site.within(np.vstack(longer), 0.5 * width)
 
 
-def _missing_subfield(site: Site, size: float, position: Position) -> Defect:
+def _missing_subfield(site: Site, _: float, position: Position) -> Defect:
     """Erase the subfield at the position; size is ignored."""
-    del size
     tissue, _ = site.label(position, np.isin(site.volume.tissue, site.volume.protocol.sheet))
     return site.erased(site.volume.tissue == tissue)
 
@@ -248,12 +244,8 @@ def _missing_slices(site: Site, size: float, position: Position) -> Defect:
     affine = site.volume.affine
     middle = site.column(position).mean(axis=0)
     index = np.linalg.solve(affine[:3, :3], middle - affine[:3, 3])[across]
-    number = np.arange(site.wall.shape[across])
     half = max(0.5 * size / float(edges[across]), 0.5)
-    chosen = np.abs(number - index) <= half
-    shape = [1, 1, 1]
-    shape[across] = -1
-    gone = np.broadcast_to(chosen.reshape(shape), site.wall.shape)
+    gone = np.abs(np.indices(site.wall.shape)[across] - index) <= half
     return site.erased(gone & (site.volume.tissue > 0))
 
 
@@ -267,9 +259,8 @@ def _part_inside(site: Site, size: float, position: Position, *, part: Part) -> 
     return site.relabeled(where, Tissue.HIPPOCAMPUS if whole else None, part)
 
 
-def _cut_short(site: Site, size: float, position: Position) -> Defect:
+def _cut_short(site: Site, size: float, _: Position) -> Defect:
     """Erase all labels anterior of a cross-section; size is what remains of the body, mm."""
-    del position
     return site.erased((site.v * site.length > size) & (site.volume.tissue > 0))
 
 
@@ -285,31 +276,22 @@ def _waist(site: Site, size: float, position: Position) -> Defect:
     return site.erased(site.wall & (depth <= size) & site.slab(position, 4.0))
 
 
-def _wrong_voxels(site: Site, size: float, position: Position) -> Defect:
+def _wrong_voxels(site: Site, size: float, _: Position) -> Defect:
     """Stretch the voxels across the long axis, as a wrong header does; size is the factor."""
-    del position
     affine = site.volume.affine.copy()
     affine[:, int(np.argmin(site.voxel_axes()[1]))] *= size
     return Defect(volume=replace(site.volume, affine=affine), changed=site.points[site.wall])
 
 
-def _at_border(site: Site, size: float, position: Position) -> Defect:
+def _at_border(site: Site, size: float, _: Position) -> Defect:
     """Let the image end inside the body; size is what the body loses, mm (0: it just touches)."""
-    del position
     edges, along = site.voxel_axes()
     across = int(np.argmin(along))
     last = int(site.voxels[:, across].max()) - round(size / float(edges[across]))
-    keep: list[slice] = [slice(None)] * 3
-    keep[across] = slice(0, last + 1)
-    box = tuple(keep)
-    lost = np.ones(site.wall.shape, dtype=bool)
-    lost[box] = False
-    border = np.zeros(site.wall.shape, dtype=bool)
-    keep[across] = slice(last, last + 1)
-    border[tuple(keep)] = True
+    box = (slice(None),) * across + (slice(0, last + 1),)
     return Defect(
         volume=replace(site.volume, tissue=site.volume.tissue[box], part=site.volume.part[box]),
-        changed=site.points[(lost | border) & site.wall],
+        changed=site.points[(np.indices(site.wall.shape)[across] >= last) & site.wall],
     )
 
 
@@ -342,9 +324,8 @@ def _relabeled_tip(site: Site, size: float, position: Position) -> Defect:
     return site.relabeled(site.among(tip) & site.slab(position, 4.0), Tissue.OTHER, Part.UNKNOWN)
 
 
-def _ends_flush(site: Site, size: float, position: Position) -> Defect:
+def _ends_flush(site: Site, _size: float, _position: Position) -> Defect:
     """Erase head and tail, so that the labels end where the body does; size is ignored."""
-    del size, position
     return site.erased(np.isin(site.volume.part, (Part.HEAD, Part.TAIL)))
 
 
@@ -377,12 +358,11 @@ def _ragged_end(site: Site, size: float, position: Position) -> Defect:
     return site.relabeled(site.among(tongue), Tissue.HIPPOCAMPUS, Part.TAIL)
 
 
-def _uncus(site: Site, size: float, position: Position, *, bridge: float) -> Defect:
+def _uncus(site: Site, size: float, _: Position, *, bridge: float) -> Defect:
     """Add CA2/3 medially of the front, joined by CA1 over ``bridge`` mm; size is its reach, mm.
 
     A round bar 3 mm thick, from 2 mm before the anterior end to ``size`` behind it.
     """
-    del position
     medial, front = (site.column((u, 1.0)).mean(axis=0) for u in (0.0, 0.5))
     away = medial - front
     away -= (away @ site.axis) * site.axis

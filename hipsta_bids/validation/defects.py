@@ -1,6 +1,6 @@
 """How damaged labels end: repaired, flagged or refused, and how far the maps move."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -18,8 +18,8 @@ from hipsta_bids.validation.cases import (
     measure_reference,
     run_cases,
 )
-from hipsta_bids.validation.damage import Position, Site, make_defect
-from hipsta_bids.validation.report import Cell, Cells, Suite, Table
+from hipsta_bids.validation.damage import Injury, Position, Site, make_defect
+from hipsta_bids.validation.report import Cell, Cells, Content, suite, table
 
 NEAR = 2.0
 """mm; columns within this distance of a changed voxel are near the defect."""
@@ -55,8 +55,8 @@ VOXEL = 0.4
 
 MIDDLE: Position = (0.5, 0.5)
 HOLES: tuple[Position, ...] = (MIDDLE, (0.2, 0.35), (0.82, 0.6))
-#: Kind, size (see the kind's description) and position. The quick selection takes every third.
-PLAN: tuple[tuple[str, float, Position], ...] = (
+#: The quick selection takes every third.
+PLAN: tuple[Injury, ...] = (
     *(("hole", r, p) for r in (0.4, 0.8, 1.3, 1.6, 2.0) for p in HOLES),
     ("cavity", 0.4, MIDDLE),
     ("cavity", 0.8, MIDDLE),
@@ -89,15 +89,15 @@ class Trial:
     """One body with one defect."""
 
     body: ValidationBody
-    kind: str
-    size: float
-    position: Position
+    injury: Injury
+    mended: bool = True
+    """False: what lost its label is labeled as tissue outside, and stays a hole."""
 
     @property
     def name(self) -> str:
         """Of the body, for people."""
         if isinstance(self.body, PhantomSpec):
-            return self.body.kind
+            return self.body.kind + (", layer" if self.body.layer_thickness else "")
         return f"labels {self.body.subject} {self.body.hemi}"
 
 
@@ -143,31 +143,27 @@ class Damage:
         return tuple(rule for rule, broken in rules if broken)
 
 
-def run(full: bool, labels: Path | None = None) -> Suite:
+@suite("defects")
+def run(full: bool, labels: Path | None = None) -> Iterator[Content]:
     """Damage bodies in many ways and measure them."""
-    bodies: list[ValidationBody] = list(SPECS if full else SPECS[:1])
-    if labels is not None:
-        bodies += fine_segmentations(labels, VOXEL)[::2]
+    bodies: list[ValidationBody] = [
+        *SPECS[: None if full else 1],
+        *fine_segmentations(labels, VOXEL)[::2],
+    ]
     plan = PLAN if full else PLAN[::3]
-    trials = [Trial(body=body, kind=k, size=s, position=p) for body in bodies for k, s, p in plan]
+    trials = [Trial(body=body, injury=injury) for body in bodies for injury in plan]
     results = [
         refused(result) if isinstance(result, Refusal) else result
         for result in run_cases(measure_trial, trials, timeout=TIMEOUT)
     ]
-    return Suite(
-        name="defects",
-        title="Damaged labels",
-        text="Each defect is put into a body, and the map compared with that of the undamaged "
-        "one, column by column. A map that is handed out as sound, the defect unnoticed or "
-        "repaired, has to be right; flagged ones say where to look, and refused ones why.",
-        tables=(_cases(trials, results), _totals(results)),
-    )
+    yield _cases(trials, results)
+    yield _totals(results)
 
 
 def measure_trial(trial: Trial) -> Damage:
     """Measure one damaged body and compare it with the undamaged one."""
     _, hemi, reference = measure_reference(trial.body, VOXEL)
-    defect = make_defect(site_of(trial.body), trial.kind, trial.size, trial.position)
+    defect = make_defect(site_of(trial.body), *trial.injury)
     return compare(measure_body(defect.volume, hemi), reference, defect.changed)
 
 
@@ -208,14 +204,15 @@ def refused(refusal: Refusal) -> Damage:
     return Damage(status=status, reasons=(refusal.reason,), message=refusal.message)
 
 
-def _cases(trials: list[Trial], results: list[Damage]) -> Table:
-    rows: list[Cells] = []
+@table("defects.defects")
+def _cases(trials: list[Trial], results: list[Damage]) -> Iterator[Cells]:
     for trial, result in zip(trials, results, strict=True):
+        kind, size, position = trial.injury
         cells: dict[str, Cell] = {
             "body": trial.name,
-            "defect": trial.kind,
-            "size": f"{trial.size:g}",
-            "position (u, v)": "{:g}, {:g}".format(*trial.position),
+            "defect": kind,
+            "size": f"{size:g}",
+            "position (u, v)": "{:g}, {:g}".format(*position),
             "outcome": OUTCOMES[result.status],
             "reason": ", ".join(result.reasons) or "-",
         }
@@ -227,33 +224,12 @@ def _cases(trials: list[Trial], results: list[Damage]) -> Table:
                 "change of mean (mm)": result.mean,
             }
         broken = ", ".join(result.missed) or "-"
-        rows.append({**cells, "rules broken": broken, "met": not result.missed})
-    return Table(
-        title="Defects",
-        rows=rows,
-        notes="Sizes are radii, widths, depths or lengths in mm; a share of voxels for salt; a "
-        "factor for wrong voxels. Rules, for maps handed out as sound: at most "
-        f"{MAX_WRONG:.0%} of the columns off by > {WRONG:g} mm (*wrong*), none moved by > "
-        f"{MAX_SHIFT:g} mm farther than {NEAR:g} mm from the defect (*moved*), at most "
-        f"{MAX_CHANGED:.0%} of the body changed by repairs (*big*). A refusal says where, unless "
-        f"it concerns the whole body (*placeless*). No case crashes or takes more than "
-        f"{TIMEOUT:g} s (*crash*).",
-        digits=2,
-    )
+        yield {**cells, "rules broken": broken, "met": not result.missed}
 
 
-def _totals(results: list[Damage]) -> Table:
-    ends = [OUTCOMES[result.status] for result in results]
-    return Table(
-        title="How damaged labels ended",
-        rows=[
-            {
-                "outcome": word,
-                "cases": ends.count(word),
-                "of them within the rules": sum(
-                    not r.missed for r, end in zip(results, ends, strict=True) if end == word
-                ),
-            }
-            for word in OUTCOMES.values()
-        ],
-    )
+@table("defects.ends")
+def _totals(results: list[Damage]) -> Iterator[Cells]:
+    for status, word in OUTCOMES.items():
+        group = [result for result in results if result.status == status]
+        kept = sum(not result.missed for result in group)
+        yield {"outcome": word, "cases": len(group), "of them within the rules": kept}

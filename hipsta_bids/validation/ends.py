@@ -1,6 +1,6 @@
 """Ends of the body: found where no label says so, and oblique where labels do."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import product
@@ -23,11 +23,12 @@ from hipsta_bids.validation.cases import (
     load_body,
     measure_body,
     refusal_notes,
+    rms,
     run_cases,
     truth_at,
 )
 from hipsta_bids.validation.population import find_bodies, is_fine
-from hipsta_bids.validation.report import Cell, Cells, Suite, Table
+from hipsta_bids.validation.report import Cell, Cells, Content, suite, table
 from hipsta_bids.validation.thick_slices import FULL_VOXEL, PHANTOMS, PIXEL, reslice
 
 ENDS: tuple[End, End] = ("posterior", "anterior")
@@ -120,33 +121,27 @@ class Oblique:
     """Direction that the planes are tilted about: across the sheet, or through it."""
 
 
-def run(full: bool, labels: Path | None = None) -> Suite:
+@suite("ends")
+def run(full: bool, labels: Path | None = None) -> Iterator[Content]:
     """Find ends without labels on copies of bodies; measure bodies between oblique end planes."""
-    bodies: list[ValidationBody] = list(PHANTOMS if full else PHANTOMS[:1])
-    if labels is not None:
+    bodies: list[ValidationBody] = [*PHANTOMS[: None if full else 1]]
+    if labels:
         fine = [body for body in find_bodies(labels) if is_fine(load_body(body, FULL_VOXEL)[0])]
         bodies += fine if full else fine[:2]
     plan = (STEPS, OFFSETS, TILTS) if full else (STEPS[-1:], OFFSETS[::2], TILTS[:1])
     copies = tuple(product(*plan))
     jobs = [Job(body=body, copies=copies) for body in bodies]
-    results = run_cases(find_ends, jobs, timeout=120.0)
-    found = dict(zip(jobs, results, strict=True))
+    found = dict(zip(jobs, run_cases(find_ends, jobs, timeout=120.0), strict=True))
     cases = [
         Oblique(spec=spec, degrees=degrees, about=about)
         for spec in (OBLIQUE if full else OBLIQUE[:1])
         for degrees in (DEGREES if full else DEGREES[-1:])
         for about in (ABOUT if full else ABOUT[:1])
     ]
-    return Suite(
-        name="ends",
-        title="Ends of the body",
-        text=_TEXT.strip() + left_out(labels),
-        tables=(
-            _copies_table(found),
-            _places_table(found),
-            _oblique_table(cases, run_cases(measure_oblique, cases)),
-        ),
-    )
+    yield _copies_table(found)
+    yield _places_table(found)
+    yield _oblique_table(cases, run_cases(measure_oblique, cases))
+    yield left_out(labels)
 
 
 def find_ends(job: Job) -> Found:
@@ -217,15 +212,15 @@ def measure_oblique(case: Oblique) -> tuple[str, Float]:
     return maps.status, np.where(inside, maps.thickness - truth.thickness, np.nan)
 
 
-def _copies_table(results: Mapping[Job, Found | Refusal]) -> Table:
+@table("ends.copies")
+def _copies_table(results: Mapping[Job, Found | Refusal]) -> Iterator[Cells | str]:
     """SD of ends over copies, by body and in the mean."""
-    rows: list[Cells] = []
     for kind in MAX_OFF:
         group = {job: r for job, r in results.items() if job.kind == kind}
         found = {job: r for job, r in group.items() if isinstance(r, Found) and len(r.copies) > 1}
         numbers = [_numbers(job, result) for job, result in found.items()]
         for job, row in zip(found, numbers, strict=True):
-            rows.append({"body": job.name, **dict(zip(_COLUMNS, row, strict=True))})
+            yield {"body": job.name, **dict(zip(_COLUMNS, row, strict=True))}
         if group:
             mean, met = dict[str, Cell](), False
             if found:
@@ -239,14 +234,8 @@ def _copies_table(results: Mapping[Job, Found | Refusal]) -> Table:
             )
             targets = ", ".join(f"{limit:g}" for limit in MAX_SPREAD)
             mean = {"body": f"{kind}, mean", **mean, "refused": refused, "targets": targets}
-            rows.append({**mean, "met": met and not refused})
-    lost = {job.name: [result] for job, result in results.items()}
-    return Table(
-        title="Ends without labels, over copies of a body, mm",
-        rows=rows,
-        digits=2,
-        notes=_COPIES_NOTES + refusal_notes(lost),
-    )
+            yield {**mean, "met": met and not refused}
+    yield refusal_notes({job.name: [result] for job, result in results.items()})
 
 
 _COLUMNS = (
@@ -268,53 +257,45 @@ def _numbers(job: Job, found: Found) -> list[float]:
     return [float(number) for number in both]
 
 
-def _places_table(results: Mapping[Job, Found | Refusal]) -> Table:
+@table("ends.places")
+def _places_table(results: Mapping[Job, Found | Refusal]) -> Iterator[Cells]:
     """Where ends are found in a body's own voxels, against where labels have them."""
     found = {job: r.own for job, r in results.items() if isinstance(r, Found) and r.own}
-    rows: list[Cells] = []
-
-    def add(kind: str, what: str, off: Sequence[float], worst: bool, target: float | None) -> None:
-        rms, largest = float(np.sqrt(np.mean(np.square(off)))), float(np.abs(off).max())
-        cells: dict[str, Cell] = {"bodies": kind, "number": len(off), "what": what}
-        cells |= {"mean": f"{np.mean(off):+.2f}", "RMS": rms, "largest": largest}
-        if target is not None:
-            cells["target"] = f"{'largest' if worst else 'RMS'} ≤ {target:g}"
-            cells["met"] = (largest if worst else rms) <= target
-        rows.append(cells)
-
     for (kind, limits), variant in product(MAX_OFF.items(), (FOUND, KEPT)):
         group = [own[variant] for job, own in found.items() if job.kind == kind and variant in own]
         for k, end in enumerate(ENDS if group else ()):
-            if variant == FOUND or end == ENDS[0]:
-                target = limits[k] if variant == FOUND else None
-                add(kind, f"{end} {variant}", [ends[k] for ends in group], False, target)
+            off = [ends[k] for ends in group]
+            if variant == FOUND:
+                row = _place_row(kind, f"{end} {variant}", off)
+                yield {**row, "target": f"RMS ≤ {limits[k]:g}", "met": rms(off) <= limits[k]}
+            elif end == ENDS[0]:
+                yield _place_row(kind, f"{end} {variant}", off)
     sides: dict[str, list[float]] = {}
     for job, own in found.items():
         if not isinstance(job.body, PhantomSpec):
             sides.setdefault(job.body.subject, []).append(own[FOUND][1] - own[FOUND][0])
     if pairs := [both[0] - both[1] for both in sides.values() if len(both) > 1]:
-        add("labels", "length, left minus right", pairs, True, MAX_SIDES)
-    return Table(
-        title="Ends without labels against head and tail labels, mm",
-        rows=rows,
-        digits=2,
-        notes=_PLACES_NOTES,
-    )
+        met = max(map(abs, pairs)) <= MAX_SIDES
+        row = _place_row("labels", "length, left minus right", pairs)
+        yield {**row, "target": f"largest ≤ {MAX_SIDES:g}", "met": met}
 
 
+def _place_row(kind: str, what: str, off: Sequence[float]) -> Cells:
+    mean, largest = f"{np.mean(off):+.2f}", float(np.abs(off).max())
+    cells: Cells = {"bodies": kind, "number": len(off), "what": what}
+    return {**cells, "mean": mean, "RMS": rms(off), "largest": largest}
+
+
+@table("ends.oblique")
 def _oblique_table(
     cases: Sequence[Oblique], results: Sequence[tuple[str, Float] | Refusal]
-) -> Table:
+) -> Iterator[Cells | str]:
     """Error of thickness beside oblique end planes."""
-    rows: list[Cells] = []
-    lost: dict[str, list[Refusal]] = {}
-    for case, result in zip(cases, results, strict=True):
-        name = f"{case.spec.kind}, {case.degrees:g}° about the {case.about}"
+    names = [f"{c.spec.kind}, {c.degrees:g}° about the {c.about}" for c in cases]
+    for name, result in zip(names, results, strict=True):
         cells: dict[str, Cell] = {"planes": name}
         met = False
-        if isinstance(result, Refusal):
-            lost[name] = [result]
-        else:
+        if not isinstance(result, Refusal):
             status, error = result
             of_rows = np.nanmean(error, axis=0)
             ends = of_rows[[0, 1, -2, -1]]
@@ -325,42 +306,5 @@ def _oblique_table(
                 "all rows": f"{of_rows.mean():+.3f}",
                 "largest of a column": float(np.nanmax(np.abs(error))),
             }
-        rows.append({**cells, "target": f"≤ {MAX_ROW:g}", "met": met})
-    return Table(
-        title="Rows beside oblique end planes: error of their mean thickness, mm",
-        rows=rows,
-        notes=_OBLIQUE_NOTES + refusal_notes(lost),
-    )
-
-
-_TEXT = f"""\
-Where labels name no head and tail, the ends of the body are found in its cross-sections. Copies of
-each body, in slices of {STEPS[0]:g}, {STEPS[1]:g} and {STEPS[2]:g} mm, shifted by quarters of a
-slice and tilted by {TILTS[1]:g}° either way, have to end at the same places. Bodies are those with
-fine voxels, their head and tail labels taken away, and phantoms whose CA2 and CA3 end with the
-body.
-"""
-
-_COPIES_NOTES = """\
-Targets: SD over the copies of the posterior end, the anterior end and the length, mean over bodies,
-and the largest range of the length. By slices alone: SD of an edge that may lie anywhere between
-two slices, their distance over the root of 12. No method sees more where labels stop from one slice
-to the next, as in phantoms, and in the tail of all labels here but HippUnfold's: their SD misses
-the target, and is about that. Uncertainty is the standard error that the program writes, mean over
-the copies; ranges beyond the target are those of the brain where it is largest.
-"""
-
-_PLACES_NOTES = """\
-In each body's own voxels; positive is anterior. The automatic plane lies across the body. Where
-labels stop along an oblique plane, as in the tail of these real ones, it goes to where
-cross-sections are full; *oblique sections kept* shows what remains of the error without that
-(`body.end_reach` 0). Head labels begin at a share of the length here, not at the uncus that the
-rule goes by, which the anterior error holds, too. Left minus right: error of the difference of both
-sides' lengths; the largest comes from anterior ends that are off in opposite directions.
-"""
-
-_OBLIQUE_NOTES = f"""\
-Phantoms of 2 mm whose head and tail begin at tilted planes; real planes are oblique by up to 38°.
-Each of the two rows beside an end must be right to {MAX_ROW:g} mm; the last one was off by 0.04,
-0.11 and 0.27 mm at 10, 20 and 35° when the mesh ended at the planes.
-"""
+        yield {**cells, "target": f"≤ {MAX_ROW:g}", "met": met}
+    yield refusal_notes({name: [result] for name, result in zip(names, results, strict=True)})

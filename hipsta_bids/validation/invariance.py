@@ -1,6 +1,6 @@
 """What may not change a map: where the subject lies, and how voxels are stored."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,10 +23,11 @@ from hipsta_bids.validation.cases import (
     measure_case,
     random_motion,
     refusal_notes,
+    rms,
     run_cases,
     run_groups,
 )
-from hipsta_bids.validation.report import Cell, Cells, Picture, Suite, Table, show_map
+from hipsta_bids.validation.report import Cell, Cells, Content, picture, show_map, suite, table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -55,7 +56,8 @@ SPEC = PhantomSpec(kind="spiral", thickness=2.0, variation=0.15)
 MOTIONS = {"any rotation": random_motion, "up to 25° about each axis": any_pose}
 
 
-def run(full: bool, labels: Path | None = None) -> Suite:
+@suite("invariance")
+def run(full: bool, labels: Path | None = None) -> Iterator[Content]:
     """Measure a phantom in many positions, and equal voxels, also real ones, in another form."""
     count, pairs = (MOTIONS_FULL, PAIRS_FULL) if full else (MOTIONS_QUICK, PAIRS_QUICK)
     cases = {}
@@ -66,17 +68,12 @@ def run(full: bool, labels: Path | None = None) -> Suite:
     motions = {name: results[name] for name in MOTIONS}
     real = fine_segmentations(labels, FINE) if labels else []
     real = real if full else real[:1]
-    return Suite(
-        name="invariance",
-        title="Invariance",
-        text=_TEXT.strip() + left_out(labels),
-        tables=(
-            _motion_table(motions),
-            _pair_table([results[f"pair {number}"] for number in range(pairs)]),
-            *([_real_table(run_cases(measure_forms, real))] if labels else ()),
-        ),
-        pictures=(_picture(motions),),
-    )
+    yield _motion_table(motions)
+    yield _pair_table([results[f"pair {number}"] for number in range(pairs)])
+    if labels:
+        yield _real_table(run_cases(measure_forms, real))
+    yield _picture(motions)
+    yield left_out(labels)
 
 
 def _pair(number: int) -> list[Case]:
@@ -106,32 +103,25 @@ def measure_forms(item: HemisphereInput) -> tuple[float, float]:
     reference = measure_body(volume, item.hemi).thickness
     other = "LR"[item.hemi == "L"]
     maps = measure_body(mirrored, other).thickness, measure_body(stored, item.hemi).thickness
-    first, second = (float(np.sqrt(((map_ - reference) ** 2).mean())) for map_ in maps)
+    first, second = (rms(map_ - reference) for map_ in maps)
     return first, second
 
 
-def _real_table(results: Sequence[tuple[float, float] | Refusal]) -> Table:
+@table("invariance.real")
+def _real_table(results: Sequence[tuple[float, float] | Refusal]) -> Iterator[Cells | str]:
     measured = [result for result in results if not isinstance(result, Refusal)]
-    rows: list[Cells] = []
     for column, form in enumerate(("mirror image", "voxels in another order")):
         change = np.array([result[column] for result in measured] or [np.nan])
         met = len(measured) == len(results) and bool(change.max() <= MAX_RMS)
-        rows.append(
-            {
-                "form": form,
-                "hemispheres": len(results),
-                "RMS, mean": f"{change.mean():.5f}",
-                "RMS, largest": f"{change.max():.5f}",
-                "target, largest": f"≤ {MAX_RMS:g}",
-                "met": met,
-            }
-        )
-    return Table(
-        title="Real labels in another form: change of thickness, mm",
-        rows=rows,
-        notes="A mirror image has to be measured as the other side; the order of voxels is that "
-        "of other axes, all of them backward." + refusal_notes({"labels": results}),
-    )
+        yield {
+            "form": form,
+            "hemispheres": len(results),
+            "RMS, mean": f"{change.mean():.5f}",
+            "RMS, largest": f"{change.max():.5f}",
+            "target, largest": f"≤ {MAX_RMS:g}",
+            "met": met,
+        }
+    yield refusal_notes({"labels": results})
 
 
 def _maps(group: Sequence[Measured | Refusal]) -> Float | None:
@@ -140,8 +130,8 @@ def _maps(group: Sequence[Measured | Refusal]) -> Float | None:
     return np.array(maps) if len(maps) > 1 else None
 
 
-def _motion_table(motions: Mapping[str, Sequence[Measured | Refusal]]) -> Table:
-    rows: list[Cells] = []
+@table("invariance.motions")
+def _motion_table(motions: Mapping[str, Sequence[Measured | Refusal]]) -> Iterator[Cells]:
     for name, group in motions.items():
         maps = _maps(group)
         refused = sum(isinstance(m, Refusal) for m in group)
@@ -150,7 +140,7 @@ def _motion_table(motions: Mapping[str, Sequence[Measured | Refusal]]) -> Table:
         if maps is not None:
             of_mean = float(maps.mean(axis=(1, 2)).std(ddof=1))
             at_points = maps.std(axis=0, ddof=1)
-            overall = float(np.sqrt((at_points**2).mean()))
+            overall = rms(at_points)
             good = of_mean <= MAX_SD_OF_MEAN and overall <= MAX_POINTWISE_SD and not refused
             cells |= {
                 "SD of the mean": of_mean,
@@ -159,64 +149,39 @@ def _motion_table(motions: Mapping[str, Sequence[Measured | Refusal]]) -> Table:
                 "95th percentile": float(np.quantile(at_points, 0.95)),
             }
         targets = (f"≤ {MAX_SD_OF_MEAN:g}", f"≤ {MAX_POINTWISE_SD:g}")
-        rows.append({**cells, "target, mean": targets[0], "target, point": targets[1], "met": good})
-    return Table(
-        title="One phantom in many positions, mm",
-        rows=rows,
-        digits=4,
-        notes="A point is a node of the sheet's grid; the SD is over the motions.",
-    )
+        yield {**cells, "target, mean": targets[0], "target, point": targets[1], "met": good}
 
 
-def _pair_table(pairs: Sequence[Sequence[Measured | Refusal]]) -> Table:
-    rows: list[Cells] = []
+@table("invariance.forms")
+def _pair_table(pairs: Sequence[Sequence[Measured | Refusal]]) -> Iterator[Cells | str]:
     for column, name in enumerate(("mirror image", *(f"voxel axes {axes}" for axes in AXES)), 1):
+        cells: dict[str, Cell] = {
+            "form": name,
+            "mean": None,
+            "mean absolute": None,
+            "largest": None,
+        }
+        both = [(pair[0], pair[column]) for pair in pairs]
         changes = [
             b.thickness - a.thickness
-            for a, b in ((pair[0], pair[column]) for pair in pairs)
+            for a, b in both
             if isinstance(a, Measured) and isinstance(b, Measured)
         ]
-        absolute = np.abs(changes)
-        complete = len(changes) == len(pairs)
-        rows.append(
-            {
-                "form": name,
-                "mean": f"{np.mean(changes):+.5f}" if complete else None,
-                "mean absolute": f"{absolute.mean():.5f}" if complete else None,
-                "largest": f"{absolute.max():.5f}" if complete else None,
-                "target, mean absolute": f"≤ {MAX_CHANGE:g}",
-                "met": complete and bool(absolute.mean() <= MAX_CHANGE),
-            }
-        )
-    return Table(
-        title="The same voxels in another form: change of thickness, mm",
-        rows=rows,
-        notes=f"Number of poses: {len(pairs)}.",
-    )
+        met = False
+        if len(changes) == len(pairs):
+            size = np.abs(changes)
+            met = bool(size.mean() <= MAX_CHANGE)
+            cells |= {"mean": f"{np.mean(changes):+.5f}", "mean absolute": f"{size.mean():.5f}"}
+            cells["largest"] = f"{size.max():.5f}"
+        yield {**cells, "target, mean absolute": f"≤ {MAX_CHANGE:g}", "met": met}
+    yield f"Number of poses: {len(pairs)}."
 
 
-def _picture(motions: Mapping[str, Sequence[Measured | Refusal]]) -> Picture:
+@picture("invariance")
+def _picture(figure: "Figure", motions: Mapping[str, Sequence[Measured | Refusal]]) -> None:
     found = {name: maps for name, group in motions.items() if (maps := _maps(group)) is not None}
-
-    def draw(figure: "Figure") -> None:
-        axes = figure.subplots(1, max(1, len(found)), squeeze=False)[0]
-        for axis, (name, maps) in zip(axes, found.items(), strict=False):
-            spread = maps.std(axis=0, ddof=1)
-            image = show_map(axis, spread, name, cmap="viridis", vmin=0, vmax=0.1)
-            figure.colorbar(image, ax=axis, label="SD, mm")
-
-    return Picture(
-        name="invariance",
-        caption="SD of thickness over the motions at each point of the sheet, mm.",
-        draw=draw,
-        size=(9.0, 3.2),
-    )
-
-
-_TEXT = """\
-One spiral of 2.0 mm ± 15 % in voxels of 0.4 mm. First in random positions: the phantom moves and
-the grid stays, so that every position gives other voxels. Motions are uniform over all rotations
-with shifts of up to 20 mm, and, as subjects lie in a scanner, of up to 25° and 2 mm. Then the very
-same voxels mirrored (a left hemisphere becomes a right one) and stored in another order; so, too,
-real labels.
-"""
+    axes = figure.subplots(1, max(1, len(found)), squeeze=False)[0]
+    for axis, (name, maps) in zip(axes, found.items(), strict=False):
+        spread = maps.std(axis=0, ddof=1)
+        image = show_map(axis, spread, name, cmap="viridis", vmin=0, vmax=0.1)
+        figure.colorbar(image, ax=axis, label="SD, mm")

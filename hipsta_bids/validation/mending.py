@@ -1,6 +1,6 @@
 """What labels lack or have too much, planted: cavities, ragged ends, and an uncus."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -22,17 +22,18 @@ from hipsta_bids.validation.cases import (
     run_groups,
     truth_at,
 )
-from hipsta_bids.validation.damage import Position, make_defect
+from hipsta_bids.validation.damage import Injury, make_defect
 from hipsta_bids.validation.defects import (
     MAX_SHIFT,
     MAX_WRONG,
     VOXEL,
     WRONG,
     Damage,
+    Trial,
     compare,
     site_of,
 )
-from hipsta_bids.validation.report import Cell, Cells, Suite, Table
+from hipsta_bids.validation.report import Cell, Cells, Content, suite, table
 
 LAYERED = tuple(
     PhantomSpec(kind=kind, thickness=2.0, length=12.0, layer_thickness=0.6)
@@ -41,16 +42,13 @@ LAYERED = tuple(
 PLAIN = tuple(replace(spec, layer_thickness=0.0) for spec in LAYERED)
 """Without the molecular layer that the others have."""
 
-#: Kind, size (see the kind's description) and position.
-Planted = tuple[str, float, Position]
-
-CAVITIES: tuple[Planted, ...] = (
+CAVITIES: tuple[Injury, ...] = (
     ("vessel", 0.8, (0.7, 0.5)),
     ("cyst", 1.0, (0.65, 0.4)),
     ("stratum", 6.0, (0.65, 0.5)),
 )
-RAGGED: tuple[Planted, ...] = (("ragged-end", 1.0, (0.5, 0.0)), ("ragged-end", 2.5, (0.3, 0.0)))
-UNCUS: tuple[Planted, ...] = tuple(
+RAGGED: tuple[Injury, ...] = (("ragged-end", 1.0, (0.5, 0.0)), ("ragged-end", 2.5, (0.3, 0.0)))
+UNCUS: tuple[Injury, ...] = tuple(
     (kind, reach, (0.0, 1.0)) for kind, reach in product(("uncus", "attached-uncus"), (1.5, 3.5))
 )
 
@@ -58,24 +56,6 @@ MAX_MEAN = 0.02
 """mm, change of the mean thickness by what was mended."""
 FAR = 2.0
 """mm behind the anterior end, from which on an uncus is warned of."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Trial:
-    """One body with something planted."""
-
-    body: ValidationBody
-    planted: Planted
-    mended: bool = True
-    """False: what lost its label is labeled as tissue outside, and stays a hole."""
-
-    @property
-    def name(self) -> str:
-        """Of the body, for people."""
-        if isinstance(self.body, PhantomSpec):
-            layer = ", layer" if self.body.layer_thickness else ""
-            return f"{self.body.kind}{layer}"
-        return f"labels {self.body.subject} {self.body.hemi}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,50 +82,40 @@ class Outcome:
         return (self.damage.near_wrong + self.damage.far_wrong) / self.damage.columns
 
 
-def run(full: bool, labels: Path | None = None) -> Suite:
+@suite("mending")
+def run(full: bool, labels: Path | None = None) -> Iterator[Content]:
     """Plant what has to be mended into phantoms and segmentations, and measure them."""
-    real: list[ValidationBody] = []
-    if labels is not None:
-        fine = fine_segmentations(labels, VOXEL)
-        real = list(fine[::2] if full else fine[:1])
-    bodies = [*(LAYERED if full else LAYERED[:1]), *real]
-    some = slice(None) if full else slice(-1, None)
+    fine = fine_segmentations(labels, VOXEL)
+    some = slice(None if full else -1, None)
+    bodies: list[ValidationBody] = [*LAYERED[: None if full else 1]]
+    bodies += fine[::2] if full else fine[:1]
     hollow = [
-        Trial(body=body, planted=planted, mended=mended)
+        Trial(body=body, injury=injury, mended=mended)
         for body in (*bodies, *(PLAIN[1:] if full else ()))
-        for planted in CAVITIES[some]
+        for injury in CAVITIES[some]
         for mended in (True, False)
     ]
-    ragged = [Trial(body=body, planted=planted) for body in bodies for planted in RAGGED[some]]
-    beside = [
-        Trial(body=body, planted=planted)
-        for body in (PLAIN if full else LAYERED[:1])
-        for planted in UNCUS[some]
-    ]
+    ragged = [Trial(body=body, injury=injury) for body in bodies for injury in RAGGED[some]]
+    front = PLAIN if full else LAYERED[:1]
+    beside = [Trial(body=body, injury=injury) for body in front for injury in UNCUS[some]]
     results = run_groups(measure_trial, {"hollow": hollow, "ragged": ragged, "beside": beside})
-    return Suite(
-        name="mending",
-        title="Mended labels",
-        text=_TEXT.strip() + left_out(labels),
-        tables=(
-            _cavities(hollow, results["hollow"]),
-            _ragged(ragged, results["ragged"]),
-            _uncus(beside, results["beside"]),
-        ),
-    )
+    yield _cavities(hollow, results["hollow"])
+    yield _ragged(ragged, results["ragged"])
+    yield _uncus(beside, results["beside"])
+    yield left_out(labels)
 
 
 def measure_trial(trial: Trial) -> Outcome:
     """Measure a body with something planted, and compare it with the one as it was."""
-    kind, size, position = trial.planted
     volume, hemi, reference = measure_reference(trial.body, VOXEL)
-    defect = make_defect(site_of(trial.body), kind, size, position)
+    defect = make_defect(site_of(trial.body), *trial.injury)
     labels = defect.volume
     if not trial.mended:
         hole = labels.tissue != volume.tissue
         labels = replace(labels, tissue=np.where(hole, np.uint8(Tissue.OTHER), labels.tissue))
     maps = measure_body(labels, hemi)
     voxel = abs(float(np.linalg.det(volume.affine[:3, :3])))
+    kind = trial.injury[0]
     found = {"ragged-end": voxel * maps.qc["end_voxels_inside"]}
     found |= dict.fromkeys(("uncus", "attached-uncus"), maps.qc["uncus_mm3"])
     return Outcome(
@@ -177,7 +147,7 @@ def _same_plane(volume: LabelVolume, hemi: str, maps: HemisphereMaps) -> float:
 
 def _truth(trial: Trial, reference: HemisphereMaps) -> HemisphereMaps:
     """Put the known thickness of a phantom into its map, for cavities; real ones stay."""
-    if not (isinstance(trial.body, PhantomSpec) and trial.planted in CAVITIES):
+    if not (isinstance(trial.body, PhantomSpec) and trial.injury in CAVITIES):
         return reference
     middle = reference.sheet.points[:, :, reference.sheet.middle]
     truth, inside = truth_at(Phantom(trial.body), middle)
@@ -185,34 +155,31 @@ def _truth(trial: Trial, reference: HemisphereMaps) -> HemisphereMaps:
     return replace(reference, maps={**reference.maps, "thickness": thickness})
 
 
-def _name(trial: Trial) -> dict[str, Cell]:
-    kind, size, _ = trial.planted
-    return {"body": trial.name, "planted": kind, "size, mm": f"{size:g}"}
-
-
-def _lost(trials: Sequence[Trial], results: Sequence[Outcome | Refusal]) -> str:
-    """List refusals, but for what some labels have no room for."""
-    return refusal_notes(
-        {
-            f"{t.name}, {t.planted[0]}": [r]
-            for t, r in zip(trials, results, strict=True)
-            if not _empty(r)
-        }
-    )
-
-
 def _empty(result: Outcome | Refusal) -> bool:
     """Whether there was nothing to be planted, such as a layer that a protocol lacks."""
     return isinstance(result, Refusal) and result.reason == "defect-empty"
 
 
-def _cavities(trials: Sequence[Trial], results: Sequence[Outcome | Refusal]) -> Table:
-    rows: list[Cells] = []
-    for k in range(0, len(trials), 2):
-        mended, hollow = results[k : k + 2]
+def _name(trial: Trial) -> dict[str, Cell]:
+    kind, size, _ = trial.injury
+    return {"body": trial.name, "planted": kind, "size, mm": f"{size:g}"}
+
+
+def _lost(trials: Sequence[Trial], results: Sequence[Outcome | Refusal]) -> str:
+    """List refusals, but for what some labels have no room for."""
+    pairs = zip(trials, results, strict=True)
+    return refusal_notes({f"{t.name}, {t.injury[0]}": [r] for t, r in pairs if not _empty(r)})
+
+
+@table("mending.cavities")
+def _cavities(
+    trials: Sequence[Trial], results: Sequence[Outcome | Refusal]
+) -> Iterator[Cells | str]:
+    """Trials come in pairs, mended and not."""
+    for trial, mended, hollow in zip(trials[::2], results[::2], results[1::2], strict=True):
         if _empty(mended):
             continue
-        cells, met = _name(trials[k]), False
+        cells, met = _name(trial), False
         if isinstance(mended, Outcome):
             met = mended.off <= MAX_WRONG and abs(mended.damage.mean) <= MAX_MEAN
             met &= mended.damage.status == Status.REPAIRED
@@ -230,14 +197,12 @@ def _cavities(trials: Sequence[Trial], results: Sequence[Outcome | Refusal]) -> 
                 "not mended: off": f"{hollow.off:.1%}",
                 "not mended: mean": f"{hollow.damage.mean:+.3f}",
             }
-        rows.append({**cells, "met": met})
-    return Table(
-        title="Cavities at the inner wall", rows=rows, notes=_CAVITY_NOTES + _lost(trials, results)
-    )
+        yield {**cells, "met": met}
+    yield _lost(trials, results)
 
 
-def _ragged(trials: Sequence[Trial], results: Sequence[Outcome | Refusal]) -> Table:
-    rows: list[Cells] = []
+@table("mending.ragged")
+def _ragged(trials: Sequence[Trial], results: Sequence[Outcome | Refusal]) -> Iterator[Cells | str]:
     for trial, result in zip(trials, results, strict=True):
         cells, met = _name(trial), False
         if isinstance(result, Outcome):
@@ -251,23 +216,19 @@ def _ragged(trials: Sequence[Trial], results: Sequence[Outcome | Refusal]) -> Ta
                 "off, same plane": f"{result.same_plane:.1%}",
                 "mean": f"{result.damage.mean:+.3f}",
             }
-        rows.append({**cells, "met": met})
-    return Table(
-        title="Tail labels that reach into the body",
-        rows=rows,
-        notes=_RAGGED_NOTES + _lost(trials, results),
-    )
+        yield {**cells, "met": met}
+    yield _lost(trials, results)
 
 
-def _uncus(trials: Sequence[Trial], results: Sequence[Outcome | Refusal]) -> Table:
-    rows: list[Cells] = []
+@table("mending.uncus")
+def _uncus(trials: Sequence[Trial], results: Sequence[Outcome | Refusal]) -> Iterator[Cells | str]:
     for trial, result in zip(trials, results, strict=True):
         cells, met = _name(trial), False
         if isinstance(result, Outcome):
             damage = result.damage
             met = result.found > 0 and damage.status == Status.REPAIRED and not damage.changed
             met &= not result.off and damage.shift <= MAX_SHIFT
-            met &= result.warned == (trial.planted[1] > FAR)
+            met &= result.warned == (trial.injury[1] > FAR)
             cells |= {
                 "volume, mm3": f"{result.planted:.1f}",
                 "left out": f"{result.found:.1f}",
@@ -277,41 +238,5 @@ def _uncus(trials: Sequence[Trial], results: Sequence[Outcome | Refusal]) -> Tab
                 "largest change, mm": damage.shift,
                 "changed by repairs": f"{damage.changed:.1%}",
             }
-        rows.append({**cells, "met": met})
-    return Table(
-        title="An uncus beside the front of the body",
-        rows=rows,
-        notes=_UNCUS_NOTES + _lost(trials, results),
-    )
-
-
-_TEXT = """\
-What real labels lack or have too much is planted, mended by the program, and the map compared with
-the right one: of phantoms with cavities the known thickness, else the map of the labels before.
-"""
-
-_CAVITY_NOTES = f"""\
-Vessels and cysts are tubes and balls at the inner wall, partly in the sheet and its molecular
-layer, partly in its interior, the dentate gyrus; a stratum is a part of the layer (size is its
-length). Found: with the cavities that real labels have anyway. Off: columns that differ by more
-than {WRONG:g} mm; mean: change of the mean thickness, mm. *Not mended*: the same voxels labeled as
-a tissue outside, which the program leaves alone. Targets: repaired, at most {MAX_WRONG:.0%} off,
-mean within {MAX_MEAN:g} mm. Where a protocol has the layer, a narrow cavity becomes layer as a
-whole: misses are vessels of which half lay in the interior, which makes the wall thicker there.
-Without a layer the same vessel is divided between both sides, and no column is off.
-"""
-
-_RAGGED_NOTES = f"""\
-A tongue of tail label reaches into the body (size is how far). Its voxels have to get the subfield
-of a neighbor, and would be a hole otherwise. Targets: handed over, at most {MAX_WRONG:.0%} off. The
-end plane is fitted to the labels and moves with the tongue, and all rows with it. *Same plane* is
-against the labels before, cut at the plane that moved: what is off there is not the plane's doing.
-"""
-
-_UNCUS_NOTES = f"""\
-A bar of CA2/3 medially of the body, from 2 mm before the anterior end to some way behind it (size),
-alone or attached by CA1. Targets: left out, repaired and not flagged, no column off, none moved by
-more than {MAX_SHIFT:g} mm, not counted among repairs' changes; and a warning if it begins more than
-{FAR:g} mm behind the end. What lies before the end is left out with the head. A miss is where the
-CA1 that attaches it stays at the medial edge.
-"""
+        yield {**cells, "met": met}
+    yield _lost(trials, results)

@@ -5,12 +5,13 @@ protocols. The limit of each flag is compared with quantiles of its statistic, a
 that did not set it.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
+from nibabel.affines import from_matvec
 from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
@@ -18,23 +19,33 @@ from scipy.spatial.transform import Rotation
 from hipsta_bids.errors import SettingsError
 from hipsta_bids.geometry.body import extract_body
 from hipsta_bids.geometry.digital import to_ras, voxel_points
-from hipsta_bids.inputs.search import InputRequest, find_hemispheres
 from hipsta_bids.phantom import PhantomSpec
 from hipsta_bids.settings import Settings
-from hipsta_bids.types import Float, HemisphereMaps, LabelVolume, Status
+from hipsta_bids.types import Float, LabelVolume, Status
 from hipsta_bids.validation.cases import (
+    MIRROR,
     Refusal,
     ValidationBody,
     attempt,
     hippunfold_beside,
     load_body,
+    longest_edge,
     measure_body,
     refusal_notes,
     run_cases,
+    segmentations,
+    turned,
 )
-from hipsta_bids.validation.damage import Position, Site, make_defect
-from hipsta_bids.validation.defects import PLAN, WRONG, Damage, compare, refused
-from hipsta_bids.validation.report import Cell, Cells, Suite, Table
+from hipsta_bids.validation.damage import Injury, Site, make_defect
+from hipsta_bids.validation.defects import (
+    PLAN,
+    WRONG,  # noqa: F401  (in texts)
+    Damage,
+    compare,
+    refused,
+)
+from hipsta_bids.validation.report import Cell, Cells, Content, Suite, suite, table
+from hipsta_bids.validation.thick_slices import FULL_VOXEL, PHANTOMS, slice_frame
 
 SEED = 3
 #: Voxels that usual protocols give: FreeSurfer; HSF and others on isotropic scans; ASHS at 7 T and
@@ -57,7 +68,6 @@ CRISP = 0.6
 """Voxels, SD of the Gaussian on the labels before they are drawn anew."""
 FINE = 0.6
 """mm; voxels without a longer edge are fine."""
-PHANTOM_VOXEL = 0.3
 WARPS_QUICK, WARPS_FULL = 1, 3
 
 MULTIPLES = (0.7, 0.85, 1.0, 1.2, 1.5)
@@ -94,9 +104,6 @@ CALIBRATED: Mapping[str, tuple[str, float]] = MappingProxyType(
     }
 )
 
-Injury = tuple[str, float, Position]
-"""Kind of damage, its size and position."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Specimen:
@@ -112,16 +119,15 @@ class Specimen:
     @property
     def brain(self) -> str:
         """Name of the brain, both sides and all namings of labels together."""
-        if isinstance(self.body, PhantomSpec):
-            return f"phantom {self.body.kind}"
-        return self.body.subject
+        body = self.body
+        return f"phantom {body.kind}" if isinstance(body, PhantomSpec) else body.subject
 
     @property
     def origin(self) -> str:
         """Name of labels and warp, whatever the voxels."""
-        if isinstance(self.body, PhantomSpec):
-            return f"{self.body.kind} {self.number}"
         body = self.body
+        if isinstance(body, PhantomSpec):
+            return f"{body.kind} {self.number}"
         return f"{body.subject} {body.hemi} {body.source} {self.number}"
 
 
@@ -138,7 +144,6 @@ class Member:
     """Longest edge of the voxels, mm."""
     margins: Mapping[str, float]
     """Statistic over limit by reason of the undamaged one."""
-    injuries: tuple[Injury, ...]
     damages: tuple[Damage, ...]
 
     @property
@@ -150,18 +155,12 @@ class Member:
 def run(full: bool, labels: Path | None = None) -> Suite:
     """Measure the population and count flags."""
     specimens = plan(find_bodies(labels), full)
-    results = run_cases(measure_specimen, specimens, timeout=TIMEOUT)
-    return describe(specimens, results)
+    return describe(specimens, run_cases(measure_specimen, specimens, timeout=TIMEOUT))
 
 
-def find_bodies(labels: Path | None) -> list[ValidationBody]:
+def find_bodies(labels: Path | None) -> Sequence[ValidationBody]:
     """Find segmentations of a dataset, and of ``hippunfold`` beside it; phantoms without one."""
-    if labels is None:
-        kinds = (("spiral", 2.0), ("tight", 1.6), ("arc", 1.4))
-        return [PhantomSpec(kind=k, thickness=t, variation=0.3) for k, t in kinds]
-    folders = [labels, *hippunfold_beside(labels)]
-    found = [item for path in folders for item in find_hemispheres(InputRequest(bids_dir=path))]
-    return [item for item in found if item.problem is None]
+    return segmentations(labels, *hippunfold_beside(labels)) if labels else PHANTOMS
 
 
 def plan(bodies: Sequence[ValidationBody], full: bool) -> list[Specimen]:
@@ -170,10 +169,8 @@ def plan(bodies: Sequence[ValidationBody], full: bool) -> list[Specimen]:
     order = np.random.default_rng(SEED).permutation(len(PLAN))
     specimens: list[Specimen] = []
     for body in bodies:
-        sizes: Sequence[tuple[float, float, float] | None] = (None,)
-        if is_fine(load_body(body, PHANTOM_VOXEL)[0]):
-            sizes = SIZES
-        ways = [(None, 0)] + [(size, 1 + n) for n in range(warps) for size in sizes]
+        sizes = SIZES if is_fine(load_body(body, FULL_VOXEL)[0]) else (None,)
+        ways = [(None, 0), *((size, 1 + n) for n in range(warps) for size in sizes)]
         for size, number in ways:
             injury = PLAN[order[len(specimens) % len(PLAN)]]
             specimens.append(Specimen(body=body, number=number, voxel=size, injuries=(injury,)))
@@ -182,7 +179,7 @@ def plan(bodies: Sequence[ValidationBody], full: bool) -> list[Specimen]:
 
 def is_fine(volume: LabelVolume) -> bool:
     """Whether labels can be drawn anew in other voxels."""
-    return bool(np.linalg.norm(volume.affine[:3, :3], axis=0).max() <= FINE)
+    return longest_edge(volume) <= FINE
 
 
 def measure_specimen(specimen: Specimen) -> Member:
@@ -190,34 +187,29 @@ def measure_specimen(specimen: Specimen) -> Member:
     volume, hemi = make_labels(specimen)
     maps = measure_body(volume, hemi)
     site = Site(volume, maps.sheet)
-    damages, done = [], []
-    for kind, size, position in specimen.injuries:
+    damages = []
+    for injury in specimen.injuries:
         try:
-            defect = make_defect(site, kind, size, position)
+            defect = make_defect(site, *injury)
         except SettingsError:  # too small for these voxels, or nothing there to damage
             continue
-        done.append((kind, size, position))
-        damages.append(_measured(defect.volume, hemi, maps, defect.changed))
+        found = attempt(lambda labels: measure_body(labels, hemi), defect.volume)
+        damages.append(
+            refused(found) if isinstance(found, Refusal) else compare(found, maps, defect.changed)
+        )
     return Member(
         brain=specimen.brain,
         origin=specimen.origin,
         mean=float(np.nanmean(maps.thickness)),
-        spacing=float(np.linalg.norm(volume.affine[:3, :3], axis=0).max()),
+        spacing=longest_edge(volume),
         margins=maps.qc["flag_margins"],
-        injuries=tuple(done),
         damages=tuple(damages),
     )
 
 
-def _measured(volume: LabelVolume, hemi: str, reference: HemisphereMaps, changed: Float) -> Damage:
-    """Measure damaged labels; a refusal is a result, too."""
-    found = attempt(lambda labels: measure_body(labels, hemi), volume)
-    return refused(found) if isinstance(found, Refusal) else compare(found, reference, changed)
-
-
 def make_labels(specimen: Specimen) -> tuple[LabelVolume, str]:
     """Draw the labels of a specimen; its hemisphere."""
-    volume, hemi = load_body(specimen.body, PHANTOM_VOXEL)
+    volume, hemi = load_body(specimen.body, FULL_VOXEL)
     if specimen.number == 0:
         return volume, hemi
     seed = (SEED, specimen.number, *map(ord, specimen.brain))
@@ -229,17 +221,15 @@ def make_labels(specimen: Specimen) -> tuple[LabelVolume, str]:
         shape, affine = volume.tissue.shape, volume.affine
     else:
         shape, affine = _grid(volume, specimen.voxel, pose)
-    points = _centers(shape, affine)
+    points = to_ras(np.moveaxis(np.indices(shape), 0, -1), affine)
     warp = smooth_warp(voxel_points(volume.tissue > 0, volume.affine), sd, scale, generator)
-    moved = points + warp(points)
-    index = to_ras(moved, np.linalg.inv(volume.affine))
+    index = to_ras(points + warp(points), np.linalg.inv(volume.affine))
     if specimen.voxel is None:
         across = int(np.linalg.norm(volume.affine[:3, :3], axis=0).argmax())
         index[..., across] = np.indices(shape)[across]
     drawn = redraw(volume, index, affine)
     if mirrored:
-        mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
-        return replace(drawn, affine=mirror @ drawn.affine), "LR"[hemi == "L"]
+        return replace(drawn, affine=MIRROR @ drawn.affine), "LR"[hemi == "L"]
     return drawn, hemi
 
 
@@ -274,30 +264,18 @@ def _grid(
 ) -> tuple[tuple[int, ...], Float]:
     """Shape and affine of a turned grid round all labels; slices lie across the long axis."""
     if max(voxel) <= FINE:
-        turn = Rotation.from_euler("xyz", generator.uniform(-TURN, TURN, 3), degrees=True)
-        frame = turn.as_matrix()
+        frame = turned(generator, TURN)
     else:
-        axis = extract_body(volume, Settings().body).ends.axis
-        aside = np.cross(axis, [0.0, 0.0, 1.0])
-        aside /= np.linalg.norm(aside)
         about = generator.uniform(0, np.pi)
         lean = np.deg2rad(TILT) * generator.standard_normal()
         tilt = Rotation.from_rotvec(lean * np.array([np.cos(about), np.sin(about), 0.0]))
-        frame = np.column_stack([aside, np.cross(axis, aside), axis]) @ tilt.as_matrix()
+        frame = slice_frame(extract_body(volume, Settings().body).ends.axis) @ tilt.as_matrix()
     matrix = frame * np.array(voxel)
     inside = voxel_points(volume.tissue > 0, volume.affine) @ np.linalg.inv(matrix).T
     room = 4.0 / np.array(voxel)
     low = np.floor(inside.min(axis=0) - room) + generator.random(3)
     shape = np.ceil(inside.max(axis=0) + room - low).astype(int)
-    affine = np.eye(4)
-    affine[:3, :3], affine[:3, 3] = matrix, matrix @ low
-    return tuple(int(n) for n in shape), affine
-
-
-def _centers(shape: tuple[int, ...], affine: Float) -> NDArray[np.float64]:
-    """Centers (I, J, K, 3) of voxels, RAS mm."""
-    index = np.moveaxis(np.indices(shape), 0, -1)
-    return np.asarray(to_ras(index, affine))
+    return tuple(int(n) for n in shape), from_matvec(matrix, matrix @ low)
 
 
 def redraw(volume: LabelVolume, index: Float, affine: Float) -> LabelVolume:
@@ -317,7 +295,7 @@ def redraw(volume: LabelVolume, index: Float, affine: Float) -> LabelVolume:
         where = at[:, here]
         best = np.full(where.shape[1], -1.0)
         label = np.zeros(where.shape[1], dtype=np.intp)
-        sharp = np.where(np.array(_edges(volume.affine)) > FINE, 0.0, CRISP)
+        sharp = np.where(np.linalg.norm(volume.affine[:3, :3], axis=0) > FINE, 0.0, CRISP)
         for kind in range(len(kinds)):
             soft = ndimage.gaussian_filter((number == kind).astype(np.float32), sharp)
             value = ndimage.map_coordinates(soft, where, order=1)
@@ -332,12 +310,10 @@ def redraw(volume: LabelVolume, index: Float, affine: Float) -> LabelVolume:
     )
 
 
-def _edges(affine: Float) -> list[float]:
-    edges: list[float] = np.linalg.norm(affine[:3, :3], axis=0).tolist()
-    return edges
-
-
-def describe(specimens: Sequence[Specimen], results: Sequence[Member | Refusal]) -> Suite:
+@suite("population")
+def describe(
+    specimens: Sequence[Specimen], results: Sequence[Member | Refusal]
+) -> Iterator[Content]:
     """Make the tables of a population that was measured."""
     members = [result for result in results if isinstance(result, Member)]
     names = {
@@ -346,17 +322,10 @@ def describe(specimens: Sequence[Specimen], results: Sequence[Member | Refusal])
         for s, result in zip(specimens, results, strict=True)
         if isinstance(result, Refusal)
     }
-    return Suite(
-        name="population",
-        title="Flags on a population",
-        text=_TEXT,
-        tables=(
-            _counts(members),
-            _curves(members),
-            _quantiles(members),
-            _left_out(members, refusal_notes(names)),
-        ),
-    )
+    yield _counts(members)
+    yield _curves(members)
+    yield _quantiles(members)
+    yield _left_out(members, refusal_notes(names))
 
 
 def set_limits(members: Sequence[Member]) -> dict[str, float]:
@@ -390,43 +359,31 @@ def _percent(hits: Sequence[object]) -> str | None:
     return f"{_share(hits):.1%} of {len(hits)}" if len(hits) else None
 
 
-def _counts(members: Sequence[Member]) -> Table:
+@table("population.present")
+def _counts(members: Sequence[Member]) -> Iterator[Cells]:
     """At the present limits, by size of voxels."""
     finest = {m.origin: m.mean for m in sorted(members, key=lambda m: -m.spacing)}
-    rows: list[Cells] = []
     for spacing in sorted({round(m.spacing, 2) for m in members}):
         group = [m for m in members if round(m.spacing, 2) == spacing]
+        flagged = [is_flagged(m.margins, {}) for m in group]
+        off = [abs(m.mean - finest[m.origin]) > MAX_MEAN for m in group]
         damages = [d for m in group for d in m.damages]
         silent = [s for d in damages if (s := is_silent(d, {})) is not None]
-        rows.append(
-            {
-                "longest edge, mm": f"{spacing:g}",
-                "undamaged, flagged": _percent([is_flagged(m.margins, {}) for m in group]),
-                "of these, off by > 0.1 mm": sum(
-                    is_flagged(m.margins, {}) and abs(m.mean - finest[m.origin]) > MAX_MEAN
-                    for m in group
-                ),
-                "accepted, off by > 0.1 mm": sum(
-                    not is_flagged(m.margins, {}) and abs(m.mean - finest[m.origin]) > MAX_MEAN
-                    for m in group
-                ),
-                "damaged, refused": _percent([d.status == Status.FAILED for d in damages]),
-                "damaged, flagged": _percent([d.status == Status.FLAGGED for d in damages]),
-                "accepted, wrong far away": _percent(silent),
-            }
-        )
-    return Table(
-        title="Present limits",
-        rows=rows,
-        notes=f"Off: the mean thickness differs by more than {MAX_MEAN:g} mm from that in the "
-        "finest voxels of the same labels and warp; then a flag is no false one.",
-    )
+        yield {
+            "longest edge, mm": f"{spacing:g}",
+            "undamaged, flagged": _percent(flagged),
+            "of these, off by > 0.1 mm": int(np.sum(np.array(off) & flagged)),
+            "accepted, off by > 0.1 mm": int(np.sum(np.array(off) > flagged)),
+            "damaged, refused": _percent([d.status == Status.FAILED for d in damages]),
+            "damaged, flagged": _percent([d.status == Status.FLAGGED for d in damages]),
+            "accepted, wrong far away": _percent(silent),
+        }
 
 
-def _curves(members: Sequence[Member]) -> Table:
+@table("population.curves")
+def _curves(members: Sequence[Member]) -> Iterator[Cells | str]:
     """By flag: how often it is raised at multiples of its limit, undamaged and damaged."""
     reasons = sorted({r for m in members for r, v in m.margins.items()})
-    rows: list[Cells] = []
     for kind in MAX_FALSE:
         group = [m for m in members if m.kind == kind]
         damages = [d for m in group for d in m.damages if d.margins]
@@ -441,18 +398,16 @@ def _curves(members: Sequence[Member]) -> Table:
                 cells: dict[str, Cell] = {"voxels": kind, "flag": reason}
                 for k, (false, found) in zip(MULTIPLES, shares, strict=True):
                     cells[f"x {k:g}"] = f"{false:.1%} / {found:.0%}"
-                rows.append(cells)
-    return Table(
-        title="Flags on undamaged / damaged hemispheres at multiples of the present limit",
-        rows=rows,
-        notes=f"Undamaged: {len(members)}. Damaged ones that were measured count; a flag is not "
-        "expected for each damage. Flags that are missing were never raised.",
+                yield cells
+    yield (
+        f"Undamaged: {len(members)}. Damaged ones that were measured count; a flag is not "
+        "expected for each damage. Flags that are missing were never raised."
     )
 
 
-def _quantiles(members: Sequence[Member]) -> Table:
+@table("population.quantiles")
+def _quantiles(members: Sequence[Member]) -> Iterator[Cells]:
     checks, limits = Settings().checks, set_limits(members)
-    rows: list[Cells] = []
     for reason in sorted({reason for m in members for reason in m.margins}):
         cells: dict[str, Cell] = {"flag": reason}
         for kind in MAX_FALSE:
@@ -468,75 +423,44 @@ def _quantiles(members: Sequence[Member]) -> Table:
                 "present": ", ".join(f"{value:g}" for value in present),
                 "asked for": asked,
             }
-        rows.append(cells)
-    return Table(
-        title="Quantiles of undamaged statistics, multiples of the present limits",
-        rows=rows,
-        notes=f"Asked for: the quantile {QUANTILE:g} over all voxels, times {ROOM:g}, but no less "
-        "than what matters to a map. Other limits do not follow the population.",
-        digits=2,
-    )
+        yield cells
 
 
-def _left_out(members: Sequence[Member], notes: str) -> Table:
+@table("population.left_out")
+def _left_out(members: Sequence[Member], refused: str) -> Iterator[Cells | str]:
     """Judge limits on brains that did not set them."""
-    rows: list[Cells] = []
     for kind, most in MAX_FALSE.items():
-        false: list[tuple[bool, bool]] = []
-        silent: list[tuple[bool | None, bool | None]] = []
+        every: dict[str, tuple[list[bool], list[bool]]] = {
+            name: ([], []) for name in ("present", "quantile")
+        }
         for brain in dict.fromkeys(m.brain for m in members):
             others = [m for m in members if m.brain != brain]
-            limits = set_limits(others) if others else {}
             group = [m for m in members if m.brain == brain and m.kind == kind]
-            flags = [(is_flagged(m.margins, {}), is_flagged(m.margins, limits)) for m in group]
-            wrong = [(is_silent(d, {}), is_silent(d, limits)) for m in group for d in m.damages]
-            false, silent = false + flags, silent + wrong
-            rows.append(_judged(brain, kind, flags, wrong))
-        rows.append(
-            {
-                **_judged("all", kind, false, silent),
-                "targets": f"≤ {most:.0%}, ≤ {MAX_SILENT:.0%}",
-                "present met": bool(
-                    _share([a for a, _ in false]) <= most
-                    and not _share([a for a, _ in silent if a is not None]) > MAX_SILENT
-                ),
-                "quantile met": bool(
-                    _share([b for _, b in false]) <= most
-                    and not _share([b for _, b in silent if b is not None]) > MAX_SILENT
-                ),
-            }
-        )
-    return Table(
-        title="Limits judged on brains left out",
-        rows=rows,
-        notes="Quantile: limits as the other brains ask for. Accepted "
-        f"and wrong: damaged, not refused or flagged, and more than {MAX_FAR:.0%} of the columns "
-        f"away from the damage off by > {WRONG:g} mm against the undamaged map of the same "
-        f"labels.{notes}",
-    )
+            asked = set_limits(others) if others else {}
+            judged = {"present": _judge(group, {}), "quantile": _judge(group, asked)}
+            for name, (false, silent) in judged.items():
+                every[name] = every[name][0] + false, every[name][1] + silent
+            yield {"brain": brain, "voxels": kind, **_judged(judged)}
+        met = {
+            f"{name} met": _share(false) <= most and not _share(silent) > MAX_SILENT
+            for name, (false, silent) in every.items()
+        }
+        targets = f"≤ {most:.0%}, ≤ {MAX_SILENT:.0%}"
+        yield {"brain": "all", "voxels": kind, **_judged(every), "targets": targets, **met}
+    yield refused
 
 
-def _judged(
-    brain: str,
-    kind: str,
-    false: Sequence[tuple[bool, bool]],
-    silent: Sequence[tuple[bool | None, bool | None]],
-) -> dict[str, Cell]:
-    cells: dict[str, Cell] = {"brain": brain, "voxels": kind}
-    for k, name in enumerate(("present limits", "quantile")):
-        cells[f"{name}: false flags"] = _percent([pair[k] for pair in false])
-        cells[f"{name}: accepted and wrong"] = _percent(
-            [pair[k] for pair in silent if pair[k] is not None]
-        )
+def _judge(group: Sequence[Member], limits: Mapping[str, float]) -> tuple[list[bool], list[bool]]:
+    """Who of the undamaged is flagged, and which of the damaged that are accepted is wrong."""
+    silent = [is_silent(damage, limits) for member in group for damage in member.damages]
+    flags = [is_flagged(member.margins, limits) for member in group]
+    return flags, [wrong for wrong in silent if wrong is not None]
+
+
+def _judged(found: Mapping[str, tuple[list[bool], list[bool]]]) -> dict[str, Cell]:
+    cells: dict[str, Cell] = {}
+    for name, title in (("present", "present limits"), ("quantile", "quantile")):
+        false, silent = found[name]
+        cells[f"{title}: false flags"] = _percent(false)
+        cells[f"{title}: accepted and wrong"] = _percent(silent)
     return cells
-
-
-_TEXT = f"""\
-Segmentations are warped smoothly (standard deviation {WARP_SD[0]:g} to {WARP_SD[1]:g} mm along each
-axis at scales of {WARP_SCALE[0]:g} to {WARP_SCALE[1]:g} mm), turned by up to {TURN:g}° or, in
-slices, tilted by {TILT:g}° (standard deviation), mirrored, and drawn in the voxels of usual
-protocols; each also as it is. Labels with thick slices keep their own, and are warped within them.
-Each is measured undamaged, and with damages of the suite *Damaged labels*, of all kinds and
-severities in turn; the map of the same labels before is the truth. With `--labels DIR`, a folder
-`hippunfold` beside it is measured, too; without, phantoms.
-"""

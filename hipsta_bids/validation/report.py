@@ -3,13 +3,15 @@
 import platform
 import re
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import wraps
 from importlib import import_module, resources
 from importlib.metadata import version
+from inspect import signature
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec
 
 from hipsta_bids import __version__
 from hipsta_bids.errors import UsageError, did_you_mean
@@ -141,6 +143,93 @@ class Suite:
         return sum(table.missed for table in self.tables)
 
 
+Given = ParamSpec("Given")
+
+Content = Table | Picture | str | Mapping[str, object]
+"""What suites are made of: tables, figures, more text, and numbers for the text."""
+
+
+def table(
+    name: str,
+) -> Callable[[Callable[Given, Iterable[Cells | str]]], Callable[Given, Table]]:
+    """Make a table of the rows that a function yields; texts that it yields follow the notes.
+
+    ``name`` is ``suite.table`` in ``suites.toml``, which has title and notes. What these name in
+    braces are constants of the function's module, or its arguments.
+    """
+    suite_name, _, key = name.partition(".")
+    texts = _TABLE[suite_name]["tables"][key]
+
+    def decorate(rows: Callable[Given, Iterable[Cells | str]]) -> Callable[Given, Table]:
+        @wraps(rows)
+        def make(*args: Given.args, **kwargs: Given.kwargs) -> Table:
+            values = rows.__globals__ | signature(rows).bind(*args, **kwargs).arguments
+            found = list(rows(*args, **kwargs))
+            return Table(
+                title=texts["title"].format_map(values),
+                rows=[row for row in found if not isinstance(row, str)],
+                notes=texts.get("notes", "").format_map(values)
+                + "".join(text for text in found if isinstance(text, str)),
+                digits=texts.get("digits", 3),
+            )
+
+        return make
+
+    return decorate
+
+
+def suite(name: str) -> Callable[[Callable[Given, Iterable[Content]]], Callable[Given, Suite]]:
+    """Make a suite of the tables, figures, texts and numbers that a function yields.
+
+    Title and text are those of ``suites.toml``; texts that are yielded follow. What the text names
+    in braces are constants of the function's module, or numbers that are yielded.
+    """
+    texts = _TABLE[name]
+
+    def decorate(run: Callable[Given, Iterable[Content]]) -> Callable[Given, Suite]:
+        @wraps(run)
+        def make(*args: Given.args, **kwargs: Given.kwargs) -> Suite:
+            found, values = list(run(*args, **kwargs)), dict(run.__globals__)
+            for numbers in found:
+                if isinstance(numbers, Mapping):
+                    values |= numbers
+            return Suite(
+                name=name,
+                title=texts["title"],
+                text=texts["text"].format_map(values)
+                + "".join(text for text in found if isinstance(text, str)),
+                tables=tuple(one for one in found if isinstance(one, Table)),
+                pictures=tuple(one for one in found if isinstance(one, Picture)),
+            )
+
+        return make
+
+    return decorate
+
+
+def picture(
+    name: str,
+) -> Callable[[Callable[Concatenate["Figure", Given], None]], Callable[Given, Picture]]:
+    """Make a figure of a function that draws into an empty one, with the texts of its suite."""
+    texts = _TABLE[name]["picture"]
+
+    def decorate(
+        draw: Callable[Concatenate["Figure", Given], None],
+    ) -> Callable[Given, Picture]:
+        def make(*args: Given.args, **kwargs: Given.kwargs) -> Picture:
+            width, height = texts["size"]
+            return Picture(
+                name=name,
+                caption=texts["caption"],
+                draw=lambda figure: draw(figure, *args, **kwargs),
+                size=(width, height),
+            )
+
+        return make
+
+    return decorate
+
+
 def run_suite(name: str, *, full: bool, labels: Path | None = None) -> Suite:
     """Run one suite."""
     module, function = SUITES[name].split(":")
@@ -180,24 +269,15 @@ def validate(
 def page(suites: Sequence[Suite], *, full: bool, labels: bool = False) -> str:
     """Write the page in Markdown."""
     names = [suite.name for suite in suites]
-    some = "" if names == list(SUITES) else " --suite " + " ".join(names)
-    command = (
-        "hipsta-bids validate"
-        + (" --full" if full else "")
-        + some
-        + (" --labels BIDS_DIR" if labels else "")
-    )
+    command = "hipsta-bids validate" + (" --full" if full else "")
+    command += "" if names == list(SUITES) else " --suite " + " ".join(names)
+    command += " --labels BIDS_DIR" if labels else ""
     python = f"Python {platform.python_version()}"
     libraries = ", ".join([python, *(f"{name} {version(name)}" for name in _LIBRARIES)])
     counts: list[Cells] = [
-        {
-            "suite": suite.title,
-            "table": table.title,
-            "targets": table.targets,
-            "missed": table.missed,
-        }
-        for suite in suites
-        for table in suite.tables or (Table(title="left out", rows=()),)
+        {"suite": one.title, "table": t.title, "targets": t.targets, "missed": t.missed}
+        for one in suites
+        for t in one.tables or (Table(title="left out", rows=()),)
     ]
     intro = (
         f"Written by `{command}` of hipsta_bids {__version__} ({libraries}). The same command"
@@ -280,12 +360,9 @@ def _figure(picture: Picture) -> str:
 
 
 def _section(suite: Suite) -> str:
-    parts = [f"## {suite.title}"]
-    if suite.text:
-        parts.append(suite.text.strip())
-    parts += [markdown(table) for table in suite.tables]
-    parts += [_figure(picture) for picture in suite.pictures]
-    return "\n\n".join(parts)
+    text = [suite.text.strip()] if suite.text else []
+    shown = [*map(markdown, suite.tables), *map(_figure, suite.pictures)]
+    return "\n\n".join([f"## {suite.title}", *text, *shown])
 
 
 def markdown(table: Table) -> str:

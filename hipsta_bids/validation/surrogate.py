@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hipsta_bids.derivatives import dataset, hemisphere
-from hipsta_bids.derivatives.hemisphere import ResultPlace, read_sheet
+from hipsta_bids.derivatives import dataset
+from hipsta_bids.derivatives.hemisphere import ResultPlace, format_column, read_sheet
 from hipsta_bids.derivatives.names import HemisphereName
 from hipsta_bids.errors import (
     ExitCode,
@@ -28,7 +28,6 @@ from hipsta_bids.geometry.surrogate import (
 )
 from hipsta_bids.inputs.labels import read_label_volume
 from hipsta_bids.inputs.scan import HemisphereInput
-from hipsta_bids.inputs.search import InputRequest, find_hemispheres
 from hipsta_bids.io import files
 from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.settings import Settings
@@ -39,9 +38,10 @@ from hipsta_bids.validation.cases import (
     load_body,
     measure_body,
     run_cases,
+    segmentations,
     truth_at,
 )
-from hipsta_bids.validation.report import Cell, Cells, Picture, Suite, Table
+from hipsta_bids.validation.report import Cell, Cells, Content, picture, suite, table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -133,13 +133,11 @@ def _measure(item: HemisphereInput, place: ResultPlace, settings: Settings) -> l
             if profile.sampling == "proportional":
                 lines.append(_line(profile, mesh))
     files.write_tsv(place.path("surrogate"), list(COLUMNS), rows)
-    files.write_json(
-        place.path("surrogate_sidecar"),
-        {
-            name: {"Description": text} | ({"Units": unit} if unit else {})
-            for name, (text, unit) in COLUMNS.items()
-        },
-    )
+    described = {
+        name: {"Description": text} | ({"Units": unit} if unit else {})
+        for name, (text, unit) in COLUMNS.items()
+    }
+    files.write_json(place.path("surrogate_sidecar"), described)
     return lines
 
 
@@ -153,16 +151,8 @@ def _read_sheet(place: ResultPlace) -> tuple[Float, Float] | None:
 
 
 def _rows(profile: SurrogateProfile, mesh: Float) -> Iterator[list[str]]:
-    columns = [
-        hemisphere.format_column(values, _DIGITS)
-        for values in (
-            profile.fraction,
-            profile.distance,
-            *profile.points.T,
-            profile.thickness,
-            mesh,
-        )
-    ]
+    places = (profile.fraction, profile.distance, *profile.points.T)
+    columns = (format_column(column, _DIGITS) for column in (*places, profile.thickness, mesh))
     for number, cells in enumerate(zip(*columns, strict=True), start=1):
         yield [f"{profile.position:g}", profile.sampling, str(number), *cells]
 
@@ -178,7 +168,7 @@ def _line(profile: SurrogateProfile, mesh: Float) -> str:
     )
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class Compared:
     """Thickness at the same points, by slice; all arrays (slices, N), mm."""
 
@@ -194,24 +184,18 @@ class Compared:
     """Of slices that the surrogate refused."""
 
 
-def run(full: bool, labels: Path | None = None) -> Suite:
+@suite("surrogate")
+def run(full: bool, labels: Path | None = None) -> Iterator[Content]:
     """Compare on phantoms and, where there are any, on real segmentations."""
-    bodies: list[ValidationBody] = list(PHANTOMS if full else PHANTOMS[:1])
-    n_phantoms = len(bodies)
-    if labels is not None:
-        bodies += [
-            item for item in find_hemispheres(InputRequest(bids_dir=labels)) if not item.problem
-        ]
+    phantoms = PHANTOMS[: None if full else 1]
+    bodies: list[ValidationBody] = [*phantoms, *(segmentations(labels) if labels else ())]
     results = run_cases(compare_body, bodies)
     shown = [(_name(b), r) for b, r in zip(bodies, results, strict=True) if isinstance(r, Compared)]
-    pictured = [*shown[:2], *shown[n_phantoms:][:2]]
-    return Suite(
-        name="surrogate",
-        title="Thickness without a mesh",
-        text=_TEXT.format(slices=", ".join(f"{p:.0%}" for p in POSITIONS)),
-        tables=(_table(bodies, results),),
-        pictures=(_picture(pictured),) if pictured else (),
-    )
+    pictured = [*shown[:2], *shown[len(phantoms) :][:2]]
+    yield _table(bodies, results)
+    if pictured:
+        yield _picture(pictured)
+    yield {"slices": ", ".join(f"{p:.0%}" for p in POSITIONS)}
 
 
 def compare_body(body: ValidationBody) -> Compared:
@@ -234,14 +218,8 @@ def compare_body(body: ValidationBody) -> Compared:
         columns.append((even.fraction, even.thickness, mesh, _truth(phantom, even.points)))
         others.append((steps.fraction, steps.thickness))
     stacked = np.array(columns).reshape(len(columns), 4, settings.sheet.x_nodes)
-    return Compared(
-        fraction=stacked[:, 0],
-        surrogate=stacked[:, 1],
-        mesh=stacked[:, 2],
-        truth=stacked[:, 3],
-        equidistant=tuple(others),
-        problems=tuple(problems),
-    )
+    fraction, thickness, mesh, truth = np.moveaxis(stacked, 1, 0)
+    return Compared(fraction, thickness, mesh, truth, tuple(others), tuple(problems))
 
 
 def _truth(phantom: Phantom | None, points: Float) -> Float:
@@ -258,8 +236,10 @@ def _name(body: ValidationBody) -> str:
     return f"sub-{body.subject} {body.hemi} ({body.protocol.name})"
 
 
-def _table(bodies: Sequence[ValidationBody], results: Sequence[Compared | Refusal]) -> Table:
-    rows: list[Cells] = []
+@table("surrogate.mesh")
+def _table(
+    bodies: Sequence[ValidationBody], results: Sequence[Compared | Refusal]
+) -> Iterator[Cells]:
     for body, result in zip(bodies, results, strict=True):
         is_phantom = isinstance(body, PhantomSpec)
         cells: dict[str, Cell] = {"body": _name(body)}
@@ -280,48 +260,23 @@ def _table(bodies: Sequence[ValidationBody], results: Sequence[Compared | Refusa
                 "slope on truth": true.slope if is_phantom else None,
             }
         cells["target"] = f"r ≥ {LEAST_CORRELATION}" if is_phantom else "n/a"
-        rows.append({**cells, "met": met if is_phantom else None})
-    return Table(title="Surrogate against mesh", rows=rows, notes=_NOTES)
+        yield {**cells, "met": met if is_phantom else None}
 
 
-def _picture(shown: Sequence[tuple[str, Compared]]) -> Picture:
-    def draw(figure: "Figure") -> None:
-        axes = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
-        for axis, (name, result) in zip(axes, shown, strict=True):
-            k = len(result.surrogate) // 2
-            x = result.fraction[k]
-            if np.isfinite(result.truth[k]).any():
-                axis.plot(x, result.truth[k], color="0.6", linewidth=3, label="truth")
-            axis.plot(x, result.mesh[k], "C0-", label="mesh")
-            axis.plot(x, result.surrogate[k], "C1o", markersize=3, label="proportional")
-            axis.plot(*result.equidistant[k], "C3+", markersize=5, label="equidistant")
-            axis.set_title(name, fontsize="small")
-            axis.set_xlabel("position on the medial axis")
-        axes[0].set_ylim(bottom=0)
-        axes[0].set_ylabel("thickness, mm")
-        axes[0].legend(fontsize="small")
-
-    return Picture(
-        name="surrogate",
-        caption="Thickness from medial (0) to lateral (1) in the middle slice: of the mesh, and of"
-        " the surrogate with proportional and equidistant sampling. At the edges the closest points"
-        " lie on the rounded ends.",
-        draw=draw,
-        size=(3.0 * max(len(shown), 2), 3.2),
-    )
-
-
-_TEXT = """\
-`hipsta-bids surrogate` measures thickness in single slices from the medial axis of the labels and
-the closest points of their outline on both sides, without a mesh (here at {slices} of the body's
-length). It shares the labels with the mesh and nothing else: a thickening that both show lies in
-the labels, one that the mesh alone shows does not.
-"""
-
-_NOTES = """\
-Phantoms in voxels of 0.4 mm. At each point of the proportional sampling, the mesh's thickness is
-that of the mid-surface nearby. Slope: of the surrogate on the other, by least squares over all
-slices. The surrogate is measured in the plane of the slice: where the wall is oblique to it, as in
-real bodies, it reads more than a line straight through the wall. It repairs nothing: where labels
-touch across a fold it reads the sum of both walls, or finds a loop and refuses the slice.
-"""
+@picture("surrogate")
+def _picture(figure: "Figure", shown: Sequence[tuple[str, Compared]]) -> None:
+    figure.set_size_inches(3.0 * max(len(shown), 2), 3.2)
+    axes = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
+    for axis, (name, result) in zip(axes, shown, strict=True):
+        k = len(result.surrogate) // 2
+        x = result.fraction[k]
+        if np.isfinite(result.truth[k]).any():
+            axis.plot(x, result.truth[k], color="0.6", linewidth=3, label="truth")
+        axis.plot(x, result.mesh[k], "C0-", label="mesh")
+        axis.plot(x, result.surrogate[k], "C1o", markersize=3, label="proportional")
+        axis.plot(*result.equidistant[k], "C3+", markersize=5, label="equidistant")
+        axis.set_title(name, fontsize="small")
+        axis.set_xlabel("position on the medial axis")
+    axes[0].set_ylim(bottom=0)
+    axes[0].set_ylabel("thickness, mm")
+    axes[0].legend(fontsize="small")

@@ -1,10 +1,11 @@
 """Thick slices: bodies are resliced, measured and compared with full resolution."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from nibabel.affines import from_matvec
 from scipy.spatial.transform import Rotation
 
 from hipsta_bids.geometry.body import extract_body
@@ -18,9 +19,10 @@ from hipsta_bids.validation.cases import (
     measure_body,
     measure_reference,
     refusal_notes,
+    rms,
     run_cases,
 )
-from hipsta_bids.validation.report import Cell, Cells, Suite, Table
+from hipsta_bids.validation.report import Cell, Cells, Content, suite, table
 
 PIXEL = 0.4
 """mm, of the slices."""
@@ -56,6 +58,9 @@ PHANTOMS = (
 )
 
 
+_GROUP = ("bodies", "slices, mm", "tilt")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Trial:
     """One hemisphere in slices."""
@@ -65,6 +70,12 @@ class Trial:
     """Distance of slices, mm."""
     offset: float
     tilt: float
+
+    @property
+    def group(self) -> tuple[str, str, str]:
+        """What its rows are about: bodies, distance of slices in mm, and tilt."""
+        kind = "phantoms" if isinstance(self.body, PhantomSpec) else "labels"
+        return kind, f"{self.step:g}", f"{TILT if self.tilt else 0:g}°"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -82,7 +93,8 @@ class Outcome:
     """RMS change, mm, of the map at full resolution, known at slices only, when these are moved by
     half their distance."""
     sampled: tuple[tuple[float, float], ...]
-    """The same two numbers for the map at full resolution, known at slices only."""
+    """Change of the mean and correlation if the map at full resolution were known at slices only,
+    at three offsets of these."""
 
     @property
     def accepted(self) -> bool:
@@ -90,14 +102,16 @@ class Outcome:
         return self.status in (Status.OK, Status.REPAIRED)
 
 
-def run(full: bool, labels: Path | None = None) -> Suite:
+@suite("slices")
+def run(full: bool, labels: Path | None = None) -> Iterator[Content]:
     """Reslice bodies, segmentations of a dataset with fine voxels among them, and measure them."""
     steps = tuple(TARGETS) if full else (2.0,)
     ways = [(offset, 0.0) for offset in (OFFSETS if full else OFFSETS[::2])]
     ways += [(offset, TILT) for offset in (OFFSETS[::2] if full else OFFSETS[:1])]
-    bodies: list[ValidationBody] = list(PHANTOMS if full else PHANTOMS[:1])
-    if labels is not None:
-        bodies += fine_segmentations(labels, PIXEL)
+    bodies: list[ValidationBody] = [
+        *PHANTOMS[: None if full else 1],
+        *fine_segmentations(labels, PIXEL),
+    ]
     trials = [
         Trial(body=body, step=step, offset=offset, tilt=tilt)
         for body in bodies
@@ -105,12 +119,8 @@ def run(full: bool, labels: Path | None = None) -> Suite:
         for offset, tilt in plan
     ]
     results = run_cases(measure_trial, trials)
-    return Suite(
-        name="slices",
-        title="Thick slices",
-        text=_TEXT,
-        tables=(_table(trials, results), _half_table(trials, results)),
-    )
+    yield _table(trials, results)
+    yield _half_table(trials, results)
 
 
 def measure_trial(trial: Trial) -> Outcome:
@@ -124,6 +134,11 @@ def measure_trial(trial: Trial) -> Outcome:
 
 def compare(maps: HemisphereMaps, reference: HemisphereMaps, step: float) -> Outcome:
     """Set a map from slices, ``step`` mm apart, beside the one at full resolution, node by node."""
+    sampled = []
+    for offset in SAMPLED_OFFSETS:
+        map_ = _sampled_map(reference, step, offset + 0.5 / len(SAMPLED_OFFSETS))
+        correlation = float(np.corrcoef(map_.ravel(), reference.thickness.ravel())[0, 1])
+        sampled.append((float(map_.mean() - reference.thickness.mean()), correlation))
     both = np.isfinite(maps.thickness) & np.isfinite(reference.thickness)
     pair = maps.thickness[both], reference.thickness[both]
     return Outcome(
@@ -131,22 +146,9 @@ def compare(maps: HemisphereMaps, reference: HemisphereMaps, step: float) -> Out
         change=float(pair[0].mean() - pair[1].mean()),
         correlation=float(np.corrcoef(*pair)[0, 1]),
         thickness=maps.thickness,
-        half_sampled=_rms(*(_sampled_map(reference, step, offset) for offset in (0.0, 0.5))),
-        sampled=_sampled(reference, step),
+        half_sampled=rms(_sampled_map(reference, step, 0.0) - _sampled_map(reference, step, 0.5)),
+        sampled=tuple(sampled),
     )
-
-
-def _sampled(reference: HemisphereMaps, step: float) -> tuple[tuple[float, float], ...]:
-    """Change of the mean and correlation if the map itself were known at slices only.
-
-    At three offsets of the slices.
-    """
-    found = []
-    for offset in SAMPLED_OFFSETS:
-        map_ = _sampled_map(reference, step, offset + 0.5 / len(SAMPLED_OFFSETS))
-        correlation = float(np.corrcoef(map_.ravel(), reference.thickness.ravel())[0, 1])
-        found.append((float(map_.mean() - reference.thickness.mean()), correlation))
-    return tuple(found)
 
 
 def _sampled_map(reference: HemisphereMaps, step: float, offset: float) -> Float:
@@ -160,9 +162,11 @@ def _sampled_map(reference: HemisphereMaps, step: float, offset: float) -> Float
     return np.asarray(thickness @ weights @ back)
 
 
-def _rms(first: Float, second: Float) -> float:
-    """Root mean square difference of two maps where both are known."""
-    return float(np.sqrt(np.nanmean((first - second) ** 2)))
+def slice_frame(axis: Float) -> Float:
+    """Matrix (3, 3) of unit vectors in slices across an axis, and the axis."""
+    aside = np.cross(axis, [0.0, 0.0, 1.0])
+    aside /= np.linalg.norm(aside)
+    return np.column_stack([aside, np.cross(axis, aside), axis])
 
 
 def reslice(
@@ -178,10 +182,8 @@ def reslice(
     ``axis`` is the unit vector (3,) across the slices; ``voxel_size`` is pixel, pixel and distance
     of slices, mm; ``offset`` is a fraction of that distance, ``tilt`` in degrees.
     """
-    aside = np.cross(axis, [0.0, 0.0, 1.0])
-    aside /= np.linalg.norm(aside)
     turn = Rotation.from_euler("x", tilt, degrees=True).as_matrix()
-    matrix = np.column_stack([aside, np.cross(axis, aside), axis]) @ turn * np.array(voxel_size)
+    matrix = slice_frame(axis) @ turn * np.array(voxel_size)
     size = np.array(volume.tissue.shape) - 1
     corners = np.array(np.meshgrid(*([0, n] for n in size))).reshape(3, -1)
     corners = volume.affine[:3, :3] @ corners + volume.affine[:3, 3:]
@@ -189,9 +191,7 @@ def reslice(
     reach = np.linalg.solve(matrix, corners - middle[:, None])
     low = np.floor(reach.min(axis=1)) - 1
     shape = (np.ceil(reach.max(axis=1)) + 2 - low).astype(int)
-    affine = np.eye(4)
-    affine[:3, :3] = matrix
-    affine[:3, 3] = middle + matrix @ (low + np.array([0.0, 0.0, offset]))
+    affine = from_matvec(matrix, middle + matrix @ (low + np.array([0.0, 0.0, offset])))
     to_volume = np.linalg.inv(volume.affine) @ affine
     index = np.indices(shape).reshape(3, -1)
     nearest = np.rint(to_volume[:3, :3] @ index + to_volume[:3, 3:]).astype(int)
@@ -207,130 +207,77 @@ def reslice(
     )
 
 
-def _table(trials: Sequence[Trial], results: Sequence[Outcome | Refusal]) -> Table:
-    groups: dict[tuple[str, float, bool], list[Outcome | Refusal]] = {}
+@table("slices.maps")
+def _table(trials: Sequence[Trial], results: Sequence[Outcome | Refusal]) -> Iterator[Cells | str]:
+    groups: dict[tuple[str, str, str], list[Outcome | Refusal]] = {}
     for trial, result in zip(trials, results, strict=True):
-        kind = "phantoms" if isinstance(trial.body, PhantomSpec) else "labels"
-        groups.setdefault((kind, trial.step, trial.tilt > 0), []).append(result)
-    refusals = refusal_notes(
+        groups.setdefault(trial.group, []).append(result)
+    for key, group in groups.items():
+        found = [result for result in group if isinstance(result, Outcome)]
+        target = TARGETS.get(float(key[1]))
+        accepted = max((abs(result.change) for result in found if result.accepted), default=0.0)
+        met = bool(found) and accepted <= MAX_ACCEPTED
+        cells: dict[str, Cell] = dict(zip(_GROUP, key, strict=True))
+        cells |= {
+            "number": len(group),
+            "refused": len(group) - len(found),
+            "flagged": sum(not result.accepted for result in found),
+        }
+        if found:
+            change = np.array([result.change for result in found])
+            mean, worst, likeness, lowest = _four(change, [result.correlation for result in found])
+            sampled = np.array([sample for result in found for sample in result.sampled])
+            if target:
+                met &= mean <= target[0] and worst <= target[1]
+                met &= likeness >= target[2] and lowest >= target[3]
+                met &= sum(result.accepted for result in found) >= LEAST_ACCEPTED * len(group)
+            cells |= {
+                "change of mean, mm": f"{change.mean():+.3f}",
+                "size of change, mean": mean,
+                "size of change, worst": worst,
+                "worst of accepted": accepted,
+                "correlation, median": likeness,
+                "correlation, worst": lowest,
+                "by sampling alone": "{:.3f} / {:.3f}, {:.2f} / {:.2f}".format(*_four(*sampled.T)),
+            }
+        targets = "{:g} / {:g}, {:g} / {:g}".format(*target) if target else None
+        yield {**cells, "targets": targets, "met": met}
+    yield refusal_notes(
         {
-            f"{kind}, {step:g} mm, {'tilted' if tilted else 'straight'}": group
-            for (kind, step, tilted), group in groups.items()
+            f"{kind}, {step} mm, {'straight' if tilt == '0°' else 'tilted'}": group
+            for (kind, step, tilt), group in groups.items()
         }
     )
-    return Table(
-        title="Maps from slices beside those at full resolution",
-        rows=[_row(*key, group) for key, group in groups.items()],
-        notes=_NOTES.format(accepted=MAX_ACCEPTED, share=LEAST_ACCEPTED) + refusals,
-    )
 
 
-def _row(kind: str, step: float, tilted: bool, group: Sequence[Outcome | Refusal]) -> Cells:
-    found = [result for result in group if isinstance(result, Outcome)]
-    target = TARGETS.get(step)
-    accepted = max((abs(result.change) for result in found if result.accepted), default=0.0)
-    met = bool(found) and accepted <= MAX_ACCEPTED
-    cells: dict[str, Cell] = {
-        "bodies": kind,
-        "slices, mm": f"{step:g}",
-        "tilt": f"{TILT if tilted else 0:g}°",
-        "number": len(group),
-        "refused": len(group) - len(found),
-        "flagged": sum(not result.accepted for result in found),
-    }
-    if found:
-        change = np.array([result.change for result in found])
-        mean, worst, likeness, lowest = _four(change, [result.correlation for result in found])
-        sampled = np.array([sample for result in found for sample in result.sampled])
-        if target:
-            met &= mean <= target[0] and worst <= target[1]
-            met &= likeness >= target[2] and lowest >= target[3]
-            met &= sum(result.accepted for result in found) >= LEAST_ACCEPTED * len(group)
-        cells |= {
-            "change of mean, mm": f"{change.mean():+.3f}",
-            "size of change, mean": mean,
-            "size of change, worst": worst,
-            "worst of accepted": accepted,
-            "correlation, median": likeness,
-            "correlation, worst": lowest,
-            "by sampling alone": "{:.3f} / {:.3f}, {:.2f} / {:.2f}".format(*_four(*sampled.T)),
-        }
-    cells["targets"] = "{:g} / {:g}, {:g} / {:g}".format(*target) if target else None
-    return {**cells, "met": met}
-
-
-def _half_table(trials: Sequence[Trial], results: Sequence[Outcome | Refusal]) -> Table:
+@table("slices.half")
+def _half_table(trials: Sequence[Trial], results: Sequence[Outcome | Refusal]) -> Iterator[Cells]:
     """Compare maps whose slices lie half their distance apart."""
-    known = {(t.body, t.step, t.tilt, t.offset): r for t, r in zip(trials, results, strict=True)}
-    groups: dict[tuple[str, float, bool], list[tuple[Outcome | Refusal, Outcome | Refusal]]] = {}
-    for (body, step, tilt, offset), first in known.items():
-        second = known.get((body, step, tilt, offset + 0.5))
+    known = dict(zip(trials, results, strict=True))
+    groups: dict[tuple[str, str, str], list[tuple[Outcome | Refusal, Outcome | Refusal]]] = {}
+    for trial, first in known.items():
+        second = known.get(replace(trial, offset=trial.offset + 0.5))
         if second is not None:
-            kind = "phantoms" if isinstance(body, PhantomSpec) else "labels"
-            groups.setdefault((kind, step, tilt > 0), []).append((first, second))
-    return Table(
-        title="Maps from slices half a slice apart",
-        rows=[_half_row(*key, pairs) for key, pairs in groups.items()],
-        notes=_HALF_NOTES,
-    )
-
-
-def _half_row(
-    kind: str,
-    step: float,
-    tilted: bool,
-    pairs: Sequence[tuple[Outcome | Refusal, Outcome | Refusal]],
-) -> Cells:
-    both = [(a, b) for a, b in pairs if isinstance(a, Outcome) and isinstance(b, Outcome)]
-    sound = [[isinstance(r, Outcome) and r.accepted for r in pair] for pair in pairs]
-    flips = sum(first != second for first, second in sound)
-    cells: dict[str, Cell] = {
-        "bodies": kind,
-        "slices, mm": f"{step:g}",
-        "tilt": f"{TILT if tilted else 0:g}°",
-        "pairs": len(pairs),
-        "one accepted only": flips,
-    }
-    met = bool(both) and flips <= MAX_FLIPS * len(pairs)
-    if both:
-        change = np.array([_rms(a.thickness, b.thickness) for a, b in both])
-        met &= bool(change.mean() <= MAX_HALF_CHANGE)
-        cells |= {
-            "RMS change, mean": float(change.mean()),
-            "RMS change, worst": float(change.max()),
-            "by sampling alone": float(np.mean([a.half_sampled for a, _ in both])),
-        }
-    cells["targets"] = f"{MAX_HALF_CHANGE:g}, {MAX_FLIPS:.0%}"
-    return {**cells, "met": met}
+            groups.setdefault(trial.group, []).append((first, second))
+    for key, pairs in groups.items():
+        both = [(a, b) for a, b in pairs if isinstance(a, Outcome) and isinstance(b, Outcome)]
+        sound = [[isinstance(r, Outcome) and r.accepted for r in pair] for pair in pairs]
+        flips = sum(first != second for first, second in sound)
+        cells: dict[str, Cell] = dict(zip(_GROUP, key, strict=True))
+        cells |= {"pairs": len(pairs), "one accepted only": flips}
+        met = bool(both) and flips <= MAX_FLIPS * len(pairs)
+        if both:
+            change = np.array([rms(a.thickness - b.thickness) for a, b in both])
+            met &= bool(change.mean() <= MAX_HALF_CHANGE)
+            cells |= {
+                "RMS change, mean": float(change.mean()),
+                "RMS change, worst": float(change.max()),
+                "by sampling alone": float(np.mean([a.half_sampled for a, _ in both])),
+            }
+        yield {**cells, "targets": f"{MAX_HALF_CHANGE:g}, {MAX_FLIPS:.0%}", "met": met}
 
 
 def _four(change: Float, correlation: Float | list[float]) -> tuple[float, ...]:
     """Size of the change, mean and worst; correlation, median and worst."""
     size = np.abs(change)
     return tuple(map(float, (size.mean(), size.max(), np.median(correlation), np.min(correlation))))
-
-
-_TEXT = """\
-Labels in voxels of 0.3 mm are taken at the centers of voxels of 0.4 x 0.4 mm and 1 to 2 mm, as if
-drawn on thick slices: across the long axis at four offsets, and tilted by 10° at two. The map is
-compared with that of the same labels at full resolution, at the same nodes of the sheet.
-Voxels of 0.4 mm throughout check that reference: what they change does not come from the slices.
-Real labels are measured with `--labels`; phantoms have a wall that varies by 30 %.
-"""
-
-_NOTES = """\
-Targets: size of the change of the mean thickness, mean / worst, mm, and correlation of the maps,
-median / worst, flagged maps included; at least {share:.0%} accepted; and no accepted map may be off
-by more than {accepted:g} mm.
-By sampling alone: the same four numbers if the map at full resolution were known without error at
-the slices and linear between them, constant beyond the last. No method that sees nothing but
-the slices can do much better.
-"""
-
-_HALF_NOTES = """\
-The same body in slices that were moved by half their distance: root mean square change of the map,
-mm, and in how many pairs one map is handed out as sound and the other is not. Targets: mean change,
-share of such pairs. By sampling alone: the change of the map at full resolution, known at these
-slices only. Thick slices leave open where between two of them the body ends: that alone moves the
-rows by up to half a slice at either end.
-"""

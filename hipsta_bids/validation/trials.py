@@ -1,6 +1,6 @@
 """Sample sizes against simulated trials: power as it was stated, and as it comes out."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,7 +10,7 @@ from scipy import stats
 from statsmodels.stats.multitest import multipletests
 
 from hipsta_bids.group.covariates import VisitTime
-from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, SideMaps
+from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort
 from hipsta_bids.group.formula import Contrast
 from hipsta_bids.group.mixed import fit_mixed
 from hipsta_bids.group.model import ModelRequest
@@ -25,22 +25,23 @@ from hipsta_bids.group.power import (
 from hipsta_bids.group.reference import Modeled, Reference, Retested, retest_cohort
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.types import Bool, Float
-from hipsta_bids.validation.group import smooth_noise
-from hipsta_bids.validation.report import Cells, Suite, Table
+from hipsta_bids.validation.group import smooth_noise, thickness_side
+from hipsta_bids.validation.report import Cells, Content, suite, table
 
 TRIALS, MIXED_TRIALS, MAP_TRIALS, FEW_MAP_TRIALS = 4000, 1000, 400, 150
 #: Target: stated and observed power differ by at most this.
 MAX_DIFFERENCE = 0.03
 
 _MEAN, _BETWEEN, _WITHIN = 1.6, 0.16, 0.04  # mm
-_SLOPE, _SLOPE_SD = -0.004, 0.003  # mm per month
+_MICROMETERS = (-4.0, 3.0)  # per month: mean of slopes, and their SD
+_SLOPE, _SLOPE_SD = (slope / 1000 for slope in _MICROMETERS)  # mm per month
 _COHORT, _MAP_COHORT = 5000, 400  # participants of the reference
 _FOLLOWED = (0.0, 12.0, 24.0)  # months of the reference's visits
 _AT_ONCE = 100  # trials with dropouts, by one mixed model
 _PROCEDURES = {"bh": "fdr_bh", "fdr2": "fdr_tsbky"}
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class TrialDesign:
     """One question, and the reference that answers it."""
 
@@ -66,62 +67,52 @@ class TrialDesign:
         return self.nodes != (1, 1)
 
 
+def _thinner(share: float, *visits: float) -> TrialEffect:
+    return TrialEffect(kind=THINNING, share=share, visits=visits)
+
+
+def _slower(share: float, *visits: float) -> TrialEffect:
+    return TrialEffect(kind=SLOWING, share=share, visits=visits)
+
+
 DESIGNS = (
+    TrialDesign("measure, one visit, 5 % thinner", _thinner(0.05)),
+    TrialDesign("measure, months 0, 12, 24, 30 % slower", _slower(0.3, 0, 12, 24)),
     TrialDesign(
-        title="measure, one visit, 5 % thinner",
-        effect=TrialEffect(kind=THINNING, share=0.05),
-    ),
-    TrialDesign(
-        title="measure, months 0, 12, 24, 30 % slower",
-        effect=TrialEffect(kind=SLOWING, share=0.3, visits=(0, 12, 24)),
-    ),
-    TrialDesign(
-        title="measure, months 0 to 24 by 6, 25 % slower, 20 % drop out",
-        effect=TrialEffect(kind=SLOWING, share=0.25, visits=(0, 6, 12, 18, 24)),
+        "measure, months 0 to 24 by 6, 25 % slower, 20 % drop out",
+        _slower(0.25, 0, 6, 12, 18, 24),
         power={"power": 0.9, "dropout": 0.2},
     ),
     TrialDesign(
-        title="measure, test-retest, months 0, 12, 2 % thinner",
-        effect=TrialEffect(kind=THINNING, share=0.02, visits=(0, 12)),
-        retest=True,
+        "measure, test-retest, months 0, 12, 2 % thinner", _thinner(0.02, 0, 12), retest=True
     ),
     TrialDesign(
-        title="map, one visit, 5 % thinner at 10 % of the points, bh",
-        effect=TrialEffect(kind=THINNING, share=0.05),
+        "map, one visit, 5 % thinner at 10 % of the points, bh",
+        _thinner(0.05),
         nodes=(40, 21),
         power={"affected": 0.1},
         correction="bh",
     ),
     TrialDesign(
-        title="map, one visit, 5 % thinner at 30 % of the points, fdr2",
-        effect=TrialEffect(kind=THINNING, share=0.05),
+        "map, one visit, 5 % thinner at 30 % of the points, fdr2",
+        _thinner(0.05),
         nodes=(40, 21),
         power={"affected": 0.3, "power": 0.9},
     ),
     TrialDesign(
-        title="measure, months 0, 12, 24, 36, 30 % slower, 40 % drop out",
-        effect=TrialEffect(kind=SLOWING, share=0.3, visits=(0, 12, 24, 36)),
+        "measure, months 0, 12, 24, 36, 30 % slower, 40 % drop out",
+        _slower(0.3, 0, 12, 24, 36),
         power={"dropout": 0.4},
     ),
 )
 
 
-@dataclass(frozen=True)
-class TrialOutcome:
-    """A sample size and what became of it."""
+def simulate_design(design: TrialDesign, trials: int, seed: int = 0) -> dict[str, float]:
+    """Find the sample size from a simulated reference cohort, and run trials of that size.
 
-    per_arm: int
-    enrolled: int
-    stated: float
-    """Power of the test, with those who complete the trial."""
-    observed: float
-    """Share of trials that find the effect; of maps mean share of the affected points found."""
-    se: float
-    """Standard error of this share."""
-
-
-def simulate_design(design: TrialDesign, trials: int, seed: int = 0) -> TrialOutcome:
-    """Find the sample size from a simulated reference cohort, and run trials of that size."""
+    Returns participants, power of the test with those who complete the trial, and the share of
+    trials that find the effect, of maps mean share of the affected points found, by heading.
+    """
     random = np.random.default_rng(seed)
     reference = _reference(design, random)
     settings = design.settings
@@ -138,13 +129,14 @@ def simulate_design(design: TrialDesign, trials: int, seed: int = 0) -> TrialOut
         ]
     else:
         shares = [_trial(design, enrolled, random) for _ in range(trials)]
-    return TrialOutcome(
-        per_arm=per_arm,
-        enrolled=enrolled,
-        stated=float(np.mean(power_of(found.cohen_d, np.full(found.sd.shape, per_arm), alpha))),
-        observed=float(np.mean(shares)),
-        se=float(np.std(shares) / np.sqrt(trials)),
-    )
+    power = power_of(found.cohen_d, np.full(found.sd.shape, per_arm), alpha)
+    return {
+        "per arm": per_arm,
+        "enrolled": enrolled,
+        "stated power": float(np.mean(power)),
+        "observed power": float(np.mean(shares)),
+        "SE": float(np.std(shares) / np.sqrt(trials)),
+    }
 
 
 def _reference(design: TrialDesign, random: np.random.Generator) -> Reference:
@@ -157,7 +149,6 @@ def _reference(design: TrialDesign, random: np.random.Generator) -> Reference:
     values += (np.multiply.outer(slopes * np.ones(people), visits))[..., None, None]
     if design.effect.visits:
         values += _WITHIN * random.standard_normal(values.shape)
-    rows = people * len(visits)
     names = [f"sub-{i:05d}" for i in range(people)]
     table = pd.DataFrame(
         {
@@ -166,13 +157,7 @@ def _reference(design: TrialDesign, random: np.random.Generator) -> Reference:
             "months": np.tile(visits, people),
         }
     )
-    side = SideMaps(
-        rows=np.arange(rows),
-        maps={"thickness": values.reshape(rows, *design.nodes)},
-        subfield=np.zeros((rows, *design.nodes), dtype=np.int8),
-        names=("all",),
-        summary=pd.DataFrame(index=range(rows)),
-    )
+    side = thickness_side(values.reshape(-1, *design.nodes))
     axes = [np.linspace(-1, 1, n) for n in design.nodes]
     cohort = Cohort(table=table, sides={"L": side}, x=axes[0], y=axes[1], units={})
     source: Modeled | Retested
@@ -251,40 +236,17 @@ def _map_trial(design: TrialDesign, per_arm: int, random: np.random.Generator) -
     return float(rejected[affected.ravel()].mean())
 
 
-def run(full: bool) -> Suite:
+@suite("trials")
+def run(full: bool) -> Iterator[Content]:
     """Simulate the trials of all designs."""
-    rows: list[Cells] = []
+    yield _trials(MAP_TRIALS if full else FEW_MAP_TRIALS)
+
+
+@table("trials.trials")
+def _trials(map_trials: int) -> Iterator[Cells]:
     for design in DESIGNS:
         trials = MIXED_TRIALS if design.power.get("dropout") else TRIALS
-        trials = (MAP_TRIALS if full else FEW_MAP_TRIALS) if design.is_map else trials
+        trials = map_trials if design.is_map else trials
         found = simulate_design(design, trials)
-        rows.append(
-            {
-                "design": design.title,
-                "per arm": found.per_arm,
-                "enrolled": found.enrolled,
-                "stated power": found.stated,
-                "observed power": found.observed,
-                "SE": found.se,
-                "trials": trials,
-                "met": abs(found.observed - found.stated) <= MAX_DIFFERENCE,
-            }
-        )
-    return Suite(
-        name="trials",
-        title="Sample sizes of trials",
-        text="A reference cohort is simulated, described by the group level, and asked how many"
-        " participants a trial needs. Trials of that size are then simulated and analyzed.",
-        tables=(
-            Table(
-                title="Simulated trials",
-                rows=rows,
-                notes=f"Values between participants have an SD of {_BETWEEN:g} mm around"
-                f" {_MEAN:g} mm; with several visits, slopes one of {1000 * _SLOPE_SD:g} µm around"
-                f" {1000 * _SLOPE:g} µm per month, and single visits one of {_WITHIN:g} mm."
-                f" References have {_COHORT} participants, of maps {_MAP_COHORT}. Of maps, power is"
-                " the mean share of the affected points that are found. Target: it differs from"
-                f" what was stated by at most {MAX_DIFFERENCE:g}.",
-            ),
-        ),
-    )
+        met = abs(found["observed power"] - found["stated power"]) <= MAX_DIFFERENCE
+        yield {"design": design.title, **found, "trials": trials, "met": met}

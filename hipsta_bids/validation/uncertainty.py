@@ -1,7 +1,6 @@
 """The SD that perturbed copies of labels predict, beside that over poses of phantoms."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from scipy.stats import spearmanr
@@ -20,7 +19,7 @@ from hipsta_bids.validation.cases import (
     measure_case,
     run_groups,
 )
-from hipsta_bids.validation.report import Cell, Cells, Suite, Table
+from hipsta_bids.validation.report import Cell, Cells, Content, suite, table
 from hipsta_bids.validation.thick_slices import PHANTOMS
 
 SEED = 20232
@@ -38,60 +37,33 @@ MAX_SD_RATIO = 1.5
 """Of the SD over poses and the one that copies predict, either way; perfect labels, one voxel."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Copied:
-    """A phantom of whose labels perturbed copies are measured."""
-
-    case: Case
-    jitter: float
-    """As in the settings."""
-    copies: int
+def measure_copies(copied: tuple[Case, float, int]) -> Uncertainty:
+    """Estimate the uncertainty of a phantom by jittered copies."""
+    case, jitter, copies = copied
+    settings = Settings().changed(uncertainty={"jitter": jitter})
+    return estimate_uncertainty(draw(Phantom(case.spec), case), case.hemi, settings, copies)
 
 
-def measure_copies(copied: Copied) -> Uncertainty:
-    """Estimate the uncertainty of one phantom."""
-    settings = Settings().changed(uncertainty={"jitter": copied.jitter})
-    volume = draw(Phantom(copied.case.spec), copied.case)
-    return estimate_uncertainty(volume, copied.case.hemi, settings, copied.copies)
-
-
-def run(full: bool) -> Suite:
+@suite("uncertainty")
+def run(full: bool) -> Iterator[Content]:
     """Set the SD that perturbed copies predict beside that over poses of a phantom."""
-    poses = POSES_FULL if full else POSES_QUICK
-    copied, copies = (COPIED_FULL, COPIES_FULL) if full else (COPIED_QUICK, COPIES_QUICK)
-    cases = {
-        (spec.kind, voxel): _posed(spec, voxel, poses)
-        for spec in (PHANTOMS if full else PHANTOMS[:1])
-        for voxel in VOXELS
-    }
+    if full:
+        yield _sds(PHANTOMS, POSES_FULL, COPIED_FULL, COPIES_FULL)
+    else:
+        yield _sds(PHANTOMS[:1], POSES_QUICK, COPIED_QUICK, COPIES_QUICK)
+
+
+@table("uncertainty.sd")
+def _sds(specs: Sequence[PhantomSpec], poses: int, copied: int, copies: int) -> Iterator[Cells]:
+    cases = {(spec.kind, voxel): _posed(spec, voxel, poses) for spec in specs for voxel in VOXELS}
     seen = run_groups(measure_case, cases)
-    predicted = run_groups(
-        measure_copies,
-        {
-            (*key, cause): [
-                Copied(case=case, jitter=jitter, copies=copies) for case in group[:copied]
-            ]
-            for key, group in cases.items()
-            for cause, jitter in CAUSES.items()
-        },
-    )
-    rows = [
-        _uncertainty_row(kind, voxel, cause, seen[kind, voxel], predicted[kind, voxel, cause])
-        for kind, voxel in cases
-        for cause in CAUSES
-    ]
-    return Suite(
-        name="uncertainty",
-        title="Uncertainty",
-        text=_TEXT,
-        tables=(
-            Table(
-                title="SD of thickness over poses, and as predicted from copies of one pose, mm",
-                rows=rows,
-                notes=_NOTES.format(copies=copies, poses=poses, copied=copied),
-            ),
-        ),
-    )
+    plan = {
+        (*key, cause): [(case, jitter, copies) for case in group[:copied]]
+        for key, group in cases.items()
+        for cause, jitter in CAUSES.items()
+    }
+    for (kind, voxel, cause), predicted in run_groups(measure_copies, plan).items():
+        yield _uncertainty_row(kind, voxel, cause, seen[kind, voxel], predicted)
 
 
 def _posed(spec: PhantomSpec, voxel: tuple[float, float, float], count: int) -> list[Case]:
@@ -150,19 +122,3 @@ def _rank(a: Float, b: Float) -> float:
     """Rank correlation over the nodes that both know."""
     both = np.isfinite(a) & np.isfinite(b)
     return float(spearmanr(a[both], b[both]).statistic)
-
-
-_TEXT = """\
-`--uncertainty` measures perturbed copies of one segmentation and tells the SD at each point. A
-phantom in many positions shows what it should be: its labels are perfect but for their voxels, so
-copies that differ in the voxels alone should predict the SD over positions. By default, copies also
-allow for boundaries that are drawn up to half a voxel away. These labels have no such errors, so
-the SD is larger.
-"""
-
-_NOTES = """\
-Poses: {poses}; of {copied} of them {copies} copies each were measured. SDs are root mean squares
-over the sheet; the rank correlation is over the points of the sheet, and cannot be higher than two
-halves of the poses allow, whose SDs are correlated as given. No number was fitted to phantoms.
-Between thick slices a copy knows no more than the slices that it is made from, and predicts less.
-"""

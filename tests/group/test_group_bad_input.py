@@ -326,14 +326,16 @@ def test_contrasts_name_columns_with_blanks_in_backticks(study):
 
 
 @pytest.mark.usefixtures("without_figures")
-def test_names_of_groups_may_have_equals_signs(study):
+def test_names_of_groups_may_have_any_signs(study):
     path = study.data / "participants.tsv"
     text = path.read_text()
-    path.write_text(text.replace("\tCN", "\tMMSE>=24").replace("\tAD", "\t=low()"))
+    path.write_text(text.replace("\tCN", "\tâgé 女>=24").replace("\tAD", "\t=low()"))
     call = [str(study.data), str(study.out), "group", *FAST, "--name", "signs"]
     assert main(call) == 0
     maps = files.read_tsv(study.out / "group" / "signs" / "maps.tsv")
-    assert {row["contrast"] for row in maps} == {"MMSE>=24-=low()"}
+    assert {row["contrast"] for row in maps} == {"âgé 女>=24-=low()"}
+    files_of = (study.out / "group" / "signs").glob("*contrast-AgeU597324Low_*.shape.gii")
+    assert len(list(files_of)) > 0
 
 
 def test_exclusions_name_one_protocol_and_region():

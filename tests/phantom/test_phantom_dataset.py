@@ -106,7 +106,7 @@ def test_layout_holds_what_was_drawn(tmp_path, name):
     item = Hemisphere(subject="07", hemi="R", spec=SMALL, pose=pose)
     write_dataset(tmp_path, [item], layouts=[name], voxel_size=COARSE)
     layout = LAYOUTS[name]
-    path = layout.path.format(subject="sub-07", side=layout.sides["R"])
+    path = layout.path.format(subject="sub-07", side=layout.sides[1])
     image = nib.load(tmp_path / "derivatives" / name / path)
     protocol = load_protocol(layout.protocol)
     drawn = Phantom(SMALL).label_volume(

@@ -14,7 +14,7 @@ SPIRAL = defects.SPECS[0]
 
 
 def trial(kind, size, position=(0.5, 0.5)):
-    return Trial(body=SPIRAL, kind=kind, size=size, position=position)
+    return Trial(body=SPIRAL, injury=(kind, size, position))
 
 
 @pytest.mark.parametrize("position", [(0.5, 0.5), (0.2, 0.35), (0.82, 0.6)])

@@ -4,14 +4,14 @@ import pytest
 
 from hipsta_bids.cli.commands import validate_parser
 from hipsta_bids.validation import group
-from hipsta_bids.validation.group import SimulationResult
 
-GOOD = SimulationResult(
-    false_discovery_rate=0.02, core_power=0.8, peak_error=1.0, null_findings=0.03, cohorts=4
-)
-BAD = SimulationResult(
-    false_discovery_rate=0.67, core_power=0.8, peak_error=2.0, null_findings=0.8, cohorts=4
-)
+GOOD = {
+    "FDR": 0.02,
+    "core power": 0.8,
+    "peak error, nodes": 1.0,
+    "null cohorts with findings": 0.03,
+}
+BAD = GOOD | {"FDR": 0.67, "peak error, nodes": 2.0, "null cohorts with findings": 0.8}
 
 
 @pytest.mark.parametrize(
@@ -24,11 +24,9 @@ def test_registered_must_pass_and_unregistered_must_fail(monkeypatch, unregister
         return unregistered if settings.registration.align == "none" else GOOD
 
     monkeypatch.setattr(group, "run_simulation", simulate)
-    monkeypatch.setattr(group, "_corrections", lambda _cohorts: None)
-    monkeypatch.setattr(group, "_amplitudes", lambda _cohorts: None)
-    monkeypatch.setattr(group, "_together", lambda _cohorts: None)
-    monkeypatch.setattr(group, "repeated_visits", lambda *_limits: None)
-    table, *_ = group.run(full=False).tables
+    for name in ("_corrections", "_amplitudes", "_together", "repeated_visits"):
+        monkeypatch.setattr(group, name, lambda *_: "")
+    (table,) = group.run(full=False).tables
     assert table.targets == 3
     assert table.missed == missed
 
@@ -48,7 +46,7 @@ def test_the_default_moves_groups_least_where_curvature_differs(monkeypatch):
 @pytest.mark.long
 def test_corrections_keep_the_family_wise_error_and_find_the_effect(monkeypatch):
     monkeypatch.setattr(group, "PERMUTATIONS", 60)
-    table = group._corrections(12)
+    table = group._corrections(12, *group._limits(12))
     assert table.targets == 4
     assert table.missed == 0
     power = {row["correction"]: row["core power"] for row in table.rows}
@@ -61,7 +59,7 @@ def test_corrections_keep_the_family_wise_error_and_find_the_effect(monkeypatch)
 
 def test_measures_together_keep_the_family_wise_error_and_find_more(monkeypatch):
     monkeypatch.setattr(group, "PERMUTATIONS", 60)
-    table = group._together(10)
+    table = group._together(10, *group._limits(10))
     assert table.targets == 5
     assert table.missed == 0
     both, single = (

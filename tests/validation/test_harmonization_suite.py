@@ -31,19 +31,19 @@ def test_cohort_has_what_was_planted():
 def test_means_of_sites_are_taken_out():
     found = left_over(PLAN, SEEDS, SETTINGS)
     # Known to .16 SD / .45 SD / sqrt(60 sites), times what points have in common: .02.
-    assert abs(found.shift) < 0.06
-    assert abs(found.scale) < 0.08
-    assert 0.2 < found.shift_local < 0.7
+    assert abs(found["shift left"]) < 0.06
+    assert abs(found["scale left"]) < 0.08
+    assert 0.2 < found["of shift, local part left"] < 0.7
 
 
 def test_sites_that_are_ignored_bias_effects_and_sites_in_the_model_do_not():
     how = {"with_combat": False, "with_site": False}
-    ignored = analyze_sites(PLAN, SEEDS, SETTINGS, repeated=False, **how)
-    assert abs(ignored.estimate / PLAN.effect - 1) > 0.2
+    ignored, few = analyze_sites(PLAN, SEEDS, SETTINGS, repeated=False, **how)
+    assert abs(ignored / PLAN.effect - 1) > 0.2
     how = {"with_combat": True, "with_site": True}
-    kept = analyze_sites(PLAN, SEEDS, SETTINGS, repeated=False, **how)
-    assert kept.estimate == pytest.approx(PLAN.effect, abs=0.08)  # .2 / sqrt(12), two of them
-    assert kept.rejected > ignored.rejected
+    kept, more = analyze_sites(PLAN, SEEDS, SETTINGS, repeated=False, **how)
+    assert kept == pytest.approx(PLAN.effect, abs=0.08)  # .2 / sqrt(12), two of them
+    assert more > few
 
 
 def test_suite_judges_what_is_offered(monkeypatch):

@@ -17,13 +17,13 @@ ARC = mending.LAYERED[0]
 
 
 def trials(*planted, body=ARC):
-    return [Trial(body=body, planted=one) for one in planted]
+    return [Trial(body=body, injury=one) for one in planted]
 
 
 def test_a_missing_stratum_is_mended_and_thins_the_wall_if_it_is_not():
     planted = dict.fromkeys(CAVITIES)
     (stratum,) = (one for one in planted if one[0] == "stratum")
-    pair = [Trial(body=ARC, planted=stratum, mended=mended) for mended in (True, False)]
+    pair = [Trial(body=ARC, injury=stratum, mended=mended) for mended in (True, False)]
     mended, hollow = map(measure_trial, pair)
     assert mended.found == pytest.approx(mended.planted)
     assert hollow.found == 0
@@ -67,7 +67,7 @@ def test_tail_labels_in_the_body_make_a_map_impossible_if_they_are_not_handed_ov
 @pytest.mark.long
 def test_an_uncus_is_left_out_with_a_warning_and_noticed_if_it_is_not(monkeypatch):
     detached, attached = trials(UNCUS[1], UNCUS[2])
-    assert (detached.planted[0], attached.planted[0]) == ("uncus", "attached-uncus")
+    assert (detached.injury[0], attached.injury[0]) == ("uncus", "attached-uncus")
     right = [measure_trial(detached), measure_trial(attached)]
     assert [outcome.warned for outcome in right] == [True, False]
     monkeypatch.setattr(geometry_body, "find_uncus", lambda *_: np.zeros((0, 3), np.intp))
@@ -83,7 +83,7 @@ def test_an_uncus_is_left_out_with_a_warning_and_noticed_if_it_is_not(monkeypatc
 def test_what_cannot_be_planted_is_left_out_and_refusals_are_told():
     empty = Refusal(reason="defect-empty", message="no layer")
     refused = Refusal(reason="topology", message="a knot")
-    pair = [Trial(body=ARC, planted=CAVITIES[0], mended=mended) for mended in (True, False)]
+    pair = [Trial(body=ARC, injury=CAVITIES[0], mended=mended) for mended in (True, False)]
     table = mending._cavities([*pair, *pair], [empty, empty, refused, refused])
     assert [row["met"] for row in table.rows] == [False]
     assert "topology: a knot" in table.notes

@@ -11,6 +11,8 @@ import pytest
 
 from hipsta_bids.cli import main
 from hipsta_bids.errors import ExitCode
+from hipsta_bids.validation import accuracy, cases, thick_slices
+from hipsta_bids.validation.cases import Refusal
 from hipsta_bids.validation.report import (
     QUESTIONS,
     SUITES,
@@ -205,6 +207,19 @@ def test_every_suite_can_be_imported(name):
     module, function = SUITES[name].split(":")
     run = getattr(import_module(f"hipsta_bids.validation.{module}"), function)
     assert len(signature(run).parameters) == 1 + (name in WITH_LABELS)
+
+
+@pytest.mark.parametrize(
+    "name", ["accuracy", "limits", "slices", "convergence", "invariance", "uncertainty"]
+)
+def test_a_suite_of_which_nothing_is_measured_misses_all_targets(monkeypatch, name):
+    lost = Refusal(reason="crash", message="a bug")
+    for module in (accuracy, cases, thick_slices):
+        monkeypatch.setattr(module, "run_cases", lambda _, given: [lost for _ in given])
+    suite = run_suite(name, full=False)
+    assert suite.missed == suite.targets > 0
+    # All that texts name in braces is known.
+    assert not re.search(r"\{\w", page([suite], full=False))
 
 
 @pytest.mark.usefixtures("one_suite")

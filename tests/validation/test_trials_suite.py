@@ -12,14 +12,16 @@ from hipsta_bids.validation.trials import DESIGNS, simulate_design
 def test_stated_power_is_observed(design):
     found = simulate_design(design, 300)
     # Four standard errors of 300 trials, and the reference's own error.
-    assert found.observed == pytest.approx(found.stated, abs=4 * found.se + 0.02)
-    assert found.enrolled > found.per_arm or design.retest
+    assert found["observed power"] == pytest.approx(
+        found["stated power"], abs=4 * found["SE"] + 0.02
+    )
+    assert found["enrolled"] > found["per arm"] or design.retest
 
 
 def test_stated_power_of_maps_is_observed():
     # Coarse and rough maps: fast, and many points tell the share that is found.
     found = simulate_design(replace(DESIGNS[4], nodes=(20, 10), smoothness=0.5), 60)
-    assert found.observed == pytest.approx(found.stated, abs=0.05)
+    assert found["observed power"] == pytest.approx(found["stated power"], abs=0.05)
 
 
 def test_a_wrong_size_is_noticed(monkeypatch):
@@ -31,4 +33,4 @@ def test_a_wrong_size_is_noticed(monkeypatch):
 
     monkeypatch.setattr(trials, "sample_size", half)
     found = simulate_design(DESIGNS[0], 300)
-    assert found.stated - found.observed > 2 * trials.MAX_DIFFERENCE
+    assert found["stated power"] - found["observed power"] > 2 * trials.MAX_DIFFERENCE
