@@ -28,9 +28,8 @@ from hipsta_bids.derivatives.names import (
 from hipsta_bids.derivatives.sidecars import SHARED
 from hipsta_bids.errors import EXIT_MEANINGS
 from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY, Column
-from hipsta_bids.group.joint import JOINT_COLUMNS
 from hipsta_bids.group.settings import GroupSettings
-from hipsta_bids.group.tables import COLUMNS
+from hipsta_bids.group.tables import COLUMNS, JOINT_COLUMNS
 from hipsta_bids.reports.page import reason_actions, reason_sections
 from hipsta_bids.settings import Settings
 

@@ -207,31 +207,29 @@ def analyze_cohort(
     }
     registered = {hemi: side.registered for hemi, side in sides.items()} or cohort.sides
     measured = replace(cohort, sides=registered)
-    done = None
-    if plan is not None:
-        how = {hemi: side.registration for hemi, side in sides.items()}
-        done = harmonize_cohort(measured, plan, settings, measures, how)
-    compared = compare_sessions(measured if done is None else done.cohort, comparison)
-    fitted = _fit_sides(compared, measures.maps, rows, comparison, settings)
-    found = correct(fitted, rows, table, settings)
+    fit = partial(
+        _fit_cohort,
+        plan=plan,
+        measures=measures,
+        rows=rows,
+        comparison=comparison,
+        settings=settings,
+    )
+    how = {hemi: side.registration for hemi, side in sides.items()}
+    done, compared, fitted, found = fit(measured, registrations=how)
     unregistered: Mapping[MapKey, Discoveries] = {}
-    if settings.registration.align != "none" and settings.multiplicity.method not in PERMUTATIONS:
-        plain = _as_measured(cohort, plan, settings, measures)
-        if plain is not None:
-            again = compare_sessions(plain, comparison)
-            refitted = _fit_sides(again, measures.maps, rows, comparison, settings)
-            unregistered = correct(refitted, rows, table, settings)
-    scores = None
-    if comparison.normative is not None:
-        tell("w-scores")
-        scores = score_cohort(
-            compared,
-            model,
-            comparison.normative,
-            settings,
-            measures=measures,
-            references=references,
-        )
+    # Effects of sites from a file are those of registered nodes.
+    again = settings.registration.align != "none" and (plan is None or plan.saved is None)
+    if again and settings.multiplicity.method not in PERMUTATIONS:
+        unregistered = fit(cohort)[3]
+    scores = score_cohort(
+        compared,
+        model,
+        comparison.normative,
+        settings,
+        measures=measures,
+        references=references,
+    )
     tell("summary measures")
     summaries, notes = fit_summaries(
         compared,
@@ -268,36 +266,26 @@ def analyze_cohort(
     )
 
 
-def _as_measured(
-    cohort: Cohort, plan: SitePlan | None, settings: GroupSettings, measures: Measures
-) -> Cohort | None:
-    """Harmonize maps without registration; a file's effects are those of registered nodes."""
-    if plan is None:
-        return cohort
-    if plan.saved is not None:
-        return None
-    return harmonize_cohort(cohort, plan, settings, measures, {}).cohort
-
-
 def analyze_points(cohort: Cohort, analysis: Analysis, settings: GroupSettings) -> Analysis:
     """Fit the model of an analysis to further maps, which are not registered."""
     maps = tuple(dict.fromkeys(name for side in cohort.sides.values() for name in side.maps))
-    done, measured = None, Measures(maps=maps, summaries=())
-    if analysis.harmonization is not None:
-        done = harmonize_cohort(cohort, analysis.harmonization.plan, settings, measured, {})
-    compared = compare_sessions(cohort if done is None else done.cohort, analysis.comparison)
-    fitted = _fit_sides(compared, maps, analysis.row_model, analysis.comparison, settings)
-    scores = None
-    if analysis.comparison.normative is not None:
-        tell("w-scores")
-        scores = score_cohort(
-            compared,
-            analysis.model,
-            analysis.comparison.normative,
-            settings,
-            measures=measured,
-            references=analysis.design.references,
-        )
+    measured, done = Measures(maps=maps, summaries=()), analysis.harmonization
+    done, compared, fitted, found = _fit_cohort(
+        cohort,
+        plan=None if done is None else done.plan,
+        measures=measured,
+        rows=analysis.row_model,
+        comparison=analysis.comparison,
+        settings=settings,
+    )
+    scores = score_cohort(
+        compared,
+        analysis.model,
+        analysis.comparison.normative,
+        settings,
+        measures=measured,
+        references=analysis.design.references,
+    )
     return replace(
         analysis,
         sides={},
@@ -305,7 +293,7 @@ def analyze_points(cohort: Cohort, analysis: Analysis, settings: GroupSettings) 
         measured=measured,
         compared=compared,
         fitted=fitted,
-        found=correct(fitted, analysis.row_model, compared.table, settings),
+        found=found,
         unregistered={},
         measures=(),
         pairs=(),
@@ -333,14 +321,21 @@ def _check_weights(comparison: Comparison, settings: GroupSettings) -> None:
         )
 
 
-def _fit_sides(
-    compared: Cohort,
-    maps: tuple[str, ...],
+def _fit_cohort(
+    cohort: Cohort,
+    *,
+    plan: SitePlan | None,
+    measures: Measures,
     rows: RowModel,
     comparison: Comparison,
     settings: GroupSettings,
-) -> dict[str, FittedMaps]:
-    """Fit each hemisphere, and left minus right if that is asked for."""
+    registrations: Mapping[str, Registration] | None = None,
+) -> tuple[Harmonization | None, Cohort, dict[str, FittedMaps], dict[MapKey, Discoveries]]:
+    """Harmonize, compare sessions, and fit each hemisphere, and left minus right if asked for."""
+    done, maps = None, measures.maps
+    if plan is not None:
+        done = harmonize_cohort(cohort, plan, settings, measures, registrations or {})
+    compared = compare_sessions(cohort if done is None else done.cohort, comparison)
     fitted = {
         hemi: fit_maps(hemi, side.only(maps), rows, settings)
         for hemi, side in each("models", list(compared.sides.items()) if maps else [])
@@ -351,7 +346,7 @@ def _fit_sides(
         both = asymmetry_maps(compared, maps, relative)
         contrasts = with_mean(rows.design)
         fitted[BOTH] = fit_maps(BOTH, both, rows, settings, contrasts=contrasts)
-    return fitted
+    return done, compared, fitted, correct(fitted, rows, compared.table, settings)
 
 
 def _references(

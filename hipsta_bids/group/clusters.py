@@ -109,11 +109,20 @@ class Cluster:
     shares: Mapping[str, float]
     """Fraction of the points in each subfield."""
 
+    @property
+    def columns(self) -> dict[str, object]:
+        """Columns of tables of peaks."""
+        shares = (f"{name} {share:.0%}" for name, share in self.shares.items())
+        return {"extent": self.extent, "shares": "; ".join(shares)}
+
 
 def find_clusters(
     significant: Bool, statistic: Float, subfield: NDArray[np.str_], edges: Int
 ) -> list[Cluster]:
-    """Find connected regions of one sign among points, largest first."""
+    """Find connected regions of one sign among points, largest first.
+
+    Without any, the peak of the whole map, if it has one, is a cluster of no points.
+    """
     clusters = []
     for sign in (1, -1):
         labels, count = label_regions(significant & (sign * statistic > 0), edges)
@@ -124,6 +133,8 @@ def find_clusters(
             names, counts = np.unique(own[own != MISSING], return_counts=True)
             shares = dict(zip(names.tolist(), (counts / len(members)).tolist(), strict=True))
             clusters.append(Cluster(len(members), peak, shares))
+    if not clusters and np.isfinite(statistic).any():
+        return [Cluster(0, int(np.nanargmax(np.abs(statistic))), {})]
     return sorted(clusters, key=lambda cluster: -cluster.extent)
 
 
@@ -139,6 +150,17 @@ class Frame:
     ``surface_z`` on a mesh."""
     subfield: NDArray[np.str_]
     """(points,) names."""
+
+    @property
+    def columns(self) -> dict[str, Any]:
+        """Columns of tables of points."""
+        return {**self.number, **self.position, "subfield": self.subfield}
+
+    def at(self, point: int) -> dict[str, Any]:
+        """Say where a point is, in tables of peaks; a node of the sheet by its coordinates."""
+        number = self.number if "vertex" in self.number else {}
+        where = {**number, **self.position, "subfield": self.subfield}
+        return {name: values[point] for name, values in where.items()}
 
     @classmethod
     def of_sheet(cls, x: Float, y: Float, subfield: NDArray[np.str_]) -> "Frame":
@@ -186,9 +208,7 @@ def effect_columns(test: PointTest) -> dict[str, str | Float]:
 def point_columns(test: PointTest, found: "Discoveries", frame: Frame, n: Int) -> dict[str, object]:
     """Columns of a map of statistics, with the participants (points,) of each point."""
     return {
-        **frame.number,
-        **frame.position,
-        "subfield": frame.subfield,
+        **frame.columns,
         "n": n,
         **test_columns(test),
         "p_corrected": found.adjusted,
@@ -221,31 +241,20 @@ def peak_table(test: PointTest, found: "Discoveries", frame: Frame, edges: Int) 
 
     Effect sizes are Cohen's d for t, else partial eta squared.
     """
-    clusters = find_clusters(found.rejected.ravel(), test.statistic, frame.subfield, edges)
-    if not clusters and np.isfinite(test.statistic).any():
-        clusters = [Cluster(0, int(np.nanargmax(np.abs(test.statistic))), {})]
-    where = {**(frame.number if "vertex" in frame.number else {}), **frame.position}
-    values = {**test_columns(test), "p_corrected": found.adjusted.ravel()}
+    values = {**test_columns(test), "p_corrected": found.adjusted.ravel(), **effect_columns(test)}
     del values["estimate"], values["se"]
-    effect = effect_columns(test)
     return pd.DataFrame(
         [
             {
                 "contrast": test.contrast.name,
                 "test": test.kind,
-                **{name: own[point] for name, own in where.items()},
-                "subfield": frame.subfield[point],
-                **{name: own[point] for name, own in values.items()},
+                **frame.at(one.peak),
                 **{
-                    name: own if isinstance(own, str) else own[point]
-                    for name, own in effect.items()
+                    name: own if isinstance(own, str) else own[one.peak]
+                    for name, own in values.items()
                 },
-                "extent": cluster.extent,
-                "shares": "; ".join(
-                    f"{name} {share:.0%}" for name, share in cluster.shares.items()
-                ),
+                **one.columns,
             }
-            for cluster in clusters
-            for point in [cluster.peak]
+            for one in find_clusters(found.rejected.ravel(), test.statistic, frame.subfield, edges)
         ]
     )

@@ -19,7 +19,7 @@ from hipsta_bids import __version__
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.data import Bool, Float, Int, Key, Nested, read_foreign
 from hipsta_bids.group.formula import Contrast
-from hipsta_bids.group.glm import chunks
+from hipsta_bids.group.glm import chunks, products_of, sum_by
 from hipsta_bids.group.grammar import closed_formula
 from hipsta_bids.group.mixed import fit_mixed
 from hipsta_bids.group.settings import GroupSettings, HarmonizationSettings
@@ -87,29 +87,16 @@ class SiteMoments:
 def fit_effects(
     values: Float, visits: Visits, n_sites: int, settings: GroupSettings, *, pooled: bool
 ) -> tuple[SiteEffects, SiteMoments]:
-    """Estimate the effects of sites.
+    """Estimate the effects of sites on values (visits, points), NaN where missing.
 
-    Parameters
-    ----------
-    values : array
-        (visits, points), NaN where missing.
-    visits : Visits
-        Participants with several of them get random intercepts, and the residual SD is the root
-        mean square of the conditional residuals, as the variant MSR of Beer et al. (2020): without
-        effects of sites it leaves the values as they are.
-    n_sites : int
-        Every site has visits.
-    settings : GroupSettings
-        ``harmonization``, and ``longitudinal`` for random intercepts.
-    pooled : bool
-        Whether points inform each other (empirical Bayes), as those of one map do. Otherwise each
-        site's own mean and variance are taken out.
+    Participants with several visits get random intercepts, and the residual SD is the root mean
+    square of the conditional residuals, as the variant MSR of Beer et al. (2020): without effects
+    of sites it leaves the values as they are. Every one of the ``n_sites`` has visits. Where
+    effects are ``pooled``, points inform each other (empirical Bayes), as those of one map do;
+    else each site's own mean and variance are taken out.
 
-    Returns
-    -------
-    SiteEffects, SiteMoments
-        Parameters, NaN at points where missing values leave sites and columns inseparable; and the
-        residuals of sites before harmonization.
+    Parameters are NaN at points where missing values leave sites and columns inseparable; moments
+    are those of residuals before harmonization.
     """
     used = np.flatnonzero(visits.site >= 0)
     values, visits = values[used], visits.take(used)
@@ -125,7 +112,10 @@ def fit_effects(
     if visits.participant is None:
         for part in chunks((len(values), len(varies)), design.shape[1]):
             points = varies[part]
-            found[:, points] = _least_squares(values[:, points], design)
+            own = values[:, points]
+            present = np.isfinite(own).astype(np.float64)
+            # On the diagonal are numbers of values, but for rounding.
+            found[:, points] = solve_weighted(np.nan_to_num(own), present, design, 0.5)
     elif len(varies):
         there = np.flatnonzero(design.any(axis=0))
         any_contrast = Contrast("", np.eye(len(there))[:1])
@@ -205,36 +195,20 @@ def _varies(values: Float) -> Bool:
     return np.asarray(low < values.max(axis=0, where=known, initial=-np.inf))
 
 
-def _least_squares(values: Float, design: Float) -> Float:
-    """(columns, points) coefficients with values missing anywhere; NaN where none are unique.
-
-    A site without values at a point has the coefficient 0 there.
-    """
-    present = np.isfinite(values)
-    grams = np.repeat((design.T @ design)[None], values.shape[1], axis=0)
-    for point in np.flatnonzero(~present.all(axis=0)):
-        lost = design[~present[:, point]]
-        grams[point] -= lost.T @ lost
-    right = (design.T @ np.where(present, values, 0.0)).T
-    return solve_points(
-        grams, right, 0.5
-    )  # on the diagonal are numbers of values, but for rounding
+def solve_weighted(values: Float, weight: Float, design: Float, least: float = 0.0) -> Float:
+    """(columns, points) weighted least squares, with weights (rows, points) of each point."""
+    columns = design.shape[1]
+    grams = np.zeros((values.shape[1], columns**2))
+    for rows in chunks((columns**2, len(design)), 1):
+        grams += weight[rows].T @ products_of(design[rows])
+    return _solve_points(grams.reshape(-1, columns, columns), (weight * values).T @ design, least)
 
 
-def solve_points(grams: Float, right: Float, least: float) -> Float:
-    """Solve the normal equations of each point.
+def _solve_points(grams: Float, right: Float, least: float) -> Float:
+    """Solve the normal equations of each point: (columns, points), NaN where none is unique.
 
-    Parameters
-    ----------
-    grams, right : array
-        (points, columns, columns) and (points, columns); ``grams`` is overwritten.
-    least : float
-        A column with no more than this on the diagonal has no values: its coefficient is 0.
-
-    Returns
-    -------
-    array
-        (columns, points), NaN where the coefficients are not unique.
+    ``grams`` (points, columns, columns) is overwritten; ``right`` is (points, columns). A column
+    with no more than ``least`` on the diagonal has no values: its coefficient is 0.
     """
     diagonal = np.arange(grams.shape[1])
     size = grams[:, diagonal, diagonal]
@@ -268,11 +242,9 @@ def _residuals(
 def _intercepts(rest: Float, participant: Int, ratio: Float) -> Float:
     """(visits, points) predicted random intercepts."""
     _, numbers = np.unique(participant, return_inverse=True)
-    order = np.argsort(numbers, kind="stable")
-    starts = np.searchsorted(numbers[order], np.arange(numbers.max() + 1))
     known = np.isfinite(rest)
-    total = np.add.reduceat(np.where(known, rest, 0.0)[order], starts, axis=0)
-    count = np.add.reduceat(known[order].astype(np.float64), starts, axis=0)
+    total = sum_by(numbers, np.where(known, rest, 0.0))
+    count = sum_by(numbers, known.astype(np.float64))
     return np.asarray((total * ratio / (1 + count * ratio))[numbers])
 
 
@@ -419,10 +391,7 @@ class SavedEffects(TomlTable):
 def load_effects(path: Path) -> SavedEffects:
     """Read ``harmonization.json``; nothing in it is run.
 
-    Raises
-    ------
-    ModelError
-        If the file is too large, of another format, or its parts do not fit each other.
+    ModelError if it is too large, of another format, or its parts do not fit each other.
     """
     try:
         return read_foreign(path, SavedEffects, most=_LARGEST).model_copy(

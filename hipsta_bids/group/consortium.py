@@ -19,7 +19,7 @@ from hipsta_bids.group.figures import Drawing
 from hipsta_bids.group.glm import FittedMaps, PointTest
 from hipsta_bids.group.inference import PERMUTATIONS
 from hipsta_bids.group.meta import FIXED, RANDOM
-from hipsta_bids.group.methods import PROCEDURES, Citations
+from hipsta_bids.group.methods import Citations, discovery_text
 from hipsta_bids.group.panels import Row, contrasts, draw_pages
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.sites import (
@@ -27,7 +27,6 @@ from hipsta_bids.group.sites import (
     analyze_sites,
     check_agreement,
     meta_tables,
-    point_test,
 )
 from hipsta_bids.group.tables import META_COLUMNS
 from hipsta_bids.group.write import (
@@ -54,13 +53,7 @@ class MetaOptions:
 
 
 def run_meta(options: MetaOptions, settings: GroupSettings) -> tuple[Path, list[str]]:
-    """Combine the summaries of sites; returns the page and what should be known.
-
-    Raises
-    ------
-    HipstaError
-        If a summary cannot be read, or sites do not agree.
-    """
+    """Combine the summaries of sites; returns the page and what should be known."""
     if settings.multiplicity.method in PERMUTATIONS:
         raise UsageError(
             "meta: there is nobody to permute in summaries; use --correction fdr2 or bh",
@@ -113,19 +106,9 @@ def _read(given: Sequence[tuple[str | None, Path]]) -> list[SiteSummary]:
 
 def _write_maps(folder: Path, meta: Meta) -> None:
     """Write maps of both models as GIFTI and CIFTI, and the sheets to draw them on."""
-    cohort, confidence = _cohort(meta), meta.settings.meta.confidence
-    write_stats(
-        folder,
-        stats_of(
-            (
-                item.key(effects),
-                point_test(item, effects, confidence),
-                meta.found[item.key(effects)],
-            )
-            for item in meta.of("map")
-            for effects in item.result.models
-        ),
-    )
+    tests = (one for item in meta.of("map") for one in meta.tests(item))
+    write_stats(folder, stats_of((key, test, meta.found[key]) for key, test, _ in tests))
+    cohort = _cohort(meta)
     for hemi in dict.fromkeys(item.model.hemi for item in meta.of("map")):
         write_surface(folder, cohort, _place(meta, hemi, cohort), hemi)
 
@@ -145,8 +128,7 @@ def _figures(meta: Meta) -> Iterator[tuple[str, Drawing]]:
     for item in maps:
         measures = tests.setdefault(item.model.hemi, {})
         measures.setdefault(item.model.measures[0], []).extend(
-            point_test(item, effects, meta.settings.meta.confidence)
-            for effects in item.result.models
+            test for _, test, _ in meta.tests(item)
         )
     places = {hemi: _place(meta, hemi, cohort) for hemi in tests}
     like = {item.label(RANDOM): item.label(FIXED) for item in maps}
@@ -255,8 +237,6 @@ def _methods(meta: Meta) -> str:
             f" Hartung {cite('knapp-hartung')}, with standard errors not smaller than without their"
             f" correction {cite('modified')}"
         )
-    correction = meta.settings.multiplicity
-    family = "each map" if correction.scope == "map" else "both hemispheres together"
     what = (
         f"Measures of the hippocampus {cite('method')} of {meta.people} participants{groups} at"
         f" {len(sites)} sites were combined with hipsta_bids {__version__}; no values of"
@@ -271,9 +251,8 @@ def _methods(meta: Meta) -> str:
     if meta.items[0].result.without:
         effects += " All was repeated without each of the sites."
     errors = (
-        f"The false discovery rate was held at {correction.alpha:g} by"
-        f" {PROCEDURES[correction.method]} {cite(correction.method)}, for {family}, and for all"
-        " summary measures of a contrast together. Effect sizes are Cohen's d: the estimate over"
+        f"{discovery_text(meta.settings.multiplicity, cite)}, and for all summary measures of a"
+        " contrast together. Effect sizes are Cohen's d: the estimate over"
         f" the residual standard deviation within sites, with {how.confidence:.0%} confidence"
         " limits."
     )

@@ -4,6 +4,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -237,51 +238,38 @@ def add_time(table: pd.DataFrame, settings: GroupSettings) -> VisitTime:
     """
     covariates = tuple(settings.model.covariates)
     by_name = {str(column).casefold(): str(column) for column in table.columns}
-    age = by_name.get("age")
-    result = table
-    ages = None
-    if age is not None:
-        ages = typed(table[age], settings.design)
+    people, made = table[PARTICIPANT], dict[str, Any]()
+    times, unit = None, 1.0
+    if "age" in by_name:
+        ages = typed(table[by_name["age"]], settings.design)
         if pd.api.types.is_numeric_dtype(ages):
             check_numbers(ages, settings.design)
-        if _varies(ages, table):
-            first = ages.groupby(table[PARTICIPANT]).transform("first")
-            result = result.assign(**{FIRST_AGE: first})
+        if _varies(ages, people):
+            times, made[FIRST_AGE] = ages, ages.groupby(people).transform("first")
             covariates = tuple(
                 FIRST_AGE if name.casefold() == "age" else name for name in covariates
             )
-        else:
-            ages = None
-    column = _given(table, settings.longitudinal.time_columns, by_name, settings)
-    if column is None and _DATE in table.columns and table[_DATE].notna().any():
-        days = _dates(table[_DATE])
-        result, column = result.assign(**{TIME: _since_first(days, table) / _DAYS_PER_YEAR}), TIME
-    elif column is None and ages is not None:
-        result, column = result.assign(**{TIME: _since_first(ages, table)}), TIME
-    elif column is not None:
-        result = result.assign(**{column: typed(table[column], settings.design)})
-    return VisitTime(result, column, covariates)
+    names = [name.casefold() for name in settings.longitudinal.time_columns]
+    named = {by_name[name]: table[by_name[name]] for name in names if name in by_name}
+    given = ((name, typed(values, settings.design)) for name, values in named.items())
+    column, own = next((one for one in given if _varies(one[1], people)), (None, None))
+    if column is None:
+        if _DATE in table.columns and table[_DATE].notna().any():
+            times, unit = _dates(table[_DATE]), _DAYS_PER_YEAR
+        if times is not None:
+            first = times.groupby(people).transform("min")
+            column, own = TIME, (times - first) / unit
+    if column is not None:
+        made[column] = own
+    return VisitTime(table.assign(**made), column, covariates)
 
 
-def _varies(values: pd.Series, table: pd.DataFrame) -> bool:
-    """Whether values differ between sessions of a participant."""
+def _varies(values: pd.Series, people: pd.Series) -> bool:
+    """Whether numbers differ between sessions of a participant."""
     if not pd.api.types.is_numeric_dtype(values):
         return False
-    own = values.groupby(table[PARTICIPANT])
+    own = values.groupby(people)
     return bool((own.transform("min") < own.transform("max")).any())
-
-
-def _given(
-    table: pd.DataFrame, names: Sequence[str], by_name: dict[str, str], settings: GroupSettings
-) -> str | None:
-    for name in names:
-        column = by_name.get(name.casefold())
-        if column is None:
-            continue
-        values = typed(table[column], settings.design)
-        if _varies(values, table):
-            return column
-    return None
 
 
 def _dates(values: pd.Series) -> pd.Series:
@@ -295,7 +283,3 @@ def _dates(values: pd.Series) -> pd.Series:
         ) from error
     days = (dates - dates.min()) / pd.Timedelta(days=1)
     return days.astype(np.float64)
-
-
-def _since_first(values: pd.Series, table: pd.DataFrame) -> pd.Series:
-    return values - values.groupby(table[PARTICIPANT]).transform("min")

@@ -22,7 +22,7 @@ from hipsta_bids.errors import InputError, ModelError
 from hipsta_bids.group.analysis import Analysis, templates_of
 from hipsta_bids.group.data import Cohort, Float, Int, read_foreign, rounded
 from hipsta_bids.group.formula import typed
-from hipsta_bids.group.glm import FittedMaps, fit_points, with_mean
+from hipsta_bids.group.glm import FittedMaps, PointTest, fit_points, with_mean
 from hipsta_bids.group.grammar import closed_formula
 from hipsta_bids.group.meta import SiteFit
 from hipsta_bids.group.model import Design, build_design
@@ -226,25 +226,11 @@ def summarize(
     site: str,
     inputs: Mapping[str, Any],
 ) -> tuple[dict[str, Any], list[str]]:
-    """Make the summary of an analysis, and note what it leaves out.
+    """Make the summary of an analysis of linear models, and note what it leaves out.
 
-    Parameters
-    ----------
-    cohort : Cohort
-        For coordinates and units.
-    analysis : Analysis
-        Of linear models with one row per participant.
-    settings : GroupSettings
-        The limits are those of ``exchange``.
-    site : str
-        Name of the site.
-    inputs : mapping
-        ``seg``, ``region``, ``settings_hash`` and ``versions`` of the sheets.
-
-    Raises
-    ------
-    ModelError
-        If so few participants are behind a number that it could be traced to one of them.
+    The cohort has coordinates and units; ``inputs`` are ``seg``, ``region``, ``settings_hash`` and
+    ``versions`` of the sheets. ModelError if so few participants are behind a number that it could
+    be traced to one of them.
     """
     _check_model(analysis, settings)
     compared = analysis.compared
@@ -274,9 +260,7 @@ def summarize(
         groups = _counts(table[analysis.groups.column], analysis.groups.reference)
     for design in designs.values():
         _check_people({**factors, "group": groups}, design, settings.exchange)
-    models = [
-        _model(**one, settings=settings) for one in _blocks(compared, analysis, rows, designs)
-    ]
+    models = list(_models(compared, analysis, rows, designs, settings))
     if not models:
         raise ModelError(
             "--export-summary: nothing to export; maps of other programs are not in a summary",
@@ -376,38 +360,41 @@ def _check_people(
         raise ModelError(f"--export-summary: {problem}", reason="small-cell")
 
 
-def _blocks(
-    compared: Cohort, analysis: Analysis, rows: Int, designs: Mapping[str, Design]
+def _models(
+    compared: Cohort,
+    analysis: Analysis,
+    rows: Int,
+    designs: Mapping[str, Design],
+    settings: GroupSettings,
 ) -> Iterator[dict[str, Any]]:
-    """Values of the participants, (rows, points), with their model."""
+    """Models of maps, and of summary measures, of the participants in ``rows``."""
+    formula = analysis.model.formula
     for hemi, one in analysis.fitted.items():
         places = np.searchsorted(one.maps.rows, rows)
         for measure, fit in one.fits.items():
+            values = one.maps.maps[measure][places].reshape(len(rows), -1)
             yield {
                 "kind": "map",
                 "hemi": hemi,
                 "measures": [measure],
-                "formula": analysis.model.formula,
-                "values": one.maps.maps[measure][places].reshape(len(rows), -1),
-                "design": designs[analysis.model.formula],
-                "tests": [test.contrast.name for test in fit.tests],
+                "formula": formula,
                 "subfield": _subfields(one),
+                **_model(values, designs[formula], fit.tests, settings),
             }
     for fitted in analysis.measures:
         if fitted.formula not in designs:
             continue
-        values = summary_values(compared, fitted.hemi, analysis.measured.summaries).iloc[rows]
+        table = summary_values(compared, fitted.hemi, analysis.measured.summaries).iloc[rows]
         # Also those that do not vary here, so that all sites have the same measures.
-        adjusted = fitted.formula != analysis.model.formula
-        own = [str(c) for c in values if not adjusted or str(c).startswith("volume")]
+        adjusted = fitted.formula != formula
+        names = [str(c) for c in table if not adjusted or str(c).startswith("volume")]
+        values = table[names].to_numpy(dtype=np.float64)
         yield {
             "kind": "summary",
             "hemi": fitted.hemi,
-            "measures": own,
+            "measures": names,
             "formula": fitted.formula,
-            "values": values[own].to_numpy(dtype=np.float64),
-            "design": designs[fitted.formula],
-            "tests": [test.contrast.name for test in fitted.fit.tests],
+            **_model(values, designs[fitted.formula], fitted.fit.tests, settings),
         }
 
 
@@ -417,15 +404,11 @@ def _subfields(one: FittedMaps) -> list[str | None]:
 
 
 def _model(
-    *,
-    values: Float,
-    design: Design,
-    tests: Sequence[str],
-    settings: GroupSettings,
-    **what: Any,  # noqa: ANN401  (entries of JSON)
+    values: Float, design: Design, tests: Sequence[PointTest], settings: GroupSettings
 ) -> dict[str, Any]:
     """Fit the model where all participants have a value, and spell the results."""
-    contrasts = [one for one in design.contrasts if one.n_rows == 1 and one.name in tests]
+    names = [test.contrast.name for test in tests]
+    contrasts = [one for one in design.contrasts if one.n_rows == 1 and one.name in names]
     complete = np.isfinite(values).all(axis=0)
     fit = fit_points(np.where(complete, values, 0.0), design.matrix, contrasts, settings.glm)
     there = complete & np.isfinite(fit.sigma)
@@ -434,7 +417,6 @@ def _model(
         return rounded(np.where(there, numbers, np.nan))  # type: ignore[no-any-return]
 
     return {
-        **what,
         "columns": list(design.columns),
         "df": len(design.matrix) - len(design.columns),
         "covariance": rounded(np.linalg.inv(design.matrix.T @ design.matrix)),

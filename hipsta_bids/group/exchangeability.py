@@ -173,14 +173,10 @@ def choose_exchange(
             return "whole"
         return "within" if inside and not (whole or visits.slopes) else "flip"
     if (wanted == "whole" and not whole) or (wanted == "within" and not inside):
-        what = (
-            "is the same in all participants"
-            if wanted == "whole"
-            else "differs between participants"
-        )
+        what = "differs between" if wanted == "within" else "is the same in all"
         raise ModelError(
-            f"permutation: {contrast.name} {what}, which multiplicity.visits {wanted} does not"
-            " test; use auto",
+            f"permutation: {contrast.name} {what} participants, which multiplicity.visits"
+            f" {wanted} does not test; use auto",
             reason="permutation-blocks",
         )
     return wanted

@@ -119,10 +119,7 @@ class Choices:
 def read_choices(exclusions: Path | None, ratings: Path | None) -> Choices:
     """Read the user's tables; one of ratings may stand for one of exclusions.
 
-    Raises
-    ------
-    InputError
-        If a table lacks a column, or has another rating than `RATINGS`.
+    InputError if a table lacks a column, or has another rating than `RATINGS`.
     """
     excluded = [] if exclusions is None else _read(exclusions, ())
     rated = [] if ratings is None else _read(ratings, (_RATING,))

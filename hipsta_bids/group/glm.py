@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import special
 from scipy.optimize import elementwise
 from statsmodels.regression.linear_model import OLS
@@ -36,9 +36,9 @@ def t_limits(t: Float, df: Float, confidence: float) -> tuple[Float, Float]:
 
     def limit(probability: float) -> Float:
         def excess(center: Float, t: Float, df: Float) -> Float:
-            return _floats(special.nctdtr(df, center, t)) - probability
+            return np.asarray(special.nctdtr(df, center, t) - probability)
 
-        return _root(excess, _floats(special.nctdtrinc(df, probability, t)), t, df)
+        return _root(excess, special.nctdtrinc(df, probability, t), t, df)
 
     return limit(1 - tail), limit(tail)
 
@@ -51,11 +51,11 @@ def f_limits(f: Float, df1: int, df2: Float, confidence: float) -> tuple[Float, 
     def limit(probability: float) -> Float:
         def excess(center: Float, f: Float, df: Float) -> Float:
             at = np.maximum(center, 0.0)
-            return _floats(special.ncfdtr(first, df, at, f)) - probability
+            return np.asarray(special.ncfdtr(first, df, at, f) - probability)
 
         reachable = special.fdtr(first, df2, f) > probability
         inside = np.where(reachable, f, np.nan)
-        start = _floats(special.ncfdtrinc(first, df2, probability, inside))
+        start = special.ncfdtrinc(first, df2, probability, inside)
         root = np.maximum(_root(excess, start, inside, df2), 0.0)
         far = start >= _FARTHEST
         if far.any():
@@ -67,15 +67,12 @@ def f_limits(f: Float, df1: int, df2: Float, confidence: float) -> tuple[Float, 
     return limit(1 - tail), limit(tail)
 
 
-def _root(function: Callable[..., Float], start: Float, statistic: Float, df: Float) -> Float:
+def _root(function: Callable[..., Float], near: ArrayLike, statistic: Float, df: Float) -> Float:
     """Polish approximate roots; keep those that cannot be bracketed."""
+    start: Float = np.asarray(near, dtype=np.float64)
     reach = _BRACKET * (1 + np.abs(start))
     found = elementwise.find_root(function, (start - reach, start + reach), args=(statistic, df))
     return np.where(found.success, found.x, start)
-
-
-def _floats(values: object) -> Float:
-    return np.asarray(values, dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -158,7 +155,7 @@ def fit_points(
     ``errors`` are the SDs of the measurements, (subjects, points); values weigh by
     :func:`uncertainty_weights` then, those without an SD are left out, and standard errors are HC3.
     """
-    _check(maps, matrix, contrasts)
+    check_design(maps, matrix, contrasts)
     basis, triangle = np.linalg.qr(matrix)
     back = np.linalg.inv(triangle)
     blocks = [
@@ -180,11 +177,12 @@ def fit_points(
     return PointwiseFit(back @ fit.scores.T, fit.sigma, fit.n, tests)
 
 
-def _check(maps: Float, matrix: Float, contrasts: Sequence[Contrast]) -> None:
+def check_design(maps: Float, matrix: Float, contrasts: Sequence[Contrast]) -> None:
+    """Refuse a design that cannot be fitted, as where some rows have no maps."""
     if maps.ndim != 2 or matrix.ndim != 2 or maps.shape[0] != matrix.shape[0]:  # noqa: PLR2004 -- tables
         raise ModelError(
             f"model: maps of shape {maps.shape} do not fit a design of shape {matrix.shape};"
-            " both need one row per subject",
+            " both need as many rows",
             reason="design-shape",
         )
     if not np.isfinite(matrix).all():
@@ -195,7 +193,7 @@ def _check(maps: Float, matrix: Float, contrasts: Sequence[Contrast]) -> None:
     if np.linalg.matrix_rank(matrix) < matrix.shape[1]:
         raise ModelError(
             f"model: the design's {matrix.shape[1]} columns are not independent, given"
-            f" {matrix.shape[0]} subjects; leave one out",
+            f" {matrix.shape[0]} rows; leave one out",
             reason="design-rank",
         )
     for contrast in contrasts:
@@ -205,6 +203,18 @@ def _check(maps: Float, matrix: Float, contrasts: Sequence[Contrast]) -> None:
                 f" {matrix.shape[1]} columns",
                 reason="contrast-shape",
             )
+
+
+def products_of(matrix: Float) -> Float:
+    """(rows, columns * columns) products of the values of each row."""
+    return (matrix[:, :, None] * matrix[:, None, :]).reshape(len(matrix), -1)
+
+
+def sum_by(numbers: Int, values: Float) -> Float:
+    """Sum rows of values (rows, ...) by numbers from 0 on, each of which occurs."""
+    order = np.argsort(numbers, kind="stable")
+    starts = np.searchsorted(numbers[order], np.arange(numbers.max() + 1))
+    return np.asarray(np.add.reduceat(values[order], starts, axis=0))
 
 
 def chunks(shape: tuple[int, ...], columns: int) -> Iterator[slice]:
@@ -217,21 +227,16 @@ def uncertainty_weights(maps: Float, errors: Float, basis: Float, settings: GlmS
     """Weights 1 / (t2 + s2), mean 1, of values (subjects, points) with error variances s2.
 
     t2 is the variance between subjects at a point: the residual variance of the unweighted fit,
-    less what the errors explain of it,
-
-        t2 = (sum of squared residuals - sum s2 (1 - leverage)) / (n - columns),
-
-    by the method of moments (Hedges and Olkin 1985, Statistical Methods for Meta-Analysis, chapter
-    9; with covariates Raudenbush 2009). SDs from a few copies are rough and may all be too large or
-    too small; tests have HC3 standard errors, which do not take them at their word. 0 where a value
-    or SD is missing.
+    less what the errors explain of it, (sum of squared residuals - sum s2 (1 - leverage)) /
+    (n - columns), by the method of moments (Hedges and Olkin 1985, Statistical Methods for
+    Meta-Analysis, chapter 9; with covariates Raudenbush 2009). Rough SDs are no matter, since tests
+    have HC3 standard errors. 0 where a value or SD is missing.
     """
     present = np.isfinite(maps) & np.isfinite(errors)
     ordinary = settings.changed(covariance="ordinary")
     plain = fit_block(np.where(present, maps, np.nan), basis, ordinary)
     squared = np.where(present, errors, 0.0) ** 2
-    products = (basis[:, :, None] * basis[:, None, :]).reshape(len(basis), -1)
-    spread = (squared.T @ products).reshape(plain.covariance.shape)
+    spread = (squared.T @ products_of(basis)).reshape(plain.covariance.shape)
     variance = plain.sigma**2
     inverse = plain.covariance / variance[:, None, None]
     explained = squared.sum(axis=0) - np.einsum("pij,pij->p", inverse, spread)
@@ -262,9 +267,8 @@ def fit_block(
         inverse = np.repeat(np.eye(columns)[None], maps.shape[1], axis=0)
         usable = n - columns >= settings.min_residual_df
     else:
-        products = (basis[:, :, None] * basis[:, None, :]).reshape(len(basis), -1)
         shares = present.astype(np.float64) if weights is None else weights
-        information = (shares.T @ products).reshape(-1, columns, columns)
+        information = (shares.T @ products_of(basis)).reshape(-1, columns, columns)
         usable = np.linalg.eigvalsh(information)[:, 0] > settings.min_information
         usable &= n - columns >= settings.min_residual_df
         information[~usable] = np.eye(columns)
@@ -303,8 +307,7 @@ def _hc3(
         leverage, residuals = weights * leverage, weights * residuals
     alone = (1 - leverage < np.sqrt(np.finfo(np.float64).eps)) & present
     weights = np.where(alone, np.nan, residuals / np.where(alone, 1.0, 1 - leverage)) ** 2
-    products = (basis[:, :, None] * basis[:, None, :]).reshape(len(basis), -1)
-    meat = (weights.T @ products).reshape(inverse.shape)
+    meat = (weights.T @ products_of(basis)).reshape(inverse.shape)
     sandwich: Float = inverse @ meat @ inverse
     return sandwich
 
@@ -316,44 +319,31 @@ def _test(
     estimate = fit.scores @ rotated.T
     spread = rotated @ fit.covariance @ rotated.T
     se = np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
-    if contrast.n_rows == 1:
-        return t_test(
-            contrast, estimate[:, 0], se[:, 0], df=df, sigma=fit.sigma, confidence=confidence
-        )
-    f = _wald(estimate, spread)
-    p = np.asarray(special.fdtrc(float(contrast.n_rows), df, f), dtype=np.float64)
+    statistic = estimate[:, 0] / se[:, 0] if contrast.n_rows == 1 else _wald(estimate, spread)
     where = {"df": df, "estimate": estimate.T, "se": se.T, "sigma": fit.sigma}
-    return with_effects(contrast, f, p, **where, confidence=confidence)
-
-
-def t_test(
-    contrast: Contrast, estimate: Float, se: Float, *, df: Float, sigma: Float, confidence: float
-) -> PointTest:
-    """Test one row of weights, by estimates and standard errors at each point."""
-    t = estimate / se
-    p = np.asarray(2 * special.stdtr(df, -np.abs(t)), dtype=np.float64)
-    where = {"df": df, "estimate": estimate[None], "se": se[None], "sigma": sigma}
-    return with_effects(contrast, t, p, **where, confidence=confidence)
+    return with_effects(contrast, statistic, **where, confidence=confidence)
 
 
 def with_effects(
     contrast: Contrast,
     statistic: Float,
-    p: Float,
     *,
     df: Float,
     estimate: Float,
     se: Float,
     sigma: Float,
     confidence: float,
+    p: Float | None = None,
 ) -> PointTest:
-    """Add Cohen's d (of t) and partial eta squared, with limits, to tests at each point."""
+    """Add p-values, Cohen's d (of t) and partial eta squared, with limits, to t or F."""
     rows = contrast.n_rows
     if rows == 1:
+        tail = 2 * special.stdtr(df, -np.abs(statistic))
         squared = statistic**2
         cohen_d = estimate[0] / sigma
         d_limits = np.stack(t_limits(statistic, df, confidence)) * (se[0] / sigma)
     else:
+        tail = special.fdtrc(float(rows), df, statistic)
         squared = statistic
         cohen_d = np.full(len(df), np.nan)
         d_limits = np.full((2, len(df)), np.nan)
@@ -361,7 +351,7 @@ def with_effects(
     return PointTest(
         contrast=contrast,
         statistic=statistic,
-        p=p,
+        p=np.asarray(tail if p is None else p, dtype=np.float64),
         df=df,
         estimate=estimate,
         se=se,
@@ -388,7 +378,7 @@ def fit_measures(
 
     A column is left out by the same rules, and effect sizes are the same.
     """
-    _check(values, matrix, contrasts)
+    check_design(values, matrix, contrasts)
     block = fit_block(values, np.linalg.qr(matrix)[0], settings)
     tested: Bool = np.asarray(np.isfinite(block.covariance).all(axis=(1, 2)))
     n_points = values.shape[1]
@@ -412,7 +402,7 @@ def fit_measures(
         with_effects(
             contrast,
             table[0],
-            table[1],
+            p=table[1],
             df=df,
             estimate=table[2 : 2 + contrast.n_rows],
             se=table[2 + contrast.n_rows :],
@@ -499,19 +489,16 @@ def fit_maps(
         side.rows, model.design.rows, assume_unique=True, return_indices=True
     )
     tested = model.design.contrasts if contrasts is None else contrasts
+    fits = {}
     try:
-        fits = {
-            name: model.fit(_values(side.maps[name], used), rows, tested, settings)
-            if settings.glm.weights == "none"
-            else fit_points(
-                _values(side.maps[name], used),
-                model.design.matrix[rows],
-                tested,
-                settings.glm,
-                _values(side.errors[name], used),
-            )
-            for name in side.maps
-        }
+        for name in side.maps:
+            values = _values(side.maps[name], used)
+            if settings.glm.weights == "none":
+                fits[name] = model.fit(values, rows, tested, settings)
+            else:
+                errors = _values(side.errors[name], used)
+                matrix = model.design.matrix[rows]
+                fits[name] = fit_points(values, matrix, tested, settings.glm, errors)
     except ModelError as error:
         raise ModelError(f"hemisphere {hemi}: {error}", reason=error.reason) from error
     for name, fit in fits.items():

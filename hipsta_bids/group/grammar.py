@@ -64,13 +64,7 @@ class ClosedFormula:
 
 
 def closed_formula(text: str) -> ClosedFormula:
-    """Check the right-hand side of a formula.
-
-    Raises
-    ------
-    UsageError
-        The message names the first part that is not allowed, and what is.
-    """
+    """Check the right-hand side of a formula; UsageError names what is not allowed, and what is."""
     names: dict[str, None] = {}
     plain: set[str] = set()
     parts: list[str] = []

@@ -115,12 +115,8 @@ def plan_sites(
     """Say what is harmonized, or refuse what cannot be told apart; ``None`` if nothing is asked.
 
     All terms of the model without the site are kept; in changes between two sessions, also their
-    interactions with the session. Of an earlier analysis, its own terms are.
-
-    Raises
-    ------
-    ModelError
-        If sites are too small, or explain a column of the model.
+    interactions with the session. Of an earlier analysis, its own terms are. ModelError if sites
+    are too small, or explain a column of the model.
     """
     column = saved.column if saved else settings.harmonization.column
     if not column:

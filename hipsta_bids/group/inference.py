@@ -1,6 +1,6 @@
 """What survives when many points are tested: false discovery rate, or permutations of residuals."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
@@ -156,13 +156,23 @@ def combine_evidence(p: Float, how: str) -> Float:
 
 @dataclass(frozen=True, eq=False)
 class _Member:
-    """One map of a run."""
+    """One map of a run, with the design split into what is tested and what is not."""
 
     part: PermutationPart
-    model: "_Model"
+    """With the blocks in its visits."""
     blocks: Int | None
     exchange: Exchange | None
     """Of visits."""
+    basis: Float
+    """(subjects, columns) orthonormal, tested ones first."""
+    rows: int
+    residuals: Float
+    """(subjects, points) what the columns not tested leave; zero where missing."""
+    squares: Float
+    df: Float
+    """(points,) NaN where there is nothing to test."""
+    flips: bool
+    """Whether the columns not tested cannot make a constant: then it is tested, by signs."""
 
     @classmethod
     def build(
@@ -173,41 +183,76 @@ class _Member:
         blocks: Int | None,
     ) -> "_Member":
         maps, matrix = part.maps, part.matrix
-        if part.edges.max(initial=-1) >= maps.shape[1] or maps.shape[0] != matrix.shape[0]:
-            raise ModelError(
-                f"permutation: maps of shape {maps.shape} do not fit edges between"
-                f" {part.edges.max(initial=-1) + 1} points and {matrix.shape[0]} subjects",
-                reason="design-shape",
-            )
-        model = _Model.build(maps, matrix, contrast)
+        tested, rest = split(matrix, contrast)
+        present = np.isfinite(maps)
+        residuals = np.where(present, maps, 0.0)
+        if rest.shape[1]:
+            fitted = rest @ fit_points(maps, rest, (), GlmSettings()).coefficients
+            residuals = np.nan_to_num(np.where(present, maps - fitted, 0.0))
+        squares = np.einsum("sp,sp->p", residuals, residuals)
+        df = present.sum(axis=0) - matrix.shape[1]
         own = None if blocks is None else blocks[part.subjects]
         exchange = None
         if part.visits is not None:
             visits = replace(part.visits, blocks=own)
             part = replace(part, visits=visits)
             exchange = choose_exchange(matrix, contrast, visits, settings.visits)
-        flips = model.tests_common_part() if exchange is None else exchange == "flip"
-        if own is not None and not flips:
-            tested = matrix @ np.linalg.pinv(contrast.weights)
-            varies = varies_inside(tested, own)
+        flips = not spans(rest, np.ones(len(rest)))
+        if own is not None and not (flips if exchange is None else exchange == "flip"):
+            weights = matrix @ np.linalg.pinv(contrast.weights)
+            varies = varies_inside(weights, own)
             if part.visits is not None and exchange == "whole":
-                varies = varies_between(tested, part.visits)
-            _check_blocks(contrast, varies=varies)
-        return cls(part, model, own, exchange)
+                varies = varies_between(weights, part.visits)
+            if not varies:  # shuffling cannot break it up
+                raise ModelError(
+                    f"permutation: {contrast.name} does not vary inside the blocks, so that"
+                    " shuffling there says nothing about it; leave --blocks out, or choose larger"
+                    " blocks",
+                    reason="permutation-blocks",
+                )
+        usable = (df > 0) & (squares > 0)
+        return cls(
+            part=part,
+            blocks=own,
+            exchange=exchange,
+            basis=np.column_stack([tested, rest]),
+            rows=contrast.n_rows,
+            residuals=residuals,
+            squares=squares,
+            df=np.where(usable, df, np.nan),
+            flips=flips,
+        )
 
     def shuffled(self, keys: Float) -> Float:
-        """Permuted designs that are given by keys of subjects."""
-        basis, own, visits = self.model.basis, keys[:, self.part.subjects], self.part.visits
+        """Permuted designs (batch, columns, subjects) that are given by keys of subjects."""
+        basis, own, visits = self.basis, keys[:, self.part.subjects], self.part.visits
         bases: Iterable[Float] = (shuffle(basis, self.blocks, key) for key in own)
         if visits is not None and self.exchange is not None:
             pairs = zip(keys, own, strict=True)
             bases = (visits.shuffle(basis, self.exchange, *pair) for pair in pairs)
-        elif self.model.tests_common_part():
+        elif self.flips:
             bases = (flip(basis, key) for key in own)
         designs = np.empty((len(keys), *basis.T.shape))
         for design, one in zip(designs, bases, strict=True):
             design[:] = one.T
         return designs
+
+    def statistics(self, bases: Float) -> Float:
+        """Signed t, or square root of F, (batch, points) of bases (batch, columns, subjects)."""
+        # One product of large matrices is many times as fast as one for each basis.
+        scores = (bases.reshape(-1, bases.shape[2]) @ self.residuals).reshape(*bases.shape[:2], -1)
+        noise = self.squares - np.einsum("bcp,bcp->bp", scores, scores)
+        tested = scores[:, : self.rows]
+        gained = np.einsum("bcp,bcp->bp", tested, tested) / self.rows
+        # Rounding only may take the noise below zero, where the model fits perfectly.
+        t = np.sqrt(gained * self.df / np.maximum(noise, np.finfo(np.float64).eps * self.squares))
+        return np.asarray(np.copysign(t, tested[:, 0]) if self.rows == 1 else t, dtype=np.float64)
+
+    def p_values(self, t: Float) -> Float:
+        """Two-sided p-values of these statistics."""
+        if self.rows == 1:
+            return np.asarray(2 * special.stdtr(self.df, -np.abs(t)), dtype=np.float64)
+        return np.asarray(special.fdtrc(self.rows, self.df, t**2), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,7 +280,7 @@ class _Run:
         own = part.parts if isinstance(part, JointPart) else [part]
         combine = part.combine if isinstance(part, JointPart) else None
         members = [_Member.build(one, contrast, settings, blocks) for one in own]
-        observed = _together(members, [m.model.basis.T[None] for m in members], combine)
+        observed = _together(members, [one.basis.T[None] for one in members], combine)
         enhanced = _enhanced(observed, own[0].edges, settings)
         counts = np.ones((3, observed.shape[1]))
         return cls(members, combine, contrast, settings, observed, enhanced, counts)
@@ -263,76 +308,16 @@ class _Run:
 
 def _together(members: Sequence[_Member], bases: Sequence[Float], how: str | None) -> Float:
     """Return the statistics of one map, or of several combined, by designs."""
-    pairs = zip(members, bases, strict=True)
-    own = [(one.model, one.model.statistics(basis)) for one, basis in pairs]
+    own = [one.statistics(basis) for one, basis in zip(members, bases, strict=True)]
     if how is None:
-        return own[0][1]
-    return combine_evidence(np.stack([model.p_values(t) for model, t in own]), how)
-
-
-def _check_blocks(contrast: Contrast, *, varies: bool) -> None:
-    """Refuse blocks inside which what is tested does not vary: shuffling cannot break it up."""
-    if not varies:
-        raise ModelError(
-            f"permutation: {contrast.name} does not vary inside the blocks, so that shuffling there"
-            " says nothing about it; leave --blocks out, or choose larger blocks",
-            reason="permutation-blocks",
-        )
+        return own[0]
+    pairs = zip(members, own, strict=True)
+    return combine_evidence(np.stack([one.p_values(t) for one, t in pairs]), how)
 
 
 def _enhanced(t: Float, edges: Int, settings: MultiplicitySettings) -> Float:
     """Cluster enhancement, zero where the method does without."""
     return np.zeros_like(t) if settings.method == _MAXIMUM else enhance(t, edges, settings)
-
-
-@dataclass(frozen=True)
-class _Model:
-    """The design, split into what is tested and what is not; both orthonormal."""
-
-    basis: Float
-    """(subjects, columns), tested ones first."""
-    rows: int
-    residuals: Float
-    """(subjects, points) what the columns not tested leave; zero where missing."""
-    squares: Float
-    df: Float
-    """(points,) NaN where there is nothing to test."""
-
-    @classmethod
-    def build(cls, maps: Float, matrix: Float, contrast: Contrast) -> "_Model":
-        rows = contrast.n_rows
-        tested, rest = split(matrix, contrast)
-        present = np.isfinite(maps)
-        residuals = np.where(present, maps, 0.0)
-        if rest.shape[1]:
-            fitted = rest @ fit_points(maps, rest, (), GlmSettings()).coefficients
-            residuals = np.nan_to_num(np.where(present, maps - fitted, 0.0))
-        squares = np.einsum("sp,sp->p", residuals, residuals)
-        df = present.sum(axis=0) - matrix.shape[1]
-        usable = (df > 0) & (squares > 0)
-        basis = np.column_stack([tested, rest])
-        return cls(basis, rows, residuals, squares, np.where(usable, df, np.nan))
-
-    def tests_common_part(self) -> bool:
-        """Whether the columns not tested cannot make a constant: then it is tested."""
-        return not spans(self.basis[:, self.rows :], np.ones(len(self.basis)))
-
-    def statistics(self, bases: Float) -> Float:
-        """Signed t, or square root of F, (batch, points) of bases (batch, columns, subjects)."""
-        # One product of large matrices is many times as fast as one for each basis.
-        scores = (bases.reshape(-1, bases.shape[2]) @ self.residuals).reshape(*bases.shape[:2], -1)
-        noise = self.squares - np.einsum("bcp,bcp->bp", scores, scores)
-        tested = scores[:, : self.rows]
-        gained = np.einsum("bcp,bcp->bp", tested, tested) / self.rows
-        # Rounding only may take the noise below zero, where the model fits perfectly.
-        t = np.sqrt(gained * self.df / np.maximum(noise, np.finfo(np.float64).eps * self.squares))
-        return np.asarray(np.copysign(t, tested[:, 0]) if self.rows == 1 else t, dtype=np.float64)
-
-    def p_values(self, t: Float) -> Float:
-        """Two-sided p-values of these statistics."""
-        if self.rows == 1:
-            return np.asarray(2 * special.stdtr(self.df, -np.abs(t)), dtype=np.float64)
-        return np.asarray(special.fdtrc(self.rows, self.df, t**2), dtype=np.float64)
 
 
 def _maximum(values: Float) -> Float:
@@ -417,33 +402,54 @@ def discover(
 
 
 def correct_joint(
-    groups: Mapping[MapKey, Sequence[tuple[FittedMaps, str]]],
+    groups: Mapping[MapKey, Mapping[str, tuple[FittedMaps, str]]],
     contrasts: Mapping[str, Contrast],
     model: RowModel,
     table: pd.DataFrame,
     settings: GroupSettings,
 ) -> dict[MapKey, tuple[PermutationTest, Discoveries]]:
-    """Test maps together that have the same points: fits and measures by the key of the result."""
+    """Test maps together that have the same points: fits and measures by title, by result."""
     how = settings.multiplicity
     if how.method not in PERMUTATIONS:
         how = how.changed(method=_MAXIMUM)
-    blocks = row_blocks(model, table, how)
+
+    def part(key: MapKey) -> JointPart:
+        own = [_part(*one, model, how) for one in groups[key].values()]
+        return JointPart(own, settings.joint.combine)
+
+    tested = {key: contrasts[key.contrast] for key in groups}
+    return _permuted(tested, part, row_blocks(model, table, how), how)
+
+
+def _permuted(
+    tested: Mapping[MapKey, Contrast],
+    part: Callable[[MapKey], PermutationPart | JointPart],
+    blocks: Int | None,
+    how: MultiplicitySettings,
+    raw: Mapping[MapKey, Float] | None = None,
+) -> dict[MapKey, tuple[PermutationTest, Discoveries]]:
+    """Permute families of maps; ``raw`` are p-values of points for cut-offs, if others are told."""
     found: dict[MapKey, tuple[PermutationTest, Discoveries]] = {}
-    together = families(groups, how.scope)
+    together = families(tested, how.scope)
+    enhanced = how.method == "permutation-tfce"
     for number, keys in enumerate(together):
         results = permute(
-            [
-                JointPart([_part(*one, model, how) for one in groups[key]], settings.joint.combine)
-                for key in keys
-            ],
-            contrasts[keys[0].contrast],
+            [part(key) for key in keys],
+            tested[keys[0]],
             settings=how,
             blocks=blocks,
             family=(number, len(together)),
         )
-        raw = [result.p_uncorrected for result in results]
-        survive = _permuted_discoveries(results, raw, how)
-        found |= dict(zip(keys, zip(results, survive, strict=True), strict=True))
+        corrected = [one.p_enhanced if enhanced else one.p_max for one in results]
+        rejected = [p <= how.alpha for p in corrected]
+        n_tests = sum(int(np.isfinite(p).sum()) for p in corrected)
+        cutoff = np.nan
+        if n_tests and not enhanced:
+            own = [one.p_uncorrected for one in results] if raw is None else [raw[k] for k in keys]
+            p, survive = np.concatenate(own), np.concatenate(rejected)
+            cutoff = p[survive].max() if survive.any() else np.nanmin(p) * BELOW_ALL
+        for key, one, p, flags in zip(keys, results, corrected, rejected, strict=True):
+            found[key] = one, Discoveries(p, flags, float(cutoff), n_tests, how.alpha)
     return found
 
 
@@ -473,21 +479,14 @@ def correct(
     if how.method not in PERMUTATIONS:
         return discover({key: test.p for key, test in tests.items()}, how)
     check_permutations(settings)
-    blocks = row_blocks(model, table, how)
-    found: dict[MapKey, Discoveries] = {}
-    together = families(tests, how.scope)
-    for number, keys in enumerate(together):
-        parts = [_part(fitted[key.hemi], key.measure, model, how) for key in keys]
-        results = permute(
-            parts,
-            tests[keys[0]].contrast,
-            settings=how,
-            blocks=blocks,
-            family=(number, len(together)),
-        )
-        raw = [tests[key].p for key in keys]
-        found |= dict(zip(keys, _permuted_discoveries(results, raw, how), strict=True))
-    return {key: found[key] for key in tests}
+    found = _permuted(
+        {key: test.contrast for key, test in tests.items()},
+        lambda key: _part(fitted[key.hemi], key.measure, model, how),
+        row_blocks(model, table, how),
+        how,
+        {key: test.p for key, test in tests.items()},
+    )
+    return {key: found[key][1] for key in tests}
 
 
 def check_permutations(settings: GroupSettings) -> None:
@@ -522,20 +521,3 @@ def row_blocks(model: RowModel, table: pd.DataFrame, how: MultiplicitySettings) 
             reason="permutation-blocks",
         )
     return np.asarray(blocks, dtype=np.int64)
-
-
-def _permuted_discoveries(
-    results: Sequence[PermutationTest], raw: Sequence[Float], how: MultiplicitySettings
-) -> list[Discoveries]:
-    enhanced = how.method == "permutation-tfce"
-    corrected = [one.p_enhanced if enhanced else one.p_max for one in results]
-    rejected = [p <= how.alpha for p in corrected]
-    n_tests = sum(int(np.isfinite(p).sum()) for p in corrected)
-    cutoff = np.nan
-    if n_tests and not enhanced:
-        own, survive = np.concatenate(raw), np.concatenate(rejected)
-        cutoff = own[survive].max() if survive.any() else np.nanmin(own) * BELOW_ALL
-    return [
-        Discoveries(p, flags, float(cutoff), n_tests, how.alpha)
-        for p, flags in zip(corrected, rejected, strict=True)
-    ]

@@ -10,7 +10,7 @@ import pandas as pd
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.analysis import Analysis
-from hipsta_bids.group.clusters import Cluster, edges_of, find_clusters, frame_of
+from hipsta_bids.group.clusters import edges_of, find_clusters, frame_of
 from hipsta_bids.group.comparison import BOTH, Comparison, asymmetry_name
 from hipsta_bids.group.data import Cohort
 from hipsta_bids.group.glm import FittedMaps, PointTest
@@ -32,18 +32,6 @@ from hipsta_bids.reports.group_tables import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Meaning of the columns that no other table has.
-JOINT_COLUMNS: Mapping[str, str] = {
-    "hemi": "hemisphere, L or R; both where left and right are tested together; LR of left"
-    " minus right",
-    "statistic": "combined evidence: the normal quantile of the combined two-sided p-value, if"
-    " measures were independent",
-    "p": "p-value of the point by permutation, not corrected",
-    "p_corrected": "p-value corrected for all points of the family by permutation",
-    "n": "participants with a value, of the measure that has fewest",
-    "test": "z",
-    "measures": "effect size and p-value of each measure at the peak, not corrected",
-}
 _EFFECTS = {"t": "cohen_d", "F": "partial_eta_squared"}
 _LEAST_Z = 4.0  # at the end of the colors
 
@@ -109,19 +97,19 @@ def combine_maps(analyses: Sequence[Analysis], settings: GroupSettings) -> dict[
         for each in analyses
         if any(names[0] in one.fits for one in each.fitted.values())
     )
-    groups: dict[MapKey, list[tuple[FittedMaps, str]]] = {}
-    titles: dict[MapKey, list[str]] = {}
+    groups: dict[MapKey, dict[str, tuple[FittedMaps, str]]] = {}
     contrasts = {}
     for hemis in [("L", "R")] if sides else [("L",), ("R",), (BOTH,)]:
-        own = [(fits.get((name, hemi)), name, hemi) for hemi, name in product(hemis, names)]
-        parts = [(one, name) for one, name, _ in own if one is not None]
-        if len(parts) < len(own):
+        if not all((name, hemi) in fits for hemi, name in product(hemis, names)):
             continue
-        _check_points(names, [one for one, _ in parts])
-        for test in parts[0][0].fits[names[0]].tests:
+        parts = {
+            name if len(hemis) == 1 else f"{name} {SIDES[hemi]}": (fits[name, hemi], name)
+            for hemi, name in product(hemis, names)
+        }
+        _check_points(names, [one for one, _ in parts.values()])
+        for test in fits[names[0], hemis[0]].fits[names[0]].tests:
             key = MapKey(JOINT, test.contrast.name, BOTH_SIDES if len(hemis) > 1 else hemis[0])
             groups[key], contrasts[test.contrast.name] = parts, test.contrast
-            titles[key] = [n if len(hemis) == 1 else f"{n} {SIDES[h]}" for _, n, h in own]
     if not groups:
         raise ModelError(
             f"--joint {' '.join(names)}: no side has them all; leave one out", reason="joint-maps"
@@ -129,13 +117,7 @@ def combine_maps(analyses: Sequence[Analysis], settings: GroupSettings) -> dict[
     model = analyses[0].row_model
     found = correct_joint(groups, contrasts, model, analyses[0].compared.table, settings)
     return {
-        key: JointMap(
-            key=key,
-            parts=dict(zip(titles[key], groups[key], strict=True)),
-            cohort=cohort,
-            test=test,
-            found=own,
-        )
+        key: JointMap(key=key, parts=groups[key], cohort=cohort, test=test, found=own)
         for key, (test, own) in found.items()
     }
 
@@ -161,9 +143,7 @@ def joint_points(one: JointMap) -> pd.DataFrame:
     """List all points of a map, with the p-value of each measure by itself."""
     frame = frame_of(one.cohort, one.place)
     columns = {
-        **frame.number,
-        **frame.position,
-        "subfield": frame.subfield,
+        **frame.columns,
         "n": np.min([fit.fits[measure].n for fit, measure in one.parts.values()], axis=0),
         "statistic": one.test.statistic,
         "p": one.test.p_uncorrected,
@@ -180,31 +160,24 @@ def joint_peaks(joint: Sequence[JointMap], settings: GroupSettings) -> pd.DataFr
     for one in joint:
         frame, tests, z = frame_of(one.cohort, one.place), one.tests, one.test.statistic
         edges = edges_of(one.place.maps, settings.multiplicity.neighbors)
-        clusters = find_clusters(one.found.rejected, z, frame.subfield, edges)
-        if not clusters and np.isfinite(z).any():
-            clusters = [Cluster(0, int(np.nanargmax(z)), {})]
-        where = {**(frame.number if "vertex" in frame.number else {}), **frame.position}
-        for cluster in clusters:
+        for cluster in find_clusters(one.found.rejected, z, frame.subfield, edges):
             at = cluster.peak
             words = [
                 f"{title} {effect_name(_EFFECTS[test.kind])} {number_text(test.effect[at])},"
                 f" p {p_text(test.p[at])}"
                 for title, test in tests.items()
             ]
-            shares = (f"{name} {share:.0%}" for name, share in cluster.shares.items())
             rows.append(
                 {
                     "measure": JOINT,
                     "contrast": one.key.contrast,
                     "hemi": one.key.hemi,
-                    **{name: values[at] for name, values in where.items()},
-                    "subfield": frame.subfield[at],
+                    **frame.at(at),
                     "test": "z",
                     "statistic": z[at],
                     "p": one.test.p_uncorrected[at],
                     "p_corrected": one.found.adjusted[at],
-                    "extent": cluster.extent,
-                    "shares": "; ".join(shares),
+                    **cluster.columns,
                     "measures": "; ".join(words),
                 }
             )

@@ -9,6 +9,7 @@ from statsmodels.discrete.discrete_model import Logit
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.data import Bool, Float
+from hipsta_bids.group.glm import products_of
 from hipsta_bids.group.settings import ClassificationSettings
 
 #: Largest sum of margins, per subject, that still counts as rounding of the linear program.
@@ -73,26 +74,48 @@ def fit_logistic(
     firth: bool,
     free: Bool | None = None,
 ) -> LogisticFit:
-    """Fit a logistic regression by maximum likelihood, or by Firth's method.
+    """Fit a logistic regression by maximum likelihood (statsmodels), or by Firth's method.
 
     Of Firth's, columns that are not ``free`` stay zero but count in the penalty, as the penalized
     likelihood-ratio test needs it (Heinze and Schemper 2002).
     """
+    scale = _scales(matrix)
+    scaled = matrix / scale
     if firth:
-        return _fit_firth(matrix, case, settings, free)
-    fit = _fit_maximum(matrix, case, settings)
-    if fit is None:
+        everybody = np.ones((1, len(case)))
+        beta, value = firth_maxima(scaled, case, everybody, settings, free)
+        covariance = np.linalg.inv(_Sets.of(scaled, case, everybody).information(beta)[0])
+        return LogisticFit(
+            coefficients=beta[0] / scale,
+            se=np.sqrt(np.diagonal(covariance)) / scale,
+            # The penalty is that of the columns as given.
+            log_likelihood=float(value[0]) + float(np.log(scale).sum()),
+            firth=True,
+        )
+    model = Logit(case.astype(np.float64), scaled, check_rank=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of separation, which the caller looks for
+        try:
+            found = model.fit(
+                method="newton",
+                maxiter=settings.iterations,
+                tol=_CONVERGED,
+                disp=False,
+                warn_convergence=False,
+            )
+        except np.linalg.LinAlgError as error:
+            raise _no_convergence(settings.iterations) from error
+    if not found.mle_retvals["converged"]:
         raise _no_convergence(settings.iterations)
-    return fit
+    return LogisticFit(found.params / scale, found.bse / scale, float(found.llf), firth=False)
 
 
 def fit_overlapping_or_firth(
     matrix: Float, case: Bool, settings: ClassificationSettings
 ) -> LogisticFit:
     """Fit by maximum likelihood if the groups overlap, else by Firth's method."""
-    if not overlaps(matrix, case) and is_separated(matrix, case):
-        return _fit_firth(matrix, case, settings)
-    return fit_logistic(matrix, case, settings, firth=False)
+    separated = not overlaps(matrix, case) and is_separated(matrix, case)
+    return fit_logistic(matrix, case, settings, firth=separated)
 
 
 def overlaps(matrix: Float, case: Bool) -> bool:
@@ -116,7 +139,7 @@ def maxima(basis: Float, case: Bool, kept: Float, start: Float | None = None) ->
     sets the steps converged: with separated groups each step is about as long as the one before.
     """
     columns = basis.shape[1]
-    products = _products(basis)
+    products = products_of(basis)
     beta = np.tile(np.zeros(columns) if start is None else start, (len(kept), 1))
     settled = np.zeros(len(kept), dtype=bool)
     lost = np.zeros(len(kept), dtype=bool)
@@ -155,45 +178,6 @@ def _scales(matrix: Float) -> Float:
     spread = matrix.std(axis=0)
     size = np.maximum(np.abs(matrix).max(axis=0), 1e-300)
     return np.asarray(np.where(spread > 0, spread, size), dtype=np.float64)
-
-
-def _fit_maximum(matrix: Float, case: Bool, settings: ClassificationSettings) -> LogisticFit | None:
-    """Maximize the likelihood by statsmodels; None if that does not converge."""
-    scale = _scales(matrix)
-    model = Logit(case.astype(np.float64), matrix / scale, check_rank=False)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of separation, which the caller looks for
-        try:
-            found = model.fit(
-                method="newton",
-                maxiter=settings.iterations,
-                tol=_CONVERGED,
-                disp=False,
-                warn_convergence=False,
-            )
-        except np.linalg.LinAlgError:
-            return None
-    if not found.mle_retvals["converged"]:
-        return None
-    return LogisticFit(found.params / scale, found.bse / scale, float(found.llf), firth=False)
-
-
-def _fit_firth(
-    matrix: Float, case: Bool, settings: ClassificationSettings, free: Bool | None = None
-) -> LogisticFit:
-    """Fit all subjects by Firth's method; see :func:`firth_maxima`."""
-    scale = _scales(matrix)
-    scaled = matrix / scale
-    everybody = np.ones((1, len(case)))
-    beta, value = firth_maxima(scaled, case, everybody, settings, free)
-    covariance = np.linalg.inv(_Sets.of(scaled, case, everybody).information(beta)[0])
-    return LogisticFit(
-        coefficients=beta[0] / scale,
-        se=np.sqrt(np.diagonal(covariance)) / scale,
-        # The penalty is that of the columns as given.
-        log_likelihood=float(value[0]) + float(np.log(scale).sum()),
-        firth=True,
-    )
 
 
 def firth_maxima(
@@ -244,7 +228,7 @@ class _Sets:
 
     @classmethod
     def of(cls, matrix: Float, case: Bool, kept: Float) -> "_Sets":
-        return cls(matrix, _products(matrix), case, kept)
+        return cls(matrix, products_of(matrix), case, kept)
 
     def information(self, beta: Float) -> Float:
         chance = special.expit(beta @ self.matrix.T)
@@ -289,8 +273,3 @@ class _Sets:
         longest = np.maximum(np.abs(step).max(axis=1), 1e-300)
         share = np.minimum(1.0, _LONGEST_STEP / longest)
         return step * share[:, None], np.sum(gradient * along, axis=1) * share
-
-
-def _products(matrix: Float) -> Float:
-    """(subjects, columns * columns) products of each subject's values."""
-    return (matrix[:, :, None] * matrix[:, None, :]).reshape(len(matrix), -1)

@@ -87,29 +87,19 @@ def combine(
     test: str = "normal",
     least: int = 2,
 ) -> RandomEffects:
-    """Combine independent estimates with known variances, at each point.
+    """Combine independent estimates (sites, points) with known variances; NaN is none.
 
-    Parameters
-    ----------
-    estimates, variances : array
-        (sites, points); NaN where a site has none.
-    method : str
-        How the variance between sites is estimated: ``fixed`` (it is zero, so that weights are
-        inverse variances), ``dl`` (DerSimonian and Laird 1986) or ``reml`` (restricted maximum
-        likelihood by Fisher scoring, Viechtbauer 2005); or that variance (points,).
-    test : str
-        ``normal``; ``plain``: standard errors from the spread of the sites' estimates, and t with
-        ``sites - 1`` degrees of freedom (Knapp and Hartung 2003); or ``modified``: the same, but no
-        standard error smaller than that of ``normal`` (Roever, Knapp and Friede 2015).
-    least : int
-        Sites below which a point has no result.
+    ``method`` is how the variance between sites is estimated: ``fixed`` (it is zero, so that
+    weights are inverse variances), ``dl`` (DerSimonian and Laird 1986) or ``reml`` (restricted
+    maximum likelihood by Fisher scoring, Viechtbauer 2005); or that variance (points,).
 
-    Returns
-    -------
-    RandomEffects
-        I squared is that of Higgins and Thompson (2002) in terms of tau squared: tau squared over
-        its sum with the typical variance within sites. For ``fixed`` and ``dl`` it is
-        (Q - df) / Q.
+    ``test`` is ``normal``; ``plain``: standard errors from the spread of the sites' estimates, and
+    t with ``sites - 1`` degrees of freedom (Knapp and Hartung 2003); or ``modified``: the same, but
+    no standard error smaller than that of ``normal`` (Roever, Knapp and Friede 2015). Points of
+    fewer sites than ``least`` have no result.
+
+    I squared is that of Higgins and Thompson (2002) in terms of tau squared: tau squared over its
+    sum with the typical variance within sites. For ``fixed`` and ``dl`` it is (Q - df) / Q.
     """
     known = np.isfinite(estimates) & np.isfinite(variances) & (variances > 0)
     sites = known.sum(axis=0).astype(np.float64)
@@ -208,25 +198,11 @@ def join(
     covariances and residual variances only, so that results are exactly those of one table with
     all participants and the site as a further factor (Becker and Wu 2007).
 
-    Parameters
-    ----------
-    fits : list of SiteFit
-        The same columns in all.
-    weights : array
-        (columns,) of the contrast; 0 for the constant, which differs between sites.
-    intercept : int or None
-        Column of the constant, ``None`` without one: then all coefficients are common.
-    least : int
-        Sites below which a point has no result.
-    vary : bool
-        Whether the contrast has a random deviation at each site, a random slope: its variance is
-        estimated by restricted maximum likelihood, and tests are by t with ``sites - 1`` degrees of
-        freedom.
-
-    Returns
-    -------
-    Combined, array
-        And the variance between sites (points,), 0 unless it varies.
+    All fits have the same columns; the contrast's ``weights`` (columns,) are 0 for the
+    ``intercept``, which differs between sites (``None``: all coefficients are common). Points of
+    fewer sites than ``least`` have no result. With ``vary`` each site has a random deviation, a
+    random slope: its variance (points,), the second result, is estimated by restricted maximum
+    likelihood, and tests are by t with ``sites - 1`` degrees of freedom; else it is 0.
     """
     slopes = np.arange(len(weights)) != (-1 if intercept is None else intercept)
     present = np.stack([np.isfinite(fit.sd) for fit in fits])

@@ -31,6 +31,7 @@ _MEASURED = {
     "whole": "the whole hippocampus on one sheet (experimental)",
 }
 
+_FAMILIES = {"map": "each map", "hemispheres": "both hemispheres together"}
 #: Procedures that hold false discovery rates.
 PROCEDURES: Mapping[str, str] = {
     "bh": "the procedure of Benjamini and Hochberg",
@@ -74,9 +75,20 @@ def methods_text(
     """Word what was done and what came out."""
     cite = Citations()
     paragraphs = [_sample(cohort, analysis, n_out, cite("method"), others)]
-    paragraphs[0] += _rated(ratings)
-    if analysis.sides or others:
-        paragraphs.append(_alignment(analysis, settings, cite, others))
+    if ratings is not None:
+        counts = ", ".join(f"{n} {rating}" for rating, n in ratings.items())
+        paragraphs[0] += (
+            f" Hemispheres were rated on their report pages ({counts}); those rated exclude were"
+            " left out."
+        )
+    aligned = [_registration(analysis, settings, cite)] if analysis.sides else []
+    if others:
+        aligned.append(
+            f"Maps of other programs ({', '.join(others)}) were taken as they are, point by point,"
+            " without registration."
+        )
+    if aligned:
+        paragraphs.append(" ".join(aligned))
     if region in EXPERIMENTAL and analysis.fitted:
         paragraphs.append(_rims(analysis))
     paragraphs += _harmonization(analysis, cite)
@@ -87,9 +99,7 @@ def methods_text(
     if analysis.scores is not None:
         paragraphs.append(_normative(analysis.scores, settings, cite("normative")))
     if analysis.pairs:
-        paragraphs.append(
-            _classification(analysis, settings, cite("delong"), cite("firth"), cite("snell"))
-        )
+        paragraphs.append(_classification(analysis, settings, cite))
     if analysis.found:
         paragraphs.append(_findings(analysis))
     if analysis.skipped:
@@ -104,45 +114,20 @@ def _sample(
     table = analysis.compared.table.iloc[rows]
     people = cohort.table[PARTICIPANT].nunique()
     visits = f" ({len(cohort.table)} visits)" if len(cohort.table) > people else ""
-    maps = _words([*analysis.measured.maps, *others]) or "summaries"
+    names = [name.replace("_", " ") for name in (*analysis.measured.maps, *others)]
+    maps = ", ".join(f"map of {name}" for name in names) or "summaries"
     text = (
         f"Measures of the hippocampus {method} ({maps}) of"
         f" {people} participants{visits} were analyzed with hipsta_bids {__version__};"
         f" {analysis.n_participants} had all variables of the model"
     )
     if analysis.groups is not None:
-        names = table[analysis.groups.column][~table[PARTICIPANT].duplicated()]
-        counts = Counter(names.dropna().astype(str))
+        members = table[analysis.groups.column][~table[PARTICIPANT].duplicated()]
+        counts = Counter(members.dropna().astype(str))
         text += f" ({', '.join(f'{counts[g]} {g}' for g in analysis.groups.levels)})"
     if sheets := ", ".join(f"{len(one.used)} {hemi}" for hemi, one in analysis.fitted.items()):
         text += f", with hemispheres {sheets}"
     return f"{text}. {n_out} hemispheres or visits were left out; the table of exclusions says why."
-
-
-def _rated(ratings: Mapping[str, int] | None) -> str:
-    if ratings is None:
-        return ""
-    counts = ", ".join(f"{n} {rating}" for rating, n in ratings.items())
-    return (
-        f" Hemispheres were rated on their report pages ({counts}); those rated exclude were left"
-        " out."
-    )
-
-
-def _words(names: Sequence[str]) -> str:
-    return ", ".join(f"map of {name.replace('_', ' ')}" for name in names)
-
-
-def _alignment(
-    analysis: Analysis, settings: GroupSettings, cite: Callable[[str], str], others: Sequence[str]
-) -> str:
-    parts = [_registration(analysis, settings, cite)] if analysis.sides else []
-    if others:
-        parts.append(
-            f"Maps of other programs ({', '.join(others)}) were taken as they are, point by point,"
-            " without registration."
-        )
-    return " ".join(parts)
 
 
 def _registration(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], str]) -> str:
@@ -303,7 +288,7 @@ def _nonlinear(analysis: Analysis, settings: GroupSettings) -> str:
 
 
 def _correction(how: MultiplicitySettings, cite: Callable[[str], str], analysis: Analysis) -> str:
-    family = "each map" if how.scope == "map" else "both hemispheres together"
+    family = _FAMILIES[how.scope]
     if how.method in PERMUTATIONS:
         statistic = "the largest absolute statistic"
         if how.method == "permutation-tfce":
@@ -331,10 +316,14 @@ def _correction(how: MultiplicitySettings, cite: Callable[[str], str], analysis:
             f" {how.permutations} permutations{inside} of {shuffled}; seed"
             f" {how.seed}) {cite('permutation')}, for {family}.{end}"
         )
+    return f"{discovery_text(how, cite)}."
+
+
+def discovery_text(how: MultiplicitySettings, cite: Callable[[str], str]) -> str:
+    """Word how the false discovery rate was held."""
     return (
         f"The false discovery rate was held at {how.alpha:g} by {PROCEDURES[how.method]}"
-        f" {cite(how.method)}, for"
-        f" {family}."
+        f" {cite(how.method)}, for {_FAMILIES[how.scope]}"
     )
 
 
@@ -444,10 +433,9 @@ def _normative(scores: Scores, settings: GroupSettings, source: str) -> str:
     )
 
 
-def _classification(
-    analysis: Analysis, settings: GroupSettings, delong: str, firth: str, snell: str
-) -> str:
+def _classification(analysis: Analysis, settings: GroupSettings, cite: Citations) -> str:
     how = settings.classification
+    delong, firth, snell = map(cite, ("delong", "firth", "snell"))
     separated = sum(pair.comparison.separated for _, _, pair in analysis.pairs)
     by_firth = (
         f" {separated} comparisons were separated and fitted by Firth's method {firth}."

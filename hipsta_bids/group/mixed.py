@@ -12,7 +12,15 @@ from hipsta_bids.errors import ModelError
 from hipsta_bids.group.data import PARTICIPANT, Bool, Float, Int
 from hipsta_bids.group.exchangeability import Visits
 from hipsta_bids.group.formula import Contrast
-from hipsta_bids.group.glm import PointTest, PointwiseFit, RowModel, chunks, t_test, with_effects
+from hipsta_bids.group.glm import (
+    PointTest,
+    PointwiseFit,
+    RowModel,
+    check_design,
+    chunks,
+    sum_by,
+    with_effects,
+)
 from hipsta_bids.group.model import Design
 from hipsta_bids.group.random_slope import (
     best_triangles,
@@ -115,13 +123,11 @@ class Sums:
 def collect_sums(maps: Float, basis: Float, participants: Int) -> Sums:
     """Sum over sessions and participants."""
     present = np.isfinite(maps)
-    order = np.argsort(participants, kind="stable")
-    starts = np.searchsorted(participants[order], np.arange(participants.max() + 1))
-    counts = np.add.reduceat(present[order].astype(np.float64), starts, axis=0)
+    counts = sum_by(participants, present.astype(np.float64))
     columns = np.empty((*maps.shape, basis.shape[1] + 1))
     columns[..., :-1] = present[:, :, None] * basis[:, None, :]
     columns[..., -1] = np.where(present, maps, 0.0)
-    own = np.add.reduceat(columns[order], starts, axis=0)
+    own = sum_by(participants, columns)
     sizes = np.unique(np.maximum(counts, 1.0))
     chosen = [np.where(counts == size, 1.0, 0.0) for size in sizes]
 
@@ -190,8 +196,16 @@ def fit_mixed(
     are independent, with the degrees of freedom that give F its expectation (Fai and Cornelius
     1996).
     """
-    numbers = _check(maps, matrix, participants)
-    if times is not None and np.bincount(numbers).max() < _SLOPE_SESSIONS:
+    check_design(maps, matrix, contrasts)
+    _, numbers, counts = np.unique(
+        np.asarray(participants), return_inverse=True, return_counts=True
+    )
+    if counts.max() == 1:
+        raise ModelError(
+            "longitudinal model: no participant has two sessions; use a linear model",
+            reason="one-session",
+        )
+    if times is not None and counts.max() < _SLOPE_SESSIONS:
         raise ModelError(
             "longitudinal model: no participant has three sessions, so that slopes cannot be"
             " separated from noise; use random intercepts",
@@ -243,14 +257,10 @@ def _tests(
         rows = slice(start, start + contrast.n_rows)
         start = rows.stop
         estimate, se, t, df = (whole[name][rows] for name in ("estimate", "se", "t", "df"))
-        if contrast.n_rows == 1:
-            yield t_test(contrast, estimate[0], se[0], df=df[0], sigma=sigma, confidence=confidence)
-            continue
-        f = np.mean(t**2, axis=0)
-        freedom = _denominator(df)
-        p = np.asarray(special.fdtrc(float(contrast.n_rows), freedom, f), dtype=np.float64)
-        where = {"df": freedom, "estimate": estimate, "se": se, "sigma": sigma}
-        yield with_effects(contrast, f, p, **where, confidence=confidence)
+        single = contrast.n_rows == 1
+        where = {"df": df[0] if single else _denominator(df), "estimate": estimate, "se": se}
+        statistic = t[0] if single else np.mean(t**2, axis=0)
+        yield with_effects(contrast, statistic, **where, sigma=sigma, confidence=confidence)
 
 
 def _denominator(df: Float) -> Float:
@@ -262,10 +272,13 @@ def _denominator(df: Float) -> Float:
     return np.where(np.isfinite(df).all(axis=0) & np.isnan(found), least, found)
 
 
-def _independent(rotated: Sequence[Float], inverse: Float) -> tuple[Float, Float]:
-    """Rows of weights at each point, and those that make the rows of a contrast independent.
+def _tested(
+    rotated: Sequence[Float], scores: Float, inverse: Float, variance: Float
+) -> tuple[Float, dict[str, Float]]:
+    """Rows that make those of each contrast independent, and estimates of these; points last.
 
-    ``inverse`` is (points, columns, columns); both results are (rows, points, columns).
+    Rows are (rows, points, columns), scores (points, columns), the inverse (points, columns,
+    columns).
     """
     given, turned = [], []
     for rows in rotated:
@@ -275,36 +288,13 @@ def _independent(rotated: Sequence[Float], inverse: Float) -> tuple[Float, Float
             axes = np.linalg.eigh(rows @ inverse @ rows.T)[1]
             own = np.einsum("pjk,ji->kpi", axes, rows)
         turned.append(own)
-    return np.concatenate(given), np.concatenate(turned)
-
-
-def _check(
-    maps: Float,
-    matrix: Float,
-    participants: Sequence[str] | NDArray[np.str_],
-) -> Int:
-    """Refuse what cannot be fitted; participants as numbers otherwise."""
-    if not len(maps) == len(matrix) == len(participants):
-        raise ModelError(
-            f"longitudinal model: {len(maps)} maps, {len(matrix)} rows of the design and"
-            f" {len(participants)} participants; all need one per session",
-            reason="design-shape",
-        )
-    if np.linalg.matrix_rank(matrix) < matrix.shape[1]:
-        raise ModelError(
-            f"longitudinal model: the design's {matrix.shape[1]} columns are not independent;"
-            " leave one out",
-            reason="design-rank",
-        )
-    _, numbers, counts = np.unique(
-        np.asarray(participants), return_inverse=True, return_counts=True
+    both = np.concatenate(given), np.concatenate(turned)
+    (estimate, se), (other, root) = (
+        (np.einsum("cpj,pj->cp", rows, scores), np.sqrt(forms(inverse, rows) * variance))
+        for rows in both
     )
-    if counts.max() == 1:
-        raise ModelError(
-            "longitudinal model: no participant has two sessions; use a linear model",
-            reason="one-session",
-        )
-    return np.asarray(numbers, dtype=np.int64)
+    found = {"scores": scores.T, "residual": variance, "estimate": estimate, "se": se}
+    return both[1], found | {"t": other / root}
 
 
 def _fit(
@@ -324,23 +314,18 @@ def _fit(
     state = sums.at(ratio)
     freedom = sums.n - columns
     variance = state.residual[0] / freedom
-    given, turned = _independent(rotated, state.inverse)
+    turned, found = _tested(rotated, state.scores, state.inverse, variance)
     form = forms(state.inverse, turned)
     slope = -forms(state.inverse @ state.information_first @ state.inverse, turned)
     df = _satterthwaite(form, slope, freedom, ratio, state)
     blank = np.where(usable, 1.0, np.nan)
-    return {
-        "scores": state.scores.T * blank,
-        "residual": variance * blank,
-        "participant": variance * ratio * blank,
-        "slope": np.full(len(blank), np.nan),
-        "n": sums.n.astype(np.float64),
-        "estimate": np.einsum("cpj,pj->cp", given, state.scores) * blank,
-        "se": np.sqrt(forms(state.inverse, given) * variance) * blank,
-        "t": np.einsum("cpj,pj->cp", turned, state.scores) / np.sqrt(form * variance) * blank,
-        "df": df * blank,
-        "loss": (freedom * np.log(state.residual[0]) + state.penalty[0]) * blank,
+    found |= {
+        "participant": variance * ratio,
+        "df": df,
+        "loss": freedom * np.log(state.residual[0]) + state.penalty[0],
     }
+    found = {name: values * blank for name, values in found.items()}
+    return found | {"slope": np.full(len(blank), np.nan), "n": sums.n.astype(np.float64)}
 
 
 def _fit_slopes(
@@ -363,26 +348,21 @@ def _fit_slopes(
     triangles = best_triangles(kept, settings)
     state = solve_slopes(kept, triangles)
     variance = state.residual / (kept.n - basis.shape[1])
-    given, turned = _independent(rotated, state.inverse)
-    se, root = (np.sqrt(forms(state.inverse, rows) * variance) for rows in (given, turned))
+    turned, found = _tested(rotated, state.scores, state.inverse, variance)
+    found |= {
+        "participant": variance * triangles[:, 0] ** 2,
+        "slope": variance * np.sum(triangles[:, 1:] ** 2, axis=1) / unit**2,
+        "df": slope_freedom(kept, triangles, turned),
+        "loss": (kept.n - basis.shape[1]) * np.log(state.residual) + state.penalty,
+    }
 
     def spread(values: Float) -> Float:
         full = np.full((*values.shape[:-1], len(usable)), np.nan)
         full[..., usable] = values
         return full
 
-    return {
-        "scores": spread(state.scores.T),
-        "residual": spread(variance),
-        "participant": spread(variance * triangles[:, 0] ** 2),
-        "slope": spread(variance * np.sum(triangles[:, 1:] ** 2, axis=1) / unit**2),
-        "n": sums.n.astype(np.float64),
-        "estimate": spread(np.einsum("cpj,pj->cp", given, state.scores)),
-        "se": spread(se),
-        "t": spread(np.einsum("cpj,pj->cp", turned, state.scores) / root),
-        "df": spread(slope_freedom(kept, triangles, turned)),
-        "loss": spread((kept.n - basis.shape[1]) * np.log(state.residual) + state.penalty),
-    }
+    spaced = {name: spread(values) for name, values in found.items()}
+    return spaced | {"n": sums.n.astype(np.float64)}
 
 
 def _satterthwaite(form: Float, slope: Float, freedom: Int, ratio: Float, state: State) -> Float:

@@ -18,6 +18,7 @@ from hipsta_bids.group.comparison import Comparison
 from hipsta_bids.group.covariates import FIRST_AGE, VisitTime
 from hipsta_bids.group.data import PARTICIPANT, SESSION, Float, Int
 from hipsta_bids.group.formula import (
+    INTERCEPT,
     Contrast,
     ContrastSpec,
     ModelSpec,
@@ -112,15 +113,15 @@ def default_formula(
     """Spell the right-hand side: the groups, and each covariate that varies."""
     first = " * ".join(name for name in (groups.column if groups else None, time) if name)
     names = settings.model.covariates if covariates is None else covariates
-    found = _varying(table, names, settings)
-    return " + ".join([first or "1", *(_shaped(name, settings) for name in found)])
-
-
-def _shaped(name: str, settings: GroupSettings) -> str:
-    """Write a covariate; age as the settings say."""
-    shape = settings.model.age if name.casefold() in _AGES else "linear"
-    forms = {"quadratic": f"poly({name}, 2)", "spline": f'cr({name}, df=3, constraints="center")'}
-    return forms.get(shape, name)
+    by_name = {str(column).casefold(): str(column) for column in table.columns}
+    terms = [first or "1"]
+    for name in (by_name[name.casefold()] for name in names if name.casefold() in by_name):
+        if len(typed(table[name], settings.design).dropna().unique()) > 1:
+            shape = settings.model.age if name.casefold() in _AGES else "linear"
+            bent = {"quadratic": f"poly({name}, 2)"}
+            bent["spline"] = f'cr({name}, df=3, constraints="center")'
+            terms.append(bent.get(shape, name))
+    return " + ".join(terms)
 
 
 def default_contrasts(
@@ -149,13 +150,6 @@ def empty_covariates(table: pd.DataFrame, settings: GroupSettings) -> list[str]:
     wanted = {name.casefold() for name in settings.model.covariates}
     named = [str(name) for name in table.columns if str(name).casefold() in wanted]
     return [name for name in named if typed(table[name], settings.design).isna().all()]
-
-
-def _varying(table: pd.DataFrame, names: Sequence[str], settings: GroupSettings) -> list[str]:
-    by_name = {str(column).casefold(): str(column) for column in table.columns}
-    found = [by_name[name.casefold()] for name in names if name.casefold() in by_name]
-    levels = {name: typed(table[name], settings.design).dropna().unique() for name in found}
-    return [name for name in found if len(levels[name]) > 1]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -373,8 +367,7 @@ class _Terms:
 
     def _row(self, name: str, contrast: str) -> Float:
         if name in self.columns:
-            unit = np.arange(len(self.columns)) == self.columns.index(name)
-            return np.asarray(unit, dtype=np.float64)
+            return np.asarray(np.eye(len(self.columns))[self.columns.index(name)])
         factor, level = self._split(name)
         if factor is None:
             known = [
@@ -390,10 +383,8 @@ class _Terms:
         # The mean of the model over all rows if every one had this level.
         moved = self.table.copy()
         moved[factor] = pd.Categorical([level] * len(moved), categories=self.levels[factor])
-        matrix = np.asarray(
-            self.spec.get_model_matrix(moved, context=dict(CONTEXT)), dtype=np.float64
-        )
-        return np.asarray(np.asarray(matrix, dtype=np.float64).mean(axis=0), dtype=np.float64)
+        matrix = self.spec.get_model_matrix(moved, context=dict(CONTEXT))
+        return np.asarray(np.asarray(matrix, dtype=np.float64).mean(axis=0))
 
     def _split(self, name: str) -> tuple[str | None, str]:
         """Factor and level of ``factor[level]`` or ``factor.level``."""
@@ -407,11 +398,7 @@ class _Terms:
 def _dummies(columns: tuple[str, ...], test: str | None) -> list[ContrastSpec]:
     if test is None:
         return []
-    return [
-        ContrastSpec(column, (column,), ((1.0,),), test)
-        for column in columns
-        if column != "Intercept"
-    ]
+    return [ContrastSpec(one, (one,), ((1.0,),), test) for one in columns if one != INTERCEPT]
 
 
 def _read_formula(text: str) -> Formula:

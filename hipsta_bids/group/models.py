@@ -1,8 +1,8 @@
 """The models of the group level on arrays, without files: ``hipsta_bids.group``."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -72,6 +72,9 @@ class GroupFit:
     def _tests(self, side: str) -> tuple[PointTest, ...]:
         return self.fitted[side].fits[self.measure].tests
 
+    def _found(self, side: str, test: PointTest) -> Discoveries:
+        return self.found[MapKey(self.measure, test.contrast.name, side)]
+
     @cached_property
     def maps(self) -> Mapping[str, Float]:
         """Arrays (side, contrast, x, y), or (side, contrast, vertex); NaN where nothing is tested.
@@ -79,36 +82,26 @@ class GroupFit:
         ``estimate`` and ``se`` in the unit of the maps, ``statistic`` (t or F), ``df``, ``p``,
         ``p_corrected``, and ``effect`` (Cohen's d, or partial eta squared of F).
         """
-        return {name: self._array(name) for name in _ARRAYS}
+        return {name: self._stacked(partial(self._values, name)) for name in _ARRAYS}
 
     @cached_property
     def significant(self) -> Bool:
         """Points that survive the correction, in the shape of :attr:`maps`."""
-        return self._stacked(
-            [[self.found[self._key(s, c)].rejected for c in self.contrasts] for s in self.sides]
-        )
-
-    def _array(self, name: str) -> Float:
-        return self._stacked(
-            [[self._values(name, side, test) for test in self._tests(side)] for side in self.sides]
-        )
+        return self._stacked(lambda side, test: self._found(side, test).rejected)
 
     def _values(self, name: str, side: str, test: PointTest) -> Float:
         if name == "p_corrected":
-            return self.found[self._key(side, test.contrast.name)].adjusted
+            return self._found(side, test).adjusted
         if name in {"estimate", "se"}:
             rows = getattr(test, name)
             return rows[0] if test.kind == "t" else np.full(rows.shape[1], np.nan)
         return np.asarray(getattr(test, name))
 
-    def _stacked(self, values: Sequence[Sequence[NDArray[_Number]]]) -> NDArray[_Number]:
-        array = np.array(values)
+    def _stacked(self, values: Callable[[str, PointTest], NDArray[_Number]]) -> NDArray[_Number]:
+        array = np.array([[values(one, test) for test in self._tests(one)] for one in self.sides])
         maps = self.fitted[self.sides[0]].maps
         inner = maps.shape if maps.mesh is None and maps.shape[1] > 1 else maps.shape[:1]
         return array.reshape(*array.shape[:2], *inner)
-
-    def _key(self, side: str, contrast: str) -> MapKey:
-        return MapKey(self.measure, contrast, side)
 
     @cached_property
     def table(self) -> pd.DataFrame:
@@ -116,7 +109,7 @@ class GroupFit:
         rows = []
         for i, side in enumerate(self.sides):
             for j, test in enumerate(self._tests(side)):
-                found = self.found[self._key(side, test.contrast.name)]
+                found = self._found(side, test)
                 effects = self.maps["effect"][i, j]
                 known = np.isfinite(effects).any()
                 rows.append(

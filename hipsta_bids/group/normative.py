@@ -17,6 +17,7 @@ from hipsta_bids.group.grammar import closed_formula
 from hipsta_bids.group.model import build_design
 from hipsta_bids.group.settings import GlmSettings, GroupSettings
 from hipsta_bids.group.summaries import hemispheres, summary_values
+from hipsta_bids.progress import tell
 
 #: Region of a score that is the mean over the whole sheet.
 WHOLE = "all"
@@ -31,8 +32,6 @@ class NormativeScores:
     group (Jack et al. 1997)."""
     p: Float
     """(subjects, points) two-sided, with the uncertainty of the expectation."""
-    n_reference: NDArray[np.int64]
-    """(points,) reference subjects with a value."""
 
 
 def w_scores(maps: Float, matrix: Float, reference: Bool, settings: GlmSettings) -> NormativeScores:
@@ -48,11 +47,6 @@ def w_scores(maps: Float, matrix: Float, reference: Bool, settings: GlmSettings)
             reason="normative-covariance",
         )
     own = matrix[reference]
-    if not np.isfinite(matrix).all():
-        raise ModelError(
-            "normative scores: covariates are missing; keep complete rows only",
-            reason="design-missing",
-        )
     if len(own) - matrix.shape[1] <= settings.min_residual_df:
         raise ModelError(
             f"normative scores: {len(own)} reference subjects are too few for"
@@ -71,11 +65,7 @@ def w_scores(maps: Float, matrix: Float, reference: Bool, settings: GlmSettings)
         _score(np.asarray(maps[:, part], dtype=np.float64), rotated, basis, reference, settings)
         for part in chunks(maps.shape, matrix.shape[1])
     ]
-    return NormativeScores(
-        w=np.hstack([part.w for part in parts]),
-        p=np.hstack([part.p for part in parts]),
-        n_reference=np.concatenate([part.n_reference for part in parts]),
-    )
+    return NormativeScores(*map(np.hstack, zip(*parts, strict=True)))
 
 
 def _score(
@@ -84,7 +74,7 @@ def _score(
     basis: Float,
     reference: Bool,
     settings: GlmSettings,
-) -> NormativeScores:
+) -> tuple[Float, Float]:
     fit = fit_block(maps[reference], basis, settings)
     inverse = fit.covariance / (fit.sigma**2)[:, None, None]
     leverage = np.einsum("psi,si->sp", rotated @ inverse, rotated)
@@ -105,7 +95,7 @@ def _score(
     spread = np.where(member, leverage / kept, leverage)
     freedom = np.where(member, df - 1, df)
     p = 2 * special.stdtr(freedom, -np.abs(w) / np.sqrt(1 + spread))
-    return NormativeScores(w, np.asarray(p, dtype=np.float64), fit.n)
+    return w, np.asarray(p, dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -141,13 +131,16 @@ class Scores:
 def score_cohort(
     cohort: Cohort,
     model: ModelSpec,
-    normative: tuple[str, str],
+    normative: tuple[str, str] | None,
     settings: GroupSettings,
     *,
     measures: Measures,
     references: Mapping[str, str],
-) -> Scores:
+) -> Scores | None:
     """Score all participants who have the covariates of a model, whatever their group."""
+    if normative is None:
+        return None
+    tell("w-scores")
     factor, level = normative
     formula = without_variable(model.formula, factor)
     known = closed_formula(formula).names
@@ -179,12 +172,19 @@ def score_cohort(
             subfield=most_frequent(side.subfield[used], len(side.names)),
             names=side.names,
         )
-    parts = [
-        *map_rows(cohort, sides, settings),
-        *_summary_rows(
-            cohort, design.rows, design.matrix, reference, measures=measures, settings=settings
-        ),
-    ]
+    parts = list(map_rows(cohort, sides, settings))
+    for hemi in hemispheres(cohort):
+        values = summary_values(cohort, hemi, measures.summaries).iloc[design.rows]
+        among = values[reference]
+        values = values.loc[:, (among.max() > among.min()).to_numpy()]
+        if values.columns.empty:
+            continue
+        numbers = values.to_numpy(dtype=np.float64)
+        found = w_scores(numbers, design.matrix, reference, settings.glm)
+        for i, measure in enumerate(map(str, values.columns)):
+            what = {"hemi": hemi, "measure": measure, "region": None, "reference": reference}
+            numbers_of = {"w": found.w[:, i], "p": found.p[:, i], "low": np.nan, "high": np.nan}
+            parts.append(score_rows(cohort, design.rows, **what, **numbers_of))
     return Scores(
         factor=factor,
         level=level,
@@ -234,39 +234,6 @@ def map_rows(
                     low=(out[:, points] & (w < 0)).sum(axis=1) / count,
                     high=(out[:, points] & (w > 0)).sum(axis=1) / count,
                 )
-
-
-def _summary_rows(
-    cohort: Cohort,
-    rows: Int,
-    matrix: Float,
-    reference: NDArray[np.bool_],
-    *,
-    measures: Measures,
-    settings: GroupSettings,
-) -> Iterator[pd.DataFrame]:
-    for hemi in hemispheres(cohort):
-        values = summary_values(cohort, hemi, measures.summaries).iloc[rows]
-        own = values[reference]
-        varying = values.columns[(own.max() > own.min()).to_numpy()]
-        if not len(varying):
-            continue
-        found = w_scores(
-            values[varying].to_numpy(dtype=np.float64), matrix, reference, settings.glm
-        )
-        for i, measure in enumerate(varying):
-            yield score_rows(
-                cohort,
-                rows,
-                hemi=hemi,
-                measure=str(measure),
-                region=None,
-                reference=reference,
-                w=found.w[:, i],
-                p=found.p[:, i],
-                low=np.nan,
-                high=np.nan,
-            )
 
 
 def score_rows(cohort: Cohort, rows: Int, **columns: object) -> pd.DataFrame:

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -13,7 +14,6 @@ from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group import write
-from hipsta_bids.group.analysis import SideResult, templates_of
 from hipsta_bids.group.comparison import BOTH, Comparison
 from hipsta_bids.group.covariates import FIRST_AGE
 from hipsta_bids.group.data import PARTICIPANT, Bool, Cohort, Float, Int, Key
@@ -37,19 +37,11 @@ from hipsta_bids.group.run import (
     GroupInputs,
     GroupOptions,
     GroupResult,
-    read_inputs,
     read_templates,
 )
 from hipsta_bids.group.settings import GroupSettings, NormSettings
 from hipsta_bids.group.summaries import hemispheres, summary_values
-from hipsta_bids.group.tables import registration_tables
-from hipsta_bids.group.trials import (
-    draw_maps,
-    folder_of,
-    members,
-    register_cohorts,
-    write_answer,
-)
+from hipsta_bids.group.trials import Asked, draw_maps, folder_of, members
 from hipsta_bids.group.warps import Template, templates_from_json
 from hipsta_bids.io import files
 from hipsta_bids.progress import tell
@@ -73,25 +65,11 @@ class NormsRequest:
     """Column and level of those who tell shift and scale of new sites."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Chosen:
-    """What is asked for, and of which visits."""
-
-    options: GroupOptions
-    request: NormsRequest
-    settings: GroupSettings
-    inputs: GroupInputs
-    keep: Bool
-    """Of the visits that were read."""
-    cohort: Cohort
-    left_out: dict[str, tuple[str, str]]
-    """Reason and message by visit."""
-
-
 @dataclass(frozen=True, eq=False)
 class _Made:
     """What is written."""
 
+    request: NormsRequest
     file: NormsFile
     norms: Mapping[Key, Norms]
     people: People
@@ -108,27 +86,20 @@ class _Made:
 
 
 def run_norms(options: GroupOptions, request: NormsRequest, settings: GroupSettings) -> GroupResult:
-    """Fit norms, or score people by them, and write all results or none.
-
-    Raises
-    ------
-    HipstaError
-        If inputs, file or output folder do not allow it.
-    """
+    """Fit norms, or score people by them, and write all results or none."""
     dataset.check_own_dataset(options.out_dir)
     if request.file is not None:
         return _score_people(options, request, request.file, settings)
-    chosen = _choose(options, request, settings)
-    file, how = _planned(chosen), settings.norms
-    people = _people(chosen, file)
-    file = _counted(file, people, how)
-    sides, cohorts, found = _registered(chosen, read_templates(options.template, chosen.cohort))
+    chosen = Asked.read(options, request.among, settings)
+    file, people = _planned(chosen)
+    template, tables, cohorts, found = _registered(
+        chosen, read_templates(options.template, chosen.cohort)
+    )
     tell("norms")
-    file = file.model_copy(update={"template": templates_of(sides)})
-    norms, table = _fit(found, people, file, how)
-    tables = dict(registration_tables(chosen.cohort, sides)) if sides else {}
-    tables["coverage"] = table
-    return _write(chosen, _Made(file, norms, people, cohorts, found, tables, len(file.sites)), ())
+    file = file.model_copy(update={"template": template})
+    norms, tables["coverage"] = _fit(found, people, file, settings.norms)
+    known = len(file.sites)
+    return _write(chosen, _Made(request, file, norms, people, cohorts, found, tables, known), ())
 
 
 def _score_people(
@@ -141,7 +112,7 @@ def _score_people(
     every = Comparison(longitudinal=True)  # each visit has a score
     options = replace(options, measures=measures, comparison=every)
     settings = settings.changed(registration=file.registration)
-    chosen = _choose(options, request, settings)
+    chosen = Asked.read(options, request.among, settings)
     notes, table = _check(file, path, chosen.inputs), chosen.cohort.table
     again = table.duplicated([PARTICIPANT, *({file.site} & set(table.columns))])
     if again.any() and FIRST_AGE not in table:
@@ -155,9 +126,9 @@ def _score_people(
         raise ModelError(f"{path}: nobody here can be scored: {why}", reason="norms-differ")
     everyone = members(table, request.controls, "--controls")
     controls = everyone & (request.controls is not None) & ~again.to_numpy()
-    file = _with_new_sites(chosen, file, people, controls)
+    file = _with_new_sites(chosen, request, file, people, controls)
     templates = None if file.template is None else templates_from_json(file.template, str(path))
-    sides, cohorts, found = _registered(chosen, templates)
+    _, tables, cohorts, found = _registered(chosen, templates)
     found = {key: own for key, own in found.items() if key in norms}
     adapted = controls & people.known & (people.site >= known)
     tell("norms")
@@ -171,32 +142,17 @@ def _score_people(
     scored = {
         name: _score_maps(one, found, extended, people, adapted) for name, one in cohorts.items()
     }
-    tables = dict(registration_tables(chosen.cohort, sides)) if sides else {}
-    made = _Made(file, extended, people, cohorts, found, tables, known, scored, adapted)
+    made = _Made(request, file, extended, people, cohorts, found, tables, known, scored, adapted)
     tables["zscores"] = pd.concat(_score_rows(made, adapted, settings), ignore_index=True)
     return _write(chosen, made, notes)
 
 
-def _choose(options: GroupOptions, request: NormsRequest, settings: GroupSettings) -> _Chosen:
-    tell("reading")
-    inputs = read_inputs(options, settings)
-    keep = members(inputs.cohort.table, request.among)
-    why = "not-asked", "another level than --among"
-    left_out = dict.fromkeys(map(str, inputs.cohort.table.index[~keep]), why)
-    return _Chosen(
-        options=options, request=request, settings=settings, inputs=inputs, keep=keep,
-        cohort=inputs.cohort.take(keep), left_out=left_out,
-    )  # fmt: skip
-
-
 def _registered(
-    chosen: _Chosen, templates: Mapping[str, Template] | None
-) -> tuple[dict[str, SideResult], dict[str, Cohort], Values]:
+    chosen: Asked, templates: Mapping[str, Template] | None
+) -> tuple[dict[str, Any] | None, dict[str, pd.DataFrame], dict[str, Cohort], Values]:
     """Register maps, and collect them and summary measures of each side and of the mean of both."""
     inputs = chosen.inputs
-    sides, cohorts = register_cohorts(
-        chosen.cohort, inputs, chosen.keep, chosen.settings, templates
-    )
+    template, cohorts, tables = chosen.register(templates)
     names = [*inputs.measures.maps, *inputs.others]
     found: dict[Key, tuple[Int, Float]] = {}
     for name, cohort in cohorts.items():
@@ -213,13 +169,13 @@ def _registered(
         table = summary_values(chosen.cohort, hemi, inputs.measures.summaries)
         for name in table.columns:
             found[hemi, str(name)] = every, table[[name]].to_numpy(dtype=np.float64)
-    return sides, cohorts, found
+    return template, tables, cohorts, found
 
 
-def _write(chosen: _Chosen, made: _Made, notes: Iterable[str]) -> GroupResult:
+def _write(chosen: Asked, made: _Made, notes: Iterable[str]) -> GroupResult:
     """Write all results; charts are of the measures that the settings name."""
     file, people, cohort = made.file, made.people, chosen.cohort
-    request, settings = chosen.request, chosen.settings
+    request, settings = made.request, chosen.settings
     charts = [
         file.centiles(norms).assign(hemi=hemi, measure=name, unit=cohort.units.get(name, "1"))
         for (hemi, name), norms in made.norms.items()
@@ -269,15 +225,12 @@ def _write(chosen: _Chosen, made: _Made, notes: Iterable[str]) -> GroupResult:
         "among": request.among,
     }
     name = folder_of(["norms" if request.file is None else "scores"], request.among)
-    notes = [*chosen.inputs.notes, *notes]
+    notes = [*notes]
     if later := sum(one.reason == "later-session" for one in chosen.inputs.exclusions):
         notes.append(f"{later} later sessions are not in the norms, which take first ones")
     if file.site not in cohort.table:
         notes.append(f"no column {file.site!r}: all are taken to be at one, {_NO_SITE!r}")
-    return write_answer(
-        chosen.options, name, chosen.inputs, settings, left_out=chosen.left_out, notes=notes,
-        visits=visits, tables=made.tables, record=record, fill=fill,
-    )  # fmt: skip
+    return chosen.write(name, notes, visits=visits, tables=made.tables, record=record, fill=fill)
 
 
 def _protocol(inputs: GroupInputs) -> tuple[str, str]:
@@ -286,8 +239,11 @@ def _protocol(inputs: GroupInputs) -> tuple[str, str]:
     return (records[0].place.name.seg, records[0].place.name.region) if records else ("none",) * 2
 
 
-def _planned(chosen: _Chosen) -> NormsFile:
-    """Say what norms are about, before they are fitted."""
+def _planned(chosen: Asked) -> tuple[NormsFile, People]:
+    """Say what norms are about, before they are fitted, and of whom.
+
+    Refuses a cohort that is too small, or whose sexes are those of sites.
+    """
     cohort, inputs, settings = chosen.cohort, chosen.inputs, chosen.settings
     how, found, table = settings.norms, inputs.found, cohort.table
     check_names([how.age], table.columns)
@@ -296,7 +252,7 @@ def _planned(chosen: _Chosen) -> NormsFile:
     for labels in (sites, sexes):
         complete &= True if labels is None else labels.notna().to_numpy()
     knots = choose_knots(_ages(table, how.age, settings)[complete], how)
-    return NormsFile(
+    file = NormsFile(
         description="norms of maps and summary measures by age, sex and site",
         format=1,
         hash="",
@@ -318,6 +274,24 @@ def _planned(chosen: _Chosen) -> NormsFile:
         participants=1,
         norms={},
     )
+    people = _people(chosen, file)
+    known = people.known
+    numbers = np.bincount(people.site[known], minlength=len(file.sites)).tolist()
+    counts = dict(zip(file.sites, numbers, strict=True))
+    if small := [f"{site} ({n})" for site, n in counts.items() if n < how.least_site]:
+        raise ModelError(
+            f"--fit-norms: too few participants at {file.site} {listed(small)}; each needs"
+            f" {how.least_site}: leave these out by --exclude, or join those of one scanner",
+            reason="norms-reference",
+        )
+    both = np.hstack([np.eye(len(counts))[people.site[known]], people.sex[known]])
+    if np.linalg.matrix_rank(both) < both.shape[1]:
+        raise ModelError(
+            f"--fit-norms: {file.sex} does not vary within {file.site}, so that their effects"
+            " cannot be told apart; add sites with both",
+            reason="norms-reference",
+        )
+    return file.model_copy(update={"sites": counts, "participants": int(known.sum())}), people
 
 
 def _ages(table: pd.DataFrame, column: str, settings: GroupSettings) -> Float:
@@ -333,7 +307,7 @@ def _site_labels(table: pd.DataFrame, column: str, settings: GroupSettings) -> p
     return level_labels(table[column], settings.design)
 
 
-def _people(chosen: _Chosen, file: NormsFile) -> People:
+def _people(chosen: Asked, file: NormsFile) -> People:
     """Describe visits as norms have to know them, new sites last; others are left out."""
     table, settings = chosen.cohort.table, chosen.settings
     check_names([file.age, *([file.sex] if file.sexes else [])], table.columns)
@@ -357,27 +331,6 @@ def _people(chosen: _Chosen, file: NormsFile) -> People:
     sites = [*file.sites, *sorted(set(labels[usable]) - set(file.sites))]
     site = np.where(usable, pd.Categorical(labels, categories=sites).codes, -1).astype(np.int64)
     return People(age=age, sex=sex, site=site)
-
-
-def _counted(file: NormsFile, people: People, how: NormSettings) -> NormsFile:
-    """Count a reference cohort; refuse one that is too small, or whose sexes are those of sites."""
-    known = people.known
-    counts = np.bincount(people.site[known], minlength=len(file.sites)).tolist()
-    sites = dict(zip(file.sites, counts, strict=True))
-    if small := [f"{site} ({n})" for site, n in sites.items() if n < how.least_site]:
-        raise ModelError(
-            f"--fit-norms: too few participants at {file.site} {listed(small)}; each needs"
-            f" {how.least_site}: leave these out by --exclude, or join those of one scanner",
-            reason="norms-reference",
-        )
-    both = np.hstack([np.eye(len(sites))[people.site[known]], people.sex[known]])
-    if np.linalg.matrix_rank(both) < both.shape[1]:
-        raise ModelError(
-            f"--fit-norms: {file.sex} does not vary within {file.site}, so that their effects"
-            " cannot be told apart; add sites with both",
-            reason="norms-reference",
-        )
-    return file.model_copy(update={"sites": sites, "participants": int(known.sum())})
 
 
 def _check(file: NormsFile, path: Path, inputs: GroupInputs) -> list[str]:
@@ -418,9 +371,11 @@ def _check(file: NormsFile, path: Path, inputs: GroupInputs) -> list[str]:
     return []
 
 
-def _with_new_sites(chosen: _Chosen, file: NormsFile, people: People, controls: Bool) -> NormsFile:
+def _with_new_sites(
+    chosen: Asked, request: NormsRequest, file: NormsFile, people: People, controls: Bool
+) -> NormsFile:
     """Add the names of new sites, if they have controls enough."""
-    table, request, settings = chosen.cohort.table, chosen.request, chosen.settings
+    table, settings = chosen.cohort.table, chosen.settings
     least, sites = settings.norms.least_controls, dict(file.sites)
     labels = _site_labels(table, file.site, settings).to_numpy()
     for number in range(len(sites), int(people.site.max(initial=-1)) + 1):
@@ -488,7 +443,7 @@ def _score_maps(
                 continue
             one = norms[hemi, measure]
             z = one.score(values[hemi, measure][1], people.take(side.rows))
-            scores[measure] = NormativeScores(z, 2 * special.ndtr(-np.abs(z)), one.n.sum(axis=0))
+            scores[measure] = NormativeScores(z, 2 * special.ndtr(-np.abs(z)))
         if scores:
             scored[hemi] = ScoredMaps(
                 rows=side.rows,

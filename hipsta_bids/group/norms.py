@@ -19,7 +19,7 @@ from pydantic import Field
 from scipy import special
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.combat import solve_points
+from hipsta_bids.group.combat import solve_weighted
 from hipsta_bids.group.data import Bool, Float, Int, Key, as_nested, read_foreign
 from hipsta_bids.group.exchange import Known, Number, Text
 from hipsta_bids.group.glm import chunks
@@ -135,16 +135,8 @@ class Norms:
     def extended(self, values: Float, people: People, n_sites: int, least: int) -> "Norms":
         """Add sites beyond those that are known: their shift and scale, all else as it is.
 
-        Parameters
-        ----------
-        values : array
-            (visits, points) of controls, NaN where missing.
-        people : People
-            The controls; sites from ``len(self.n)`` on are new.
-        n_sites : int
-            Sites with the new ones.
-        least : int
-            Controls with a value that a point needs at a site.
+        ``values`` (visits, points) are of controls, NaN where missing; sites of ``people`` from
+        ``len(self.n)`` on are new, up to ``n_sites``. A point needs ``least`` values at a site.
         """
         blocks: list[list[Any]] = [[self.shift], [self.scale], [self.n]]
         for site in range(len(self.n), n_sites):
@@ -242,7 +234,7 @@ def _fit(
     coefficients = np.full((design.shape[1], values.shape[1]), np.nan)
     for _ in range(_STEPS):
         weight = there * np.exp(-2 * (spread @ log_sd))
-        coefficients = _weighted(filled, weight, design)
+        coefficients = solve_weighted(filled, weight, design)
         square = (filled - design @ coefficients) ** 2 * weight / kept
         step = back @ np.where(there, square - 1, 0.0)
         log_sd += np.clip(np.nan_to_num(step), -_LARGEST_STEP, _LARGEST_STEP)
@@ -271,16 +263,6 @@ def _spread_of(filled: Float, there: Bool) -> Float:
     count = np.maximum(there.sum(axis=0), 1)
     mean = filled.sum(axis=0) / count
     return np.asarray(np.sqrt((there * (filled - mean) ** 2).sum(axis=0) / count))
-
-
-def _weighted(values: Float, weight: Float, design: Float) -> Float:
-    """(columns, points) weighted least squares with weights of each point."""
-    columns = design.shape[1]
-    grams = np.zeros((values.shape[1], columns**2))
-    for rows in chunks((columns**2, len(design)), 1):
-        products = (design[rows, :, None] * design[rows, None, :]).reshape(-1, columns**2)
-        grams += weight[rows].T @ products
-    return solve_points(grams.reshape(-1, columns, columns), (weight * values).T @ design, 0.0)
 
 
 def _power(order: Float) -> Float:
@@ -471,10 +453,7 @@ def _digest(content: Mapping[str, Any]) -> str:
 def load_norms(path: Path) -> tuple[NormsFile, dict[Key, Norms]]:
     """Read what :func:`save_norms` wrote; nothing in it is run.
 
-    Raises
-    ------
-    ModelError
-        If the file is too large, changed, of another format, or its parts do not fit each other.
+    ModelError if it is too large, changed, of another format, or its parts do not fit each other.
     """
     try:
         file = read_foreign(path, NormsFile, most=_LARGEST)

@@ -13,6 +13,7 @@ from itertools import product
 import numpy as np
 
 from hipsta_bids.group.data import Float, Int
+from hipsta_bids.group.glm import products_of, sum_by
 from hipsta_bids.group.settings import LongitudinalSettings
 
 #: Step of numerical derivatives of the three numbers; times have a standard deviation of 1.
@@ -80,19 +81,16 @@ def collect_slope_sums(maps: Float, basis: Float, participants: Int, times: Floa
     present = np.isfinite(maps)
     weight = present.astype(np.float64)
     values = np.where(present, maps, 0.0)
-    order = np.argsort(participants, kind="stable")
-    starts = np.searchsorted(participants[order], np.arange(participants.max() + 1))
     powers = np.stack([np.ones_like(times), times, times**2])
-    products = (basis[:, :, None] * basis[:, None, :]).reshape(len(basis), -1)
     columns = basis.shape[1]
 
     def per_person(table: Float) -> Float:
-        return np.moveaxis(np.add.reduceat(table[order], starts, axis=0), 0, 1)
+        return np.moveaxis(sum_by(participants, table), 0, 1)
 
     shown = weight[:, :1] if present.all() else weight
     return SlopeSums(
         n=present.sum(axis=0),
-        squares=(weight.T @ products).reshape(-1, columns, columns),
+        squares=(weight.T @ products_of(basis)).reshape(-1, columns, columns),
         products=values.T @ basis,
         total=np.einsum("sp,sp->p", values, values),
         moments=np.stack([per_person(shown * power[:, None]) for power in powers]),
@@ -200,9 +198,12 @@ def slope_freedom(sums: SlopeSums, triangles: Float, rows: Float) -> Float:
         hessian[:, 0, i + 1] = -(up.residual - down.residual) / (2 * _STEP) / variance
         hessian[:, i + 1, 0] = hessian[:, 0, i + 1]
         slopes.append((forms(up.inverse, rows) - forms(down.inverse, rows)) / (2 * _STEP))
-    hessian[:, 1:, 1:] = _second(
-        lambda at: _fixed_variance(solve_slopes(sums, at), variance), triangles
-    )
+
+    def fixed_variance(at: Float) -> Float:
+        state = solve_slopes(sums, at)
+        return np.asarray(state.penalty + state.residual / variance)
+
+    hessian[:, 1:, 1:] = _second(fixed_variance, triangles)
     form = forms(base.inverse, rows)
     gradient = np.stack([np.ones_like(form), *(slope / form for slope in slopes)], axis=-1)
     size, axes = np.linalg.eigh(hessian)
@@ -210,10 +211,6 @@ def slope_freedom(sums: SlopeSums, triangles: Float, rows: Float) -> Float:
     inverse = np.where(valid, 1 / np.where(valid, size, 1.0), 0.0)
     turned = np.einsum("cpi,pij->cpj", gradient, axes)
     return np.asarray(1 / np.einsum("cpj,pj->cp", turned**2, inverse), dtype=np.float64)
-
-
-def _fixed_variance(state: SlopeState, variance: Float) -> Float:
-    return np.asarray(state.penalty + state.residual / variance)
 
 
 def forms(inverse: Float, rows: Float) -> Float:

@@ -18,7 +18,12 @@ from hipsta_bids.group.glm import FittedMaps, PointwiseFit, RowModel, fit_maps, 
 from hipsta_bids.group.mixed import longitudinal_model
 from hipsta_bids.group.model import ModelRequest, build_design, default_formula
 from hipsta_bids.group.settings import GroupSettings, RetestSettings
-from hipsta_bids.group.summaries import fit_summaries, hemispheres, summary_values
+from hipsta_bids.group.summaries import (
+    fit_summaries,
+    hemispheres,
+    participants_with,
+    summary_values,
+)
 
 #: Months per unit of columns of time with these names.
 _MONTHS = {"years": 12.0, "months": 1.0, "days": 12 / 365.25}
@@ -61,24 +66,13 @@ class Repeatability:
 
 
 def repeatability(values: Float, *, confidence: float = 0.95, least: int = 3) -> Repeatability:
-    """Split the variance of repeated measurements into that between and that within participants.
+    """Split the variance of values (participants, sessions, points) between and within people.
 
-    Parameters
-    ----------
-    values : array
-        (participants, sessions, points); where one session is missing, the participant is left out
-        at that point.
-    confidence : float, optional
-        Coverage of the limits.
-    least : int, optional
-        Points with fewer complete participants are NaN.
-
-    Returns
-    -------
-    Repeatability
-        The within-subject SD is the root of the mean variance of a participant's values (Bland and
-        Altman 1996), its limits those of chi squared. ICC(2,1) is that of Shrout and Fleiss (1979),
-        with the limits of McGraw and Wong (1996, table 7, ICC(A,1)).
+    Where one session is missing, the participant is left out at that point; points with fewer
+    complete participants than ``least`` are NaN. The within-subject SD is the root of the mean
+    variance of a participant's values (Bland and Altman 1996), its limits those of chi squared.
+    ICC(2,1) is that of Shrout and Fleiss (1979), with the limits of McGraw and Wong (1996, table 7,
+    ICC(A,1)).
     """
     k = values.shape[1]
     complete: Bool = np.asarray(np.isfinite(values).all(axis=1))
@@ -368,10 +362,8 @@ class Modeled:
 
     def _reference(self, rows: Int, values: Float, fit: PointwiseFit) -> Reference:
         """At one visit with the residual variance; over time with changes and both variances."""
-        numbers, names = pd.factorize(self._table[PARTICIPANT].iloc[rows])
-        seen = np.zeros((len(names), values.shape[1]), dtype=bool)
-        np.logical_or.at(seen, numbers, np.isfinite(values))
-        n = seen.sum(axis=0)
+        who = self._table[PARTICIPANT].iloc[rows].to_numpy()
+        n = participants_with(np.isfinite(values), who)
         plain = Reference(
             n=n,
             mean=mean_of_known(values, 0),

@@ -1,6 +1,6 @@
 """The group level from files to files."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -159,9 +159,7 @@ def run_group(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         If inputs, model or output folder do not allow it.
     """
     dataset.check_own_dataset(options.out_dir)
-    result = _analyze(options, settings)
-    page, problem = make_page(options, result.folder.name)
-    return replace(result, page=page, problem=problem)
+    return with_page(options, _analyze(options, settings))
 
 
 def _analyze(options: GroupOptions, settings: GroupSettings) -> GroupResult:
@@ -203,21 +201,18 @@ def _analyze(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         found |= other.found
     joint = combine_maps([analysis, *(other for _, other in others.values())], settings)
     found |= {key: one.found for key, one in joint.items()}
+    tested = tuple(joint.values())
     analysis = replace(analysis, found=found)
     exclusions = [*inputs.exclusions, *_incomplete(analysis)]
     wanted = wanted_measures(options.model, options.measures)
-    region = options.sheets.region
-    name = folder_name(model.formula, wanted) + options.comparison.suffix
-    name = options.model.name or (name if region == "body" else f"{name}_{region}")
     notes = [*inputs.notes, *_notes(options, inputs, analysis, settings)]
     summary = _summary(options, inputs, analysis, settings, notes)
     tell("average surfaces")
     shapes = average_shapes(inputs.found.records, cohort, analysis, settings)
     # One is enough from here on, and all may take much memory.
     inputs = replace(inputs, found=replace(inputs.found, records=inputs.found.records[:1]))
-    describe_dataset(options)
-    with write.model_folder(options.out_dir, name) as folder:
-        tell("tables and maps")
+
+    def fill(folder: Path) -> dict[str, Any]:
         write_results(
             folder,
             cohort,
@@ -225,8 +220,8 @@ def _analyze(options: GroupOptions, settings: GroupSettings) -> GroupResult:
             settings,
             exclusions,
             others=others,
-            joint=tuple(joint.values()),
-            region=region,
+            joint=tested,
+            region=options.sheets.region,
             ratings=inputs.found.ratings,
         )
         files.write_json(folder / "model.json", document)
@@ -235,16 +230,66 @@ def _analyze(options: GroupOptions, settings: GroupSettings) -> GroupResult:
         write_shapes(folder, shapes)
         if analysis.sides and inputs.found.records and not shapes:
             notes.append("no average surfaces: those of the participant level are missing")
-        notes += draw(folder, cohort, analysis, shapes, others=others, joint=tuple(joint.values()))
-        told = [*inputs.found.warnings, *notes]
-        record = _record(options, inputs.found, settings, analysis, told)
+        notes.extend(draw(folder, cohort, analysis, shapes, others=others, joint=tested))
+        return _record(analysis, inputs.found.ratings)
+
+    return write_folder(
+        options,
+        folder_name(model.formula, wanted) + options.comparison.suffix,
+        inputs,
+        settings,
+        notes=notes,
+        counts=(analysis.n_participants, len(exclusions)),
+        fill=fill,
+    )
+
+
+def write_folder(
+    options: GroupOptions,
+    name: str,
+    inputs: GroupInputs,
+    settings: GroupSettings,
+    *,
+    notes: list[str],
+    counts: tuple[int, int],
+    fill: Callable[[Path], Mapping[str, Any]],
+) -> GroupResult:
+    """Write all results or none.
+
+    ``fill`` writes into the folder, adds to the notes, and returns what is recorded; ``counts`` are
+    of participants and of what is left out.
+    """
+    found, region = inputs.found, options.sheets.region
+    name = options.model.name or (name if region == "body" else f"{name}_{region}")
+    _describe_dataset(options)
+    with write.model_folder(options.out_dir, name) as folder:
+        tell("tables and maps")
+        record = {
+            "command": list(options.command),
+            "version": __version__,
+            "inputs": {
+                "datasets": [str(root.resolve()) for root in options.sheets.roots],
+                "settings_hash": found.settings_hash,
+                "versions": found.versions,
+                "seg": found.records[0].place.name.seg if found.records else None,
+                "region": region,
+                "maps": dict(options.maps),
+                "volumes": dict(options.volumes),
+                "covariates": [str(path) for path in options.covariates],
+                "template": options.template and str(options.template),
+                "harmonization": options.harmonize_model and str(options.harmonize_model),
+            },
+            **fill(folder),
+            "notes": [*found.warnings, *notes],
+            "settings": resolve(settings),
+        }
         files.write_json(folder / "analysis.json", record)
     return GroupResult(
         folder=options.out_dir / write.GROUP_FOLDER / name,
-        n_participants=analysis.n_participants,
-        n_excluded=len(exclusions),
+        n_participants=counts[0],
+        n_excluded=counts[1],
         notes=tuple(notes),
-        warnings=inputs.found.warnings,
+        warnings=found.warnings,
     )
 
 
@@ -431,18 +476,9 @@ def _notes(
     return notes
 
 
-def _record(
-    options: GroupOptions,
-    found: Collection,
-    settings: GroupSettings,
-    analysis: Analysis,
-    notes: Sequence[str],
-) -> dict[str, Any]:
-    """Record what was run, with which settings and seeds, on what."""
+def _record(analysis: Analysis, ratings: Mapping[str, int] | None) -> dict[str, Any]:
+    """Record what was fitted to what."""
     return {
-        "command": list(options.command),
-        "version": __version__,
-        "inputs": record_inputs(options, found),
         "harmonization": None
         if analysis.harmonization is None
         else harmonization_record(analysis.harmonization, analysis.groups),
@@ -455,27 +491,15 @@ def _record(
         "groups": None if analysis.groups is None else asdict(analysis.groups),
         "participants": analysis.n_participants,
         "rows": len(analysis.design.rows),
-        "ratings": found.ratings,
+        "ratings": ratings,
         "hemispheres": {hemi: len(one.used) for hemi, one in analysis.fitted.items()},
-        "notes": notes,
-        "settings": resolve(settings),
     }
 
 
-def record_inputs(options: GroupOptions, found: Collection) -> dict[str, Any]:
-    """Record what was read."""
-    return {
-        "datasets": [str(root.resolve()) for root in options.sheets.roots],
-        "settings_hash": found.settings_hash,
-        "versions": found.versions,
-        "seg": found.records[0].place.name.seg if found.records else None,
-        "region": options.sheets.region,
-        "maps": dict(options.maps),
-        "volumes": dict(options.volumes),
-        "covariates": [str(path) for path in options.covariates],
-        "template": None if options.template is None else str(options.template),
-        "harmonization": None if options.harmonize_model is None else str(options.harmonize_model),
-    }
+def with_page(options: GroupOptions, result: GroupResult) -> GroupResult:
+    """Add the page to results that were written."""
+    page, problem = make_page(options, result.folder.name)
+    return replace(result, page=page, problem=problem)
 
 
 def make_page(options: GroupOptions, name: str) -> tuple[Path | None, str | None]:
@@ -489,7 +513,7 @@ def make_page(options: GroupOptions, name: str) -> tuple[Path | None, str | None
     return (path if problem is None else None), problem
 
 
-def describe_dataset(options: GroupOptions) -> None:
+def _describe_dataset(options: GroupOptions) -> None:
     """Describe the output dataset, if the participant level has not."""
     files.make_folder(options.out_dir)
     if not (options.out_dir / "dataset_description.json").exists():

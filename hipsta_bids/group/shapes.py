@@ -12,7 +12,8 @@ from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.sheet import is_left_handed
 from hipsta_bids.group.analysis import Analysis, mean_of_known, members_of
 from hipsta_bids.group.collect import SheetRecord
-from hipsta_bids.group.data import PARTICIPANT, SESSION, Cohort, Float
+from hipsta_bids.group.data import PARTICIPANT, Cohort, Float
+from hipsta_bids.group.read import visit_name
 from hipsta_bids.group.settings import GroupSettings, ShapeSettings
 from hipsta_bids.group.warps import warp_values
 from hipsta_bids.io import files, gifti
@@ -127,20 +128,15 @@ def average_shapes(
     records: Sequence[SheetRecord], cohort: Cohort, analysis: Analysis, settings: GroupSettings
 ) -> dict[str, AverageShape]:
     """Average the surfaces of each hemisphere, of the first visit of each participant."""
-    place_of = {
-        (f"sub-{r.place.name.subject}", r.place.name.session or "", r.place.name.hemi): r.place
-        for r in records
-    }
+    names = [(record.place.name, record.place) for record in records]
+    place_of = {(visit_name(one.subject, one.session), one.hemi): place for one, place in names}
     shapes = {}
     for hemi, side in analysis.sides.items() if records else ():
         visits = cohort.table.iloc[side.registered.rows]
         first = np.flatnonzero(~visits[PARTICIPANT].duplicated().to_numpy())
         most = min(len(first), settings.shapes.most)
         chosen = first[np.linspace(0, len(first) - 1, most).round().astype(np.int64)]
-        keys = [
-            (str(row[PARTICIPANT]), str(row[SESSION] or "").removeprefix("ses-"), hemi)
-            for row in visits.iloc[chosen].to_dict("records")
-        ]
+        keys = [(str(name), hemi) for name in visits.index[chosen]]
         chosen = chosen[[key in place_of for key in keys]]
         places = [place_of[key] for key in keys if key in place_of]
         read, layers = _read_layers(places, side.registered.shape)

@@ -69,6 +69,25 @@ class Meta:
     """Points by hemisphere."""
     settings: GroupSettings
 
+    def tests(self, item: Item) -> Iterator[tuple[MapKey, PointTest, Combined]]:
+        """A combined estimate as tests; Cohen's d is over the residual SD within sites."""
+        sd, none = item.result.sd, np.full(len(item.result.sd), np.nan)
+        for effects, one in item.result.models.items():
+            limits = one.limits(self.settings.meta.confidence)
+            test = PointTest(
+                contrast=Contrast(item.label(effects), np.ones(1)),
+                statistic=one.statistic,
+                p=one.p,
+                df=one.df,
+                estimate=one.estimate[None],
+                se=one.se[None],
+                cohen_d=one.estimate / sd,
+                cohen_d_limits=np.stack(limits) / sd,
+                eta_squared=none,
+                eta_squared_limits=np.stack([none, none]),
+            )
+            yield item.key(effects), test, one
+
     def of(self, kind: str) -> Iterator[Item]:
         """Contrasts of maps, or of summary measures."""
         return (item for item in self.items if item.model.kind == kind)
@@ -87,10 +106,7 @@ class Meta:
 def check_agreement(sites: Sequence[SiteSummary]) -> list[str]:
     """Refuse summaries that are not about the same; note what may differ but should be known.
 
-    Raises
-    ------
-    ModelError
-        One line that names the site that differs from most, and the item.
+    ModelError in one line that names the site that differs from most, and the item.
     """
     items: dict[str, Callable[[SiteSummary], object]] = {
         "segmentation protocol": lambda site: site.seg,
@@ -166,6 +182,7 @@ def _few(values: Sequence[float]) -> str:
     return f"{len(values)} nodes from {values[0]:.4g} to {values[-1]:.4g}" if values else "none"
 
 
+@np.errstate(over="ignore", divide="ignore", invalid="ignore")  # of numbers as others sent them
 def analyze_sites(sites: list[SiteSummary], settings: GroupSettings) -> Meta:
     """Combine each contrast of each model, and tell which points survive."""
     items = [
@@ -173,7 +190,12 @@ def analyze_sites(sites: list[SiteSummary], settings: GroupSettings) -> Meta:
             number=number,
             model=model,
             contrast=contrast,
-            result=_combined(sites, number, contrast, settings),
+            result=meta_analyze(
+                [site.models[number].fit for site in sites],
+                [np.array(site.models[number].contrasts[contrast]) for site in sites],
+                model.intercept,
+                settings.meta,
+            ),
         )
         for number, model in enumerate(sites[0].models)
         for contrast in model.contrasts
@@ -189,19 +211,6 @@ def analyze_sites(sites: list[SiteSummary], settings: GroupSettings) -> Meta:
     return Meta(sites=sites, items=items, found=found, frame=frames, settings=settings)
 
 
-@np.errstate(over="ignore", divide="ignore", invalid="ignore")  # of numbers as others sent them
-def _combined(
-    sites: Sequence[SiteSummary], number: int, contrast: str, settings: GroupSettings
-) -> MetaResult:
-    models = [site.models[number] for site in sites]
-    return meta_analyze(
-        [model.fit for model in models],
-        [np.array(model.contrasts[contrast]) for model in models],
-        models[0].intercept,
-        settings.meta,
-    )
-
-
 def _frame(sites: Sequence[SiteSummary], number: int) -> Frame:
     """Locate points, in the subfield that most participants have there."""
     first = sites[0]
@@ -212,24 +221,6 @@ def _frame(sites: Sequence[SiteSummary], number: int) -> Frame:
     names = [vote.most_common(1)[0][0] if vote else files.MISSING for vote in votes]
     shape = len(first.x), len(first.y)
     return Frame.of_sheet(np.array(first.x), np.array(first.y), np.array(names).reshape(shape))
-
-
-def point_test(item: Item, effects: str, confidence: float) -> PointTest:
-    """Write a combined estimate as a test; Cohen's d is over the residual SD within sites."""
-    one, sd = item.result.models[effects], item.result.sd
-    none = np.full(len(sd), np.nan)
-    return PointTest(
-        contrast=Contrast(item.label(effects), np.ones(1)),
-        statistic=one.statistic,
-        p=one.p,
-        df=one.df,
-        estimate=one.estimate[None],
-        se=one.se[None],
-        cohen_d=one.estimate / sd,
-        cohen_d_limits=np.stack(one.limits(confidence)) / sd,
-        eta_squared=none,
-        eta_squared_limits=np.stack([none, none]),
-    )
 
 
 def meta_tables(meta: Meta) -> Iterator[tuple[str, pd.DataFrame]]:
@@ -243,12 +234,11 @@ def meta_tables(meta: Meta) -> Iterator[tuple[str, pd.DataFrame]]:
     for item in meta.of("map"):
         frame = meta.frame[item.model.hemi]
         own = []
-        for effects in item.result.models:
-            key, test = item.key(effects), point_test(item, effects, confidence)
+        for key, test, one in meta.tests(item):
             found = meta.found[key]
             stem = tables.map_name(key.hemi, key.measure, key.contrast)
             rows.append(overview_row(stem, key, found))
-            low, high = item.result.models[effects].limits(confidence)
+            low, high = one.limits(confidence)
             columns = {
                 **point_columns(test, found, frame, meta.counts(item).astype(int)),
                 "n_sites": item.result.random.sites.astype(int),
@@ -282,25 +272,13 @@ def meta_tables(meta: Meta) -> Iterator[tuple[str, pd.DataFrame]]:
 def _sites(meta: Meta) -> pd.DataFrame:
     rows = []
     for site in meta.sites:
+        levels = {f"{k}_{level}": n for k, own in site.factors.items() for level, n in own.items()}
         numbers = {
-            f"{name}_{what}": value
-            for name, own in site.covariates.items()
-            for what, value in own.items()
+            f"{k}_{what}": v for k, own in site.covariates.items() for what, v in own.items()
         }
-        levels = {
-            f"{name}_{level}": n for name, own in site.factors.items() for level, n in own.items()
-        }
-        rows.append(
-            {
-                "site": site.site,
-                "n": site.participants,
-                **levels,
-                **numbers,
-                "df": site.models[0].df,
-                "version": site.version,
-                "template": site.template_hash,
-            }
-        )
+        people = {"site": site.site, "n": site.participants, **levels, **numbers}
+        about = {"version": site.version, "template": site.template_hash}
+        rows.append({**people, "df": site.models[0].df, **about})
     return pd.DataFrame(rows)
 
 
@@ -316,12 +294,8 @@ def _points(peaks: Sequence[pd.DataFrame], frame: Frame) -> list[int]:
         return []
     own = table[table["extent"] > 0] if (table["extent"] > 0).any() else table.tail(1)
     own = own.reindex(own["statistic"].abs().sort_values(ascending=False, kind="stable").index)
-    at = {
-        (x, y): point
-        for point, (x, y) in enumerate(
-            zip(frame.position["x"].tolist(), frame.position["y"].tolist(), strict=True)
-        )
-    }
+    x, y = (frame.position[axis].tolist() for axis in "xy")
+    at = {place: point for point, place in enumerate(zip(x, y, strict=True))}
     nodes = np.stack([frame.number["node_x"], frame.number["node_y"]])
     kept: list[int] = []
     for place in zip(own["x"].tolist(), own["y"].tolist(), strict=True):
@@ -385,8 +359,7 @@ def _summaries(meta: Meta) -> pd.DataFrame:
     parts = []
     for item in meta.of("summary"):
         other = combine(item.result.estimates, item.result.ses**2, "dl", least=least)
-        for effects, one in item.result.models.items():
-            test = point_test(item, effects, confidence)
+        for key, test, one in meta.tests(item):
             low, high = one.limits(confidence)
             parts.append(
                 pd.DataFrame(
@@ -395,7 +368,7 @@ def _summaries(meta: Meta) -> pd.DataFrame:
                         "measure": item.model.measures,
                         "unit": item.model.units,
                         "model": item.model.formula,
-                        "contrast": item.label(effects),
+                        "contrast": key.contrast,
                         "test": "t",
                         "n": meta.counts(item).astype(int),
                         "visits": meta.counts(item).astype(int),

@@ -65,50 +65,43 @@ def fit_summaries(
 ) -> tuple[list[MeasureFit], list[str]]:
     """Fit the model of the maps to all summary measures; volumes also with intracranial volume."""
     fits: list[MeasureFit] = []
-    notes: list[str] = []
-    for hemi in hemispheres(cohort):
-        values = summary_values(cohort, hemi, only)
-        fits += _fit(cohort, values, hemi, model.formula, rows_of(design), settings)
+
+    def fit(formula: str, model: RowModel, start: str = "") -> None:
+        rows = model.design.rows
+        for hemi in hemispheres(cohort):
+            values = summary_values(cohort, hemi, only).iloc[rows]
+            named = values.columns.astype(str).str.startswith(start)
+            values = values.loc[:, named & (values.max() > values.min()).to_numpy()]
+            if not values.columns.size:
+                continue
+            present = np.flatnonzero(values.notna().any(axis=1).to_numpy())
+            maps: Float = values.to_numpy(dtype=np.float64)[present]
+            who = cohort.table[PARTICIPANT].iloc[rows[present]].to_numpy()
+            fits.append(
+                MeasureFit(
+                    hemi=hemi,
+                    measures=tuple(values.columns),
+                    formula=formula,
+                    fit=model.fit_measures(maps, present, model.design.contrasts, settings),
+                    participants=participants_with(np.isfinite(maps), who),
+                )
+            )
+
+    fit(model.formula, rows_of(design))
     if not fits:
-        return fits, notes
+        return fits, []
     if icv is None:
-        notes.append("volumes are not adjusted: no intracranial volume is known")
-        return fits, notes
+        return fits, ["volumes are not adjusted: no intracranial volume is known"]
     if icv in closed_formula(model.formula).names:
-        return fits, notes
+        return fits, []
     try:
         adjusted = replace(model, formula=f"{model.formula} + {icv}")
         larger = build_design(cohort.table, adjusted, settings.design, references)
         larger = replace(larger, contrasts=_same_names(larger, design))
     except ModelError as error:
-        notes.append(f"volumes are not adjusted for {icv}: {error}")
-        return fits, notes
-    for hemi in hemispheres(cohort):
-        values = summary_values(cohort, hemi, only)
-        volumes = [name for name in values.columns if name.startswith("volume")]
-        own = values[volumes]
-        fits += _fit(cohort, own, hemi, adjusted.formula, rows_of(larger), settings)
-    return fits, notes
-
-
-def _fit(  # noqa: PLR0917
-    cohort: Cohort,
-    values: pd.DataFrame,
-    hemi: str,
-    formula: str,
-    model: RowModel,
-    settings: GroupSettings,
-) -> list[MeasureFit]:
-    own = values.iloc[model.design.rows]
-    varying = tuple(own.columns[(own.max() > own.min()).to_numpy()])
-    present = np.flatnonzero(own[list(varying)].notna().any(axis=1).to_numpy())
-    if not varying:
-        return []
-    maps: Float = own[list(varying)].to_numpy(dtype=np.float64)[present]
-    fit = model.fit_measures(maps, present, model.design.contrasts, settings)
-    who = cohort.table[PARTICIPANT].iloc[model.design.rows[present]].to_numpy()
-    people = participants_with(np.isfinite(maps), who)
-    return [MeasureFit(hemi=hemi, measures=varying, formula=formula, fit=fit, participants=people)]
+        return fits, [f"volumes are not adjusted for {icv}: {error}"]
+    fit(adjusted.formula, rows_of(larger), "volume")
+    return fits, []
 
 
 def participants_with(known: Bool, who: NDArray[np.object_]) -> Int:

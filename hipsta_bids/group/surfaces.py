@@ -11,7 +11,7 @@ import pandas as pd
 
 from hipsta_bids.errors import InputError, NothingToDoError, UsageError
 from hipsta_bids.geometry.catalog import MAPS, why_impossible
-from hipsta_bids.group.data import Cohort, Int, SideMaps
+from hipsta_bids.group.data import Cohort, SideMaps
 from hipsta_bids.group.read import CURVATURE, THICKNESS, Measured
 from hipsta_bids.inputs.maps import Found, check_pattern, fields_of, fill, find, scan
 from hipsta_bids.io.files import entities
@@ -166,20 +166,16 @@ def read_maps(
             )
         shape = nodes if mesh is None else (points, 1)
         values = np.stack([one.values.reshape(shape) for one in maps])  # noqa: PD011  (no table)
-        side = _empty(np.array([row_of[visit] for visit in own], dtype=np.int64), shape)
-        sides[hemi] = replace(side, maps={name: values}, mesh=mesh)
+        sides[hemi] = SideMaps(
+            rows=np.array([row_of[visit] for visit in own], dtype=np.int64),
+            maps={name: values},
+            subfield=np.full(values.shape, -1, dtype=np.int8),
+            names=(),
+            summary=pd.DataFrame(index=range(len(own))),
+            mesh=mesh,
+        )
         units.append(first.unit)
     return sides, units[0], notes
-
-
-def _empty(rows: Int, shape: tuple[int, int]) -> SideMaps:
-    return SideMaps(
-        rows=rows,
-        maps={},
-        subfield=np.full((len(rows), *shape), -1, dtype=np.int8),
-        names=(),
-        summary=pd.DataFrame(index=range(len(rows))),
-    )
 
 
 def _refuse_mixed(name: str, hemi: str, paths: Sequence[Path], maps: Sequence[PointMap]) -> None:
@@ -196,15 +192,11 @@ def _refuse_mixed(name: str, hemi: str, paths: Sequence[Path], maps: Sequence[Po
 
 def _mesh(found: ExternalFiles, hemi: str, points: int) -> Mesh | None:
     """Read the surface that the user named, or else that beside the first map that has one."""
-    paths = found.files[hemi]
     if found.request.surface is not None:
         return _named_surface(found, hemi, points)
-    for path in paths.values():
-        for candidate in _surfaces_beside(path, hemi):
-            mesh = read_mesh(candidate)
-            if len(mesh.points) == points:
-                return mesh
-    return None
+    paths = found.files[hemi].values()
+    meshes = (read_mesh(one) for path in paths for one in _surfaces_beside(path, hemi))
+    return next((mesh for mesh in meshes if len(mesh.points) == points), None)
 
 
 def _named_surface(found: ExternalFiles, hemi: str, points: int) -> Mesh:
@@ -232,19 +224,16 @@ def _named_surface(found: ExternalFiles, hemi: str, points: int) -> Mesh:
 def _surfaces_beside(path: Path, hemi: str) -> list[Path]:
     """HippUnfold's unfolded surface: beside the map, or in version 2 in ``surf/``."""
     own = {**entities(path.name), "hemi": hemi}
-    folders = [path.parent, path.parent.parent / "surf"]
-    return [
-        candidate
-        for folder in folders
-        for candidate in sorted(folder.glob("*space-unfold*_midthickness.surf.gii"))
-        if _belongs(own, entities(candidate.name))
-    ]
-
-
-def _belongs(own: Mapping[str, str], surface: Mapping[str, str]) -> bool:
     keys = ("sub", "ses", "hemi", "den", "label")
+    folders = path.parent, path.parent.parent / "surf"
+    pattern = "*space-unfold*_midthickness.surf.gii"
+    found = {one: entities(one.name) for folder in folders for one in sorted(folder.glob(pattern))}
     # Sheets of this program have an unfolded surface too, but their maps have their grid.
-    return "seg" not in surface and all(own.get(key) == surface.get(key) for key in keys)
+    return [
+        one
+        for one, other in found.items()
+        if "seg" not in other and all(own.get(key) == other.get(key) for key in keys)
+    ]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -46,6 +46,8 @@ _MEANINGS = tomllib.loads((files("hipsta_bids.group") / "columns.toml").read_tex
 COLUMNS: Mapping[str, str] = _MEANINGS["group"]
 #: The same of a meta-analysis.
 META_COLUMNS: Mapping[str, str] = COLUMNS | _MEANINGS["meta"]
+#: The same of measures that are tested together.
+JOINT_COLUMNS: Mapping[str, str] = COLUMNS | _MEANINGS["joint"]
 
 
 def result_tables(cohort: Cohort, analysis: Analysis, settings: GroupSettings) -> Iterator[Named]:

@@ -1,6 +1,6 @@
 """Agreement of repeated sessions and sample sizes of trials, from files to files."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,7 @@ from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.names import TRIAL_MAPS, TRIAL_TABLES
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group import write
-from hipsta_bids.group.analysis import SideResult, register_side, templates_of
+from hipsta_bids.group.analysis import register_side, templates_of
 from hipsta_bids.group.clusters import frame_of
 from hipsta_bids.group.collect import exclude_visits
 from hipsta_bids.group.comparison import Comparison
@@ -35,7 +35,6 @@ from hipsta_bids.group.power import (
 from hipsta_bids.group.reference import (
     Modeled,
     Reference,
-    RetestCohort,
     Retested,
     Source,
     Tables,
@@ -46,18 +45,16 @@ from hipsta_bids.group.run import (
     GroupInputs,
     GroupOptions,
     GroupResult,
-    describe_dataset,
-    make_page,
     read_inputs,
     read_templates,
-    record_inputs,
+    with_page,
+    write_folder,
 )
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.tables import entity_label, registration_tables
 from hipsta_bids.group.warps import Template
 from hipsta_bids.io import files, gifti
 from hipsta_bids.progress import each, tell
-from hipsta_bids.protocols.toml import resolve
 from hipsta_bids.reports.group_tables import display_name, with_brackets
 
 if TYPE_CHECKING:
@@ -131,44 +128,122 @@ class MapFound(Found):
     place: FittedMaps
 
 
-def run_trial(options: GroupOptions, request: TrialRequest, settings: GroupSettings) -> GroupResult:
-    """Measure the agreement of sessions, or sample sizes, and write all results or none.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Asked:
+    """What was read, and the visits that a question other than a comparison is about."""
 
-    Raises
-    ------
-    HipstaError
-        If inputs, sessions or output folder do not allow it.
-    """
+    options: GroupOptions
+    settings: GroupSettings
+    inputs: GroupInputs
+    keep: Bool
+    """Of the visits that were read."""
+    cohort: Cohort
+    """Of those that are kept."""
+    left_out: dict[str, tuple[str, str]]
+    """Reason and message by visit."""
+
+    @classmethod
+    def read(
+        cls, options: GroupOptions, among: tuple[str, str] | None, settings: GroupSettings
+    ) -> "Asked":
+        """Read all visits, and keep those that are asked for."""
+        tell("reading")
+        inputs = read_inputs(options, settings)
+        keep = members(inputs.cohort.table, among)
+        why = "not-asked", "another level than --among"
+        return cls(
+            options=options,
+            settings=settings,
+            inputs=inputs,
+            keep=keep,
+            cohort=inputs.cohort.take(keep),
+            left_out=dict.fromkeys(map(str, inputs.cohort.table.index[~keep]), why),
+        )
+
+    def register(
+        self, templates: Mapping[str, Template] | None
+    ) -> tuple[dict[str, Any] | None, dict[str, Cohort], dict[str, pd.DataFrame]]:
+        """Register sheets: templates for a file, cohorts (other maps by name), and tables."""
+        cohort = self.cohort
+        with_maps = list(cohort.sides) if self.inputs.measures.maps else []
+        sides = {
+            hemi: register_side(
+                cohort, hemi, groups=None, settings=self.settings, templates=templates
+            )
+            for hemi in each("registration", with_maps)
+        }
+        registered = {hemi: side.registered for hemi, side in sides.items()} or cohort.sides
+        others = {name: other.take(self.keep) for name, other in self.inputs.others.items()}
+        cohorts = {"": replace(cohort, sides=registered), **others}
+        tables = dict(registration_tables(cohort, sides)) if sides else {}
+        return templates_of(sides), cohorts, tables
+
+    def write(
+        self,
+        name: str,
+        notes: Iterable[str],
+        *,
+        visits: pd.DataFrame,
+        tables: Mapping[str, pd.DataFrame],
+        record: Mapping[str, Any],
+        fill: Callable[[Path], list[str]],
+    ) -> GroupResult:
+        """Write what these questions share, and a page; ``fill`` writes all else, and notes."""
+        excluded = exclude_visits(self.inputs.cohort.table, self.left_out)
+        excluded = [*self.inputs.exclusions, *excluded]
+        told, people = [*self.inputs.notes, *notes], int(visits[PARTICIPANT].nunique())
+
+        def everything(folder: Path) -> dict[str, Any]:
+            for title, table in tables.items():
+                write.write_table(folder, title, table)
+            write.write_exclusions(folder, excluded)
+            write.write_table(folder, "covariates", visits, described=False)
+            told.extend(fill(folder))
+            return {"participants": people, "rows": len(visits), **record}
+
+        result = write_folder(
+            self.options,
+            name,
+            self.inputs,
+            self.settings,
+            notes=told,
+            counts=(people, len(excluded)),
+            fill=everything,
+        )
+        return with_page(self.options, result)
+
+
+def run_trial(options: GroupOptions, request: TrialRequest, settings: GroupSettings) -> GroupResult:
+    """Measure the agreement of sessions, or sample sizes, and write all results or none."""
     dataset.check_own_dataset(options.out_dir)
     effect = request.effect
     if effect is not None:
         point_level(settings)  # refuses before anything is read
     repeated = request.retest or bool(effect and effect.visits)
     options = replace(options, comparison=Comparison(longitudinal=repeated))
-    tell("reading")
-    inputs = read_inputs(options, settings)
-    cohort, retest, left_out = _choose(inputs.cohort, request, settings)
-    kept = inputs.cohort.table.index.isin(cohort.table.index)
-    templates = read_templates(options.template, cohort)
-    sides, cohorts = register_cohorts(cohort, inputs, kept, settings, templates)
+    asked, retest = Asked.read(options, request.among, settings), None
+    if request.retest:
+        retest = retest_cohort(asked.cohort, settings.retest.min_participants)
+        why = {v: ("incomplete-sessions", text) for v, text in retest.left_out.items()}
+        keep = asked.inputs.cohort.table.index.isin(retest.cohort.table.index)
+        left_out = asked.left_out | why
+        asked = replace(asked, keep=keep, cohort=retest.cohort, left_out=left_out)
+    cohort, inputs = asked.cohort, asked.inputs
+    templates, cohorts, tables = asked.register(read_templates(options.template, cohort))
     tell("points and measures")
     source: Source
     if retest is not None:
         source = Retested(retest, settings, repeated=bool(effect and effect.visits))
     else:
         source = Modeled(cohort, options.model, settings, inputs.time)
-        left_out |= {
-            visit: ("incomplete", f"{variable} is missing")
-            for variable, visits in source.model.design.dropped.items()
-            for visit in visits
-        }
-    asked = _Question(source, request, settings)
+        for variable, visits in source.model.design.dropped.items():
+            asked.left_out.update(dict.fromkeys(visits, ("incomplete", f"{variable} is missing")))
+    question = _Question(source, request, settings)
     maps = {
-        name: list(_of_maps(asked, one, (name,) if name else inputs.measures.maps))
+        name: list(_of_maps(question, one, (name,) if name else inputs.measures.maps))
         for name, one in cohorts.items()
     }
-    measures = list(_of_measures(asked, cohorts[""], inputs.measures.summaries))
-    notes = [*inputs.notes, *_notes(asked, maps, inputs)]
+    measures = list(_of_measures(question, cohorts[""], inputs.measures.summaries))
     modeled = cohort.table
     if isinstance(source, Modeled):
         modeled = modeled.iloc[source.model.design.rows]
@@ -178,9 +253,9 @@ def run_trial(options: GroupOptions, request: TrialRequest, settings: GroupSetti
         _write_measures(folder, cohort, measures)
         for surface, found in maps.items():
             _write_maps(folder, surface, cohorts[surface], found)
-        if templates := templates_of(sides):
+        if templates:
             files.write_json(folder / "template.json", templates)
-        text = _methods(asked, modeled, maps, options.sheets.region)
+        text = _methods(question, modeled, maps, options.sheets.region)
         files.write_text(folder / "methods.md", text)
         figures = (figure for key, own in maps.items() for figure in _figures(cohorts[key], own))
         return write.write_figures(folder, figures)
@@ -192,93 +267,8 @@ def run_trial(options: GroupOptions, request: TrialRequest, settings: GroupSetti
         "power": effect and asdict(effect) | {"alpha_point": point_level(settings)},
         "among": request.among,
     }
-    return write_answer(
-        options, request.name, inputs, settings, left_out=left_out, notes=notes, visits=modeled,
-        tables=dict(registration_tables(cohort, sides)) if sides else {}, record=record, fill=fill,
-    )  # fmt: skip
-
-
-def register_cohorts(
-    cohort: Cohort,
-    inputs: GroupInputs,
-    kept: Bool,
-    settings: GroupSettings,
-    templates: Mapping[str, Template] | None,
-) -> tuple[dict[str, SideResult], dict[str, Cohort]]:
-    """Register sheets of the visits that are kept; with them, other maps of these by name."""
-    sides = {
-        hemi: register_side(cohort, hemi, groups=None, settings=settings, templates=templates)
-        for hemi in each("registration", list(cohort.sides) if inputs.measures.maps else [])
-    }
-    registered = {hemi: side.registered for hemi, side in sides.items()} or cohort.sides
-    others = {name: other.take(kept) for name, other in inputs.others.items()}
-    return sides, {"": replace(cohort, sides=registered), **others}
-
-
-def write_answer(
-    options: GroupOptions,
-    name: str,
-    inputs: GroupInputs,
-    settings: GroupSettings,
-    *,
-    left_out: Mapping[str, tuple[str, str]],
-    notes: Sequence[str],
-    visits: pd.DataFrame,
-    tables: Mapping[str, pd.DataFrame],
-    record: Mapping[str, Any],
-    fill: Callable[[Path], list[str]],
-) -> GroupResult:
-    """Write what all questions other than comparisons have in common, and make the page.
-
-    ``fill`` writes all else into the folder, and returns notes.
-    """
-    excluded = [*inputs.exclusions, *exclude_visits(inputs.cohort.table, left_out)]
-    region, people = options.sheets.region, int(visits[PARTICIPANT].nunique())
-    name = options.model.name or name + ("" if region == "body" else f"_{region}")
-    describe_dataset(options)
-    with write.model_folder(options.out_dir, name) as folder:
-        tell("tables and maps")
-        for title, table in tables.items():
-            write.write_table(folder, title, table)
-        write.write_exclusions(folder, excluded)
-        write.write_table(folder, "covariates", visits, described=False)
-        notes = [*notes, *fill(folder)]
-        every = {
-            "command": list(options.command),
-            "version": __version__,
-            "inputs": record_inputs(options, inputs.found),
-            "participants": people,
-            "rows": len(visits),
-            **record,
-            "notes": [*inputs.found.warnings, *notes],
-            "settings": resolve(settings),
-        }
-        files.write_json(folder / "analysis.json", every)
-    page, problem = make_page(options, name)
-    return GroupResult(
-        folder=options.out_dir / write.GROUP_FOLDER / name,
-        page=page,
-        problem=problem,
-        n_participants=people,
-        n_excluded=len(excluded),
-        notes=tuple(notes),
-        warnings=inputs.found.warnings,
-    )
-
-
-def _choose(
-    cohort: Cohort, request: TrialRequest, settings: GroupSettings
-) -> tuple[Cohort, RetestCohort | None, dict[str, tuple[str, str]]]:
-    """Keep the visits that are asked for; of others reason and message."""
-    keep = members(cohort.table, request.among)
-    message = "another level than --among"
-    left_out = dict.fromkeys(cohort.table.index[~keep].astype(str), ("not-asked", message))
-    cohort = cohort.take(keep)
-    if not request.retest:
-        return cohort, None, left_out
-    retest = retest_cohort(cohort, settings.retest.min_participants)
-    left_out |= {v: ("incomplete-sessions", why) for v, why in retest.left_out.items()}
-    return retest.cohort, retest, left_out
+    notes = _notes(question, maps, inputs)
+    return asked.write(request.name, notes, visits=modeled, tables=tables, record=record, fill=fill)
 
 
 def members(table: pd.DataFrame, among: tuple[str, str] | None, option: str = "--among") -> Bool:
@@ -413,14 +403,11 @@ def _write_maps(folder: Path, surface: str, cohort: Cohort, found: Sequence[MapF
         blocks = []
         for one in found:
             if question in one.tables:
-                frame = frame_of(cohort, one.place)
                 columns = {
                     "hemi": one.hemi,
                     "measure": one.measures[0],
                     "unit": cohort.units.get(one.measures[0], "1"),
-                    **frame.number,
-                    **frame.position,
-                    "subfield": frame.subfield,
+                    **frame_of(cohort, one.place).columns,
                     **one.tables[question],
                 }
                 blocks.append(pd.DataFrame(columns))

@@ -115,16 +115,9 @@ def across(along: Float, lateral: Float, *, below: bool) -> Float:
 def look(mesh: Mesh, axes: Float, scale: float, shape: tuple[int, int]) -> View:
     """Find what each pixel of a picture shows, with a depth buffer.
 
-    Parameters
-    ----------
-    mesh : Mesh
-        The surface, whose both sides are visible, in mm.
-    axes : (3, 3) array
-        Unit vectors to the right, upward, and to the viewer.
-    scale : float
-        Pixels per mm.
-    shape : tuple of int
-        Height and width of the picture in pixels; the surface is in its middle.
+    Both sides of the mesh (mm) are visible. ``axes`` (3, 3) are unit vectors to the right, upward
+    and to the viewer, ``scale`` is in pixels per mm, and ``shape`` is the height and width of the
+    picture in pixels, whose middle is the surface's.
     """
     rows, columns = (n * _FINER for n in shape)
     seen = mesh.points @ axes.T * (scale * _FINER)

@@ -201,12 +201,12 @@ def _beside(records: Sequence[SheetRecord]) -> Iterator[VolumeTable]:
 
 
 def _matching(name: str, pattern: str, root: Path, measured: Measured) -> list[VolumeTable]:
-    visits = set(measured.visits.index)
-    tables = []
-    for one in scan(pattern, root):
-        visit = visit_name(one.subject, one.session)
-        if visit in visits:
-            tables.append(VolumeTable(name=name, visit=visit, path=one.path, hemi=one.hemi))
+    found = [(visit_name(one.subject, one.session), one) for one in scan(pattern, root)]
+    tables = [
+        VolumeTable(name=name, visit=visit, path=one.path, hemi=one.hemi)
+        for visit, one in found
+        if visit in measured.visits.index
+    ]
     if not tables:
         raise NothingToDoError(
             f"--volumes {name}: no file matches {pattern} (in {root}) for any participant here",

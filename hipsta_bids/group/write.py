@@ -34,19 +34,14 @@ from hipsta_bids.group.figures import Drawing, draw_figures, encode
 from hipsta_bids.group.glm import FittedMaps, PointTest
 from hipsta_bids.group.harmonize import digests, effects_of
 from hipsta_bids.group.inference import Discoveries, MapKey
-from hipsta_bids.group.joint import (
-    JOINT_COLUMNS,
-    JointMap,
-    draw_joint,
-    joint_peaks,
-    joint_points,
-)
+from hipsta_bids.group.joint import JointMap, draw_joint, joint_peaks, joint_points
 from hipsta_bids.group.methods import methods_text
 from hipsta_bids.group.normative import ScoredMaps
 from hipsta_bids.group.settings import GroupSettings
 from hipsta_bids.group.shapes import AverageShape
 from hipsta_bids.group.tables import (
     COLUMNS,
+    JOINT_COLUMNS,
     design_table,
     entity_label,
     map_name,
@@ -434,15 +429,14 @@ def _write_joint(folder: Path, joint: Sequence[JointMap], settings: GroupSetting
     """Write tests of several measures together."""
     if not joint:
         return
-    meaning = {**COLUMNS, **JOINT_COLUMNS}
-    write_table(folder, f"{JOINT}_peaks", joint_peaks(joint, settings), meaning=meaning)
+    write_table(folder, f"{JOINT}_peaks", joint_peaks(joint, settings), meaning=JOINT_COLUMNS)
     for one in joint:
         name = map_name(one.key.hemi, one.key.measure, one.key.contrast)
         parts = {
             f"p_{title.replace(' ', '_')}": f"p-value of {title} alone, not corrected"
             for title in one.parts
         }
-        write_table(folder, name, joint_points(one), meaning={**meaning, **parts})
+        write_table(folder, name, joint_points(one), meaning={**JOINT_COLUMNS, **parts})
     write_stats(
         folder,
         {one.key: {"z": one.test.statistic, "pcorrected": one.found.adjusted} for one in joint},

@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import pandas as pd
 
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.hemisphere import ResultPlace, format_column
@@ -125,3 +126,8 @@ def write_participants(data, rows, columns=("participant_id", "group", "age", "s
 
 def read_participants(data):
     return [list(row.values()) for row in files.read_tsv(data / "participants.tsv")]
+
+
+def table(path):
+    """Read a table of results."""
+    return pd.read_csv(path, sep="\t", na_values="n/a")

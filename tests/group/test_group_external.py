@@ -6,7 +6,6 @@ from pathlib import Path
 
 import nibabel as nib
 import numpy as np
-import pandas as pd
 import pytest
 from hippunfold_like import (
     PATTERNS,
@@ -23,6 +22,7 @@ from small_cohorts import (
     PLAN,
     place_of,
     read_participants,
+    table,
     write_dataset,
     write_participants,
 )
@@ -113,10 +113,6 @@ def alone(written):
     """Results without any sheet; figures are drawn."""
     assert run(written, "--maps", f"hipp={PATTERNS[1]}", out="alone") == 0
     return written / "alone" / "group" / MODEL
-
-
-def table(path):
-    return pd.read_csv(path, sep="\t", na_values="n/a")
 
 
 def statmap(folder, hemi, name="hipp"):

@@ -14,6 +14,7 @@ from small_cohorts import (
     begin_dataset,
     place_of,
     read_participants,
+    table,
     write_hemisphere,
     write_participants,
 )
@@ -86,10 +87,6 @@ def results(study, quick):
 @pytest.fixture(autouse=True)
 def _no_figures(monkeypatch):
     monkeypatch.setattr(write, "draw_figures", lambda *_: iter(()))
-
-
-def table(path):
-    return pd.read_csv(path, sep="\t", na_values="n/a")
 
 
 def test_planted_shift_and_scale_are_found(results):

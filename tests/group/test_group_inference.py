@@ -9,7 +9,15 @@ import pandas as pd
 import pytest
 from pyarrow import parquet
 from scipy import stats
-from small_cohorts import GROUPS, PLAN, place_of, write_dataset, write_participants, write_sessions
+from small_cohorts import (
+    GROUPS,
+    PLAN,
+    place_of,
+    table,
+    write_dataset,
+    write_participants,
+    write_sessions,
+)
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.group import write
@@ -52,10 +60,6 @@ def sessions(tmp_path_factory):
     ]
     write_participants(data, rows)
     return data, out
-
-
-def table(path):
-    return pd.read_csv(path, sep="\t", na_values="n/a")
 
 
 def run(dataset, *options):

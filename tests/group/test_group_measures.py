@@ -3,10 +3,9 @@
 import json
 
 import numpy as np
-import pandas as pd
 import pytest
 from pyarrow import parquet
-from small_cohorts import NODES, PLAN, place_of, write_dataset
+from small_cohorts import NODES, PLAN, place_of, table, write_dataset
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.errors import InputError
@@ -63,10 +62,6 @@ def _no_figures(request, monkeypatch):
 def run(dataset, quick, *options):
     data, out = dataset
     return main([str(data), str(out), "group", *quick, *options]), out / "group"
-
-
-def table(path):
-    return pd.read_csv(path, sep="\t", na_values="n/a")
 
 
 def test_other_maps_are_fitted_and_handed_over(dataset, quick):

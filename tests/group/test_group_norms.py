@@ -5,13 +5,12 @@ import shutil
 
 import nibabel as nib
 import numpy as np
-import pandas as pd
 import pytest
 from hippunfold_like import flat_surface, write_map, write_surface
 from norm_cohorts import write_people
 from pyarrow import parquet
 from scipy import stats
-from small_cohorts import NODES, place_of, read_participants, write_participants
+from small_cohorts import NODES, place_of, read_participants, table, write_participants
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.group import norming
@@ -81,10 +80,6 @@ def scores(people, norms):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(norming, "_figures", lambda *_: iter(()))
         return score(people, norms, *CONTROLS)
-
-
-def table(path):
-    return pd.read_csv(path, sep="\t", na_values="n/a")
 
 
 def edited(norms, folder, **changes):

@@ -24,7 +24,7 @@ from browsing import (
 from page_outline import Outline
 from selenium import webdriver
 from selenium.webdriver.common.keys import Keys
-from small_cohorts import NODES, write_dataset
+from small_cohorts import NODES, table, write_dataset
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.group import figures, write
@@ -83,10 +83,6 @@ def page(out):
 def copy(out, tmp_path):
     """A copy to do harm to."""
     return shutil.copytree(out, tmp_path / "copy")
-
-
-def table(path):
-    return pd.read_csv(path, sep="\t", na_values="n/a")
 
 
 def scenes(text):

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from PIL import Image
 from pyarrow import parquet
-from small_cohorts import GROUPS, NODES, PLAN, place_of, write_dataset
+from small_cohorts import GROUPS, NODES, PLAN, place_of, table, write_dataset
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.group import analysis, read, run, write
@@ -46,10 +46,6 @@ def _quick_figures(request, monkeypatch):
     """Figures take longer than all else; the module's own run draws them."""
     if "with_figures" not in request.fixturenames:
         monkeypatch.setattr(write, "draw_figures", lambda *_: iter(()))
-
-
-def table(path):
-    return pd.read_csv(path, sep="\t", na_values="n/a")
 
 
 def statmap(folder, hemi):

@@ -5,10 +5,9 @@ import re
 
 import nibabel as nib
 import numpy as np
-import pandas as pd
 import pytest
 from hippunfold_like import flat_surface, names, write_map, write_surface
-from small_cohorts import NODES, place_of, write_participants, write_sessions
+from small_cohorts import NODES, place_of, table, write_participants, write_sessions
 from statsmodels.api import OLS
 from statsmodels.stats.power import TTestIndPower
 
@@ -55,10 +54,6 @@ def run(dataset, *options):
     data, out = dataset
     assert main([str(data), str(out), "group", *options, "--name", "found"]) == 0
     return out / "group" / "found"
-
-
-def table(path):
-    return pd.read_csv(path, sep="\t", na_values="n/a")
 
 
 def sheets(out, hemi, column, sessions, skipped=()):

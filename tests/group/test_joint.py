@@ -2,10 +2,9 @@
 
 import nibabel as nib
 import numpy as np
-import pandas as pd
 import pytest
 from scipy import stats
-from small_cohorts import write_dataset
+from small_cohorts import table, write_dataset
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.group import write
@@ -80,10 +79,6 @@ def dataset(tmp_path_factory):
 def _no_figures(monkeypatch):
     """Figures of single measures take longer than all else."""
     monkeypatch.setattr(write, "draw_figures", lambda *_: iter(()))
-
-
-def table(path):
-    return pd.read_csv(path, sep="\t", na_values="n/a")
 
 
 def run(dataset, quick, *options):

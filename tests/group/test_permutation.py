@@ -131,8 +131,6 @@ def test_seed_repeats_and_missing_points_stay_missing():
     np.testing.assert_array_equal(one.p_enhanced, two.p_enhanced)
     assert np.isnan(one.p_max[7])
     assert np.isfinite(np.delete(one.p_max, 7)).all()
-    with pytest.raises(ModelError, match="edges between 72 points"):
-        permute(maps, matrix, GROUP, (9, 8), settings=SETTINGS)
 
 
 def repeated(random, slope_sd=0.3, people=30):

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy import ndimage, stats
-from small_cohorts import write_dataset
+from small_cohorts import table, write_dataset
 
 from hipsta_bids.cli.commands import meta_parser, phantom_parser
 from hipsta_bids.cli.group import group_parser
@@ -63,10 +63,6 @@ def check_printed(shown, printed):
     for line in shown.splitlines():
         if line.strip() not in {"...", ""}:
             assert any(one.startswith(plain(line)) for one in lines), line
-
-
-def table(path):
-    return pd.read_csv(path, sep="\t", na_values="n/a")
 
 
 def participants():
