@@ -40,11 +40,11 @@ PLAUSIBLE = (0.9, 2.2)
 
 
 def run(out):
-    return main.main([str(DATA), str(out), "participant", "--n-procs", "2"])
+    return main.main([str(DATA), str(out), "participant", "--n-procs", "1"])
 
 
 @pytest.fixture(scope="module")
-def out(tmp_path_factory):
+def out(tmp_path_factory, workers):  # noqa: ARG001 -- this process would need more memory
     folder = tmp_path_factory.mktemp("shared") / "out"
     assert run(folder) == ExitCode.OK
     return folder
