@@ -58,7 +58,7 @@ def without_workers():
         yield
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def workers():
     """Let runs start worker processes."""
     with pytest.MonkeyPatch.context() as patch:
