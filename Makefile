@@ -50,11 +50,8 @@ lint: $(STAMP)
 	"$(BIN)/codespell"
 
 types: $(STAMP)
-	"$(BIN)/python" -m mypy --strict
-	"$(BIN)/python" -m mypy --strict tools/*.py
-	MYPYPATH=tools "$(BIN)/python" -m mypy --strict tools/make-descriptors
-	MYPYPATH=tools "$(BIN)/python" -m mypy --strict tools/make-docs
-	MYPYPATH=benchmarks "$(BIN)/python" -m mypy --strict benchmarks/*.py
+	MYPYPATH=tools:benchmarks "$(BIN)/python" -m mypy --strict --scripts-are-modules \
+		hipsta_bids tools/*.py tools/make-descriptors tools/make-docs benchmarks/*.py
 
 layers: $(STAMP)
 	"$(BIN)/lint-imports" --no-cache
