@@ -12,6 +12,10 @@ USABLE := import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))
 PYTHON ?= $(shell for python in python3.13 python3.12 python3.11 python3; do \
 	"$$python" -c '$(USABLE)' >/dev/null 2>&1 && echo "$$python" && break; done)
 
+# Bytecode is kept whatever the surroundings say: each of the processes that tests start would
+# compile all packages again.
+export PYTHONDONTWRITEBYTECODE :=
+
 BIN := $(VENV)/bin
 # Changes to either file mean that the environment is out of date.
 STAMP := $(VENV)/.made-from-lock
@@ -46,11 +50,8 @@ lint: $(STAMP)
 	"$(BIN)/codespell"
 
 types: $(STAMP)
-	"$(BIN)/python" -m mypy --strict
-	"$(BIN)/python" -m mypy --strict tools/*.py
-	MYPYPATH=tools "$(BIN)/python" -m mypy --strict tools/make-descriptors
-	MYPYPATH=tools "$(BIN)/python" -m mypy --strict tools/make-docs
-	MYPYPATH=benchmarks "$(BIN)/python" -m mypy --strict benchmarks/*.py
+	MYPYPATH=tools:benchmarks "$(BIN)/python" -m mypy --strict --scripts-are-modules \
+		hipsta_bids tools/*.py tools/make-descriptors tools/make-docs benchmarks/*.py
 
 layers: $(STAMP)
 	"$(BIN)/lint-imports" --no-cache

@@ -1,4 +1,4 @@
-"""What tests get: pages and a browser on request only, and no reason that the table lacks."""
+"""What tests get: pages, workers, a browser on request only, and no reason the table lacks."""
 
 import os
 import sys
@@ -8,6 +8,7 @@ import pytest
 
 import hipsta_bids
 from hipsta_bids.errors import HipstaError
+from hipsta_bids.participant.pool import run_jobs
 from hipsta_bids.reports.page import reason_sections
 from hipsta_bids.types import Flag
 
@@ -38,6 +39,31 @@ def without_pages():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("hipsta_bids.participant.pages._try_all", lambda *_: None)
         patch.setattr("hipsta_bids.group.run.write_group_report", lambda *_: None)
+        yield
+
+
+#: What starts worker processes.
+_STARTERS = ("participant.run", "participant.pages", "validation.cases")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def without_workers():
+    """Do all jobs in this process: workers take seconds to start, and have tests of their own."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in _STARTERS:
+            patch.setattr(
+                f"hipsta_bids.{module}.run_jobs",
+                lambda plan, jobs: ((job, plan.work(job)) for job in jobs),
+            )
+        yield
+
+
+@pytest.fixture
+def workers():
+    """Let runs start worker processes."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in _STARTERS:
+            patch.setattr(f"hipsta_bids.{module}.run_jobs", run_jobs)
         yield
 
 

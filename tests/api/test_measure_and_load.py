@@ -26,28 +26,30 @@ from hipsta_bids.phantom import encode
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.settings import Settings
 
-CASES = {side: measured(spiral(), hemi=side, voxel=0.5) for side in "LR"}
-LEFT = CASES["L"]
 SECOND = HemisphereName(subject="02", session=None, hemi="L", seg="freesurfer")
+
+
+def phantom(side="L"):
+    return measured(spiral(), hemi=side, voxel=0.5)
 
 
 @pytest.fixture(scope="module")
 def left():
-    return hb.measure(LEFT.volume, side="L")
+    return hb.measure(phantom().volume, side="L")
 
 
 class TestMeasure:
     def test_maps_are_those_of_the_stages(self, left):
         assert left.maps.keys() == left.units.keys()
-        for name, values in LEFT.maps.maps.items():
+        for name, values in phantom().maps.maps.items():
             np.testing.assert_array_equal(left.maps[name], values)
-        assert left.summary["volume"] == LEFT.maps.summary["volume"]
-        assert left.status == LEFT.maps.status
+        assert left.summary["volume"] == phantom().maps.summary["volume"]
+        assert left.status == phantom().maps.status
         assert left.message == ""
 
     @pytest.mark.parametrize("kind", ["array", "image", "file"])
     def test_codes_give_the_same_as_the_volume(self, left, kind, tmp_path):
-        codes, affine = encode(LEFT.volume).astype(np.int16), LEFT.volume.affine
+        codes, affine = encode(phantom().volume).astype(np.int16), phantom().volume.affine
         image = nib.Nifti1Image(codes, affine)
         nib.save(image, tmp_path / "labels.nii.gz")
         given = {"array": codes, "image": image, "file": str(tmp_path / "labels.nii.gz")}
@@ -68,10 +70,10 @@ class TestMeasure:
 
     def test_settings_and_region_count(self):
         settings = Settings().changed(sheet={"x_nodes": 21})
-        found = hb.measure(LEFT.volume, "L", settings=settings)
+        found = hb.measure(phantom().volume, "L", settings=settings)
         assert found.maps["thickness"].shape == (21, 21)
         with pytest.raises(ProtocolError, match="neighboring cortex"):
-            hb.measure(LEFT.volume, "L", region="extended")
+            hb.measure(phantom().volume, "L", region="extended")
 
     @pytest.mark.parametrize(
         ("named", "message"),
@@ -83,19 +85,19 @@ class TestMeasure:
         ],
     )
     def test_what_is_missing_or_wrong_is_named(self, named, message):
-        given = {"side": "L", "protocol": "freesurfer", "affine": LEFT.volume.affine}
+        given = {"side": "L", "protocol": "freesurfer", "affine": phantom().volume.affine}
         with pytest.raises(ValueError, match=message):
-            hb.measure(encode(LEFT.volume), **(given | named))
+            hb.measure(encode(phantom().volume), **(given | named))
 
     def test_an_image_has_its_own_affine(self):
-        image = nib.Nifti1Image(encode(LEFT.volume).astype(np.int16), LEFT.volume.affine)
+        image = nib.Nifti1Image(encode(phantom().volume).astype(np.int16), phantom().volume.affine)
         with pytest.raises(ValueError, match="of its own"):
             hb.measure(image, "L", "freesurfer", affine=np.eye(4))
 
     def test_labels_of_another_protocol_or_shape_are_refused(self, tmp_path):
-        affine = LEFT.volume.affine
+        affine = phantom().volume.affine
         with pytest.raises(ProtocolError, match="the labels fit freesurfer"):
-            hb.measure(encode(LEFT.volume), "L", "hippunfold", affine=affine)
+            hb.measure(encode(phantom().volume), "L", "hippunfold", affine=affine)
         with pytest.raises(InputError, match="3 axes"):
             hb.measure(np.ones((3, 3)), "L", "freesurfer", affine=affine)
         nib.save(nib.Nifti1Image(np.zeros((9, 9, 9), np.int16), np.eye(4)), tmp_path / "no.nii.gz")
@@ -119,7 +121,7 @@ class TestMeasurement:
 
     @pytest.mark.parametrize("side", ["L", "R"])
     def test_triangles_face_the_exterior(self, side):
-        found = hb.measure(CASES[side].volume, side)
+        found = hb.measure(phantom(side).volume, side)
         middle, outer = (found.surface(level).points for level in ("midthickness", "exterior"))
         corners = middle[found.surface().triangles]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -133,7 +135,7 @@ class TestMeasurement:
 
 def write(root, subject, side, *, session=None, seg="freesurfer", fail=False):
     name = HemisphereName(subject=subject, session=session, hemi=side, seg=seg)
-    place, case = ResultPlace(root=root, name=name), CASES[side]
+    place, case = ResultPlace(root=root, name=name), phantom(side)
     if fail:
         error = GeometryError("there is a gap", reason="body-interrupted")
         write_failure(place, error, {})
@@ -158,7 +160,8 @@ class TestLoad:
         assert dict(maps.thickness.sizes) == {
             "participant": 3, "session": 1, "side": 2, "x": 41, "y": 21,
         }  # fmt: skip
-        for side, case in CASES.items():
+        for side in "LR":
+            case = phantom(side)
             own = maps.sel(participant="sub-01", side=side).squeeze("session")
             np.testing.assert_allclose(own.thickness, case.maps.thickness, atol=6e-5)
             middle = case.maps.sheet.points[:, :, case.maps.sheet.middle]
@@ -175,7 +178,7 @@ class TestLoad:
         dataset.settle_settings(tmp_path, Settings())
         write(tmp_path, "01", "L")
         write(tmp_path, "02", "L")
-        maps = CASES["L"].maps
+        maps = phantom().maps
         place = ResultPlace(root=tmp_path, name=SECOND)
         write_spread(place, {n: 0.1 + 0 * m for n, m in maps.maps.items()}, {}, 8)
         values = np.stack([maps.thickness, -maps.thickness], axis=2)
@@ -253,8 +256,8 @@ class TestLoad:
 
 
 def test_flags_are_handed_on():
-    maps = replace(LEFT.maps, repairs=("a tunnel was closed",))
+    maps = replace(phantom().maps, repairs=("a tunnel was closed",))
     found = api_maps.Measurement(
-        side="L", protocol=LEFT.volume.protocol, settings=Settings(), hemisphere=maps
+        side="L", protocol=phantom().volume.protocol, settings=Settings(), hemisphere=maps
     )
     assert (found.status, found.message) == ("repaired", "a tunnel was closed")

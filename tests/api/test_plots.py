@@ -1,5 +1,7 @@
 """Drawing maps on axes of matplotlib."""
 
+from functools import cache
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -9,7 +11,10 @@ from measured_phantoms import measured, spiral
 
 import hipsta_bids as hb
 
-LEFT, RIGHT = (hb.measure(measured(spiral(), hemi=s, voxel=0.5).volume, s) for s in "LR")
+
+@cache
+def found(side):
+    return hb.measure(measured(spiral(), hemi=side, voxel=0.5).volume, side)
 
 
 def drawn(axis):
@@ -21,9 +26,9 @@ def drawn(axis):
 class TestSheet:
     @pytest.mark.parametrize("kind", ["measurement", "dataset"])
     def test_values_are_those_of_the_map(self, kind):
-        data = LEFT if kind == "measurement" else LEFT.dataset
+        data = found("L") if kind == "measurement" else found("L").dataset
         axis = hb.plot_sheet(data, "curvature", ax=Figure().subplots())
-        np.testing.assert_array_equal(drawn(axis).get_array(), LEFT.maps["curvature"].T)
+        np.testing.assert_array_equal(drawn(axis).get_array(), found("L").maps["curvature"].T)
         low, high = drawn(axis).get_clim()
         assert low == -high  # zero means something
         assert {text.get_text() for text in axis.texts} >= {"CA1", "Sub"}
@@ -32,7 +37,7 @@ class TestSheet:
     def test_both_sides_lie_alike(self):
         """As on all pages."""
         axes = Figure().subplots(1, 2)
-        for axis, data in zip(axes, (LEFT, RIGHT), strict=True):
+        for axis, data in zip(axes, (found("L"), found("R")), strict=True):
             hb.plot_sheet(data, ax=axis, colorbar=False)
         for axis in axes:
             assert axis.get_xlabel() == "medial  ←  mm  →  lateral"
@@ -40,31 +45,31 @@ class TestSheet:
         assert len(axes[0].figure.axes) == 2
 
     def test_limits_are_taken(self):
-        axis = hb.plot_sheet(LEFT, ax=Figure().subplots(), limits=(1.0, 3.0))
+        axis = hb.plot_sheet(found("L"), ax=Figure().subplots(), limits=(1.0, 3.0))
         assert drawn(axis).get_clim() == (1.0, 3.0)
 
     def test_size_is_in_millimeters(self):
-        axis = hb.plot_sheet(RIGHT, ax=Figure().subplots())
-        expected = RIGHT.summary[["extent_x", "extent_y"]]
+        axis = hb.plot_sheet(found("R"), ax=Figure().subplots())
+        expected = found("R").summary[["extent_x", "extent_y"]]
         corner = drawn(axis).get_coordinates()[-1, -1]
         np.testing.assert_allclose(corner, expected, rtol=0.03)
 
     def test_wrong_data_are_refused(self):
         with pytest.raises(ValueError, match="measure is 'depht'; choose 'thickness' or"):
-            hb.plot_sheet(LEFT, "depht", ax=Figure().subplots())
+            hb.plot_sheet(found("L"), "depht", ax=Figure().subplots())
         with pytest.raises(ValueError, match="select one participant"):
-            hb.plot_sheet(LEFT.dataset, "depth", ax=Figure().subplots())
+            hb.plot_sheet(found("L").dataset, "depth", ax=Figure().subplots())
 
 
 class TestSurface:
     @pytest.mark.parametrize("kind", ["measurement", "dataset"])
     def test_faces_lie_on_the_surface(self, kind):
-        data = LEFT if kind == "measurement" else LEFT.dataset
+        data = found("L") if kind == "measurement" else found("L").dataset
         axis = hb.plot_surface(data, ax=Figure().add_subplot(projection="3d"))
         (faces,) = axis.collections
-        nx, ny = LEFT.maps["thickness"].shape
+        nx, ny = found("L").maps["thickness"].shape
         assert len(faces.get_facecolor()) == 2 * (nx - 1) * (ny - 1)
-        points = LEFT.surface().points
+        points = found("L").surface().points
         np.testing.assert_allclose(axis.get_xlim(), (points[:, 0].min(), points[:, 0].max()))
         places = {text.get_text(): text.get_position_3d() for text in axis.texts}
         back, front = (points.reshape(nx, ny, 3)[:, row].mean(axis=0) for row in (0, -1))
@@ -72,17 +77,17 @@ class TestSurface:
 
     def test_other_surfaces_are_drawn(self):
         axis = hb.plot_surface(
-            LEFT, level="exterior", ax=Figure().add_subplot(projection="3d"), view=(0, 90)
+            found("L"), level="exterior", ax=Figure().add_subplot(projection="3d"), view=(0, 90)
         )
         assert (axis.elev, axis.azim) == (0, 90)
-        points = LEFT.surface("exterior").points
+        points = found("L").surface("exterior").points
         np.testing.assert_allclose(axis.get_zlim(), (points[:, 2].min(), points[:, 2].max()))
         with pytest.raises(ValueError, match="no surface 'exterior'"):
-            hb.plot_surface(LEFT.dataset, level="exterior", ax=axis)
+            hb.plot_surface(found("L").dataset, level="exterior", ax=axis)
 
     def test_flat_axes_are_refused(self):
         with pytest.raises(ValueError, match="projection='3d'"):
-            hb.plot_surface(LEFT, ax=Figure().subplots())
+            hb.plot_surface(found("L"), ax=Figure().subplots())
 
 
 def fit_two_groups():

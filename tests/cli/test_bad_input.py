@@ -179,6 +179,7 @@ def enlarge(path, *shape):
     nib.save(nib.MGHImage(data, affine), path)
 
 
+@pytest.mark.usefixtures("workers")  # have little memory before
 def test_memory_decides_what_is_read(good, tmp_path, capsys):
     """0.6 GB for one process: half of it is 12.5 million voxels of 24 bytes."""
     bids_dir, out = tmp_path / "bids", tmp_path / "out"
@@ -216,29 +217,25 @@ def a_file(path):
 
 
 @pytest.mark.parametrize(
-    ("prepare", "options", "code", "message"),
+    ("prepare", "options", "expected"),
     [
-        (Path.exists, (), ExitCode.BAD_DATA, "no such folder"),
-        (a_file, (), ExitCode.BAD_DATA, "is a file, but a folder is needed"),
-        (Path.mkdir, (), ExitCode.NOTHING_TO_DO, "no hippocampal segmentation"),
-        (Path.mkdir, ("--ashs-dir", "nowhere"), ExitCode.BAD_DATA, "nowhere: no such folder"),
-        (Path.mkdir, ("-d", "a=nowhere"), ExitCode.BAD_DATA, "nowhere: no such folder"),
-        (Path.mkdir, ("--scheme", "nowhere.toml"), ExitCode.BAD_DATA, "nowhere.toml"),
-        (Path.mkdir, ("--bids-filter-file", "nowhere.json"), ExitCode.BAD_DATA, "nowhere.json"),
+        (Path.exists, (), (ExitCode.BAD_DATA, "no such folder")),
+        (a_file, (), (ExitCode.BAD_DATA, "is a file, but a folder is needed")),
+        (Path.mkdir, (), (ExitCode.NOTHING_TO_DO, "no hippocampal segmentation")),
+        (Path.mkdir, ("--ashs-dir", "nowhere"), (ExitCode.BAD_DATA, "nowhere: no such folder")),
+        (Path.mkdir, ("-d", "a=nowhere"), (ExitCode.BAD_DATA, "nowhere: no such folder")),
+        (Path.mkdir, ("--scheme", "nowhere.toml"), (ExitCode.BAD_DATA, "nowhere.toml")),
+        (Path.mkdir, ("--bids-filter-file", "nowhere.json"), (ExitCode.BAD_DATA, "nowhere.json")),
     ],
 )
-def test_unusable_folders_get_one_line(tmp_path, prepare, options, code, message):
+def test_unusable_folders_get_one_line(tmp_path, capsys, prepare, options, expected):
     prepare(tmp_path / "bids")
-    done = subprocess.run(
-        [*COMMAND, "bids", "out", "participant", *options],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == code
-    assert message in done.stderr
-    assert done.stderr.count("\n") == 1
+    code, message = expected
+    folders = map(str, (tmp_path / "bids", tmp_path / "out"))
+    assert main.main([*folders, "participant", *options]) == code
+    said = capsys.readouterr().err
+    assert message in said
+    assert said.count("\n") == 1
     assert not (tmp_path / "out").exists()
 
 
@@ -258,36 +255,39 @@ def obey_permissions():
         ctypes.CDLL(None).prctl(drop, capability)
 
 
+FORBIDDEN = f"""
+import os, sys
+from hipsta_bids.cli.main import main
+for folder, mode in (("bids", 0), ("{FREESURFER}", 0), ("out", 0o111)):
+    os.chmod(folder, mode)
+    try:
+        code = main(["bids", "out", "participant", "--freesurfer-dir", "{FREESURFER}"])
+    finally:
+        os.chmod(folder, 0o700)
+    print(int(code), os.listdir("out"), file=sys.stderr)
+"""
+
+
 @pytest.mark.skipif(
     os.geteuid() == 0 and sys.platform != "linux", reason="root may read and write everything"
 )
-@pytest.mark.parametrize(
-    ("which", "code", "message"),
-    [
-        ("bids", ExitCode.BAD_DATA, "cannot list the folder"),
-        (FREESURFER, ExitCode.BAD_DATA, "cannot list the folder"),
-        ("out", ExitCode.NOT_WRITABLE, "not allowed to write there"),
-    ],
-)
 @pytest.mark.usefixtures("bids_dir")
-def test_forbidden_folders_get_one_line(tmp_path, which, code, message):
+def test_forbidden_folders_get_one_line(tmp_path):
     (tmp_path / "out").mkdir()
-    (tmp_path / which).chmod(0o111 if which == "out" else 0)
-    try:
-        done = subprocess.run(
-            [*COMMAND, "bids", "out", "participant", "--freesurfer-dir", str(FREESURFER)],
-            cwd=tmp_path,
-            preexec_fn=obey_permissions,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-    finally:
-        (tmp_path / which).chmod(0o700)
-    assert done.returncode == code, done.stderr
-    assert message in done.stderr
-    assert done.stderr.count("\n") == 1
-    assert list((tmp_path / "out").iterdir()) == []
+    done = subprocess.run(
+        [sys.executable, "-c", FORBIDDEN],
+        cwd=tmp_path,
+        preexec_fn=obey_permissions,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    bad, refused = int(ExitCode.BAD_DATA), int(ExitCode.NOT_WRITABLE)
+    dataset, first, freesurfer, second, out, third = done.stderr.splitlines()
+    assert [first, second, third] == [f"{bad} []", f"{bad} []", f"{refused} []"]
+    assert "cannot list the folder" in dataset
+    assert "cannot list the folder" in freesurfer
+    assert "not allowed to write there" in out
 
 
 def test_wanted_participant_that_does_not_exist(bids_dir, tmp_path, capsys):

@@ -215,18 +215,20 @@ def test_unreadable_status_is_rebuilt(tmp_path):
     assert len(read_status(tmp_path)) == 1
 
 
-def add_rows(folder, subject):
+def add_rows(folder, subject, started=None):
+    if started:
+        started.set()
     for session in range(20):
         update_status(folder, [row(subject) | {"session": f"ses-{session}"}])
 
 
 def test_runs_side_by_side_lose_no_row(tmp_path):
     context = multiprocessing.get_context("spawn")
-    runs = [context.Process(target=add_rows, args=(tmp_path, f"sub-{k}")) for k in range(2)]
-    for run in runs:
-        run.start()
-    for run in runs:
-        run.join()
+    other = context.Process(target=add_rows, args=(tmp_path, "sub-1", started := context.Event()))
+    other.start()
+    assert started.wait(100)
+    add_rows(tmp_path, "sub-0")
+    other.join()
     assert len(read_status(tmp_path)) == 40
 
 

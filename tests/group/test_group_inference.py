@@ -212,7 +212,7 @@ def test_longitudinal_model_finds_the_slopes(sessions, quick, random):
 
 def test_default_model_with_a_curve_of_age_tests_it(sessions, quick):
     """Also in a mixed model, where the spline's part beyond a line takes an F test."""
-    options = ("--longitudinal", "--age-model", "spline", "--measures", "thickness")
+    options = ("--longitudinal", "intercept", "--age-model", "spline", "--measures", "thickness")
     folder = run(sessions, *quick, *PLAIN, *options)
     formula = json.loads((folder / "analysis.json").read_text())["formula"]
     assert formula == 'group * time + cr(age, df=3, constraints="center") + sex'
@@ -279,7 +279,10 @@ def test_asymmetry_is_left_minus_right_in_the_same_model(dataset, quick):
         (["--paired", "1", "9"], 65, "there is no session ses-9"),
         (["--paired", "1", "2", "--longitudinal"], 64, "not both"),
         (
-            ["--longitudinal", "--correction", "permutation-tfce", "--blocks", "session_id"],
+            [
+                *("--longitudinal", "intercept", "--correction", "permutation-tfce"),
+                *("--blocks", "session_id", "--measures", "thickness"),
+            ],
             65,
             "changes between visits of a participant",
         ),

@@ -69,7 +69,7 @@ def test_large_samples_give_the_p_of_the_t_test():
 
 
 def test_family_wise_error_is_kept_on_null_maps():
-    few = SETTINGS.changed(permutations=60)
+    few = SETTINGS.changed(permutations=40)
     smallest = []
     for seed in range(120):
         _, matrix, maps = case(seed, subjects=24)
@@ -101,7 +101,7 @@ def test_blocks_keep_a_site_effect_from_looking_like_a_group_effect():
         group = random.random(40) < np.where(site, 0.8, 0.2)
         matrix = np.column_stack([np.ones(40), group])
         maps = random.standard_normal((40, 4)) + 1.0 * site[:, None]
-        few = SETTINGS.changed(permutations=60, seed=seed)
+        few = SETTINGS.changed(permutations=40, seed=seed)
         for i, blocks in enumerate((None, site)):
             contrast = Contrast("group", np.array([0.0, 1.0]))
             found = permute(maps, matrix, contrast, (2, 2), settings=few, blocks=blocks)

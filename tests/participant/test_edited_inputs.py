@@ -11,8 +11,6 @@ from measured_phantoms import Damage, measured, results, spiral
 from hipsta_bids.cli import main
 from hipsta_bids.errors import ExitCode
 from hipsta_bids.io import files
-from hipsta_bids.participant import run as runner
-from hipsta_bids.participant.job import run_job
 from hipsta_bids.phantom import encode
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import GridSettings, Settings
@@ -20,12 +18,6 @@ from hipsta_bids.settings import GridSettings, Settings
 #: Coarse, for speed.
 SETTINGS = Settings(grid=GridSettings(spacing=0.5))
 SEG = "freesurfer"
-
-
-@pytest.fixture(autouse=True)
-def in_this_process(monkeypatch):
-    """Workers take seconds to start."""
-    monkeypatch.setattr(runner, "run_jobs", lambda _, jobs: ((job, run_job(job)) for job in jobs))
 
 
 def run(data, out, *options):

@@ -8,19 +8,11 @@ from hipsta_bids.cli import main
 from hipsta_bids.errors import ExitCode, InputError
 from hipsta_bids.inputs.ends import read_ends
 from hipsta_bids.io import files
-from hipsta_bids.participant import run as runner
-from hipsta_bids.participant.job import run_job
 from hipsta_bids.phantom import Hemisphere, Phantom, PhantomSpec, write_dataset
 
 SPEC = PhantomSpec(kind="spiral", thickness=2.0, length=12.0)
 SEG = "freesurfer"
 HEADER = "participant_id\themi\tend\tr\ta\ts"
-
-
-@pytest.fixture(autouse=True)
-def in_this_process(monkeypatch):
-    """Workers take seconds to start."""
-    monkeypatch.setattr(runner, "run_jobs", lambda _, jobs: ((job, run_job(job)) for job in jobs))
 
 
 @pytest.fixture(scope="module")

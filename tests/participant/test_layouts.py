@@ -190,7 +190,7 @@ def out(tmp_path_factory):
     write_hippunfold(derivatives / "hippunfold")
     write_tools(derivatives)
     write_lab(derivatives / "our-lab", "desc-hipp_", TABLE)
-    code = main.main([str(bids), str(bids / "out"), "participant", "--n-procs", "2"])
+    code = main.main([str(bids), str(bids / "out"), "participant"])
     assert code == ExitCode.OK
     return bids / "out"
 

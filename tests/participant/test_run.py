@@ -17,7 +17,6 @@ from hipsta_bids.derivatives.sidecars import SHARED
 from hipsta_bids.errors import ExitCode, InputError, OutputError, SettingsError
 from hipsta_bids.inputs.scan import Edit
 from hipsta_bids.io import files
-from hipsta_bids.participant import pool
 from hipsta_bids.participant import run as runner
 from hipsta_bids.participant.run import RunOptions, n_workers, run_participants
 from hipsta_bids.settings import BodySettings, Settings
@@ -26,19 +25,11 @@ from hipsta_bids.types import Status
 
 @pytest.fixture(autouse=True)
 def stand_ins(monkeypatch):
-    """No geometry, and no worker processes either unless a test asks for them: it is faster."""
+    """No geometry: it is faster."""
     for name in ("hipsta_bids.inputs.labels", "hipsta_bids.participant.measure"):
         monkeypatch.setitem(sys.modules, name, None)  # put back afterwards
     monkeypatch.setattr(runner, "run_job", stand_in_job)
     monkeypatch.setattr(runner, "warm_up", None)
-    monkeypatch.setattr(
-        runner, "run_jobs", lambda plan, jobs: ((job, plan.work(job)) for job in jobs)
-    )
-
-
-@pytest.fixture
-def workers(monkeypatch):
-    monkeypatch.setattr(runner, "run_jobs", pool.run_jobs)
 
 
 def run(items, out, **options):

@@ -1,9 +1,12 @@
 """Cases in workers that refuse, fail, die or hang."""
 
+import pytest
 from validation_jobs import work
 
 from hipsta_bids.participant.pool import processors
 from hipsta_bids.validation.cases import Refusal, run_cases
+
+pytestmark = pytest.mark.usefixtures("workers")
 
 
 def test_results_come_in_the_order_of_the_cases():
