@@ -19,7 +19,7 @@ from hipsta_bids.io import files
 #: Number of rows that a message lists.
 _SHOWN = 6
 #: Column of BIDS' sessions.tsv with dates, and columns that are made here.
-_DATE, TIME, FIRST_AGE = "acq_time", "time", "age_first"
+_DATE, TIME, FIRST_AGE, _ICV = "acq_time", "time", "age_first", "icv"
 _DAYS_PER_YEAR = 365.25
 #: Levels of factors that are numbers, and characters of a name for one.
 _CODE = re.compile(r"-?\d+(\.\d+)?")
@@ -194,6 +194,26 @@ def _join(joined: pd.DataFrame, table: pd.DataFrame, path: Path) -> pd.DataFrame
             values = values.where(values.notna(), result[column])
         result[column] = values
     return result
+
+
+def add_icv(
+    table: pd.DataFrame, sources: Mapping[str, tuple[str, Path]], settings: GroupSettings
+) -> tuple[pd.DataFrame, str | None]:
+    """Find the column of intracranial volume, or make one from what the programs estimated.
+
+    ``sources`` are addresses of segmentations, and the datasets whose records have them, by visit.
+    """
+    by_name = {str(column).casefold(): str(column) for column in table.columns}
+    for name in settings.model.icv_columns:
+        if name in by_name:
+            return table, by_name[name]
+    known = {name: sources[name] for name in table.index if name in sources}
+    read = read_icv([source for source, _ in known.values()], [root for _, root in known.values()])
+    if all(volume is None for volume in read):
+        return table, None
+    volumes = dict(zip(known, read, strict=True))
+    column = pd.array([volumes.get(name) for name in table.index], dtype=np.float64)
+    return table.assign(**{_ICV: column}), _ICV
 
 
 def read_icv(sources: Sequence[str], roots: Sequence[Path]) -> list[float | None]:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset
@@ -24,7 +23,7 @@ from hipsta_bids.group.collect import (
 )
 from hipsta_bids.group.combat import load_effects
 from hipsta_bids.group.comparison import Comparison, choose_visits
-from hipsta_bids.group.covariates import VisitTime, add_time, read_covariates, read_icv
+from hipsta_bids.group.covariates import VisitTime, add_icv, add_time, read_covariates
 from hipsta_bids.group.data import Cohort, Measures
 from hipsta_bids.group.exchange import SUMMARY, summarize, write_summary
 from hipsta_bids.group.formula import parse_model, with_factors
@@ -63,8 +62,6 @@ from hipsta_bids.progress import tell
 from hipsta_bids.protocols.toml import resolve
 from hipsta_bids.reports.group import write_group_report
 
-#: Column that takes the intracranial volume estimated by the segmentation's program.
-_ICV = "icv"
 #: Hemispheres that notes name.
 _SHOWN = 4
 
@@ -347,7 +344,8 @@ def read_inputs(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
     there = np.isin(np.arange(len(everybody.table)), np.concatenate([one.rows for one in sides]))
     cohort, reasons = choose_visits(everybody.take(there), options.comparison)
     keep = everybody.table.index.isin(cohort.table.index)
-    cohort, icv = _with_icv(cohort, measured, settings)
+    table, icv = add_icv(cohort.table, measured.sources, settings)
+    cohort = replace(cohort, table=table)
     time = None
     if options.comparison.longitudinal:
         time = add_time(cohort.table, settings)
@@ -411,26 +409,6 @@ def _damaged(measured: Measured) -> tuple[str, ...]:
     ]
     more = len(measured.damaged) - _SHOWN
     return (*shown, f"{more} more are left out alike, see excluded.tsv") if more > 0 else (*shown,)
-
-
-def _with_icv(
-    cohort: Cohort, measured: Measured, settings: GroupSettings
-) -> tuple[Cohort, str | None]:
-    """Find the column of intracranial volume, or make one from what the programs estimated."""
-    by_name = {str(column).casefold(): str(column) for column in cohort.table.columns}
-    for name in settings.model.icv_columns:
-        if name in by_name:
-            return cohort, by_name[name]
-    known = {
-        name: measured.sources[name] for name in cohort.table.index if name in measured.sources
-    }
-    read = read_icv([source for source, _ in known.values()], [root for _, root in known.values()])
-    volumes = dict(zip(known, read, strict=True))
-    if all(volume is None for volume in read):
-        return cohort, None
-    column = [volumes.get(name) for name in cohort.table.index]
-    table = cohort.table.assign(**{_ICV: pd.array(column, dtype=np.float64)})
-    return replace(cohort, table=table), _ICV
 
 
 def _notes(
