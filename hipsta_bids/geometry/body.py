@@ -130,9 +130,9 @@ class Body:
             near, far = points[last & (depth <= middle)], points[last & (depth >= middle)]
             step = near.mean(axis=0) - far.mean(axis=0)
             step /= max(float(np.linalg.norm(step)), 1e-9)
-            normal = ends.posterior_normal if end == "posterior" else ends.anterior_normal
             # Nearly along the plane, or of a single slice, it says nothing.
-            found[end] = step if -sign * (step @ normal) > _LEAST_SLOPE else -sign * ends.axis
+            along = -sign * (step @ ends[end].normal) > _LEAST_SLOPE
+            found[end] = step if along else -sign * ends.axis
         return found
 
     def to_voxels(self, points: Float) -> Float:

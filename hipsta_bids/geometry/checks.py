@@ -211,8 +211,8 @@ def _check_beyond(volume: LabelVolume, body: Body, settings: CheckSettings) -> l
     found = []
     ends = body.ends
     for end, rule, height in (
-        ("posterior", ends.posterior_rule, ends.height(points, "posterior")),
-        ("anterior", ends.anterior_rule, -ends.height(points, "anterior")),
+        ("posterior", ends.posterior.rule, ends.height(points, "posterior")),
+        ("anterior", ends.anterior.rule, -ends.height(points, "anterior")),
     ):
         if rule in ("labels", "user"):
             continue

@@ -268,7 +268,7 @@ def _fit_grid(body: Body, hemi: str, settings: GridSettings) -> WedgeGrid:
     """
     _, points = body.inside_points()
     axis = body.ends.axis
-    nearest = np.rint(body.to_voxels(body.ends.posterior_point))
+    nearest = np.rint(body.to_voxels(body.ends.posterior.point))
     anchor = body.affine[:3, :3] @ nearest + body.affine[:3, 3]
     flat = (points - anchor) - np.outer((points - anchor) @ axis, axis)
     across = _directions_across(body, hemi, flat)
@@ -286,10 +286,7 @@ def _fit_grid(body: Body, hemi: str, settings: GridSettings) -> WedgeGrid:
     ends = body.ends.beyond(settings.beyond)
     planes = [
         _plane_height(point, normal, origin, across * settings.spacing, axis)
-        for point, normal in (
-            (ends.posterior_point, ends.posterior_normal),
-            (ends.anterior_point, ends.anterior_normal),
-        )
+        for point, normal, *_ in (ends.posterior, ends.anterior)
     ]
     corners = np.array([[1, a, b] for a in (0, size[0]) for b in (0, size[1])])
     gaps = corners @ (planes[1] - planes[0])

@@ -124,15 +124,13 @@ def _measure(
     if settings.body.region in EXPERIMENTAL:
         whole = measure_hemisphere(volume, hemi, settings.changed(grid=grid), _no_clock)
         return whole.maps, whole.summary
-    evidence, _ = unfold(volume, hemi, settings.changed(grid=grid), _no_clock)
-    measured = evidence.measured
-    check_thickness(measured.thickness, evidence.boundaries.sheet_thickness, settings.checks)
+    measured = unfold(volume, hemi, settings.changed(grid=grid), _no_clock)
+    check_thickness(measured.thickness, measured.boundaries.sheet_thickness, settings.checks)
     tissues = for_region(volume.protocol, settings.body.region).sheet
     return measure_maps(measured), summarize(measured, tissues)
 
 
-def _no_clock(stage: str) -> AbstractContextManager[None]:
-    del stage
+def _no_clock(_: str) -> AbstractContextManager[None]:
     return nullcontext()
 
 

@@ -8,7 +8,7 @@ from scipy import ndimage
 
 from hipsta_bids.geometry.body import Body, extract_body
 from hipsta_bids.geometry.boundaries import Boundaries, find_boundaries
-from hipsta_bids.geometry.ends import EndPlanes
+from hipsta_bids.geometry.ends import EndPlane, EndPlanes
 from hipsta_bids.geometry.fem import Laplace, volume_laplace
 from hipsta_bids.geometry.grid import Field, WedgeGrid, resample_body
 from hipsta_bids.geometry.mesh import extract_surface, tetrahedralize
@@ -104,13 +104,9 @@ def straight_ends(length, *, tilt=0.0):
     normal = rotation(1, tilt) @ [0.0, 0.0, 1.0]
     middle = normal + np.array([0.0, 0.0, 1.0])
     return EndPlanes(
-        posterior_point=np.zeros(3),
-        posterior_normal=np.array([0.0, 0.0, 1.0]),
-        anterior_point=np.array([0.0, 0.0, length]),
-        anterior_normal=normal,
+        posterior=EndPlane(np.zeros(3), np.array([0.0, 0.0, 1.0]), "labels"),
+        anterior=EndPlane(np.array([0.0, 0.0, length]), normal, "labels"),
         axis=middle / np.linalg.norm(middle),
-        posterior_rule="labels",
-        anterior_rule="labels",
         half_slice=0.0,
     )
 
