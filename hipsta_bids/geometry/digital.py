@@ -15,7 +15,7 @@ Membranes are sought in padded arrays: along the axis by a layer for a plate and
 across it by one of free space.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from itertools import pairwise
 from typing import Any, Literal, NamedTuple
@@ -84,7 +84,7 @@ def widened(mask: Bool) -> Bool:
     return mask
 
 
-def box(low: Index, high: Index) -> Box:
+def box(low: Iterable[int], high: Iterable[int]) -> Box:
     """Part of a grid from one index (3,) up to, but without, another."""
     first, second, third = (slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
     return first, second, third

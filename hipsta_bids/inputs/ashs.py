@@ -21,7 +21,7 @@ from hipsta_bids.inputs.scan import (
     VisitFolders,
     list_visits,
     several_files,
-    subject_folders,
+    sort_folders,
     unknown_protocol,
 )
 from hipsta_bids.inputs.selection import Selection, measurable
@@ -256,7 +256,6 @@ def find_ashs(
             protocol=protocol,
             files=(chosen.path,),
             bilateral=bilateral,
-            code_offset=protocol.shift(hemi) if bilateral else 0,
             source=source.name,
             source_path=source.path,
             why=f"{chosen.kind}{', both hemispheres in one file' if bilateral else ''}; {why}",
@@ -269,7 +268,7 @@ def sample_files(source: Source) -> Callable[[], list[_Image]]:
     """Prepare a sample of a dataset's segmentations, the same whoever is processed."""
 
     def sample() -> list[_Image]:
-        folders = subject_folders(source.path)
+        folders = sort_folders(source.path)[0]
         step = max(len(folders) // _SAMPLE, 1)
         found = []
         for visit in list_visits(folders[::step]):

@@ -110,8 +110,6 @@ class HemisphereInput(Hemisphere):
     """The protocol of the second file."""
     bilateral: bool = False
     """The file carries both hemispheres, the codes of one shifted by ``protocol.offset``."""
-    code_offset: int = 0
-    """To be subtracted from the codes of this hemisphere."""
     source: str
     """Name of the dataset."""
     source_path: Path
@@ -140,6 +138,11 @@ class HemisphereInput(Hemisphere):
     def edited(self) -> tuple[str, ...]:
         """Kinds of edits, each once."""
         return tuple(dict.fromkeys(edit.kind for edit in self.edits))
+
+    @property
+    def code_offset(self) -> int:
+        """What is to be subtracted from the codes of this hemisphere."""
+        return self.protocol.shift(self.hemi) if self.bilateral else 0
 
     @property
     def key(self) -> tuple[str, str, str, str]:
@@ -266,11 +269,6 @@ def _is_folder(entry: os.DirEntry[str]) -> bool:
 def plain_label(name: str) -> str:
     """Make a BIDS label of a name: ``AD_05`` and ``sub-AD_05`` become ``AD05``."""
     return re.sub(r"[^A-Za-z0-9+]", "", name.removeprefix("sub-"))
-
-
-def subject_folders(root: Path, *, any_name: bool = False) -> list[SubjectFolder]:
-    """List the subjects' folders of a dataset, sorted by name."""
-    return sort_folders(root, any_name=any_name)[0]
 
 
 def sort_folders(
@@ -494,7 +492,7 @@ def list_participants(request: InputRequest) -> frozenset[str]:
     the names of the folders, as indexing thousands of subjects takes minutes.
     """
     if request.bids_database_dir is None:
-        return frozenset(folder.subject for folder in subject_folders(request.bids_dir))
+        return frozenset(folder.subject for folder in sort_folders(request.bids_dir)[0])
     return _from_index(request.bids_dir, request.bids_database_dir)
 
 

@@ -29,7 +29,6 @@ from hipsta_bids.inputs.scan import (
     list_sources,
     list_visits,
     sort_folders,
-    subject_folders,
 )
 from hipsta_bids.inputs.selection import Selection, make_selection
 from hipsta_bids.inputs.tools import find_hippunfold, find_tools
@@ -187,7 +186,7 @@ def list_subjects(request: InputRequest) -> tuple[str, ...]:
             {
                 folder.subject
                 for source in list_sources(request)
-                for folder in subject_folders(source.path, any_name=source.any_name)
+                for folder in sort_folders(source.path, any_name=source.any_name)[0]
                 if selection.wants_folder(folder)
             }
         )
@@ -326,7 +325,7 @@ def _nothing(
         subjects = {
             folder.subject
             for source in sources
-            for folder in subject_folders(source.path, any_name=source.any_name)
+            for folder in sort_folders(source.path, any_name=source.any_name)[0]
         }
         return NothingToDoError(
             f"no hippocampal segmentation matches {' '.join(restricted)} in {searched} "

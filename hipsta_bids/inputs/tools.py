@@ -130,7 +130,6 @@ def _choose(
         protocol=protocol,
         files=(chosen.path,),
         bilateral=bilateral,
-        code_offset=protocol.shift(hemi) if bilateral else 0,
         source=source.name,
         source_path=source.path,
         why=f"{tool.title}{', both hemispheres in one file' if bilateral else ''}, {why}",
