@@ -16,8 +16,8 @@ from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.checks import name_place
 from hipsta_bids.geometry.fem import DIRECTION_RESIDUAL, Laplace
-from hipsta_bids.geometry.mesh import mean_wall_thickness, signed_volume
-from hipsta_bids.geometry.wall import Wall, edge_graph, end_to_end
+from hipsta_bids.geometry.mesh import edge_graph, mean_wall_thickness, signed_volume
+from hipsta_bids.geometry.wall import Wall, end_to_end
 from hipsta_bids.settings import BoundarySettings
 from hipsta_bids.types import Bool, Float, Int, Surface
 

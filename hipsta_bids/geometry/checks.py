@@ -175,16 +175,11 @@ def check_image(body: Body, settings: CheckSettings) -> list[Finding]:
     ]
 
 
-def _sliced_lengthwise(body: Body, settings: CheckSettings) -> bool:
-    """Whether the longest edge of the voxels is long, and lies across the long axis."""
-    edges = np.linalg.norm(body.affine[:3, :3], axis=0)
-    return bool(edges.max() > settings.slice_ratio * edges.min() and not cut_across(body))
-
-
 def _voxel_across(body: Body, settings: CheckSettings) -> float:
-    """Edge of the voxels across the sheet, mm."""
-    if _sliced_lengthwise(body, settings):
-        return float(np.linalg.norm(body.affine[:3, :3], axis=0).max())
+    """Edge of the voxels across the sheet, mm: the longest one if slices lie along the axis."""
+    edges = np.linalg.norm(body.affine[:3, :3], axis=0)
+    if edges.max() > settings.slice_ratio * edges.min() and not cut_across(body):
+        return float(edges.max())
     return in_plane_voxel(body.affine)
 
 

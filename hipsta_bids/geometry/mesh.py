@@ -104,10 +104,14 @@ def smooth_vertices(nodes: Float, faces: Int, settings: SurfaceSettings) -> Floa
     return _taubin(nodes, faces, unique_edges(faces), (none, none), settings)
 
 
-def _adjacency(edges: Int, count: int) -> sparse.csr_array:
-    ones = np.ones(2 * len(edges))
+def edge_graph(edges: Int, weights: Float, count: int) -> sparse.csr_array:
+    """Make a symmetric graph of edges (E, 2) with weights (E,)."""
     both = np.vstack([edges, edges[:, ::-1]])
-    return sparse.csr_array((ones, (both[:, 0], both[:, 1])), shape=(count, count))
+    return sparse.csr_array((np.tile(weights, 2), (both[:, 0], both[:, 1])), shape=(count, count))
+
+
+def _adjacency(edges: Int, count: int) -> sparse.csr_array:
+    return edge_graph(edges, np.ones(len(edges)), count)
 
 
 def _taubin(

@@ -159,12 +159,6 @@ def vertex_normals(vertices: Float, triangles: Int) -> Float:
     return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1), 1e-12)[:, None])
 
 
-def edge_graph(edges: Int, weights: Float, count: int) -> sparse.csr_array:
-    """Make a symmetric graph of edges (E, 2) with weights (E,)."""
-    both = np.vstack([edges, edges[:, ::-1]])
-    return sparse.csr_array((np.tile(weights, 2), (both[:, 0], both[:, 1])), shape=(count, count))
-
-
 def end_to_end(wall: Wall, values: Float) -> tuple[Float, Float] | None:
     """Zero lines that run from the posterior to the anterior end, if there are exactly two."""
     side = values > 0

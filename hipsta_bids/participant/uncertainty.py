@@ -27,6 +27,8 @@ from scipy.spatial.transform import Rotation
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.catalog import measure_maps, summarize
 from hipsta_bids.geometry.checks import check_thickness
+from hipsta_bids.geometry.digital import box
+from hipsta_bids.io.volumes import moved
 from hipsta_bids.participant.measure import measure_hemisphere, unfold
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.protocols.load import for_region
@@ -184,17 +186,14 @@ def _cropped(volume: LabelVolume) -> LabelVolume:
         return volume
     where = np.argwhere(labeled)
     low = np.maximum(where.min(axis=0) - 2, 0)
-    box = tuple(slice(a, b) for a, b in zip(low, where.max(axis=0) + 3, strict=True))
-    affine = volume.affine.copy()
-    affine[:3, 3] += affine[:3, :3] @ low
+    around = box(low, where.max(axis=0) + 3)
     mask = volume.edited_mask
-    return LabelVolume(
-        tissue=volume.tissue[box],
-        part=volume.part[box],
-        affine=affine,
-        protocol=volume.protocol,
-        edited_mask=None if mask is None else replace(mask, inside=mask.inside[box]),
-        given_ends=volume.given_ends,
+    return replace(
+        volume,
+        tissue=volume.tissue[around],
+        part=volume.part[around],
+        affine=moved(volume.affine, low),
+        edited_mask=None if mask is None else replace(mask, inside=mask.inside[around]),
     )
 
 

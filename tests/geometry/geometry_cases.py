@@ -47,7 +47,7 @@ def solve_case(phantom, *, protocol="freesurfer", settings=None, **drawing):
     volume = phantom.label_volume(load_protocol(protocol), **drawing)
     body = extract_body(volume, chosen.body)
     field = resampled(body, chosen, drawing.get("hemi", "L"))
-    solid = repair_topology(field, chosen.topology)
+    solid = solid_of(field, chosen.topology)
     surface = extract_surface(solid.field, chosen.surface)
     mesh = tetrahedralize(surface, chosen.tetra, field.grid.frame)
     laplace = volume_laplace(mesh)
@@ -97,6 +97,11 @@ def rigid(degrees=(20.0, -35.0, 50.0), shift=(11.0, -7.0, 4.0)):
         pose[:3, :3] = rotation(axis, angle) @ pose[:3, :3]
     pose[:3, 3] = shift
     return pose
+
+
+def solid_of(field, settings):
+    """The field with its topology repaired; no subfield is named, and no turns touch."""
+    return repair_topology(field, settings, lambda _: "", lambda _: False)
 
 
 def straight_ends(length, *, tilt=0.0):
