@@ -55,15 +55,6 @@ class InputRequest:
     bids_database_dir: Path | None = None
 
 
-def several_files(folder: Path, names: Iterable[str]) -> InputError:
-    """Say that several files of a folder are equally good for a hemisphere."""
-    return InputError(
-        f"{folder}: {' and '.join(names)} are equally good; "
-        "keep one of them in the subject's folder",
-        reason="several-files",
-    )
-
-
 def unknown_protocol(name: str, title: str) -> Protocol:
     """Stand in where codes are not understood: the hemisphere fails, but has a name in outputs."""
     return Protocol(name=name, title=title, citation="", sheet=(), layer=(), interior=(), labels=())

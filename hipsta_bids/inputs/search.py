@@ -13,7 +13,7 @@ from pathlib import Path
 
 from hipsta_bids.derivatives.dataset import read_description
 from hipsta_bids.errors import NothingToDoError, UsageError
-from hipsta_bids.inputs.ashs import AtlasFinder, choose_atlas, find_ashs, sample_files
+from hipsta_bids.inputs.ashs import AtlasFinder, choose_atlas, find_ashs
 from hipsta_bids.inputs.edits import EditedFile, attach_edits, each_once, edits_of_visit, list_edits
 from hipsta_bids.inputs.freesurfer import find_freesurfer, same_labels, without_labels
 from hipsta_bids.inputs.generic import find_named, forget_tables
@@ -236,7 +236,7 @@ def _search(source: Source, selection: Selection, option: Protocol | None, found
     found.others += others
     found.renamed += [folder for folder in folders if folder.renamed]
     anew = _renaming(folders)
-    atlases = AtlasFinder(source.path, option, sample_files(source))
+    atlases = AtlasFinder(source.path, option)
     for visit in filter(selection.wants_visit, list_visits(folders, found.ignored)):
         found.edited += edits_of_visit(visit, source.path, source.name, beside=True)
         items = list(_search_visit(visit, source, selection, atlases))
@@ -260,7 +260,7 @@ def _search_visit(
     if "freesurfer" in source.layouts:
         yield from find_freesurfer(visit, source, selection)
     if "ashs" in source.layouts:
-        yield from find_ashs(visit, source, atlases, selection)
+        yield from find_ashs(visit, source, selection, atlases)
     if "hippunfold" in source.layouts:
         yield from find_hippunfold(visit, source, selection)
     if "tools" in source.layouts:

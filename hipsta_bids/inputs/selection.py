@@ -1,19 +1,21 @@
-"""Which of what is found is wanted: labels of options, and entities of the filter file."""
+"""Which of what is found is wanted, by options and the filter file, and which of several files."""
 
 import difflib
 import json
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from hipsta_bids.errors import InputError, ProtocolError, UsageError
+from hipsta_bids.errors import HipstaError, InputError, ProtocolError, UsageError
 from hipsta_bids.inputs.scan import (
     HEMIS,
+    HemisphereInput,
     Ignored,
     InputRequest,
+    Source,
     SubjectFolder,
     VisitFolders,
     plain_label,
@@ -82,6 +84,52 @@ class Selection:
     def _passes(self, entity: str, value: str | None) -> bool:
         rule = self.rules.get(entity)
         return rule is None or rule(value)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SidedFile:
+    """Labels of one hemisphere, or of both."""
+
+    path: Path
+    hemi: str | None
+    """None for both."""
+    rank: tuple[int, ...]
+    """Order of preference, the least first."""
+
+
+def choose_file(
+    files: Sequence[SidedFile],
+    visit: VisitFolders,
+    hemi: str,
+    source: Source,
+    *,
+    found: tuple[Protocol, HipstaError | None],
+    why: tuple[str, str],
+    passed_over: Iterable[tuple[str, str]],
+) -> HemisphereInput:
+    """Take the first file of a hemisphere, unless another one is as good."""
+    (protocol, problem), chosen = found, files[0]
+    rivals = [file.path.name for file in files if file.rank == chosen.rank]
+    if len(rivals) > 1:
+        problem = InputError(
+            f"{chosen.path.parent}: {' and '.join(rivals)} are equally good; "
+            "keep one of them in the subject's folder",
+            reason="several-files",
+        )
+    both = ", both hemispheres in one file" if chosen.hemi is None else ""
+    return HemisphereInput(
+        subject=visit.subject,
+        session=visit.session,
+        hemi=hemi,
+        protocol=protocol,
+        files=(chosen.path,),
+        bilateral=chosen.hemi is None,
+        source=source.name,
+        source_path=source.path,
+        why=both.join(why),
+        passed_over=tuple(passed_over),
+        problem=problem,
+    )
 
 
 def make_selection(request: InputRequest) -> Selection:
