@@ -312,8 +312,7 @@ def join_cortex(volume: LabelVolume, hippocampal: Tissues, region: str) -> Tissu
 def check_reach(points: Float, tissue: Tissues, ends: EndPlanes, settings: BodySettings) -> None:
     """Refuse cortex, among points (N, 3) of a region, that does not reach from end to end."""
     cortex = tissue > Tissue.HIPPOCAMPUS
-    below = ends.height(points[cortex], "posterior")
-    above = -ends.height(points[cortex], "anterior")
+    below, above = ends.depths(points[cortex])
     length = ends.length(points)
     # Levels are as long as a voxel, so that each level with labels holds a center of one.
     count = max(int(length / (2 * ends.half_slice)), 1)

@@ -32,6 +32,7 @@ from hipsta_bids.settings import CheckSettings, TopologySettings
 from hipsta_bids.types import (
     Bool,
     Coordinates,
+    End,
     Finding,
     Float,
     LabelVolume,
@@ -205,14 +206,12 @@ def _check_beyond(volume: LabelVolume, body: Body, settings: CheckSettings) -> l
     points = voxel_points(labeled, volume.affine)
     found = []
     ends = body.ends
-    for end, rule, height in (
-        ("posterior", ends.posterior.rule, ends.height(points, "posterior")),
-        ("anterior", ends.anterior.rule, -ends.height(points, "anterior")),
-    ):
-        if rule in ("labels", "user"):
+    sides: tuple[End, ...] = ("posterior", "anterior")
+    for end, depth in zip(sides, ends.depths(points), strict=True):
+        if ends[end].rule in ("labels", "user"):
             continue
-        near = points[(height > 0) & (height < settings.beyond_reach)]
-        beyond = np.count_nonzero((height < 0) & (height > -settings.beyond_reach))
+        near = points[(depth > 0) & (depth < settings.beyond_reach)]
+        beyond = np.count_nonzero((depth < 0) & (depth > -settings.beyond_reach))
         found.append(
             Finding(
                 reason="labels-end",

@@ -77,9 +77,13 @@ class EndPlanes:
             anterior=self.anterior._replace(point=self.anterior.point + step),
         )
 
+    def depths(self, points: Float) -> tuple[Float, Float]:
+        """Distances of (N, 3) points from both planes, mm, (N,); positive inside of each."""
+        return self.height(points, "posterior"), -self.height(points, "anterior")
+
     def depth(self, points: Float) -> Float:
         """Distance of (N, 3) points from the nearer plane, mm, (N,); positive between them."""
-        return np.minimum(self.height(points, "posterior"), -self.height(points, "anterior"))
+        return np.minimum(*self.depths(points))
 
     def length(self, points: Float) -> float:
         """Mean distance between the planes along the axis, over (N, 3) points, mm."""

@@ -307,7 +307,7 @@ def _labeled_ends(body: Body) -> tuple[bool, bool]:
     points = voxel_points(body.tissue > 0, body.affine)
     thickness = float(np.linalg.norm(body.affine[:3, 0]))
     known = []
-    for depth in (body.ends.height(points, "posterior"), -body.ends.height(points, "anterior")):
+    for depth in body.ends.depths(points):
         inner = np.count_nonzero((depth > 0) & (depth < thickness))
         outer = np.count_nonzero((depth < 0) & (depth > -thickness))
         known.append(bool(outer > 0.5 * inner))  # a label that is only blurred at the plane is less
@@ -329,7 +329,7 @@ def _depths(body: Body, part: Box) -> tuple[Float, Float]:
     """Depths of the box's voxels inside the planes at its first and last slices, mm."""
     index = np.meshgrid(*(np.arange(side.start, side.stop) for side in part), indexing="ij")
     points = to_ras(np.stack(index, axis=-1), body.affine)
-    return body.ends.height(points, "posterior"), -body.ends.height(points, "anterior")
+    return body.ends.depths(points)
 
 
 def _extrapolate(

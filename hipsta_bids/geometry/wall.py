@@ -59,8 +59,7 @@ class Wall:
         self.triangles = number[triangles]
         self.posterior = surface.posterior_cap[self.index]
         self.anterior = surface.anterior_cap[self.index]
-        below = body.ends.height(self.vertices, "posterior")
-        above = -body.ends.height(self.vertices, "anterior")
+        below, above = body.ends.depths(self.vertices)
         self.share = np.clip(below / (below + above), 0, 1)
         self.edges = unique_edges(self.triangles)
         self.lengths = np.linalg.norm(np.diff(self.vertices[self.edges], axis=1)[:, 0], axis=1)

@@ -78,11 +78,13 @@ class MapSource:
 
     name: str
     """What its outputs are called."""
+    pattern: str = ""
+    """Path with placeholders, absolute or relative to the BIDS dataset; may have wildcards."""
     sampling: str
     """``depth`` or ``mid``, see :func:`~hipsta_bids.geometry.sampling.sample_on_sheet`."""
     interpolation: str
     """``linear`` or ``nearest``."""
-    path: Path | None
+    path: Path | None = None
     """None where there is no file, or more than one that it could be."""
     missing: str | None = None
     """Why there is no path, in one phrase."""

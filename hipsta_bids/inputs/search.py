@@ -219,10 +219,9 @@ def dataset_notes(request: InputRequest, items: Iterable[HemisphereInput]) -> tu
         notes.append(
             f"{request.bids_dir} has no dataset_description.json, which BIDS requires; going on"
         )
-    asked = make_selection(request).subjects
-    known = asked or list_participants(request)
-    left_out = make_selection(request).excluded
-    without = sorted(known - left_out - {item.subject for item in items})
+    selection = make_selection(request)
+    known = selection.subjects or list_participants(request)
+    without = sorted(known - selection.excluded - {item.subject for item in items})
     if without:
         notes.append(f"no segmentation found for {_count(without, 'participant')}")
     return tuple(notes)

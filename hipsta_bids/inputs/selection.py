@@ -140,6 +140,7 @@ def make_selection(request: InputRequest) -> Selection:
             f"--hemi {' '.join(map(str, wrong))}: choose among {', '.join(HEMIS)}",
             reason="bad-hemisphere",
         )
+    choice = request.protocol or None
     return Selection(
         subjects=_labels(
             _plain(request, request.participant_labels), "sub-", "--participant-label"
@@ -151,13 +152,10 @@ def make_selection(request: InputRequest) -> Selection:
         hemis=request.hemis,
         rules=_rules(request.bids_filter_file) if request.bids_filter_file else {},
         fs_analysis=request.fs_analysis,
-        protocol=_chosen_protocol(request.protocol) if request.protocol else None,
+        protocol=None
+        if choice is None
+        else measurable(load_protocol(Path(choice) if Path(choice).is_file() else str(choice))),
     )
-
-
-def _chosen_protocol(choice: str | Path) -> Protocol:
-    """Load a protocol by the name of a file or of a bundled one."""
-    return measurable(load_protocol(Path(choice) if Path(choice).is_file() else str(choice)))
 
 
 def measurable(protocol: Protocol) -> Protocol:

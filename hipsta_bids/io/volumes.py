@@ -137,15 +137,9 @@ def read_labels(path: Path, margin: float = 0.0, part: Box | None = None) -> Lab
     """Read what is not zero in an image of labels or a mask, or a given part of it.
 
     Shape and type are checked before any voxel is read, and no more than a slab is read at once:
-    what a header declares does not decide how much memory is needed.
-
-    Parameters
-    ----------
-    path : Path
-    margin : float
-        Voxels up to this distance (mm, along the image's axes) are kept around what is not zero.
-    part : tuple of slice, optional
-        The part to read instead, as far as the image goes.
+    what a header declares does not decide how much memory is needed. Voxels up to ``margin`` (mm,
+    along the image's axes) are kept around what is not zero; ``part`` is read instead of that, as
+    far as the image goes.
     """
     with _opened(path) as image:
         shape = _label_shape(image, path)

@@ -8,6 +8,7 @@ This is a parametric bootstrap (Efron and Tibshirani 1993, An Introduction to th
 """
 
 import hashlib
+import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
@@ -84,21 +85,10 @@ class Uncertainty:
 def estimate_uncertainty(
     volume: LabelVolume, hemi: str, settings: Settings, copies: int
 ) -> Uncertainty:
-    """Measure perturbed copies of a label volume, and take the SD at each node of the sheet.
+    """Measure 2 or more perturbed copies of labels, and take the SD (n - 1) at each node.
 
-    Parameters
-    ----------
-    volume : LabelVolume
-    hemi : {"L", "R"}
-    settings : Settings
-    copies : int
-        Number of copies, 2 or more. The same labels always give the same copies, and the first ones
-        do not depend on how many there are.
-
-    Returns
-    -------
-    Uncertainty
-        SDs with ``n - 1`` in the denominator.
+    The same labels always give the same copies, and the first ones do not depend on how many there
+    are.
     """
     found: list[tuple[Mapping[str, Float], Mapping[str, float]]] = []
     for number in range(copies):
@@ -141,12 +131,10 @@ def _spread(rows: Sequence[Mapping[str, Any]]) -> dict[str, Float]:
     spread = {}
     for name in rows[0]:
         values = np.array([row[name] for row in rows], dtype=np.float64)
-        known = np.isfinite(values)
-        count = known.sum(axis=0)
-        mean = np.where(known, values, 0.0).sum(axis=0) / np.maximum(count, 1)
-        squares = np.where(known, (values - mean) ** 2, 0.0).sum(axis=0)
-        sd = np.sqrt(squares / np.maximum(count - 1, 1))
-        spread[name] = np.where(count >= LEAST, sd, np.nan)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # where fewer than two know it
+            sd = np.nanstd(np.where(np.isfinite(values), values, np.nan), axis=0, ddof=1)
+        spread[name] = np.asarray(sd)
     return spread
 
 
