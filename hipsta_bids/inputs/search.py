@@ -116,7 +116,13 @@ def find_inputs(request: InputRequest) -> Findings:
     items, notes = attach_edits(
         _without_clashes(found.items, sources), each_once(found.edited), selection
     )
-    notes += (*_renaming_note(found.renamed, items), *_ignored_note(ignored))
+    subjects = {item.subject for item in items}
+    renamed = [f"{f.path.name} as sub-{f.subject}" for f in found.renamed if f.subject in subjects]
+    if renamed:
+        notes += (f"renamed: {_count(renamed, 'FreeSurfer folder')}",)
+    unused = [entry.name for entry in ignored if not entry.template]
+    if unused:
+        notes += (f"not used: {_count(unused, 'folder')}; --dry-run and the log say why",)
     return Findings(items=items, notes=notes, ignored=ignored)
 
 
@@ -153,24 +159,9 @@ def _renaming(folders: Iterable[SubjectFolder]) -> dict[tuple[str, str | None], 
     }
 
 
-def _renaming_note(
-    renamed: Iterable[SubjectFolder], items: Iterable[HemisphereInput]
-) -> Iterator[str]:
-    subjects = {item.subject for item in items}
-    names = [f"{f.path.name} as sub-{f.subject}" for f in renamed if f.subject in subjects]
-    if names:
-        yield f"renamed: {_count(names, 'FreeSurfer folder')}"
-
-
 def _place(path: Path) -> str:
     """Where an entry is, however its folder was reached; the entry itself may be any link."""
     return os.path.join(os.path.realpath(path.parent), path.name)  # noqa: PTH118 (many of them)
-
-
-def _ignored_note(ignored: Iterable[Ignored]) -> Iterator[str]:
-    names = [entry.name for entry in ignored if not entry.template]
-    if names:
-        yield f"not used: {_count(names, 'folder')}; --dry-run and the log say why"
 
 
 def ignored_table(ignored: Iterable[Ignored]) -> list[dict[str, str]]:

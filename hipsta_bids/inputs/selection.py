@@ -78,8 +78,11 @@ class Selection:
         """Check whether a file with BIDS entities in its name is wanted."""
         if not self.rules:
             return True
-        found = _parse(path)
-        return all(rule(found.get(key)) for key, rule in self.rules.items())
+        from bids.layout import parse_file_entities  # noqa: PLC0415 (takes seconds)
+
+        found = parse_file_entities(str(path), entities=list(_entities().values()))
+        given = {key: str(value) for key, value in found.items()}
+        return all(rule(given.get(key)) for key, rule in self.rules.items())
 
     def _passes(self, entity: str, value: str | None) -> bool:
         rule = self.rules.get(entity)
@@ -233,10 +236,3 @@ def _entities() -> dict[str, Any]:
 
     configs = (Config.load(name) for name in ("bids", "derivatives"))
     return {name: entity for config in configs for name, entity in config.entities.items()}
-
-
-def _parse(path: Path) -> dict[str, str]:
-    from bids.layout import parse_file_entities  # noqa: PLC0415 (see above)
-
-    found = parse_file_entities(str(path), entities=list(_entities().values()))
-    return {key: str(value) for key, value in found.items()}

@@ -31,7 +31,7 @@ from hipsta_bids.participant.maps import (
 )
 from hipsta_bids.protocols.load import for_region
 from hipsta_bids.settings import Settings
-from hipsta_bids.types import BodyMask, GivenEnd, HemisphereMaps, Status
+from hipsta_bids.types import BodyMask, HemisphereMaps, Status
 
 if TYPE_CHECKING:
     from hipsta_bids.participant.uncertainty import Uncertainty
@@ -131,6 +131,11 @@ def base_record(job: Job) -> dict[str, Any]:
     """Begin the quality record with what is known before any input is read."""
     item = job.item
     sources = dict(job.sources)
+    given = [
+        {"end": end.end, "point_ras_mm": end.point}
+        | ({"normal_ras": end.normal} if end.normal else {})
+        for end in item.ends
+    ]
     return {
         "version": __version__,
         "settings_hash": job.settings_hash,
@@ -148,14 +153,8 @@ def base_record(job: Job) -> dict[str, Any]:
             for path, why in item.passed_over
         ],
         "notes": item.notes,
-        **({"given_ends": [_given_end(end) for end in item.ends]} if item.ends else {}),
+        **({"given_ends": given} if given else {}),
     }
-
-
-def _given_end(end: GivenEnd) -> dict[str, Any]:
-    """Describe an end that a person has placed."""
-    normal = {"normal_ras": end.normal} if end.normal else {}
-    return {"end": end.end, "point_ras_mm": end.point, **normal}
 
 
 def hash_inputs(job: Job, record: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:

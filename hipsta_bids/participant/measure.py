@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry.body import Body, check_mask, check_side, extract_body
+from hipsta_bids.geometry.body import check_mask, check_side, extract_body
 from hipsta_bids.geometry.boundaries import Boundaries, find_boundaries
 from hipsta_bids.geometry.catalog import (
     Measured,
@@ -232,12 +232,6 @@ def _whole(row: tuple[str, float, float, str, str, Float | float]) -> Finding:
     return replace(finding, points=where[np.isfinite(where).all(axis=-1)])
 
 
-def _told(repair: Repair, sheet: Sheet, settings: Settings) -> str:
-    """Write what a repair changed, and what it means for the map."""
-    known = add_consequence(_of_repair(repair), sheet, settings.checks)
-    return f"{repair}{consequence_text(known)}"
-
-
 def quality_metrics(evidence: Evidence) -> dict[str, Any]:
     """Numbers and words that say whether to trust the map, JSON-serializable."""
     solid, boundaries, surface = evidence.solid, evidence.boundaries, evidence.surface
@@ -322,7 +316,10 @@ def unfold(volume: LabelVolume, hemi: str, settings: Settings, clock: Clock) -> 
         bending = bending_angle(sheet, settings.measures)
         if body.region != "body" and boundaries.side_rule == "bending":
             boundaries = replace(boundaries, side_rule="continuity")
-        if _sides_exchanged(sheet, boundaries.side_rule, bending, hemi):
+        # Labels have decided already.
+        if (boundaries.side_rule == "continuity" and is_flipped(sheet, hemi)) or (
+            boundaries.side_rule == "bending" and bending < 0
+        ):
             sheet, coordinates, boundaries = _flipped(sheet, coordinates, boundaries)
             bending = -bending
         whole = sample_sheet(mesh, coordinates, whole_body(settings.sheet))
@@ -386,6 +383,10 @@ def measure_hemisphere(
     evidence = unfold(volume, hemi, settings, clock)
     sheet = evidence.sheet
     with clock("measures"):
+        repairs = [
+            add_consequence(_of_repair(repair), sheet, settings.checks)
+            for repair in evidence.solid.repairs
+        ]
         layers, folded_layers = _layers(sheet, settings)
         findings = [*_find(volume, hemi, evidence), *folded_layers]
         maps = measure_maps(evidence)
@@ -401,7 +402,7 @@ def measure_hemisphere(
             summary=summarize(evidence, for_region(volume.protocol, region).sheet),
             qc={**quality_metrics(evidence), "flag_margins": flag_margins(findings)},
             repairs=(
-                *(_told(repair, sheet, settings) for repair in evidence.solid.repairs),
+                *(f"{finding.what}{consequence_text(finding)}" for finding in repairs),
                 *describe_uncus(evidence.body, settings.checks),
             ),
             flags=_flags(evidence, findings),
@@ -413,11 +414,16 @@ def measure_hemisphere(
 def _find(volume: LabelVolume, hemi: str, evidence: Evidence) -> list[Finding]:
     """List what the checks of a body found, within its limit or not."""
     body, settings, checks = evidence.body, evidence.settings, evidence.settings.checks
+    mask = volume.edited_mask
     return [
         *check_end_labels(volume, body, checks),
         *check_thickness(evidence.thickness, evidence.boundaries.sheet_thickness, checks),
         *([check_flipped(evidence.sheet, hemi)] if body.region == "extended" else []),
-        *_check_edited_mask(volume, body, settings),
+        *(
+            check_mask(mask, body.mask_change, in_plane_voxel(body.affine), settings.body)
+            if mask and body.mask_change
+            else []
+        ),
         *find_all(evidence),
     ]
 
@@ -434,13 +440,6 @@ def find_body(volume: LabelVolume, settings: Settings) -> BodyMask | None:
     except GeometryError:
         return None
     return volume.in_file(body.inside)
-
-
-def _check_edited_mask(volume: LabelVolume, body: Body, settings: Settings) -> list[Finding]:
-    if volume.edited_mask is None or body.mask_change is None:
-        return []
-    voxel = in_plane_voxel(body.affine)
-    return check_mask(volume.edited_mask, body.mask_change, voxel, settings.body)
 
 
 def _filled(
@@ -466,13 +465,6 @@ def _layers(sheet: Sheet, settings: Settings) -> tuple[Sheet, list[Finding]]:
         return sheet, []
     layers, folded = equal_volume_layers(sheet)
     return layers, [check_layers(folded, sheet)]
-
-
-def _sides_exchanged(sheet: Sheet, rule: str, bending: float, hemi: str) -> bool:
-    """Decide whether interior and exterior have to be exchanged; labels have decided already."""
-    if rule == "continuity":
-        return is_flipped(sheet, hemi)
-    return rule == "bending" and bending < 0
 
 
 def _flipped(

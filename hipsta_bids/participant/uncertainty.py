@@ -97,14 +97,12 @@ def estimate_uncertainty(
             found.append(_measure(copy, hemi, settings))
         except GeometryError:
             continue
-    enough = len(found) >= max(LEAST, copies / 2)
+    enough = found if len(found) >= max(LEAST, copies / 2) else []
     return Uncertainty(
         copies=copies,
         failed=copies - len(found),
-        maps=_spread([maps for maps, _ in found]) if enough else {},
-        summary={k: float(v) for k, v in _spread([one for _, one in found]).items()}
-        if enough
-        else {},
+        maps=_spread([maps for maps, _ in enough]),
+        summary={k: float(v) for k, v in _spread([one for _, one in enough]).items()},
     )
 
 
@@ -129,7 +127,7 @@ def _no_clock(_: str) -> AbstractContextManager[None]:
 def _spread(rows: Sequence[Mapping[str, Any]]) -> dict[str, Float]:
     """SD over copies by name, of what at least two of them know; NaN elsewhere."""
     spread = {}
-    for name in rows[0]:
+    for name in rows[0] if rows else ():
         values = np.array([row[name] for row in rows], dtype=np.float64)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # where fewer than two know it
