@@ -348,7 +348,7 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
         echo(f"note: region {settings.body.region} is experimental")
     request = input_request(options)
     echo_start(options.analysis_level, options.bids_dir)
-    from hipsta_bids.inputs.ends import attach_ends  # noqa: PLC0415  (heavy)
+    from hipsta_bids.inputs.edits import attach_ends  # noqa: PLC0415  (heavy)
     from hipsta_bids.inputs.maps import attach, map_requests  # noqa: PLC0415  (heavy)
     from hipsta_bids.inputs.search import dataset_notes, ignored_table, selection_table  # noqa: PLC0415  (heavy)
     from hipsta_bids.io.volumes import limit_memory  # noqa: PLC0415  (heavy)

@@ -130,9 +130,9 @@ class Body:
             near, far = points[last & (depth <= middle)], points[last & (depth >= middle)]
             step = near.mean(axis=0) - far.mean(axis=0)
             step /= max(float(np.linalg.norm(step)), 1e-9)
-            normal = ends.posterior_normal if end == "posterior" else ends.anterior_normal
             # Nearly along the plane, or of a single slice, it says nothing.
-            found[end] = step if -sign * (step @ normal) > _LEAST_SLOPE else -sign * ends.axis
+            along = -sign * (step @ ends[end].normal) > _LEAST_SLOPE
+            found[end] = step if along else -sign * ends.axis
         return found
 
     def to_voxels(self, points: Float) -> Float:
@@ -312,8 +312,7 @@ def join_cortex(volume: LabelVolume, hippocampal: Tissues, region: str) -> Tissu
 def check_reach(points: Float, tissue: Tissues, ends: EndPlanes, settings: BodySettings) -> None:
     """Refuse cortex, among points (N, 3) of a region, that does not reach from end to end."""
     cortex = tissue > Tissue.HIPPOCAMPUS
-    below = ends.height(points[cortex], "posterior")
-    above = -ends.height(points[cortex], "anterior")
+    below, above = ends.depths(points[cortex])
     length = ends.length(points)
     # Levels are as long as a voxel, so that each level with labels holds a center of one.
     count = max(int(length / (2 * ends.half_slice)), 1)

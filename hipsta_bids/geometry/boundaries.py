@@ -16,8 +16,8 @@ from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.checks import name_place
 from hipsta_bids.geometry.fem import DIRECTION_RESIDUAL, Laplace
-from hipsta_bids.geometry.mesh import mean_wall_thickness, signed_volume
-from hipsta_bids.geometry.wall import Wall, edge_graph, end_to_end
+from hipsta_bids.geometry.mesh import edge_graph, mean_wall_thickness, signed_volume
+from hipsta_bids.geometry.wall import Wall, end_to_end
 from hipsta_bids.settings import BoundarySettings
 from hipsta_bids.types import Bool, Float, Int, Surface
 
@@ -269,7 +269,7 @@ def find_boundaries(
     paths, depths = rim_paths(wall, laplace, body, settings)
     rims = (wall.vertices[paths[0]], wall.vertices[paths[1]])
     guided = guided_curves(wall, paths, depths, thickness, settings)
-    curves = _eigenfunction_curves(wall)
+    curves = end_to_end(wall, wall.bend_aware.eigenfunctions(1)[1][:, 0])
     distance = float("nan")
     if curves is not None and guided is not None:
         distance = _curve_distance(curves, guided)
@@ -283,7 +283,7 @@ def find_boundaries(
     if _rank(pair[0], body) > _rank(pair[1], body):
         pair, strips = (pair[1], pair[0]), (strips[1], strips[0])
     sides, side_rule, margin = _interior_first(sides, wall, body, settings)
-    area = _strip_area(wall, strips[0] | strips[1])
+    area = float(wall.areas[(strips[0] | strips[1])[wall.triangles].all(axis=1)].sum())
     return Boundaries(
         medial=wall.index[strips[0]],
         lateral=wall.index[strips[1]],
@@ -342,22 +342,11 @@ def _inseparable(rims: Pair, body: Body) -> GeometryError:
     )
 
 
-def _eigenfunction_curves(wall: Wall) -> Pair | None:
-    """Zero lines of the first anisotropic eigenfunction, if exactly two run from end to end."""
-    _, functions = wall.bend_aware.eigenfunctions(1)
-    return end_to_end(wall, functions[:, 0])
-
-
 def _curve_distance(first: Pair, second: Pair) -> float:
-    """Mean distance of the curves of one pair from those of the other, the worse of the two."""
-    gaps = np.array([[_gap(a, b) for b in second] for a in first])
+    """Mean distance of the curves of one pair from those of the other, mm, the worse of the two."""
+    gaps = np.array([[np.mean(cKDTree(b).query(a)[0]) for b in second] for a in first])
     straight, crossed = np.diag(gaps), np.diag(gaps[:, ::-1])
     return float(min(straight.max(), crossed.max()))
-
-
-def _gap(points: Float, curve: Float) -> float:
-    """Mean distance of points from the nearest ones of a curve, mm."""
-    return float(np.mean(cKDTree(curve).query(points)[0]))
 
 
 def _rank(curve: Float, body: Body) -> float:
@@ -382,8 +371,3 @@ def _interior_first(
         return sides, "bending", float("nan")
     margin = abs(share[0] - share[1])
     return (sides if share[0] > share[1] else (sides[1], sides[0])), "labels", margin
-
-
-def _strip_area(wall: Wall, strips: Bool) -> float:
-    """Area of the triangles within the strips, mm2."""
-    return float(wall.areas[strips[wall.triangles].all(axis=1)].sum())

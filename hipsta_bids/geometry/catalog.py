@@ -308,31 +308,30 @@ SECTIONS: tuple[SectionMeasure, ...] = (
 )
 
 
-def _over_body(name: str) -> SummaryMeasure:
+def _mean(row: Column, how: str, compute: Callable[[Measured], float]) -> SummaryMeasure:
+    """Describe the mean of a map or of a section's measure."""
+    return SummaryMeasure(
+        f"{row.name}_mean",
+        row.unit,
+        f"{row.definition}{how}",
+        compute,
+        source=row.source,
+        digits=row.digits,
+    )
+
+
+def _over_body(row: SectionMeasure) -> SummaryMeasure:
     """Average a section's measure over the body's length."""
-    row = next(row for row in SECTIONS if row.name == name)
-    return SummaryMeasure(
-        f"{name}_mean",
-        row.unit,
-        f"{row.definition}, mean over the length of the body",
-        lambda m: m.sections.mean(row.compute(m.sections)),
-        source=row.source,
-        digits=row.digits,
-    )
+    how = ", mean over the length of the body"
+    return _mean(row, how, lambda m: m.sections.mean(row.compute(m.sections)))
 
 
-def _over_sheet(name: str) -> SummaryMeasure:
+def _over_sheet(row: MapMeasure) -> SummaryMeasure:
     """Average a map over the part of the sheet where it is reliable: away from the edges."""
-    row = next(row for row in MAPS if row.name == name)
-    return SummaryMeasure(
-        f"{name}_mean",
-        row.unit,
-        f"{row.definition}; mean over the mid-surface away from rims and ends, by half"
-        " of measures.curvature_window",
-        lambda m: m.mean(row.compute(m), m.away),
-        source=row.source,
-        digits=row.digits,
+    how = (
+        "; mean over the mid-surface away from rims and ends, by half of measures.curvature_window"
     )
+    return _mean(row, how, lambda m: m.mean(row.compute(m), m.away))
 
 
 SUMMARY: tuple[SummaryMeasure, ...] = (
@@ -347,7 +346,6 @@ SUMMARY: tuple[SummaryMeasure, ...] = (
         "mm",
         "mean thickness over the nodes of the sheet",
         lambda m: float(m.thickness[m.sheet.valid].mean()),
-        source=DIERS,
     ),
     SummaryMeasure(
         "extent_x",
@@ -398,8 +396,8 @@ SUMMARY: tuple[SummaryMeasure, ...] = (
         lambda m: (m.wall_area(0) + m.wall_area(-1)) / m.volume,
         digits=5,
     ),
-    *map(_over_body, ("circumference", "interior_exterior_ratio", "section_area", "shape_index")),
-    *map(_over_sheet, (row.name for row in MAPS if "curvature" in row.name)),
+    *map(_over_body, SECTIONS[-4:]),  # what describes the shape of a section
+    *(_over_sheet(row) for row in MAPS if "curvature" in row.name),
 )
 
 PER_SUBFIELD: tuple[SubfieldMeasure, ...] = (

@@ -32,6 +32,7 @@ from hipsta_bids.settings import CheckSettings, TopologySettings
 from hipsta_bids.types import (
     Bool,
     Coordinates,
+    End,
     Finding,
     Float,
     LabelVolume,
@@ -175,16 +176,11 @@ def check_image(body: Body, settings: CheckSettings) -> list[Finding]:
     ]
 
 
-def _sliced_lengthwise(body: Body, settings: CheckSettings) -> bool:
-    """Whether the longest edge of the voxels is long, and lies across the long axis."""
-    edges = np.linalg.norm(body.affine[:3, :3], axis=0)
-    return bool(edges.max() > settings.slice_ratio * edges.min() and not cut_across(body))
-
-
 def _voxel_across(body: Body, settings: CheckSettings) -> float:
-    """Edge of the voxels across the sheet, mm."""
-    if _sliced_lengthwise(body, settings):
-        return float(np.linalg.norm(body.affine[:3, :3], axis=0).max())
+    """Edge of the voxels across the sheet, mm: the longest one if slices lie along the axis."""
+    edges = np.linalg.norm(body.affine[:3, :3], axis=0)
+    if edges.max() > settings.slice_ratio * edges.min() and not cut_across(body):
+        return float(edges.max())
     return in_plane_voxel(body.affine)
 
 
@@ -210,14 +206,12 @@ def _check_beyond(volume: LabelVolume, body: Body, settings: CheckSettings) -> l
     points = voxel_points(labeled, volume.affine)
     found = []
     ends = body.ends
-    for end, rule, height in (
-        ("posterior", ends.posterior_rule, ends.height(points, "posterior")),
-        ("anterior", ends.anterior_rule, -ends.height(points, "anterior")),
-    ):
-        if rule in ("labels", "user"):
+    sides: tuple[End, ...] = ("posterior", "anterior")
+    for end, depth in zip(sides, ends.depths(points), strict=True):
+        if ends[end].rule in ("labels", "user"):
             continue
-        near = points[(height > 0) & (height < settings.beyond_reach)]
-        beyond = np.count_nonzero((height < 0) & (height > -settings.beyond_reach))
+        near = points[(depth > 0) & (depth < settings.beyond_reach)]
+        beyond = np.count_nonzero((depth < 0) & (depth > -settings.beyond_reach))
         found.append(
             Finding(
                 reason="labels-end",

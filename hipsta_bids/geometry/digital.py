@@ -15,7 +15,7 @@ Membranes are sought in padded arrays: along the axis by a layer for a plate and
 across it by one of free space.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from itertools import pairwise
 from typing import Any, Literal, NamedTuple
@@ -84,7 +84,7 @@ def widened(mask: Bool) -> Bool:
     return mask
 
 
-def box(low: Index, high: Index) -> Box:
+def box(low: Iterable[int], high: Iterable[int]) -> Box:
     """Part of a grid from one index (3,) up to, but without, another."""
     first, second, third = (slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
     return first, second, third
@@ -292,7 +292,8 @@ def apply_membranes(
         Edit(kind, where)
         for kind, membrane in both
         for where in _pieces(membrane)
-        if not (plates and _in_plates(where, solid))
+        # Nothing can be changed in the plates.
+        if not (plates and np.isin(where[:, 2], (1, solid.shape[2] - 2)).any())
     ]
     candidates = _priced(found, solid, values, settings, contact)
     edits: list[Edit] = []
@@ -370,11 +371,6 @@ def _ranked(values: NDArray[np.float32], settings: TopologySettings) -> NDArray[
     inside = values > 0
     depth = ndimage.distance_transform_edt(inside) - ndimage.distance_transform_edt(~inside)
     return np.asarray(values + settings.depth_rank * depth, dtype=np.float32)
-
-
-def _in_plates(where: Index, solid: Bool) -> bool:
-    """Whether a membrane lies in one of the plates, where nothing can be changed."""
-    return bool(((where[:, 2] == 1) | (where[:, 2] == solid.shape[2] - 2)).any())
 
 
 def _inner_ball(solid: Bool, values: NDArray[np.float32]) -> Bool:

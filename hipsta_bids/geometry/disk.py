@@ -9,8 +9,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry.mesh import triangle_areas, unique_edges
-from hipsta_bids.geometry.wall import edge_graph
+from hipsta_bids.geometry.mesh import edge_graph, triangle_areas, unique_edges
 from hipsta_bids.types import Float, Int, TetMesh
 
 _FLOOR, _CEILING = 0.05, 20.0

@@ -28,71 +28,67 @@ _BESIDE = 2.0
 """What lies within this distance of a plane is its cross-section, mm."""
 
 
-class _Plane(NamedTuple):
-    """One end plane, and the rule by which it was found."""
+class EndPlane(NamedTuple):
+    """One end plane, and the rule by which it was found.
+
+    The rule is ``user``, ``labels``, or what the automatic rule found most different beyond the
+    plane: ``subfields`` (no CA1, CA2 or CA3), ``core`` (no dentate gyrus) or ``cross-section``.
+    """
 
     point: Float
+    """(3,) RAS mm."""
     normal: Float
+    """(3,) unit vector that points anterior."""
     rule: str
     uncertainty: float = 0.0
-    """Standard error of its place, mm, if the automatic rule found it."""
+    """Standard error over the cues of the automatic rule, mm."""
+
+    def entry(self) -> dict[str, list[float]]:
+        """Describe the plane for the quality record."""
+        point, normal = self.point.round(3).tolist(), self.normal.round(4).tolist()
+        return {"point_ras_mm": point, "normal_ras": normal}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class EndPlanes:
-    """Two planes, each by a point (3,), RAS mm, and a unit normal (3,) that points anterior.
+    """The planes between which the body lies."""
 
-    A plane's rule is ``user``, ``labels``, or what the automatic rule found most different beyond
-    it: ``subfields`` (no CA1, CA2 or CA3), ``core`` (no dentate gyrus) or ``cross-section``.
-    """
-
-    posterior_point: Float
-    posterior_normal: Float
-    posterior_rule: str
-    anterior_point: Float
-    anterior_normal: Float
-    anterior_rule: str
+    posterior: EndPlane
+    anterior: EndPlane
     axis: Float
     """(3,) unit vector, posterior to anterior, between the two normals."""
     half_slice: float
     """Half of a voxel's extent along the axis, mm."""
-    posterior_uncertainty: float = 0.0
-    """Standard error over the cues of the automatic rule, mm."""
-    anterior_uncertainty: float = 0.0
-    """The same of the anterior end."""
+
+    def __getitem__(self, end: End) -> EndPlane:
+        """Return one of the planes."""
+        return self.posterior if end == "posterior" else self.anterior
 
     def height(self, points: Float, end: End) -> Float:
         """Distance of (N, 3) points from one end plane, mm, (N,); positive anterior of it."""
-        if end == "posterior":
-            return np.asarray((points - self.posterior_point) @ self.posterior_normal)
-        return np.asarray((points - self.anterior_point) @ self.anterior_normal)
-
-    def entry(self, end: End) -> dict[str, list[float]]:
-        """Describe one end plane for the quality record."""
-        point, normal = (
-            (self.posterior_point, self.posterior_normal)
-            if end == "posterior"
-            else (self.anterior_point, self.anterior_normal)
-        )
-        return {"point_ras_mm": point.round(3).tolist(), "normal_ras": normal.round(4).tolist()}
+        return np.asarray((points - self[end].point) @ self[end].normal)
 
     def beyond(self, distance: float) -> "EndPlanes":
         """Planes that lie farther apart, each moved outward along the axis by a distance, mm."""
         step = distance * self.axis
         return replace(
             self,
-            posterior_point=self.posterior_point - step,
-            anterior_point=self.anterior_point + step,
+            posterior=self.posterior._replace(point=self.posterior.point - step),
+            anterior=self.anterior._replace(point=self.anterior.point + step),
         )
+
+    def depths(self, points: Float) -> tuple[Float, Float]:
+        """Distances of (N, 3) points from both planes, mm, (N,); positive inside of each."""
+        return self.height(points, "posterior"), -self.height(points, "anterior")
 
     def depth(self, points: Float) -> Float:
         """Distance of (N, 3) points from the nearer plane, mm, (N,); positive between them."""
-        return np.minimum(self.height(points, "posterior"), -self.height(points, "anterior"))
+        return np.minimum(*self.depths(points))
 
     def length(self, points: Float) -> float:
         """Mean distance between the planes along the axis, over (N, 3) points, mm."""
-        below = self.height(points, "posterior") / (self.posterior_normal @ self.axis)
-        above = self.height(points, "anterior") / (self.anterior_normal @ self.axis)
+        below = self.height(points, "posterior") / (self.posterior.normal @ self.axis)
+        above = self.height(points, "anterior") / (self.anterior.normal @ self.axis)
         return float(np.mean(below - above))
 
 
@@ -112,7 +108,7 @@ def find_end_planes(
 
     is_head, is_tail = parts == Part.HEAD, parts == Part.TAIL
     is_body = np.isin(volume.part[hippocampal], (Part.BODY, Part.UNKNOWN))
-    planes: dict[End, _Plane] = {}
+    planes: dict[End, EndPlane] = {}
     sides: tuple[tuple[End, Bool, Bool], ...] = (
         ("posterior", is_tail, is_body),
         ("anterior", is_body, is_head),
@@ -125,7 +121,7 @@ def find_end_planes(
                 if across is None
                 else _plane_along_slices(points[below], points[above], across, settings)
             )
-            planes[end] = _Plane(point, normal, "labels")
+            planes[end] = EndPlane(point, normal, "labels")
     for given in volume.given_ends:
         _check_inside(given, points)
         without = planes[given.end].normal if given.end in planes else axis
@@ -134,12 +130,12 @@ def find_end_planes(
         across = _body_axis(points[~is_head & ~is_tail], axis, planes)
         known = {end: _level(plane, points, across) for end, plane in planes.items()}
         for end, found in find_ends(volume, sheet, across, known, settings).items():
-            plane = _Plane(found.level * across, across, found.rule, found.uncertainty)
+            plane = EndPlane(found.level * across, across, found.rule, found.uncertainty)
             planes.setdefault(end, plane)
     return _checked(planes, axis, half_slice)
 
 
-def _level(plane: _Plane, points: Float, axis: Float) -> float:
+def _level(plane: EndPlane, points: Float, axis: Float) -> float:
     """Where a plane lies along the axis in the middle of the hippocampus, at points (N, 3), mm."""
     near = points[np.abs((points - plane.point) @ plane.normal) < _BESIDE]
     return float((near.mean(axis=0) if len(near) else plane.point) @ axis)
@@ -157,12 +153,12 @@ def _check_inside(given: GivenEnd, points: Float) -> None:
         )
 
 
-def _given_plane(given: GivenEnd, without: Float, axis: Float) -> _Plane:
+def _given_plane(given: GivenEnd, without: Float, axis: Float) -> EndPlane:
     """Place a user's plane; its normal is that of the plane without it, if none is given."""
     if given.normal is None:
-        return _Plane(np.array(given.point), without, "user")
+        return EndPlane(np.array(given.point), without, "user")
     normal = np.array(given.normal) / np.linalg.norm(given.normal)
-    return _Plane(np.array(given.point), normal if normal @ axis > 0 else -normal, "user")
+    return EndPlane(np.array(given.point), normal if normal @ axis > 0 else -normal, "user")
 
 
 def _largest_ends(part: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -177,7 +173,7 @@ def _largest_ends(part: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return kept
 
 
-def _checked(planes: dict[End, _Plane], axis: Float, half_slice: float) -> EndPlanes:
+def _checked(planes: dict[End, EndPlane], axis: Float, half_slice: float) -> EndPlanes:
     """Combine two planes that lie across the long axis; refuse others."""
     for end, (point, normal, rule, _) in planes.items():
         at = position_text(point)
@@ -214,16 +210,10 @@ def _checked(planes: dict[End, _Plane], axis: Float, half_slice: float) -> EndPl
     posterior, anterior = planes["posterior"], planes["anterior"]
     middle = posterior.normal + anterior.normal
     return EndPlanes(
-        posterior_point=posterior.point,
-        posterior_normal=posterior.normal,
-        posterior_rule=posterior.rule,
-        anterior_point=anterior.point,
-        anterior_normal=anterior.normal,
-        anterior_rule=anterior.rule,
+        posterior=posterior,
+        anterior=anterior,
         axis=middle / np.linalg.norm(middle),
         half_slice=half_slice,
-        posterior_uncertainty=posterior.uncertainty,
-        anterior_uncertainty=anterior.uncertainty,
     )
 
 
@@ -254,7 +244,7 @@ def _long_axis(points: Float, parts: NDArray[np.uint8]) -> Float:
     return np.asarray(vectors[:, -1] if along > 0 else -vectors[:, -1])
 
 
-def _body_axis(points: Float, axis: Float, planes: dict[End, _Plane]) -> Float:
+def _body_axis(points: Float, axis: Float, planes: dict[End, EndPlane]) -> Float:
     """First principal axis (3,) of the body, at points (N, 3), directed as the long axis.
 
     Where it is short and wide, that says little: then the other end's normal, or the long axis.

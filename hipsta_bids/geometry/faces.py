@@ -17,8 +17,14 @@ from skimage.measure import marching_cubes
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.digital import FACES, piece_sizes, to_ras
 from hipsta_bids.geometry.fem import compact_groups, solve_two_level
-from hipsta_bids.geometry.mesh import signed_volume, smooth_vertices, unique_edges, vertex_areas
-from hipsta_bids.geometry.wall import edge_graph, vertex_normals
+from hipsta_bids.geometry.mesh import (
+    edge_graph,
+    signed_volume,
+    smooth_vertices,
+    unique_edges,
+    vertex_areas,
+)
+from hipsta_bids.geometry.wall import vertex_normals
 from hipsta_bids.protocols.protocol import CORE, Tissue
 from hipsta_bids.settings import SurfaceSettings
 from hipsta_bids.types import Bool, Float, Int, LabelVolume, Surface

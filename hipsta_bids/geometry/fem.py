@@ -1,7 +1,7 @@
 """The Laplace operator of a mesh: LaPy's matrices of linear finite elements, and their solution."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from copy import copy
 from functools import cached_property
@@ -233,31 +233,13 @@ def solve_two_level(
         sums = coarse @ np.bincount(groups, root * rest, len(coarse))
         return np.asarray(rest + root * sums[groups])
 
-    return inverse * _conjugate_gradients(scaled, inverse * right, both_levels, residual)
-
-
-def _conjugate_gradients(
-    matrix: sparse.csr_array,
-    right: Float,
-    precondition: Callable[[Float], Float],
-    residual: float,
-) -> Float:
-    result, rest = np.zeros(len(right)), right.copy()
-    step = precondition(rest)
-    size = float(rest @ step)
-    limit = residual * float(np.linalg.norm(right))
-    for _ in range(_MAX_STEPS):
-        if np.linalg.norm(rest) <= limit:
-            return result
-        change = matrix @ step
-        length = size / float(step @ change)
-        result += length * step
-        rest -= length * change
-        ahead = precondition(rest)
-        before, size = size, float(rest @ ahead)
-        step *= size / before
-        step += ahead
-    raise _unsolvable()
+    levels = linalg.LinearOperator(matrix.shape, matvec=both_levels, dtype=np.float64)
+    result, unfinished = linalg.cg(
+        scaled, inverse * right, rtol=residual, atol=0.0, maxiter=_MAX_STEPS, M=levels
+    )
+    if unfinished:
+        raise _unsolvable()
+    return np.asarray(inverse * result)
 
 
 def _coarse_inverse(matrix: sparse.csr_array, free: Bool, groups: NDArray[np.intp]) -> Float:

@@ -268,7 +268,7 @@ def _fit_grid(body: Body, hemi: str, settings: GridSettings) -> WedgeGrid:
     """
     _, points = body.inside_points()
     axis = body.ends.axis
-    nearest = np.rint(body.to_voxels(body.ends.posterior_point))
+    nearest = np.rint(body.to_voxels(body.ends.posterior.point))
     anchor = body.affine[:3, :3] @ nearest + body.affine[:3, 3]
     flat = (points - anchor) - np.outer((points - anchor) @ axis, axis)
     across = _directions_across(body, hemi, flat)
@@ -284,12 +284,11 @@ def _fit_grid(body: Body, hemi: str, settings: GridSettings) -> WedgeGrid:
     size = (last - first).astype(int) + 1
     origin = anchor + settings.spacing * first @ across
     ends = body.ends.beyond(settings.beyond)
+    # Heights above the grid's base as linear functions of the node numbers.
+    steps = across * settings.spacing
     planes = [
-        _plane_height(point, normal, origin, across * settings.spacing, axis)
-        for point, normal in (
-            (ends.posterior_point, ends.posterior_normal),
-            (ends.anterior_point, ends.anterior_normal),
-        )
+        np.array([(point - origin) @ normal, *(-(steps @ normal))]) / (normal @ axis)
+        for point, normal, *_ in (ends.posterior, ends.anterior)
     ]
     corners = np.array([[1, a, b] for a in (0, size[0]) for b in (0, size[1])])
     gaps = corners @ (planes[1] - planes[0])
@@ -330,9 +329,3 @@ def _directions_across(body: Body, hemi: str, flat: Float) -> Float:
     first = side * projected[best] / length[best]
     second = np.cross(axis, first)
     return np.stack([first, second if hemi == "L" else -second])
-
-
-def _plane_height(point: Float, normal: Float, origin: Float, steps: Float, axis: Float) -> Float:
-    """Height of a plane above the grid's base as a linear function of the node numbers."""
-    along = normal @ axis
-    return np.array([(point - origin) @ normal, *(-(steps @ normal))]) / along

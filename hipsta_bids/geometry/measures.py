@@ -255,8 +255,7 @@ class CrossSections:
 
 def cut_sections(whole: Sheet, thickness: Float, settings: MeasureSettings) -> CrossSections:
     """Measure the cross-sections of a body, given the mean thickness (Ny,) of each."""
-    middle = whole.points[:, :, whole.middle]
-    steps = np.linalg.norm(np.diff(middle, axis=1), axis=-1).mean(axis=0)
+    steps = _steps(whole, whole.middle, 1).mean(axis=0)
     return CrossSections(
         position=np.concatenate([[0.0], steps.cumsum()]),
         interior=wall_length(whole, 0, settings),

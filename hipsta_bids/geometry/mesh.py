@@ -63,11 +63,12 @@ def vertex_areas(vertices: Float, triangles: Int) -> Float:
 
 def lateral_triangles(surface: Surface) -> Bool:
     """Whether each triangle belongs to the wall, not to a cap, (F,)."""
-    first, second = (
-        surface.posterior_cap[surface.triangles],
-        surface.anterior_cap[surface.triangles],
-    )
-    return np.asarray(~(first.all(axis=1) | second.all(axis=1)))
+    return ~_on_cap(surface.triangles, (surface.posterior_cap, surface.anterior_cap))
+
+
+def _on_cap(triangles: Int, caps: tuple[Bool, Bool]) -> Bool:
+    """Whether all corners of a triangle are on the same cap, (F,)."""
+    return np.asarray(caps[0][triangles].all(axis=1) | caps[1][triangles].all(axis=1))
 
 
 def mean_wall_thickness(surface: Surface) -> float:
@@ -104,10 +105,14 @@ def smooth_vertices(nodes: Float, faces: Int, settings: SurfaceSettings) -> Floa
     return _taubin(nodes, faces, unique_edges(faces), (none, none), settings)
 
 
-def _adjacency(edges: Int, count: int) -> sparse.csr_array:
-    ones = np.ones(2 * len(edges))
+def edge_graph(edges: Int, weights: Float, count: int) -> sparse.csr_array:
+    """Make a symmetric graph of edges (E, 2) with weights (E,)."""
     both = np.vstack([edges, edges[:, ::-1]])
-    return sparse.csr_array((ones, (both[:, 0], both[:, 1])), shape=(count, count))
+    return sparse.csr_array((np.tile(weights, 2), (both[:, 0], both[:, 1])), shape=(count, count))
+
+
+def _adjacency(edges: Int, count: int) -> sparse.csr_array:
+    return edge_graph(edges, np.ones(len(edges)), count)
 
 
 def _taubin(
@@ -115,7 +120,7 @@ def _taubin(
 ) -> Float:
     """Smooth in grid coordinates; caps stay in their planes, outlines on themselves."""
     cap = caps[0] | caps[1]
-    on_cap = caps[0][faces].all(axis=1) | caps[1][faces].all(axis=1)
+    on_cap = _on_cap(faces, caps)
     outline = np.zeros(len(nodes), dtype=bool)
     outline[faces[~on_cap]] = True
     outline &= cap

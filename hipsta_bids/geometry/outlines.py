@@ -82,6 +82,7 @@ def _join(
     ribbon, which may bend into the uncus. But where it has a subfield that the largest one lacks,
     and a slice beside shows the ribbon between them, the ribbon is broken here.
     """
+    block = np.ones((settings.upsampling,) * 2)
     for _ in range(settings.max_fragments):
         pieces, count = ndimage.label(distance > 0)
         if count < 2:  # noqa: PLR2004 -- one piece is the aim
@@ -103,7 +104,8 @@ def _join(
             start = np.array([axis[place] for axis in nearest])
             way = pixel * _segment_distance(distance.shape, start, np.array(place))
             broken = number in lacked and not jump[place]
-            broken = broken and _shown(way < pixel, beside, settings.upsampling)
+            shown = (np.kron(image > 0, block)[way < pixel].mean() for image in beside)
+            broken = broken and any(share > _SHOWN for share in shown)
             limit = settings.max_break if broken else settings.max_gap
             if cost[place] <= limit:
                 found.append((float(cost[place]), number, way))
@@ -125,12 +127,6 @@ def _join(
 def _with_others(pieces: NDArray[Any], main: Bool, ranks: Float) -> NDArray[Any]:
     """Numbers of the pieces (I, J) with a subfield that the largest one lacks."""
     return np.asarray(np.unique(pieces[np.isfinite(ranks) & ~np.isin(ranks, ranks[main])]))
-
-
-def _shown(way: Bool, beside: Sequence[NDArray[np.uint8]], upsampling: int) -> bool:
-    """Whether any of the slices beside shows enough of the way as ribbon."""
-    shares = (np.kron(image > 0, np.ones((upsampling,) * 2))[way].mean() for image in beside)
-    return any(share > _SHOWN for share in shares)
 
 
 def _segment_distance(shape: tuple[int, ...], start: Int, end: Int) -> Float:

@@ -208,26 +208,22 @@ def has_thick_slices(affine: Float, settings: SliceSettings) -> bool:
 def sample_slices(body: Body, points: Float, settings: SliceSettings) -> Stack:
     """Sample the body's mask between and beyond its thick slices, at points (N, 3), RAS mm."""
     body = _in_own_order(body)
-    edges = np.linalg.norm(body.affine[:3, :3], axis=0)
-    through = int(np.argmax(edges))
-    pixel = float(np.delete(edges, through).mean())
-    labeled = _labeled_ends(body, through)
-    sheet = np.moveaxis(body.tissue, through, 0)
-    inside = np.moveaxis(body.inside, through, 0)
-    part = _bounds(inside, sheet, settings.reach / pixel, labeled)
-    tissue = sheet[part].copy()
-    for step, depth, known in zip((1, -1), _depths(body, through, part), labeled, strict=True):
+    pixel = float(np.linalg.norm(body.affine[:3, :3], axis=0)[1:].mean())
+    labeled = _labeled_ends(body)
+    part = _bounds(body, settings.reach / pixel, labeled)
+    tissue = body.tissue[part].copy()
+    for step, depth, known in zip((1, -1), _depths(body, part), labeled, strict=True):
         if not known:
             _extrapolate(tissue[::step], (depth < settings.hidden_depth)[::step], pixel, settings)
     stack = _stacked(tissue, pixel, settings)
-    voxels = body.to_voxels(points)[:, _order(through)] - low_corner(part)
+    voxels = body.to_voxels(points) - low_corner(part)
     where = ((voxels[:, 1:] + 0.5) * settings.upsampling - 0.5).astype(np.float32).T
     distance = stack.blend(voxels[:, 0].astype(np.float32), where)
     return np.asarray(np.clip(distance / (2 * settings.edge) + 0.5, 0, 1), dtype=np.float32)
 
 
 def _in_own_order(body: Body) -> Body:
-    """Count the body's voxels from posterior to anterior and from medial to lateral.
+    """Count the body's slices from posterior to anterior, first, and voxels from medial to lateral.
 
     So the order in which an image stores its voxels decides nothing. What refers to voxels by their
     indices is left as it was.
@@ -243,16 +239,9 @@ def _in_own_order(body: Body) -> Body:
     affine = body.affine.copy()
     affine[:3, 3] += affine[:3, :3] @ np.where(steps < 0, np.array(body.tissue.shape) - 1, 0)
     affine[:3, :3] = (affine[:3, :3] * steps)[:, order]
-    tissue, hippocampal = (v.transpose(order)[flips] for v in (body.tissue, body.hippocampal))
-    interior, inside = (v.transpose(order)[flips] for v in (body.interior, body.inside))
-    return replace(
-        body,
-        tissue=tissue,
-        hippocampal=hippocampal,
-        interior=interior,
-        inside=inside,
-        affine=affine,
-    )
+    names = ("tissue", "hippocampal", "interior", "inside")
+    volumes = {name: getattr(body, name).transpose(order)[flips] for name in names}
+    return replace(body, **volumes, affine=affine)
 
 
 def _stacked(tissue: NDArray[np.uint8], pixel: float, settings: SliceSettings) -> _SliceStack:
@@ -313,49 +302,34 @@ def _align(
             bends[:, number] = bend.T.reshape(bends[:, number].shape)
 
 
-def _labeled_ends(body: Body, through: int) -> tuple[bool, bool]:
+def _labeled_ends(body: Body) -> tuple[bool, bool]:
     """Whether the sheet's labels go on beyond the first and beyond the last slice of the body."""
     points = voxel_points(body.tissue > 0, body.affine)
-    thickness = float(np.linalg.norm(body.affine[:3, through]))
+    thickness = float(np.linalg.norm(body.affine[:3, 0]))
     known = []
-    for depth in (body.ends.height(points, "posterior"), -body.ends.height(points, "anterior")):
+    for depth in body.ends.depths(points):
         inner = np.count_nonzero((depth > 0) & (depth < thickness))
         outer = np.count_nonzero((depth < 0) & (depth > -thickness))
         known.append(bool(outer > 0.5 * inner))  # a label that is only blurred at the plane is less
-    return (known[0], known[1]) if _runs_forward(body, through) else (known[1], known[0])
+    return known[0], known[1]
 
 
-def _runs_forward(body: Body, through: int) -> bool:
-    """Whether slices are counted from posterior to anterior."""
-    return bool(body.ends.axis @ body.affine[:3, through] > 0)
-
-
-def _order(through: int) -> list[int]:
-    """Axes of the image, the one through the slices first."""
-    return [through, *(axis for axis in range(3) if axis != through)]
-
-
-def _bounds(
-    inside: Bool, sheet: NDArray[np.uint8], margin: float, labeled: tuple[bool, bool]
-) -> Box:
+def _bounds(body: Body, margin: float, labeled: tuple[bool, bool]) -> Box:
     """Box round the sheet in the body's slices, and in one slice more where labels go on."""
-    levels = np.flatnonzero(inside.any(axis=(1, 2)))
+    levels = np.flatnonzero(body.inside.any(axis=(1, 2)))
     first = max(int(levels[0]) - labeled[0], 0)
-    last = min(int(levels[-1]) + labeled[1], len(inside) - 1)
-    index = positions(sheet[first : last + 1] > 0) + np.array([first, 0, 0])
+    last = min(int(levels[-1]) + labeled[1], len(body.inside) - 1)
+    index = positions(body.tissue[first : last + 1] > 0) + np.array([first, 0, 0])
     room = np.ceil([0, margin, margin]).astype(int)
     low, high = index.min(axis=0) - room, index.max(axis=0) + 1 + room
-    return box(np.maximum(low, 0), np.minimum(high, inside.shape))
+    return box(np.maximum(low, 0), np.minimum(high, body.inside.shape))
 
 
-def _depths(body: Body, through: int, part: Box) -> tuple[Float, Float]:
+def _depths(body: Body, part: Box) -> tuple[Float, Float]:
     """Depths of the box's voxels inside the planes at its first and last slices, mm."""
     index = np.meshgrid(*(np.arange(side.start, side.stop) for side in part), indexing="ij")
-    columns = [*_order(through), 3]
-    points = to_ras(np.stack(index, axis=-1), body.affine[:, columns])
-    posterior = body.ends.height(points, "posterior")
-    anterior = -body.ends.height(points, "anterior")
-    return (posterior, anterior) if _runs_forward(body, through) else (anterior, posterior)
+    points = to_ras(np.stack(index, axis=-1), body.affine)
+    return body.ends.depths(points)
 
 
 def _extrapolate(

@@ -101,7 +101,7 @@ def draw_slice(body: Body, position: float, settings: SurrogateSettings) -> _Sli
     The plane rotates from the posterior to the anterior end plane as it moves along the body.
     """
     ends, (_, points) = body.ends, body.inside_points()
-    normal = (1 - position) * ends.posterior_normal + position * ends.anterior_normal
+    normal = (1 - position) * ends.posterior.normal + position * ends.anterior.normal
     height = (1 - position) * ends.height(points, "posterior")
     height = height + position * ends.height(points, "anterior")
     normal, height = normal / np.linalg.norm(normal), height / np.linalg.norm(normal)

@@ -105,8 +105,8 @@ class SolidField:
 def repair_topology(
     field: Field,
     settings: TopologySettings,
-    locate: Locate | None = None,
-    contact: Contact | None = None,
+    locate: Locate,
+    contact: Contact,
 ) -> SolidField:
     """Make the positive part of a field one solid piece without tunnels.
 
@@ -130,7 +130,7 @@ def repair_topology(
     _refuse_strips(state, field, settings, locate)
 
     def touching(where: Index) -> bool:
-        return contact is not None and contact(field.grid.to_ras((where - FIRST).astype(float)))
+        return contact(field.grid.to_ras((where - FIRST).astype(float)))
 
     edits = _before_smoothing(field)
     edits += _remove_islands(state, field, locate) + _fill_cavities(state)
@@ -225,9 +225,7 @@ def _has_strips(state: Bool, settings: TopologySettings) -> bool:
     return len(sizes) > 1 and bool(sizes[1] > settings.flag_fraction * sizes[0])
 
 
-def _refuse_strips(
-    state: Bool, field: Field, settings: TopologySettings, locate: Locate | None
-) -> None:
+def _refuse_strips(state: Bool, field: Field, settings: TopologySettings, locate: Locate) -> None:
     """Refuse a ribbon that a gap divides from end to end, and say where."""
     if not _has_strips(state, settings):
         return
@@ -236,7 +234,7 @@ def _refuse_strips(
     facing = positions((pieces == through[1]) & (gap <= gap[pieces == through[1]].min() + 1))
     other = nearest[:, *facing.T].T
     center = 0.5 * (facing.mean(axis=0) + other.mean(axis=0))
-    names = locate(field.grid.to_ras(np.vstack([facing, other]).astype(float))) if locate else ""
+    names = locate(field.grid.to_ras(np.vstack([facing, other]).astype(float)))
     at = position_text(field.grid.to_ras(center[None])[0], names)
     raise GeometryError(
         f"a gap divides the sheet into {len(through)} strips from end to end, at {at}: "
@@ -245,14 +243,12 @@ def _refuse_strips(
     )
 
 
-def _unrepaired(
-    edits: list[Edit], state: Bool, field: Field, locate: Locate | None
-) -> GeometryError:
+def _unrepaired(edits: list[Edit], state: Bool, field: Field, locate: Locate) -> GeometryError:
     """Report the largest of the repairs that did not lead to one solid piece."""
     nothing = Edit("cut", positions(state))
     where = max(edits, key=lambda edit: len(edit.where), default=nothing).where
     point = field.grid.to_ras((where - FIRST).mean(axis=0, keepdims=True))
-    at = position_text(point[0], locate(point) if locate else "")
+    at = position_text(point[0], locate(point))
     return GeometryError(
         f"the labels have holes or bridges that could not be repaired (Euler number "
         f"{euler(state)}, with closed ends {euler(state, plates=True)}, instead of 1), the "
@@ -261,13 +257,13 @@ def _unrepaired(
     )
 
 
-def _interrupted(pieces: Index, field: Field, locate: Locate | None) -> GeometryError:
+def _interrupted(pieces: Index, field: Field, locate: Locate) -> GeometryError:
     """Report where the body ends that begins at the posterior plane."""
     first = int(np.flatnonzero((pieces > 0).any(axis=(0, 1)))[0])
     nodes = positions(np.isin(pieces, np.unique(pieces[:, :, first])) & (pieces > 0))
     level = nodes[:, 2].max() if first == 0 else first
     point = field.grid.to_ras(nodes[nodes[:, 2] == level].astype(float))
-    at = position_text(point.mean(axis=0), locate(point) if locate else "")
+    at = position_text(point.mean(axis=0), locate(point))
     return GeometryError(
         f"the body is interrupted at {at}: no connected path of its labels leads from the "
         "posterior to the anterior end plane; fill in missing slices, correct head and tail labels "
@@ -276,7 +272,7 @@ def _interrupted(pieces: Index, field: Field, locate: Locate | None) -> Geometry
     )
 
 
-def _remove_islands(state: Bool, field: Field, locate: Locate | None) -> list[Edit]:
+def _remove_islands(state: Bool, field: Field, locate: Locate) -> list[Edit]:
     """Remove (in place) all but the largest piece that reaches from plate to plate."""
     pieces, count, through = _through_pieces(state)
     if not len(through):
@@ -313,7 +309,7 @@ def _fill_cavities(state: Bool, *, plates: bool = False) -> list[Edit]:
 
 
 def _describe(
-    edit: Edit, field: Field, size: int, settings: TopologySettings, locate: Locate | None
+    edit: Edit, field: Field, size: int, settings: TopologySettings, locate: Locate
 ) -> Repair:
     """Locate one change, and find out whether it is large."""
     kind, where = edit.kind, edit.where
@@ -328,7 +324,7 @@ def _describe(
         voxels=len(where),
         cost=cost,
         position=(float(center[0]), float(center[1]), float(center[2])),
-        subfield=locate(center[None]) if locate else "",
+        subfield=locate(center[None]),
         excess=float("inf")
         if edit.doubtful or (kind == "fill" and _beside_slit(inside, field))
         else max(cost / max(limit, 1e-9), 0.0 if kind == "uncus" else len(where) / (share * size)),

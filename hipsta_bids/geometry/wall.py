@@ -59,8 +59,7 @@ class Wall:
         self.triangles = number[triangles]
         self.posterior = surface.posterior_cap[self.index]
         self.anterior = surface.anterior_cap[self.index]
-        below = body.ends.height(self.vertices, "posterior")
-        above = -body.ends.height(self.vertices, "anterior")
+        below, above = body.ends.depths(self.vertices)
         self.share = np.clip(below / (below + above), 0, 1)
         self.edges = unique_edges(self.triangles)
         self.lengths = np.linalg.norm(np.diff(self.vertices[self.edges], axis=1)[:, 0], axis=1)
@@ -157,12 +156,6 @@ def vertex_normals(vertices: Float, triangles: Int) -> Float:
     index = triangles.ravel()
     total = np.stack([np.bincount(index, column, len(vertices)) for column in faces.T], 1)
     return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1), 1e-12)[:, None])
-
-
-def edge_graph(edges: Int, weights: Float, count: int) -> sparse.csr_array:
-    """Make a symmetric graph of edges (E, 2) with weights (E,)."""
-    both = np.vstack([edges, edges[:, ::-1]])
-    return sparse.csr_array((np.tile(weights, 2), (both[:, 0], both[:, 1])), shape=(count, count))
 
 
 def end_to_end(wall: Wall, values: Float) -> tuple[Float, Float] | None:

@@ -40,17 +40,7 @@ class Candidate:
 
 
 def find_anatomy(labels: Path, hemisphere: Hemisphere, bids_dir: Path) -> Iterator[Candidate]:
-    """List anatomical images that may lie behind labels, best first; none is opened.
-
-    Parameters
-    ----------
-    labels : Path
-        The segmentation.
-    hemisphere : Hemisphere
-        Whose it is.
-    bids_dir : Path
-        The BIDS dataset, with T1w and T2w images.
-    """
+    """List anatomical images that may lie behind a hemisphere's labels, best first, unopened."""
     if freesurfer.volume_table(labels) is not None:
         for name in _FREESURFER:
             if (path := labels.with_name(name)).is_file():

@@ -6,8 +6,7 @@ ASHS takes for the subject's ID is often wrong; the folder decides. A file witho
 """
 
 import re
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
 
@@ -20,11 +19,10 @@ from hipsta_bids.inputs.scan import (
     Source,
     VisitFolders,
     list_visits,
-    several_files,
-    subject_folders,
+    sort_folders,
     unknown_protocol,
 )
-from hipsta_bids.inputs.selection import Selection, measurable
+from hipsta_bids.inputs.selection import Selection, SidedFile, choose_file, measurable
 from hipsta_bids.protocols.load import agrees, load_protocol, protocol_names
 from hipsta_bids.protocols.protocol import Protocol, Tissue
 
@@ -75,12 +73,8 @@ class AtlasFinder:
     several atlases by name, if the body is the same with all of them.
     """
 
-    def __init__(
-        self, root: Path, option: Protocol | None, sample: Callable[[], list[_Image]]
-    ) -> None:
-        self._root = root
-        self._option = option
-        self._sample = sample
+    def __init__(self, root: Path, option: Protocol | None) -> None:
+        self._root, self._option = root, option
         self._values: dict[_Image, frozenset[int]] = {}
         self._tables: dict[Path, Protocol] = {}
 
@@ -143,7 +137,7 @@ class AtlasFinder:
         Several only if the body is the same with all of them; none if the files disagree.
         """
         proofs: list[list[Protocol]] = []
-        for image in self._sample():
+        for image in _sample_files(self._root):
             try:
                 fitting = self._fitting(image)
             except InputError:  # its own hemisphere will report it
@@ -205,22 +199,6 @@ def _one_body(protocols: list[Protocol]) -> bool:
     return bool(protocols) and all(protocols[0].same_body(other) for other in protocols[1:])
 
 
-@dataclass(frozen=True, kw_only=True)
-class _File:
-    path: Path
-    hemi: str | None
-    """None for both."""
-    kind: str
-    own_id: bool
-    """The name agrees with the subject's folder."""
-
-    @property
-    def rank(self) -> tuple[bool, int, bool, bool]:
-        """One hemisphere before both, later steps before earlier, ``final`` before others."""
-        outside = self.path.parent.name != "final"
-        return self.hemi is None, _KINDS.index(self.kind), outside, not self.own_id
-
-
 def volume_table(path: Path) -> Path | None:
     """Name the table of volumes that was written with a segmentation."""
     match = _NAME.fullmatch(path.name)
@@ -228,7 +206,7 @@ def volume_table(path: Path) -> Path | None:
 
 
 def find_ashs(
-    visit: VisitFolders, source: Source, atlases: AtlasFinder, selection: Selection
+    visit: VisitFolders, source: Source, selection: Selection, atlases: AtlasFinder
 ) -> Iterator[HemisphereInput]:
     """Find ASHS's segmentations of one visit."""
     everything = _files(visit)
@@ -239,51 +217,37 @@ def find_ashs(
         chosen = files[0]
         bilateral = chosen.hemi is None
         protocol, why, problem = atlases.identify((chosen.path, hemi, bilateral))
-        rivals = [file.path.name for file in files if file.rank == chosen.rank]
-        if len(rivals) > 1:
-            problem = several_files(chosen.path.parent, rivals)
-        elif problem is None and bilateral and not protocol.offset:
+        if problem is None and bilateral and not protocol.offset:
             problem = InputError(
                 f"{chosen.path}: neither left nor right is in its name, and the protocol "
                 f"{protocol.name} does not say how the hemispheres differ; set right_offset in its "
                 "TOML file",
                 reason="unknown-hemisphere",
             )
-        yield HemisphereInput(
-            subject=visit.subject,
-            session=visit.session,
-            hemi=hemi,
-            protocol=protocol,
-            files=(chosen.path,),
-            bilateral=bilateral,
-            code_offset=protocol.shift(hemi) if bilateral else 0,
-            source=source.name,
-            source_path=source.path,
-            why=f"{chosen.kind}{', both hemispheres in one file' if bilateral else ''}; {why}",
-            passed_over=tuple(_passed_over(files)),
-            problem=problem,
+        yield choose_file(
+            files,
+            visit,
+            hemi,
+            source,
+            found=(protocol, problem),
+            why=(_kind(chosen), f"; {why}"),
+            passed_over=_passed_over(files),
         )
 
 
-def sample_files(source: Source) -> Callable[[], list[_Image]]:
-    """Prepare a sample of a dataset's segmentations, the same whoever is processed."""
-
-    def sample() -> list[_Image]:
-        folders = subject_folders(source.path)
-        step = max(len(folders) // _SAMPLE, 1)
-        found = []
-        for visit in list_visits(folders[::step]):
-            files = _files(visit)
-            for hemi in _SIDES.values():
-                best = next((file for file in files if file.hemi in (hemi, None)), None)
-                if best is not None:
-                    found.append((best.path, hemi, best.hemi is None))
-        return found
-
-    return sample
+def _sample_files(root: Path) -> Iterator[_Image]:
+    """List a sample of a dataset's segmentations, the same whoever is processed."""
+    folders = sort_folders(root)[0]
+    step = max(len(folders) // _SAMPLE, 1)
+    for visit in list_visits(folders[::step]):
+        files = _files(visit)
+        for hemi in _SIDES.values():
+            best = next((file for file in files if file.hemi in (hemi, None)), None)
+            if best is not None:
+                yield best.path, hemi, best.hemi is None
 
 
-def _files(visit: VisitFolders) -> list[_File]:
+def _files(visit: VisitFolders) -> list[SidedFile]:
     """List the segmentations of one visit, best first."""
     matches = (
         (folder.path / name, _NAME.fullmatch(name))
@@ -291,26 +255,28 @@ def _files(visit: VisitFolders) -> list[_File]:
         for name in folder.names
         if "lfseg" in name
     )
-    files = [
-        _File(
-            path=path,
-            hemi=_SIDES.get(match["stem"].rsplit("_", 1)[-1].lower()),
-            kind=match["kind"],
-            own_id=f"sub-{visit.subject}" in path.name,
-        )
-        for path, match in matches
-        if match
-    ]
+    files = []
+    for path, match in matches:
+        if match:
+            hemi = _SIDES.get(match["stem"].rsplit("_", 1)[-1].lower())
+            # One hemisphere before both, later steps before earlier, final before others.
+            outside, other_id = path.parent.name != "final", f"sub-{visit.subject}" not in path.name
+            rank = (hemi is None, _KINDS.index(match["kind"]), outside, other_id)
+            files.append(SidedFile(path=path, hemi=hemi, rank=rank))
     return sorted(files, key=lambda file: (file.rank, str(file.path)))
 
 
-def _passed_over(files: list[_File]) -> Iterator[tuple[str, str]]:
+def _kind(file: SidedFile) -> str:
+    return _KINDS[file.rank[1]]
+
+
+def _passed_over(files: list[SidedFile]) -> Iterator[tuple[str, str]]:
     chosen = files[0]
     for file in files[1:]:
         if file.hemi is None and chosen.hemi is not None:
             reason = "both hemispheres in one file; one file per hemisphere comes first"
-        elif file.kind != chosen.kind:
-            reason = f"{chosen.kind} comes before {file.kind}"
+        elif _kind(file) != _kind(chosen):
+            reason = f"{_kind(chosen)} comes before {_kind(file)}"
         elif file.rank == chosen.rank:
             reason = "as good as the first one"
         else:

@@ -32,8 +32,6 @@ _HALF = 0.5 - 1e-6
 #: How many values an error message lists.
 _SHOWN = 5
 
-_Box = tuple[slice, slice, slice]
-
 
 def read_label_volume(item: HemisphereInput, region: str = "body") -> LabelVolume:
     """Read one hemisphere's segmentation.
@@ -74,7 +72,9 @@ def read_label_volume(item: HemisphereInput, region: str = "body") -> LabelVolum
     image = read_labels(path, MARGIN)
     if not image.data.size:
         raise _empty(path)
-    codes = _one_hemisphere(_integers(image.data, path), item, path)
+    codes = _integers(image.data, path)
+    if item.bilateral:
+        codes = _one_hemisphere(codes, item.protocol, item.hemi, path)
     tissue, part = _translate(codes, item.protocol, path)
     for other in item.files[1:]:
         more = _beside(other, path, image, edited=labels is not None)
@@ -107,20 +107,9 @@ def label_volume(
     what messages call the image.
     """
     whole = _integers(image.data, path)
-    bilateral = bool(protocol.offset) and bool((whole > protocol.offset).any())
-    item = HemisphereInput(
-        subject="",
-        session=None,
-        hemi=hemi,
-        protocol=protocol,
-        files=(path,),
-        bilateral=bilateral,
-        code_offset=protocol.shift(hemi) if bilateral else 0,
-        source="",
-        source_path=path,
-        why="given",
-    )
-    tissue, part = _translate(_one_hemisphere(whole, item, path), protocol, path)
+    if protocol.offset and (whole > protocol.offset).any():
+        whole = _one_hemisphere(whole, protocol, hemi, path)
+    tissue, part = _translate(whole, protocol, path)
     return _cropped(tissue, part, image, protocol, region=region, path=path)
 
 
@@ -141,7 +130,11 @@ def _cropped(
 ) -> LabelVolume:
     """Crop what was translated to the labels that are wanted, and a margin."""
     part = np.where(tissue == Tissue.BACKGROUND, np.uint8(Part.UNKNOWN), part)
-    inner = _bounding_box(_wanted(tissue, protocol, region), image.affine, path)
+    wanted = _wanted(tissue, protocol, region)
+    if not wanted.any():
+        raise _empty(path)
+    hits = [np.asarray(wanted.any(axis=axes)) for axes in ((1, 2), (0, 2), (0, 1))]
+    inner = box_with_margin(hits, MARGIN, image.affine)
     first, second, third = (a + b.start for a, b in zip(image.start, inner, strict=True))
     return LabelVolume(
         tissue=tissue[inner],
@@ -155,7 +148,7 @@ def _cropped(
 
 def _beside(other: Path, path: Path, image: LabelImage, *, edited: bool) -> NDArray[Any]:
     """Read a second file where the first has labels, at nearest voxels if that one was edited."""
-    beside = read_labels(other, box=image.box)
+    beside = read_labels(other, part=image.box)
     if beside.shape == image.shape and np.allclose(
         beside.affine, image.affine, rtol=0, atol=_SAME_GRID
     ):
@@ -211,14 +204,6 @@ def _empty(path: Path) -> InputError:
     )
 
 
-def _bounding_box(inside: Bool, affine: Float, path: Path) -> _Box:
-    """Bounding box of all true voxels, with the margin as far as the image goes."""
-    if not inside.any():
-        raise _empty(path)
-    hits = [np.asarray(inside.any(axis=axes)) for axes in ((1, 2), (0, 2), (0, 1))]
-    return box_with_margin(hits, MARGIN, affine)
-
-
 def _integers(data: NDArray[Any], path: Path) -> NDArray[np.integer[Any]]:
     """Convert labels to integers, if they are whole numbers."""
     if np.issubdtype(data.dtype, np.integer):
@@ -238,19 +223,17 @@ def _integers(data: NDArray[Any], path: Path) -> NDArray[np.integer[Any]]:
 
 
 def _one_hemisphere(
-    codes: NDArray[np.integer[Any]], item: HemisphereInput, path: Path
+    codes: NDArray[np.integer[Any]], protocol: Protocol, hemi: str, path: Path
 ) -> NDArray[np.integer[Any]]:
     """Keep one hemisphere's labels of a file that carries both, without the offset."""
-    if not item.bilateral:
-        return codes
-    offset = item.protocol.offset
-    own = codes > offset if item.code_offset else (codes > 0) & (codes < offset)
+    offset, shift = protocol.offset, protocol.shift(hemi)
+    own = codes > offset if shift else (codes > 0) & (codes < offset)
     if not own.any():
         raise InputError(
-            f"{path}: no labels of hemisphere {item.hemi} in this file of both hemispheres",
+            f"{path}: no labels of hemisphere {hemi} in this file of both hemispheres",
             reason="empty-labels",
         )
-    return np.where(own, codes - np.asarray(item.code_offset, codes.dtype), 0)
+    return np.where(own, codes - np.asarray(shift, codes.dtype), 0)
 
 
 def _translate(

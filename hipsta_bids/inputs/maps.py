@@ -170,22 +170,11 @@ def _expression(pattern: str) -> str:
     return expression
 
 
-@dataclass(frozen=True, kw_only=True)
-class MapRequest:
-    """A volume that every hemisphere may have."""
-
-    name: str
-    pattern: str
-    """Path with placeholders, absolute or relative to the BIDS dataset; may have wildcards."""
-    sampling: str
-    interpolation: str
-
-
 def map_requests(
     patterns: Sequence[tuple[str, str]],
     samplings: Sequence[tuple[str | None, str]],
     interpolations: Sequence[tuple[str | None, str]],
-) -> tuple[MapRequest, ...]:
+) -> tuple[MapSource, ...]:
     """Combine and check the options about maps; choices without a name are for all other maps."""
     names = [name for name, _ in patterns]
     taken = {row.desc for row in (*OUTPUTS, *EXTRA_OUTPUTS)} | {"x", "y", *(m.name for m in MAPS)}
@@ -203,7 +192,7 @@ def map_requests(
     where = {None: "depth", **dict(samplings)}
     how = {None: "linear", **dict(interpolations)}
     return tuple(
-        MapRequest(
+        MapSource(
             name=name,
             pattern=pattern,
             sampling=where.get(name, where[None]),
@@ -215,7 +204,7 @@ def map_requests(
 
 def attach(
     items: Iterable[HemisphereInput],
-    requests: Sequence[MapRequest],
+    requests: Sequence[MapSource],
     regions: Path | None,
     bids_dir: Path,
 ) -> tuple[tuple[HemisphereInput, ...], tuple[str, ...]]:
@@ -242,7 +231,7 @@ def attach(
     return found, tuple(notes)
 
 
-def _source(item: HemisphereInput, request: MapRequest, bids_dir: Path) -> MapSource:
+def _source(item: HemisphereInput, request: MapSource, bids_dir: Path) -> MapSource:
     name = fill(request.pattern, item.subject, item.session, item.hemi)
     matches = find(name, bids_dir)
     missing = None
@@ -250,10 +239,8 @@ def _source(item: HemisphereInput, request: MapRequest, bids_dir: Path) -> MapSo
         missing = f"no file {name}"
     elif len(matches) > 1:
         missing = f"{len(matches)} files match {name}: {matches[0]}, {matches[1]}"
-    return MapSource(
-        name=request.name,
-        sampling=request.sampling,
-        interpolation=request.interpolation,
+    return replace(
+        request,
         path=None if missing else matches[0],
         missing=missing,
         source_path=None if Path(request.pattern).is_absolute() else bids_dir,

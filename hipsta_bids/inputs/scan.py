@@ -55,15 +55,6 @@ class InputRequest:
     bids_database_dir: Path | None = None
 
 
-def several_files(folder: Path, names: Iterable[str]) -> InputError:
-    """Say that several files of a folder are equally good for a hemisphere."""
-    return InputError(
-        f"{folder}: {' and '.join(names)} are equally good; "
-        "keep one of them in the subject's folder",
-        reason="several-files",
-    )
-
-
 def unknown_protocol(name: str, title: str) -> Protocol:
     """Stand in where codes are not understood: the hemisphere fails, but has a name in outputs."""
     return Protocol(name=name, title=title, citation="", sheet=(), layer=(), interior=(), labels=())
@@ -87,11 +78,13 @@ class MapSource:
 
     name: str
     """What its outputs are called."""
+    pattern: str = ""
+    """Path with placeholders, absolute or relative to the BIDS dataset; may have wildcards."""
     sampling: str
     """``depth`` or ``mid``, see :func:`~hipsta_bids.geometry.sampling.sample_on_sheet`."""
     interpolation: str
     """``linear`` or ``nearest``."""
-    path: Path | None
+    path: Path | None = None
     """None where there is no file, or more than one that it could be."""
     missing: str | None = None
     """Why there is no path, in one phrase."""
@@ -110,8 +103,6 @@ class HemisphereInput(Hemisphere):
     """The protocol of the second file."""
     bilateral: bool = False
     """The file carries both hemispheres, the codes of one shifted by ``protocol.offset``."""
-    code_offset: int = 0
-    """To be subtracted from the codes of this hemisphere."""
     source: str
     """Name of the dataset."""
     source_path: Path
@@ -140,6 +131,11 @@ class HemisphereInput(Hemisphere):
     def edited(self) -> tuple[str, ...]:
         """Kinds of edits, each once."""
         return tuple(dict.fromkeys(edit.kind for edit in self.edits))
+
+    @property
+    def code_offset(self) -> int:
+        """What is to be subtracted from the codes of this hemisphere."""
+        return self.protocol.shift(self.hemi) if self.bilateral else 0
 
     @property
     def key(self) -> tuple[str, str, str, str]:
@@ -266,11 +262,6 @@ def _is_folder(entry: os.DirEntry[str]) -> bool:
 def plain_label(name: str) -> str:
     """Make a BIDS label of a name: ``AD_05`` and ``sub-AD_05`` become ``AD05``."""
     return re.sub(r"[^A-Za-z0-9+]", "", name.removeprefix("sub-"))
-
-
-def subject_folders(root: Path, *, any_name: bool = False) -> list[SubjectFolder]:
-    """List the subjects' folders of a dataset, sorted by name."""
-    return sort_folders(root, any_name=any_name)[0]
 
 
 def sort_folders(
@@ -494,7 +485,7 @@ def list_participants(request: InputRequest) -> frozenset[str]:
     the names of the folders, as indexing thousands of subjects takes minutes.
     """
     if request.bids_database_dir is None:
-        return frozenset(folder.subject for folder in subject_folders(request.bids_dir))
+        return frozenset(folder.subject for folder in sort_folders(request.bids_dir)[0])
     return _from_index(request.bids_dir, request.bids_database_dir)
 
 

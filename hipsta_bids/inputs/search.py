@@ -13,7 +13,7 @@ from pathlib import Path
 
 from hipsta_bids.derivatives.dataset import read_description
 from hipsta_bids.errors import NothingToDoError, UsageError
-from hipsta_bids.inputs.ashs import AtlasFinder, choose_atlas, find_ashs, sample_files
+from hipsta_bids.inputs.ashs import AtlasFinder, choose_atlas, find_ashs
 from hipsta_bids.inputs.edits import EditedFile, attach_edits, each_once, edits_of_visit, list_edits
 from hipsta_bids.inputs.freesurfer import find_freesurfer, same_labels, without_labels
 from hipsta_bids.inputs.generic import find_named, forget_tables
@@ -29,7 +29,6 @@ from hipsta_bids.inputs.scan import (
     list_sources,
     list_visits,
     sort_folders,
-    subject_folders,
 )
 from hipsta_bids.inputs.selection import Selection, make_selection
 from hipsta_bids.inputs.tools import find_hippunfold, find_tools
@@ -117,7 +116,13 @@ def find_inputs(request: InputRequest) -> Findings:
     items, notes = attach_edits(
         _without_clashes(found.items, sources), each_once(found.edited), selection
     )
-    notes += (*_renaming_note(found.renamed, items), *_ignored_note(ignored))
+    subjects = {item.subject for item in items}
+    renamed = [f"{f.path.name} as sub-{f.subject}" for f in found.renamed if f.subject in subjects]
+    if renamed:
+        notes += (f"renamed: {_count(renamed, 'FreeSurfer folder')}",)
+    unused = [entry.name for entry in ignored if not entry.template]
+    if unused:
+        notes += (f"not used: {_count(unused, 'folder')}; --dry-run and the log say why",)
     return Findings(items=items, notes=notes, ignored=ignored)
 
 
@@ -154,24 +159,9 @@ def _renaming(folders: Iterable[SubjectFolder]) -> dict[tuple[str, str | None], 
     }
 
 
-def _renaming_note(
-    renamed: Iterable[SubjectFolder], items: Iterable[HemisphereInput]
-) -> Iterator[str]:
-    subjects = {item.subject for item in items}
-    names = [f"{f.path.name} as sub-{f.subject}" for f in renamed if f.subject in subjects]
-    if names:
-        yield f"renamed: {_count(names, 'FreeSurfer folder')}"
-
-
 def _place(path: Path) -> str:
     """Where an entry is, however its folder was reached; the entry itself may be any link."""
     return os.path.join(os.path.realpath(path.parent), path.name)  # noqa: PTH118 (many of them)
-
-
-def _ignored_note(ignored: Iterable[Ignored]) -> Iterator[str]:
-    names = [entry.name for entry in ignored if not entry.template]
-    if names:
-        yield f"not used: {_count(names, 'folder')}; --dry-run and the log say why"
 
 
 def ignored_table(ignored: Iterable[Ignored]) -> list[dict[str, str]]:
@@ -187,7 +177,7 @@ def list_subjects(request: InputRequest) -> tuple[str, ...]:
             {
                 folder.subject
                 for source in list_sources(request)
-                for folder in subject_folders(source.path, any_name=source.any_name)
+                for folder in sort_folders(source.path, any_name=source.any_name)[0]
                 if selection.wants_folder(folder)
             }
         )
@@ -220,10 +210,9 @@ def dataset_notes(request: InputRequest, items: Iterable[HemisphereInput]) -> tu
         notes.append(
             f"{request.bids_dir} has no dataset_description.json, which BIDS requires; going on"
         )
-    asked = make_selection(request).subjects
-    known = asked or list_participants(request)
-    left_out = make_selection(request).excluded
-    without = sorted(known - left_out - {item.subject for item in items})
+    selection = make_selection(request)
+    known = selection.subjects or list_participants(request)
+    without = sorted(known - selection.excluded - {item.subject for item in items})
     if without:
         notes.append(f"no segmentation found for {_count(without, 'participant')}")
     return tuple(notes)
@@ -237,7 +226,7 @@ def _search(source: Source, selection: Selection, option: Protocol | None, found
     found.others += others
     found.renamed += [folder for folder in folders if folder.renamed]
     anew = _renaming(folders)
-    atlases = AtlasFinder(source.path, option, sample_files(source))
+    atlases = AtlasFinder(source.path, option)
     for visit in filter(selection.wants_visit, list_visits(folders, found.ignored)):
         found.edited += edits_of_visit(visit, source.path, source.name, beside=True)
         items = list(_search_visit(visit, source, selection, atlases))
@@ -261,7 +250,7 @@ def _search_visit(
     if "freesurfer" in source.layouts:
         yield from find_freesurfer(visit, source, selection)
     if "ashs" in source.layouts:
-        yield from find_ashs(visit, source, atlases, selection)
+        yield from find_ashs(visit, source, selection, atlases)
     if "hippunfold" in source.layouts:
         yield from find_hippunfold(visit, source, selection)
     if "tools" in source.layouts:
@@ -326,7 +315,7 @@ def _nothing(
         subjects = {
             folder.subject
             for source in sources
-            for folder in subject_folders(source.path, any_name=source.any_name)
+            for folder in sort_folders(source.path, any_name=source.any_name)[0]
         }
         return NothingToDoError(
             f"no hippocampal segmentation matches {' '.join(restricted)} in {searched} "

@@ -1,19 +1,21 @@
-"""Which of what is found is wanted: labels of options, and entities of the filter file."""
+"""Which of what is found is wanted, by options and the filter file, and which of several files."""
 
 import difflib
 import json
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from hipsta_bids.errors import InputError, ProtocolError, UsageError
+from hipsta_bids.errors import HipstaError, InputError, ProtocolError, UsageError
 from hipsta_bids.inputs.scan import (
     HEMIS,
+    HemisphereInput,
     Ignored,
     InputRequest,
+    Source,
     SubjectFolder,
     VisitFolders,
     plain_label,
@@ -76,12 +78,61 @@ class Selection:
         """Check whether a file with BIDS entities in its name is wanted."""
         if not self.rules:
             return True
-        found = _parse(path)
-        return all(rule(found.get(key)) for key, rule in self.rules.items())
+        from bids.layout import parse_file_entities  # noqa: PLC0415 (takes seconds)
+
+        found = parse_file_entities(str(path), entities=list(_entities().values()))
+        given = {key: str(value) for key, value in found.items()}
+        return all(rule(given.get(key)) for key, rule in self.rules.items())
 
     def _passes(self, entity: str, value: str | None) -> bool:
         rule = self.rules.get(entity)
         return rule is None or rule(value)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SidedFile:
+    """Labels of one hemisphere, or of both."""
+
+    path: Path
+    hemi: str | None
+    """None for both."""
+    rank: tuple[int, ...]
+    """Order of preference, the least first."""
+
+
+def choose_file(
+    files: Sequence[SidedFile],
+    visit: VisitFolders,
+    hemi: str,
+    source: Source,
+    *,
+    found: tuple[Protocol, HipstaError | None],
+    why: tuple[str, str],
+    passed_over: Iterable[tuple[str, str]],
+) -> HemisphereInput:
+    """Take the first file of a hemisphere, unless another one is as good."""
+    (protocol, problem), chosen = found, files[0]
+    rivals = [file.path.name for file in files if file.rank == chosen.rank]
+    if len(rivals) > 1:
+        problem = InputError(
+            f"{chosen.path.parent}: {' and '.join(rivals)} are equally good; "
+            "keep one of them in the subject's folder",
+            reason="several-files",
+        )
+    both = ", both hemispheres in one file" if chosen.hemi is None else ""
+    return HemisphereInput(
+        subject=visit.subject,
+        session=visit.session,
+        hemi=hemi,
+        protocol=protocol,
+        files=(chosen.path,),
+        bilateral=chosen.hemi is None,
+        source=source.name,
+        source_path=source.path,
+        why=both.join(why),
+        passed_over=tuple(passed_over),
+        problem=problem,
+    )
 
 
 def make_selection(request: InputRequest) -> Selection:
@@ -92,6 +143,7 @@ def make_selection(request: InputRequest) -> Selection:
             f"--hemi {' '.join(map(str, wrong))}: choose among {', '.join(HEMIS)}",
             reason="bad-hemisphere",
         )
+    choice = request.protocol or None
     return Selection(
         subjects=_labels(
             _plain(request, request.participant_labels), "sub-", "--participant-label"
@@ -103,13 +155,10 @@ def make_selection(request: InputRequest) -> Selection:
         hemis=request.hemis,
         rules=_rules(request.bids_filter_file) if request.bids_filter_file else {},
         fs_analysis=request.fs_analysis,
-        protocol=_chosen_protocol(request.protocol) if request.protocol else None,
+        protocol=None
+        if choice is None
+        else measurable(load_protocol(Path(choice) if Path(choice).is_file() else str(choice))),
     )
-
-
-def _chosen_protocol(choice: str | Path) -> Protocol:
-    """Load a protocol by the name of a file or of a bundled one."""
-    return measurable(load_protocol(Path(choice) if Path(choice).is_file() else str(choice)))
 
 
 def measurable(protocol: Protocol) -> Protocol:
@@ -187,10 +236,3 @@ def _entities() -> dict[str, Any]:
 
     configs = (Config.load(name) for name in ("bids", "derivatives"))
     return {name: entity for config in configs for name, entity in config.entities.items()}
-
-
-def _parse(path: Path) -> dict[str, str]:
-    from bids.layout import parse_file_entities  # noqa: PLC0415 (see above)
-
-    found = parse_file_entities(str(path), entities=list(_entities().values()))
-    return {key: str(value) for key, value in found.items()}

@@ -18,15 +18,17 @@ from hipsta_bids.inputs.scan import (
     HemisphereInput,
     Source,
     VisitFolders,
-    several_files,
     unknown_protocol,
 )
-from hipsta_bids.inputs.selection import Selection
+from hipsta_bids.inputs.selection import Selection, SidedFile, choose_file
 from hipsta_bids.io.files import entities
 from hipsta_bids.protocols.load import load_protocol, protocol_names
 from hipsta_bids.protocols.protocol import Protocol
 
 _SIDES = {"left": "L", "right": "R"}
+
+#: Why a file was passed over, by its rank.
+_ORDER = ("as good as the first one", "T2w comes first")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,18 +68,6 @@ _TOOLS = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class _File:
-    path: Path
-    hemi: str | None
-    """None for both."""
-
-    @property
-    def rank(self) -> bool:
-        """T2-weighted images, which show the subfields, before others."""
-        return "T2w" not in self.path.name
-
-
 def find_tools(
     visit: VisitFolders, source: Source, selection: Selection
 ) -> Iterator[HemisphereInput]:
@@ -89,11 +79,23 @@ def find_tools(
         found.sort(key=lambda file: (file.rank, str(file.path)))
         for hemi in selection.wanted_hemis():
             files = [file for file in found if file.hemi in (hemi, None)]
-            if files:
-                yield _choose(files, tool, hemi, visit, source=source, selection=selection)
+            if not files:
+                continue
+            protocol, why, problem = _protocol(files[0].path, tool, selection)
+            yield choose_file(
+                files,
+                visit,
+                hemi,
+                source,
+                found=(protocol, problem),
+                why=(tool.title, f", {why}"),
+                passed_over=[(file.path.name, _ORDER[file.rank[0]]) for file in files[1:]],
+            )
 
 
-def _files(folder: Folder, tool: _Tool, source: Source, selection: Selection) -> Iterator[_File]:
+def _files(
+    folder: Folder, tool: _Tool, source: Source, selection: Selection
+) -> Iterator[SidedFile]:
     """List the files of one tool in a folder."""
     named = tool.name == (selection.protocol.tool if selection.protocol else None) or any(
         tool.name in generator for generator in source.generators
@@ -105,41 +107,10 @@ def _files(folder: Folder, tool: _Tool, source: Source, selection: Selection) ->
         match = tool.pattern.fullmatch(name)
         if match and selection.wants_file(folder.path / name):
             side = match.groupdict().get("side")
-            yield _File(path=folder.path / name, hemi=_SIDES[side] if side else None)
-
-
-def _choose(
-    files: list[_File],
-    tool: _Tool,
-    hemi: str,
-    visit: VisitFolders,
-    *,
-    source: Source,
-    selection: Selection,
-) -> HemisphereInput:
-    chosen = files[0]
-    bilateral = chosen.hemi is None
-    protocol, why, problem = _protocol(chosen.path, tool, selection)
-    rivals = [file.path.name for file in files if file.rank == chosen.rank]
-    if len(rivals) > 1:
-        problem = several_files(chosen.path.parent, rivals)
-    return HemisphereInput(
-        subject=visit.subject,
-        session=visit.session,
-        hemi=hemi,
-        protocol=protocol,
-        files=(chosen.path,),
-        bilateral=bilateral,
-        code_offset=protocol.shift(hemi) if bilateral else 0,
-        source=source.name,
-        source_path=source.path,
-        why=f"{tool.title}{', both hemispheres in one file' if bilateral else ''}, {why}",
-        passed_over=tuple(
-            (file.path.name, "as good as the first one" if not file.rank else "T2w comes first")
-            for file in files[1:]
-        ),
-        problem=problem,
-    )
+            # T2-weighted images, which show the subfields, before others.
+            rank = int("T2w" not in name)
+            hemi = _SIDES[side] if side else None
+            yield SidedFile(path=folder.path / name, hemi=hemi, rank=(rank,))
 
 
 def _protocol(

@@ -18,6 +18,7 @@ from nibabel.wrapstruct import WrapStructError
 from numpy.typing import NDArray
 
 from hipsta_bids.errors import InputError
+from hipsta_bids.geometry.digital import Box, box, to_ras
 from hipsta_bids.geometry.sampling import ScalarVolume
 from hipsta_bids.types import BodyMask, Float
 
@@ -115,13 +116,9 @@ class LabelImage:
     """(4, 4), voxel index in the whole image to RAS mm."""
 
     @property
-    def box(self) -> tuple[slice, slice, slice]:
+    def box(self) -> Box:
         """Where the part lies in the whole image."""
-        first, second, third = (
-            slice(start, start + count)
-            for start, count in zip(self.start, self.data.shape, strict=True)
-        )
-        return first, second, third
+        return box(self.start, np.add(self.start, self.data.shape))
 
     @property
     def own_affine(self) -> Float:
@@ -136,36 +133,25 @@ def moved(affine: Float, start: tuple[int, int, int]) -> Float:
     return own
 
 
-def read_labels(
-    path: Path, margin: float = 0.0, box: tuple[slice, slice, slice] | None = None
-) -> LabelImage:
+def read_labels(path: Path, margin: float = 0.0, part: Box | None = None) -> LabelImage:
     """Read what is not zero in an image of labels or a mask, or a given part of it.
 
     Shape and type are checked before any voxel is read, and no more than a slab is read at once:
-    what a header declares does not decide how much memory is needed.
-
-    Parameters
-    ----------
-    path : Path
-    margin : float
-        Voxels up to this distance (mm, along the image's axes) are kept around what is not zero.
-    box : tuple of slice, optional
-        The part to read instead, as far as the image goes.
+    what a header declares does not decide how much memory is needed. Voxels up to ``margin`` (mm,
+    along the image's axes) are kept around what is not zero; ``part`` is read instead of that, as
+    far as the image goes.
     """
     with _opened(path) as image:
         shape = _label_shape(image, path)
         affine = np.asarray(image.affine, dtype=np.float64)
         _check_affine(image, affine, path, VOXEL_SIZES)
         first = None
-        if box is None:
-            box, first = _labeled_part(image, shape, margin, affine)
+        if part is None:
+            part, first = _labeled_part(image, shape, margin, affine)
         else:
-            x, y, z = (
-                slice(min(side.start, count), min(side.stop, count))
-                for side, count in zip(box, shape, strict=True)
-            )
-            box = x, y, z
-        size = math.prod(side.stop - side.start for side in box)
+            low, high = np.array([(side.start, side.stop) for side in part]).T
+            part = box(np.minimum(low, shape), np.minimum(high, shape))
+        size = math.prod(side.stop - side.start for side in part)
         if size > MOST_LABELED:
             raise InputError(
                 f"{path}: voxels other than zero fill a part of {size / 1e6:.0f} million voxels, "
@@ -173,8 +159,8 @@ def read_labels(
                 reason="image-too-large",
             )
         _check_fits(image, path, size, "the part with labels")
-        data = first[box] if first is not None else _voxels(image, shape, box)
-    start = (box[0].start, box[1].start, box[2].start)
+        data = first[part] if first is not None else _voxels(image, shape, part)
+    start = (part[0].start, part[1].start, part[2].start)
     return LabelImage(data=data, start=start, shape=shape, affine=affine)
 
 
@@ -206,11 +192,17 @@ def _label_shape(image: Any, path: Path) -> tuple[int, int, int]:  # noqa: ANN40
     return shape
 
 
-def _three_axes(image: Any, path: Path, what: str) -> tuple[int, int, int]:  # noqa: ANN401 (untyped)
-    """Shape of an image without further axes of length one; refuse what has more than three."""
+def _axes(image: Any) -> list[int]:  # noqa: ANN401 (untyped)
+    """Shape of an image without further axes of length one."""
     shape = [int(n) for n in image.shape]
     while len(shape) > _SPACE and shape[-1] == 1:
         shape.pop()
+    return shape
+
+
+def _three_axes(image: Any, path: Path, what: str) -> tuple[int, int, int]:  # noqa: ANN401 (untyped)
+    """Shape of an image without further axes of length one; refuse what has more than three."""
+    shape = _axes(image)
     if len(shape) != _SPACE:
         text = " x ".join(map(str, image.shape))
         raise InputError(
@@ -243,7 +235,7 @@ def _labeled_part(
     shape: tuple[int, int, int],
     margin: float,
     affine: Float,
-) -> tuple[tuple[slice, slice, slice], NDArray[Any] | None]:
+) -> tuple[Box, NDArray[Any] | None]:
     """Bounding box of what is not zero; also the voxels, if they were read at once."""
     hits = [np.zeros(count, dtype=bool) for count in shape]
     slab = None
@@ -254,22 +246,17 @@ def _labeled_part(
         hits[2][start : start + slab.shape[2]] = inside.any(axis=(0, 1))
     whole = slab if slab is not None and slab.shape == shape else None
     if not hits[0].any():
-        return (slice(0, 0), slice(0, 0), slice(0, 0)), whole
+        return box((0, 0, 0), (0, 0, 0)), whole
     return box_with_margin(hits, margin, affine), whole
 
 
-def box_with_margin(
-    hits: Sequence[NDArray[np.bool_]], margin: float, affine: Float
-) -> tuple[slice, slice, slice]:
+def box_with_margin(hits: Sequence[NDArray[np.bool_]], margin: float, affine: Float) -> Box:
     """Range of true positions along each axis, with a margin (mm) as far as the image goes."""
     # Headers keep single precision: 0.4999999 mm voxels are 0.5 mm voxels.
     extra = np.ceil(margin / np.linalg.norm(affine[:3, :3], axis=0) - 1e-4).astype(int)
-    first, second, third = (
-        slice(max(int(found[0] - pad), 0), min(int(found[-1] + pad) + 1, len(hit)))
-        for hit, pad in zip(hits, extra.tolist(), strict=True)
-        for found in [np.flatnonzero(hit)]
-    )
-    return first, second, third
+    ends = np.array([np.flatnonzero(hit)[[0, -1]] for hit in hits]).T
+    size = [len(hit) for hit in hits]
+    return box(np.maximum(ends[0] - extra, 0), np.minimum(ends[1] + extra + 1, size))
 
 
 def read_grid(path: Path) -> tuple[tuple[int, int, int], Float]:
@@ -289,22 +276,21 @@ def read_scalars(path: Path, points: Float) -> ScalarVolume:
         affine: Float = np.asarray(image.affine, dtype=np.float64)
         _check_affine(image, affine, path, MAP_VOXEL_SIZES)
         shape = tuple(int(n) for n in image.shape)
-        box = _box(affine, points, shape)
+        part = _part_around(affine, points, shape)
         _check_fits(
             image,
             path,
-            math.prod(b - a for a, b in box) * math.prod(shape[_SPACE:]),
+            math.prod(side.stop - side.start for side in part) * math.prod(shape[_SPACE:]),
             "the part round the sheet",
             beside=_BESIDE_MAP,
             remedy="give fewer volumes at once",
         )
-        data = np.asarray(image.dataobj[tuple(slice(a, b) for a, b in box)], dtype=np.float64)
-    start = np.array([a for a, _ in box])
-    affine[:3, 3] += affine[:3, :3] @ start
+        data = np.asarray(image.dataobj[part], dtype=np.float64)
+    start = (part[0].start, part[1].start, part[2].start)
     return ScalarVolume(
         values=data.reshape(*data.shape[:_SPACE], -1),
-        affine=affine,
-        start=(int(start[0]), int(start[1]), int(start[2])),
+        affine=moved(affine, start),
+        start=start,
         shape=(shape[0], shape[1], shape[2]),
     )
 
@@ -360,9 +346,7 @@ def _check_scalar(image: Any, path: Path) -> None:  # noqa: ANN401 (nibabel's cl
             "extract the magnitude or one channel",
             reason="not-scalar",
         )
-    shape = list(image.shape)
-    while len(shape) > _SPACE and shape[-1] == 1:
-        shape.pop()
+    shape = _axes(image)
     if not _SPACE <= len(shape) <= _SPACE + 1:
         raise InputError(
             f"{path}: has shape {' x '.join(map(str, shape))}; a map has three axes, or four with "
@@ -373,17 +357,16 @@ def _check_scalar(image: Any, path: Path) -> None:  # noqa: ANN401 (nibabel's cl
         raise InputError(f"{path}: has no voxels; make the file again", reason="empty-image")
 
 
-def _box(affine: Float, points: Float, shape: tuple[int, ...]) -> list[tuple[int, int]]:
+def _part_around(affine: Float, points: Float, shape: tuple[int, ...]) -> Box:
     """Range of voxels along each axis that interpolation at the points can reach."""
     finite = points[np.isfinite(points).all(axis=-1)]
-    to_index = np.linalg.inv(affine)
-    index = finite @ to_index[:3, :3].T + to_index[:3, 3]
+    index = to_ras(finite, np.linalg.inv(affine))
     if not len(index):
-        return [(0, 1)] * _SPACE
+        return box((0, 0, 0), (1, 1, 1))
     # One voxel more than needed on either side; at least one voxel where all points lie outside.
     low = np.clip(np.floor(index.min(axis=0)) - 1, 0, np.array(shape[:_SPACE]) - 1).astype(int)
     high = np.clip(np.ceil(index.max(axis=0)) + 2, low + 1, shape[:_SPACE]).astype(int)
-    return list(zip(low.tolist(), high.tolist(), strict=True))
+    return box(low, high)
 
 
 def _check_affine(

@@ -31,7 +31,7 @@ from hipsta_bids.participant.maps import (
 )
 from hipsta_bids.protocols.load import for_region
 from hipsta_bids.settings import Settings
-from hipsta_bids.types import BodyMask, GivenEnd, HemisphereMaps, Status
+from hipsta_bids.types import BodyMask, HemisphereMaps, Status
 
 if TYPE_CHECKING:
     from hipsta_bids.participant.uncertainty import Uncertainty
@@ -131,6 +131,11 @@ def base_record(job: Job) -> dict[str, Any]:
     """Begin the quality record with what is known before any input is read."""
     item = job.item
     sources = dict(job.sources)
+    given = [
+        {"end": end.end, "point_ras_mm": end.point}
+        | ({"normal_ras": end.normal} if end.normal else {})
+        for end in item.ends
+    ]
     return {
         "version": __version__,
         "settings_hash": job.settings_hash,
@@ -148,14 +153,8 @@ def base_record(job: Job) -> dict[str, Any]:
             for path, why in item.passed_over
         ],
         "notes": item.notes,
-        **({"given_ends": [_given_end(end) for end in item.ends]} if item.ends else {}),
+        **({"given_ends": given} if given else {}),
     }
-
-
-def _given_end(end: GivenEnd) -> dict[str, Any]:
-    """Describe an end that a person has placed."""
-    normal = {"normal_ras": end.normal} if end.normal else {}
-    return {"end": end.end, "point_ras_mm": end.point, **normal}
 
 
 def hash_inputs(job: Job, record: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
@@ -240,19 +239,16 @@ def helpers() -> list[str]:
     return []
 
 
-def reset_peak_memory(process: str = "self") -> None:
-    """Forget how much memory a process needed so far, where Linux allows it."""
+def reset_peak_memory() -> None:
+    """Forget how much memory this process needed so far, where Linux allows it."""
     with contextlib.suppress(OSError):
-        Path(f"/proc/{process}/clear_refs").write_text("5")
+        Path("/proc/self/clear_refs").write_text("5")
 
 
-def peak_memory(process: str = "self") -> float:
-    """Largest resident memory of a process since the last reset, in bytes.
-
-    Where there is no ``/proc``: of this process since it began, whichever was asked for.
-    """
+def peak_memory() -> float:
+    """Largest resident memory since the last reset, or the start without ``/proc``, in bytes."""
     with contextlib.suppress(OSError, StopIteration, ValueError):
-        lines = Path(f"/proc/{process}/status").read_text().splitlines()
+        lines = Path("/proc/self/status").read_text().splitlines()
         return 1024.0 * int(next(line for line in lines if line.startswith("VmHWM")).split()[1])
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return float(peak if sys.platform == "darwin" else 1024 * peak)  # getrusage(2): bytes, or KiB

@@ -3,7 +3,7 @@
 Nothing here can fail a hemisphere: what cannot be used is a flag, and its shape is unharmed.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -43,17 +43,10 @@ def write_map(
     place: ResultPlace, source: MapSource, sampled: SampledMap, about: Mapping[str, object]
 ) -> None:
     """Write one map: table, sidecar and GIFTI."""
-    nx, ny, count = sampled.values.shape
-    flat = sampled.values.reshape(nx * ny, count)
-    x, y = np.divmod(np.arange(nx * ny), ny)
+    count = sampled.values.shape[2]
     names = _column_names(source.name, count)
     digits = 7 if source.interpolation == "linear" else 15
-    cells = [_cells(column, digits) for column in flat.T]
-    files.write_tsv(
-        place.path("map_table", source.name),
-        ["x", "y", *names],
-        zip(map(str, (x + 1).tolist()), map(str, (y + 1).tolist()), *cells, strict=True),
-    )
+    write_nodes(place.path("map_table", source.name), names, sampled.values, digits)
     definitions: dict[str, object] = {
         "x": {"Description": "node number along x, 1 at the medial end (subiculum)"},
         "y": {"Description": "node number along y, 1 at the posterior end"},
@@ -63,9 +56,18 @@ def write_map(
         definitions[name] = {"Description": f"{text}, in its own unit"}
     files.write_json(place.path("map_sidecar", source.name), dict(about) | definitions)
     key = "map_shape" if count == 1 else "map_series"
+    flat = sampled.values.reshape(-1, count)
     files.write_bytes(
         place.path(key, source.name), gifti.maps_bytes(flat, hemi=place.name.hemi, names=names)
     )
+
+
+def write_nodes(path: Path, names: Sequence[str], values: Float, digits: int = 7) -> None:
+    """Write values (Nx, Ny, columns) of a sheet as a table with one row per node."""
+    x, y = np.indices(values.shape[:2]).reshape(2, -1) + 1
+    cells = [_cells(column, digits) for column in values.reshape(len(x), -1).T]
+    rows = zip(map(str, x.tolist()), map(str, y.tolist()), *cells, strict=True)
+    files.write_tsv(path, ["x", "y", *names], rows)
 
 
 def _cells(values: Float, digits: int = 7) -> list[str]:

@@ -7,13 +7,13 @@ tetrahedra, boundaries, coordinates, sheet, measures.
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 
 from hipsta_bids.errors import GeometryError
-from hipsta_bids.geometry.body import Body, check_mask, check_side, extract_body
+from hipsta_bids.geometry.body import check_mask, check_side, extract_body
 from hipsta_bids.geometry.boundaries import Boundaries, find_boundaries
 from hipsta_bids.geometry.catalog import (
     Measured,
@@ -93,10 +93,10 @@ _PARTS = {
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Evidence:
+class Evidence(Measured):
     """One hemisphere's sheet, and what the stages found out on their way to it."""
 
-    measured: Measured
+    coordinates: Coordinates
     side: float
     """How far the medial subfields lie medially of CA1, mm."""
     solid: SolidField
@@ -111,15 +111,16 @@ class Evidence:
     folded: float
     """Fraction of the volume in which the coordinates have the opposite orientation."""
 
+    @cached_property
+    def repaired(self) -> Bool:
+        """Columns (Nx, Ny) that a repair touched."""
+        return repaired_columns(self.sheet, self.solid, self.settings.measures)
 
-def find_all(evidence: Evidence, repaired: Bool) -> list[Finding]:
-    """List what the checks of one hemisphere found, within their limits or not.
 
-    ``repaired`` marks the columns (Nx, Ny) that a repair touched.
-    """
-    measured, solid, boundaries = evidence.measured, evidence.solid, evidence.boundaries
-    body, sheet, settings = measured.body, measured.sheet, measured.settings
-    checks = settings.checks
+def find_all(evidence: Evidence) -> list[Finding]:
+    """List what the checks of one hemisphere found, within their limits or not."""
+    solid, boundaries, settings = evidence.solid, evidence.boundaries, evidence.settings
+    body, sheet, checks = evidence.body, evidence.sheet, settings.checks
     middle = sheet.points[:, :, sheet.middle]
     present = set(np.unique(body.tissue[body.inside]).tolist())
     edges = np.minimum(*(np.linalg.norm(middle - middle[[end]], axis=2) for end in (0, -1)))
@@ -134,8 +135,8 @@ def find_all(evidence: Evidence, repaired: Bool) -> list[Finding]:
             middle[:, row],
         )
         for end, uncertainty, row in (
-            ("posterior", ends.posterior_uncertainty, 0),
-            ("anterior", ends.anterior_uncertainty, -1),
+            ("posterior", ends.posterior.uncertainty, 0),
+            ("anterior", ends.anterior.uncertainty, -1),
         )
     ]
     rows += [
@@ -157,7 +158,7 @@ def find_all(evidence: Evidence, repaired: Bool) -> list[Finding]:
             settings.topology.flag_fraction,
             f"{solid.changed_fraction:.1%} of the body was changed by repairs",
             "look at the labels",
-            middle[repaired],
+            middle[evidence.repaired],
         ),
         (
             "boundary-doubtful",
@@ -203,8 +204,8 @@ def find_all(evidence: Evidence, repaired: Bool) -> list[Finding]:
         *check_labels(body, checks),
         *check_cross_sections(solid.field, body, checks, solid.touched & (solid.field.values < 0)),
         *check_rows(sheet, checks),
-        *check_edges(measured.whole, checks),
-        *check_ridges(sheet, measured.thickness, checks),
+        *check_edges(evidence.whole, checks),
+        *check_ridges(sheet, evidence.thickness, checks),
     ]
 
 
@@ -231,21 +232,11 @@ def _whole(row: tuple[str, float, float, str, str, Float | float]) -> Finding:
     return replace(finding, points=where[np.isfinite(where).all(axis=-1)])
 
 
-def _told(repair: Repair, sheet: Sheet, settings: Settings) -> str:
-    """Write what a repair changed, and what it means for the map."""
-    known = add_consequence(_of_repair(repair), sheet, settings.checks)
-    return f"{repair}{consequence_text(known)}"
-
-
-def quality_metrics(evidence: Evidence, repaired: Bool) -> dict[str, Any]:
-    """Numbers and words that say whether to trust the map, JSON-serializable.
-
-    ``repaired`` marks the columns (Nx, Ny) that a repair touched.
-    """
-    measured, solid, boundaries = evidence.measured, evidence.solid, evidence.boundaries
-    body, ends, surface = measured.body, measured.body.ends, measured.surface
-    quality = tetra_quality(measured.mesh)
-    valid = measured.sheet.valid
+def quality_metrics(evidence: Evidence) -> dict[str, Any]:
+    """Numbers and words that say whether to trust the map, JSON-serializable."""
+    solid, boundaries, surface = evidence.solid, evidence.boundaries, evidence.surface
+    body, ends, valid = evidence.body, evidence.body.ends, evidence.sheet.valid
+    quality = tetra_quality(evidence.mesh)
     return {
         "region": body.region,
         "voxel_size_mm": np.linalg.norm(body.affine[:3, :3], axis=0).round(4).tolist(),
@@ -256,12 +247,12 @@ def quality_metrics(evidence: Evidence, repaired: Bool) -> dict[str, Any]:
         "end_voxels_inside": body.handed_over,
         "body_length_mm": ends.length(body.inside_points()[1]),
         "medial_offset_mm": evidence.side,
-        "posterior_end_rule": ends.posterior_rule,
-        "anterior_end_rule": ends.anterior_rule,
-        "posterior_end_uncertainty_mm": ends.posterior_uncertainty,
-        "anterior_end_uncertainty_mm": ends.anterior_uncertainty,
-        "posterior_plane": ends.entry("posterior"),
-        "anterior_plane": ends.entry("anterior"),
+        "posterior_end_rule": ends.posterior.rule,
+        "anterior_end_rule": ends.anterior.rule,
+        "posterior_end_uncertainty_mm": ends.posterior.uncertainty,
+        "anterior_end_uncertainty_mm": ends.anterior.uncertainty,
+        "posterior_plane": ends.posterior.entry(),
+        "anterior_plane": ends.anterior.entry(),
         "voxels_across": evidence.voxels_across,
         "euler_before": solid.euler_before,
         "euler_after": solid.euler_after,
@@ -270,7 +261,7 @@ def quality_metrics(evidence: Evidence, repaired: Bool) -> dict[str, Any]:
         "posterior_cap_vertices": int(surface.posterior_cap.sum()),
         "anterior_cap_vertices": int(surface.anterior_cap.sum()),
         "extra_smoothing": evidence.smoothed,
-        "tetrahedra": len(measured.mesh.tetrahedra),
+        "tetrahedra": len(evidence.mesh.tetrahedra),
         "tetra_quality_median": float(np.median(quality)),
         "tetra_quality_p01": float(np.quantile(quality, 0.01)),
         "boundary_rule": boundaries.rule,
@@ -286,7 +277,7 @@ def quality_metrics(evidence: Evidence, repaired: Bool) -> dict[str, Any]:
         "filled_fraction": float(1 - valid.mean()),
         "thickness_expected_mm": boundaries.sheet_thickness,
         "regions_outside": "head and tail (as in Diers et al. 2023)",
-        "repaired_fraction": float(repaired.mean()),
+        "repaired_fraction": float(evidence.repaired.mean()),
         **({"mask_change": asdict(body.mask_change)} if body.mask_change else {}),
     }
 
@@ -294,9 +285,7 @@ def quality_metrics(evidence: Evidence, repaired: Bool) -> dict[str, Any]:
 Clock = Callable[[str], AbstractContextManager[None]]
 
 
-def unfold(
-    volume: LabelVolume, hemi: str, settings: Settings, clock: Clock
-) -> tuple[Evidence, Coordinates]:
+def unfold(volume: LabelVolume, hemi: str, settings: Settings, clock: Clock) -> Evidence:
     """Lay out the sheet of one hippocampal body; arguments are those of `measure_hemisphere`."""
     with clock("body"):
         check_voxel(volume, settings.checks)
@@ -327,22 +316,24 @@ def unfold(
         bending = bending_angle(sheet, settings.measures)
         if body.region != "body" and boundaries.side_rule == "bending":
             boundaries = replace(boundaries, side_rule="continuity")
-        if _sides_exchanged(sheet, boundaries.side_rule, bending, hemi):
+        # Labels have decided already.
+        if (boundaries.side_rule == "continuity" and is_flipped(sheet, hemi)) or (
+            boundaries.side_rule == "bending" and bending < 0
+        ):
             sheet, coordinates, boundaries = _flipped(sheet, coordinates, boundaries)
             bending = -bending
         whole = sample_sheet(mesh, coordinates, whole_body(settings.sheet))
         subfield = label_sheet(sheet, body)
         folded = folded_fraction(mesh, coordinates)
-    evidence = Evidence(
-        measured=Measured(
-            body=body,
-            surface=surface,
-            mesh=mesh,
-            sheet=sheet,
-            subfield=subfield,
-            whole=whole,
-            settings=settings,
-        ),
+    return Evidence(
+        body=body,
+        surface=surface,
+        mesh=mesh,
+        coordinates=coordinates,
+        sheet=sheet,
+        subfield=subfield,
+        whole=whole,
+        settings=settings,
         side=side,
         solid=solid,
         voxels_across=across,
@@ -352,7 +343,6 @@ def unfold(
         bending=bending,
         folded=folded,
     )
-    return evidence, coordinates
 
 
 def measure_hemisphere(
@@ -387,57 +377,60 @@ def measure_hemisphere(
     if region in EXPERIMENTAL:
         check_fine(volume)
         only = settings.changed(body={"region": "body"})
-        evidence, coordinates = unfold(volume, hemi, only, clock)
-        repaired = repaired_columns(evidence.measured.sheet, evidence.solid, settings.measures)
-        flags = _flags(evidence, _find(volume, hemi, evidence, repaired))
-        own = Own(evidence.measured.body, evidence.measured.mesh, coordinates, flags)
+        body = unfold(volume, hemi, only, clock)
+        own = Own(body.body, body.mesh, body.coordinates, _flags(body, _find(volume, hemi, body)))
         return measure_whole(volume, hemi, settings, clock, own)
-    evidence, coordinates = unfold(volume, hemi, settings, clock)
-    measured, solid = evidence.measured, evidence.solid
-    body, sheet = measured.body, measured.sheet
+    evidence = unfold(volume, hemi, settings, clock)
+    sheet = evidence.sheet
     with clock("measures"):
+        repairs = [
+            add_consequence(_of_repair(repair), sheet, settings.checks)
+            for repair in evidence.solid.repairs
+        ]
         layers, folded_layers = _layers(sheet, settings)
-        repaired = repaired_columns(sheet, solid, settings.measures)
-        findings = [*_find(volume, hemi, evidence, repaired), *folded_layers]
-        maps = measure_maps(measured)
+        findings = [*_find(volume, hemi, evidence), *folded_layers]
+        maps = measure_maps(evidence)
         return HemisphereMaps(
             sheet=sheet,
             layers=layers,
             maps=maps,
             profiles=average_profiles(maps, sheet),
-            sections=measure_sections(measured),
-            subfield=measured.subfield,
-            repaired=repaired,
-            body_mask=volume.in_file(body.inside),
-            summary=summarize(measured, for_region(volume.protocol, body.region).sheet),
-            qc={**quality_metrics(evidence, repaired), "flag_margins": flag_margins(findings)},
+            sections=measure_sections(evidence),
+            subfield=evidence.subfield,
+            repaired=evidence.repaired,
+            body_mask=volume.in_file(evidence.body.inside),
+            summary=summarize(evidence, for_region(volume.protocol, region).sheet),
+            qc={**quality_metrics(evidence), "flag_margins": flag_margins(findings)},
             repairs=(
-                *(_told(repair, sheet, settings) for repair in solid.repairs),
-                *describe_uncus(body, settings.checks),
+                *(f"{finding.what}{consequence_text(finding)}" for finding in repairs),
+                *describe_uncus(evidence.body, settings.checks),
             ),
             flags=_flags(evidence, findings),
-            mesh=measured.mesh,
-            coordinates=coordinates,
+            mesh=evidence.mesh,
+            coordinates=evidence.coordinates,
         )
 
 
-def _find(volume: LabelVolume, hemi: str, evidence: Evidence, repaired: Bool) -> list[Finding]:
+def _find(volume: LabelVolume, hemi: str, evidence: Evidence) -> list[Finding]:
     """List what the checks of a body found, within its limit or not."""
-    measured, settings = evidence.measured, evidence.measured.settings
-    body, checks = measured.body, settings.checks
+    body, settings, checks = evidence.body, evidence.settings, evidence.settings.checks
+    mask = volume.edited_mask
     return [
         *check_end_labels(volume, body, checks),
-        *check_thickness(measured.thickness, evidence.boundaries.sheet_thickness, checks),
-        *([check_flipped(measured.sheet, hemi)] if body.region == "extended" else []),
-        *_check_edited_mask(volume, body, settings),
-        *find_all(evidence, repaired),
+        *check_thickness(evidence.thickness, evidence.boundaries.sheet_thickness, checks),
+        *([check_flipped(evidence.sheet, hemi)] if body.region == "extended" else []),
+        *(
+            check_mask(mask, body.mask_change, in_plane_voxel(body.affine), settings.body)
+            if mask and body.mask_change
+            else []
+        ),
+        *find_all(evidence),
     ]
 
 
 def _flags(evidence: Evidence, findings: list[Finding]) -> tuple[Flag, ...]:
-    measured = evidence.measured
-    place = partial(name_place, body=measured.body)
-    return tuple(raise_flags(findings, measured.sheet, place, measured.settings.checks))
+    place = partial(name_place, body=evidence.body)
+    return tuple(raise_flags(findings, evidence.sheet, place, evidence.settings.checks))
 
 
 def find_body(volume: LabelVolume, settings: Settings) -> BodyMask | None:
@@ -447,13 +440,6 @@ def find_body(volume: LabelVolume, settings: Settings) -> BodyMask | None:
     except GeometryError:
         return None
     return volume.in_file(body.inside)
-
-
-def _check_edited_mask(volume: LabelVolume, body: Body, settings: Settings) -> list[Finding]:
-    if volume.edited_mask is None or body.mask_change is None:
-        return []
-    voxel = in_plane_voxel(body.affine)
-    return check_mask(volume.edited_mask, body.mask_change, voxel, settings.body)
 
 
 def _filled(
@@ -479,13 +465,6 @@ def _layers(sheet: Sheet, settings: Settings) -> tuple[Sheet, list[Finding]]:
         return sheet, []
     layers, folded = equal_volume_layers(sheet)
     return layers, [check_layers(folded, sheet)]
-
-
-def _sides_exchanged(sheet: Sheet, rule: str, bending: float, hemi: str) -> bool:
-    """Decide whether interior and exterior have to be exchanged; labels have decided already."""
-    if rule == "continuity":
-        return is_flipped(sheet, hemi)
-    return rule == "bending" and bending < 0
 
 
 def _flipped(

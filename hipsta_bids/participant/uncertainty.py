@@ -8,6 +8,7 @@ This is a parametric bootstrap (Efron and Tibshirani 1993, An Introduction to th
 """
 
 import hashlib
+import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
@@ -27,6 +28,8 @@ from scipy.spatial.transform import Rotation
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.catalog import measure_maps, summarize
 from hipsta_bids.geometry.checks import check_thickness
+from hipsta_bids.geometry.digital import box
+from hipsta_bids.io.volumes import moved
 from hipsta_bids.participant.measure import measure_hemisphere, unfold
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.protocols.load import for_region
@@ -82,21 +85,10 @@ class Uncertainty:
 def estimate_uncertainty(
     volume: LabelVolume, hemi: str, settings: Settings, copies: int
 ) -> Uncertainty:
-    """Measure perturbed copies of a label volume, and take the SD at each node of the sheet.
+    """Measure 2 or more perturbed copies of labels, and take the SD (n - 1) at each node.
 
-    Parameters
-    ----------
-    volume : LabelVolume
-    hemi : {"L", "R"}
-    settings : Settings
-    copies : int
-        Number of copies, 2 or more. The same labels always give the same copies, and the first ones
-        do not depend on how many there are.
-
-    Returns
-    -------
-    Uncertainty
-        SDs with ``n - 1`` in the denominator.
+    The same labels always give the same copies, and the first ones do not depend on how many there
+    are.
     """
     found: list[tuple[Mapping[str, Float], Mapping[str, float]]] = []
     for number in range(copies):
@@ -105,14 +97,12 @@ def estimate_uncertainty(
             found.append(_measure(copy, hemi, settings))
         except GeometryError:
             continue
-    enough = len(found) >= max(LEAST, copies / 2)
+    enough = found if len(found) >= max(LEAST, copies / 2) else []
     return Uncertainty(
         copies=copies,
         failed=copies - len(found),
-        maps=_spread([maps for maps, _ in found]) if enough else {},
-        summary={k: float(v) for k, v in _spread([one for _, one in found]).items()}
-        if enough
-        else {},
+        maps=_spread([maps for maps, _ in enough]),
+        summary={k: float(v) for k, v in _spread([one for _, one in enough]).items()},
     )
 
 
@@ -124,29 +114,25 @@ def _measure(
     if settings.body.region in EXPERIMENTAL:
         whole = measure_hemisphere(volume, hemi, settings.changed(grid=grid), _no_clock)
         return whole.maps, whole.summary
-    evidence, _ = unfold(volume, hemi, settings.changed(grid=grid), _no_clock)
-    measured = evidence.measured
-    check_thickness(measured.thickness, evidence.boundaries.sheet_thickness, settings.checks)
+    measured = unfold(volume, hemi, settings.changed(grid=grid), _no_clock)
+    check_thickness(measured.thickness, measured.boundaries.sheet_thickness, settings.checks)
     tissues = for_region(volume.protocol, settings.body.region).sheet
     return measure_maps(measured), summarize(measured, tissues)
 
 
-def _no_clock(stage: str) -> AbstractContextManager[None]:
-    del stage
+def _no_clock(_: str) -> AbstractContextManager[None]:
     return nullcontext()
 
 
 def _spread(rows: Sequence[Mapping[str, Any]]) -> dict[str, Float]:
     """SD over copies by name, of what at least two of them know; NaN elsewhere."""
     spread = {}
-    for name in rows[0]:
+    for name in rows[0] if rows else ():
         values = np.array([row[name] for row in rows], dtype=np.float64)
-        known = np.isfinite(values)
-        count = known.sum(axis=0)
-        mean = np.where(known, values, 0.0).sum(axis=0) / np.maximum(count, 1)
-        squares = np.where(known, (values - mean) ** 2, 0.0).sum(axis=0)
-        sd = np.sqrt(squares / np.maximum(count - 1, 1))
-        spread[name] = np.where(count >= LEAST, sd, np.nan)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # where fewer than two know it
+            sd = np.nanstd(np.where(np.isfinite(values), values, np.nan), axis=0, ddof=1)
+        spread[name] = np.asarray(sd)
     return spread
 
 
@@ -186,17 +172,14 @@ def _cropped(volume: LabelVolume) -> LabelVolume:
         return volume
     where = np.argwhere(labeled)
     low = np.maximum(where.min(axis=0) - 2, 0)
-    box = tuple(slice(a, b) for a, b in zip(low, where.max(axis=0) + 3, strict=True))
-    affine = volume.affine.copy()
-    affine[:3, 3] += affine[:3, :3] @ low
+    around = box(low, where.max(axis=0) + 3)
     mask = volume.edited_mask
-    return LabelVolume(
-        tissue=volume.tissue[box],
-        part=volume.part[box],
-        affine=affine,
-        protocol=volume.protocol,
-        edited_mask=None if mask is None else replace(mask, inside=mask.inside[box]),
-        given_ends=volume.given_ends,
+    return replace(
+        volume,
+        tissue=volume.tissue[around],
+        part=volume.part[around],
+        affine=moved(volume.affine, low),
+        edited_mask=None if mask is None else replace(mask, inside=mask.inside[around]),
     )
 
 

@@ -16,6 +16,7 @@ from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.geometry.sheet import sheet_levels
 from hipsta_bids.io import files, gifti
 from hipsta_bids.io.gifti import DENSE_SCALARS, PointMap
+from hipsta_bids.participant.maps import write_nodes
 from hipsta_bids.settings import SheetSettings
 from hipsta_bids.types import Float, Mesh
 
@@ -85,32 +86,11 @@ def resample(
 ) -> str:
     """Move maps of one or both sides to HippUnfold's vertices, or from there to the whole sheet.
 
-    Parameters
-    ----------
-    paths : sequence of Path
-        Maps: tables or GIFTI files of the whole sheet, or GIFTI or CIFTI files of HippUnfold.
-    out : Path
-        GIFTI, CIFTI or, of one side of the sheet, a table, by its ending.
-    surfaces : sequence of Path
-        HippUnfold's unfolded surface: one for both sides or one for each.
-    settings : SheetSettings
-        Those that the sheets were measured with.
-    column : str
-        Column of a table that holds the map.
-    sheets : sequence of Path
-        ``desc-proximodistal`` maps of the sheets, one for each side.
-
-    Returns
-    -------
-    str
-        What was done, in one line.
-
-    Raises
-    ------
-    UsageError
-        If the output is an input, or its ending is none of those or does not go with the maps.
-    InputError
-        If a file cannot be read, is of another region, or does not fit the surface.
+    Maps are tables (``column`` holds the map) or GIFTI files of the whole sheet, or GIFTI or CIFTI
+    files of HippUnfold; ``out`` is GIFTI, CIFTI or, of one side of the sheet, a table, by its
+    ending. ``surfaces`` are HippUnfold's unfolded ones, one for both sides or one for each;
+    ``settings`` those that the sheets were measured with; ``sheets`` their ``desc-proximodistal``
+    maps, one for each side. Returns what was done, in one line.
     """
     if not out.name.endswith((TABLE, *METRICS, DENSE_SCALARS)):
         ends = ", ".join((*METRICS, DENSE_SCALARS))
@@ -186,12 +166,7 @@ def _write(out: Path, maps: Mapping[str, SheetMap], *, to_nodes: bool) -> None:
         raise UsageError(
             f"{out}: tables are of sheets; name a {METRICS[0]} file for vertices", reason="usage"
         )
-    nodes = np.argwhere(np.ones(first.values.shape, dtype=bool)) + 1
-    rows = (
-        (str(x), str(y), f"{value:.7g}" if np.isfinite(value) else files.MISSING)
-        for (x, y), value in zip(nodes, flat[first.hemi], strict=True)
-    )
-    files.write_tsv(out, ["x", "y", first.name], rows)
+    write_nodes(out, [first.name], first.values[..., None])
 
 
 def _read(path: Path, column: str) -> list[SheetMap]:

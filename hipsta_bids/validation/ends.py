@@ -155,7 +155,7 @@ def find_ends(job: Job) -> Found:
     def places(labels: LabelVolume, settings: BodySettings = settings) -> list[float]:
         ends = extract_body(labels, settings).ends
         gaps = [body.ends.height(near[end], end) - ends.height(near[end], end) for end in ENDS]
-        unsure = ends.posterior_uncertainty, ends.anterior_uncertainty
+        unsure = ends.posterior.uncertainty, ends.anterior.uncertainty
         return [*(float(gap.mean()) for gap in gaps), *unsure]
 
     bare = _without_ends(volume, job.body)

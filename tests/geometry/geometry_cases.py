@@ -8,7 +8,7 @@ from scipy import ndimage
 
 from hipsta_bids.geometry.body import Body, extract_body
 from hipsta_bids.geometry.boundaries import Boundaries, find_boundaries
-from hipsta_bids.geometry.ends import EndPlanes
+from hipsta_bids.geometry.ends import EndPlane, EndPlanes
 from hipsta_bids.geometry.fem import Laplace, volume_laplace
 from hipsta_bids.geometry.grid import Field, WedgeGrid, resample_body
 from hipsta_bids.geometry.mesh import extract_surface, tetrahedralize
@@ -47,7 +47,7 @@ def solve_case(phantom, *, protocol="freesurfer", settings=None, **drawing):
     volume = phantom.label_volume(load_protocol(protocol), **drawing)
     body = extract_body(volume, chosen.body)
     field = resampled(body, chosen, drawing.get("hemi", "L"))
-    solid = repair_topology(field, chosen.topology)
+    solid = solid_of(field, chosen.topology)
     surface = extract_surface(solid.field, chosen.surface)
     mesh = tetrahedralize(surface, chosen.tetra, field.grid.frame)
     laplace = volume_laplace(mesh)
@@ -99,18 +99,19 @@ def rigid(degrees=(20.0, -35.0, 50.0), shift=(11.0, -7.0, 4.0)):
     return pose
 
 
+def solid_of(field, settings):
+    """The field with its topology repaired; no subfield is named, and no turns touch."""
+    return repair_topology(field, settings, lambda _: "", lambda _: False)
+
+
 def straight_ends(length, *, tilt=0.0):
     """End planes of a body along +z from 0 to ``length`` mm; the anterior one may be tilted."""
     normal = rotation(1, tilt) @ [0.0, 0.0, 1.0]
     middle = normal + np.array([0.0, 0.0, 1.0])
     return EndPlanes(
-        posterior_point=np.zeros(3),
-        posterior_normal=np.array([0.0, 0.0, 1.0]),
-        anterior_point=np.array([0.0, 0.0, length]),
-        anterior_normal=normal,
+        posterior=EndPlane(np.zeros(3), np.array([0.0, 0.0, 1.0]), "labels"),
+        anterior=EndPlane(np.array([0.0, 0.0, length]), normal, "labels"),
         axis=middle / np.linalg.norm(middle),
-        posterior_rule="labels",
-        anterior_rule="labels",
         half_slice=0.0,
     )
 

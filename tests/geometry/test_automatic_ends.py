@@ -68,14 +68,14 @@ def places(volume):
     ends = ends_of(volume)
     middle = np.array([[0.0, 0.0, 0.5]])
     return [
-        float(-ends.height(middle, end)[0] / getattr(ends, f"{end}_normal")[1])
+        float(-ends.height(middle, end)[0] / ends[end].normal[1])
         for end in ("posterior", "anterior")
     ]
 
 
 def test_ends_lie_where_the_dentate_gyrus_and_the_uncus_begin():
     ends = ends_of(drawn())
-    assert (ends.posterior_rule, ends.anterior_rule) == ("core", "cross-section")
+    assert (ends.posterior.rule, ends.anterior.rule) == ("core", "cross-section")
     # The long axis leans towards the uncus.
     np.testing.assert_allclose(places(drawn()), [TAIL, UNCUS], atol=0.6)
 
@@ -99,10 +99,10 @@ def test_ends_move_with_the_volume_and_with_its_mirror_image():
     image = ends_of(drawn((0.4, 2.0, 0.4), mirror=True))
     flip = np.diag([-1.0, 1.0, 1.0])
     for end in ("posterior", "anterior"):
-        point, normal = getattr(here, f"{end}_point"), getattr(here, f"{end}_normal")
+        point, normal = here[end].point, here[end].normal
         moved = (pose[:3, :3] @ point + pose[:3, 3])[None]
         assert abs(there.height(moved, end)[0]) < 1e-8
-        np.testing.assert_allclose(getattr(there, f"{end}_normal"), pose[:3, :3] @ normal)
+        np.testing.assert_allclose(there[end].normal, pose[:3, :3] @ normal)
         assert abs(image.height((flip @ point)[None], end)[0]) < 1e-8
 
 
@@ -114,8 +114,8 @@ def test_phantom_ends_are_found_in_thick_slices(shift):
     pose[1, 3] = 2.0 * shift
     volume = phantom.label_volume(HIPPUNFOLD, voxel_size=(0.4, 2.0, 0.4), pose=pose)
     ends = extract_body(volume, BODY).ends
-    assert ends.posterior_uncertainty < 0.5
-    assert ends.anterior_uncertainty < 0.5
+    assert ends.posterior.uncertainty < 0.5
+    assert ends.anterior.uncertainty < 0.5
     u = np.linspace(0.1, 0.9, 9)
     for end, v in (("posterior", 0.0), ("anterior", 1.0)):
         plane = phantom.body.place(u, v, 0.0) + pose[:3, 3]
@@ -129,10 +129,10 @@ def test_an_oblique_plane_of_the_tail_leaves_the_head_alone():
     x, y, _ = np.moveaxis(index @ volume.affine[:3, :3].T + volume.affine[:3, 3], -1, 0)
     part = np.where((volume.tissue > 0) & (y < TAIL + 0.6 * x), Part.TAIL, Part.UNKNOWN)
     ends = ends_of(replace(volume, part=part))
-    assert (ends.posterior_rule, ends.anterior_rule) == ("labels", "cross-section")
-    assert degrees_between(ends.posterior_normal, [-0.6, 1.0, 0.0]) < 3.0
+    assert (ends.posterior.rule, ends.anterior.rule) == ("labels", "cross-section")
+    assert degrees_between(ends.posterior.normal, [-0.6, 1.0, 0.0]) < 3.0
     # The body's own axis leans a little towards the uncus.
-    assert degrees_between(ends.anterior_normal, [0.0, 1.0, 0.0]) < 12.0
+    assert degrees_between(ends.anterior.normal, [0.0, 1.0, 0.0]) < 12.0
     assert abs(ends.height(np.array([[0.0, UNCUS, 0.5]]), "anterior")[0]) < 0.8
 
 
@@ -151,9 +151,9 @@ def test_an_end_is_less_certain_where_the_cues_differ():
     ).reshape(volume.tissue.shape)
     tissue = np.where(early, np.uint8(Tissue.DENTATE_GYRUS), volume.tissue)
     sure, unsure = ends_of(volume), ends_of(replace(volume, tissue=tissue))
-    assert sure.anterior_uncertainty < 1.0
-    assert unsure.anterior_uncertainty > sure.anterior_uncertainty + 0.5
-    assert unsure.posterior_uncertainty < 0.5
+    assert sure.anterior.uncertainty < 1.0
+    assert unsure.anterior.uncertainty > sure.anterior.uncertainty + 0.5
+    assert unsure.posterior.uncertainty < 0.5
     # It moves towards that, and not all the way.
     moved = places(replace(volume, tissue=tissue))[1] - places(volume)[1]
     assert -5.5 < moved < -0.5
@@ -165,23 +165,23 @@ def test_a_users_plane_goes_before_what_is_found():
     plain = ends_of(volume)
     given = replace(volume, given_ends=(GivenEnd(end="anterior", point=point, normal=normal),))
     ends = ends_of(given)
-    assert (ends.posterior_rule, ends.anterior_rule) == (plain.posterior_rule, "user")
-    assert ends.anterior_uncertainty == 0.0
+    assert (ends.posterior.rule, ends.anterior.rule) == (plain.posterior.rule, "user")
+    assert ends.anterior.uncertainty == 0.0
     assert abs(ends.height(np.array([point]), "anterior")[0]) < 1e-9
-    np.testing.assert_allclose(ends.anterior_normal, -np.array(normal) / np.linalg.norm(normal))
+    np.testing.assert_allclose(ends.anterior.normal, -np.array(normal) / np.linalg.norm(normal))
     moved = replace(given, given_ends=(GivenEnd(end="anterior", point=point),))
-    np.testing.assert_allclose(ends_of(moved).anterior_normal, plain.anterior_normal)
+    np.testing.assert_allclose(ends_of(moved).anterior.normal, plain.anterior.normal)
 
 
 def test_a_users_plane_goes_before_labels(arc):
     plain = arc.body.ends
-    point = plain.anterior_point - 1.5 * plain.axis
+    point = plain.anterior.point - 1.5 * plain.axis
     given = (GivenEnd(end="anterior", point=tuple(point)),)
     ends = extract_body(replace(arc.volume, given_ends=given), BODY).ends
-    assert (ends.posterior_rule, ends.anterior_rule) == ("labels", "user")
-    np.testing.assert_allclose(ends.anterior_point, point)
-    np.testing.assert_allclose(ends.anterior_normal, plain.anterior_normal)
-    np.testing.assert_allclose(ends.posterior_point, plain.posterior_point)
+    assert (ends.posterior.rule, ends.anterior.rule) == ("labels", "user")
+    np.testing.assert_allclose(ends.anterior.point, point)
+    np.testing.assert_allclose(ends.anterior.normal, plain.anterior.normal)
+    np.testing.assert_allclose(ends.posterior.point, plain.posterior.point)
 
 
 @pytest.mark.parametrize(

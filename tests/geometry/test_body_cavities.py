@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from geometry_cases import resampled, short_phantom
+from geometry_cases import resampled, short_phantom, solid_of
 
 from hipsta_bids.geometry.body import extract_body
 from hipsta_bids.geometry.digital import to_ras
-from hipsta_bids.geometry.topology import repair_topology
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import BodySettings, TopologySettings
@@ -76,9 +75,7 @@ def test_what_is_open_to_the_outside_stays_as_it_is(volume):
 
 def test_columns_through_a_cavity_are_marked(volume):
     hole = within(volume, 0.8) & (volume.tissue == Tissue.MOLECULAR_LAYER)
-    solid = repair_topology(
-        resampled(extract_body(without(volume, hole), BODY)), TopologySettings()
-    )
+    solid = solid_of(resampled(extract_body(without(volume, hole), BODY)), TopologySettings())
     (repair,) = solid.repairs
     assert repair.kind == "cavity"
     assert np.linalg.norm(np.subtract(repair.position, MIDDLE)) < 0.5

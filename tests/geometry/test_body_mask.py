@@ -48,8 +48,9 @@ def test_a_mask_that_changes_nothing_changes_nothing(protocol, voxels):
     after = corrected(volume, before.inside)
     for name in ("tissue", "inside", "interior"):
         np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
-    for name in ("posterior_point", "posterior_normal", "anterior_point", "anterior_normal"):
-        np.testing.assert_array_equal(getattr(after.ends, name), getattr(before.ends, name))
+    for end in ("posterior", "anterior"):
+        np.testing.assert_array_equal(after.ends[end].point, before.ends[end].point)
+        np.testing.assert_array_equal(after.ends[end].normal, before.ends[end].normal)
 
 
 def test_voxels_outside_of_the_mask_are_no_body(volume, body):

@@ -6,7 +6,7 @@ from geometry_cases import plain_body
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body, check_reach, extract_body, join_cortex
-from hipsta_bids.geometry.ends import EndPlanes
+from hipsta_bids.geometry.ends import EndPlane, EndPlanes
 from hipsta_bids.geometry.sheet import check_flipped, is_flipped
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Tissue
@@ -15,12 +15,8 @@ from hipsta_bids.types import LabelVolume, Sheet
 
 UP = np.array([0.0, 0.0, 1.0])
 ENDS = EndPlanes(
-    posterior_point=np.zeros(3),
-    posterior_normal=UP,
-    posterior_rule="labels",
-    anterior_point=10 * UP,
-    anterior_normal=UP,
-    anterior_rule="labels",
+    posterior=EndPlane(np.zeros(3), UP, "labels"),
+    anterior=EndPlane(10 * UP, UP, "labels"),
     axis=UP,
     half_slice=0.5,
 )

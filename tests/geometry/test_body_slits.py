@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from geometry_cases import resampled
+from geometry_cases import resampled, solid_of
 
 from hipsta_bids.geometry.body import extract_body
 from hipsta_bids.geometry.completion import fill_pits, fill_slits
-from hipsta_bids.geometry.topology import repair_topology
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import BodySettings, TopologySettings
 from hipsta_bids.validation.damage import Site, make_defect
@@ -119,7 +118,7 @@ def test_a_slit_in_a_phantom_is_filled(arc, place):
     # The labels may move the end planes by a hair; elsewhere nothing is added.
     added = body.inside & ~arc.body.inside
     assert np.count_nonzero(added) <= 0.001 * np.count_nonzero(body.inside)
-    solid = repair_topology(resampled(body), TopologySettings())
+    solid = solid_of(resampled(body), TopologySettings())
     # Where the slit meets the dentate gyrus, it is a cavity.
     assert {"slit"} <= {repair.kind for repair in solid.repairs} <= {"slit", "cavity"}
     assert solid.changed_fraction > 0

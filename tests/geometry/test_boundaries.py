@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from geometry_cases import resampled, short_phantom
+from geometry_cases import resampled, short_phantom, solid_of
 from scipy.spatial import cKDTree
 
 from hipsta_bids.errors import GeometryError
@@ -14,7 +14,6 @@ from hipsta_bids.geometry.fem import volume_laplace
 from hipsta_bids.geometry.measures import bending_angle
 from hipsta_bids.geometry.mesh import extract_surface, lateral_triangles, tetrahedralize
 from hipsta_bids.geometry.sheet import sample_sheet, solve_coordinates
-from hipsta_bids.geometry.topology import repair_topology
 from hipsta_bids.geometry.wall import Wall
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.settings import BoundarySettings, MeasureSettings, Settings, SheetSettings
@@ -168,7 +167,7 @@ def test_the_mirror_image_has_the_same_boundaries():
 def solve_volume(volume, hemi):
     settings = Settings()
     body = extract_body(volume, settings.body)
-    solid = repair_topology(resampled(body, settings, hemi), settings.topology)
+    solid = solid_of(resampled(body, settings, hemi), settings.topology)
     surface = extract_surface(solid.field, settings.surface)
     mesh = tetrahedralize(surface, settings.tetra, solid.field.grid.frame)
     return find_boundaries(surface, volume_laplace(mesh), body, settings.boundaries)

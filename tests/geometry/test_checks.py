@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from geometry_cases import box_mesh, plain_body, resampled, short_phantom, straight_ends
+from geometry_cases import box_mesh, plain_body, resampled, short_phantom, solid_of, straight_ends
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
@@ -21,7 +21,6 @@ from hipsta_bids.geometry.checks import (
 from hipsta_bids.geometry.grid import check_voxel
 from hipsta_bids.geometry.measures import measure_thickness
 from hipsta_bids.geometry.mesh import extract_surface
-from hipsta_bids.geometry.topology import repair_topology
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import CheckSettings, Settings
@@ -34,7 +33,7 @@ def surface_of(kind, voxel, thickness):
     phantom = short_phantom(kind=kind, curvature=None, thickness=thickness, length=10.0, width=20.0)
     volume = phantom.label_volume(load_protocol("freesurfer"), voxel_size=(voxel,) * 3)
     body = extract_body(volume, ALL.body)
-    solid = repair_topology(resampled(body), ALL.topology)
+    solid = solid_of(resampled(body), ALL.topology)
     return extract_surface(solid.field, ALL.surface), body
 
 

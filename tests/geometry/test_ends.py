@@ -47,10 +47,10 @@ def ends_of(volume, settings=BODY):
 def test_planar_interfaces_are_found(tail, head, slice_mm):
     normals = [rotation(0, a) @ rotation(2, b) @ [0.0, 1.0, 0.0] for a, b in (tail, head)]
     ends = ends_of(rod(*normals, voxel=(0.4, slice_mm, 0.4)))
-    assert ends.posterior_rule == ends.anterior_rule == "labels"
+    assert ends.posterior.rule == ends.anterior.rule == "labels"
     # The study behind the rule found 1.3 degrees at slices of 2 mm.
-    assert degrees_between(ends.posterior_normal, normals[0]) < 1.5
-    assert degrees_between(ends.anterior_normal, normals[1]) < 1.5
+    assert degrees_between(ends.posterior.normal, normals[0]) < 1.5
+    assert degrees_between(ends.anterior.normal, normals[1]) < 1.5
     # Labels by voxel center say nothing about the place within half a slice.
     middle = np.array([[0.0, -8.2, 0.0], [0.0, 8.2, 0.0]])
     assert abs(ends.height(middle[:1], "posterior")[0]) < 0.5 * slice_mm
@@ -61,8 +61,8 @@ def test_a_tilt_of_one_step_between_thick_slices_is_found_roughly():
     normal = rotation(0, 15) @ [0.0, 1.0, 0.0]
     ends = ends_of(rod(normal, normal, voxel=(0.4, 2.0, 0.4)))
     # 14 mm times tan(15 degrees) is less than two slices: the labels show a step or two only.
-    assert degrees_between(ends.posterior_normal, normal) < 3.0
-    assert degrees_between(ends.anterior_normal, normal) < 3.0
+    assert degrees_between(ends.posterior.normal, normal) < 3.0
+    assert degrees_between(ends.anterior.normal, normal) < 3.0
 
 
 @pytest.mark.parametrize("share", [0.15, 0.5, 0.85])
@@ -76,13 +76,13 @@ def test_one_slice_with_labels_of_both_sides_tilts_the_plane_little(share):
         tissue=volume.tissue, part=part, affine=volume.affine, protocol=volume.protocol
     )
     along = np.array([0.0, 1.0, 0.0])
-    assert degrees_between(ends_of(mixed).posterior_normal, along) < BODY.plane_tilt
+    assert degrees_between(ends_of(mixed).posterior.normal, along) < BODY.plane_tilt
     # The plane goes through that slice, within half of its thickness.
     level = volume.affine[1, 1] * first + volume.affine[1, 3]
-    assert abs(ends_of(mixed).posterior_point @ along - level) < 1.0
+    assert abs(ends_of(mixed).posterior.point @ along - level) < 1.0
     if share == 0.5:  # where it allows for most, the plane keeps to the slices
-        free = ends_of(mixed, BODY.changed(plane_prior=1e-4)).posterior_normal
-        tilt = degrees_between(ends_of(mixed).posterior_normal, along)
+        free = ends_of(mixed, BODY.changed(plane_prior=1e-4)).posterior.normal
+        tilt = degrees_between(ends_of(mixed).posterior.normal, along)
         assert degrees_between(free, along) > 1.2 * tilt
 
 
@@ -91,9 +91,9 @@ def test_planes_move_with_the_volume():
     normals = [rotation(0, 15) @ [0.0, 1.0, 0.0], rotation(2, -10) @ [0.0, 1.0, 0.0]]
     still, moved = ends_of(rod(*normals)), ends_of(rod(*normals, pose=pose))
     for end in ("posterior", "anterior"):
-        turned = pose[:3, :3] @ getattr(still, f"{end}_normal")
+        turned = pose[:3, :3] @ still[end].normal
         # The same voxels in another place: only rounding and where Newton's steps end differ.
-        np.testing.assert_allclose(getattr(moved, f"{end}_normal"), turned, atol=1e-4)
+        np.testing.assert_allclose(moved[end].normal, turned, atol=1e-4)
 
 
 def test_normals_and_axis_point_from_tail_to_head():
@@ -129,7 +129,7 @@ def test_rule_of_the_paper_finds_the_body_without_head_and_tail_labels(protocol,
     phantom = short_phantom(length=14.0)
     volume = phantom.label_volume(load_protocol(protocol), voxel_size=(0.4, slice_mm, 0.4))
     body = extract_body(volume, BODY)
-    assert "labels" not in (body.ends.posterior_rule, body.ends.anterior_rule)
+    assert "labels" not in (body.ends.posterior.rule, body.ends.anterior.rule)
     u = np.linspace(0.1, 0.9, 9)
     for end, v in (("posterior", 0.0), ("anterior", 1.0)):
         height = body.ends.height(phantom.body.place(u, v, 0.0), end)
@@ -148,8 +148,8 @@ def test_end_margin_shortens_the_body_at_both_ends():
 
 def test_end_margin_leaves_labelled_ends_alone(arc):
     less = extract_body(arc.volume, BodySettings(end_margin=1.5)).ends
-    np.testing.assert_array_equal(less.posterior_point, arc.body.ends.posterior_point)
-    np.testing.assert_array_equal(less.anterior_point, arc.body.ends.anterior_point)
+    np.testing.assert_array_equal(less.posterior.point, arc.body.ends.posterior.point)
+    np.testing.assert_array_equal(less.anterior.point, arc.body.ends.anterior.point)
 
 
 def without(volume, part):
@@ -167,13 +167,13 @@ def test_an_end_without_labels_is_cut_across_the_body(arc, lost, kept):
     """Planes of labels may be oblique, which says nothing about the other end."""
     ends = extract_body(without(arc.volume, lost), BODY).ends
     other = "anterior" if kept == "posterior" else "posterior"
-    for part in ("point", "normal"):
-        of_labels = getattr(arc.body.ends, f"{kept}_{part}")
-        np.testing.assert_allclose(getattr(ends, f"{kept}_{part}"), of_labels, atol=1e-9)
+    of_labels = arc.body.ends[kept]
+    np.testing.assert_allclose(ends[kept].point, of_labels.point, atol=1e-9)
+    np.testing.assert_allclose(ends[kept].normal, of_labels.normal, atol=1e-9)
     first, last = (arc.phantom.body.place(np.array([0.5]), v, 0.0)[0] for v in (0.0, 1.0))
-    assert degrees_between(last - first, getattr(ends, f"{other}_normal")) < 5.0
-    assert getattr(ends, f"{kept}_rule") == "labels"
-    assert getattr(ends, f"{other}_rule") != "labels"
+    assert degrees_between(last - first, ends[other].normal) < 5.0
+    assert ends[kept].rule == "labels"
+    assert ends[other].rule != "labels"
 
 
 def test_few_head_voxels_count_as_none(arc):
@@ -183,7 +183,7 @@ def test_few_head_voxels_count_as_none(arc):
     volume = LabelVolume(
         tissue=arc.volume.tissue, part=part, affine=arc.volume.affine, protocol=FREESURFER
     )
-    assert extract_body(volume, BODY).ends.anterior_rule != "labels"
+    assert extract_body(volume, BODY).ends.anterior.rule != "labels"
 
 
 def sheet_with_head(*, twofold):
@@ -207,7 +207,7 @@ def sheet_with_head(*, twofold):
 @pytest.mark.parametrize("twofold", [True, False])
 def test_body_stops_before_the_head_where_ca2_goes_on_into_it(twofold):
     ends = ends_of(sheet_with_head(twofold=twofold))
-    assert ends.anterior_rule == "cross-section"
+    assert ends.anterior.rule == "cross-section"
     middle = np.array([[9.5, 19.75, 6.75]])
     # To a slice of 0.5 mm; the principal axis leans towards the asymmetric head by a few degrees.
     assert abs(ends.height(middle, "anterior")[0]) < 1.0
@@ -223,7 +223,7 @@ def test_body_stops_before_the_bend_of_the_tail_too():
     )
     # CA1 beside CA2 everywhere, so that only the second layer tells the tail from the body.
     ends = ends_of(turned)
-    assert (ends.posterior_rule, ends.anterior_rule) == ("cross-section", "subfields")
+    assert (ends.posterior.rule, ends.anterior.rule) == ("cross-section", "subfields")
     middle = np.array([[9.5, 11.75, 6.75]])
     assert abs(ends.height(middle, "posterior")[0]) < 1.0  # as above
 
@@ -235,7 +235,7 @@ def test_a_plain_rod_has_no_head_to_stop_at():
     ends = ends_of(
         LabelVolume(tissue=tissue, part=volume.part, affine=volume.affine, protocol=HIPPUNFOLD)
     )
-    assert ends.anterior_rule == "subfields"
+    assert ends.anterior.rule == "subfields"
     far = np.array([[9.5, 31.5, 6.75]])
     assert abs(ends.height(far, "anterior")[0]) < 0.5 + 1e-6  # half a slice beyond the last center
 
@@ -267,7 +267,7 @@ def posterior_end(ends):
 
 def test_the_body_ends_where_its_core_vanishes_in_the_tail():
     ends = ends_round_core(slices(12))
-    assert (ends.posterior_rule, ends.anterior_rule) == ("core", "subfields")
+    assert (ends.posterior.rule, ends.anterior.rule) == ("core", "subfields")
     # The axis leans by a degree towards the core.
     assert posterior_end(ends) == pytest.approx(12 * 0.5, abs=0.2)
 
@@ -288,14 +288,14 @@ def test_remnants_of_the_core_do_not_count():
 def test_nothing_is_taken_off_where_the_labels_begin_with_the_core_or_have_none(core):
     ends = ends_round_core(core)
     front = "core" if len(core) == 50 else "subfields"
-    assert (ends.posterior_rule, ends.anterior_rule) == ("subfields", front)
+    assert (ends.posterior.rule, ends.anterior.rule) == ("subfields", front)
     # A slice that the leaning axis fills in part may go.
     assert -0.1 < posterior_end(ends) < 0.6
 
 
 def test_labels_of_the_tail_go_before_the_core():
     ends = ends_round_core(slices(16), tail=8)
-    assert ends.posterior_rule == "labels"
+    assert ends.posterior.rule == "labels"
     assert posterior_end(ends) == pytest.approx(8 * 0.5, abs=0.1)
 
 
@@ -327,8 +327,8 @@ def test_stray_end_labels_do_not_move_the_planes():
         tissue=plain.tissue, part=part, affine=plain.affine, protocol=plain.protocol
     )
     before, after = ends_of(plain), ends_of(stray)
-    np.testing.assert_allclose(after.posterior_normal, before.posterior_normal, atol=1e-6)
-    np.testing.assert_allclose(after.posterior_point, before.posterior_point, atol=1e-6)
+    np.testing.assert_allclose(after.posterior.normal, before.posterior.normal, atol=1e-6)
+    np.testing.assert_allclose(after.posterior.point, before.posterior.point, atol=1e-6)
     np.testing.assert_allclose(after.axis, before.axis, atol=1e-6)
 
 
@@ -354,8 +354,8 @@ def test_labels_that_do_not_lead_away_from_their_end_are_refused():
     """The interface of the tail lies along what is left of the body."""
     turned = ends_mod._checked(
         {
-            "posterior": ends_mod._Plane(np.zeros(3), np.array([0.0, 1.0, 0.0]), "labels"),
-            "anterior": ends_mod._Plane(np.ones(3), np.array([0.0, 1.0, 0.0]), "subfields"),
+            "posterior": ends_mod.EndPlane(np.zeros(3), np.array([0.0, 1.0, 0.0]), "labels"),
+            "anterior": ends_mod.EndPlane(np.ones(3), np.array([0.0, 1.0, 0.0]), "subfields"),
         },
         np.array([0.0, 1.0, 0.0]),
         0.2,
@@ -364,8 +364,8 @@ def test_labels_that_do_not_lead_away_from_their_end_are_refused():
     with pytest.raises(GeometryError, match="may be cut short there") as caught:
         ends_mod._checked(
             {
-                "posterior": ends_mod._Plane(np.zeros(3), np.array([0.5, 0.866, 0.0]), "labels"),
-                "anterior": ends_mod._Plane(np.ones(3), np.array([0.5, 0.866, 0.0]), "subfields"),
+                "posterior": ends_mod.EndPlane(np.zeros(3), np.array([0.5, 0.866, 0.0]), "labels"),
+                "anterior": ends_mod.EndPlane(np.ones(3), np.array([0.5, 0.866, 0.0]), "subfields"),
             },
             np.array([0.94, -0.34, 0.0]),  # 80 degrees from the normals
             0.2,
@@ -389,7 +389,7 @@ def test_cross_sections_that_have_a_part_of_the_labels_only_are_left_out(slope):
         protocol=HIPPUNFOLD,
     )
     ends = ends_of(volume)
-    assert (ends.posterior_rule, ends.anterior_rule) == ("subfields", "subfields")
+    assert (ends.posterior.rule, ends.anterior.rule) == ("subfields", "subfields")
     corners = np.array([[2.0, 0.5 * 8, 6.75], [17.0, 0.5 * (8 + slope * 30), 6.75]])
     # The principal axis leans the other way. Up to a fifth of the cross-section may be missing, 3
     # of 15 mm: less counts in part. And half a slice of 0.5 mm either way.

@@ -50,7 +50,7 @@ def test_labels_are_read_inside_of_the_end_planes():
     grid = resampled(body).grid
     places = continued_nodes(grid, body, 0.6)
     assert places[..., 2].min() == pytest.approx(0.6)
-    assert places[..., 2].max() == pytest.approx(ends.anterior_point[2] - 0.6)
+    assert places[..., 2].max() == pytest.approx(ends.anterior.point[2] - 0.6)
     free = grid.node_points()
     inner = (free[..., 2] > 0.6) & (free[..., 2] < 7.4)
     np.testing.assert_allclose(places[inner], free[inner], atol=EXACT)
@@ -154,19 +154,15 @@ def test_in_plane_voxel(edges, wanted):
 def test_planes_that_meet_beside_the_body_are_refused():
     body = box_body(tilt=0.0)
     ends = body.ends
-    normal = rotation(1, 60) @ ends.anterior_normal
-    middle = normal + ends.posterior_normal
+    normal = rotation(1, 60) @ ends.anterior.normal
+    middle = normal + ends.posterior.normal
     crossed = plain_body(
         body.tissue,
         body.affine,
         EndPlanes(
-            posterior_point=ends.posterior_point,
-            posterior_normal=ends.posterior_normal,
-            anterior_point=ends.anterior_point,
-            anterior_normal=normal,
+            posterior=ends.posterior,
+            anterior=ends.anterior._replace(normal=normal),
             axis=middle / np.linalg.norm(middle),
-            posterior_rule="labels",
-            anterior_rule="labels",
             half_slice=0.2,
         ),
     )

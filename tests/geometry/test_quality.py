@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hipsta_bids.geometry.catalog import Measured
 from hipsta_bids.geometry.topology import Repair
 from hipsta_bids.participant.measure import Evidence, find_all, quality_metrics
 from hipsta_bids.protocols.protocol import Tissue
@@ -17,7 +16,7 @@ from hipsta_bids.types import Sheet
 @pytest.fixture
 def evidence(arc):
     """Nothing to warn about."""
-    measured = Measured(
+    return Evidence(
         body=arc.body,
         surface=arc.surface,
         mesh=arc.mesh,
@@ -25,9 +24,7 @@ def evidence(arc):
         subfield=np.zeros(arc.sheet.valid.shape, dtype=np.uint8),
         whole=arc.sheet,
         settings=Settings(),
-    )
-    return Evidence(
-        measured=measured,
+        coordinates=arc.coordinates,
         side=5.0,
         solid=arc.solid,
         voxels_across=5.0,
@@ -39,12 +36,8 @@ def evidence(arc):
     )
 
 
-def with_measured(evidence, **changes):
-    return replace(evidence, measured=replace(evidence.measured, **changes))
-
-
 def findings(evidence):
-    return find_all(evidence, np.zeros(evidence.measured.sheet.valid.shape, dtype=bool))
+    return find_all(evidence)
 
 
 def reasons(evidence):
@@ -59,9 +52,9 @@ def test_a_sound_hemisphere_has_no_flags(evidence):
     "absent", [(Tissue.PRESUBICULUM, Tissue.SUBICULUM), (Tissue.CA1,), (Tissue.CA2_3,)]
 )
 def test_a_missing_end_of_the_ribbon_is_flagged(evidence, absent):
-    body = evidence.measured.body
+    body = evidence.body
     inside = body.inside & ~np.isin(body.tissue, absent)
-    found = reasons(with_measured(evidence, body=replace(body, inside=inside)))
+    found = reasons(replace(evidence, body=replace(body, inside=inside)))
     # Without CA1 the rest is two pieces, too.
     assert found == ["subfield-missing"] + ["loose-part"] * (absent == (Tissue.CA1,))
 
@@ -119,28 +112,26 @@ def test_folded(evidence, folded, wanted):
 
 @pytest.mark.parametrize(("columns", "wanted"), [(25, ["columns-filled"]), (10, [])])
 def test_columns_filled(evidence, columns, wanted):
-    sheet = evidence.measured.sheet
+    sheet = evidence.sheet
     valid = np.ones(sheet.valid.shape, dtype=bool)
     valid.reshape(-1)[:columns] = False  # of 861, 2 % are 17
     sheet = Sheet(points=sheet.points, valid=valid)
-    assert reasons(with_measured(evidence, sheet=sheet)) == wanted
+    assert reasons(replace(evidence, sheet=sheet)) == wanted
 
 
 def test_metrics_are_json_and_complete(evidence):
-    measured = evidence.measured
-    repaired = np.arange(10).reshape(5, 2) < 1
-    metrics = quality_metrics(evidence, repaired)
+    metrics = quality_metrics(evidence)
     again = json.loads(json.dumps(metrics))
-    assert again["body_voxels"] == np.count_nonzero(measured.body.inside)
+    assert again["body_voxels"] == np.count_nonzero(evidence.body.inside)
     assert again["voxel_size_mm"] == [0.4, 0.4, 0.4]
     assert again["body_length_mm"] == pytest.approx(8.0, abs=0.2)  # half a voxel
     assert again["posterior_end_rule"] == again["anterior_end_rule"] == "labels"
     assert again["euler_before"] == again["euler_after"] == 1
-    assert again["surface_vertices"] == len(measured.surface.vertices)
-    assert again["tetrahedra"] == len(measured.mesh.tetrahedra)
+    assert again["surface_vertices"] == len(evidence.surface.vertices)
+    assert again["tetrahedra"] == len(evidence.mesh.tetrahedra)
     assert 0 < again["tetra_quality_p01"] < again["tetra_quality_median"] <= 1
     assert again["filled_columns"] == 0
-    assert again["repaired_fraction"] == 0.1
+    assert again["repaired_fraction"] == evidence.repaired.mean()
     assert "mask_change" not in again  # no mask was edited
     assert again["thickness_expected_mm"] == pytest.approx(2.0, rel=0.05)  # rims
     assert np.linalg.norm(again["posterior_plane"]["normal_ras"]) == pytest.approx(1, abs=1e-3)

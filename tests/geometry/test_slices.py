@@ -1,5 +1,7 @@
 """Outlines of slices, their registration, and shapes between thick slices."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from geometry_cases import plain_body, solve_case, straight_ends
@@ -225,16 +227,11 @@ def test_what_an_oblique_end_label_hides_is_continued():
     straight = slice_body(block([10] * 7), first=-3.0, length=8.0)
     ends = straight_ends(8.0)
     normal = np.array([0.0, np.sin(0.3), np.cos(0.3)])
-    tilted = type(ends)(
-        **{
-            **{name: getattr(ends, name) for name in ends.__dataclass_fields__},
-            "posterior_point": np.array([0.0, 12.0, 1.0]),
-            "posterior_normal": normal,
-        }
-    )
+    posterior = ends.posterior._replace(point=np.array([0.0, 12.0, 1.0]), normal=normal)
+    tilted = replace(ends, posterior=posterior)
     index = np.argwhere(straight.tissue > 0)
     points = index @ straight.affine[:3, :3].T + straight.affine[:3, 3]
-    keep = (points - tilted.posterior_point) @ normal > 0
+    keep = (points - tilted.posterior.point) @ normal > 0
     tissue = np.zeros_like(straight.tissue)
     tissue[tuple(index[keep].T)] = Tissue.CA1
     body = plain_body(tissue, straight.affine, tilted)

@@ -4,14 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from geometry_cases import field_of, ribbon_mask, straight_grid
+from geometry_cases import field_of, ribbon_mask, solid_of, straight_grid
 from scipy import ndimage
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.digital import euler_number
 from hipsta_bids.geometry.grid import Field
 from hipsta_bids.geometry.mesh import extract_surface
-from hipsta_bids.geometry.topology import repair_topology
 from hipsta_bids.settings import SurfaceSettings, TopologySettings
 
 TOPOLOGY = TopologySettings()
@@ -24,7 +23,7 @@ def repaired(mask, **changes):
     """Repair a mask's field; check what must hold whatever was wrong."""
     # Unchecked: shares below zero make every cut sever.
     settings = TopologySettings().model_copy(update=changes)
-    solid = repair_topology(field_of(mask, spacing=SPACING), settings)
+    solid = solid_of(field_of(mask, spacing=SPACING), settings)
     positive = solid.field.values > 0
     assert euler_number(positive) == solid.euler_after == 1
     assert ndimage.label(positive)[1] == 1
@@ -191,7 +190,7 @@ def test_a_strand_along_an_end_plane_is_cut(hole):
     if hole:
         values[15:18, 4:12, 12:15] = -0.1
     field = Field(grid=straight_grid(values.shape, SPACING), values=values)
-    first, *others = repair_topology(field, TopologySettings()).repairs
+    first, *others = solid_of(field, TopologySettings()).repairs
     assert (first.kind, first.voxels) == ("cut", 1)
     assert first.position[2] == 0
     assert [repair.kind for repair in others] == (["fill"] if hole else []) + ["cavity"]
@@ -262,7 +261,7 @@ def test_an_interrupted_body_is_refused():
     mask = ribbon_mask()
     mask[..., 13:18] = False
     with pytest.raises(GeometryError, match="no connected path of its labels") as caught:
-        repair_topology(field_of(mask), TOPOLOGY)
+        solid_of(field_of(mask), TOPOLOGY)
     assert caught.value.reason == "body-interrupted"
 
 
@@ -270,14 +269,14 @@ def test_a_body_that_vanishes_is_refused():
     mask = np.zeros(SHAPE, dtype=bool)
     mask[20, 10:30] = True  # one node thick: gone after smoothing
     with pytest.raises(GeometryError, match="nothing is left of the body") as caught:
-        repair_topology(field_of(mask, sigma=1.2), TOPOLOGY)
+        solid_of(field_of(mask, sigma=1.2), TOPOLOGY)
     assert caught.value.reason == "sheet-too-thin"
 
 
 def test_giving_up_is_an_error():
     mask, *_ = with_hole()
     with pytest.raises(GeometryError, match="could not be repaired") as caught:
-        repair_topology(field_of(mask), TopologySettings(rounds=0))
+        solid_of(field_of(mask), TopologySettings(rounds=0))
     assert caught.value.reason == "topology"
 
 
@@ -293,7 +292,7 @@ def noisy_field(seed):
 @pytest.mark.parametrize("seed", range(60))
 def test_noisy_ribbons_become_one_sphere(seed):
     field = noisy_field(seed)
-    solid = repair_topology(field, TOPOLOGY)
+    solid = solid_of(field, TOPOLOGY)
     positive = solid.field.values > 0
     assert euler_number(positive) == 1
     surface = extract_surface(solid.field, SurfaceSettings(taubin_iterations=0))
@@ -317,7 +316,7 @@ def test_ambiguous_cubes_keep_foreground_corners_apart():
     mask[8:13, 8:13] = True
     mask[3:13, 3:13, 8:] = True
     values = np.where(mask, 0.5, -0.5).astype(np.float32)
-    solid = repair_topology(Field(grid=field_of(mask).grid, values=values), TOPOLOGY)
+    solid = solid_of(Field(grid=field_of(mask).grid, values=values), TOPOLOGY)
     extract_surface(solid.field, SurfaceSettings())
     assert euler_number(solid.field.values > 0) == 1
 
@@ -326,7 +325,7 @@ def test_separated_turns_are_reported(slab):
     separated = np.zeros(slab.field.grid.shape, dtype=bool)
     where = np.argwhere(slab.field.values > 0.3)[:5]  # fewer than 1 % of the body
     separated[tuple(where.T)] = True
-    found = repair_topology(replace(slab.field, separated=separated), TopologySettings())
+    found = solid_of(replace(slab.field, separated=separated), TopologySettings())
     (repair,) = found.repairs
     assert (repair.kind, repair.voxels, repair.large) == ("part", 5, False)
     assert str(repair).startswith("parted two turns that touch, by a slit of 5 grid nodes at RAS")
@@ -340,6 +339,6 @@ def test_a_hole_beside_a_slit_between_turns_is_doubtful(apart, doubtful):
     field = field_of(mask, spacing=SPACING)
     separated = np.zeros(mask.shape, dtype=bool)
     separated[6:10, 19:22, 16 + apart] = True
-    found = repair_topology(replace(field, separated=separated), TopologySettings())
+    found = solid_of(replace(field, separated=separated), TopologySettings())
     (fill,) = [repair for repair in found.repairs if repair.kind == "fill"]
     assert fill.large == doubtful

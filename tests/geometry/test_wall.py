@@ -5,8 +5,8 @@ import pytest
 from geometry_cases import cylinder
 from lapy import Solver, TriaMesh
 
-from hipsta_bids.geometry.mesh import lateral_triangles
-from hipsta_bids.geometry.wall import Wall, _Mesh, edge_graph, end_to_end
+from hipsta_bids.geometry.mesh import edge_graph, lateral_triangles
+from hipsta_bids.geometry.wall import Wall, _Mesh, end_to_end
 from hipsta_bids.settings import BoundarySettings
 
 SETTINGS = BoundarySettings()

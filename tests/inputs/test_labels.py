@@ -157,9 +157,7 @@ def test_one_hemisphere_is_taken_from_a_file_of_both(tmp_path):
     data[40, 5, 5] = 108
     path = save(tmp_path / "a.nii", data)
     left = read_label_volume(make_item(path, protocol="ashsABC3T", bilateral=True))
-    right = read_label_volume(
-        make_item(path, protocol="ashsABC3T", bilateral=True, code_offset=100, hemi="R")
-    )
+    right = read_label_volume(make_item(path, protocol="ashsABC3T", bilateral=True, hemi="R"))
     assert (left.tissue == Tissue.CA1).sum() == 27
     assert not (left.tissue == Tissue.SUBICULUM).any()
     assert (right.tissue == Tissue.CA1).sum() == 35
@@ -169,7 +167,6 @@ def test_one_hemisphere_is_taken_from_a_file_of_both(tmp_path):
         save(tmp_path / "b.nii", data),
         protocol="ashsABC3T",
         bilateral=True,
-        code_offset=100,
         hemi="R",
     )
     with pytest.raises(InputError, match="no labels of hemisphere R") as caught:
@@ -184,7 +181,7 @@ def test_the_left_hemisphere_may_have_the_higher_codes(tmp_path):
     data[40, 5, :2] = 222, 33  # white matter: left alveus, left fornix
     item = make_item(save(tmp_path / "a.nii", data), protocol="cobralab", bilateral=True, hemi="R")
     right = read_label_volume(item)
-    left = read_label_volume(replace(item, hemi="L", code_offset=100))
+    left = read_label_volume(replace(item, hemi="L"))
     assert [(side.tissue == Tissue.CA1).sum() for side in (left, right)] == [12, 9]
     assert (left.tissue == Tissue.OTHER).sum() == 1
     assert (right.tissue == Tissue.OTHER).sum() <= 1
@@ -494,7 +491,7 @@ def test_voxels_beyond_two_gigabytes_are_read_where_they_are(tmp_path):
         file.seek(header.get_data_offset() + edge**3 - 3)
         file.write(bytes([1, 2, 3]))
     last = (slice(edge - 4, edge), slice(edge - 1, edge), slice(edge - 1, edge))
-    assert read_labels(path, box=last).data.ravel().tolist() == [0, 1, 2, 3]
+    assert read_labels(path, part=last).data.ravel().tolist() == [0, 1, 2, 3]
 
 
 def test_memory_bounds_maps_of_several_volumes(tmp_path, monkeypatch):

@@ -6,7 +6,7 @@ from measured_phantoms import results
 
 from hipsta_bids.cli import main
 from hipsta_bids.errors import ExitCode, InputError
-from hipsta_bids.inputs.ends import read_ends
+from hipsta_bids.inputs.edits import read_ends
 from hipsta_bids.io import files
 from hipsta_bids.phantom import Hemisphere, Phantom, PhantomSpec, write_dataset
 
