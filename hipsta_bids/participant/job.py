@@ -239,16 +239,19 @@ def helpers() -> list[str]:
     return []
 
 
-def reset_peak_memory() -> None:
-    """Forget how much memory this process needed so far, where Linux allows it."""
+def reset_peak_memory(process: str = "self") -> None:
+    """Forget how much memory a process needed so far, where Linux allows it."""
     with contextlib.suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")
+        Path(f"/proc/{process}/clear_refs").write_text("5")
 
 
-def peak_memory() -> float:
-    """Largest resident memory since the last reset, or the start without ``/proc``, in bytes."""
+def peak_memory(process: str = "self") -> float:
+    """Largest resident memory of a process since the last reset, in bytes.
+
+    Where there is no ``/proc``: of this process since it began, whichever was asked for.
+    """
     with contextlib.suppress(OSError, StopIteration, ValueError):
-        lines = Path("/proc/self/status").read_text().splitlines()
+        lines = Path(f"/proc/{process}/status").read_text().splitlines()
         return 1024.0 * int(next(line for line in lines if line.startswith("VmHWM")).split()[1])
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return float(peak if sys.platform == "darwin" else 1024 * peak)  # getrusage(2): bytes, or KiB
