@@ -21,11 +21,11 @@ from hipsta_bids.derivatives.names import (
     EXTRA_OUTPUTS,
     IGNORED,
     OUTPUTS,
+    SHARED,
     HemisphereName,
     Output,
     output_name,
 )
-from hipsta_bids.derivatives.sidecars import SHARED
 from hipsta_bids.errors import EXIT_MEANINGS
 from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY, Column
 from hipsta_bids.group.settings import GroupSettings

@@ -14,13 +14,15 @@ from numpy.typing import NDArray
 from hipsta_bids.derivatives.names import (
     EXTRA_OUTPUTS,
     OUTPUTS,
+    SHARED,
     HemisphereName,
+    describe,
     name_of_record,
     output_name,
     output_path,
     output_pattern,
+    sources,
 )
-from hipsta_bids.derivatives.sidecars import SHARED, describe, sources
 from hipsta_bids.errors import HipstaError, InputError
 from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY, Column
 from hipsta_bids.geometry.sheet import is_left_handed, layer_depth

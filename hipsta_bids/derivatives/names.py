@@ -1,16 +1,17 @@
-"""The table of outputs, and the names and paths of results.
+"""The table of outputs, the names and paths of results, and what sidecars say of images.
 
 Entities follow the order of BIDS 1.11 (``sub ses hemi space seg label desc``). What the standard
 has no rule for is listed in ``.bidsignore``, with the reason, from the table beside it.
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
+from typing import Any
 
 from hipsta_bids.geometry.catalog import MAPS
-from hipsta_bids.io.files import LOGS
+from hipsta_bids.io import files
 from hipsta_bids.protocols import EXPERIMENTAL
 from hipsta_bids.types import Hemisphere
 
@@ -269,7 +270,7 @@ DATASET_FILES: dict[str, str] = {
     "citation": "CITATION.md",
     "status": "status.tsv",
     "status_sidecar": "status.json",
-    "logs": LOGS,
+    "logs": files.LOGS,
     "group": "group",
     "report": "report.html",
 }
@@ -391,3 +392,45 @@ def ignore_file() -> str:
     """Compose ``.bidsignore``: patterns of names that BIDS 1.11 has no rule for, and why."""
     lines = [_IGNORE_HEAD, *(f"# {why}\n{pattern}" for pattern, why in IGNORED.items())]
     return "\n".join(lines) + "\n"
+
+
+#: The sidecars that images of every hemisphere share, in the root of the dataset, as BIDS inherits
+#: them; what a hemisphere's images come from is said beside them.
+SHARED = tuple(row for row in OUTPUTS if row.images)
+
+#: Where coordinates are, by the name of the space: ``orig`` is that of the segmentation.
+_SPACES = {None: "orig", "unfold": "plane in which the sheet is laid flat to scale, mm"}
+
+
+def write_shared(root: Path) -> None:
+    """Write what holds for all hemispheres."""
+    for row in SHARED:
+        files.write_json(root / row.for_all, describe(row))
+
+
+def describe(sidecar: Output) -> dict[str, str]:
+    """Say what the images of a sidecar are, from the table of outputs."""
+    about = {
+        "Description": _by_name(sidecar, lambda image: image.description),
+        "SpatialReference": _by_name(sidecar, lambda image: _SPACES[image.space]),
+        "Units": _by_name(sidecar, lambda image: image.unit or ""),
+    }
+    if sidecar.suffix == "mask":
+        about["Type"] = "ROI"
+    return {key: text for key, text in about.items() if text}
+
+
+def _by_name(sidecar: Output, text_of: Callable[[Output], str]) -> str:
+    """Join what is to be said of images that share a sidecar; those without entities come first."""
+    names: dict[str, list[str]] = {}
+    for image in sidecar.images:
+        entity = f"space-{image.space}" if image.space else f"desc-{image.desc}"
+        names.setdefault(text_of(image), []).append(entity)
+    first, *others = names
+    return "; ".join([first, *(f"with {', '.join(names[text])}: {text}" for text in others)])
+
+
+def sources(record: Mapping[str, Any]) -> list[str]:
+    """List the inputs of a quality record, edited ones included, as BIDS addresses."""
+    entries = [*(record.get("inputs") or ()), *(record.get("edited") or ())]
+    return list(dict.fromkeys(str(entry["file"]) for entry in entries))

@@ -29,8 +29,7 @@ from hipsta_bids.derivatives.dataset import (
     write_sidecar,
 )
 from hipsta_bids.derivatives.hemisphere import ResultPlace
-from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName
-from hipsta_bids.derivatives.sidecars import write_shared
+from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName, write_shared
 from hipsta_bids.errors import ExitCode, HipstaError, InputError, OutputError, ProtocolError
 from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.io import files

@@ -2,6 +2,7 @@
 
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -147,8 +148,8 @@ def test_the_same_labels_twice(monkeypatch, tmp_path, capsys):
     # One file with both hemispheres, and a participant whose sides are copies of each other.
     items[1] = make_input(inputs, "01", hemi="R")
     both = items[0].files
-    items[1] = type(items[1])(**{**vars(items[1]), "files": both, "bilateral": True})
-    items[0] = type(items[0])(**{**vars(items[0]), "bilateral": True})
+    items[1] = replace(items[1], files=both, bilateral=True)
+    items[0] = replace(items[0], bilateral=True)
     monkeypatch.setattr(search, "dataset_notes", lambda *_: ())
     command = ("x", out, "participant")
 

@@ -9,13 +9,13 @@ from hipsta_bids.derivatives.names import (
     EXTRA_OUTPUTS,
     IGNORED,
     OUTPUTS,
+    SHARED,
     HemisphereName,
     ignore_file,
     output_name,
     output_path,
     participant_report,
 )
-from hipsta_bids.derivatives.sidecars import SHARED
 
 FULL = HemisphereName(subject="01", session="02", hemi="R", seg="freesurfer")
 

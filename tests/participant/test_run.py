@@ -12,8 +12,7 @@ import pytest
 from stand_ins import THICKNESS, make_input, stand_in_job, thread_job
 
 from hipsta_bids.derivatives.dataset import COLUMNS, read_status
-from hipsta_bids.derivatives.names import OUTPUTS
-from hipsta_bids.derivatives.sidecars import SHARED
+from hipsta_bids.derivatives.names import OUTPUTS, SHARED
 from hipsta_bids.errors import ExitCode, InputError, OutputError, SettingsError
 from hipsta_bids.inputs.scan import Edit
 from hipsta_bids.io import files
