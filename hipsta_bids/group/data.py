@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from textwrap import shorten
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from hipsta_bids.io import files
 from hipsta_bids.protocols.toml import Table, first_mistake
@@ -23,6 +23,9 @@ Int = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 Key = tuple[str, str]
 """Hemisphere and measure."""
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Known = list[Number | None]
+"""Numbers in JSON; null where one is missing."""
 Nested = dict[str, dict[str, dict[str, list[Any]]]]
 """Arrays by hemisphere, measure and name as lists, for JSON."""
 

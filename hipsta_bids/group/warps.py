@@ -14,7 +14,7 @@ from pydantic import AfterValidator, Field, model_validator
 from scipy.interpolate import BSpline
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.data import Float, Int, blocks, checked_foreign
+from hipsta_bids.group.data import Float, Int, Number, blocks, checked_foreign
 from hipsta_bids.group.settings import RegistrationSettings
 from hipsta_bids.protocols.toml import Fraction, TomlTable
 
@@ -34,7 +34,6 @@ def _rising(values: list[float]) -> list[float]:
     return values
 
 
-_Number = Annotated[float, Field(allow_inf_nan=False)]
 _Rising = Annotated[list[Fraction], Field(max_length=1000), AfterValidator(_rising)]
 
 
@@ -234,12 +233,12 @@ class _SavedTemplate(TomlTable):
     """A template in a file, which may be other people's and hold anything."""
 
     knots: _Rising
-    mean: list[_Number]
-    components: list[list[_Number]]
-    noise: Annotated[_Number, Field(gt=0)]
-    scale: Annotated[_Number, Field(gt=0)] | None
+    mean: list[Number]
+    components: list[list[Number]]
+    noise: Annotated[Number, Field(gt=0)]
+    scale: Annotated[Number, Field(gt=0)] | None
     align: Literal["registr", "penalized"]
-    warp_variance: Annotated[_Number, Field(gt=0)] | None
+    warp_variance: Annotated[Number, Field(gt=0)] | None
     turns: Annotated[int, Field(ge=0, le=1000)]
     center: Annotated[_Rising, Field(min_length=2)]
 
