@@ -129,6 +129,8 @@ class CohortPlan:
             problem = f"a head has 0 to {_MOST_DIGITATIONS} digitations, not {self.head}"
         if not 1 <= self.n_subjects <= _MOST_SUBJECTS:
             problem = f"{self.n_subjects} subjects; give 1 to {_MOST_SUBJECTS:,}"
+        if self.seed < 0:
+            problem = f"seed {self.seed}; give 0 or more"
         if not self.groups or len(set(self.groups)) < len(self.groups):
             problem = "give at least one group, and groups with different names"
         if self.site and not (self.site.isascii() and self.site.isalnum()):
