@@ -80,12 +80,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _SIGNALED + signal.SIGPIPE
     except Exception as error:  # noqa: BLE001  (any other exception is a bug: show it whole)
         if isinstance(error, OSError) and error.filename and error.errno in _OF_PATHS:
-            path = str(error.filename)[:_LONGEST_PATH]
-            warn(f"hipsta-bids: {path}: {error.strerror}; check the path, and who may read it")
-            return int(ExitCode.BAD_DATA)
-        traceback.print_exc()
-        warn("hipsta-bids: internal error; please report it with the lines above")
-        return int(ExitCode.INTERNAL)
+            path, code = str(error.filename)[:_LONGEST_PATH], ExitCode.BAD_DATA
+            text = f"{path}: {error.strerror}; check the path, and who may read it"
+        else:
+            text, code = "internal error; please report it with the lines above", ExitCode.INTERNAL
+            traceback.print_exc()
+        warn(f"hipsta-bids: {text}")
+        return int(code)
 
 
 @contextlib.contextmanager
