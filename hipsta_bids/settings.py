@@ -336,9 +336,9 @@ class SheetSettings(SettingsTable):
     The grid of Hipsta (Diers et al. 2023) is x_extent 0.9, y_extent 0.975, z_extent 0.9.
     """
 
-    x_nodes: Annotated[int, Field(ge=3)] = 41
+    x_nodes: Annotated[int, Field(ge=3, le=1000)] = 41
     """Nodes from medial to lateral."""
-    y_nodes: Annotated[int, Field(ge=3)] = 21
+    y_nodes: Annotated[int, Field(ge=3, le=1000)] = 21
     """Nodes from posterior to anterior."""
     z_nodes: Odd = 9
     """Nodes from interior to exterior, odd so that the middle one is the mid-surface."""

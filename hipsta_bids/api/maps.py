@@ -16,7 +16,7 @@ from hipsta_bids.derivatives.hemisphere import POSITION, STATE, read_sheet, shee
 from hipsta_bids.errors import InputError, NothingToDoError
 from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.geometry.sheet import is_left_handed, layer_depth
-from hipsta_bids.group.collect import settings_of
+from hipsta_bids.group.collect import grid_of
 from hipsta_bids.group.read import node_coordinates
 from hipsta_bids.inputs.labels import MARGIN, label_volume
 from hipsta_bids.io import files
@@ -27,7 +27,7 @@ from hipsta_bids.protocols import body_ends
 from hipsta_bids.protocols.load import for_region, load_protocol
 from hipsta_bids.protocols.protocol import Protocol
 from hipsta_bids.reports.results import SIDES, Hemisphere, SheetTable, find_results
-from hipsta_bids.settings import Settings, load_settings
+from hipsta_bids.settings import Settings, SheetSettings, load_settings
 from hipsta_bids.types import Flag, Float, HemisphereMaps, LabelVolume, Mesh, Sheet
 
 if TYPE_CHECKING:
@@ -158,7 +158,7 @@ class Measurement:
         variables |= {name: (grid, values, attributes(name)) for name, values in state.items()}
         variables |= _three_dimensional(layers)
         coordinates = {
-            **node_axes(self.settings.sheet.model_dump(), self.settings.body.region),
+            **node_axes(self.settings.sheet, self.settings.body.region),
             "layer": (["layer"], np.linspace(0, 1, nz), {"long_name": "interior to exterior"}),
             "ras": (["ras"], list(POSITION), {}),
         }
@@ -183,7 +183,7 @@ def attributes(name: str) -> dict[str, str]:
     return {"long_name": words, **({"units": unit} if unit else {})}
 
 
-def node_axes(grid: Mapping[str, Any], region: str) -> dict[str, Any]:
+def node_axes(grid: SheetSettings, region: str) -> dict[str, Any]:
     """Coordinates of the nodes, by the settings of the sheet."""
     both = zip("xy", node_coordinates(grid, region), strict=True)
     return {axis: ([axis], values, _NODES[axis]) for axis, values in both}
@@ -409,7 +409,7 @@ def _row(one: Hemisphere) -> dict[str, object]:
 def _lazy_dataset(root: Path, own: list[Hemisphere], table: pd.DataFrame) -> "xr.Dataset":
     from hipsta_bids.io.xarrays import make_dataset, read_later  # noqa: PLC0415  (optional)
 
-    axes_of_nodes = node_axes(settings_of(root)["sheet"], table["region"].iloc[0])
+    axes_of_nodes = node_axes(grid_of(root), table["region"].iloc[0])
     nx, ny = (len(values) for _, values, _ in axes_of_nodes.values())
     shape = nx, ny
     labels = [sorted(table[column].unique()) for column in ("participant_id", "session_id", "hemi")]

@@ -1,6 +1,7 @@
 """The command line: which command runs, what ends it early, and its exit code."""
 
 import contextlib
+import errno
 import os
 import signal
 import sys
@@ -16,6 +17,9 @@ from hipsta_bids.cli.group import LEVEL, is_group_level, run_group_level
 from hipsta_bids.cli.participant import LEVELS, build_parser, run_participant_level
 from hipsta_bids.errors import EXIT_MEANINGS, ExitCode, HipstaError, UsageError, did_you_mean
 
+#: What a path or a file system may refuse anywhere.
+_OF_PATHS = {errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EACCES, errno.EIO, errno.ESTALE}
+_LONGEST_PATH = 300  # characters shown
 _SIGNALED = 128  # shells report death by signal n as 128 + n
 
 #: Commands beside the BIDS App: name, its function in `commands`, arguments and meaning for the
@@ -74,10 +78,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         # The reader of the output is gone (as in `| head`); do not fail again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return _SIGNALED + signal.SIGPIPE
-    except Exception:  # noqa: BLE001  (any other exception is a bug: show it whole)
-        traceback.print_exc()
-        warn("hipsta-bids: internal error; please report it with the lines above")
-        return int(ExitCode.INTERNAL)
+    except Exception as error:  # noqa: BLE001  (any other exception is a bug: show it whole)
+        if isinstance(error, OSError) and error.filename and error.errno in _OF_PATHS:
+            path, code = str(error.filename)[:_LONGEST_PATH], ExitCode.BAD_DATA
+            text = f"{path}: {error.strerror}; check the path, and who may read it"
+        else:
+            text, code = "internal error; please report it with the lines above", ExitCode.INTERNAL
+            traceback.print_exc()
+        warn(f"hipsta-bids: {text}")
+        return int(code)
 
 
 @contextlib.contextmanager

@@ -68,9 +68,7 @@ _MEASURED_REGION = (
     "the sheet between the two end planes of the hippocampal body; head and tail are not measured"
     " and not part of any number"
 )
-
 _WHOLE_REGION = "the hippocampal sheet with head, and tail where it has subfields; experimental"
-
 _MILLIMETER_DIGITS = 4
 
 #: Names of surfaces in Workbench, where there is one that fits.
@@ -474,7 +472,12 @@ def _order(place: ResultPlace) -> tuple[str, ...]:
 
 def read_record(place: ResultPlace) -> dict[str, Any]:
     """Read the quality record."""
-    return files.read_json(place.path("qc"))
+    record = files.read_json(place.path("qc"))
+    for name in ("inputs", "edited"):
+        entries = record.get(name) or []
+        if not isinstance(entries, list) or not all(isinstance(one, dict) for one in entries):
+            raise InputError(f"{place.path('qc')}: bad {name}; {_REDO}", reason="bad-json")
+    return record
 
 
 def read_summary(place: ResultPlace) -> dict[str, float]:
@@ -507,16 +510,14 @@ def read_sheet(
             with path.open(encoding="utf-8") as file:
                 columns = file.readline().rstrip("\n").split("\t")
             numbers = [name for name in columns if name not in {*NODES, *STATE}]
+        types = dict.fromkeys(numbers, pa.float64()) | dict.fromkeys(words, pa.string())
         table = csv.read_csv(
             path,
             read_options=csv.ReadOptions(use_threads=False),
             parse_options=csv.ParseOptions(delimiter="\t"),
             convert_options=csv.ConvertOptions(
                 include_columns=["x", "y", *numbers, *words],
-                column_types={
-                    **dict.fromkeys(numbers, pa.float64()),
-                    **dict.fromkeys(words, pa.string()),
-                },
+                column_types=types,
                 null_values=[files.MISSING],
                 strings_can_be_null=True,
             ),
@@ -528,7 +529,7 @@ def read_sheet(
         raise InputError(
             f"{path}: not readable as a sheet ({first}); {_REDO}", reason="unreadable-table"
         ) from error
-    expected = np.divmod(np.arange(nx * ny), ny)
+    expected = np.divmod(np.arange(len(x)), max(ny, 1))
     if len(x) != nx * ny or (x != expected[0] + 1).any() or (y != expected[1] + 1).any():
         said = ", as the settings say" if shape else ""
         raise InputError(

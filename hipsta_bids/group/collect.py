@@ -18,11 +18,11 @@ from hipsta_bids.derivatives.hemisphere import (
 from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName
 from hipsta_bids.errors import InputError, NothingToDoError
 from hipsta_bids.group.covariates import relocate
-from hipsta_bids.group.data import PARTICIPANT, SESSION
+from hipsta_bids.group.data import PARTICIPANT, SESSION, checked_foreign
 from hipsta_bids.group.exclusions import SHOWN, Choices, QualityCondition, read_choices
 from hipsta_bids.io import files
-from hipsta_bids.protocols.toml import resolve, settings_hash
-from hipsta_bids.settings import Settings
+from hipsta_bids.protocols.toml import settings_hash
+from hipsta_bids.settings import Settings, SheetSettings
 from hipsta_bids.types import Status
 
 
@@ -103,9 +103,10 @@ def exclude_visits(table: pd.DataFrame, left_out: Mapping[str, tuple[str, str]])
 class Collection:
     """What was found."""
 
-    settings: Mapping[str, Any]
-    """Those of the participant level, resolved."""
+    grid: SheetSettings
+    """Of the sheets."""
     settings_hash: str
+    """Of all settings of the participant level."""
     records: tuple[SheetRecord, ...] = ()
     """Sorted by subject, session, hemisphere."""
     exclusions: tuple[Exclusion, ...] = ()
@@ -129,7 +130,7 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
     notes = _other_regions(everything, request)
     if may_lack and not found:
         return Collection(
-            settings=resolve(Settings()), settings_hash=settings_hash(Settings()), notes=notes
+            grid=SheetSettings(), settings_hash=settings_hash(Settings()), notes=notes
         )
     seg = _one_protocol(found, everything, request)
     found = [place for place in found if place.name.seg == seg]
@@ -154,7 +155,7 @@ def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collecti
     return Collection(
         records=tuple(kept),
         exclusions=tuple(left_out),
-        settings=settings_of(kept[0].place.root),
+        grid=grid_of(kept[0].place.root),
         settings_hash=digest,
         versions=tuple(sorted({record.version for record in kept})),
         ratings=choices.counts((place.name, _digest(place)) for place in found),
@@ -331,13 +332,17 @@ def _one_settings(kept: Sequence[SheetRecord]) -> str:
     return next(iter(counts))
 
 
-def settings_of(root: Path) -> Mapping[str, Any]:
-    """Read the settings that the results of an output dataset share."""
-    settings = files.read_json(root / DATASET_FILES["settings"]).get("settings")
-    if not isinstance(settings, Mapping):
+def grid_of(root: Path) -> SheetSettings:
+    """Read the grid of the sheets of an output dataset."""
+    path = root / DATASET_FILES["settings"]
+    settings = files.read_json(path).get("settings")
+    grid = settings.get("sheet") if isinstance(settings, Mapping) else None
+    if isinstance(grid, Mapping):  # other versions may have had more settings
+        grid = {name: grid[name] for name in SheetSettings.model_fields if name in grid}
+    try:
+        return checked_foreign(grid, SheetSettings)
+    except ValueError as error:
         raise InputError(
-            f"{root / DATASET_FILES['settings']}: holds no settings; run the participant level"
-            " again",
+            f"{path}: no settings of a sheet: {error}; run the participant level again",
             reason="bad-json",
-        )
-    return settings
+        ) from error

@@ -374,17 +374,22 @@ class SavedEffects(TomlTable):
         found = {}
         for hemi, measures in nested.items():
             for measure, entry in measures.items():
-                arrays = {name: np.array(entry.get(name, ()), dtype=np.float64) for name in ARRAYS}
-                points = len(arrays["mean"])
-                arrays["slopes"] = arrays["slopes"].reshape(-1, points)  # without columns: (0,)
-                for name, values in arrays.items():
+                try:
+                    own = {name: np.array(entry.get(name, ()), np.float64) for name in ARRAYS}
+                except (TypeError, ValueError) as error:
+                    raise ValueError(f"no numbers of {measure}, {hemi}: {error}") from error
+                points = len(own["mean"])
+                own["slopes"] = own["slopes"].reshape(-1, points)  # without columns: (0,)
+                for name, values in own.items():
                     counts = rows.get(name, {len(self.sites)})
                     known = {(points,)} if name in _FLAT else {(row, points) for row in counts}
                     if values.shape not in known:
                         raise ValueError(f"{name} of {measure}, {hemi}, has {values.shape}")
+                    if np.isinf(values).any():
+                        raise ValueError(f"{name} of {measure}, {hemi}, is infinite")
                     if name in {"sd", "scale"} and (values <= 0).any():
                         raise ValueError(f"{name} of {measure}, {hemi}, is not positive")
-                found[hemi, measure] = SiteEffects(**arrays)
+                found[hemi, measure] = SiteEffects(**own)
         return found
 
 

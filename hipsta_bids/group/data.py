@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from textwrap import shorten
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from hipsta_bids.io import files
 from hipsta_bids.protocols.toml import Table, first_mistake
@@ -23,6 +23,9 @@ Int = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 Key = tuple[str, str]
 """Hemisphere and measure."""
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Known = list[Number | None]
+"""Numbers in JSON; null where one is missing."""
 Nested = dict[str, dict[str, dict[str, list[Any]]]]
 """Arrays by hemisphere, measure and name as lists, for JSON."""
 
@@ -33,7 +36,8 @@ PARTICIPANT, SESSION = "participant_id", "session_id"
 #: More sheets of a side are kept in single precision, whose rounding is less than a hundredth of
 #: that of the tables, and registered whenever they are asked for, to save memory.
 MOST_KEPT = 10_000
-_SHEETS = 4000  # in memory at once, where each counts on its own
+#: Sheets in memory at once, where each counts on its own.
+SHEETS = 4000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,7 +102,7 @@ def sheets_of(maps: Mapping[str, Float], name: str, own: Bool | Int) -> Float:
 def parts_of_sheets(maps: Mapping[str, Float], name: str, own: Bool | Int) -> Iterator[Float]:
     """Take sheets of one map, some at a time; the order is kept."""
     rows = np.flatnonzero(own) if own.dtype == np.bool_ else own
-    return (sheets_of(maps, name, rows[part]) for part in blocks(len(rows), _SHEETS))
+    return (sheets_of(maps, name, rows[part]) for part in blocks(len(rows), SHEETS))
 
 
 def blocks(count: int, size: int) -> Iterator[slice]:
@@ -200,8 +204,13 @@ def read_foreign(path: Path, kind: type[Table], *, most: float) -> Table:
     """
     if path.is_file() and path.stat().st_size > most:
         raise ValueError(f"larger than {most / 1e6:g} MB")
+    return checked_foreign(files.read_json(path), kind)
+
+
+def checked_foreign(content: object, kind: type[Table]) -> Table:
+    """Check what a file of other people holds; ValueError of one line if something is wrong."""
     try:
-        return kind.model_validate(files.read_json(path))
+        return kind.model_validate(content)
     except RecursionError as error:
         raise ValueError("lists within lists without end") from error
     except ValidationError as error:

@@ -20,7 +20,7 @@ from pydantic import AfterValidator, Field
 from hipsta_bids import __version__
 from hipsta_bids.errors import InputError, ModelError
 from hipsta_bids.group.analysis import Analysis, templates_of
-from hipsta_bids.group.data import Cohort, Float, Int, read_foreign, rounded
+from hipsta_bids.group.data import Cohort, Float, Int, Known, Number, read_foreign, rounded
 from hipsta_bids.group.formula import typed
 from hipsta_bids.group.glm import FittedMaps, PointTest, fit_points, with_mean
 from hipsta_bids.group.grammar import closed_formula
@@ -54,9 +54,7 @@ def _printable(text: str) -> str:
 Text = Annotated[str, Field(max_length=500), AfterValidator(_printable)]
 Word = Annotated[str, Field(min_length=1, max_length=60, pattern=r"^[\w][\w .+-]*$")]
 Name = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^\w[\w .:+-]*$")]
-Number = Annotated[float, Field(allow_inf_nan=False)]
 Numbers = list[Number]
-Known = list[Number | None]
 
 
 class ModelSummary(TomlTable):

@@ -273,8 +273,7 @@ def draw_registration(cohort: Cohort, analysis: Analysis) -> "list[Figure]":
             axis.set_title(f"{SIDES[hemi]}, {when} registration")
             axis.set_ylabel(label)
         after.sharey(before)
-        nodes = side.registration.warps.shape[1]
-        moved = (side.registration.warps - np.linspace(0, 1, nodes)) * (nodes - 1)
+        moved = side.registration.shifts
         every = -(-len(moved) // _MOST_LINES)
         for color, own in zip(cycle(COLORS), members.values(), strict=False):
             shifts.plot(cohort.x, moved[own][::every].T, color=color, alpha=0.25, linewidth=0.4)

@@ -123,7 +123,10 @@ def parse_model(document: Mapping[str, Any]) -> ModelSpec:
     if not isinstance(model, Mapping) or str(model.get("Type", "glm")).lower() != "glm":
         raise _refusal("needs a Model of Type glm")
     dummy = node.get("DummyContrasts")
-    specs = tuple(_parse_contrast(one) for one in node.get("Contrasts", ()))
+    contrasts = node.get("Contrasts", [])
+    if not isinstance(contrasts, list):
+        raise _refusal("has Contrasts that are no list")
+    specs = tuple(_parse_contrast(one) for one in contrasts)
     names = [spec.name for spec in specs]
     if twice := sorted({one for one in names if names.count(one) > 1}):
         raise _refusal(f"has contrasts of the same name: {', '.join(twice)}")
@@ -198,13 +201,13 @@ def _parse_contrast(contrast: Mapping[str, Any]) -> ContrastSpec:
     test = str(contrast.get("Test", "t"))
     if test not in {"t", "F"}:
         raise _refusal(f"has contrast {name!r} with test {test!r}; use t or F")
-    conditions = tuple(str(one) for one in contrast.get("ConditionList", ()))
-    given = contrast.get("Weights", [1] * len(conditions))
-    rows = given if given and isinstance(given[0], list) else [given]
     try:
-        weights = tuple(tuple(_number(value) for value in row) for row in rows)
-    except (TypeError, ValueError):
-        raise _refusal(f"has contrast {name!r} with weights that are no numbers") from None
+        conditions = tuple(map(str, contrast.get("ConditionList", ())))
+        given = contrast.get("Weights", [1] * len(conditions))
+        rows = given if given and isinstance(given[0], list) else [given]
+        weights = tuple(tuple(map(_number, row)) for row in rows)
+    except (TypeError, ValueError, LookupError, ZeroDivisionError):
+        raise _refusal(f"has contrast {name!r} without lists of names and numbers") from None
     if not conditions or any(len(row) != len(conditions) for row in weights):
         raise _refusal(f"has contrast {name!r} with {len(conditions)} conditions and other weights")
     if test == "t" and len(weights) > 1:
@@ -214,10 +217,11 @@ def _parse_contrast(contrast: Mapping[str, Any]) -> ContrastSpec:
 
 def _number(value: object) -> float:
     """Weights may be fractions such as ``1/3``."""
-    if isinstance(value, str) and "/" in value:
-        above, below = value.split("/")
-        return float(above) / float(below)
-    return float(value)  # type: ignore[arg-type]
+    above, _, below = str(value).partition("/")
+    number = float(above) / float(below or 1)
+    if not np.isfinite(number):
+        raise ValueError(number)
+    return number
 
 
 def _formula(model: Mapping[str, Any]) -> str:
@@ -501,11 +505,7 @@ def _levels(
     check_spelling(counts, name)
     levels = sorted(counts, key=in_order)
     numbers = pd.to_numeric(pd.Series(levels), errors="coerce")
-    codes = [
-        level
-        for level, number in zip(levels, numbers, strict=True)
-        if number in settings.missing_codes
-    ]
+    codes = [one for one, n in zip(levels, numbers, strict=True) if n in settings.missing_codes]
     if codes and numbers.isna().any():
         raise ModelError(
             f"model: column {name!r} has {', '.join(f'{code} ({counts[code]})' for code in codes)}"

@@ -20,8 +20,8 @@ from scipy import special
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.combat import solve_weighted
-from hipsta_bids.group.data import Bool, Float, Int, Key, as_nested, read_foreign
-from hipsta_bids.group.exchange import Known, Number, Text
+from hipsta_bids.group.data import Bool, Float, Int, Key, Known, Number, as_nested, read_foreign
+from hipsta_bids.group.exchange import Text
 from hipsta_bids.group.glm import chunks
 from hipsta_bids.group.settings import NormSettings
 from hipsta_bids.io import files
@@ -352,6 +352,9 @@ def _likelihood(residuals: Float, shape: Float) -> tuple[Float, Float, Float]:
     return (terms * there).sum(axis=0), single.sum(axis=1).T, information
 
 
+_Age = Annotated[Number, Field(ge=-1000, le=1000)]  # charts have a row for each year
+
+
 class NormArrays(TomlTable):
     """The arrays of :class:`Norms`; null where nothing is known."""
 
@@ -389,7 +392,7 @@ class NormsFile(TomlTable):
     sex: Text
     site: Text
     """Columns."""
-    knots: Annotated[list[Number], Field(min_length=3, max_length=50)]
+    knots: Annotated[list[_Age], Field(min_length=3, max_length=50)]
     """Of the spline of age; the outer ones are the range."""
     sexes: list[Text]
     """Levels; empty where sex was not known."""

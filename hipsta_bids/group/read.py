@@ -122,7 +122,7 @@ class Measured:
 
 def read_sheets(
     records: Sequence[SheetRecord],
-    settings: Mapping[str, Any],
+    grid: SheetSettings,
     maps: Sequence[str],
     visits: Sequence[VisitKey] | None = None,
     *,
@@ -136,7 +136,7 @@ def read_sheets(
     if error_window:
         _check_errors(records, maps)
     region = records[0].place.name.region if records else "body"
-    x, y = node_coordinates(settings["sheet"], region)
+    x, y = node_coordinates(grid, region)
     shape = len(x), len(y)
     visits = visits_of(records) if visits is None else visits
     row_of = {visit: row for row, visit in enumerate(visits)}
@@ -253,12 +253,9 @@ def visits_of(records: Sequence[SheetRecord]) -> list[VisitKey]:
     return list(dict.fromkeys((r.place.name.subject, r.place.name.session) for r in records))
 
 
-def node_coordinates(grid: Mapping[str, Any], region: str) -> tuple[Float, Float]:
-    """Coordinates of the nodes along x and y, by the settings of the sheet.
-
-    They are without the rounding errors that would show in tables.
-    """
-    x, y, _ = sheet_levels(SheetSettings.model_construct(**grid), region)
+def node_coordinates(grid: SheetSettings, region: str) -> tuple[Float, Float]:
+    """Coordinates of the nodes along x and y, without rounding errors that tables would show."""
+    x, y, _ = sheet_levels(grid, region)
     return x.round(10) + 0.0, y.round(10) + 0.0
 
 

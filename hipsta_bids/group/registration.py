@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.data import Bool, Float, blocks
+from hipsta_bids.group.data import SHEETS, Bool, Float, blocks
 from hipsta_bids.group.formula import Contrast
 from hipsta_bids.group.inference import PermutationPart, permute
 from hipsta_bids.group.settings import MultiplicitySettings, RegistrationSettings
@@ -26,7 +26,6 @@ from hipsta_bids.group.warps import (
 
 #: Displacements that vary less, as a share of the largest variance, are those of fixed ends.
 _ROUNDING = 1e-12
-_SHEETS = 4000  # in memory at once
 
 
 @dataclass(frozen=True)
@@ -46,6 +45,16 @@ class Registration:
     """(subjects,) root mean square of warp minus identity, in grid nodes."""
     extreme: Bool
     """(subjects,) whose displacement is an outlier."""
+
+    @property
+    def shifts(self) -> Float:
+        """(subjects, nodes) registered minus original position, in nodes; positive is lateral."""
+        return _shifts(self.warps)
+
+
+def _shifts(warps: Float) -> Float:
+    nodes = warps.shape[1]
+    return np.asarray((warps - np.linspace(0.0, 1.0, nodes)) * (nodes - 1), dtype=np.float64)
 
 
 def _numbers(settings: RegistrationSettings) -> dict[str, Any]:
@@ -124,6 +133,12 @@ def register_to(
         raise ModelError(
             "registration: the template was made with another setting of"
             f" standardize, not {str(settings.standardize).lower()}; use the same",
+            reason="template-mismatch",
+        )
+    if (nodes := profiles.shape[1]) != len(template.center):
+        raise ModelError(
+            f"registration: the template has {len(template.center)} nodes along x, the sheets have"
+            f" {nodes}; use one of the same grid",
             reason="template-mismatch",
         )
     _check_profiles(profiles, settings)
@@ -211,8 +226,7 @@ def _finish(
     *,
     converged: bool,
 ) -> Registration:
-    nodes = profiles.shape[1]
-    displacement = np.sqrt(np.mean((warps - np.linspace(0, 1, nodes)) ** 2, axis=1)) * (nodes - 1)
+    displacement = np.sqrt(np.mean(_shifts(warps) ** 2, axis=1))
     spread = float(stats.median_abs_deviation(displacement, scale="normal"))
     limit = float(np.median(displacement)) + settings.extreme * spread
     return Registration(
@@ -246,7 +260,7 @@ class GroupShift:
 def mean_profiles(maps: Float, settings: RegistrationSettings) -> Float:
     """Profiles of curvature along x: means over y, with gaps filled linearly."""
     counts, profiles = np.empty(maps.shape[:2], dtype=np.int64), np.empty(maps.shape[:2])
-    for part in blocks(len(maps), _SHEETS):
+    for part in blocks(len(maps), SHEETS):
         present = np.isfinite(maps[part])
         counts[part] = present.sum(axis=2)
         sums = np.where(present, maps[part], 0.0).sum(axis=2, dtype=np.float64)
@@ -304,9 +318,7 @@ def shift_difference(
     seed : int
     """
     _, first, index = np.unique(people, return_index=True, return_inverse=True)
-    nodes = registration.warps.shape[1]
-    moved = (registration.warps - np.linspace(0, 1, nodes)) * (nodes - 1)
-    totals = [np.bincount(index, column) for column in moved.T]
+    totals = [np.bincount(index, column) for column in registration.shifts.T]
     own: Float = np.stack(totals, axis=1) / np.bincount(index)[:, None]
     names, member = np.unique(np.asarray(groups)[first], return_inverse=True)
     matrix = np.eye(len(names))[member]
@@ -335,12 +347,10 @@ def shift_by_group(
     registration: Registration, groups: Sequence[str] | NDArray[np.str_]
 ) -> Mapping[str, GroupShift]:
     """Mean displacement of each group along x (figure A5 of the paper)."""
-    names = np.asarray(groups)
-    nodes = registration.warps.shape[1]
-    shift = (registration.warps - np.linspace(0, 1, nodes)) * (nodes - 1)
+    names, shifts = np.asarray(groups), registration.shifts
     result = {}
     for name in np.unique(names):
-        part = shift[names == name]
-        spread = part.std(axis=0, ddof=1) if len(part) > 1 else np.full(nodes, np.nan)
+        part = shifts[names == name]
+        spread = part.std(axis=0, ddof=1) if len(part) > 1 else np.full(part.shape[1], np.nan)
         result[str(name)] = GroupShift(part.mean(axis=0), spread / np.sqrt(len(part)), len(part))
     return result

@@ -396,7 +396,7 @@ def _read_maps(
             reason="no-uncertainty",
         )
     measured = read_sheets(
-        found.records, found.settings, own, visits, rules=rules, error_window=error_window
+        found.records, found.grid, own, visits, rules=rules, error_window=error_window
     )
     return add_external(measured, files_of, visits)
 

@@ -5,16 +5,18 @@ components, estimated by expectation-maximization, and can be kept as JSON.
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
-from typing import Any
+from dataclasses import asdict, dataclass
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import AfterValidator, Field, model_validator
 from scipy.interpolate import BSpline
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.data import Float, Int, blocks
+from hipsta_bids.group.data import Float, Int, Number, blocks, checked_foreign
 from hipsta_bids.group.settings import RegistrationSettings
+from hipsta_bids.protocols.toml import Fraction, TomlTable
 
 #: Cubic B-splines on the unit interval, clamped at its ends.
 _DEGREE = 3
@@ -24,6 +26,15 @@ _DAMPING, _FACTOR, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 5.0, 1e-9, 1e9
 _BLOCK, _MAPS = 2000, 250
 #: Fields of a template that are arrays, and the one that JSON has no infinity for.
 _ARRAYS, _INFINITE = ("knots", "mean", "components", "center"), "warp_variance"
+
+
+def _rising(values: list[float]) -> list[float]:
+    if (np.diff(values) < 0).any():
+        raise ValueError("numbers that rise")
+    return values
+
+
+_Rising = Annotated[list[Fraction], Field(max_length=1000), AfterValidator(_rising)]
 
 
 def inner_knots(values: Float, splines: int) -> Float:
@@ -218,21 +229,45 @@ def templates_to_json(templates: Mapping[str, Template]) -> dict[str, Any]:
     return {"Description": "template of curvature profiles along x", "Hemispheres": entries}
 
 
+class _SavedTemplate(TomlTable):
+    """A template in a file, which may be other people's and hold anything."""
+
+    knots: _Rising
+    mean: list[Number]
+    components: list[list[Number]]
+    noise: Annotated[Number, Field(gt=0)]
+    scale: Annotated[Number, Field(gt=0)] | None
+    align: Literal["registr", "penalized"]
+    warp_variance: Annotated[Number, Field(gt=0)] | None
+    turns: Annotated[int, Field(ge=0, le=1000)]
+    center: Annotated[_Rising, Field(min_length=2)]
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        """Refuse numbers that do not fit each other."""
+        rows = {len(row) for row in self.components}
+        sizes = {len(self.knots) + _DEGREE + 1, len(self.mean), len(self.components)}
+        if len(sizes) > 1 or len(rows) != 1 or not 0 < rows.pop() <= len(self.mean):
+            raise ValueError("knots, mean and components do not fit each other")
+        if not np.allclose([self.center[0], 1 - self.center[-1]], 0):
+            raise ValueError("center does not go from 0 to 1")
+        return self
+
+
 def templates_from_json(content: Mapping[str, Any], where: str) -> dict[str, Template]:
     """Read what :func:`templates_to_json` wrote."""
     try:
         found = {}
         for hemi, entry in content["Hemispheres"].items():
-            values = {field.name: entry[field.name] for field in fields(Template)}
-            for name in _ARRAYS:
-                values[name] = np.array(values[name], dtype=np.float64)
+            values = dict(checked_foreign(entry, _SavedTemplate))
+            values |= {name: np.array(values[name], dtype=np.float64) for name in _ARRAYS}
             if values[_INFINITE] is None:
                 values[_INFINITE] = np.inf
             found[str(hemi)] = Template(**values)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, AttributeError, TypeError, ValueError) as error:
+        what = error if isinstance(error, ValueError) else "it has no Hemispheres"
         raise ModelError(
-            f"{where}: not a template ({type(error).__name__}: {error}); use the template.json of"
-            " another analysis",
+            f"{where}: not a template: {what}; use the template.json of another analysis",
             reason="template-file",
         ) from error
     return found

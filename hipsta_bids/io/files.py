@@ -30,6 +30,8 @@ LOGS = "logs"
 MISSING = "n/a"
 """A missing value in BIDS tables."""
 
+_HALF_LETTERS = r"\ud"  # with two digits more, a half of a letter beyond the first plane
+
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _FORBIDDEN = {errno.EROFS, errno.EACCES, errno.EPERM}
 _TEMPORARY = ".tmp"
@@ -220,7 +222,10 @@ def plain(value: Any) -> Any:  # noqa: ANN401  (JSON values have no narrower com
 def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON object."""
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        value = json.loads(text)
+        if _HALF_LETTERS in text.lower():  # can be read, but not be written
+            json.dumps(value, ensure_ascii=False).encode()
     except FileNotFoundError as error:
         raise InputError(
             f"{path}: no such file; check its name", reason="unreadable-json"

@@ -19,7 +19,7 @@ from xml.parsers.expat import ExpatError
 
 import nibabel as nib
 import numpy as np
-from nibabel.cifti2.cifti2 import Cifti2BrainModel, Cifti2Image
+from nibabel.cifti2.cifti2 import Cifti2BrainModel, Cifti2HeaderError, Cifti2Image
 from nibabel.cifti2.cifti2_axes import BrainModelAxis, ScalarAxis
 from nibabel.filebasedimages import ImageFileError
 from nibabel.gifti.gifti import (
@@ -51,9 +51,10 @@ _CIFTI_SIDES = {"LEFT": "L", "RIGHT": "R"}
 
 #: What nibabel raises on files that are damaged.
 _DAMAGE = (
-    *(OSError, ValueError, TypeError, LookupError, AttributeError),
-    *(ImageFileError, HeaderDataError, ExpatError, zlib.error, struct.error),
+    *(OSError, ValueError, TypeError, LookupError, AttributeError, AssertionError, MemoryError),
+    *(ImageFileError, HeaderDataError, Cifti2HeaderError, ExpatError, zlib.error, struct.error),
 )
+_MOST_VERTICES = 10_000_000  # of a surface that a file names but does not hold
 
 #: Names of the harmonic coordinates as point data of the tetrahedral mesh, in their order.
 COORDINATE_NAMES = ("medial_lateral", "posterior_anterior", "interior_exterior")
@@ -201,9 +202,11 @@ def _from_cifti(path: Path, hemi: str) -> PointMap:
             f"{path}: has no surface of hemisphere {hemi}; leave {{hemi}} out of the pattern",
             reason="unreadable-map",
         )
-    values = np.full(model.surface_number_of_vertices, np.nan)
     first, count = model.index_offset, model.index_count
     try:
+        if model.surface_number_of_vertices > _MOST_VERTICES:
+            raise ValueError(f"a surface of {model.surface_number_of_vertices} vertices")
+        values = np.full(model.surface_number_of_vertices, np.nan)
         values[list(model.vertex_indices)] = image.dataobj[0, first : first + count]
     except _DAMAGE as error:
         raise _unreadable(path, "CIFTI", error) from error

@@ -12,6 +12,7 @@ from typing import Any
 import nibabel as nib
 import numpy as np
 from nibabel.filebasedimages import ImageFileError
+from nibabel.freesurfer.mghformat import MGHError
 from nibabel.openers import ImageOpener
 from nibabel.spatialimages import HeaderDataError
 from nibabel.wrapstruct import WrapStructError
@@ -42,6 +43,7 @@ _READ_ERRORS = (
     MemoryError,
     zlib.error,
     ImageFileError,
+    MGHError,
     HeaderDataError,
     WrapStructError,
 )

@@ -127,8 +127,9 @@ class CohortPlan:
             problem = "a head has a shape of its own; leave out shift, cortex and kind"
         if self.head is not None and not 0 <= self.head <= _MOST_DIGITATIONS:
             problem = f"a head has 0 to {_MOST_DIGITATIONS} digitations, not {self.head}"
-        if not 1 <= self.n_subjects <= _MOST_SUBJECTS:
+        if not (1 <= self.n_subjects <= _MOST_SUBJECTS and self.seed >= 0):
             problem = f"{self.n_subjects} subjects; give 1 to {_MOST_SUBJECTS:,}"
+            problem += f", and a seed of 0 or more, not {self.seed}"
         if not self.groups or len(set(self.groups)) < len(self.groups):
             problem = "give at least one group, and groups with different names"
         if self.site and not (self.site.isascii() and self.site.isalnum()):

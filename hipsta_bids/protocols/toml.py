@@ -28,6 +28,7 @@ _LINE = 96
 _EXPECTED = {
     "bool_type": "true or false",
     "float_type": "a number",
+    "finite_number": "a finite number",
     "int_type": "a whole number",
     "string_type": "a text",
     "tuple_type": "a list",

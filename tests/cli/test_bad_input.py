@@ -224,6 +224,7 @@ def a_file(path):
         (Path.mkdir, (), (ExitCode.NOTHING_TO_DO, "no hippocampal segmentation")),
         (Path.mkdir, ("--ashs-dir", "nowhere"), (ExitCode.BAD_DATA, "nowhere: no such folder")),
         (Path.mkdir, ("-d", "a=nowhere"), (ExitCode.BAD_DATA, "nowhere: no such folder")),
+        (Path.mkdir, ("--protocol", "x" * 3000), (ExitCode.BAD_DATA, "File name too long")),
         (Path.mkdir, ("--scheme", "nowhere.toml"), (ExitCode.BAD_DATA, "nowhere.toml")),
         (Path.mkdir, ("--bids-filter-file", "nowhere.json"), (ExitCode.BAD_DATA, "nowhere.json")),
     ],

@@ -171,6 +171,14 @@ def other_grid(study):
     path.write_text("\n".join(lines[:-7]) + "\n")
 
 
+def no_list_of_files(study):
+    edit_record(place_of(study.out, "07", "R"), inputs=["rh.mgz"])
+
+
+def no_grid(study):
+    files.write_json(study.out / "desc-settings.json", {"settings": {"sheet": {"x_nodes": "41"}}})
+
+
 def no_sheet(study):
     place_of(study.out, "05", "L").path("sheet").unlink()
 
@@ -227,6 +235,8 @@ def no_values(study):
         (one_patient, [], 65, "AD (1)"),
         (mixed_settings, [], 65, "sub-07_hemi-R"),
         (other_grid, [], 65, "21 x 7 nodes"),
+        (no_list_of_files, [], 65, "hemi-R_seg-demo_desc-qc_metrics.json: bad inputs"),
+        (no_grid, [], 65, "x_nodes is '41', but has to be a whole number"),
         (no_sheet, [], 65, "sub-05_hemi-L"),
         (unfinished, [], 65, "sub-99_hemi-L"),
         (second_protocol, [], 65, "choose one by --seg"),

@@ -300,6 +300,11 @@ SPOILED = {
         65,
         "sd of thickness, L, is not positive",
     ),
+    "point": (
+        lambda c: c["Maps"]["L"]["thickness"]["mean"].__setitem__(3, {}),
+        65,
+        "no numbers of thickness, L",
+    ),
     "formula": (lambda c: c.update(Formula="__import__('os')"), 64, "is not allowed"),
     "level": (
         lambda c: c["Levels"].update(group=["CN", "MCI"]),

@@ -183,6 +183,35 @@ def test_frozen_template_gives_the_same_warps_to_a_part_of_the_subjects(results,
     np.testing.assert_allclose(part[nodes], whole.loc[part.index, nodes], atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("field", "value", "said"),
+    [
+        ("turns", 10**9, "turns is 1000000000, but has to be at most 1000"),  # it would never end
+        ("noise", -1, "noise is -1, but has to be above 0"),
+        ("noise", float("nan"), "noise is nan, but has to be a finite number"),
+        ("mean", [1.0], "knots, mean and components do not fit each other"),
+        ("knots", [0.9, 0.1, 0.2, 0.3], "numbers that rise"),
+        ("center", [0.2, 1.0], "center does not go from 0 to 1"),
+        ("center", [0.0, 1.0], "the template has 2 nodes along x"),
+        (None, [], "it has no Hemispheres"),
+    ],
+)
+def test_templates_of_others_may_hold_anything(  # noqa: PLR0917 -- cases
+    results, dataset, quick, tmp_path, capsys, field, value, said
+):
+    content = json.loads((results / "template.json").read_text())
+    if field is None:
+        content["Hemispheres"] = value
+    else:
+        content["Hemispheres"]["R"][field] = value
+    path = tmp_path / "template.json"
+    path.write_text(json.dumps(content))
+    where = [str(each) for each in dataset]
+    assert main([*where, "group", *quick, "--template", str(path), "--name", "bad"]) == 65
+    (line,) = capsys.readouterr().err.strip().splitlines()[-1:]
+    assert said in line
+
+
 def test_formula_contrast_reference_and_options(dataset, quick):
     data, out = dataset
     code = main(

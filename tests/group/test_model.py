@@ -229,7 +229,12 @@ def test_refuses_models_that_say_something_else():
         document(glm | {"Contrasts": [{"Name": "c", "ConditionList": ["age"], "Test": "z"}]}),
         document(glm | {"Contrasts": [{"Name": "c", "ConditionList": ["a"], "Weights": [1, 2]}]}),
         document(glm | {"Contrasts": [{"Name": "c", "ConditionList": ["a"], "Weights": ["x"]}]}),
+        document(glm | {"Contrasts": [{"Name": "c", "ConditionList": ["a"], "Weights": ["1/0"]}]}),
+        document(glm | {"Contrasts": [{"Name": "c", "ConditionList": ["a"], "Weights": [np.nan]}]}),
+        document(glm | {"Contrasts": [{"Name": "c", "ConditionList": ["a"], "Weights": 1.0}]}),
+        document(glm | {"Contrasts": [{"Name": "c", "ConditionList": 7}]}),
         document(glm | {"Contrasts": [{"Name": "c", "ConditionList": ["a"]}] * 2}),
+        document(glm | {"Contrasts": None}),
     ]
     for case in cases:
         with pytest.raises(ModelError) as caught:

@@ -11,6 +11,7 @@ from hippunfold_like import (
     write_map,
     write_surface,
 )
+from nibabel.cifti2 import BrainModelAxis, Cifti2Image, ScalarAxis
 
 from hipsta_bids.errors import InputError, NothingToDoError, UsageError
 from hipsta_bids.group.surfaces import find_maps, map_patterns, read_maps
@@ -142,6 +143,26 @@ def test_damaged_files_are_refused(tmp_path, content, words):
     path = tmp_path / "x.shape.gii"
     path.write_bytes(content)
     with pytest.raises(InputError, match=words):
+        read_map(path, "x", "L")
+
+
+def test_damaged_headers_are_refused(tmp_path):
+    def spoil(path, old, new):
+        content = path.read_bytes()
+        assert old in content
+        path.write_bytes(content.replace(old, new, 1))
+        return path
+
+    write_map(tmp_path / "x.shape.gii", np.zeros(12))
+    with pytest.raises(InputError, match="not readable as GIFTI"):
+        read_map(spoil(tmp_path / "x.shape.gii", b'Dim0="12"', b'Dim0="21"'), "x", "L")
+    path = tmp_path / "x.dscalar.nii"
+    write_cifti(path, {"L": np.ones(50)})
+    with pytest.raises(InputError, match="not readable as CIFTI"):
+        read_map(spoil(path, b"TYPE_SURFACE", b"TYPE_SURFACF"), "x", "L")
+    far = BrainModelAxis.from_surface(np.arange(50), 10**12, "CORTEX_LEFT")
+    Cifti2Image(np.ones((1, 50), np.float32), (ScalarAxis(["x"]), far)).to_filename(path)
+    with pytest.raises(InputError, match="a surface of 1000000000000 vertices"):
         read_map(path, "x", "L")
 
 

@@ -214,6 +214,13 @@ def truncated(path, size):
     path.write_bytes(path.read_bytes()[:size])
 
 
+def without_size(path):
+    save(path, make_labels())
+    content = bytearray(path.read_bytes())
+    content[4:8] = bytes(4)
+    path.write_bytes(content)
+
+
 def corrupt(path):
     save(path, make_labels())
     path.write_bytes(path.read_bytes()[:-40] + b"\xff" * 40)
@@ -239,6 +246,7 @@ BROKEN = {
     "truncated.nii": lambda path: truncated(path, 20000),
     "truncated.mgh": lambda path: truncated(path, 20000),
     "truncated.mgz": lambda path: truncated(path, 200),
+    "no-size.mgh": without_size,
     "corrupt.nii.gz": corrupt,
     "4d.nii": lambda path: save(path, np.stack([make_labels()] * 2, axis=-1)),
     "2d.nii": lambda path: save(path, make_labels()[20]),

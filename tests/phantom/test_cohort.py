@@ -175,6 +175,7 @@ def test_help_names_the_regions():
         (("--groups", "a", "a"), "groups with different names"),
         (("--n-subjects", "0"), "0 subjects; give 1 to 10,000"),
         (("--n-subjects", "1000000000"), "1000000000 subjects"),
+        (("--seed", "-1"), "a seed of 0 or more, not -1"),
         (("--layout", "hipsta"), "layout 'hipsta' is unknown"),
         (("--thinning", "5"), "leaves no wall"),
         (("--thinning", "nan"), "thinning depth nan is outside"),
