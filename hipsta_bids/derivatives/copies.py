@@ -46,7 +46,7 @@ def describe_copies(names: Sequence[HemisphereName]) -> str:
 
 
 def _list(names: Sequence[HemisphereName]) -> str:
-    titles = [f"{name.stem}_{name.protocol}" for name in names]
+    titles = [name.title for name in names]
     more = len(titles) - _SHOWN
     return ", ".join(titles[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
 

@@ -63,7 +63,7 @@ class Job:
     @property
     def title(self) -> str:
         """Name in messages."""
-        return f"{self.place.name.stem}_{self.place.name.protocol}"
+        return self.place.name.title
 
 
 @dataclass(frozen=True, kw_only=True)
