@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from hipsta_bids.cli.console import echo, echo_table, warn
-from hipsta_bids.cli.parser import Parser, adder, from_namespace
+from hipsta_bids.cli.parser import Parser, adder, from_namespace, given_settings
 from hipsta_bids.cli.participant import (
     LEVELS,
     add_segmentations,
@@ -373,10 +373,7 @@ def run_meta_analysis(arguments: Sequence[str]) -> ExitCode:
         "meta": {"random": options.random},
         "multiplicity": {"method": options.correction, "scope": options.fdr_scope},
     }
-    settings = load_group_settings(options.settings)
-    for section, values in chosen.items():
-        given = {name: value for name, value in values.items() if value is not None}
-        settings = settings.changed(**{section: given})
+    settings = load_group_settings(options.settings).changed(**given_settings(chosen))
     request = MetaOptions(
         sites=tuple(_site(text) for text in options.sites),
         out_dir=options.out,

@@ -14,6 +14,7 @@ from hipsta_bids.cli.parser import (
     bids_label,
     factor_level,
     from_namespace,
+    given_settings,
     named_pattern,
     positive_int,
 )
@@ -408,9 +409,7 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
         "power": {"power": parsed.power_level, "dropout": parsed.dropout},
     }
     settings = load_group_settings(parsed.settings)
-    for section, options in chosen.items():
-        given = {name: value for name, value in options.items() if value is not None}
-        settings = settings.changed(**{section: given})
+    settings = settings.changed(**given_settings(chosen))
     if parsed.harmonize:
         # The default model has what is harmonized instead of other names of the same.
         same = {"site", "scanner", "center"}

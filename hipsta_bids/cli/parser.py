@@ -193,6 +193,14 @@ def named_path(text: str) -> tuple[str, Path]:
     return folder.name, folder
 
 
+def given_settings(chosen: Mapping[str, Mapping[str, object]]) -> dict[str, dict[str, object]]:
+    """Keep the settings, by group, that an option has set."""
+    return {
+        group: {name: value for name, value in options.items() if value is not None}
+        for group, options in chosen.items()
+    }
+
+
 def positive_int(text: str) -> int:
     """Read a whole number above 0."""
     if not text.isascii() or not text.isdigit() or int(text) < 1:

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from hipsta_bids.derivatives.dataset import agrees, name_of, read_status, update_status
-from hipsta_bids.derivatives.names import HemisphereName, output_path
+from hipsta_bids.derivatives.hemisphere import ResultPlace, read_record
+from hipsta_bids.derivatives.names import HemisphereName
 from hipsta_bids.errors import InputError
 from hipsta_bids.io import files
 
@@ -46,7 +47,7 @@ def describe_copies(names: Sequence[HemisphereName]) -> str:
 
 
 def _list(names: Sequence[HemisphereName]) -> str:
-    titles = [f"{name.stem}_{name.protocol}" for name in names]
+    titles = [name.title for name in names]
     more = len(titles) - _SHOWN
     return ", ".join(titles[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
 
@@ -65,7 +66,7 @@ def mark_copies(root: Path) -> list[tuple[HemisphereName, ...]]:
     for row in read_status(root):
         name = name_of(row)
         with contextlib.suppress(InputError):
-            record = files.read_json(root / output_path(name, "qc"))
+            record = read_record(ResultPlace(root=root, name=name))
             if agrees(row, record):
                 rows[name], records[name] = row, record
     groups = same_labels(records.items())

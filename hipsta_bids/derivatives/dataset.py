@@ -84,7 +84,8 @@ def settle_settings(root: Path, settings: Settings) -> str:
         earlier = files.read_json(path)
         if earlier.get("hash") == digest:
             return digest
-        theirs = flatten(earlier.get("settings", {}))
+        before = earlier.get("settings")
+        theirs = flatten(before if isinstance(before, dict) else {})
         ours = flatten(resolved)
         changes = [
             f"{key} was {theirs.get(key, 'not there')}, now {ours.get(key, 'not there')}"
@@ -122,14 +123,16 @@ def write_description(root: Path, sources: Mapping[str, Path]) -> None:
     links = {name: link_to(folder, root) for name, folder in sources.items()}
     entries = [_source(folder, links[name]) for name, folder in sources.items()]
     known = {str(folder.resolve()) for folder in sources.values()}
-    kept = [e for e in earlier.get("SourceDatasets", []) if not _is_at(e.get("URL"), root, known)]
+    before = earlier.get("SourceDatasets")
+    before = [e for e in before if isinstance(e, dict)] if isinstance(before, list) else []
+    kept = [e for e in before if not _is_at(e.get("URL"), root, known)]
     description = {
         "Name": "Hippocampal thickness and curvature maps",
         "BIDSVersion": BIDS_VERSION,
         "DatasetType": "derivative",
         "GeneratedBy": [_maker()],
-        "SourceDatasets": sorted(kept + entries, key=lambda entry: str(entry["URL"])),
-        "DatasetLinks": dict(sorted((earlier.get("DatasetLinks", {}) | links).items())),
+        "SourceDatasets": sorted(kept + entries, key=lambda entry: str(entry.get("URL"))),
+        "DatasetLinks": dict(sorted(((read_links(root) if earlier else {}) | links).items())),
     }
     files.write_json(path, description)
     write_notes(root)

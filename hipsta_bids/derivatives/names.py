@@ -50,6 +50,11 @@ class HemisphereName(Hemisphere):
         return f"sub-{self.subject}{session}_hemi-{self.hemi}"
 
     @property
+    def title(self) -> str:
+        """Name in messages, logs and pages."""
+        return f"{self.stem}_{self.protocol}"
+
+    @property
     def folder(self) -> PurePosixPath:
         """Folder of the results, relative to the output dataset."""
         session = [f"ses-{self.session}"] if self.session else []

@@ -17,7 +17,7 @@ import numpy as np
 from hipsta_bids import __version__
 from hipsta_bids.derivatives import hemisphere
 from hipsta_bids.derivatives.dataset import source_address
-from hipsta_bids.derivatives.hemisphere import ResultPlace
+from hipsta_bids.derivatives.hemisphere import ResultPlace, read_record
 from hipsta_bids.errors import GeometryError, HipstaError, InputError, OutputError, ProtocolError
 from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.io import files
@@ -63,7 +63,7 @@ class Job:
     @property
     def title(self) -> str:
         """Name in messages."""
-        return f"{self.place.name.stem}_{self.place.name.protocol}"
+        return self.place.name.title
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +93,7 @@ class Outcome:
 def recorded(job: Job) -> Outcome | None:
     """Read how a hemisphere ended, if it did with the same settings and version."""
     try:
-        record = files.read_json(job.place.path("qc"))
+        record = read_record(job.place)
         status = Status(record.get("status", ""))
     except (InputError, ValueError):
         return None

@@ -106,21 +106,19 @@ class Cohort:
 
     def origin(self, hemisphere: Hemisphere) -> Origin | None:
         """Find the run that measured a hemisphere, if its log is there."""
-        return self.origins.get(title_of(hemisphere.place.name))
+        return self.origins.get(hemisphere.place.name.title)
 
     @cached_property
     def verdicts(self) -> Mapping[str, Verdict]:
         """What each hemisphere's page says first, by title of the hemisphere."""
         checks = Settings().checks.model_dump() | dict(self.settings.get("checks") or {})
-        return {
-            title_of(h.place.name): verdict_of(h, checks["flag_reach"]) for h in self.hemispheres
-        }
+        return {h.place.name.title: verdict_of(h, checks["flag_reach"]) for h in self.hemispheres}
 
     @cached_property
     def ranking(self) -> list[Hemisphere]:
         """All hemispheres, the most severe first; of equal ones by name."""
         severity = {title: verdict.severity for title, verdict in self.verdicts.items()}
-        return sorted(self.hemispheres, key=lambda h: -severity[title_of(h.place.name)])
+        return sorted(self.hemispheres, key=lambda h: -severity[h.place.name.title])
 
     def profiles(self, name: HemisphereName, column: str) -> Float:
         """(N, Nx) means over y of a map, of all hemispheres of the same kind."""
@@ -137,11 +135,6 @@ class Cohort:
 
 def _kind(name: HemisphereName) -> tuple[str, str, str]:
     return name.hemi, name.seg, name.region
-
-
-def title_of(name: HemisphereName) -> str:
-    """Name a hemisphere as the log does."""
-    return f"{name.stem}_{name.protocol}"
 
 
 def read_cohort(root: Path) -> Cohort:
@@ -213,7 +206,7 @@ def distances(cohort: Cohort, thickness: Mapping[str, Float]) -> dict[str, Dista
             continue
         table = np.array([[h.summary.get(m.name, np.nan) for m in MEASURES] for h in members])
         titles = [m.title for m in MEASURES]
-        maps = [thickness.get(title_of(h.place.name), np.empty((0, 0))) for h in members]
+        maps = [thickness.get(h.place.name.title, np.empty((0, 0))) for h in members]
         scores = np.abs(np.nan_to_num(robust_scores(table)))
         if maps[0].size and len({m.shape for m in maps}) == 1:
             # A map much like the median map is no outlier.
@@ -222,7 +215,7 @@ def distances(cohort: Cohort, thickness: Mapping[str, Float]) -> dict[str, Dista
             titles.append("Map of thickness")
         for row, hemisphere in zip(scores, members, strict=True):
             farthest = int(np.argmax(row))
-            found[title_of(hemisphere.place.name)] = Distance(
+            found[hemisphere.place.name.title] = Distance(
                 value=float(row[farthest]), measure=titles[farthest]
             )
     return found
@@ -242,7 +235,7 @@ def cohort_page(cohort: Cohort) -> str | None:
         return None
     maps = [read_maps(h) if h.measured else {} for h in hemispheres]
     thickness = {
-        title_of(h.place.name): found["thickness"]
+        h.place.name.title: found["thickness"]
         for h, found in zip(hemispheres, maps, strict=True)
         if found
     }
@@ -250,9 +243,8 @@ def cohort_page(cohort: Cohort) -> str | None:
     sprites, grid = make_sprites(maps)
     counts = Counter(str(h.status) for h in hemispheres)
     rows = [
-        _row(h, cohort.verdicts[title], apart.get(title), grid.tiles.get(n))
+        _row(h, cohort, apart.get(h.place.name.title), grid.tiles.get(n))
         for n, h in enumerate(hemispheres)
-        for title in [title_of(h.place.name)]
     ]
     return render(
         "cohort.html",
@@ -323,13 +315,14 @@ def _columns(hemispheres: Sequence[Hemisphere], *, compared: bool) -> list[Mappi
 
 
 def _row(
-    hemisphere: Hemisphere, verdict: Verdict, distance: Distance | None, tile: int | None
+    hemisphere: Hemisphere, cohort: Cohort, distance: Distance | None, tile: int | None
 ) -> dict[str, Any]:
     name, record = hemisphere.place.name, hemisphere.record
+    verdict = cohort.verdicts[name.title]
     numbers = {key: hemisphere.summary.get(key, np.nan) for key in _SHOWN}
     numbers |= {key: number(hemisphere.metrics, key) for key in _QUALITY}
     return {
-        "key": title_of(name),
+        "key": name.title,
         "page": participant_report(name.subject, name.session),
         "hash": record.get("input_hash") or "",
         "participant": f"sub-{name.subject}",

@@ -38,9 +38,6 @@ from hipsta_bids.reports.slices import point_panels, section_panels, slice_panel
 from hipsta_bids.reports.verdict import RATINGS
 from hipsta_bids.types import Float, Status
 
-# Data of the three-dimensional view of a page.
-
-
 #: Finer masks of failed hemispheres are thinned to about this edge before they are drawn, mm.
 _EDGE = 0.6
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from hipsta_bids.derivatives.dataset import container_of_process
 from hipsta_bids.derivatives.names import output_name, participant_report
-from hipsta_bids.reports.cohort import Cohort, title_of
+from hipsta_bids.reports.cohort import Cohort
 from hipsta_bids.reports.results import SURFACES, Hemisphere, Views, input_path
 from hipsta_bids.reports.verdict import verdict_of
 
@@ -22,8 +22,8 @@ _NIFTI = (".nii", ".nii.gz")
 
 def card_of(hemisphere: Hemisphere, cohort: Cohort, views: Views | None) -> Mapping[str, Any]:
     """Collect what the page says first about a hemisphere, and what leads on from there."""
-    key, record = title_of(hemisphere.place.name), hemisphere.record
-    order = [title_of(other.place.name) for other in cohort.ranking]
+    key, record = hemisphere.place.name.title, hemisphere.record
+    order = [other.place.name.title for other in cohort.ranking]
     n = order.index(key) if key in order else None
     before = cohort.ranking[n - 1] if n else None
     after = cohort.ranking[n + 1] if n is not None and n + 1 < len(order) else None
@@ -51,7 +51,7 @@ def _link(hemisphere: Hemisphere | None, cohort: Cohort) -> tuple[str, str] | No
     if hemisphere is None:
         return None
     name = hemisphere.place.name
-    title = title_of(name)
+    title = name.title
     verdict = cohort.verdicts[title].title.lower()
     words = f"sub-{name.subject}{f' ses-{name.session}' if name.session else ''} {hemisphere.side}"
     if len({other.place.name.protocol for other in cohort.hemispheres}) > 1:
@@ -111,7 +111,7 @@ def correction_of(hemispheres: Sequence[Hemisphere]) -> Mapping[str, Any]:
         mask = hemisphere.place.path("body_mask")
         by_mask = mask.exists() and name.region == "body"  # of other regions labels are corrected
         path = input_path(hemisphere)
-        suffix = f"{name.stem}_{name.protocol}_desc-edited"
+        suffix = f"{name.title}_desc-edited"
         choices.append(
             {
                 "side": hemisphere.side,

@@ -11,6 +11,7 @@ from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.dataset import COLUMNS, read_status, update_status, write_sidecar
 from hipsta_bids.derivatives.names import DATASET_FILES
 from hipsta_bids.errors import InputError, SettingsError, UsageError
+from hipsta_bids.io import files
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.settings import BodySettings, Settings
 
@@ -52,6 +53,23 @@ def test_description_keeps_earlier_sources_and_needs_no_container(tmp_path, monk
     urls = [entry["URL"] for entry in description(tmp_path / "out")["SourceDatasets"]]
     assert urls == ["../a", "../b"]
     assert "Container" not in description(tmp_path / "out")["GeneratedBy"][0]
+
+
+@pytest.mark.parametrize("damage", [None, "x", 7, ["x", {"URL": 3}, {}], {"a": []}])
+def test_a_damaged_description_is_written_anew(tmp_path, damage):
+    dataset.write_description(tmp_path, {"a": tmp_path / "a"})
+    content = description(tmp_path) | {"SourceDatasets": damage, "DatasetLinks": damage}
+    files.write_json(tmp_path / "dataset_description.json", content)
+    dataset.write_description(tmp_path, {"b": tmp_path / "b"})
+    assert {"URL": "b"} in description(tmp_path)["SourceDatasets"]
+    assert description(tmp_path)["DatasetLinks"]["b"] == "b"
+
+
+@pytest.mark.parametrize("damage", [None, "x", [1]])
+def test_damaged_settings_are_other_settings(tmp_path, damage):
+    files.write_json(tmp_path / "desc-settings.json", {"hash": "0", "settings": damage})
+    with pytest.raises(SettingsError, match="holds results with other settings"):
+        dataset.settle_settings(tmp_path, Settings())
 
 
 def test_apptainer_and_the_address_in_the_package_are_named(tmp_path, monkeypatch):

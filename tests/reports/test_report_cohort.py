@@ -14,7 +14,6 @@ from hipsta_bids.reports.cohort import (
     distances,
     read_cohort,
     robust_scores,
-    title_of,
 )
 from hipsta_bids.reports.results import Hemisphere, find_results
 
@@ -67,7 +66,7 @@ def test_a_map_that_differs_is_found_where_all_numbers_agree(tmp_path):
     maps = {}
     for n in range(SMALLEST_COMPARED):
         place = make(tmp_path, f"{n:02d}", rng.normal(1.0, 0.01, len(MEASURES)))
-        maps[title_of(place.name)] = rng.normal(2.0, 0.1, (5, 4))
+        maps[place.name.title] = rng.normal(2.0, 0.1, (5, 4))
     maps["sub-04_hemi-L_seg-P"][:2] += 1.0
     found = distances(read_cohort(tmp_path), maps)
     assert found["sub-04_hemi-L_seg-P"].measure == "Map of thickness"
