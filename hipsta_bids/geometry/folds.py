@@ -2,6 +2,7 @@
 
 Where the cleft between two banks is lost, the wall there has the same face on both sides. Banks of
 low folds hardly face each other: what is left of such a fold is a narrow ridge of a thick wall.
+Two walls are thick beside any wall of the head; a thin neighborhood alone makes no ridge.
 """
 
 from dataclasses import dataclass
@@ -20,6 +21,9 @@ LINK = 1.0
 RIDGE, SLOPE, AROUND = 1.35, 1.25, 4.0
 """A ridge is thicker than this multiple of the median up to this distance, mm, and its slopes than
 the second."""
+TWO_WALLS = 1.5
+"""A ridge is thicker than this multiple of the median of all columns among which it is looked for.
+Without it, walls that vary smoothly have ridges where what lies round them is thin."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -71,6 +75,9 @@ def find_ridges(sheet: Sheet, among: Bool) -> list[tuple[Bool, float]]:
     ratio = np.zeros(thickness.shape)
     ratio[sheet.valid] = known / [np.median(known[own]) for own in near]
     places, count = ndimage.label(among & (ratio > SLOPE))
-    share = np.where(ratio > RIDGE, column_area(sheet), 0.0)
+    if not count:
+        return []
+    thick = thickness > TWO_WALLS * np.median(thickness[sheet.valid & among])
+    share = np.where(thick & (ratio > RIDGE), column_area(sheet), 0.0)
     areas = ndimage.sum_labels(share, places, np.arange(count) + 1)
     return [(places == number, float(area)) for number, area in enumerate(areas, start=1)]

@@ -197,6 +197,8 @@ def _choose(files: list[_File], visit: VisitFolders, hemi: str, source: Source) 
             reason="template-space",
         )
     order = "the subject's own space, the finest grid and the shortest name come first"
+    named, own = entities(chosen.path.name), {"sub": visit.subject, "ses": visit.session}
+    others = [f"{k}-{named[k]}" for k, v in own.items() if v and named.get(k, v) != v]
     return HemisphereInput(
         subject=visit.subject,
         session=visit.session,
@@ -209,6 +211,7 @@ def _choose(files: list[_File], visit: VisitFolders, hemi: str, source: Source) 
         why=f"labels named by {chosen.origin}" if chosen.protocol else "labels not described",
         passed_over=tuple((file.path.name, order) for file in files[1:]),
         problem=problem,
+        notes=(f"the file's name says {'_'.join(others)}",) if others else (),
     )
 
 

@@ -29,6 +29,9 @@ _SAME_PLACE = 0.5
 #: little less than a half, so that rounding does not decide where borders coincide.
 _HALF = 0.5 - 1e-6
 
+#: Labels may be off a whole number by this much: scaled integers and floats are rounded.
+_ROUNDING = 1e-3
+
 #: How many values an error message lists.
 _SHOWN = 5
 
@@ -205,13 +208,12 @@ def _empty(path: Path) -> InputError:
 
 
 def _integers(data: NDArray[Any], path: Path) -> NDArray[np.integer[Any]]:
-    """Convert labels to integers, if they are whole numbers."""
+    """Convert labels to integers, if they are whole numbers but for rounding."""
     if np.issubdtype(data.dtype, np.integer):
         return data
     whole = np.issubdtype(data.dtype, np.floating) and bool(
-        (
-            np.isfinite(data) & (data == np.rint(data)) & (np.abs(data) < np.iinfo(np.int32).max)
-        ).all()
+        (np.isfinite(data) & (np.abs(data) < np.iinfo(np.int32).max)).all()
+        and (np.abs(data - np.rint(data)) < _ROUNDING).all()
     )
     if not whole:
         raise InputError(
@@ -219,7 +221,8 @@ def _integers(data: NDArray[Any], path: Path) -> NDArray[np.integer[Any]]:
             "Use nearest neighbor",
             reason="non-integer-labels",
         )
-    return data.astype(np.int32)
+    rounded: NDArray[np.integer[Any]] = np.rint(data).astype(np.int32)
+    return rounded
 
 
 def _one_hemisphere(

@@ -360,6 +360,13 @@ def _inner_folders(
                 waiting.append((match["session"], path / name, True))
             elif _INNER.fullmatch(name):
                 waiting.append((session, path / name, False))
+            elif match is None and name.startswith("ses-"):
+                reason = "its name is not ses-LABEL, of letters and digits"
+                ignored.append(
+                    Ignored(
+                        path=path / name, reason=reason, subject=folder.subject, inside=folder.path
+                    )
+                )
 
 
 def _try_to_list(

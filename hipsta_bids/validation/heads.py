@@ -39,8 +39,8 @@ _TOUCHING = (
     replace(_THICK, bank=0.5, interior=0.0),
 )
 _UNEVEN = tuple(
-    replace(_FOLDS, uneven=uneven, digitations=count)
-    for uneven in (0.3, -0.3, 0.4)
+    replace(_FOLDS, uneven=uneven, digitations=count, interior=width, exterior=width)
+    for uneven, width in ((0.3, 0.8), (-0.3, 1.2), (0.4, 0.8))
     for count in (0, 2)
 )
 

@@ -141,6 +141,16 @@ def test_names_that_are_not_bids_are_listed(tmp_path):
     )
 
 
+@pytest.mark.parametrize("name", ["ses-", "ses-\u00fc", "ses-1_a"])
+def test_sessions_of_other_names_are_named(tmp_path, name):
+    fs = freesurfer(tmp_path / "derivatives" / "fs", "sub-01", f"sub-01/{name}")
+    found = search(tmp_path)
+    assert subjects(found) == ["01"]
+    place = f"sub-01/{name}"
+    assert reasons(found, fs) == {place: "its name is not ses-LABEL, of letters and digits"}
+    assert place in found.notes[0]
+
+
 def test_what_was_not_asked_for_is_not_listed(tmp_path):
     fs = freesurfer(tmp_path / "derivatives" / "fs", "sub-01", "sub-AD_05", "sub-AD_06")
     assert search(tmp_path, participant_labels=("01",)).ignored == ()

@@ -91,10 +91,11 @@ def test_types_and_whole_floats_give_the_same_labels(tmp_path, dtype):
     np.testing.assert_array_equal(volume.tissue, expected.tissue)
 
 
-def test_scaled_integers_are_read_by_their_scaled_values(tmp_path):
-    image = nib.Nifti1Image(make_labels() * 2, AFFINE)
-    image.header.set_slope_inter(0.5, 0)
-    raw = (make_labels() * 2).tobytes(order="F")
+@pytest.mark.parametrize("times", [2, 10])  # a tenth is rounded in the header
+def test_scaled_integers_are_read_by_their_scaled_values(tmp_path, times):
+    image = nib.Nifti1Image(make_labels() * times, AFFINE)
+    image.header.set_slope_inter(1 / times, 0)
+    raw = (make_labels() * times).tobytes(order="F")
     path = tmp_path / "a.nii"
     with path.open("wb") as stream:
         image.header.set_data_offset(352)

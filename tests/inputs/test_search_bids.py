@@ -159,6 +159,15 @@ def test_files_of_other_structures_are_left_out(tmp_path):
     assert item.passed_over == ()
 
 
+def test_a_name_of_somebody_else_is_noted(tmp_path):
+    dataset = lab(tmp_path, "hemi-L_dseg.nii.gz")
+    touch(dataset / "sub-02/ses-1/anat", "sub-03_ses-2_hemi-L_dseg.nii.gz")
+    own, other = find(tmp_path)
+    assert own.notes == ()
+    assert (other.subject, other.session) == ("02", "1")
+    assert other.notes == ("the file's name says sub-03_ses-2",)
+
+
 def test_the_subjects_own_space_comes_first(tmp_path):
     lab(tmp_path, *(f"hemi-L_{s}dseg.nii.gz" for s in ("", "space-T1w_", "space-MNI152_")))
     item = only(tmp_path)

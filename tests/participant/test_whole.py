@@ -204,6 +204,16 @@ def test_a_ridge_is_narrow() -> None:
     assert find_ridges(sheet, np.arange(30) > 14) == []
 
 
+@pytest.mark.parametrize(("thickness", "area"), [(1.4, 0.0), (1.6, 19 * 3)])
+def test_a_ridge_is_as_thick_as_two_walls(thickness: float, area: float) -> None:
+    """Half of that lies round it, but most of the head is 1 mm thick."""
+    x, y, z = np.meshgrid(np.arange(20.0), np.arange(30.0), [-0.5, 0.0, 0.5], indexing="ij")
+    wall = np.where(np.abs(y - 24) < 2, thickness, np.where(y > 18, 0.5, 1.0))
+    sheet = Sheet(points=np.stack([x, y, wall * z], axis=-1), valid=np.ones(x.shape[:2], bool))
+    areas = [each for columns, each in find_ridges(sheet, np.arange(30) >= 0) if columns[9, 24]]
+    assert areas == [pytest.approx(area)]
+
+
 def cube(count: int) -> TetMesh:
     """The unit cube in tetrahedra: Kuhn's six per cell."""
     grid = np.stack(np.meshgrid(*[np.arange(count + 1)] * 3, indexing="ij"), -1).reshape(-1, 3)
