@@ -367,9 +367,14 @@ def test_sheets_that_no_hippocampus_has_are_left_out_by_participant_and_measure(
         "04": ("thickness", "1.8", "thickness is 1.8 mm at all points"),
         "05": ("curvature", "1e6", "curvature reaches 1e+06 1/mm"),
         "06": ("curvature", "0", "curvature is 0 1/mm at all points"),
+        "07": ("thickness_mean", "-2", "thickness_mean reaches -2 mm"),
+        "08": ("volume", "0", "volume reaches 0 mm^3"),
+        "09": ("volume", "1e9", "volume reaches 1e+09 mm^3"),
+        "10": ("volume", "inf", "volume reaches inf mm^3"),
     }
     for subject, (column, value, _) in wrong.items():
-        path = place_of(study.out, subject, "L").path("sheet")
+        kind = "sheet" if column in {"thickness", "curvature"} else "summary"
+        path = place_of(study.out, subject, "L").path(kind)
         rows = files.read_tsv(path)
         files.write_tsv(path, list(rows[0]), [(row | {column: value}).values() for row in rows])
     assert main([str(study.data), str(study.out), "group", *FAST, "--name", "few"]) == 0
@@ -398,7 +403,7 @@ def test_damaged_hemispheres_are_left_out_by_name_and_other_versions_told(study,
     edit_record(place_of(study.out, "07", "R"), version="0.0.9")
     assert main([str(study.data), str(study.out), "group", *FAST]) == 0
     said = capsys.readouterr()
-    assert "29 participants in the model, 3 left out" in said.out
+    assert "29 participants in the model, 3 hemispheres or visits left out" in said.out
     assert "sub-05, hemisphere L, is left out: thickness reaches 1e+30 mm" in said.out
     assert "sub-06, hemisphere R, is left out: 100% of the curvature profile" in said.out
     assert said.err.startswith("warning: hemispheres were measured by several versions, 0.0.9 (1),")
