@@ -450,3 +450,25 @@ def test_sidecar_makes_factors_and_names_their_levels(study, capsys):
     assert "as a line" not in capsys.readouterr().out
     (design,) = study.out.glob("group/*/design.tsv")
     assert list(files.read_tsv(design)[0])[-2:] == ["stage[T.none]", "stage[T.some]"]
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_smaller_groups_that_vary_more_are_told_unless_the_model_allows_for_it(study, capsys):
+    said = []
+    write_participants(study.data, read_participants(study.data)[:24])
+    for factor, settings in ((1, ""), (3, ""), (1, '[glm]\ncovariance = "hc3"\n')):
+        for i in range(17, 25):
+            path = place_of(study.out, f"{i:02d}", "L").path("sheet")
+            rows = files.read_tsv(path)
+            for row in rows:
+                wall = 1.6 + factor * (float(row["thickness"]) - 1.6)
+                row["thickness"] = f"{max(0.1, wall):.4f}"
+            files.write_tsv(path, list(rows[0]), [row.values() for row in rows])
+        (study.out / "own.toml").write_text(settings)
+        options = [*FAST, "--settings", str(study.out / "own.toml"), "--name", "spread"]
+        assert main([str(study.data), str(study.out), "group", *options]) == 0
+        said.append(capsys.readouterr().out)
+    assert ["the smaller group varies more" in one for one in said] == [False, True, False]
+    assert "CN (16) and AD (8), thickness, L: the smaller group" in said[1]
+    methods = (study.out / "group" / "spread" / "methods.md").read_text()
+    assert "intracranial volume; their" not in methods  # none is known
