@@ -240,6 +240,7 @@ def no_values(study):
         (None, ["--contrast", "age-sex[M]", "age:sex[M]"], 65, "whose files would have one name"),
         (None, ["--reference", "group=XX"], 65, "XX"),
         (None, ["--formula", "group + age + I(2*age)"], 65, "combination"),
+        (None, ["--formula", "group + log(age - 80)"], 65, "no value for rows sub-01"),
         (None, ["--base", "volum"], 65, "did you mean volume?"),
         (None, ["--exclude-qc", "filled_fracton > 1"], 64, "did you mean filled_fraction?"),
         (None, ["--exclude-qc", "rule > 1"], 64, "cannot combine"),
