@@ -350,7 +350,8 @@ def _run(parsed: argparse.Namespace, arguments: Sequence[str]) -> ExitCode:
         warn(f"warning: {warning}")
     for note in result.notes:
         echo(f"note: {note}")
-    echo(f"{result.n_participants} participants in the model, {result.n_excluded} left out")
+    left_out = f"{result.n_excluded} hemispheres or visits left out"
+    echo(f"{result.n_participants} participants in the model, {left_out}")
     echo(f"results: {result.folder}")
     echo(f"what was done and found: {result.page or result.folder / 'methods.md'}")
     if result.problem is not None:

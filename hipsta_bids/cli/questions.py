@@ -1,6 +1,7 @@
 """Questions of the group level other than comparisons: their options, and which go together."""
 
 import argparse
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -114,6 +115,17 @@ def run_comparison(
 
     _refuse(parsed, (*_POWER_ONLY, "among"), "without --retest or --power")
     _refuse(parsed, ("controls",), "without --norms")
+    how = settings.multiplicity
+    if not settings.joint.measures and not how.method.startswith("permutation"):
+        _refuse(
+            parsed, ("permutations", "blocks"), "without permutations, by --correction or --joint"
+        )
+    elif how.permutations * how.alpha < 1:
+        raise UsageError(
+            f"{how.permutations} permutations cannot give p of {how.alpha:g}; at least"
+            f" {math.ceil(1 / how.alpha)} are needed, and thousands are better",
+            reason="usage",
+        )
     return run_group(options, settings)
 
 

@@ -135,6 +135,8 @@ class Column:
     """Publication that defines it."""
     digits: int = field(default=4, kw_only=True)
     """Number of decimals in tables."""
+    possible: tuple[float, float] = field(default=(0.0, np.inf), kw_only=True)
+    """Values of any hippocampus lie between these, both excluded."""
 
 
 @dataclass(frozen=True)
@@ -147,8 +149,6 @@ class MapMeasure(Column):
     """Suffix of the GIFTI file's name."""
     desc: str | None = field(default=None, kw_only=True)
     """Description in the GIFTI file's name."""
-    possible: tuple[float, float] = field(default=(0.0, np.inf), kw_only=True)
-    """Values of any hippocampus lie between these, both excluded."""
 
 
 @dataclass(frozen=True)
@@ -177,6 +177,10 @@ class SubfieldMeasure(Column):
 
 #: Curvature that no sheet reaches, 1/mm: its radius would be a hundredth of a millimeter.
 _SHARPEST = 100.0
+#: Thickness of a sheet, mm, and sizes of subfields, which may be too small to measure.
+_THICKNESS, _OR_NONE = (0.0, 10.0), (-1e-9, np.inf)
+#: Lengths, areas and volumes that no hippocampus reaches, by unit.
+_MOST = {"mm": 1e3, "mm^2": 1e5, "mm^3": 1e6}
 
 
 def _curvature(surface: str, ending: str, level: int | None) -> MapMeasure:
@@ -223,7 +227,7 @@ MAPS: tuple[MapMeasure, ...] = (
         "length of the line from the interior to the exterior wall",
         lambda m: m.thickness,
         suffix="thickness",
-        possible=(0.0, 10.0),
+        possible=_THICKNESS,
     ),
     *(_curvature(*surface) for surface in _SURFACES),
     *(_gaussian_curvature(*surface) for surface in _SURFACES),
@@ -242,24 +246,6 @@ MAPS: tuple[MapMeasure, ...] = (
         desc="extentY",
     ),
 )
-
-
-def why_impossible(name: str, values: Float) -> str | None:
-    """Say what no hippocampus has in a map of some measure, any shape; maps of others may be all.
-
-    A measure has the same value at every point only if it was not measured.
-    """
-    measure = next((row for row in MAPS if row.name == name), None)
-    known = values[np.isfinite(values)]
-    if measure is None or not known.size:
-        return None
-    least, most = float(known.min()), float(known.max())
-    worst = least if least <= measure.possible[0] else most
-    if least <= measure.possible[0] or most >= measure.possible[1]:
-        return f"{name} reaches {worst:.3g} {measure.unit}, which no sheet does"
-    if least == most and known.size > 1:
-        return f"{name} is {least:.3g} {measure.unit} at all points"
-    return None
 
 
 SECTIONS: tuple[SectionMeasure, ...] = (
@@ -317,6 +303,7 @@ def _mean(row: Column, how: str, compute: Callable[[Measured], float]) -> Summar
         compute,
         source=row.source,
         digits=row.digits,
+        possible=row.possible,
     )
 
 
@@ -340,12 +327,14 @@ SUMMARY: tuple[SummaryMeasure, ...] = (
         "mm",
         "mean thickness over the area of the sheet's mid-surface",
         lambda m: m.mean(m.thickness, m.sheet.valid),
+        possible=_THICKNESS,
     ),
     SummaryMeasure(
         "thickness_nodes",
         "mm",
         "mean thickness over the nodes of the sheet",
         lambda m: float(m.thickness[m.sheet.valid].mean()),
+        possible=_THICKNESS,
     ),
     SummaryMeasure(
         "extent_x",
@@ -365,6 +354,7 @@ SUMMARY: tuple[SummaryMeasure, ...] = (
         "mean length of the lines from the interior to the exterior wall, evenly over"
         " the mid-surface",
         lambda m: float(np.average(m.thickness, weights=m.area)),
+        possible=_THICKNESS,
     ),
     SummaryMeasure(
         "volume", "mm^3", "volume of the sheet between the end planes", lambda m: m.volume
@@ -460,3 +450,23 @@ def average_profiles(maps: Mapping[str, Float], sheet: Sheet) -> dict[str, dict[
             for name, values in maps.items()
         }
     return profiles
+
+
+def why_impossible(name: str, values: Float) -> str | None:
+    """Say what no hippocampus has in a map of some measure, any shape, or a summary measure.
+
+    Those of others may be all. A map has the same value at every point only if it was not measured.
+    """
+    measure = next((row for row in (*MAPS, *SUMMARY) if row.name == name), None)
+    measure = measure or next((r for r in PER_SUBFIELD if name.startswith(f"{r.name}_")), None)
+    known = values[~np.isnan(values)]
+    if measure is None or not known.size:
+        return None
+    least, most = float(known.min()), float(known.max())
+    limit = min(measure.possible[1], _MOST.get(measure.unit, np.inf))
+    worst = least if least <= measure.possible[0] else most
+    if least <= measure.possible[0] or most >= limit:
+        return f"{name} reaches {worst:.3g} {measure.unit}, which no sheet does"
+    if least == most and known.size > 1:
+        return f"{name} is {least:.3g} {measure.unit} at all points"
+    return None

@@ -346,9 +346,11 @@ def compare_pairs(
     for control, case in combinations(order, 2):
         both = (groups == control) | (groups == case)
         used = both & complete
-        matrix = np.column_stack([np.ones(used.sum()), base[used]])
+        # Without their means, columns like years of birth are not nearly the constant.
+        centered = [values[used] - values[used].mean(axis=0) for values in (base, added)]
+        matrix = np.column_stack([np.ones(used.sum()), centered[0]])
         try:
-            found = compare_models(matrix, added[used], groups[used] == case, settings)
+            found = compare_models(matrix, centered[1], groups[used] == case, settings)
         except ModelError as error:
             raise ModelError(f"{control} against {case}: {error}", reason=error.reason) from error
         results.append(

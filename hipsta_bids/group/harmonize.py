@@ -40,6 +40,9 @@ from hipsta_bids.group.registration import Registration
 from hipsta_bids.group.settings import DesignSettings, GroupSettings
 from hipsta_bids.group.warps import templates_to_json
 
+#: Share of a contrast's weights that counts as rounding.
+_UNTOUCHED = 1e-8
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Kept:
@@ -327,7 +330,7 @@ def _icv(
 
 
 def check_in_model(plan: SitePlan, design: Design, comparison: Comparison) -> None:
-    """Refuse a model that counts as free what was spent on sites.
+    """Refuse a model that counts as free what was spent on sites, or tests it.
 
     A test after it would take shifts that were estimated from the same data for known, and reject
     too often where groups are not balanced over sites (Nygaard et al. 2016,
@@ -344,6 +347,14 @@ def check_in_model(plan: SitePlan, design: Design, comparison: Comparison) -> No
             f" + C({plan.column}) to the formula",
             reason="sites-model",
         )
+    taken = np.linalg.pinv(design.matrix) @ (member - member.mean(axis=0))
+    for contrast in design.contrasts:
+        if np.abs(contrast.weights @ taken).max() > _UNTOUCHED * np.abs(contrast.weights).max():
+            raise ModelError(
+                f"--harmonize {plan.column}: contrast {contrast.name} is about what it takes out;"
+                " harmonize sites or scanners, and choose contrasts of others by --contrast",
+                reason="sites-model",
+            )
 
 
 def harmonize_cohort(

@@ -243,13 +243,15 @@ def _models(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], s
         )
         d = "estimate over the standard deviation of single visits"
     corrected = _correction(settings.multiplicity, cite, analysis)
+    adjusted = any(one.formula != analysis.model.formula for one in analysis.measures)
+    volumes = ", volumes also with intracranial volume" if adjusted else ""
     return (
         f"At each point of the sheet a {kind} `{analysis.model.formula}` was fitted{what}{errors}"
         f" (reference levels: {levels or 'none'}); contrasts: {names}."
         f" {corrected} Effect sizes are"
         f" Cohen's d ({d}) or partial eta squared, with"
         f" {settings.glm.confidence:.0%} confidence limits from non-central distributions. Summary"
-        " measures were tested in the same model, volumes also with intracranial volume; their"
+        f" measures were tested in the same model{volumes}; their"
         " false discovery rate was held over all measures, sides and models of a contrast."
         f"{_nonlinear(analysis, settings)}"
     )

@@ -287,7 +287,8 @@ def build_design(
     notes = {name: coding_note(numeric[name], settings) for name in map(str, numeric.columns)}
     chosen = set_levels(used, references, settings)
     try:
-        made = formula.get_model_matrix(used, na_action="raise", context=dict(CONTEXT))
+        with np.errstate(invalid="ignore", divide="ignore"):  # rows without a value are told below
+            made = formula.get_model_matrix(used, na_action="ignore", context=dict(CONTEXT))
     except Exception as error:  # formulaic raises all kinds where a formula makes no sense
         raise ModelError(
             f"formula {model.formula!r}: {str(error).partition(chr(10))[0]}", reason="formula"
@@ -419,7 +420,7 @@ def _check_matrix(
     if len(bad):
         raise ModelError(
             f"model: the formula has no value for rows {listed(rows.take(bad))}; a logarithm of"
-            " zero?",
+            " zero or less?",
             reason="design-missing",
         )
     if len(matrix) - len(columns) < settings.min_residual_df:

@@ -117,7 +117,7 @@ class Measured:
     sources: Mapping[str, tuple[str, Path]]
     """Address of one segmentation, and the dataset whose record has it, of visits with sheets."""
     damaged: tuple[Exclusion, ...] = ()
-    """Hemispheres left out because their maps are empty or impossible."""
+    """Hemispheres left out because maps are empty, or maps or summaries impossible."""
 
 
 def read_sheets(
@@ -131,7 +131,7 @@ def read_sheets(
 ) -> Measured:
     """Read all sheets and summaries, and the SDs of the maps if they have a window.
 
-    Hemispheres with empty or impossible maps are left out by ``rules``.
+    Hemispheres with empty or impossible maps or summaries are left out by ``rules``.
     """
     if error_window:
         _check_errors(records, maps)
@@ -148,7 +148,9 @@ def read_sheets(
         rows = [row_of[r.place.name.subject, r.place.name.session] for r in own]
         if own:
             side = _read_side(own, np.array(rows, dtype=np.int64), shape, names)
-            why = [_damage(side, i, rules) for i in range(len(own))]
+            columns = {str(name): one.to_numpy() for name, one in side.summary.items()}
+            doubtful = {name: one for name, one in columns.items() if why_impossible(name, one)}
+            why = [_damage(side, i, doubtful, rules) for i in range(len(own))]
             found = [
                 Exclusion.of_sheet(record.place.name, "damaged-map", text)
                 for record, text in zip(own, why, strict=True)
@@ -198,15 +200,19 @@ def leave_rare(values: Float) -> None:
     values[:, known[some].sum(axis=0) < LEAST_SHARE * some.sum()] = np.nan
 
 
-def _damage(side: SideMaps, i: int, rules: GroupSettings) -> str | None:
-    """Say why a sheet cannot be used, if it cannot."""
+def _damage(
+    side: SideMaps, i: int, doubtful: Mapping[str, Float], rules: GroupSettings
+) -> str | None:
+    """Say why a hemisphere cannot be used, if it cannot, by maps and ``doubtful`` summaries."""
     curvature = side.maps[CURVATURE][i]
     gap = float((~np.isfinite(curvature)).all(axis=1).mean())
     if gap > rules.registration.max_gap:
         return f"{gap:.0%} of the curvature profile has no value"
     if THICKNESS in side.maps and not np.isfinite(side.maps[THICKNESS][i]).any():
         return "no point of the thickness map has a value"
-    found = (why_impossible(name, values[i]) for name, values in side.maps.items())
+    values = [(name, one[i]) for name, one in side.maps.items()]
+    values += [(name, column[i : i + 1]) for name, column in doubtful.items()]
+    found = (why_impossible(name, one) for name, one in values)
     return next((text for text in found if text), None)
 
 

@@ -12,7 +12,7 @@ from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.names import group_report
 from hipsta_bids.errors import InputError, ModelError
 from hipsta_bids.group import write
-from hipsta_bids.group.analysis import Analysis, analyze_cohort, analyze_points
+from hipsta_bids.group.analysis import Analysis, analyze_cohort, analyze_points, unequal_spread
 from hipsta_bids.group.collect import (
     Collection,
     Exclusion,
@@ -443,6 +443,7 @@ def _notes(
                 f"{key.measure}, {key.contrast}, {key.hemi}: p up to {discoveries.cutoff:.3g}"
                 " survives, above the level; effects are widespread"
             )
+    notes += unequal_spread(analysis, settings.glm)
     for hemi, side in analysis.sides.items():
         if not side.registration.converged:
             notes.append(f"hemisphere {hemi}: registration had not settled when it ended")

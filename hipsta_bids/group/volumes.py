@@ -22,6 +22,8 @@ from hipsta_bids.inputs.maps import check_pattern, fields_of, scan
 from hipsta_bids.io import files
 from hipsta_bids.io.files import entities
 
+#: Volume that no structure reaches, mm^3: 10 liters.
+_MOST = 1e7
 #: Unit of all of them.
 UNIT = "mm^3"
 
@@ -115,7 +117,7 @@ def _volume(text: str) -> float:
     if text in {files.MISSING, "nan", "NaN"}:
         return float("nan")
     value = float(text)
-    if not 0 <= value < float("inf"):
+    if not 0 <= value < _MOST:
         raise ValueError(f"{text} is no volume")
     return value
 

@@ -309,7 +309,8 @@ def test_each_pair_is_the_comparison_of_its_subjects():
     used = np.isin(groups, ["CU", "DAT"]) & np.isfinite(volume + thickness)[:, 0]
     base = np.column_stack([np.ones(used.sum()), volume[used]])
     alone = compare_models(base, thickness[used], groups[used] == "DAT", PAIRS)
-    assert found[1].comparison.likelihood_ratio == alone.likelihood_ratio
+    ratio = found[1].comparison.likelihood_ratio
+    assert ratio == pytest.approx(alone.likelihood_ratio, rel=1e-9)
     assert found[1].comparison.n == used.sum()
     assert found[1].comparison.n_cases == (groups[used] == "DAT").sum()
     # Groups two steps apart are easier to tell than neighbors.
@@ -325,6 +326,19 @@ def test_names_the_pair_that_cannot_be_compared():
         compare_pairs(groups, volume, thickness, PAIRS, order=ORDER)
     with pytest.raises(ModelError, match="no participant is in group SCD"):
         compare_pairs(groups, volume, thickness, PAIRS, order=["CU", "SCD"])
+
+
+def test_separated_groups_are_compared_alike_by_years_of_any_era():
+    year = np.arange(30.0)[:, None] % 15
+    groups = np.where(np.arange(30) < 15, "CU", "DAT")
+    year[15:] += 15
+    added = np.random.default_rng(0).standard_normal((30, 1))
+    early, late = (
+        compare_pairs(groups, year + start, added, PAIRS, order=["CU", "DAT"])[0].comparison
+        for start in (0, 2000)
+    )
+    assert late.separated
+    assert late.likelihood_ratio == pytest.approx(early.likelihood_ratio, rel=1e-6)
 
 
 def test_firth_converges_where_groups_hardly_do_not_overlap():

@@ -250,6 +250,7 @@ def no_values(study):
         (None, ["--contrast", "age-sex[M]", "age:sex[M]"], 65, "whose files would have one name"),
         (None, ["--reference", "group=XX"], 65, "XX"),
         (None, ["--formula", "group + age + I(2*age)"], 65, "combination"),
+        (None, ["--formula", "group + log(age - 80)"], 65, "no value for rows sub-01"),
         (None, ["--base", "volum"], 65, "did you mean volume?"),
         (None, ["--exclude-qc", "filled_fracton > 1"], 64, "did you mean filled_fraction?"),
         (None, ["--exclude-qc", "rule > 1"], 64, "cannot combine"),
@@ -377,9 +378,14 @@ def test_sheets_that_no_hippocampus_has_are_left_out_by_participant_and_measure(
         "04": ("thickness", "1.8", "thickness is 1.8 mm at all points"),
         "05": ("curvature", "1e6", "curvature reaches 1e+06 1/mm"),
         "06": ("curvature", "0", "curvature is 0 1/mm at all points"),
+        "07": ("thickness_mean", "-2", "thickness_mean reaches -2 mm"),
+        "08": ("volume", "0", "volume reaches 0 mm^3"),
+        "09": ("volume", "1e9", "volume reaches 1e+09 mm^3"),
+        "10": ("volume", "inf", "volume reaches inf mm^3"),
     }
     for subject, (column, value, _) in wrong.items():
-        path = place_of(study.out, subject, "L").path("sheet")
+        kind = "sheet" if column in {"thickness", "curvature"} else "summary"
+        path = place_of(study.out, subject, "L").path(kind)
         rows = files.read_tsv(path)
         files.write_tsv(path, list(rows[0]), [(row | {column: value}).values() for row in rows])
     assert main([str(study.data), str(study.out), "group", *FAST, "--name", "few"]) == 0
@@ -408,7 +414,7 @@ def test_damaged_hemispheres_are_left_out_by_name_and_other_versions_told(study,
     edit_record(place_of(study.out, "07", "R"), version="0.0.9")
     assert main([str(study.data), str(study.out), "group", *FAST]) == 0
     said = capsys.readouterr()
-    assert "29 participants in the model, 3 left out" in said.out
+    assert "29 participants in the model, 3 hemispheres or visits left out" in said.out
     assert "sub-05, hemisphere L, is left out: thickness reaches 1e+30 mm" in said.out
     assert "sub-06, hemisphere R, is left out: 100% of the curvature profile" in said.out
     assert said.err.startswith("warning: hemispheres were measured by several versions, 0.0.9 (1),")
@@ -455,3 +461,25 @@ def test_sidecar_makes_factors_and_names_their_levels(study, capsys):
     assert "as a line" not in capsys.readouterr().out
     (design,) = study.out.glob("group/*/design.tsv")
     assert list(files.read_tsv(design)[0])[-2:] == ["stage[T.none]", "stage[T.some]"]
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_smaller_groups_that_vary_more_are_told_unless_the_model_allows_for_it(study, capsys):
+    said = []
+    write_participants(study.data, read_participants(study.data)[:24])
+    for factor, settings in ((1, ""), (3, ""), (1, '[glm]\ncovariance = "hc3"\n')):
+        for i in range(17, 25):
+            path = place_of(study.out, f"{i:02d}", "L").path("sheet")
+            rows = files.read_tsv(path)
+            for row in rows:
+                wall = 1.6 + factor * (float(row["thickness"]) - 1.6)
+                row["thickness"] = f"{max(0.1, wall):.4f}"
+            files.write_tsv(path, list(rows[0]), [row.values() for row in rows])
+        (study.out / "own.toml").write_text(settings)
+        options = [*FAST, "--settings", str(study.out / "own.toml"), "--name", "spread"]
+        assert main([str(study.data), str(study.out), "group", *options]) == 0
+        said.append(capsys.readouterr().out)
+    assert ["the smaller group varies more" in one for one in said] == [False, True, False]
+    assert "CN (16) and AD (8), thickness, L: the smaller group" in said[1]
+    methods = (study.out / "group" / "spread" / "methods.md").read_text()
+    assert "intracranial volume; their" not in methods  # none is known

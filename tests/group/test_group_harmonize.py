@@ -245,6 +245,11 @@ REFUSED = {
         ["--formula", "group * site"],
         "the model has group:site",
     ),
+    "what is tested": (
+        lambda rows: rows,
+        ["--harmonize", "group"],
+        "contrast CN-AD is about what it takes out",
+    ),
     "unknown column": (
         lambda rows: rows,
         ["--harmonize", "scannr"],

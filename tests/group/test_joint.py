@@ -83,7 +83,8 @@ def _no_figures(monkeypatch):
 
 def run(dataset, quick, *options):
     data, out = dataset
-    few = ["--permutations", "200", "--no-classification", "--name", "j"]
+    few = ["--no-classification", "--name", "j"]
+    few += ["--permutations", "200"] if "--joint" in options else []
     assert main([str(data), str(out), "group", *quick, *few, *options]) == 0
     return out / "group" / "j"
 

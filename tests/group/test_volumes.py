@@ -78,6 +78,7 @@ def test_hippunfold_table_of_the_same_atlas_is_taken(tmp_path):
         ("lh.hippoSfVolumes.txt", "CA1 12 13\n"),
         ("lh.hippoSfVolumes.txt", "CA1 much\n"),
         ("lh.hippoSfVolumes.txt", "CA1 -3\n"),
+        ("lh.hippoSfVolumes.txt", "CA1 1e9\n"),
         ("x_volumes.txt", "sub-01 middle CA1 15 1356.24\n"),
         ("x_volumes.tsv", "subject\tCA1\nsub-01\t3\n"),
         ("x_volumes.tsv", "subject\themi\tCA1\nsub-01\t3\n"),
