@@ -39,9 +39,9 @@ from hipsta_bids.group.grammar import closed_formula
 from hipsta_bids.group.harmonize import (
     Harmonization,
     SitePlan,
-    check_in_model,
     harmonize_cohort,
     plan_sites,
+    without_tests_of_sites,
 )
 from hipsta_bids.group.inference import (
     PERMUTATIONS,
@@ -195,7 +195,7 @@ def analyze_cohort(
     )
     design = build_design(table, model, settings.design, references)
     if plan is not None:
-        check_in_model(plan, design, comparison)
+        design = without_tests_of_sites(plan, design, model, comparison)
     if comparison.pair or not design.contrasts:
         design = replace(design, contrasts=with_mean(design))
 

@@ -329,15 +329,18 @@ def _icv(
     return (icv if np.isfinite(own).all() and np.ptp(own) > 0 else None), values
 
 
-def check_in_model(plan: SitePlan, design: Design, comparison: Comparison) -> None:
-    """Refuse a model that counts as free what was spent on sites, or tests it.
+def without_tests_of_sites(
+    plan: SitePlan, design: Design, model: ModelSpec, comparison: Comparison
+) -> Design:
+    """Refuse a model that counts as free what was spent on sites, or is asked to test it.
 
-    A test after it would take shifts that were estimated from the same data for known, and reject
-    too often where groups are not balanced over sites (Nygaard et al. 2016,
+    Tests of single columns that are about sites are left out where no contrast was named. A test
+    after it would take shifts that were estimated from the same data for known, and reject too
+    often where groups are not balanced over sites (Nygaard et al. 2016,
     doi:10.1093/biostatistics/kxv027). With the sites in the model, it pays for them.
     """
     if comparison.pair or not plan.estimated:
-        return
+        return design
     member = np.eye(len(plan.sites))[plan.visits.site[design.rows]]
     both = np.hstack([design.matrix, member])
     if np.linalg.matrix_rank(both) > np.linalg.matrix_rank(design.matrix):
@@ -348,13 +351,20 @@ def check_in_model(plan: SitePlan, design: Design, comparison: Comparison) -> No
             reason="sites-model",
         )
     taken = np.linalg.pinv(design.matrix) @ (member - member.mean(axis=0))
-    for contrast in design.contrasts:
-        if np.abs(contrast.weights @ taken).max() > _UNTOUCHED * np.abs(contrast.weights).max():
-            raise ModelError(
-                f"--harmonize {plan.column}: contrast {contrast.name} is about what it takes out;"
-                " harmonize sites or scanners, and choose contrasts of others by --contrast",
-                reason="sites-model",
-            )
+    about = [
+        one.name
+        for one in design.contrasts
+        if np.abs(one.weights @ taken).max() > _UNTOUCHED * np.abs(one.weights).max()
+    ]
+    named = {spec.name for spec in model.contrasts}
+    if about and (named.intersection(about) or len(about) == len(design.contrasts)):
+        raise ModelError(
+            f"--harmonize {plan.column}: contrast {about[0]} is about what it takes out;"
+            " harmonize sites or scanners, and choose contrasts of others by --contrast",
+            reason="sites-model",
+        )
+    kept = tuple(one for one in design.contrasts if one.name not in about)
+    return replace(design, contrasts=kept)
 
 
 def harmonize_cohort(

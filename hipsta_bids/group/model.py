@@ -44,6 +44,8 @@ from hipsta_bids.io import files
 #: How a contrast asks whether a variable bends, and the ages that the default model may bend.
 _NONLINEAR = "nonlinear"
 _AGES = ("age", FIRST_AGE)
+_HEADS = DefaultModelSettings.model_fields["icv_columns"].default
+_OLDEST = 130.0  # years
 #: A line is in the span of columns if it is off by less, in standard deviations.
 _EXACT = 1e-6
 
@@ -286,6 +288,8 @@ def build_design(
     numeric = used.select_dtypes("number")
     notes = {name: coding_note(numeric[name], settings) for name in map(str, numeric.columns)}
     chosen = set_levels(used, references, settings)
+    for name in map(str, numeric.columns):
+        _check_possible(numeric[name], name.casefold())
     try:
         with np.errstate(invalid="ignore", divide="ignore"):  # rows without a value are told below
             made = formula.get_model_matrix(used, na_action="ignore", context=dict(CONTEXT))
@@ -394,6 +398,25 @@ class _Terms:
                 if name in {f"{factor}[{level}]", f"{factor}.{level}"}:
                     return factor, level
         return None, ""
+
+
+def _check_possible(values: pd.Series, name: str) -> None:
+    """Refuse ages, and volumes of heads, that nobody has."""
+    if name not in {*_AGES, *_HEADS}:
+        return
+    numbers = values.to_numpy(dtype=np.float64)
+    first, middle = np.quantile(numbers, [0.25, 0.5])
+    bad = numbers <= 0 if name in _HEADS else numbers < 0
+    bad &= first > 0  # else they are differences from a mean
+    if name in _AGES:  # in months, say, most are larger
+        bad |= (numbers > _OLDEST) & (middle <= _OLDEST)
+    if bad.any():
+        found = listed(f"{row} ({value:g})" for row, value in values[bad].items())
+        raise ModelError(
+            f"model: column {values.name!r} has {found}, which nobody has; correct them, or mark"
+            " them n/a",
+            reason="implausible-value",
+        )
 
 
 def _dummies(columns: tuple[str, ...], test: str | None) -> list[ContrastSpec]:

@@ -122,6 +122,18 @@ def impossible_age(study):
     write_participants(study.data, rows)
 
 
+def negative_age(study):
+    rows = read_participants(study.data)
+    rows[3][2] = "-3"
+    write_participants(study.data, rows)
+
+
+def age_in_months(study):
+    rows = read_participants(study.data)
+    rows[3][2] = "150"
+    write_participants(study.data, rows)
+
+
 def coded_age(study):
     rows = read_participants(study.data)
     rows[3][2] = rows[7][2] = "-9999"
@@ -211,6 +223,8 @@ def no_values(study):
         (no_groups, [], 65, "no column tells groups"),
         (no_table, [], 65, "BIDS_DIR has no participants.tsv"),
         (impossible_age, [], 65, "has sub-04 (1e+50) where half of the others are"),
+        (negative_age, [], 65, "sub-04 (-3), which nobody has"),
+        (age_in_months, [], 65, "sub-04 (150), which nobody has"),
         (coded_age, [], 65, "has sub-04 (-9999), sub-08 (-9999) where all others are 5"),
         (coded_sex, [], 65, "'sex' has 999 (3) among words: a code for missing values?"),
         (comma_age, [], 65, "'age' holds decimal commas, as sub-01 ('74,1')"),
@@ -292,6 +306,11 @@ def test_who_alone_determines_a_coefficient_leaves_no_variance(study, capsys):
     error = capsys.readouterr().err
     assert "a participant who alone determines a coefficient" in error
     assert error.count("\n") == 1
+
+
+def test_ages_less_their_mean_may_be_negative(study):
+    ages(study, lambda age: f"{float(age) - 70:.1f}")
+    assert main([str(study.data), str(study.out), "group", *FAST]) == 0
 
 
 def test_failing_run_leaves_earlier_results(study):

@@ -145,6 +145,15 @@ def test_classifiers_do_not_see_harmonized_measures(results, study, quick):
     pd.testing.assert_frame_equal(table(results / "classification.tsv")[names], plain[names])
 
 
+def test_columns_of_sites_are_not_tested_by_themselves(study, quick):
+    data, out = study
+    model = ["--formula", "thickness ~ age + sex + site", "--name", "columns"]
+    assert main([str(data), str(out), "group", "--harmonize", "site", *model, *quick]) == 0
+    record = json.loads((out / "group" / "columns" / "analysis.json").read_text())
+    assert set(record["contrasts"]) == {"age", "sex[T.M]"}
+    assert "site[T.B]" in record["columns"]
+
+
 def test_saved_effects_give_the_same_maps_again(results, study, quick):
     data, out = study
     given = ["--harmonize-model", str(results / "harmonization.json")]
@@ -249,6 +258,11 @@ REFUSED = {
         lambda rows: rows,
         ["--harmonize", "group"],
         "contrast CN-AD is about what it takes out",
+    ),
+    "sites alone": (
+        lambda rows: rows,
+        ["--formula", "site"],
+        "contrast site[T.B] is about what it takes out",
     ),
     "unknown column": (
         lambda rows: rows,
