@@ -193,7 +193,13 @@ class QualityCondition:
 
     def holds(self, metrics: Mapping[str, Any]) -> bool:
         """Evaluate the condition; comparisons with missing metrics do not hold."""
-        return bool(self._value(self._tree, metrics))
+        return self._true(self._tree, metrics)
+
+    def _true(self, node: ast.expr, metrics: Mapping[str, Any]) -> bool:
+        value = self._value(node, metrics)
+        if not isinstance(value, (bool, type(None))):
+            raise self._refusal("has a part that compares nothing; write filled_fraction > 0.01")
+        return bool(value)
 
     def _value(self, node: ast.expr, metrics: Mapping[str, Any]) -> Any:  # noqa: ANN401 -- of the metric
         value: Any = None
@@ -207,11 +213,11 @@ class QualityCondition:
                 pairs = zip(node.ops, pairwise(values), strict=True)
                 value = all(self._act(sign, a, b) for sign, (a, b) in pairs)
             case ast.BoolOp(op=ast.And()):
-                value = all(self._value(part, metrics) for part in node.values)
+                value = all(self._true(part, metrics) for part in node.values)
             case ast.BoolOp():
-                value = any(self._value(part, metrics) for part in node.values)
+                value = any(self._true(part, metrics) for part in node.values)
             case ast.UnaryOp(op=ast.Not()):
-                value = not self._value(node.operand, metrics)
+                value = not self._true(node.operand, metrics)
             case ast.UnaryOp(op=ast.USub()):
                 value = self._act(ast.Sub(), 0, self._value(node.operand, metrics))
             case ast.BinOp():

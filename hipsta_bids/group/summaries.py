@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from hipsta_bids.errors import ModelError
+from hipsta_bids.errors import ModelError, UsageError
 from hipsta_bids.group.classify import PairComparison, compare_pairs, forget_models
 from hipsta_bids.group.comparison import BOTH
 from hipsta_bids.group.data import PARTICIPANT, Bool, Cohort, Float, Int
@@ -131,6 +131,8 @@ def classify_groups(
     labels = names.where(names.notna(), "").astype(str).to_numpy(dtype=np.str_)
     results: list[tuple[str, str, PairComparison]] = []
     notes: list[str] = []
+    if groups.column in settings.classification.base:
+        raise UsageError(f"--base {groups.column}: that is what is told apart", reason="usage")
     hemis, added = hemispheres(cohort), settings.classification.added
     for part, hemi in enumerate(hemis):
         values = summary_values(cohort, hemi)
