@@ -18,6 +18,7 @@ from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.digital import FACES, piece_sizes, to_ras
 from hipsta_bids.geometry.fem import compact_groups, solve_two_level
 from hipsta_bids.geometry.mesh import (
+    close_gaps,
     edge_graph,
     signed_volume,
     smooth_vertices,
@@ -116,7 +117,7 @@ def whole_surface(
     grid[:3, :3] = affine[:3, :3] * steps
     grid[:3, 3] = to_ras(-room, affine)
     nodes, faces, _, _ = marching_cubes(field, level=0.0)  # type: ignore[no-untyped-call]
-    faces = faces.astype(np.int32)
+    faces = close_gaps(faces.astype(np.int32), len(nodes))
     nodes = smooth_vertices(nodes.astype(np.float64), faces, surface)
     vertices = to_ras(nodes, grid)
     if signed_volume(vertices, faces) < 0:

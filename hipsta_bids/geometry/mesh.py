@@ -1,5 +1,6 @@
 """From a solid field to a closed triangle surface with planar end caps, and to its tetrahedra."""
 
+from collections.abc import Callable
 from itertools import combinations
 
 import numpy as np
@@ -41,6 +42,24 @@ def extract_surface(field: Field, settings: SurfaceSettings) -> Surface:
     return Surface(
         vertices=vertices, triangles=faces, posterior_cap=posterior, anterior_cap=anterior
     )
+
+
+def close_gaps(faces: Int, count: int) -> Int:
+    """Close gaps between triangles (F, 3) of ``count`` vertices, (F + n, 3).
+
+    Marching cubes leaves some where cells share an ambiguous face: four vertices without triangles.
+    """
+    start, end = faces.ravel().astype(np.int64), np.roll(faces, -1, axis=1).ravel()
+    lone = ~np.isin(start * count + end, end * count + start)
+    after = dict(zip(end[lone].tolist(), start[lone].tolist(), strict=True))
+    added = []
+    while after:
+        first, second = after.popitem()
+        third = after.pop(second, first)
+        while third != first:
+            added.append((first, second, third))
+            second, third = third, after.pop(third, first)
+    return np.vstack([faces, added]).astype(np.int32) if added else faces
 
 
 def signed_volume(vertices: Float, triangles: Int) -> float:
@@ -147,6 +166,26 @@ def _outline_edges(cap_faces: Int, count: int) -> Int:
     code, times = np.unique(pairs[:, 0].astype(np.int64) * count + pairs[:, 1], return_counts=True)
     once = code[times == 1]
     return np.column_stack([once // count, once % count]).astype(np.int32)
+
+
+def fill_surface(
+    surface: Surface,
+    again: Callable[[SurfaceSettings], Surface],
+    settings: SurfaceSettings,
+    tetra: TetraSettings,
+    frame: Float | None = None,
+) -> tuple[Surface, TetMesh, int]:
+    """Fill a surface with tetrahedra; smooth it more while TetGen cannot, and count how often.
+
+    ``again`` makes the surface with other settings.
+    """
+    for extra in range(settings.untangle_tries):
+        try:
+            return surface, tetrahedralize(surface, tetra, frame), extra
+        except GeometryError:
+            steps = settings.taubin_iterations * (2 + extra)
+            surface = again(settings.changed(taubin_iterations=steps))
+    return surface, tetrahedralize(surface, tetra, frame), settings.untangle_tries
 
 
 def tetrahedralize(

@@ -11,6 +11,7 @@ import re
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Generator, Iterable, Mapping
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -23,7 +24,8 @@ from hipsta_bids.errors import HipstaError, UsageError
 from hipsta_bids.participant.pool import Worker, WorkerLost, WorkerPlan
 
 _PATIENCE = 60.0  # s that an idle process stays, should the run have died
-_ANSWER_TIME = 30  # s that a scheduler gets to answer
+_ANSWER_TIME = 30  # s that a scheduler gets to answer, and before to write its file
+_PAUSE = 0.2  # s between looks at that file
 _WINDOW = 5000  # jobs at the scheduler at a time: more than there are workers, less than it minds
 _JOB_MEMORY = "1 GB"  # of a SLURM job: a hemisphere, and Dask's own worker
 
@@ -80,7 +82,11 @@ def _connect(cluster: Cluster, plan: WorkerPlan, stack: contextlib.ExitStack) ->
     if cluster.slurm is not None:
         return stack.enter_context(connect(stack.enter_context(_slurm(cluster.slurm, plan))))
     address = str(cluster.scheduler)
-    given = {"scheduler_file": address} if Path(address).is_file() else {"address": address}
+    path, end = Path(address), time.monotonic() + _ANSWER_TIME
+    # The scheduler that writes the file may just have been started.
+    while "/" in address.replace("://", "") and not path.is_file() and time.monotonic() < end:
+        time.sleep(_PAUSE)
+    given = {"scheduler_file": address} if path.is_file() else {"address": address}
     try:
         return stack.enter_context(connect(**given, timeout=_ANSWER_TIME))
     except (OSError, ValueError) as error:

@@ -48,7 +48,7 @@ from hipsta_bids.geometry.findings import (
 )
 from hipsta_bids.geometry.grid import check_voxel, in_plane_voxel, resample_body
 from hipsta_bids.geometry.measures import bending_angle
-from hipsta_bids.geometry.mesh import extract_surface, tetra_quality, tetrahedralize
+from hipsta_bids.geometry.mesh import extract_surface, fill_surface, tetra_quality
 from hipsta_bids.geometry.sheet import (
     between_planes,
     check_flipped,
@@ -77,8 +77,6 @@ from hipsta_bids.types import (
     HemisphereMaps,
     LabelVolume,
     Sheet,
-    Surface,
-    TetMesh,
 )
 
 # Numbers that say whether to trust a map, and flags.
@@ -301,7 +299,13 @@ def unfold(volume: LabelVolume, hemi: str, settings: Settings, clock: Clock) -> 
         surface = extract_surface(solid.field, settings.surface)
         across = check_voxels_across(surface, body, settings.checks)
     with clock("tetrahedra"):
-        surface, mesh, smoothed = _filled(solid, surface, settings)
+        surface, mesh, smoothed = fill_surface(
+            surface,
+            partial(extract_surface, solid.field),
+            settings.surface,
+            settings.tetra,
+            solid.field.grid.frame,
+        )
     with clock("boundaries"):
         laplace = volume_laplace(mesh, settings.boundaries.solver)
         longer = replace(body, ends=body.ends.beyond(settings.grid.beyond))
@@ -440,23 +444,6 @@ def find_body(volume: LabelVolume, settings: Settings) -> BodyMask | None:
     except GeometryError:
         return None
     return volume.in_file(body.inside)
-
-
-def _filled(
-    solid: SolidField, surface: Surface, settings: Settings
-) -> tuple[Surface, TetMesh, int]:
-    """Fill the surface; smooth it more while TetGen cannot, and count how often."""
-    frame = solid.field.grid.frame
-    for extra in range(settings.surface.untangle_tries):
-        try:
-            return surface, tetrahedralize(surface, settings.tetra, frame), extra
-        except GeometryError:
-            steps = settings.surface.taubin_iterations * (2 + extra)
-            surface = extract_surface(
-                solid.field, settings.surface.changed(taubin_iterations=steps)
-            )
-    mesh = tetrahedralize(surface, settings.tetra, frame)
-    return surface, mesh, settings.surface.untangle_tries
 
 
 def _layers(sheet: Sheet, settings: Settings) -> tuple[Sheet, list[Finding]]:

@@ -8,6 +8,7 @@ body, the grid is that of the body's own sheet: the body is measured first.
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -42,7 +43,7 @@ from hipsta_bids.geometry.findings import columns_near, flag_margins, raise_flag
 from hipsta_bids.geometry.folds import find_ridges, find_touching_banks
 from hipsta_bids.geometry.lines import Lines
 from hipsta_bids.geometry.measures import column_area, labels_at, measure_thickness
-from hipsta_bids.geometry.mesh import tetra_quality, tetrahedralize, triangle_areas, unique_edges
+from hipsta_bids.geometry.mesh import fill_surface, tetra_quality, triangle_areas, unique_edges
 from hipsta_bids.geometry.sheet import coordinates_at, fill_points, label_sheet, sheet_levels
 from hipsta_bids.protocols.protocol import CORE, LATERAL_END, MEDIAL_END, Tissue
 from hipsta_bids.settings import Settings
@@ -124,10 +125,12 @@ def measure_whole(
         far = ends.beyond(_FAR)
         body = replace(own.body, tissue=tissue, inside=tissue > 0, region=region, ends=far)
     with clock("surface"):
-        spacing = settings.grid.spacing
-        surface, field, grid = whole_surface(tissue > 0, volume.affine, spacing, settings.surface)
+        solid = partial(whole_surface, tissue > 0, volume.affine, settings.grid.spacing)
+        surface, field, grid = solid(settings.surface)
     with clock("tetrahedra"):
-        mesh = tetrahedralize(surface, settings.tetra)
+        surface, mesh, smoothed = fill_surface(
+            surface, lambda smoother: solid(smoother)[0], settings.surface, settings.tetra
+        )
     with clock("boundaries"):
         faces = find_faces(surface, volume, field, grid)
     with clock("coordinates"):
@@ -182,6 +185,7 @@ def measure_whole(
                 "voxel_size_mm": np.linalg.norm(body.affine[:3, :3], axis=0).round(4).tolist(),
                 "body_voxels": int(np.count_nonzero(body.inside)),
                 "surface_vertices": len(surface.vertices),
+                "extra_smoothing": smoothed,
                 "tetrahedra": len(mesh.tetrahedra),
                 "tetra_quality_median": float(np.median(tetra_quality(mesh))),
                 "holes_mm": [round(hole, 2) for hole in disk.holes],

@@ -6,9 +6,12 @@ from geometry_cases import box_mesh, field_of, ribbon_mask, short_phantom, strai
 from scipy import sparse
 
 from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry import mesh as meshing
 from hipsta_bids.geometry.grid import Field
 from hipsta_bids.geometry.mesh import (
+    close_gaps,
     extract_surface,
+    fill_surface,
     lateral_triangles,
     mean_wall_thickness,
     signed_volume,
@@ -17,7 +20,7 @@ from hipsta_bids.geometry.mesh import (
     triangle_areas,
     unique_edges,
 )
-from hipsta_bids.settings import SurfaceSettings
+from hipsta_bids.settings import SurfaceSettings, TetraSettings
 from hipsta_bids.types import TetMesh
 
 SMOOTH, RAW = SurfaceSettings(), SurfaceSettings(taubin_iterations=0)
@@ -51,6 +54,40 @@ def test_volume_and_wall_area(kind, volume, wall):
     areas = triangle_areas(surface.vertices, surface.triangles)
     assert areas[lateral_triangles(surface)].sum() == pytest.approx(wall, rel=0.04)
     assert mean_wall_thickness(surface) == pytest.approx(2 * volume / wall, rel=0.04)
+
+
+def test_gaps_of_two_triangles_are_closed():
+    surface = extract_surface(distance_field("box"), RAW)
+    faces, count = surface.triangles, len(surface.vertices)
+    assert close_gaps(faces, count) is faces
+    far = np.argmax(np.linalg.norm(surface.vertices - surface.vertices[faces[0, 0]], axis=1))
+    lost = []
+    for first in (0, int(np.flatnonzero((faces == far).any(axis=1))[0])):
+        shared = np.isin(faces, faces[first]).sum(axis=1) == 2
+        lost += [first, int(np.flatnonzero(shared)[0])]
+    closed = close_gaps(np.delete(faces, lost, axis=0), count)
+    assert len(closed) == len(faces)
+    assert count - len(unique_edges(closed)) + len(closed) == 2
+    volume = signed_volume(surface.vertices, faces)
+    assert signed_volume(surface.vertices, closed) == pytest.approx(volume, rel=1e-3)
+
+
+def test_a_surface_that_cannot_be_filled_is_smoothed_more(monkeypatch):
+    field, steps = distance_field("box"), []
+
+    def fill(*_):
+        if len(steps) < 2:
+            raise GeometryError("it intersects itself", reason="tetrahedralization")
+        return box_mesh((1, 1, 1))
+
+    def again(settings):
+        steps.append(settings.taubin_iterations)
+        return extract_surface(field, settings)
+
+    monkeypatch.setattr(meshing, "tetrahedralize", fill)
+    _, _, extra = fill_surface(extract_surface(field, SMOOTH), again, SMOOTH, TetraSettings())
+    assert extra == 2
+    assert steps == [32, 48]
 
 
 def test_smoothing_keeps_the_volume():

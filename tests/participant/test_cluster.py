@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -106,6 +107,22 @@ def test_a_scheduler_that_does_not_answer_is_named(tmp_path, monkeypatch):
     plan = WorkerPlan(work=work, n_workers=1, timeout=1.0, log=tmp_path / "log")
     with pytest.raises(UsageError, match=r"--dask-scheduler tcp://127\.0\.0\.1:9: no answer"):
         list(run_on_cluster(Cluster(scheduler="tcp://127.0.0.1:9"), plan, ["square 1"]))
+
+
+def test_the_file_of_a_scheduler_is_waited_for(tmp_path, monkeypatch):
+    given = {}
+
+    def connect(**options):
+        given.update(options)
+        raise OSError("that is all")
+
+    monkeypatch.setattr("distributed.Client", connect)
+    path = tmp_path / "scheduler.json"
+    threading.Timer(0.3, path.write_text, ["{}"]).start()
+    plan = WorkerPlan(work=work, n_workers=1, timeout=1.0, log=tmp_path / "log")
+    with pytest.raises(UsageError, match="that is all"):
+        list(run_on_cluster(Cluster(scheduler=str(path)), plan, ["square 1"]))
+    assert given["scheduler_file"] == str(path)
 
 
 def test_what_slurm_refuses_is_told(tmp_path, monkeypatch):
