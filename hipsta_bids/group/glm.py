@@ -492,13 +492,15 @@ def fit_maps(
     fits = {}
     try:
         for name in side.maps:
-            values = _values(side.maps[name], used)
+            # Maps of a large cohort are made here: without a name, one is gone before the next.
             if settings.glm.weights == "none":
-                fits[name] = model.fit(values, rows, tested, settings)
+                fits[name] = model.fit(_values(side.maps[name], used), rows, tested, settings)
             else:
                 errors = _values(side.errors[name], used)
                 matrix = model.design.matrix[rows]
-                fits[name] = fit_points(values, matrix, tested, settings.glm, errors)
+                fits[name] = fit_points(
+                    _values(side.maps[name], used), matrix, tested, settings.glm, errors
+                )
     except ModelError as error:
         raise ModelError(f"hemisphere {hemi}: {error}", reason=error.reason) from error
     for name, fit in fits.items():
