@@ -140,7 +140,7 @@ def run(data: Path, out: Path, size: int) -> Run:
         participants=size,
         wall=time.perf_counter() - start,
         cpu=used.ru_utime + used.ru_stime,
-        memory=used.ru_maxrss / 1024,
+        memory=used.ru_maxrss * 1024 / 1e6,
         stages=stages,
     )
 

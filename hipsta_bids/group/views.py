@@ -136,11 +136,12 @@ def look(mesh: Mesh, axes: Float, scale: float, shape: tuple[int, int]) -> View:
     weights = weights[triangle >= 0]
     normals = (_normals(mesh) @ axes.T)[mesh.triangles[triangle[triangle >= 0]]]
     depths = nearest.reshape(rows, columns) / (scale * _FINER)
-    return View(
+    light = _light(np.einsum("pci,pc->pi", normals, weights))
+    return View(  # pictures of all measures share views, so that these are kept small
         mesh=mesh,
-        triangle=triangle.reshape(rows, columns),
-        weights=weights,
-        light=_light(np.einsum("pci,pc->pi", normals, weights)),
+        triangle=triangle.reshape(rows, columns).astype(np.int32),
+        weights=weights.astype(np.float32),
+        light=light.astype(np.float32),
         outline=_outline(depths, max(_FOLD, _STEEP / (scale * _FINER))),
     )
 
