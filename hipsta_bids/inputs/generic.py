@@ -9,7 +9,9 @@ from pathlib import Path
 
 from hipsta_bids.errors import HipstaError, InputError, ProtocolError
 from hipsta_bids.inputs.scan import (
+    HEMIS,
     HemisphereInput,
+    Ignored,
     Source,
     VisitFolders,
     list_folder,
@@ -185,6 +187,19 @@ def find_named(
             # A file that nothing describes matters only if there is no other.
             if name or (source.explicit and len(groups) == 1):
                 yield _choose(group, visit, hemi, source)
+
+
+def without_side(visit: VisitFolders) -> Iterator[Ignored]:
+    """List label images whose names have a ``hemi`` that is neither L nor R."""
+    for folder in visit.folders:
+        for name in folder.names:
+            if "_hemi-" not in name or "dseg." not in name:
+                continue
+            pairs = entities(name)
+            hemi = pairs.get("hemi", "")
+            if hemi not in HEMIS and pairs["suffix"] == "dseg" and pairs["extension"] in _IMAGES:
+                reason = f"hemi-{hemi} is neither hemi-L nor hemi-R"
+                yield Ignored(path=folder.path / name, reason=reason, subject=visit.subject)
 
 
 def _choose(files: list[_File], visit: VisitFolders, hemi: str, source: Source) -> HemisphereInput:

@@ -16,7 +16,7 @@ from hipsta_bids.errors import NothingToDoError, UsageError
 from hipsta_bids.inputs.ashs import AtlasFinder, choose_atlas, find_ashs
 from hipsta_bids.inputs.edits import EditedFile, attach_edits, each_once, edits_of_visit, list_edits
 from hipsta_bids.inputs.freesurfer import find_freesurfer, same_labels, without_labels
-from hipsta_bids.inputs.generic import find_named, forget_tables
+from hipsta_bids.inputs.generic import find_named, forget_tables, without_side
 from hipsta_bids.inputs.scan import (
     HEMIS,
     HemisphereInput,
@@ -120,9 +120,8 @@ def find_inputs(request: InputRequest) -> Findings:
     renamed = [f"{f.path.name} as sub-{f.subject}" for f in found.renamed if f.subject in subjects]
     if renamed:
         notes += (f"renamed: {_count(renamed, 'FreeSurfer folder')}",)
-    unused = [entry.name for entry in ignored if not entry.template]
-    if unused:
-        notes += (f"not used: {_count(unused, 'folder')}; --dry-run and the log say why",)
+    if unused := _unused(ignored):
+        notes += (f"not used: {unused}; --dry-run and the log say why",)
     return Findings(items=items, notes=notes, ignored=ignored)
 
 
@@ -230,6 +229,7 @@ def _search(source: Source, selection: Selection, option: Protocol | None, found
     for visit in filter(selection.wants_visit, list_visits(folders, found.ignored)):
         found.edited += edits_of_visit(visit, source.path, source.name, beside=True)
         items = list(_search_visit(visit, source, selection, atlases))
+        found.ignored += without_side(visit) if "named" in source.layouts else ()
         used = [file for item in items for file in item.files]
         found.ignored += [
             Ignored(path=path, reason=_NO_LABELS, subject=visit.subject)
@@ -302,9 +302,7 @@ def _nothing(
         *([f"--bids-filter-file {request.bids_filter_file}"] if request.bids_filter_file else []),
     )
     missed = [entry for entry in ignored if not entry.template]
-    names = [entry.name for entry in missed]
-    unused = f". Not used: {_count(names, 'folder')}" if names else ""
-    unused += f": {missed[0].reason}" if names else ""
+    unused = f". Not used: {_unused(missed)}: {missed[0].reason}" if missed else ""
     if not sources:
         return NothingToDoError(
             f"{request.bids_dir}: no derivatives/* or sourcedata/* with sub-* folders; "
@@ -327,6 +325,14 @@ def _nothing(
         f"name another dataset: -d NAME=PATH{unused}",
         reason="no-segmentation",
     )
+
+
+def _unused(ignored: Iterable[Ignored]) -> str:
+    """Count and name what somebody may miss; empty if there is nothing."""
+    missed = [entry for entry in ignored if not entry.template]
+    kinds = {entry.path.is_file() for entry in missed}
+    noun = "name" if len(kinds) > 1 else "file" if kinds == {True} else "folder"
+    return _count([entry.name for entry in missed], noun) if missed else ""
 
 
 def _count(names: list[str], noun: str) -> str:

@@ -3,6 +3,8 @@
 import pytest
 from input_cases import by_key, describe, find, touch
 
+from hipsta_bids.inputs.search import InputRequest, find_inputs
+
 TABLE = (
     "index\tname\tabbreviation\tcolor\n1\tsubiculum\tSub\t#112233\n2\tCA1\tCA1\tn/a\n3\tCA3\tCA3\n"
 )
@@ -157,6 +159,17 @@ def test_files_of_other_structures_are_left_out(tmp_path):
     item = only(tmp_path)
     assert [path.name for path in item.files] == ["sub-01_hemi-L_desc-hipp_dseg.nii.gz"]
     assert item.passed_over == ()
+
+
+def test_a_side_that_is_misspelled_is_noted(tmp_path):
+    lab(tmp_path, "hemi-L_dseg.nii.gz", "hemi-r_dseg.nii.gz", "hemi-left_mask.nii.gz")
+    found = find_inputs(InputRequest(bids_dir=tmp_path))
+    (item,) = found.items
+    assert (item.hemi, item.problem) == ("L", None)
+    assert found.notes == (
+        "not used: 1 file (sub-01_hemi-r_dseg.nii.gz); --dry-run and the log say why",
+    )
+    assert [entry.reason for entry in found.ignored] == ["hemi-r is neither hemi-L nor hemi-R"]
 
 
 def test_a_name_of_somebody_else_is_noted(tmp_path):
