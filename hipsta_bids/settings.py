@@ -36,8 +36,7 @@ class BodySettings(SettingsTable):
     """Who gets the molecular layer: ``nearest-sheet`` (the nearest sheet subfield; Diers et al.
     2023) or ``nearest-label`` (the nearest label; voxels nearest to DG or CA4 are left out)."""
     join_every_layer: bool = False
-    """Join the molecular layer to the sheet also where the protocol leaves it out (HippUnfold's,
-    whose own inner wall is the outer one of that layer)."""
+    """Join the molecular layer to the sheet also where the protocol leaves it out (HippUnfold)."""
     min_length: NonNegativeFloat = 5.0
     """Shortest body that is measured, mm."""
     min_end_voxels: NonNegativeInt = 50
@@ -235,8 +234,7 @@ class TopologySettings(SettingsTable):
     flag_cut_cost: NonNegativeFloat = 2.0
     """Flag a cut that overrules more evidence than this (sum of the field)."""
     flag_fill_cost: NonNegativeFloat = 8.0
-    """Flag a filled hole whose membrane overrules more evidence than this (sum of the field; holes
-    of 0.8 mm radius cost 2 to 6, of 1 mm 6 to 11)."""
+    """Flag a filled hole whose membrane overrules more evidence (holes of .8 mm radius: 2 to 6)."""
     doubtful_fill_cost: NonNegativeFloat = 2.0
     """Flag a fill across the axis that overrules more than this (sum of the field)."""
     flag_part: NonNegativeFloat = 0.01
@@ -436,6 +434,8 @@ class CheckSettings(SettingsTable):
     """Flag rows narrower than the widest on both sides by more than this (from the population)."""
     row_dip_reach: NonNegativeFloat = 8.0
     """Distance along the axis within which rows are compared, mm."""
+    flag_subfield_gap: NonNegativeFloat = 1.5
+    """Flag rows without their edge's subfield over more than this, mm (1.2 at most in 128)."""
     edge_reach: Numbers = (2.5, 3.5, 5.0)
     """Edges are compared with themselves at these distances along the axis on both sides, mm."""
     flag_edge: Numbers = (1.8, 2.2, 2.7)

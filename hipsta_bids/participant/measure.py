@@ -25,13 +25,10 @@ from hipsta_bids.geometry.catalog import (
 from hipsta_bids.geometry.checks import (
     check_cavities,
     check_cross_sections,
-    check_edges,
     check_end_labels,
     check_image,
     check_label_order,
     check_labels,
-    check_ridges,
-    check_rows,
     check_thickness,
     check_voxels_across,
     describe_uncus,
@@ -61,6 +58,7 @@ from hipsta_bids.geometry.sheet import (
     solve_coordinates,
     whole_body,
 )
+from hipsta_bids.geometry.sheet_checks import check_edges, check_ridges, check_rows, check_subfields
 from hipsta_bids.geometry.topology import Repair, SolidField, repair_topology, repaired_columns
 from hipsta_bids.participant.whole import Own, check_fine, measure_whole
 from hipsta_bids.protocols import EXPERIMENTAL
@@ -203,6 +201,7 @@ def find_all(evidence: Evidence) -> list[Finding]:
         *check_cross_sections(solid.field, body, checks, solid.touched & (solid.field.values < 0)),
         *check_rows(sheet, checks),
         *check_edges(evidence.whole, checks),
+        *check_subfields(sheet, evidence.subfield, checks),
         *check_ridges(sheet, evidence.thickness, checks),
     ]
 

@@ -231,10 +231,10 @@ def _gap_voxels(site: Site, width: float, u: float) -> Bool:
     return site.wall & site.within(np.vstack(longer), 0.5 * width)
 
 
-def _missing_subfield(site: Site, _: float, position: Position) -> Defect:
-    """Erase the subfield at the position; size is ignored."""
+def _missing_subfield(site: Site, size: float, position: Position) -> Defect:
+    """Erase the subfield at the position; size is the length along the axis that lacks it."""
     tissue, _ = site.label(position, np.isin(site.volume.tissue, site.volume.protocol.sheet))
-    return site.erased(site.volume.tissue == tissue)
+    return site.erased((site.volume.tissue == tissue) & site.slab(position, size))
 
 
 def _missing_slices(site: Site, size: float, position: Position) -> Defect:

@@ -55,6 +55,9 @@ VOXEL = 0.4
 
 MIDDLE: Position = (0.5, 0.5)
 HOLES: tuple[Position, ...] = (MIDDLE, (0.2, 0.35), (0.82, 0.6))
+ALL_OF_IT = 200.0
+"""mm, longer than any hippocampus."""
+
 #: The quick selection takes every third.
 PLAN: tuple[Injury, ...] = (
     *(("hole", r, p) for r in (0.4, 0.8, 1.3, 1.6, 2.0) for p in HOLES),
@@ -68,7 +71,8 @@ PLAN: tuple[Injury, ...] = (
     *(("leak", r, MIDDLE) for r in (0.75, 1.5, 3.0)),
     *(("slit", w, p) for w in (0.4, 0.8, 1.2) for p in (MIDDLE, (0.15, 0.5))),
     *(("gap", w, p) for w in (0.4, 0.8, 2.0) for p in (MIDDLE, (0.78, 0.5))),
-    *(("missing-subfield", 1.0, (u, 0.5)) for u in (0.07, 0.25, 0.5, 0.78)),
+    *(("missing-subfield", ALL_OF_IT, (u, 0.5)) for u in (0.07, 0.25, 0.5, 0.78)),
+    *(("missing-subfield", t, (u, 0.5)) for t in (2.0, 4.0, 6.0) for u in (0.03, 0.97)),
     *(("missing-slices", t, MIDDLE) for t in (0.3, 1.0, 2.0)),
     *(("tail-inside", t, (0.5, v)) for t in (0.4, 2.0) for v in (0.5, 0.8)),
     *(("head-inside", t, (0.5, v)) for t in (0.4, 2.0) for v in (0.5, 0.8)),

@@ -98,6 +98,7 @@ CALIBRATED: Mapping[str, tuple[str, float]] = MappingProxyType(
         "extent-jump": ("flag_row_jump", 0.15),
         "extent-dip": ("flag_row_dip", 0.15),
         "edge-notch": ("flag_edge", 1.0),
+        "subfield-gap": ("flag_subfield_gap", 1.5),
         "thickness-ridge": ("flag_ridge", 0.45),
         "thickness-groove": ("flag_groove", 0.55),
         "thin-gap": ("flag_gap", 60),

@@ -8,15 +8,17 @@ from geometry_cases import resampled, short_phantom
 from sheet_cases import plates
 
 from hipsta_bids.geometry.body import Body, extract_body
-from hipsta_bids.geometry.checks import (
-    check_cross_sections,
+from hipsta_bids.geometry.checks import check_cross_sections
+from hipsta_bids.geometry.grid import Field
+from hipsta_bids.geometry.sheet_checks import (
     check_edges,
     check_ridges,
     check_rows,
+    check_subfields,
 )
-from hipsta_bids.geometry.grid import Field
 from hipsta_bids.phantom import Phantom
 from hipsta_bids.protocols.load import load_protocol
+from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import BodySettings, CheckSettings
 from hipsta_bids.types import Sheet
 
@@ -222,3 +224,34 @@ def test_missing_columns_make_no_band():
     thickness = banded(0.0)
     thickness[10:30, 10] = np.nan
     assert raised(check_ridges(plates(thickness=1.7), thickness, CHECKS)) == []
+
+
+def subfields(width, rows, edge):
+    """Three subfields on 41 x 21 nodes, of which the one at an edge is missing in some rows."""
+    labels = np.full((41, 21), Tissue.CA1, dtype=np.uint8)
+    own = slice(width) if edge == "medial" else slice(-width, None)
+    labels[own] = Tissue.SUBICULUM if edge == "medial" else Tissue.CA3
+    labels[own, rows] = Tissue.CA1
+    return labels
+
+
+@pytest.mark.parametrize("edge", ["medial", "lateral"])
+@pytest.mark.parametrize(
+    ("width", "rows", "value"),
+    [
+        (10, slice(8, 14), 2.4),  # rows lie .4 mm apart
+        (10, slice(2, 19), 6.8),
+        (10, slice(8, 11), 1.2),
+        (10, slice(0, 8), 0.0),  # subfields may end before the body does
+        (2, slice(8, 14), 0.0),  # .6 mm wide: no column moves
+    ],
+)
+def test_a_subfield_that_rows_lack_between_others_is_flagged(edge, width, rows, value):
+    sheet = plates()
+    (found,) = check_subfields(sheet, subfields(width, rows, edge), CHECKS)
+    assert found.value == pytest.approx(value)
+    assert (found.value > found.limit) == (value > 1.5)
+    if value:
+        assert found.what.startswith("SUBICULUM is" if edge == "medial" else "CA3 is")
+        assert set(found.points[:, 0]) == {0.0 if edge == "medial" else 12.0}
+        assert len(found.points) == rows.stop - rows.start

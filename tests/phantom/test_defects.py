@@ -85,9 +85,16 @@ def test_a_gap_goes_from_end_to_end_and_beyond(site):
 
 
 def test_a_subfield_is_erased_as_a_whole(site):
-    defect = make_defect(site, "missing-subfield", 1.0, (0.5, 0.5))
+    defect = make_defect(site, "missing-subfield", 200.0, (0.5, 0.5))
     assert not (defect.volume.tissue == Tissue.CA1).any()
     assert (defect.volume.tissue == Tissue.SUBICULUM).any()
+
+
+def test_a_subfield_is_erased_over_a_part_of_the_axis(site):
+    defect = make_defect(site, "missing-subfield", 4.0, (0.5, 0.5))
+    along = (site.v[changed(site, defect)] - 0.5) * site.length
+    assert np.abs(along).max() <= 2.0
+    assert set(np.unique(site.volume.tissue[changed(site, defect)])) == {Tissue.CA1}
 
 
 def test_parts_inside_the_body(site):

@@ -1,0 +1,181 @@
+"""What of a sheet a person should look at, as it does not resemble the sheet beside it.
+
+Rows that are narrower, edges that recede, subfields that are missing, and bands of odd thickness.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from hipsta_bids.protocols.protocol import Tissue
+from hipsta_bids.settings import CheckSettings
+from hipsta_bids.types import Finding, Float, Sheet
+
+_INWARD = 7
+"""The way into the sheet goes from an edge to this part of the columns beside it."""
+
+_LEAST_WIDTH = 1.0
+"""mm of a subfield that rows may lack: less does not move the other columns."""
+
+
+def check_rows(sheet: Sheet, settings: CheckSettings) -> list[Finding]:
+    """Flag a sheet whose medial-to-lateral length jumps from row to row, or dips."""
+    middle = sheet.points[:, :, sheet.middle]
+    lengths = np.linalg.norm(np.diff(middle, axis=0), axis=-1).sum(axis=0)
+    jumps = np.abs(np.diff(lengths)) / np.minimum(lengths[1:], lengths[:-1])
+    jumps[[0, -1]] /= 2  # a plane may cut the sheet where it flares
+    dips = 1 - lengths / _wider(lengths, middle, settings.row_dip_reach)
+    found = []
+    for reason, change, limit, what in (
+        ("extent-jump", jumps, settings.flag_row_jump, "changes by {} from one row to the next"),
+        ("extent-dip", dips, settings.flag_row_dip, "dips by {}"),
+    ):
+        row = int(np.nanargmax(change))
+        found.append(
+            Finding(
+                reason=reason,
+                value=float(change[row]),
+                limit=limit,
+                what=f"the sheet's width {what.format(f'{change[row]:.0%}')}",
+                remedy="look for missing or added parts in the labels",
+                points=_known(middle[:, row]),
+            )
+        )
+    return found
+
+
+def check_edges(whole: Sheet, settings: CheckSettings) -> list[Finding]:
+    """Flag a sheet whose medial or lateral edge recedes between parts that do not.
+
+    Notches, slits and tips without their label are too small to show in the width of the sheet, but
+    move the columns of their rows. ``whole`` goes from edge to edge.
+    """
+    middle = whole.points[:, :, whole.middle]
+    step, count = _row_step(middle), middle.shape[1]
+    inner = max(middle.shape[0] // _INWARD, 1)
+    found = []
+    for name, edge, beside in (("medial", 0, inner), ("lateral", -1, -1 - inner)):
+        rim, inward = middle[edge], middle[beside] - middle[edge]
+        best = (0.0, 0.0, settings.flag_edge[0], 0, 0)
+        for reach, limit in zip(settings.edge_reach, settings.flag_edge, strict=True):
+            k = max(round(reach / step), 1)
+            if 2 * k >= count:
+                continue
+            towards = ndimage.uniform_filter1d(np.nan_to_num(inward), 2 * k + 1, axis=0)[k:-k]
+            towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-9)
+            behind, ahead = (rim[k:-k] - rim[part] for part in (slice(-2 * k), slice(2 * k, None)))
+            depth = np.minimum(*((gap * towards).sum(axis=1) for gap in (behind, ahead)))
+            row = int(np.nan_to_num(depth).argmax())
+            size = max(float(np.nan_to_num(depth)[row]), 0.0)
+            best = max(best, (size / limit, size, limit, row + k, k))
+        _, size, limit, row, k = best
+        found.append(
+            Finding(
+                reason="edge-notch",
+                value=size,
+                limit=limit,
+                what=f"the {name} edge of the sheet recedes by {size:.1f} mm",
+                remedy="look for a notch or a missing tip in the labels",
+                points=_known(rim[max(row - k // 2, 0) : row + k // 2 + 1]),
+            )
+        )
+    return found
+
+
+def check_subfields(
+    sheet: Sheet, subfield: NDArray[np.uint8], settings: CheckSettings
+) -> list[Finding]:
+    """Flag a subfield of an edge, if rows between others that have it do not: the edge recedes.
+
+    ``subfield`` (Nx, Ny) are values of Tissue. Where less than a millimeter of a subfield can be
+    missing, the other columns hardly move.
+    """
+    middle = sheet.points[:, :, sheet.middle]
+    step, lengths = _row_step(middle), np.linalg.norm(np.gradient(middle, axis=0), axis=-1)
+    gaps = [(0.0, Tissue.BACKGROUND, 0, 0, 0)]
+    for edge in (0, -1):
+        for tissue in map(Tissue, np.unique(subfield[edge]).tolist()):
+            widths = np.where(subfield == tissue, np.nan_to_num(lengths), 0.0).sum(axis=0)
+            before, behind = (np.maximum.accumulate(widths[::way])[::way] for way in (1, -1))
+            gone = (widths == 0) & (np.minimum(before, behind) >= _LEAST_WIDTH)
+            for (part,) in ndimage.find_objects(ndimage.label(gone)[0]):
+                size = (part.stop - part.start) * step
+                gaps.append((size, tissue, edge, part.start, part.stop))
+    size, tissue, edge, first, last = max(gaps)
+    return [
+        Finding(
+            reason="subfield-gap",
+            value=size,
+            limit=settings.flag_subfield_gap,
+            what=f"{tissue.name} is missing over {size:.1f} mm, and is there before and behind",
+            remedy="complete the labels there",
+            points=_known(middle[edge, first:last]),
+        )
+    ]
+
+
+def _known(points: Float) -> Float:
+    """Rows of (N, 3) points without NaN."""
+    return points[np.isfinite(points).all(axis=1)]
+
+
+def check_ridges(sheet: Sheet, thickness: Float, settings: CheckSettings) -> list[Finding]:
+    """Flag a band across the axis where thickness (Nx, Ny), mm, differs from that on both sides.
+
+    Labels that leaked, or that a bar or a dent has changed, show in few cross-sections; thickness
+    of a whole sheet changes more slowly along the axis.
+    """
+    middle = sheet.points[:, :, sheet.middle]
+    found = []
+    for reason, sign, limits, what in (
+        ("thickness-ridge", 1, settings.flag_ridge, "thicker"),
+        ("thickness-groove", -1, settings.flag_groove, "thinner"),
+    ):
+        bands = _bands(sign * thickness, limits, _row_step(middle), settings)
+        excess, size, (column, row) = max(bands, default=(0.0, 0.0, (0, 0)))
+        half = settings.ridge_columns // 2
+        found.append(
+            Finding(
+                reason=reason,
+                value=size,
+                limit=size / excess if excess else limits[0],
+                what=f"a band of the sheet is {size:.1f} mm {what} than the sheet before and "
+                "behind it",
+                remedy="look at the labels there",
+                points=_known(middle[max(column - half, 0) : column + half + 1, row]),
+            )
+        )
+    return found
+
+
+def _bands(
+    thickness: Float, limits: tuple[float, ...], step: float, settings: CheckSettings
+) -> Iterator[tuple[float, float, tuple[int, int]]]:
+    """Thickest band at each distance: times the limit, mm above both sides, and column."""
+    for reach, limit in zip(settings.ridge_reach, limits, strict=True):
+        k = max(round(reach / step), 1)
+        if 2 * k >= thickness.shape[1]:
+            continue
+        sides = np.maximum(thickness[:, : -2 * k], thickness[:, 2 * k :])
+        above = np.nan_to_num(thickness[:, k:-k] - sides)
+        band = ndimage.uniform_filter1d(above, settings.ridge_columns, axis=0)
+        at = np.unravel_index(band.argmax(), band.shape)
+        size = max(float(band[at]), 0.0)
+        yield size / limit, size, (int(at[0]), int(at[1]) + k)
+
+
+def _row_step(middle: Float) -> float:
+    """Distance of neighboring rows of the mid-surface (Nx, Ny, 3), mm."""
+    return float(np.nanmedian(np.linalg.norm(np.diff(middle, axis=1), axis=-1)))
+
+
+def _wider(lengths: Float, middle: Float, reach: float) -> Float:
+    """Width (Ny,) that rows within ``reach`` mm attain on both sides of each row."""
+    rows = np.arange(len(lengths))
+    offset = rows[None, :] - rows[:, None]
+    near = np.abs(offset) <= max(round(reach / _row_step(middle)), 1)
+    before = np.where(near & (offset <= 0), lengths, -np.inf).max(axis=1)
+    after = np.where(near & (offset >= 0), lengths, -np.inf).max(axis=1)
+    return np.asarray(np.minimum(before, after))
