@@ -17,8 +17,8 @@ WORKDIR /build
 COPY requirements.lock requirements-dev.lock ./
 RUN python -m venv /opt/hipsta_bids; \
     sed -n '/^setuptools==/,/# via/p' requirements-dev.lock > build.lock; \
-    /opt/hipsta_bids/bin/pip install --require-hashes -r build.lock; \
-    /opt/hipsta_bids/bin/pip install --require-hashes --no-build-isolation --use-pep517 -r requirements.lock
+    /opt/hipsta_bids/bin/pip install --require-hashes --no-deps -r build.lock; \
+    /opt/hipsta_bids/bin/pip install --require-hashes --no-deps --no-build-isolation --use-pep517 -r requirements.lock
 
 # What of them is never run; docs/containers.md has what stays. Libraries in *.libs were moved by their
 # makers (auditwheel), and strip damages such files.

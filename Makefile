@@ -1,6 +1,7 @@
 # Set-up and checks. On a bare machine with Python >= 3.11, make and git:
 #   make demo    make the environment, make a synthetic dataset, measure it, compare with the truth
 #   make test    lint, types, layer contracts and tests, exactly as in CI
+#   make validation    measure accuracy: all suites, and docs/validation.md with their tables
 #   make docs    the documentation as a site in build/site, without network
 
 VENV ?= .venv
@@ -20,7 +21,7 @@ BIN := $(VENV)/bin
 # Changes to either file mean that the environment is out of date.
 STAMP := $(VENV)/.made-from-lock
 
-.PHONY: help env demo test lint types layers unit docs format lock clean
+.PHONY: help env demo test lint types layers unit validation docs format lock clean
 help:
 	@sed -n '2,/^$$/s/^# \{0,1\}//p' Makefile
 
@@ -33,8 +34,8 @@ $(STAMP): requirements-dev.lock pyproject.toml
 	 make PYTHON=/path/to/python3 ..." >&2; exit 1; }
 	@echo "Making the environment in $(VENV) from requirements-dev.lock (some minutes at first)"
 	@"$(BIN)/python" -c '$(USABLE)' >/dev/null 2>&1 || "$(PYTHON)" -m venv --clear "$(VENV)"
-	"$(BIN)/python" -m pip install -qq --disable-pip-version-check --require-hashes --no-compile \
-		-r requirements-dev.lock
+	"$(BIN)/python" -m pip install -qq --disable-pip-version-check --require-hashes --no-deps \
+		--no-compile -r requirements-dev.lock
 	"$(BIN)/python" -m pip install -qq --disable-pip-version-check --no-deps \
 		--no-build-isolation -e .
 	@touch "$@"
@@ -48,10 +49,11 @@ lint: $(STAMP)
 	"$(BIN)/python" -m ruff check .
 	"$(BIN)/python" -m ruff format --check .
 	"$(BIN)/codespell"
+	"$(BIN)/python" tools/names.py
 
 types: $(STAMP)
 	MYPYPATH=tools:benchmarks "$(BIN)/python" -m mypy --strict --scripts-are-modules \
-		hipsta_bids tools/*.py tools/make-descriptors tools/make-docs benchmarks/*.py
+		hipsta_bids validation tools/*.py tools/make-descriptors tools/make-docs benchmarks/*.py
 
 layers: $(STAMP)
 	"$(BIN)/lint-imports" --no-cache
@@ -59,6 +61,10 @@ layers: $(STAMP)
 # A thread each: the two processes would wait for each other's.
 unit: $(STAMP)
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 "$(BIN)/python" -m pytest -n 2 --dist loadfile
+
+# All suites, on the real labels too where they are: LABELS=BIDS_DIR.
+validation: $(STAMP)
+	"$(BIN)/python" -m validation --full $(if $(LABELS),--labels "$(LABELS)")
 
 docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 "$(BIN)/python" -m mkdocs build --strict --quiet

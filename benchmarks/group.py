@@ -1,7 +1,7 @@
 """Time and memory of the group level's default run, by the number of participants and by stage.
 
 Writes sheets, summaries and surfaces as the participant level leaves them: those of a phantom that
-was measured, with simulated maps (``hipsta_bids/validation/group.py``) and scattered summary
+was measured, with simulated maps (``validation/group.py``) and scattered summary
 measures, for three groups. Then runs the command::
 
     .venv/bin/python benchmarks/group.py [--sizes 40 1500 10000 50000] [--json FILE]
@@ -32,7 +32,7 @@ from hipsta_bids.cli import console
 from hipsta_bids.cli.main import main as run_command
 from hipsta_bids.derivatives.hemisphere import ResultPlace, format_column, list_results
 from hipsta_bids.io import files
-from hipsta_bids.validation.group import SimulatedCohort, SimulationPlan, simulate_cohort
+from validation.group import SimulatedCohort, SimulationPlan, simulate_cohort
 
 COMMAND = (sys.executable, "-m", "hipsta_bids.cli.main")
 GROUPS = ("CN", "MCI", "AD")

@@ -19,7 +19,7 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from hipsta_bids.api.maps import load, measure
     from hipsta_bids.api.plots import plot_group, plot_sheet, plot_surface
-    from hipsta_bids.group.models import group
+    from hipsta_bids.group.questions.models import group
 else:
 
     def __getattr__(name: str) -> object:

@@ -37,11 +37,11 @@ EXIT_MEANINGS: dict[int, str] = {
 
 
 class HipstaError(Exception):
-    """Base of all foreseen errors; ``reason`` is a name for programs, written to ``status.tsv``."""
+    """Base of all foreseen errors; ``reason`` is a name for programs, if a file can hold it."""
 
     exit_code = ExitCode.BAD_DATA
 
-    def __init__(self, message: str, *, reason: str) -> None:
+    def __init__(self, message: str, *, reason: str = "") -> None:
         super().__init__(message)
         self.reason = reason
 
@@ -89,7 +89,7 @@ class GeometryError(HipstaError):
 
 
 class ModelError(HipstaError):
-    """A statistical model cannot be fitted to these data; the reason names the obstacle."""
+    """A statistical model cannot be fitted to these data."""
 
 
 def did_you_mean(words: Iterable[str], known: Iterable[str]) -> str:

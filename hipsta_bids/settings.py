@@ -44,63 +44,12 @@ class BodySettings(SettingsTable):
     plane_reach: PositiveFloat = 3.0
     """End planes are fitted to labels within this distance of the interface, mm; head and tail
     labels that lie up to it on the wrong side get the subfield of a neighbor."""
-    plane_ratio: NonNegativeFloat = 1.8
-    """Where slices are thicker than this many pixels, they have a say in the tilt of the planes."""
-    plane_slices: PositiveFloat = 1.5
-    """There planes are fitted to labels within this many slices of the interface."""
-    plane_width: PositiveFloat = 0.05
-    """Width of the logistic function, slices."""
-    plane_tilt: Annotated[float, Field(gt=0, lt=90)] = 10.0
-    """Tilts against the slices are expected to be of this size, degrees (standard deviation)."""
-    plane_prior: NonNegativeFloat = 0.05
-    """Weight of that expectation; all labels together weigh 1."""
     end_margin: NonNegativeFloat = 0.0
     """Taken off either end where head or tail labels are missing, mm."""
-    end_smoothing: PositiveFloat = 1.0
-    """Without end labels: standard deviation by which profiles along the axis are smoothed, mm."""
-    end_usual: OpenFraction = 0.3
-    """What is usual in the body: this quantile over cross-sections with CA1 and CA2 or CA3."""
-    end_weight: PositiveFloat = 3.0
-    """How much a millimeter of certain evidence multiplies odds, natural logarithm (times 0.5)."""
-    lost_share: PositiveFraction = 0.5
-    """Even odds of an end: the sheet, CA1, or CA2 and CA3 have this share of their usual area."""
-    core_share: PositiveFraction = 0.5
-    """The same of dentate gyrus and CA4, since the sheet closes over them in the tail."""
-    lost_width: PositiveFloat = 0.5
-    """The evidence rises from none to certain over this range of such shares."""
-    uncus_spread: Annotated[float, Field(gt=1)] = 2.5
-    """Even odds: CA2 and CA3 spread this many times as far as usual, since the uncus has some."""
-    core_growth: Annotated[float, Field(gt=1)] = 1.6
-    """The same of dentate gyrus and CA4; and even odds at this multiple of their usual area."""
-    head_growth: Annotated[float, Field(gt=1)] = 1.5
-    """Even odds: the sheet has this multiple of its usual area."""
-    gap_directions: NonNegativeInt = 3
-    """A voxel without a label lies in a thin gap if it has the sheet on both sides in this
-    many of 13 directions; where an edge of the voxels is longer than ``slit_voxel``, in the same
-    share of those across that edge."""
     slit_area: NonNegativeFloat = 2.5
     """Gaps larger than this are filled if they go through the sheet, mm2."""
-    slit_openings: Fraction = 0.2
-    """A gap goes through the sheet if what is beside it falls into two parts, each of at least this
-    share (in six real bodies: none, and gaps with one opening are up to 4.0 mm2)."""
     slit_voxel: NonNegativeFloat = 0.8
     """Gaps are filled if no voxel edge is longer, mm: folds between thick slices look alike."""
-    pit_reach: PositiveFloat = 0.9
-    """A voxel without a label lies in a pit if the sheet is this near, mm, ..."""
-    pit_sides: Annotated[int, Field(ge=4, le=6)] = 5
-    """... on so many of its six sides (5 is open on one side)."""
-    pit_size: Numbers = (0.2, 1.8)
-    """Pits of this volume are filled, mm3, where gaps are (there are two in six real bodies)."""
-    uncus_size: NonNegativeFloat = 1.0
-    """Smaller pieces of CA2 or CA3 are no uncus, mm3."""
-    uncus_offset: PositiveFloat = 5.0
-    """CA2 or CA3 at the anterior plane is the uncus if it lies farther than this medially of the
-    body's own, mm (10 to 12 in three real brains)."""
-    cavity_openness: Fraction = 0.25
-    """What is enclosed in a slice is filled if at most this share of what surrounds it is open to
-    the next slices; between thick slices, whatever lies there."""
-    cavity_radius: NonNegativeFloat = 0.9
-    """A cavity with room for a ball of this radius is too wide to be the molecular layer, mm."""
     end_fullness: OpenFraction = 0.9
     """Cross-sections where labels end obliquely go below this share of those behind them."""
     end_reach: NonNegativeFloat = 3.0
@@ -121,8 +70,6 @@ class GridSettings(SettingsTable):
     min_smoothing: NonNegativeFloat = 0.36
     """Least standard deviation of that Gaussian, mm, so that finer voxels do not change maps:
     what smoothing takes from thin edges and narrow bends changes the mean thickness."""
-    margin: PositiveFloat = 1.5
-    """Free space around the body, mm."""
     beyond: NonNegativeFloat = 1.75
     """The body goes on for this much beyond each end plane, mm, as it is there: columns would be
     oblique, and too long, next to a plane that cuts the sheet obliquely."""
@@ -135,102 +82,17 @@ class SliceSettings(SettingsTable):
     """Slices thicker than this many pixels are interpolated by shape."""
     upsampling: PositiveInt = 2
     """Fine pixels per pixel."""
-    smoothing: NonNegativeFloat = 0.7
-    """Standard deviation of the Gaussian in a slice, pixels."""
-    reach: PositiveFloat = 2.0
-    """Distances from the outline are kept up to this, mm."""
-    edge: PositiveFloat = 0.2
-    """Half width of the ramp across the outline, mm."""
-    max_fragments: PositiveInt = 8
-    """Most fragments that are joined in a slice."""
-    max_rank_jump: NonNegativeInt = 2
-    """Fragments are joined preferably to subfields at most this many ranks away."""
-    bridge: NonNegativeFloat = 0.45
-    """Half width of a bridge between fragments, mm."""
     max_gap: NonNegativeFloat = 1.2
     """Fragments are joined across at most this distance, mm."""
-    max_break: NonNegativeFloat = 3.0
-    """The same where a slice beside shows the ribbon, for pieces with a subfield of their own."""
-    crumb_area: NonNegativeFloat = 1.5
-    """Fragments farther away are dropped if they are smaller than this, mm2."""
     hole_area: NonNegativeFloat = 3.0
     """Smaller holes in a slice are filled, mm2."""
-    ring_length: NonNegativeFloat = 0.02
-    """Rings are cut along the cheapest path: cost of its length, to which depth in the ribbon (mm)
-    is added."""
-    ring_beside: NonNegativeFloat = 2.0
-    """What lies in the ribbon of the slices beside costs their depth times this as well."""
-    turn_length: PositiveFloat = 3.0
-    """Turns are parts of the ribbon farther apart along it than this, mm."""
-    ribbon_nodes: Annotated[int, Field(ge=3)] = 81
-    """Nodes along the ribbon of a slice."""
-    rim_half: PositiveFloat = 0.5
-    """Half length of the edges of the ribbon along its outline, multiples of 2 area / length."""
-    least_half: NonNegativeFloat = 0.3
-    """Half the least thickness of the ribbon in a slice, mm: the working grid's smoothing leaves
-    three fourths of the height of a strip of 0.6 mm, but only half of one of 0.4 mm."""
-    match_stretch: NonNegativeFloat = 0.5
-    """Mid-lines of slices are matched by squared distance, mm2, and this times squared stretch."""
-    path_smoothing: Fraction = 1.0
-    """Paths of the ribbon's nodes through the slices: from 0 (through their places in the slices)
-    to 1 (cubic B-splines with these as control points: half the variance of noise is left)."""
-    flow_window: PositiveFloat = 1.0
-    """Standard deviation of the window of the registration of slices, mm."""
-    flow_ridge: NonNegativeFloat = 0.02
-    """Added to the mean squared slope in a window, which is 1 where outlines fill it: keeps
-    displacements small where the outlines do not tell them."""
-    flow_smoothing: NonNegativeFloat = 0.5
-    """Standard deviation of the Gaussian on displacements after each iteration, mm."""
-    flow_iterations: NonNegativeInt = 5
-    """Iterations of the registration per level."""
-    touch: NonNegativeFloat = 0.6
-    """The subiculum and CA2 or CA3 are kept apart where both are nearer than this, mm."""
-    slit: NonNegativeFloat = 0.3
-    """Half width of the slit that keeps them apart, mm."""
-    hidden_depth: NonNegativeFloat = 0.1
-    """What lies less deep than this inside an end plane is taken from inside, where the sheet's
-    labels end at the plane, mm."""
-    extrapolation: NonNegativeFloat = 0.5
-    """There, and beyond the last slice, shapes go on changing at this fraction of their pace."""
 
 
 class TopologySettings(SettingsTable):
     """Repair of holes, bridges, islands and cavities."""
 
-    levels: PositiveInt = 6
-    """Steps in which field values are ordered while growing and shrinking."""
     rounds: NonNegativeInt = 12
     """Most rounds of repair."""
-    depth_rank: NonNegativeFloat = 0.05
-    """Share of the field that each grid node of depth adds to the order of that."""
-    small_cost: NonNegativeFloat = 5.0
-    """Membranes cheaper than this are applied together; costlier ones one per round."""
-    plug_reach: NonNegativeInt = 8
-    """A filled hole becomes as thick as the wall within this distance of it, grid nodes."""
-    plug_neighbors: PositiveInt = 12
-    """Number of nearest nodes of the wall's middle that a filled hole takes its thickness from."""
-    oriented_nodes: NonNegativeInt = 4
-    """Membranes of fewer nodes have no direction."""
-    cut_across: NonNegativeFloat = 0.3
-    """A cut severs the ribbon, no bridge, if this share lies across the axis (squared areas)."""
-    sever_reach: NonNegativeInt = 2
-    """A cut severs the ribbon if the body goes on this many grid nodes before and behind it."""
-    sever_share: NonNegativeFloat = 0.1
-    """Share of the cut's nodes at which the body has to go on."""
-    sever_along: NonNegativeFloat = 0.5
-    """A cut severs in any case if the line between its stumps is more along the axis than this,"""
-    bridge_along: NonNegativeFloat = 0.25
-    """and in no case if it is less than this (squared cosines with the axis)."""
-    sever_factor: NonNegativeFloat = 1000.0
-    """Such cuts cost this much more: where one is the only way, the hemisphere is flagged."""
-    contact_reach: NonNegativeFloat = 1.2
-    """A cut this near, mm, to both the subiculum and CA2 or CA3 severs but turns that touch."""
-    fill_across: NonNegativeFloat = 0.5
-    """A fill spans the inside of a bend rather than a hole if this share lies across the axis."""
-    lid_nodes: NonNegativeFloat = 6.0
-    """A fill within this distance of an end plane closes an end and no bend, grid nodes."""
-    across_factor: NonNegativeFloat = 40.0
-    """Such fills cost this much more."""
     flag_cut_cost: NonNegativeFloat = 2.0
     """Flag a cut that overrules more evidence than this (sum of the field)."""
     flag_fill_cost: NonNegativeFloat = 8.0
@@ -248,12 +110,6 @@ class SurfaceSettings(SettingsTable):
 
     taubin_iterations: NonNegativeInt = 16
     """Pairs of shrinking and inflating steps."""
-    taubin_shrink: Fraction = 0.5
-    """Step towards the mean of the neighbors, fraction."""
-    taubin_inflate: Annotated[float, Field(ge=-1, le=0)] = -0.53
-    """Step back, fraction."""
-    untangle_tries: NonNegativeInt = 2
-    """How often a surface that TetGen cannot fill is smoothed more."""
 
 
 class TetraSettings(SettingsTable):
@@ -261,9 +117,6 @@ class TetraSettings(SettingsTable):
 
     radius_edge_ratio: Annotated[float, Field(ge=1)] = 2.0
     """Worst ratio of circumradius to shortest edge (TetGen's q)."""
-    smoothing_steps: NonNegativeInt = 0
-    """Passes in which TetGen moves its own vertices to better places (its own default is 7). They
-    cost time; on phantoms the errors were the same without."""
     timeout: PositiveFloat = 60.0
     """Give up after this time, s."""
 
@@ -278,54 +131,8 @@ class BoundarySettings(SettingsTable):
     anisotropy: NonNegativeFloat = 8.0
     """Diffusion across sharper ones, of curvature k, is slowed by exp(-anisotropy (k -
     sharp_bend)), mm."""
-    least_diffusion: PositiveFraction = 0.1
-    """Least diffusion where curves are moved to the middle of the edges of the sheet."""
-    curvature_smoothing: NonNegativeInt = 2
-    """Smoothing steps of the curvature tensor."""
-    lapy_curvature: PositiveFloat = 0.3
-    """LaPy's curvature over curvature x mean edge length (measured on cylinders)."""
-    label_neighbors: PositiveInt = 30
-    """Voxels around a vertex whose labels tell how lateral it is."""
-    label_stride: PositiveInt = 4
-    """One vertex in this many is asked."""
-    lateral_share: PositiveFraction = 0.1
-    """Share of the vertices that count as most lateral."""
-    axial_stretch: PositiveFloat = 4.0
-    """Steps along the axis count this much longer, so that distances run across it."""
-    rim_floor: PositiveFloat = 0.05
-    """Cost of a path per mm along a rim; depth below the rim adds its square, mm2."""
-    rim_zone: PositiveFloat = 1.5
-    """Depth of the rim zones, multiples of 2 volume / wall area."""
-    rim_bands: Numbers = (1.25, 1.0, 1.0)
-    """Half widths of the bands in which curves are moved to the middle of the rims, same unit."""
-    rim_reach: NonNegativeFloat = 0.75
-    """The zones hold at least all within this distance of the rim path, in the same unit."""
     max_distance: NonNegativeFloat = 1.0
     """The two rules may differ by this much, mm; beyond it the rims are taken."""
-    strip_facing: Annotated[float, Field(ge=-1, le=1)] = 0.62
-    """The boundary strips face away from the sheet: least cosine of the angle between the wall's
-    normal and the direction in which the sheet would go on."""
-    first_strip: NonNegativeFloat = 0.55
-    """At first they hold all within this distance of the curves, multiples of 2 volume / wall
-    area."""
-    least_strip: NonNegativeFloat = 0.25
-    """They hold at least all within this distance of their middle lines, in the same unit."""
-    strip_step: PositiveFloat = 0.5
-    """The direction of the sheet is found after one, two and three steps of this length from the
-    rim, in the same unit."""
-    strip_neighbors: PositiveInt = 40
-    """Number of tetrahedra over which that direction is averaged."""
-    strip_stride: PositiveInt = 4
-    """One tetrahedron in this many is asked."""
-    rim_neighbors: PositiveInt = 15
-    """Number of points of the edge over which it is averaged then."""
-    strip_reach: Numbers = (0.9, 0.75)
-    """They hold nothing farther than this from the curves, in the same unit; one value per round.
-    Later rounds start from the middle lines of the strips of the round before."""
-    probe_distances: Numbers = (0.4, 0.8, 1.2)
-    """Distances at which interior labels are looked for, mm outside the wall."""
-    min_probe_share: Fraction = 0.02
-    """Fewer hits than this share count as no interior labels."""
 
 
 class SheetSettings(SettingsTable):
@@ -365,16 +172,8 @@ class MeasureSettings(SettingsTable):
     noise along the axis with the curvature across it."""
     max_curvature: PositiveFloat = 2.5
     """Principal curvatures are bounded by this, 1/mm: the working grid holds no sharper bend."""
-    rim_start: PositiveFraction = 0.8
-    """Beyond this x, and its negative, the lengths and areas of both walls follow those of the
-    mid-surface: where a rounded rim ends a wall is arbitrary."""
-    rim_window: PositiveFloat = 0.2
-    """Extent in x, before that, over which the ratio of wall and mid-surface is taken."""
     repair_reach: PositiveFloat = 0.35
     """A column is marked as repaired this near to a grid node that a repair changed, mm."""
-    stump_reach: NonNegativeFloat = 0.7
-    """A column is marked as repaired up to this much farther from a cut than what is nearest to the
-    cut, mm."""
 
     @model_validator(mode="after")
     def _windows_hold_the_order(self) -> Self:
@@ -402,48 +201,26 @@ class CheckSettings(SettingsTable):
     """Flag if a larger fraction of the columns had to be filled from neighbors."""
     flag_bending: NonNegativeFloat = 0.5
     """Flag if the sheet turns round its exterior side by more than this, rad."""
-    slice_ratio: NonNegativeFloat = 1.5
-    """Voxels are long if their longest edge is more than this many times the shortest."""
     flag_end: NonNegativeFloat = 2.5
     """Flag an end without a label if its standard error is larger, mm (2.1 at most in 12 real)."""
     usual_length_difference: NonNegativeFloat = 4.0
     """The report marks sides whose lengths differ by more, mm (2.8 at most in real labels)."""
-    end_label_depth: NonNegativeFloat = 2.0
-    """Head or tail labels farther inside the body than this are out of place, mm."""
     end_label_share: NonNegativeFloat = 0.005
     """Flag them if they are more than this share of the body's voxels."""
-    beyond_reach: PositiveFloat = 3.0
-    """Labels are counted within this distance on both sides of an end plane, mm."""
-    beyond_share: NonNegativeFloat = 0.7
-    """Flag an end without a label if fewer lie beyond it than this share of those before it."""
-    notch_reach: Numbers = (1.0, 2.0, 3.0)
-    """A cross-section is compared with those at these distances on both sides, mm."""
     notch_share: Numbers = (0.12, 0.3, 0.35)
     """Flag if more than this share of what both sides have is missing, one per distance."""
     bump_contrast: NonNegativeFloat = 4.5
     """Flag a section with more of what others lack than so often the usual (suite population)."""
     intrusion_contrast: NonNegativeFloat = 3.7
     """The same for what both its neighbors label interior."""
-    stub_nodes: NonNegativeFloat = 6.0
-    """What lies this near to a bridge that was cut is left out of that comparison, grid nodes."""
-    section_noise: NonNegativeFloat = 0.02
-    """Share of the area added to the usual before, per mm of distance (interior: in all)."""
     flag_row_jump: NonNegativeFloat = 0.15
     """Flag if the width changes by more than this between rows, or by twice as much at an end."""
     flag_row_dip: NonNegativeFloat = 0.22
     """Flag rows narrower than the widest on both sides by more than this (from the population)."""
-    row_dip_reach: NonNegativeFloat = 8.0
-    """Distance along the axis within which rows are compared, mm."""
     flag_subfield_gap: NonNegativeFloat = 1.5
     """Flag rows without their edge's subfield over more than this, mm (1.2 at most in 128)."""
-    edge_reach: Numbers = (2.5, 3.5, 5.0)
-    """Edges are compared with themselves at these distances along the axis on both sides, mm."""
     flag_edge: Numbers = (1.8, 2.2, 2.7)
     """Flag an edge that recedes behind both by more than this, one per distance, mm."""
-    ridge_reach: Numbers = (1.0, 2.0, 3.0)
-    """Thickness is compared with that at these distances along the axis on both sides, mm."""
-    ridge_columns: PositiveInt = 9
-    """Number of neighboring columns of a row over which thickness is averaged for that."""
     flag_ridge: Numbers = (0.85, 1.4, 1.3)
     """Flag a band that is thicker than both by more than this, one per distance, mm."""
     flag_groove: Numbers = (0.55, 0.75, 0.75)
@@ -452,8 +229,6 @@ class CheckSettings(SettingsTable):
     """Warn of an uncus that begins farther than this behind the anterior plane, mm."""
     flag_cavity: NonNegativeFloat = 0.03
     """Flag a wide cavity beyond this share of the body: the mean may be off by half of it."""
-    flag_reach: PositiveFloat = 1.0
-    """A flag concerns the columns within this distance of what was found, mm."""
     flag_pinholes: NonNegativeFloat = 0.01
     """Flag labels with more single voxels without a label than this share of the sheet's."""
     flag_gap: NonNegativeInt = 70
@@ -498,17 +273,6 @@ class SurrogateSettings(SettingsTable):
     """Edge of the pixels on which the slices are drawn, mm."""
     smoothing: NonNegativeFloat = 0.4
     """Standard deviation of the Gaussian that rounds the voxels' corners, in-plane voxels."""
-    step: PositiveFloat = 0.5
-    """Distance of points in the equidistant sampling, mm."""
-    axis_smoothing: NonNegativeFloat = 0.5
-    """Standard deviation of the Gaussian that straightens the steps of the medial axis, mm."""
-    hole_area: NonNegativeFloat = 3.0
-    """Smaller holes in a slice are filled, mm2."""
-    fork: NonNegativeFloat = 1.5
-    """The medial axis forks towards the corners of the rims: so much of its ends is replaced by a
-    straight line, multiples of half the thickness there."""
-    reach: NonNegativeFloat = 1.0
-    """Compared with points of the mid-surface that lie this near, mm."""
 
 
 class Settings(SettingsTable):

@@ -20,6 +20,11 @@ _FLAT = 1e-3  # a surface is flat if it is thinner than this share of its length
 Float = NDArray[np.float64]
 Int = NDArray[np.int32]
 Bool = NDArray[np.bool_]
+#: Rows of tables, of which there may be many.
+Int64 = NDArray[np.int64]
+
+#: Columns that identify visits, with the prefixes of BIDS.
+PARTICIPANT, SESSION = "participant_id", "session_id"
 
 End = Literal["posterior", "anterior"]
 """An end of the body."""

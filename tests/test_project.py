@@ -223,3 +223,15 @@ def test_links_lead_somewhere(page):
 def test_pages_say_what_the_code_says(name):
     written = (ROOT / "docs" / name).read_text(encoding="utf-8")
     assert written == PAGES[name](), "run tools/make-docs"
+
+
+@pytest.mark.parametrize("page", ["CONTRIBUTING.md", "docs/architecture.md"])
+def test_paths_of_the_code_exist(page):
+    code = re.findall(r"`([\w./-]+)`", (ROOT / page).read_text(encoding="utf-8"))
+    paths = {text for text in code if re.search(r"/$|/.*\.(py|toml|js|html)$|^tools/", text)}
+    paths -= {"inputs/mytool.py", "shared/"}  # an example, and data beside the clone
+    assert paths
+    folders = ("", "hipsta_bids", "hipsta_bids/group", "hipsta_bids/reports")
+    places = [ROOT / folder for folder in (*folders, "hipsta_bids/reports/templates")]
+    missing = [path for path in sorted(paths) if not any((root / path).exists() for root in places)]
+    assert not missing

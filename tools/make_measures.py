@@ -27,7 +27,7 @@ from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.settings import Settings
-from hipsta_bids.validation.report import Cell, Cells, Picture, Table, markdown, render
+from validation.report import Cell, Cells, Picture, Table, markdown, render
 
 #: Where measures are found, and the rows of the catalog that are there.
 TABLES: Mapping[str, Sequence[Column]] = {

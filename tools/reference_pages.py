@@ -11,7 +11,6 @@ from hipsta_bids.cli.commands import (
     phantom_parser,
     resample_parser,
     surrogate_parser,
-    validate_parser,
 )
 from hipsta_bids.cli.group import group_parser
 from hipsta_bids.cli.participant import build_parser
@@ -28,8 +27,8 @@ from hipsta_bids.derivatives.names import (
 )
 from hipsta_bids.errors import EXIT_MEANINGS
 from hipsta_bids.geometry.catalog import MAPS, PER_SUBFIELD, SECTIONS, SUMMARY, Column
-from hipsta_bids.group.settings import GroupSettings
-from hipsta_bids.group.tables import COLUMNS, JOINT_COLUMNS
+from hipsta_bids.group.design.settings import GroupSettings
+from hipsta_bids.group.output.tables import COLUMNS, JOINT_COLUMNS
 from hipsta_bids.reports.page import reason_actions, reason_sections
 from hipsta_bids.settings import Settings
 
@@ -81,7 +80,7 @@ the rest out, and give the file with `--settings`:"""
 
 ONE_SET_TEXT = """\
 One output folder holds results of one set of settings. Do not pool results of different settings.
-Where a meaning begins with an ellipsis (...), it goes on from the row above."""
+Numbers that nobody has a reason to change are constants in the code, with their meaning."""
 
 REASONS_TEXT = """\
 Every reason has a short name that programs can read: in the column `reason` of `status.tsv`, in
@@ -90,7 +89,7 @@ with the numbers. Here is what the names mean, in the order of what to do."""
 
 OPTIONS_TEXT = """\
 `hipsta-bids BIDS_DIR OUTPUT_DIR participant` measures, `... group` compares. Other commands:
-`demo`, `phantom`, `surrogate`, `meta`, `resample`, `validate`, `settings`, `protocols`. All print
+`demo`, `phantom`, `surrogate`, `meta`, `resample`, `settings`, `protocols`. All print
 these texts with `--help`. Underscores do in place of hyphens (`--n_procs`)."""
 
 _SHARED_TEXT = "of all images with these endings: what they are, unit, space"
@@ -189,20 +188,19 @@ def settings_page() -> str:
         '```toml\n[sheet]\nx_nodes = 61\n\n[body]\nlayer_rule = "nearest-label"\n```',
         ONE_SET_TEXT,
         "## Participant level",
-        *_stages(Settings()),
+        _table(("setting", "default", "meaning"), _stages(Settings())),
         "## Group level",
-        *_stages(GroupSettings()),
+        _table(("setting", "default", "meaning"), _stages(GroupSettings())),
     ]
     return _page(parts)
 
 
-def _stages(settings: Settings | GroupSettings) -> Iterator[str]:
+def _stages(settings: Settings | GroupSettings) -> Iterator[tuple[str, str, str]]:
     for name, stage in settings:
-        yield f"### {name}"
-        yield _words(inspect.getdoc(type(stage)))
-        meanings = type(stage).model_fields
-        rows = ((f"`{k}`", f"`{json.dumps(v)}`", _words(meanings[k].description)) for k, v in stage)
-        yield _table(("setting", "default", "meaning"), rows)
+        yield f"**{name}**", "", f"**{_words(inspect.getdoc(type(stage)))}**"
+        for key, field in type(stage).model_fields.items():
+            value = json.dumps(getattr(stage, key))
+            yield f"`{name}.{key}`", f"`{value}`", _words(field.description)
 
 
 def _words(text: str | None) -> str:
@@ -243,7 +241,6 @@ def options_page() -> str:
         ("hipsta-bids surrogate", surrogate_parser()),
         ("hipsta-bids meta", meta_parser()),
         ("hipsta-bids resample", resample_parser()),
-        ("hipsta-bids validate", validate_parser()),
     ):
         parts.append(f"## {title}")
         for group in parser._action_groups:  # noqa: SLF001  (argparse shows nothing in public)

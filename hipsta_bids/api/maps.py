@@ -16,8 +16,8 @@ from hipsta_bids.derivatives.hemisphere import POSITION, STATE, read_sheet, shee
 from hipsta_bids.errors import InputError, NothingToDoError
 from hipsta_bids.geometry.catalog import MAPS
 from hipsta_bids.geometry.sheet import is_left_handed, layer_depth
-from hipsta_bids.group.collect import grid_of
-from hipsta_bids.group.read import node_coordinates
+from hipsta_bids.group.cohort.collect import grid_of
+from hipsta_bids.group.cohort.read import node_coordinates
 from hipsta_bids.inputs.labels import MARGIN, label_volume
 from hipsta_bids.io import files
 from hipsta_bids.io.gifti import sheet_triangles
@@ -382,11 +382,10 @@ def _one_protocol(root: Path, found: list[Hemisphere], wanted: str | None, regio
     if not names or wanted not in {None, *names}:
         there = ", ".join(f"{seg} (region {own})" for seg, own in every)
         there = f"there is {there}" if there else "run the participant level first"
-        raise NothingToDoError(f"{root}: no such hemisphere; {there}", reason="no-hemisphere")
+        raise NothingToDoError(f"{root}: no such hemisphere; {there}")
     if wanted is None and len(names) > 1:
         raise InputError(
-            f"{root}: hemispheres of several protocols, {', '.join(names)}; choose one by protocol",
-            reason="several-protocols",
+            f"{root}: hemispheres of several protocols, {', '.join(names)}; choose one by protocol"
         )
     return wanted or names[0]
 

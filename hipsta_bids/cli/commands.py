@@ -1,4 +1,4 @@
-"""The other commands: protocols, settings, the demonstration, phantoms, and checks of accuracy."""
+"""The other commands: protocols, settings, the demonstration, phantoms and others."""
 
 import argparse
 from collections.abc import Iterator, Sequence
@@ -16,7 +16,7 @@ from hipsta_bids.cli.participant import (
     input_request,
     run_participant_level,
 )
-from hipsta_bids.errors import ExitCode
+from hipsta_bids.errors import ExitCode, UsageError
 
 _DEMO_PROTOCOL = "freesurfer"  # the layout that the demo dataset has
 
@@ -208,36 +208,6 @@ def resample_parser() -> Parser:
     return parser
 
 
-def validate_parser() -> Parser:
-    """Describe ``hipsta-bids validate``."""
-    parser = Parser(
-        prog="hipsta-bids validate",
-        description="measure phantoms with known truth; write tables and figures",
-        epilog="the exit code is 0 whether or not targets are met: the report says which are",
-    )
-    add = adder(parser)
-    add("--full", "", "all cases, minutes instead of a quick selection")
-    add(
-        "--out", "DIR", "folder for validation.md and images/ (default: docs)", default=Path("docs")
-    )
-    add("--suite", "NAME", "only these suites", nargs="+", default=[])
-    add(
-        "--group",
-        "",
-        "only the group level: simulated cohorts",
-        action="append_const",
-        dest="suite",
-        const="group",
-    )
-    add(
-        "--labels",
-        "BIDS_DIR",
-        "a dataset with segmentations, to be measured as well, as is a folder hippunfold beside it",
-        type=Path,
-    )
-    return parser
-
-
 def list_protocols(arguments: Sequence[str]) -> ExitCode:
     """List the protocols that are known."""
     Parser("hipsta-bids protocols", "list the segmentation protocols").parse_args(arguments)
@@ -252,7 +222,7 @@ def print_settings(arguments: Sequence[str]) -> ExitCode:
     parser = Parser("hipsta-bids settings", "print all settings with their meaning, as TOML")
     parser.add_argument("level", nargs="?", choices=["group"], help="whose settings")
     group = parser.parse_args(arguments).level == "group"
-    from hipsta_bids.group.settings import GroupSettings  # noqa: PLC0415  (start-up time)
+    from hipsta_bids.group.design.settings import GroupSettings  # noqa: PLC0415  (start-up time)
     from hipsta_bids.protocols.toml import settings_toml  # noqa: PLC0415  (start-up time)
     from hipsta_bids.settings import Settings  # noqa: PLC0415  (start-up time)
 
@@ -349,7 +319,7 @@ def run_surrogate(arguments: Sequence[str]) -> ExitCode:
         ignored_table,
         selection_table,
     )
-    from hipsta_bids.validation.surrogate import crosscheck  # noqa: PLC0415  (heavy)
+    from hipsta_bids.participant.surrogate import crosscheck  # noqa: PLC0415  (heavy)
 
     request = input_request(options)
     found = find_inputs(request)
@@ -366,8 +336,8 @@ def run_surrogate(arguments: Sequence[str]) -> ExitCode:
 def run_meta_analysis(arguments: Sequence[str]) -> ExitCode:
     """Combine summaries of sites."""
     options = meta_parser().parse_intermixed_args(arguments)
-    from hipsta_bids.group.consortium import MetaOptions, run_meta  # noqa: PLC0415  (heavy)
-    from hipsta_bids.group.settings import load_group_settings  # noqa: PLC0415  (start-up time)
+    from hipsta_bids.group.design.settings import load_group_settings  # noqa: PLC0415  (start-up time)
+    from hipsta_bids.group.questions.consortium import MetaOptions, run_meta  # noqa: PLC0415  (heavy)
 
     chosen = {
         "meta": {"random": options.random},
@@ -408,12 +378,8 @@ def run_resample(arguments: Sequence[str]) -> ExitCode:
 
 
 def run_validation(arguments: Sequence[str]) -> ExitCode:
-    """Run the validation suites and write their report."""
-    options = validate_parser().parse_args(arguments)
-    from hipsta_bids.validation.report import PAGE, validate  # noqa: PLC0415  (heavy)
-
-    missed = validate(
-        options.out, full=options.full, names=options.suite, labels=options.labels, report=echo
+    """Refuse, as validation is no part of the package; takes any arguments."""
+    raise UsageError(
+        "validate: run it from a checkout of hipsta_bids, by `make validation` or"
+        f" `{' '.join(('python -m validation', *arguments))}`",
     )
-    echo(f"targets missed: {missed}; report: {options.out / PAGE}")
-    return ExitCode.OK

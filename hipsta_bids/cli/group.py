@@ -24,8 +24,8 @@ from hipsta_bids.errors import ExitCode, NothingToDoError, UsageError
 from hipsta_bids.participant.pool import processors
 
 if TYPE_CHECKING:
-    from hipsta_bids.group.run import GroupOptions
-    from hipsta_bids.group.settings import GroupSettings
+    from hipsta_bids.group.design.settings import GroupSettings
+    from hipsta_bids.group.questions.study import GroupOptions
 
 LEVEL = "group"
 
@@ -323,12 +323,11 @@ def run_group_level(arguments: Sequence[str]) -> ExitCode:
 
 def _run(parsed: argparse.Namespace, arguments: Sequence[str]) -> ExitCode:
     if parsed.model is not None and (parsed.formula or parsed.contrast):
-        raise UsageError("give --model, or --formula and --contrast", reason="usage")
+        raise UsageError("give --model, or --formula and --contrast")
     if parsed.age_model is not None and (parsed.model or parsed.formula):
         raise UsageError(
             "--age-model is of the default model; write poly(age, 2) in the formula, and --contrast"
-            ' "nonlinear(age)"',
-            reason="usage",
+            ' "nonlinear(age)"'
         )
     if parsed.reports_only:
         return _rebuild_reports(parsed.output_dir, parsed.name)
@@ -339,7 +338,7 @@ def _run(parsed: argparse.Namespace, arguments: Sequence[str]) -> ExitCode:
     from hipsta_bids.io.files import check_scratch  # noqa: PLC0415  (heavy)
 
     check_scratch()
-    from hipsta_bids.group.inference import PROCESSORS  # noqa: PLC0415  (heavy)
+    from hipsta_bids.group.stats.inference import PROCESSORS  # noqa: PLC0415  (heavy)
 
     PROCESSORS.set(parsed.n_procs)
     settings = _settings(parsed)
@@ -369,8 +368,7 @@ def _rebuild_reports(root: Path, name: str | None) -> ExitCode:
     if not models:
         raise NothingToDoError(
             f"{root}: no analysis{f' of the name {name}' if name else ''}; run the group level"
-            " without --reports-only first",
-            reason="nothing-to-report",
+            " without --reports-only first"
         )
     check_writable(root)
     problems = [write_group_report(root, model) for model in models]
@@ -384,7 +382,7 @@ def _rebuild_reports(root: Path, name: str | None) -> ExitCode:
 
 def _settings(parsed: argparse.Namespace) -> "GroupSettings":
     """Read the settings, and put those in that have an option of their own."""
-    from hipsta_bids.group.settings import load_group_settings  # noqa: PLC0415  (start-up time)
+    from hipsta_bids.group.design.settings import load_group_settings  # noqa: PLC0415  (start-up time)
 
     align = parsed.align and parsed.align.replace("penalised", "penalized")
     chosen = {
@@ -420,11 +418,10 @@ def _settings(parsed: argparse.Namespace) -> "GroupSettings":
 
 
 def _options(parsed: argparse.Namespace, arguments: Sequence[str]) -> "GroupOptions":
-    from hipsta_bids.group.collect import GroupRequest  # noqa: PLC0415  (heavy)
-    from hipsta_bids.group.comparison import Comparison  # noqa: PLC0415  (heavy)
-    from hipsta_bids.group.exclusions import QualityCondition  # noqa: PLC0415  (heavy)
-    from hipsta_bids.group.model import ModelRequest  # noqa: PLC0415  (heavy)
-    from hipsta_bids.group.run import GroupOptions  # noqa: PLC0415  (heavy)
+    from hipsta_bids.group.cohort.collect import GroupRequest  # noqa: PLC0415  (heavy)
+    from hipsta_bids.group.cohort.exclusions import QualityCondition  # noqa: PLC0415  (heavy)
+    from hipsta_bids.group.design.model import Comparison, ModelRequest  # noqa: PLC0415  (heavy)
+    from hipsta_bids.group.questions.study import GroupOptions  # noqa: PLC0415  (heavy)
 
     condition = None if parsed.exclude_qc is None else QualityCondition(parsed.exclude_qc)
     sheets = from_namespace(

@@ -34,7 +34,7 @@ COMMANDS = {
     "surrogate": ("run_surrogate", "IN OUT", "measure thickness in single slices to check maps"),
     "meta": ("run_meta_analysis", "SITE... OUT", "combine summaries of sites (group level)"),
     "resample": ("run_resample", "MAP... OUT", "move maps to HippUnfold's surfaces, or from there"),
-    "validate": ("run_validation", "", "measure accuracy on phantoms, write a report"),
+    "validate": ("run_validation", "", None),
 }
 
 _DESCRIPTOR = "--bids-exec-spec"
@@ -120,7 +120,7 @@ def _dispatch(arguments: list[str]) -> ExitCode:
         return code
     near = did_you_mean(arguments[:1], COMMANDS)
     if near and not is_app and not Path(arguments[0]).exists():
-        raise UsageError(f"{arguments[0]!r} is no command and no dataset{near}", reason="usage")
+        raise UsageError(f"{arguments[0]!r} is no command and no dataset{near}")
     if is_group_level(arguments):
         return run_group_level(arguments)
     return run_participant_level(build_parser(EPILOG).parse_args(arguments), arguments)

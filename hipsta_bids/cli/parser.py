@@ -68,7 +68,7 @@ class Parser(argparse.ArgumentParser):
         elif choice := _CHOICE.search(message):
             known = [name.strip("'\"") for name in choice["known"].split(", ")]
             hint = did_you_mean([choice["word"]], known)
-        raise UsageError(f"{message}{hint} (see {self.prog} --help)", reason="usage")
+        raise UsageError(f"{message}{hint} (see {self.prog} --help)")
 
 
 class _Ignored(argparse.Action):

@@ -338,7 +338,7 @@ def _run(options: "Namespace", arguments: Sequence[str]) -> ExitCode:
     check_folders(options)
     collects = options.analysis_level == COLLECT
     if collects and options.shard is not None:
-        raise UsageError("collect is about all parts; leave --shard out", reason="usage")
+        raise UsageError("collect is about all parts; leave --shard out")
     if options.reports_only:
         return _rebuild_reports(options)
     settings = load_settings(options.settings)
@@ -427,8 +427,7 @@ def _rebuild_reports(options: "Namespace") -> ExitCode:
     ]
     if not visits:
         raise NothingToDoError(
-            f"{root}: no results of these participants; run without --reports-only first",
-            reason="nothing-to-report",
+            f"{root}: no results of these participants; run without --reports-only first"
         )
     check_writable(root)
     progress = Progress(-1 if options.quiet else options.verbose)
@@ -457,8 +456,7 @@ def check_folders(options: "Namespace") -> None:
     if options.output_dir.resolve() == options.bids_dir.resolve():
         raise UsageError(
             f"{options.output_dir}: the output folder is the BIDS dataset itself; use for example"
-            f" {options.bids_dir / 'derivatives' / 'hipsta_bids'}",
-            reason="output-is-input",
+            f" {options.bids_dir / 'derivatives' / 'hipsta_bids'}"
         )
 
 
@@ -466,8 +464,7 @@ def check_output_is_no_input(out_dir: Path, items: "Sequence[HemisphereInput]") 
     """Refuse a folder with segmentations as output folder."""
     if out_dir.resolve() in {item.source_path.resolve() for item in items}:
         raise UsageError(
-            f"{out_dir}: the output folder holds the segmentations; choose another one",
-            reason="output-is-input",
+            f"{out_dir}: the output folder holds the segmentations; choose another one"
         )
 
 
@@ -478,7 +475,7 @@ def input_request(options: "Namespace") -> "InputRequest":
     _settle_labels(options)
     derivatives = dict(options.derivatives)
     if len(derivatives) != len(options.derivatives):
-        raise UsageError("--derivatives: a name occurs twice; give each its own", reason="usage")
+        raise UsageError("--derivatives: a name occurs twice; give each its own")
     return from_namespace(
         InputRequest,
         options,
@@ -501,8 +498,7 @@ def _settle_labels(options: "Namespace") -> None:
         if wrong and options.freesurfer_dir is None:
             raise UsageError(
                 f"--{option.replace('_', '-')}: {wrong[0]!r} is not a BIDS label (letters and"
-                " digits)",
-                reason="bad-label",
+                " digits)"
             )
         setattr(options, option, [plain_label(label) for label in labels])
 
@@ -516,8 +512,7 @@ def _run_options(
     if options.mem is not None and options.mem < WORKER_GB:
         raise UsageError(
             f"--mem: {options.mem * 1000:g} MB is less than one hemisphere may need"
-            f" ({WORKER_GB * 1000:g} MB); for gigabytes write 8G",
-            reason="too-little-memory",
+            f" ({WORKER_GB * 1000:g} MB); for gigabytes write 8G"
         )
     check_scratch(options.work_dir)
     cluster = None

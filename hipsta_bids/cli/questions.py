@@ -9,8 +9,8 @@ from hipsta_bids.cli.parser import Parser, adder, factor_level
 from hipsta_bids.errors import UsageError
 
 if TYPE_CHECKING:
-    from hipsta_bids.group.run import GroupOptions, GroupResult
-    from hipsta_bids.group.settings import GroupSettings
+    from hipsta_bids.group.design.settings import GroupSettings
+    from hipsta_bids.group.questions.study import GroupOptions, GroupResult
 
 #: Options that only sample sizes have; questions; and options that only comparisons have.
 _POWER_ONLY = ("power_level", "dropout", "visits")
@@ -111,7 +111,7 @@ def run_comparison(
     parsed: argparse.Namespace, options: "GroupOptions", settings: "GroupSettings"
 ) -> "GroupResult":
     """Compare participants."""
-    from hipsta_bids.group.run import run_group  # noqa: PLC0415  (heavy)
+    from hipsta_bids.group.questions.compare import run_group  # noqa: PLC0415  (heavy)
 
     _refuse(parsed, (*_POWER_ONLY, "among"), "without --retest or --power")
     _refuse(parsed, ("controls",), "without --norms")
@@ -123,8 +123,7 @@ def run_comparison(
     elif how.permutations * how.alpha < 1:
         raise UsageError(
             f"{how.permutations} permutations cannot give p of {how.alpha:g}; at least"
-            f" {math.ceil(1 / how.alpha)} are needed, and thousands are better",
-            reason="usage",
+            f" {math.ceil(1 / how.alpha)} are needed, and thousands are better"
         )
     return run_group(options, settings)
 
@@ -135,13 +134,12 @@ def run_question(
     """Measure the agreement of sessions, find sample sizes, fit norms or score by them."""
     asked = [f"--{name.replace('_', '-')}" for name in (*_TRIALS, *_NORMS) if getattr(parsed, name)]
     if len(asked) > 1 and asked != ["--retest", "--power"]:
-        raise UsageError(f"give one of {', '.join(asked)}", reason="usage")
+        raise UsageError(f"give one of {', '.join(asked)}")
     _refuse(parsed, _COMPARISON_ONLY, f"with {' and '.join(asked)}")
     if settings.harmonization.column:
         raise UsageError(
             f"{' and '.join(asked)}: nothing is harmonized; leave harmonization.column out of the"
-            " settings (norms have sites in their model; for --power, put the site into --formula)",
-            reason="usage",
+            " settings (norms have sites in their model; for --power, put the site into --formula)"
         )
     if parsed.power is None:
         _refuse(parsed, _POWER_ONLY, "without --power")
@@ -152,23 +150,22 @@ def run_question(
     else:
         _refuse(parsed, ("align", "template"), "with --norms, whose registration is taken")
     if parsed.fit_norms or parsed.norms:
-        from hipsta_bids.group.norming import NormsRequest, run_norms  # noqa: PLC0415  (heavy)
+        from hipsta_bids.group.questions.norming import run_norms  # noqa: PLC0415  (heavy)
 
-        norms = NormsRequest(file=parsed.norms, among=parsed.among, controls=parsed.controls)
-        return run_norms(options, norms, settings)
-    from hipsta_bids.group.power import TrialEffect  # noqa: PLC0415  (heavy)
-    from hipsta_bids.group.trials import TrialRequest, run_trial  # noqa: PLC0415  (heavy)
+        among, controls = parsed.among, parsed.controls
+        return run_norms(options, settings, path=parsed.norms, among=among, controls=controls)
+    from hipsta_bids.group.questions.trials import run_trial  # noqa: PLC0415  (heavy)
+    from hipsta_bids.group.stats.trials import TrialEffect  # noqa: PLC0415  (heavy)
 
     effect = None
     if parsed.power is not None:
         kind, share = parsed.power
         effect = TrialEffect(kind=kind, share=share, visits=parsed.visits or ())
-    request = TrialRequest(retest=parsed.retest, effect=effect, among=parsed.among)
-    return run_trial(options, request, settings)
+    return run_trial(options, settings, retest=parsed.retest, effect=effect, among=parsed.among)
 
 
 def _refuse(parsed: argparse.Namespace, names: Sequence[str], when: str) -> None:
     """Refuse options that would have no effect."""
     given = [f"--{name.replace('_', '-')}" for name in names if getattr(parsed, name)]
     if given:
-        raise UsageError(f"{', '.join(given)}: has no meaning {when}; leave it out", reason="usage")
+        raise UsageError(f"{', '.join(given)}: has no meaning {when}; leave it out")

@@ -50,8 +50,7 @@ def check_own_dataset(root: Path) -> None:
     if NAME not in makers:
         raise UsageError(
             f"{root}: already a dataset of {', '.join(makers) or 'another kind'}; choose an output"
-            " folder of its own",
-            reason="foreign-output",
+            " folder of its own"
         )
 
 
@@ -87,6 +86,11 @@ def settle_settings(root: Path, settings: Settings) -> str:
         before = earlier.get("settings")
         theirs = flatten(before if isinstance(before, dict) else {})
         ours = flatten(resolved)
+        if theirs.keys() - ours.keys():
+            raise SettingsError(
+                f"{root}: holds results of version {earlier.get('version', 'unknown')}, which had"
+                " other settings; use a new output folder, or delete this one to redo all of it"
+            )
         changes = [
             f"{key} was {theirs.get(key, 'not there')}, now {ours.get(key, 'not there')}"
             for key in dict.fromkeys((*theirs, *ours))
@@ -94,8 +98,7 @@ def settle_settings(root: Path, settings: Settings) -> str:
         ]
         raise SettingsError(
             f"{root}: holds results with other settings ({'; '.join(changes) or 'hash differs'});"
-            " use a new output folder, or delete this one to redo all of it",
-            reason="other-settings",
+            " use a new output folder, or delete this one to redo all of it"
         )
     content = {"hash": digest, "version": __version__, "settings": resolved}
     files.write_json(path, content)

@@ -532,9 +532,7 @@ def read_sheet(
     expected = np.divmod(np.arange(len(x)), max(ny, 1))
     if len(x) != nx * ny or (x != expected[0] + 1).any() or (y != expected[1] + 1).any():
         said = ", as the settings say" if shape else ""
-        raise InputError(
-            f"{path}: not a sheet of {nx} x {ny} nodes{said}; {_REDO}", reason="mixed-grids"
-        )
+        raise InputError(f"{path}: not a sheet of {nx} x {ny} nodes{said}; {_REDO}")
     found = {name: table.column(name) for name in numbers}
     found |= {name: table.column(name).fill_null("") for name in words}
     return {name: column.to_numpy().reshape(nx, ny) for name, column in found.items()}

@@ -18,6 +18,25 @@ from hipsta_bids.protocols.protocol import CORE, LATERAL_END, Tissue
 from hipsta_bids.settings import BodySettings
 from hipsta_bids.types import Bool, End, Float, LabelVolume
 
+#: Without end labels: standard deviation by which profiles along the axis are smoothed, mm.
+END_SMOOTHING = 1.0
+#: What is usual in the body: this quantile over cross-sections with CA1 and CA2 or CA3.
+END_USUAL = 0.3
+#: How much a millimeter of certain evidence multiplies odds, natural logarithm (times 0.5).
+END_WEIGHT = 3.0
+#: Even odds of an end: the sheet, CA1, or CA2 and CA3 have this share of their usual area.
+LOST_SHARE = 0.5
+#: The same of dentate gyrus and CA4, since the sheet closes over them in the tail.
+CORE_SHARE = 0.5
+#: The evidence rises from none to certain over this range of such shares.
+LOST_WIDTH = 0.5
+#: Even odds: CA2 and CA3 spread this many times as far as usual, since the uncus has some.
+UNCUS_SPREAD = 2.5
+#: The same of dentate gyrus and CA4; and even odds at this multiple of their usual area.
+CORE_GROWTH = 1.6
+#: Even odds: the sheet has this multiple of its usual area.
+HEAD_GROWTH = 1.5
+
 Cues = dict[str, Float]
 """Evidence (T,) from 0 to 1 that a level is outside of the body, by name."""
 
@@ -61,7 +80,7 @@ def find_ends(
     dentate gyrus, and cross-sections like those in its middle. All this is evidence for or against
     each level; an end is the mean over all places where the body may end, weighted by evidence.
     """
-    profile = _profile(volume, sheet, axis, settings)
+    profile = _profile(volume, sheet, axis)
     levels = profile.levels
     low, high = known.get("posterior", -np.inf), known.get("anterior", np.inf)
     typical = _has_subfields(profile) & (levels > low) & (levels < high)
@@ -71,7 +90,7 @@ def find_ends(
             "tail labels: label the head and the tail, or check that the protocol fits the labels",
             reason="no-body",
         )
-    lost, odd = _evidence(profile, typical, settings)
+    lost, odd = _evidence(profile, typical)
     ends = _mean_ends(levels, _doubt(lost, odd), known, settings)
     # The standard error over the cues, by leaving each out once (jackknife).
     less = [
@@ -95,9 +114,7 @@ def find_ends(
     return found
 
 
-def _profile(
-    volume: LabelVolume, sheet: NDArray[np.uint8], axis: Float, settings: BodySettings
-) -> _Profile:
+def _profile(volume: LabelVolume, sheet: NDArray[np.uint8], axis: Float) -> _Profile:
     """Measure cross-sections of the sheet and of what lies inside it."""
     edges = volume.affine[:3, :3]
     along = axis @ edges
@@ -113,7 +130,7 @@ def _profile(
     points = {name: voxel_points(mask, volume.affine) for name, mask in tissues.items()}
     middle = points["sheet"].mean(axis=0)
     reach = (points["sheet"] - middle) @ axis
-    margin = 5 * settings.end_smoothing + abs(along[through])
+    margin = 5 * END_SMOOTHING + abs(along[through])
     first = int(np.floor((reach.min() - margin) / _STEP))
     last = int(np.ceil((reach.max() + margin) / _STEP))
     volume_of_part = abs(float(np.linalg.det(edges))) / parts / _STEP
@@ -125,9 +142,7 @@ def _profile(
         at = (height[:, None] + offsets) / _STEP - first  # parts of voxels
         moments = np.column_stack([np.ones(len(flat)), flat, (flat**2).sum(axis=1)])
         sums = _binned(at, moments, last - first + 1)
-        sums = ndimage.gaussian_filter1d(
-            sums, settings.end_smoothing / _STEP, axis=0, mode="constant"
-        )
+        sums = ndimage.gaussian_filter1d(sums, END_SMOOTHING / _STEP, axis=0, mode="constant")
         area[name] = sums[:, 0] * volume_of_part
         mean = sums[:, 1:] / np.maximum(sums[:, :1], 1e-9)
         spread[name] = np.sqrt(np.maximum(mean[:, 3] - (mean[:, :3] ** 2).sum(axis=1), 0))
@@ -163,7 +178,7 @@ def _has_subfields(profile: _Profile) -> Bool:
     return both
 
 
-def _evidence(profile: _Profile, typical: Bool, settings: BodySettings) -> tuple[Cues, Cues]:
+def _evidence(profile: _Profile, typical: Bool) -> tuple[Cues, Cues]:
     """Weigh what speaks against each level: tissues that are lost, and shapes unlike the body's.
 
     Either is 0.5 at the share, or ratio, that the settings name. Usual is a low quantile over the
@@ -171,24 +186,24 @@ def _evidence(profile: _Profile, typical: Bool, settings: BodySettings) -> tuple
     """
 
     def usual(values: Float) -> float:
-        return max(float(np.quantile(values[typical], settings.end_usual)), 1e-6)
+        return max(float(np.quantile(values[typical], END_USUAL)), 1e-6)
 
     area, spread = profile.area, profile.spread
-    shares = dict.fromkeys(_NEEDED, settings.lost_share)
+    shares = dict.fromkeys(_NEEDED, LOST_SHARE)
     has_core = usual(area["core"]) > 0.02 * usual(area["sheet"])  # is it labeled
     if has_core:
-        shares["core"] = settings.core_share
+        shares["core"] = CORE_SHARE
     lost = {
-        name: np.clip(0.5 + (share - area[name] / usual(area[name])) / settings.lost_width, 0, 1)
+        name: np.clip(0.5 + (share - area[name] / usual(area[name])) / LOST_WIDTH, 0, 1)
         for name, share in shares.items()
     }
     ratios = {
-        "spread of CA2-3": (spread["CA2-3"], settings.uncus_spread),
-        "area of the sheet": (area["sheet"], settings.head_growth),
+        "spread of CA2-3": (spread["CA2-3"], UNCUS_SPREAD),
+        "area of the sheet": (area["sheet"], HEAD_GROWTH),
     }
     if has_core:
-        ratios["spread of the core"] = (spread["core"], settings.core_growth)
-        ratios["area of the core"] = (area["core"], settings.core_growth)
+        ratios["spread of the core"] = (spread["core"], CORE_GROWTH)
+        ratios["area of the core"] = (area["core"], CORE_GROWTH)
     odd = {
         name: np.clip(0.5 * np.log(np.maximum(x / usual(x), 1.0)) / np.log(ratio), 0, 1)
         for name, (x, ratio) in ratios.items()
@@ -212,7 +227,7 @@ def _mean_ends(
     The logarithm of a weight is the integral of 0.5 - doubt over the body, times a setting. So an
     end is near to where doubt passes one half, or a mean if it does so at several places.
     """
-    gain = settings.end_weight * np.cumsum(0.5 - doubt) * _STEP
+    gain = END_WEIGHT * np.cumsum(0.5 - doubt) * _STEP
     weight = gain - gain[:, None]
     allowed = levels - levels[:, None] >= settings.min_length
     low, high = known.get("posterior"), known.get("anterior")
@@ -245,7 +260,7 @@ def _grazed(depth: Float, area: Float, lost: Float, settings: BodySettings) -> f
     fine = np.arange(0.5, settings.end_reach / _STEP) * _STEP
     share = np.interp(fine, depth, area) / max(float(area[inner].mean()), 1e-6)
     length = _below(share, settings.end_fullness)
-    blurred = _below(ndtr(fine / settings.end_smoothing), settings.end_fullness)
+    blurred = _below(ndtr(fine / END_SMOOTHING), settings.end_fullness)
     labels_end = np.interp(-_BESIDE, depth, lost)
     return float(labels_end * max(length - blurred, 0.0))
 

@@ -182,7 +182,7 @@ def extract_body(volume: LabelVolume, settings: BodySettings) -> Body:
         volume, tissue, change = _apply_mask(volume, tissue, volume.edited_mask, ends)
         # What the mask removed may have changed the long axis.
         ends = find_end_planes(volume, tissue, settings)
-    uncus = find_uncus(tissue, volume.affine, ends, settings)
+    uncus = find_uncus(tissue, volume.affine, ends)
     tissue = tissue.copy()
     tissue[tuple(uncus.T)] = 0
     hippocampal, region = tissue, settings.region

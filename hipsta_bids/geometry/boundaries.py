@@ -21,6 +21,46 @@ from hipsta_bids.geometry.wall import Wall, end_to_end
 from hipsta_bids.settings import BoundarySettings
 from hipsta_bids.types import Bool, Float, Int, Surface
 
+#: Voxels around a vertex whose labels tell how lateral it is.
+LABEL_NEIGHBORS = 30
+#: One vertex in this many is looked up.
+LABEL_STRIDE = 4
+#: Share of the vertices that count as most lateral.
+LATERAL_SHARE = 0.1
+#: Steps along the axis count this much longer, so that distances run across it.
+AXIAL_STRETCH = 4.0
+#: Cost of a path per mm along an edge; depth below the edge adds its square, mm2.
+EDGE_FLOOR = 0.05
+#: Depth of the zones along the edges, multiples of 2 volume / wall area.
+EDGE_ZONE = 1.5
+#: Half widths of the bands in which curves are moved to the middle of the edges, same unit.
+EDGE_BANDS = (1.25, 1.0, 1.0)
+#: The zones hold at least all within this distance of the path along the edge, in the same unit.
+EDGE_ZONE_REACH = 0.75
+#: The boundary strips face away from the sheet: least cosine of the angle between the wall's
+#: normal and the direction in which the sheet would go on.
+STRIP_FACING = 0.62
+#: At first they hold all within this distance of the curves, multiples of 2 volume / wall area.
+FIRST_STRIP = 0.55
+#: They hold at least all within this distance of their middle lines, in the same unit.
+LEAST_STRIP = 0.25
+#: The direction of the sheet is found after one, two and three steps of this length from the
+#: edge, in the same unit.
+STRIP_STEP = 0.5
+#: Number of tetrahedra over which that direction is averaged.
+STRIP_NEIGHBORS = 40
+#: One tetrahedron in this many is looked up.
+STRIP_STRIDE = 4
+#: Number of points of the edge over which it is averaged then.
+EDGE_NEIGHBORS = 15
+#: They hold nothing farther than this from the curves, in the same unit; one value per round.
+#: Later rounds start from the middle lines of the strips of the round before.
+STRIP_REACH = (0.9, 0.75)
+#: Distances at which interior labels are looked for, mm outside the wall.
+PROBE_DISTANCES = (0.4, 0.8, 1.2)
+#: Fewer hits than this share count as no interior labels.
+MIN_PROBE_SHARE = 0.02
+
 #: Medial and lateral, or the other way round.
 Pair = tuple[Float, Float]
 Paths = tuple[NDArray[np.intp], NDArray[np.intp]]
@@ -28,9 +68,7 @@ Paths = tuple[NDArray[np.intp], NDArray[np.intp]]
 _SLICES = 40  # along the body, in each of which the rim is sought
 
 
-def rim_paths(
-    wall: Wall, laplace: Laplace, body: Body, settings: BoundarySettings
-) -> tuple[Paths, Pair]:
+def rim_paths(wall: Wall, laplace: Laplace, body: Body) -> tuple[Paths, Pair]:
     """Medial and lateral path from end to end where the wall is farthest from the opposite rim.
 
     Distances run inside the volume and mostly across the long axis, as steps along it are
@@ -42,45 +80,43 @@ def rim_paths(
     points, edges = laplace.points, laplace.edges
     steps = np.diff(points[edges], axis=1)[:, 0]
     along = steps @ body.ends.axis
-    stretch = settings.axial_stretch**2 - 1
+    stretch = AXIAL_STRETCH**2 - 1
     lengths = np.sqrt(np.einsum("ij,ij->i", steps, steps) + stretch * along**2)
     graph = edge_graph(edges, lengths, len(points))
-    start = _most_lateral(points, body, settings)
+    start = _most_lateral(points, body)
     paths: list[NDArray[np.intp]] = []
     depths: list[Float] = []
     for _ in range(3):  # medial from labels, lateral from medial, medial again from lateral
         distance = sparse.csgraph.dijkstra(graph, indices=start, min_only=True)[wall.index]
         depth = _below_top(distance, wall.share)
-        path = _rim_path(depth, wall, settings)
+        path = _rim_path(depth, wall)
         start = wall.index[path].astype(np.intp)
         paths.append(path)
         depths.append(depth)
     return (paths[2], paths[1]), (depths[2], depths[1])
 
 
-def guided_curves(
-    wall: Wall, paths: Paths, depths: Pair, thickness: float, settings: BoundarySettings
-) -> Pair | None:
+def guided_curves(wall: Wall, paths: Paths, depths: Pair, thickness: float) -> Pair | None:
     """Middle lines between the two sides within zones along both paths.
 
     Without these zones the wall falls into its two sides. The zero line of the harmonic function
     between them, with the same curvature-aware diffusion, runs along the edges of the sheet.
     """
     zones = [
-        (_below_rim(depth, path, wall) < settings.rim_zone * thickness)
-        | wall.near(wall.vertices[path], settings.rim_reach * thickness)
+        (_below_rim(depth, path, wall) < EDGE_ZONE * thickness)
+        | wall.near(wall.vertices[path], EDGE_ZONE_REACH * thickness)
         for path, depth in zip(paths, depths, strict=True)
     ]
     return middle_lines(wall, zones)
 
 
-def center_curves(wall: Wall, curves: Pair, thickness: float, settings: BoundarySettings) -> Pair:
+def center_curves(wall: Wall, curves: Pair, thickness: float) -> Pair:
     """Move curves to the middle of the sheet's edges, which may be rounded.
 
     The middle lines are found again in ever narrower bands of equal width on both sides: a side
     that bends more, or reaches farther into a zone, pulls the line towards itself.
     """
-    for width in settings.rim_bands:
+    for width in EDGE_BANDS:
         bands = [wall.near(curve, width * thickness) for curve in curves]
         curves = middle_lines(wall, bands) or curves
     return curves
@@ -100,19 +136,17 @@ def middle_lines(wall: Wall, zones: Sequence[Bool]) -> Pair | None:
     return lines if first >= second else (lines[1], lines[0])
 
 
-def _most_lateral(points: Float, body: Body, settings: BoundarySettings) -> NDArray[np.intp]:
+def _most_lateral(points: Float, body: Body) -> NDArray[np.intp]:
     """Vertices whose surroundings carry the most lateral labels."""
-    count = min(settings.label_neighbors, len(body.lateral))
-    asked = np.arange(0, len(points), settings.label_stride)
+    count = min(LABEL_NEIGHBORS, len(body.lateral))
+    asked = np.arange(0, len(points), LABEL_STRIDE)
     mean = body.lateral[body.nearest(points[asked], count)].mean(axis=1)
-    return np.asarray(asked[mean >= np.quantile(mean, 1 - settings.lateral_share)])
+    return np.asarray(asked[mean >= np.quantile(mean, 1 - LATERAL_SHARE)])
 
 
-def _rim_path(depth: Float, wall: Wall, settings: BoundarySettings) -> NDArray[np.intp]:
+def _rim_path(depth: Float, wall: Wall) -> NDArray[np.intp]:
     """Cheapest path from end to end; depth below the rim costs."""
-    cost = wall.lengths * (
-        settings.rim_floor + (np.maximum(depth, 0)[wall.edges].mean(axis=1)) ** 2
-    )
+    cost = wall.lengths * (EDGE_FLOOR + (np.maximum(depth, 0)[wall.edges].mean(axis=1)) ** 2)
     start, end = (
         int(np.flatnonzero(where)[np.argmin(depth[where])])
         for where in (wall.posterior, wall.anterior)
@@ -155,13 +189,13 @@ def facing_strips(
     """
     finder = _Finder(wall, laplace, thickness, settings)
     starts = curves
-    strips = _near(wall, curves, settings.first_strip * thickness)
-    for reach in settings.strip_reach:
-        lines = _near(wall, curves, settings.least_strip * thickness)
+    strips = _near(wall, curves, FIRST_STRIP * thickness)
+    for reach in STRIP_REACH:
+        lines = _near(wall, curves, LEAST_STRIP * thickness)
         limits = _near(wall, curves, reach * thickness)
         medial, lateral = (wall.index[strip] for strip in strips)
         values = laplace.between(medial, lateral, DIRECTION_RESIDUAL)
-        flow = laplace.gradient(values, settings.strip_stride)
+        flow = laplace.gradient(values, STRIP_STRIDE)
         strips = (
             finder.strip(starts[0], flow, lines[0], limits[0]),
             finder.strip(starts[1], -flow, lines[1], limits[1]),
@@ -182,22 +216,22 @@ class _Finder:
         self, wall: Wall, laplace: Laplace, thickness: float, settings: BoundarySettings
     ) -> None:
         self._wall, self._settings = wall, settings
-        self._step = settings.strip_step * thickness
+        self._step = STRIP_STEP * thickness
         links = edge_graph(wall.edges, np.ones(len(wall.edges)), len(wall.vertices))
         self._normals = _unit((links + sparse.eye_array(len(wall.vertices))) @ wall.normals)
-        asked = laplace.cells[:: settings.strip_stride]
+        asked = laplace.cells[::STRIP_STRIDE]
         self._centers = cKDTree(laplace.points[asked.T].mean(axis=0))
 
     def strip(self, starts: Float, inward: Float, line: Bool, limit: Bool) -> Bool:
         """Vertices (V,) within a limit that face away from the sheet, with a line among them."""
         away = -self._direction_at_rim(starts, inward)
         close = np.flatnonzero(limit)
-        count = min(self._settings.rim_neighbors, len(starts))
+        count = min(EDGE_NEIGHBORS, len(starts))
         _, nearest = cKDTree(starts).query(self._wall.vertices[close], k=count)
         towards = _unit(away[nearest].mean(axis=1))
         facing = line.copy()
         cosine = (self._normals[close] * towards).sum(axis=1)
-        facing[close] |= cosine > self._settings.strip_facing
+        facing[close] |= cosine > STRIP_FACING
         return self._wall.connected(facing, line)
 
     def _direction_at_rim(self, starts: Float, inward: Float) -> Float:
@@ -216,7 +250,7 @@ class _Finder:
         return _unit((4 * found[0] + found[1] - 2 * found[2]) / 3)
 
     def _mean(self, points: Float, flow: Float) -> Float:
-        _, nearest = self._centers.query(points, k=self._settings.strip_neighbors)
+        _, nearest = self._centers.query(points, k=STRIP_NEIGHBORS)
         return _unit(flow[nearest].mean(axis=1))
 
 
@@ -266,9 +300,9 @@ def find_boundaries(
     """
     wall = Wall(surface, body, settings)
     thickness = mean_wall_thickness(surface)
-    paths, depths = rim_paths(wall, laplace, body, settings)
+    paths, depths = rim_paths(wall, laplace, body)
     rims = (wall.vertices[paths[0]], wall.vertices[paths[1]])
-    guided = guided_curves(wall, paths, depths, thickness, settings)
+    guided = guided_curves(wall, paths, depths, thickness)
     curves = end_to_end(wall, wall.bend_aware.eigenfunctions(1)[1][:, 0])
     distance = float("nan")
     if curves is not None and guided is not None:
@@ -282,7 +316,7 @@ def find_boundaries(
     rule, pair, strips, sides = found
     if _rank(pair[0], body) > _rank(pair[1], body):
         pair, strips = (pair[1], pair[0]), (strips[1], strips[0])
-    sides, side_rule, margin = _interior_first(sides, wall, body, settings)
+    sides, side_rule, margin = _interior_first(sides, wall, body)
     area = float(wall.areas[(strips[0] | strips[1])[wall.triangles].all(axis=1)].sum())
     return Boundaries(
         medial=wall.index[strips[0]],
@@ -317,8 +351,8 @@ def _separating(
     for rule, found in attempts:
         if found is None:
             continue
-        pair = center_curves(wall, found, thickness, settings)
-        plain = _near(wall, pair, settings.first_strip * thickness)
+        pair = center_curves(wall, found, thickness)
+        plain = _near(wall, pair, FIRST_STRIP * thickness)
         for strips, middle in (
             facing_strips(wall, laplace, pair, thickness, settings),
             (plain, pair),
@@ -355,19 +389,19 @@ def _rank(curve: Float, body: Body) -> float:
 
 
 def _interior_first(
-    sides: tuple[Bool, Bool], wall: Wall, body: Body, settings: BoundarySettings
+    sides: tuple[Bool, Bool], wall: Wall, body: Body
 ) -> tuple[tuple[Bool, Bool], str, float]:
     """Order the sides by how often probes outward from them hit labels of the interior side."""
     if body.region == "entorhinal":  # no such label touches it
         return sides, "bending", float("nan")
     target = body.interior & (body.tissue == 0)
     hit = np.zeros(len(wall.vertices), dtype=bool)
-    for reach in settings.probe_distances:
+    for reach in PROBE_DISTANCES:
         probe = body.to_voxels(wall.vertices + reach * wall.normals)
         voxel = np.clip(np.rint(probe).astype(int), 0, np.array(target.shape) - 1)
         hit |= target[tuple(voxel.T)]
     share = [float(hit[side].mean()) for side in sides]
-    if max(share) < settings.min_probe_share:
+    if max(share) < MIN_PROBE_SHARE:
         return sides, "bending", float("nan")
     margin = abs(share[0] - share[1])
     return (sides if share[0] > share[1] else (sides[1], sides[0])), "labels", margin

@@ -79,7 +79,7 @@ class Measured:
         means = np.average(self.thickness, axis=0, weights=self.area)
         extent = self.settings.sheet.y_extent
         thickness = at_columns(means, 1 / extent, self.whole.points.shape[1])
-        return cut_sections(self.whole, thickness, self.settings.measures)
+        return cut_sections(self.whole, thickness)
 
     @cached_property
     def area(self) -> Float:
@@ -102,7 +102,7 @@ class Measured:
 
     def wall_area(self, level: int) -> float:
         """Area of the interior (0) or exterior (-1) wall, mm2."""
-        return wall_area(self.whole, level, self.settings.measures)
+        return wall_area(self.whole, level)
 
     def mean_curvature(self, level: int) -> Float:
         """(Nx, Ny) mean curvature of a level of the sheet, 1/mm."""

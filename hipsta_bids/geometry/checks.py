@@ -28,7 +28,7 @@ from hipsta_bids.geometry.grid import Field, continued_nodes, cut_across, in_pla
 from hipsta_bids.geometry.mesh import mean_wall_thickness
 from hipsta_bids.geometry.slices import points_of_ends
 from hipsta_bids.protocols.protocol import Part, Tissue, lateral_rank
-from hipsta_bids.settings import CheckSettings, TopologySettings
+from hipsta_bids.settings import CheckSettings
 from hipsta_bids.types import (
     Bool,
     Coordinates,
@@ -41,10 +41,27 @@ from hipsta_bids.types import (
     position_text,
 )
 
+#: A cut this near, mm, to both the subiculum and CA2 or CA3 severs but turns that touch.
+CONTACT_REACH = 1.2
+#: Voxels are long if their longest edge is more than this many times the shortest.
+LONG_VOXEL_RATIO = 1.5
+#: Head or tail labels farther inside the body than this are out of place, mm.
+END_LABEL_DEPTH = 2.0
+#: Labels are counted within this distance on both sides of an end plane, mm.
+BEYOND_REACH = 3.0
+#: Flag an end without a label if fewer lie beyond it than this share of those before it.
+BEYOND_SHARE = 0.7
+#: A cross-section is compared with those at these distances on both sides, mm.
+NOTCH_REACH = (1.0, 2.0, 3.0)
+#: What lies this near to a bridge that was cut is left out of that comparison, grid nodes.
+STUB_NODES = 6.0
+#: Share of the area added to the usual before, per mm of distance (interior: in all).
+SECTION_NOISE = 0.02
+
 
 def check_voxels_across(surface: Surface, body: Body, settings: CheckSettings) -> float:
     """Refuse a sheet that is too thin for its voxels; return its thickness in voxels."""
-    thickness, voxel = mean_wall_thickness(surface), _voxel_across(body, settings)
+    thickness, voxel = mean_wall_thickness(surface), _voxel_across(body)
     across = thickness / voxel
     if across < settings.min_voxels_across:
         raise GeometryError(
@@ -127,7 +144,7 @@ def name_subfields(body: Body) -> Callable[[Float], str]:
     return names
 
 
-def find_contacts(body: Body, settings: TopologySettings) -> Callable[[Float], bool]:
+def find_contacts(body: Body) -> Callable[[Float], bool]:
     """Make a function that says whether the two ends of the sheet touch at (N, 3) points, RAS mm.
 
     The subiculum and CA2 or CA3 are no neighbors on the sheet: where both are near, two of its
@@ -137,7 +154,7 @@ def find_contacts(body: Body, settings: TopologySettings) -> Callable[[Float], b
 
     def touch(at: Float) -> bool:
         middle = at.mean(axis=0)
-        return all(tree.n and tree.query(middle)[0] < settings.contact_reach for tree in trees)
+        return all(tree.n and tree.query(middle)[0] < CONTACT_REACH for tree in trees)
 
     return touch
 
@@ -147,7 +164,7 @@ def name_place(points: Float, body: Body) -> str:
     return position_text(points.mean(axis=0), name_subfields(body)(points))
 
 
-def check_image(body: Body, settings: CheckSettings) -> list[Finding]:
+def check_image(body: Body) -> list[Finding]:
     """Flag images whose voxels or borders do not suit the body."""
     edges = np.linalg.norm(body.affine[:3, :3], axis=0)
     index, points = body.inside_points()
@@ -156,7 +173,7 @@ def check_image(body: Body, settings: CheckSettings) -> list[Finding]:
         Finding(
             reason="slices-along-axis",
             value=0.0 if cut_across(body) else float(edges.max() / edges.min()),
-            limit=settings.slice_ratio,
+            limit=LONG_VOXEL_RATIO,
             what=f"the longest voxel edge ({edges.max():.2f} mm) lies across the long axis",
             remedy="check the header of the image; slices should lie across the hippocampus",
             share=1.0,
@@ -172,10 +189,10 @@ def check_image(body: Body, settings: CheckSettings) -> list[Finding]:
     ]
 
 
-def _voxel_across(body: Body, settings: CheckSettings) -> float:
+def _voxel_across(body: Body) -> float:
     """Edge of the voxels across the sheet, mm: the longest one if slices lie along the axis."""
     edges = np.linalg.norm(body.affine[:3, :3], axis=0)
-    if edges.max() > settings.slice_ratio * edges.min() and not cut_across(body):
+    if edges.max() > LONG_VOXEL_RATIO * edges.min() and not cut_across(body):
         return float(edges.max())
     return in_plane_voxel(body.affine)
 
@@ -184,7 +201,7 @@ def check_end_labels(volume: LabelVolume, body: Body, settings: CheckSettings) -
     """Flag head or tail labels amid the body, and ends beyond which nothing is labeled."""
     labeled = np.isin(volume.part, (Part.HEAD, Part.TAIL)) & (volume.tissue > 0)
     points = voxel_points(labeled, volume.affine)
-    inside = points[body.ends.depth(points) > settings.end_label_depth]
+    inside = points[body.ends.depth(points) > END_LABEL_DEPTH]
     amid = Finding(
         reason="end-labels-inside",
         value=len(inside) / max(len(body.inside_points()[0]), 1),
@@ -193,10 +210,10 @@ def check_end_labels(volume: LabelVolume, body: Body, settings: CheckSettings) -
         remedy="correct these labels",
         points=inside,
     )
-    return [amid, *_check_beyond(volume, body, settings)]
+    return [amid, *_check_beyond(volume, body)]
 
 
-def _check_beyond(volume: LabelVolume, body: Body, settings: CheckSettings) -> list[Finding]:
+def _check_beyond(volume: LabelVolume, body: Body) -> list[Finding]:
     """Flag ends without head or tail labels at which all labels end."""
     labeled = (volume.tissue > 0) & (volume.tissue <= Tissue.HIPPOCAMPUS)
     points = voxel_points(labeled, volume.affine)
@@ -206,13 +223,13 @@ def _check_beyond(volume: LabelVolume, body: Body, settings: CheckSettings) -> l
     for end, depth in zip(sides, ends.depths(points), strict=True):
         if ends[end].rule in ("labels", "user"):
             continue
-        near = points[(depth > 0) & (depth < settings.beyond_reach)]
-        beyond = np.count_nonzero((depth < 0) & (depth > -settings.beyond_reach))
+        near = points[(depth > 0) & (depth < BEYOND_REACH)]
+        beyond = np.count_nonzero((depth < 0) & (depth > -BEYOND_REACH))
         found.append(
             Finding(
                 reason="labels-end",
                 value=1 - float(beyond) / max(len(near), 1),
-                limit=1 - settings.beyond_share,
+                limit=1 - BEYOND_SHARE,
                 what=f"the labels end where the body does, at its {end} end",
                 remedy="it may be cut short there; label the whole hippocampus",
                 points=near,
@@ -318,7 +335,7 @@ def check_cross_sections(
     solid, interior = field.values > 0, _interior_nodes(field, body)
     counted = np.ones_like(solid)
     if cuts is not None and cuts.any():
-        counted = ndimage.distance_transform_edt(~cuts) > settings.stub_nodes
+        counted = ndimage.distance_transform_edt(~cuts) > STUB_NODES
     if field.cavities is not None:
         counted &= ~widened(widened(field.cavities))
     levels = slice(field.beyond, solid.shape[2] - field.beyond)
@@ -326,7 +343,7 @@ def check_cross_sections(
     step = field.grid.step
     area = float(np.median(solid.sum(axis=(0, 1))))
     notch, bump, intrusion = _Outlier(), _Outlier(), _Outlier()
-    for reach, limit in zip(settings.notch_reach, settings.notch_share, strict=True):
+    for reach, limit in zip(NOTCH_REACH, settings.notch_share, strict=True):
         k = max(round(reach / step), 1)
         if 2 * k >= solid.shape[2]:
             continue
@@ -337,7 +354,7 @@ def check_cross_sections(
         unexplained = here & counted[:, :, k:-k]
         enclosed = unexplained & interior[:, :, : -2 * k] & interior[:, :, 2 * k :]
         added = unexplained & ~before & ~after
-        noise = settings.section_noise
+        noise = SECTION_NOISE
         for outlier, part, least, contrast in (
             (bump, added, noise * reach, settings.bump_contrast),
             (intrusion, enclosed, noise, settings.intrusion_contrast),

@@ -30,6 +30,30 @@ from hipsta_bids.protocols.protocol import LATERAL_END, MEDIAL_END, Tissue
 from hipsta_bids.settings import BodySettings
 from hipsta_bids.types import Bool, Float, LabelVolume
 
+#: A voxel without a label lies in a thin gap if it has the sheet on both sides in this many of
+#: 13 directions; where an edge of the voxels is longer than ``slit_voxel``, in the same share of
+#: those across that edge.
+GAP_DIRECTIONS = 3
+#: A gap goes through the sheet if what is beside it falls into two parts, each of at least this
+#: share (in six real bodies: none, and gaps with one opening are up to 4.0 mm2).
+SLIT_OPENINGS = 0.2
+#: A voxel without a label lies in a pit if the sheet is this near, mm, ...
+PIT_REACH = 0.9
+#: ... on so many of its six sides (5 is open on one side).
+PIT_SIDES = 5
+#: Pits of this volume are filled, mm3, where gaps are (there are two in six real bodies).
+PIT_SIZE = (0.2, 1.8)
+#: Smaller pieces of CA2 or CA3 are no uncus, mm3.
+UNCUS_SIZE = 1.0
+#: CA2 or CA3 at the anterior plane is the uncus if it lies farther than this medially of the
+#: body's own, mm (10 to 12 in three real brains).
+UNCUS_OFFSET = 5.0
+#: What is enclosed in a slice is filled if at most this share of what surrounds it is open to
+#: the next slices; between thick slices, whatever lies there.
+CAVITY_OPENNESS = 0.25
+#: A cavity with room for a ball of this radius is too wide to be the molecular layer, mm.
+CAVITY_RADIUS = 0.9
+
 Index = NDArray[np.intp]
 Tissues = NDArray[np.uint8]
 
@@ -78,7 +102,7 @@ class Cavities(NamedTuple):
         return np.concatenate([np.zeros((0, 3), np.intp), *self.narrow, *self.wide])
 
 
-def find_uncus(tissue: Tissues, affine: Float, ends: EndPlanes, settings: BodySettings) -> Index:
+def find_uncus(tissue: Tissues, affine: Float, ends: EndPlanes) -> Index:
     """Find voxels (N, 3) of the uncus, which the head bends back to beside the body.
 
     It shows as a second piece of CA2 or CA3 that reaches the anterior plane far medially of the
@@ -105,12 +129,12 @@ def find_uncus(tissue: Tissues, affine: Float, ends: EndPlanes, settings: BodySe
     depth = -ends.height(points, "anterior")
     main = pieces == sizes.argmax() + 1
     found = np.zeros(len(points), dtype=bool)
-    for number in np.flatnonzero(sizes > settings.uncus_size) + 1:
+    for number in np.flatnonzero(sizes > UNCUS_SIZE) + 1:
         piece = pieces == number
         beside = main & (depth < depth[piece].max() + ends.half_slice)
         body = points[beside if beside.any() else main]
         aside = (points[piece].mean(axis=0) - body.mean(axis=0)) @ towards
-        if depth[piece].min() < 3 * ends.half_slice and aside > settings.uncus_offset:
+        if depth[piece].min() < 3 * ends.half_slice and aside > UNCUS_OFFSET:
             found |= piece
     if not found.any():
         return np.zeros((0, 3), np.intp)
@@ -192,7 +216,7 @@ def find_cavities(
     enclosed = _cannot_leave(solid, in_slice, through)
     enclosed &= np.isin(volume.tissue[around], (Tissue.BACKGROUND, Tissue.CYST))
     pieces, _ = ndimage.label(enclosed, structure=ALL)
-    most_open = 1.0 if edges[through] > settings.slit_voxel else settings.cavity_openness
+    most_open = 1.0 if edges[through] > settings.slit_voxel else CAVITY_OPENNESS
     narrow, wide = list[Index](), list[Index]()
     for number, part in enumerate(ndimage.find_objects(pieces), 1):
         room = box_around(positions(pieces[part] == number) + low_corner(part))
@@ -206,7 +230,7 @@ def find_cavities(
             continue
         if (beside & inner[room]).any():
             radius = ndimage.distance_transform_edt(np.pad(piece, 1), sampling=edges).max()
-            is_wide = float(radius) > settings.cavity_radius
+            is_wide = float(radius) > CAVITY_RADIUS
             (wide if is_wide else narrow).append(index)
     return Cavities(tuple(narrow), tuple(wide))
 
@@ -266,7 +290,7 @@ def fill_slits(
     empty = np.pad(unlabeled[around], 1)
     edges = np.linalg.norm(affine[:3, :3], axis=0)
     coarse = edges > settings.slit_voxel
-    enclosed = _enclosed(sheet, settings.gap_directions, coarse)
+    enclosed = _enclosed(sheet, GAP_DIRECTIONS, coarse)
     pieces, _ = ndimage.label(empty & beside & enclosed, structure=ALL)
     sizes = piece_sizes(pieces)
     small = np.sort(edges)[:2]
@@ -274,8 +298,7 @@ def fill_slits(
     through = [
         number
         for number in np.flatnonzero(sizes > least)
-        if not coarse.any()
-        and _opens_on_both_sides(pieces == number, sheet, settings.slit_openings)
+        if not coarse.any() and _opens_on_both_sides(pieces == number, sheet, SLIT_OPENINGS)
     ]
     filled = positions(np.isin(pieces, through)) + low_corner(around) - 1
     sizes[through] = 0
@@ -296,7 +319,7 @@ def fill_pits(
     if edges.max() > settings.slit_voxel:
         return tissue, np.zeros((0, 3), np.intp)
     around = box_around(positions(inside))
-    steps = np.maximum(np.rint(settings.pit_reach / edges), 1).astype(int)
+    steps = np.maximum(np.rint(PIT_REACH / edges), 1).astype(int)
     room = [(int(n), int(n)) for n in steps + 1]
     sheet = np.pad(tissue[around] > 0, room)
     sides = np.zeros(sheet.shape, dtype=np.int8)
@@ -307,9 +330,9 @@ def fill_pits(
     # Between the end planes: next to voxels that lie there.
     beside = widened(np.pad(inside[around], room))
     empty = np.pad(unlabeled[around], room) & ~sheet & beside
-    pieces, _ = ndimage.label(empty & (sides >= settings.pit_sides), structure=FACES)
+    pieces, _ = ndimage.label(empty & (sides >= PIT_SIDES), structure=FACES)
     sizes = piece_sizes(pieces) * float(np.prod(edges))
-    least, most = settings.pit_size
+    least, most = PIT_SIZE
     pits = np.flatnonzero((sizes >= least) & (sizes <= most))
     where = positions(np.isin(pieces, pits)) + low_corner(around) - steps - 1
     if not len(where):

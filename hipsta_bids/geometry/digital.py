@@ -28,6 +28,37 @@ from scipy.spatial import cKDTree
 from hipsta_bids.settings import TopologySettings
 from hipsta_bids.types import Bool, Float
 
+#: Steps in which field values are ordered while growing and shrinking.
+FIELD_LEVELS = 6
+#: Share of the field that each grid node of depth adds to the order of that.
+DEPTH_RANK = 0.05
+#: Membranes cheaper than this are applied together; costlier ones one per round.
+SMALL_COST = 5.0
+#: A filled hole becomes as thick as the wall within this distance of it, grid nodes.
+PLUG_REACH = 8
+#: Number of nearest nodes of the wall's middle that a filled hole takes its thickness from.
+PLUG_NEIGHBORS = 12
+#: Membranes of fewer nodes have no direction.
+ORIENTED_NODES = 4
+#: A cut severs the ribbon, no bridge, if this share lies across the axis (squared areas).
+CUT_ACROSS = 0.3
+#: A cut severs the ribbon if the body goes on this many grid nodes before and behind it.
+SEVER_REACH = 2
+#: Share of the cut's nodes at which the body has to go on.
+SEVER_SHARE = 0.1
+#: A cut severs in any case if the line between its stumps is more along the axis than this,
+SEVER_ALONG = 0.5
+#: and in no case if it is less than this (squared cosines with the axis).
+BRIDGE_ALONG = 0.25
+#: Such cuts cost this much more: where one is the only way, the hemisphere is flagged.
+SEVER_FACTOR = 1000.0
+#: A fill spans the inside of a bend rather than a hole if this share lies across the axis.
+FILL_ACROSS = 0.5
+#: A fill within this distance of an end plane closes an end and no bend, grid nodes.
+LID_NODES = 6.0
+#: Such fills cost this much more.
+ACROSS_FACTOR = 40.0
+
 Bits = NDArray[np.uint32]
 Index = NDArray[np.intp]
 Box = tuple[slice, slice, slice]
@@ -281,12 +312,12 @@ def apply_membranes(
     cross-section that are connected only further inside. ``lifted`` receives the values of filled
     holes. ``contact`` returns whether two turns of the sheet touch at nodes (N, 3).
     """
-    ranked = _ranked(values, settings)
+    ranked = _ranked(values)
     solid = with_plates(state, True) if plates else state
     if plates:
         ranked = with_plates(ranked, float(ranked.max()) + 1.0)
-    grown = grow(_inner_ball(solid, ranked), solid, ranked, settings.levels)
-    shrunk = shrink(_outer_ball(solid, ranked), solid, ranked, settings.levels)
+    grown = grow(_inner_ball(solid, ranked), solid, ranked, FIELD_LEVELS)
+    shrunk = shrink(_outer_ball(solid, ranked), solid, ranked, FIELD_LEVELS)
     both: tuple[tuple[Kind, Bool], ...] = (("cut", solid & ~grown), ("fill", shrunk & ~solid))
     found = [
         Edit(kind, where)
@@ -299,16 +330,16 @@ def apply_membranes(
     edits: list[Edit] = []
     for cost, edit in candidates:
         kind, where = edit.kind, edit.where
-        if edits and cost > settings.small_cost:
+        if edits and cost > SMALL_COST:
             break
         if edits and _gain(solid, where, kind) <= 0:
             continue  # another membrane has already removed this tunnel
         solid[tuple(where.T)] = kind == "fill"
         state[tuple(where.T)] = kind == "fill"
         if kind == "fill":
-            where = _thicken(state, lifted, where, settings)
+            where = _thicken(state, lifted, where)
         edits.append(edit._replace(where=where))
-        if cost > settings.small_cost:
+        if cost > SMALL_COST:
             break
     return edits
 
@@ -344,7 +375,7 @@ def _priced(
         if gain <= 0:
             continue
         cost = float(np.abs(values[tuple(where.T)]).sum())
-        factor = _implausibility(kind, where, solid, settings)
+        factor = _implausibility(kind, where, solid)
         if kind == "cut" and factor > 1 and contact(where):
             factor = 1.0
         at_end = kind == "cut" and any_hole and _gain(closed, where, kind) <= 0
@@ -356,21 +387,19 @@ def _priced(
         wrong = at_end and open_tunnels <= 0
         open_tunnels -= at_end
         priced.append(
-            (price * settings.across_factor, edit._replace(doubtful=True))
-            if wrong
-            else (price, edit)
+            (price * ACROSS_FACTOR, edit._replace(doubtful=True)) if wrong else (price, edit)
         )
     return sorted(priced, key=lambda c: c[0])
 
 
-def _ranked(values: NDArray[np.float32], settings: TopologySettings) -> NDArray[np.float32]:
+def _ranked(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """Order in which nodes are added or removed: by value, and by depth where values saturate.
 
     So membranes come to lie midway across a wide hole, where the field is flat.
     """
     inside = values > 0
     depth = ndimage.distance_transform_edt(inside) - ndimage.distance_transform_edt(~inside)
-    return np.asarray(values + settings.depth_rank * depth, dtype=np.float32)
+    return np.asarray(values + DEPTH_RANK * depth, dtype=np.float32)
 
 
 def _inner_ball(solid: Bool, values: NDArray[np.float32]) -> Bool:
@@ -414,7 +443,7 @@ def _gain(state: Bool, where: Index, kind: Kind) -> int:
     return euler_number(block) - before
 
 
-def _implausibility(kind: Kind, where: Index, solid: Bool, settings: TopologySettings) -> float:
+def _implausibility(kind: Kind, where: Index, solid: Bool) -> float:
     """Factor by which the price of membranes across the long axis rises.
 
     The ribbon runs along the axis, so what fills a hole in it lies along the axis too, and so does
@@ -427,20 +456,18 @@ def _implausibility(kind: Kind, where: Index, solid: Bool, settings: TopologySet
         [len(np.unique(np.delete(where, axis, axis=1), axis=0)) for axis in range(3)],
         dtype=float,
     )
-    oriented = len(where) >= settings.oriented_nodes
+    oriented = len(where) >= ORIENTED_NODES
     across = areas[2] ** 2 / float(areas @ areas)
     if kind == "cut":
         along = _stumps_along(where, solid)
-        lies_across = oriented and across > settings.cut_across and along > settings.bridge_along
-        severs = along > settings.sever_along or (
-            lies_across and _continues(where, solid, settings)
-        )
-        return settings.sever_factor if severs else 1.0
+        lies_across = oriented and across > CUT_ACROSS and along > BRIDGE_ALONG
+        severs = along > SEVER_ALONG or (lies_across and _continues(where, solid))
+        return SEVER_FACTOR if severs else 1.0
     level = float(where[:, 2].mean()) - FIRST[2]
     last = solid.shape[2] - 2 * FIRST[2] - 1
-    lid = min(level, last - level) < settings.lid_nodes
-    spans = oriented and across > settings.fill_across and not lid
-    return settings.across_factor if spans else 1.0
+    lid = min(level, last - level) < LID_NODES
+    spans = oriented and across > FILL_ACROSS and not lid
+    return ACROSS_FACTOR if spans else 1.0
 
 
 def _stumps_along(where: Index, solid: Bool) -> float:
@@ -465,7 +492,7 @@ def _stumps_along(where: Index, solid: Bool) -> float:
     return float(line[2] ** 2 / (line @ line))
 
 
-def _continues(where: Index, solid: Bool, settings: TopologySettings) -> bool:
+def _continues(where: Index, solid: Bool) -> bool:
     """Whether the body continues along the axis on both sides of most of a membrane's nodes.
 
     It may deviate by a node; beyond an end plane it counts as continued.
@@ -473,25 +500,24 @@ def _continues(where: Index, solid: Bool, settings: TopologySettings) -> bool:
     wide = ndimage.maximum_filter(solid, size=(3, 3, 1))
     both = np.ones(len(where), dtype=bool)
     a, b, w = where.T
-    for step in range(1, settings.sever_reach + 1):
+    for step in range(1, SEVER_REACH + 1):
         for level in (w - step, w + step):
             beyond = (level < FIRST[2]) | (level >= solid.shape[2] - FIRST[2])
             both &= beyond | wide[a, b, np.clip(level, 0, solid.shape[2] - 1)]
-    return bool(both.mean() > settings.sever_share)
+    return bool(both.mean() > SEVER_SHARE)
 
 
 def _thicken(
     state: Bool,
     lifted: NDArray[np.float32],
     where: Index,
-    settings: TopologySettings,
 ) -> Index:
     """Make a filled membrane as thick as the wall around it (in place), if the topology allows.
 
     Half the wall's thickness at a node of the membrane is the mean depth of the nearest nodes along
     the wall's middle, which are sought within ``plug_reach`` nodes.
     """
-    reach = settings.plug_reach
+    reach = PLUG_REACH
     low = np.maximum(where.min(axis=0) - reach, FIRST)
     high = np.minimum(where.max(axis=0) + reach + 1, np.array(state.shape) - FIRST)
     around = box(low, high)
@@ -499,7 +525,7 @@ def _thicken(
     membrane = np.zeros_like(block)
     membrane[tuple((where - low).T)] = True
     off, nearest = ndimage.distance_transform_edt(~membrane, return_indices=True)
-    at = _half_thickness(block & ~membrane, where - low, settings)
+    at = _half_thickness(block & ~membrane, where - low)
     thickness = np.zeros(block.shape)
     thickness[tuple((where - low).T)] = at
     half = thickness[tuple(nearest)]
@@ -514,7 +540,7 @@ def _thicken(
     return np.vstack([where, positions(added) + low])
 
 
-def _half_thickness(wall: Bool, nodes: Index, settings: TopologySettings) -> Float:
+def _half_thickness(wall: Bool, nodes: Index) -> Float:
     """Half the thickness of a wall, in nodes, (N,): the depth of its middle near (N, 3) nodes."""
     padded = np.pad(wall, 1, mode="edge")  # no surface where the wall continues beyond the block
     depth = ndimage.distance_transform_edt(padded)[1:-1, 1:-1, 1:-1]
@@ -522,7 +548,7 @@ def _half_thickness(wall: Bool, nodes: Index, settings: TopologySettings) -> Flo
     middle = np.argwhere(ridge)
     if not len(middle):
         return np.ones(len(nodes))
-    count = min(settings.plug_neighbors, len(middle))
+    count = min(PLUG_NEIGHBORS, len(middle))
     _, nearest = cKDTree(middle).query(nodes, k=count)
     # A node's depth is the distance from the next node outside, half a step beyond the surface.
     found = depth[tuple(middle.T)][nearest.reshape(len(nodes), count)]

@@ -19,6 +19,17 @@ from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import BodySettings
 from hipsta_bids.types import Bool, End, Float, GivenEnd, LabelVolume, position_text
 
+#: Where slices are thicker than this many pixels, they have a say in the tilt of the planes.
+PLANE_RATIO = 1.8
+#: There, planes are fitted to labels within this many slices of the interface.
+PLANE_SLICES = 1.5
+#: Width of the logistic function, slices.
+PLANE_WIDTH = 0.05
+#: Tilts against the slices are expected to be of this size, degrees (standard deviation).
+PLANE_TILT = 10.0
+#: Weight of that expectation; all labels together weigh 1.
+PLANE_PRIOR = 0.05
+
 _FAR = 10.0
 """A point of a plane may lie beside the hippocampus, but not farther than this, mm."""
 
@@ -115,11 +126,11 @@ def find_end_planes(
     )
     for end, below, above in sides:
         if min(below.sum(), above.sum()) >= settings.min_end_voxels:
-            across = _across_slices(volume.affine, axis, settings)
+            across = _across_slices(volume.affine, axis)
             point, normal = (
                 _separating_plane(points[below], points[above], axis, settings.plane_reach)
                 if across is None
-                else _plane_along_slices(points[below], points[above], across, settings)
+                else _plane_along_slices(points[below], points[above], across)
             )
             planes[end] = EndPlane(point, normal, "labels")
     for given in volume.given_ends:
@@ -274,7 +285,7 @@ def _separating_plane(below: Float, above: Float, axis: Float, reach: float) -> 
     return point, normal
 
 
-def _across_slices(affine: Float, axis: Float, settings: BodySettings) -> Float | None:
+def _across_slices(affine: Float, axis: Float) -> Float | None:
     """Vector from one slice to the next, mm, (3,), where slices are thick and lie across the axis.
 
     It points as the axis does.
@@ -284,16 +295,14 @@ def _across_slices(affine: Float, axis: Float, settings: BodySettings) -> Float 
     step = np.asarray(affine[:3, through])
     along = float(step @ axis)
     if (
-        edges[through] <= settings.plane_ratio * np.delete(edges, through).max()
+        edges[through] <= PLANE_RATIO * np.delete(edges, through).max()
         or abs(along) < edges[through] * np.cos(np.radians(60))  # cut lengthwise
     ):
         return None
     return step if along > 0 else -step
 
 
-def _plane_along_slices(
-    below: Float, above: Float, across: Float, settings: BodySettings
-) -> tuple[Float, Float]:
+def _plane_along_slices(below: Float, above: Float, across: Float) -> tuple[Float, Float]:
     """Fit the point and normal of a plane between labels in thick slices, RAS mm.
 
     The labels of one slice or two that lie on both sides leave the tilt open over a wide range. Of
@@ -306,11 +315,11 @@ def _plane_along_slices(
     low, high = below @ normal, above @ normal
     level = 0.5 * (np.quantile(low, 0.995) + np.quantile(high, 0.005))
     point, slopes = level * normal, np.zeros(2)
-    prior = np.full(3, settings.plane_prior / np.tan(np.radians(settings.plane_tilt)) ** 2)
+    prior = np.full(3, PLANE_PRIOR / np.tan(np.radians(PLANE_TILT)) ** 2)
     prior[0] = 0.0
-    reach = settings.plane_slices * step
+    reach = PLANE_SLICES * step
     # From a wide function to the narrow one: Newton's method needs a start near its end.
-    for width in (1.0, 0.3, settings.plane_width):
+    for width in (1.0, 0.3, PLANE_WIDTH):
         near = [
             # Whole slices often lie at just this distance: rounding must not decide about them.
             part[np.abs((part - point) @ (normal - slopes @ flat)) < reach + 1e-3]

@@ -10,8 +10,10 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
 
 from hipsta_bids.geometry.measures import column_area, measure_thickness
-from hipsta_bids.settings import CheckSettings
 from hipsta_bids.types import Bool, Finding, Flag, Float, Sheet
+
+#: A flag concerns the columns within this distance of what was found, mm.
+FLAG_REACH = 1.0
 
 _SAME = 0.005
 """mm; means that differ by less read the same."""
@@ -29,7 +31,6 @@ def raise_flags(
     findings: Sequence[Finding],
     sheet: Sheet,
     place: Callable[[Float], str],
-    settings: CheckSettings,
 ) -> list[Flag]:
     """Turn what is beyond its limit into flags that say where, and what it means for the map.
 
@@ -38,7 +39,7 @@ def raise_flags(
     flags = []
     for found in findings:
         if found.raised:
-            known = add_consequence(found, sheet, settings)
+            known = add_consequence(found, sheet)
             where = (
                 f", near {place(found.points)}" if len(found.points) and not found.placed else ""
             )
@@ -56,7 +57,7 @@ def raise_flags(
     return flags
 
 
-def add_consequence(finding: Finding, sheet: Sheet, settings: CheckSettings) -> Finding:
+def add_consequence(finding: Finding, sheet: Sheet) -> Finding:
     """Add which share of the columns the points of a finding concern, and what that does.
 
     The mean thickness, weighted by area, is compared with that of a map in which the columns near
@@ -64,7 +65,7 @@ def add_consequence(finding: Finding, sheet: Sheet, settings: CheckSettings) -> 
     """
     if not len(finding.points) or not np.isnan(finding.share):
         return finding
-    near = columns_near(sheet, finding.points, settings.flag_reach)
+    near = columns_near(sheet, finding.points, FLAG_REACH)
     thickness, area = measure_thickness(sheet), column_area(sheet)
     known = np.isfinite(thickness) & np.isfinite(area)
     change = float("nan")

@@ -11,9 +11,13 @@ from scipy.spatial import cKDTree
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.body import Body
 from hipsta_bids.geometry.completion import Index
+from hipsta_bids.geometry.outlines import SLIT_HALF_WIDTH, TOUCH_DISTANCE
 from hipsta_bids.geometry.slices import has_thick_slices, points_of_ends, sample_slices
 from hipsta_bids.settings import CheckSettings, GridSettings, SliceSettings
 from hipsta_bids.types import Bool, Float, LabelVolume
+
+#: Free space around the body, mm.
+GRID_MARGIN = 1.5
 
 _MAX_REPEATS = 1.3
 """Median number of equal slices in a row, along two axes, of labels that were resampled: 1 in
@@ -125,7 +129,7 @@ def resample_body(body: Body, hemi: str, settings: GridSettings, slices: SliceSe
     else:
         points = continued_nodes(grid, body, body.ends.half_slice).reshape(-1, 3)
         values = _sample_mask(body, points)
-        between = _between_turns(body, points, slices)
+        between = _between_turns(body, points)
         separated = (between & (values > 0.5)).reshape(grid.shape)  # noqa: PLR2004 -- in the mask
         values[between] = 0
     cavities = body.cavities.all
@@ -184,14 +188,14 @@ def _sample_mask(body: Body, points: Float) -> NDArray[np.float32]:
     )
 
 
-def _between_turns(body: Body, points: Float, settings: SliceSettings) -> Bool:
+def _between_turns(body: Body, points: Float) -> Bool:
     """Which of (N, 3) points, RAS mm, lie in a slit between ends of the sheet that touch."""
     medial, lateral = points_of_ends(body)
     slit = np.zeros(len(points), dtype=bool)
     if not (len(medial) and len(lateral)):
         return slit
     trees = cKDTree(medial), cKDTree(lateral)
-    reach = settings.touch + 0.5 * in_plane_voxel(body.affine)  # labels end beyond their centers
+    reach = TOUCH_DISTANCE + 0.5 * in_plane_voxel(body.affine)  # labels end beyond their centers
     gap = np.asarray(trees[1].query(medial, distance_upper_bound=reach)[0])
     touching = medial[np.isfinite(gap)]
     if not len(touching):
@@ -203,7 +207,7 @@ def _between_turns(body: Body, points: Float, settings: SliceSettings) -> Bool:
     )
     between = np.isfinite(first) & np.isfinite(second)
     first, second = first[between], second[between]
-    slit[close[between]] = np.abs(first - second) < 2 * settings.slit
+    slit[close[between]] = np.abs(first - second) < 2 * SLIT_HALF_WIDTH
     return slit
 
 
@@ -274,7 +278,7 @@ def _fit_grid(body: Body, hemi: str, settings: GridSettings) -> WedgeGrid:
     across = _directions_across(body, hemi, flat)
     reach = flat @ across.T
     aside = [settings.beyond * (way @ across.T) / abs(way @ axis) for way in body.outward.values()]
-    margin = settings.margin + float(np.linalg.norm(body.affine[:3, :3], axis=0).min())
+    margin = GRID_MARGIN + float(np.linalg.norm(body.affine[:3, :3], axis=0).min())
     first = np.floor(
         (reach.min(axis=0) + np.min(aside, axis=0).clip(max=0) - margin) / settings.spacing
     )

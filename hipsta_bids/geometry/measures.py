@@ -13,6 +13,12 @@ from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import MeasureSettings
 from hipsta_bids.types import Bool, Float, Sheet, TetMesh
 
+#: Beyond this x, and its negative, the lengths and areas of both walls follow those of the mid-
+#: surface: where a rounded edge ends a wall is arbitrary.
+ROUNDED_EDGE_START = 0.8
+#: Extent in x, before that, over which the ratio of wall and mid-surface is taken.
+ROUNDED_EDGE_WINDOW = 0.2
+
 #: Points per cell along x and y, about a tenth of a millimeter apart along x on the default grid.
 _POINTS = 4
 
@@ -174,17 +180,17 @@ def extent_y(whole: Sheet) -> Float:
     return np.asarray(_steps(whole, whole.middle, 1).sum(axis=1))
 
 
-def wall_length(whole: Sheet, level: int, settings: MeasureSettings) -> Float:
+def wall_length(whole: Sheet, level: int) -> Float:
     """Length of each line of a wall from medial to lateral edge, (Ny,), mm."""
     steps, middle = _steps(whole, level, 0), _steps(whole, whole.middle, 0)
-    return np.asarray(_continued(steps, middle, settings).sum(axis=0))
+    return np.asarray(_continued(steps, middle).sum(axis=0))
 
 
-def wall_area(whole: Sheet, level: int, settings: MeasureSettings) -> float:
+def wall_area(whole: Sheet, level: int) -> float:
     """Area of a wall from medial to lateral edge and end to end, mm2."""
     cells = layer_area(whole.points[:, :, level])
     middle = layer_area(whole.points[:, :, whole.middle])
-    return float(_continued(cells, middle, settings).sum())
+    return float(_continued(cells, middle).sum())
 
 
 def at_columns(values: Float, extent: float, count: int) -> Float:
@@ -197,11 +203,11 @@ def _steps(sheet: Sheet, level: int, axis: int) -> Float:
     return np.asarray(np.linalg.norm(np.diff(sheet.points[:, :, level], axis=axis), axis=-1))
 
 
-def _continued(wall: Float, middle: Float, settings: MeasureSettings) -> Float:
+def _continued(wall: Float, middle: Float) -> Float:
     """Replace steps (Nx - 1, M) of a wall next to the sheet's edges by scaled middle ones."""
     count = len(wall)
-    rim = round((1 - settings.rim_start) / 2 * count)
-    window = max(round(settings.rim_window / 2 * count), 1)
+    rim = round((1 - ROUNDED_EDGE_START) / 2 * count)
+    window = max(round(ROUNDED_EDGE_WINDOW / 2 * count), 1)
     if not rim or 2 * (rim + window) > count:
         return wall
     result = wall.copy()
@@ -253,14 +259,14 @@ class CrossSections:
         return float(np.trapezoid(values, self.position) / np.ptp(self.position))
 
 
-def cut_sections(whole: Sheet, thickness: Float, settings: MeasureSettings) -> CrossSections:
+def cut_sections(whole: Sheet, thickness: Float) -> CrossSections:
     """Measure the cross-sections of a body, given the mean thickness (Ny,) of each."""
     steps = _steps(whole, whole.middle, 1).mean(axis=0)
     return CrossSections(
         position=np.concatenate([[0.0], steps.cumsum()]),
-        interior=wall_length(whole, 0, settings),
+        interior=wall_length(whole, 0),
         middle=extent_x(whole),
-        exterior=wall_length(whole, -1, settings),
+        exterior=wall_length(whole, -1),
         area=section_area(whole),
         thickness=thickness,
     )

@@ -14,6 +14,30 @@ from hipsta_bids.protocols.protocol import Tissue, lateral_rank
 from hipsta_bids.settings import SliceSettings
 from hipsta_bids.types import Bool, Float, Int
 
+#: The subiculum and CA2 or CA3 are kept apart where both are nearer than this, mm.
+TOUCH_DISTANCE = 0.6
+#: Half width of the slit that keeps them apart, mm.
+SLIT_HALF_WIDTH = 0.3
+#: Standard deviation of the Gaussian in a slice, pixels.
+OUTLINE_SMOOTHING = 0.7
+#: Distances from the outline are kept up to this, mm.
+DISTANCE_REACH = 2.0
+#: Most fragments that are joined in a slice.
+MAX_FRAGMENTS = 8
+#: Fragments are joined preferably to subfields at most this many ranks away.
+MAX_RANK_JUMP = 2
+#: Half width of a bridge between fragments, mm.
+BRIDGE_HALF_WIDTH = 0.45
+#: The same where a slice beside shows the ribbon, for pieces with a subfield of their own.
+MAX_BREAK = 3.0
+#: Fragments farther away are dropped if they are smaller than this, mm2.
+CRUMB_AREA = 1.5
+#: Rings are cut along the cheapest path: cost of its length, to which depth in the ribbon (mm)
+#: is added.
+RING_LENGTH = 0.02
+#: What lies in the ribbon of the slices beside costs their depth times this as well.
+RING_BESIDE = 2.0
+
 Stack = NDArray[np.float32]
 """Images, on fine pixels or on those of the segmentation."""
 
@@ -39,16 +63,16 @@ def outline_slice(
     block = np.ones((settings.upsampling,) * 2, dtype=np.uint8)
     labels = np.kron(tissue, block)
     if not labels.any():
-        return np.full(labels.shape, -settings.reach, dtype=np.float32)
+        return np.full(labels.shape, -DISTANCE_REACH, dtype=np.float32)
     fine = pixel / settings.upsampling
-    sigma = settings.smoothing * settings.upsampling
+    sigma = OUTLINE_SMOOTHING * settings.upsampling
     smooth = ndimage.gaussian_filter((labels > 0).astype(np.float64), sigma)
     distance = _signed_distance(smooth > 0.5, fine)  # noqa: PLR2004 -- the outline
     exact = sigma * fine * ndtri(np.clip(smooth, 1e-6, 1 - 1e-6))
     distance = np.where(np.abs(distance) < sigma * fine, exact, distance)
     ranks = ranks_of(tissue, settings.upsampling)
     distance = _join(distance, ranks, beside, fine, settings)
-    return np.asarray(np.clip(distance, -settings.reach, settings.reach), dtype=np.float32)
+    return np.asarray(np.clip(distance, -DISTANCE_REACH, DISTANCE_REACH), dtype=np.float32)
 
 
 def part_distance(
@@ -57,7 +81,7 @@ def part_distance(
     """Signed distance, mm, from some subfields of a slice, accurate to a fine pixel."""
     fine = np.kron(np.isin(tissue, kinds), np.ones((settings.upsampling,) * 2, dtype=bool))
     distance = _signed_distance(fine, pixel / settings.upsampling)
-    return np.asarray(np.clip(distance, -settings.reach, settings.reach), dtype=np.float32)
+    return np.asarray(np.clip(distance, -DISTANCE_REACH, DISTANCE_REACH), dtype=np.float32)
 
 
 def _signed_distance(mask: Bool, pixel: float) -> Float:
@@ -83,7 +107,7 @@ def _join(
     and a slice beside shows the ribbon between them, the ribbon is broken here.
     """
     block = np.ones((settings.upsampling,) * 2)
-    for _ in range(settings.max_fragments):
+    for _ in range(MAX_FRAGMENTS):
         pieces, count = ndimage.label(distance > 0)
         if count < 2:  # noqa: PLR2004 -- one piece is the aim
             break
@@ -93,8 +117,8 @@ def _join(
         gap, nearest = ndimage.distance_transform_edt(~main, return_indices=True)
         # The sheet is one ribbon: a fragment belongs to a neighbor in medial-to-lateral order,
         # not to the part that happens to lie across the sulcus.
-        jump = np.abs(ranks - ranks[tuple(nearest)]) > settings.max_rank_jump
-        cost = pixel * gap + np.where(jump, settings.reach, 0)
+        jump = np.abs(ranks - ranks[tuple(nearest)]) > MAX_RANK_JUMP
+        cost = pixel * gap + np.where(jump, DISTANCE_REACH, 0)
         lacked = _with_others(pieces, main, ranks)
         found: list[tuple[float, int, Float | None]] = []
         for number in range(1, count + 1):
@@ -106,10 +130,10 @@ def _join(
             broken = number in lacked and not jump[place]
             shown = (np.kron(image > 0, block)[way < pixel].mean() for image in beside)
             broken = broken and any(share > _SHOWN for share in shown)
-            limit = settings.max_break if broken else settings.max_gap
+            limit = MAX_BREAK if broken else settings.max_gap
             if cost[place] <= limit:
                 found.append((float(cost[place]), number, way))
-            elif sizes[number] < settings.crumb_area:
+            elif sizes[number] < CRUMB_AREA:
                 found.append((float(cost[place]), number, None))
         if not found:
             break
@@ -117,7 +141,7 @@ def _join(
         if bridge is None:
             distance = np.where(pieces == number, -0.5 * pixel, distance)
         else:
-            distance = np.maximum(distance, settings.bridge - bridge)
+            distance = np.maximum(distance, BRIDGE_HALF_WIDTH - bridge)
     holes, _ = ndimage.label(distance <= 0)
     area = np.bincount(holes.ravel()) * pixel**2
     small = (area < settings.hole_area)[holes] & (distance <= 0)
@@ -138,7 +162,7 @@ def _segment_distance(shape: tuple[int, ...], start: Int, end: Int) -> Float:
     return np.asarray(np.linalg.norm(grid - foot, axis=-1))
 
 
-def cut_rings(outlines: Stack, pixel: float, settings: SliceSettings) -> Stack:
+def cut_rings(outlines: Stack, pixel: float) -> Stack:
     """Open each outline (N, I, J), mm, that closes round a hole; fine pixels of ``pixel`` mm.
 
     The sheet is a ribbon: where it closes to a ring, turns touch. The cut follows the cheapest path
@@ -148,16 +172,16 @@ def cut_rings(outlines: Stack, pixel: float, settings: SliceSettings) -> Stack:
     for number in range(len(outlines)):
         beside = [outlines[k] for k in (number - 1, number + 1) if 0 <= k < len(outlines)]
         near = np.mean(beside, axis=0) if beside else np.zeros_like(outlines[0])
-        for _ in range(settings.max_fragments):
-            path = _way_out(cut[number], near, settings)
+        for _ in range(MAX_FRAGMENTS):
+            path = _way_out(cut[number], near)
             if path is None:
                 break
             gap = pixel * ndimage.distance_transform_edt(~path)
-            cut[number] = np.minimum(cut[number], gap - settings.slit)
+            cut[number] = np.minimum(cut[number], gap - SLIT_HALF_WIDTH)
     return cut
 
 
-def _way_out(outline: Stack, beside: Stack, settings: SliceSettings) -> Bool | None:
+def _way_out(outline: Stack, beside: Stack) -> Bool | None:
     """Pixels of the cheapest path through the ribbon from its largest hole; None without holes."""
     empty, count = ndimage.label(np.pad(outline <= 0, 1, constant_values=True))
     if count == 1:
@@ -166,9 +190,9 @@ def _way_out(outline: Stack, beside: Stack, settings: SliceSettings) -> Bool | N
     sizes[empty[0, 0]] = 0
     outside, hole = empty == empty[0, 0], empty == sizes.argmax()
     depth, height = np.pad(outline, 1), np.pad(beside, 1, mode="edge")
-    cost = settings.ring_length + np.maximum(depth, 0)
-    cost += settings.ring_beside * np.clip(height + settings.slit, 0, 1.5)
-    cost[outside | (empty > 0)] = settings.ring_length
+    cost = RING_LENGTH + np.maximum(depth, 0)
+    cost += RING_BESIDE * np.clip(height + SLIT_HALF_WIDTH, 0, 1.5)
+    cost[outside | (empty > 0)] = RING_LENGTH
     nodes = np.arange(cost.size).reshape(cost.shape)
     steps = []
     for di, dj in ((0, 1), (1, 0), (1, 1), (1, -1)):
@@ -193,7 +217,7 @@ def _way_out(outline: Stack, beside: Stack, settings: SliceSettings) -> Bool | N
     return np.asarray(path.reshape(cost.shape)[1:-1, 1:-1])
 
 
-def drop_doubles(outline: Stack, rank: Float, settings: SliceSettings) -> None:
+def drop_doubles(outline: Stack, rank: Float) -> None:
     """Drop, in place, pieces of a slice (I, J) that have no subfield that the largest one lacks.
 
     The ribbon has each subfield once: such a piece is the uncus, which passes beside the body.
@@ -203,7 +227,7 @@ def drop_doubles(outline: Stack, rank: Float, settings: SliceSettings) -> None:
         return
     main = pieces == piece_sizes(pieces).argmax()
     kept = np.isin(pieces, _with_others(pieces, main, rank)) | main
-    outline[(pieces > 0) & ~kept] = -settings.reach
+    outline[(pieces > 0) & ~kept] = -DISTANCE_REACH
 
 
 def ranks_of(tissue: NDArray[np.uint8], upsampling: int) -> Float:
@@ -212,8 +236,8 @@ def ranks_of(tissue: NDArray[np.uint8], upsampling: int) -> Float:
     return np.where(labels > 0, lateral_rank(labels), np.nan)
 
 
-def keep_apart(medial: Stack, lateral: Stack, settings: SliceSettings) -> Stack:
+def keep_apart(medial: Stack, lateral: Stack) -> Stack:
     """Distance from a slit midway between the two ends of the ribbon, where both are near, mm."""
-    apart = 0.5 * np.abs(medial - lateral) - settings.slit
-    far = -np.minimum(medial, lateral) - settings.touch
+    apart = 0.5 * np.abs(medial - lateral) - SLIT_HALF_WIDTH
+    far = -np.minimum(medial, lateral) - TOUCH_DISTANCE
     return np.asarray(np.maximum(apart, far))

@@ -18,8 +18,20 @@ from skimage.measure import find_contours
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.geometry.digital import piece_sizes
 from hipsta_bids.geometry.fem import Laplace, bare_mesh
-from hipsta_bids.settings import SliceSettings
+from hipsta_bids.geometry.outlines import SLIT_HALF_WIDTH, TOUCH_DISTANCE
 from hipsta_bids.types import Float, Int
+
+#: Turns are parts of the ribbon farther apart along it than this, mm.
+TURN_LENGTH = 3.0
+#: Nodes along the ribbon of a slice.
+RIBBON_NODES = 81
+#: Half length of the edges of the ribbon along its outline, multiples of 2 area / length.
+EDGE_HALF_LENGTH = 0.5
+#: Half the least thickness of the ribbon in a slice, mm: the working grid's smoothing leaves
+#: three fourths of the height of a strip of 0.6 mm, but only half of one of 0.4 mm.
+LEAST_HALF_THICKNESS = 0.3
+#: Mid-lines of slices are matched by squared distance, mm2, and this times squared stretch.
+MATCH_STRETCH = 0.5
 
 _ACROSS = np.linspace(-1, 1, 5)
 """Coordinates across the ribbon at which it has nodes."""
@@ -46,9 +58,7 @@ class _Mesh(NamedTuple):
     """Number of vertices on the outline."""
 
 
-def ribbon_nodes(
-    outline: Float, lateral: Float, pixel: float, settings: SliceSettings
-) -> Float | None:
+def ribbon_nodes(outline: Float, lateral: Float, pixel: float) -> Float | None:
     """Nodes (X, Z, 2), in pixels, of the largest piece in a slice, the first ones medial.
 
     ``outline`` (I, J) is the signed distance, mm; ``lateral`` (I, J) grows from medial to lateral
@@ -62,7 +72,7 @@ def ribbon_nodes(
         mesh = _triangles(np.where(main | (pieces == 0), outline, -pixel), pixel)
         if mesh is None:
             return None
-        nodes = _nodes(mesh, np.where(main, lateral, np.nan), settings)
+        nodes = _nodes(mesh, np.where(main, lateral, np.nan))
     except (GeometryError, QhullError):
         return None
     return nodes if np.isfinite(nodes).all() else None
@@ -95,7 +105,7 @@ def _triangles(field: Float, pixel: float) -> _Mesh | None:
     return _Mesh(points[used], number[cells], int(used[:count].sum()))
 
 
-def _nodes(mesh: _Mesh, lateral: Float, settings: SliceSettings) -> Float:
+def _nodes(mesh: _Mesh, lateral: Float) -> Float:
     """Invert the coordinates along and across the ribbon on a regular grid; NaN where they fold."""
     flat = np.column_stack([mesh.points, np.zeros(len(mesh.points))])
     laplace = Laplace(bare_mesh(TriaMesh, flat, mesh.cells))
@@ -111,7 +121,7 @@ def _nodes(mesh: _Mesh, lateral: Float, settings: SliceSettings) -> Float:
     for tip in (int(slow[: mesh.border].argmin()), int(slow[: mesh.border].argmax())):
         gap = (around[:-1] - around[tip] + 0.5 * around[-1]) % around[-1] - 0.5 * around[-1]
         order = np.argsort(gap)
-        strips.append(order[np.abs(gap[order]) <= settings.rim_half * thickness])
+        strips.append(order[np.abs(gap[order]) <= EDGE_HALF_LENGTH * thickness])
     medial, lateral_end = strips
     walls = [
         _numbers(medial[-1], lateral_end[0], mesh.border),
@@ -121,7 +131,7 @@ def _nodes(mesh: _Mesh, lateral: Float, settings: SliceSettings) -> Float:
     # Lengths in pixels, so that triangles between the coordinates keep their shape.
     scale = 0.5 * np.array([abs(area) / thickness, thickness])
     places = np.column_stack([laplace.between(medial, lateral_end), laplace.between(first, second)])
-    rows, columns = np.meshgrid(np.linspace(-1, 1, settings.ribbon_nodes), _ACROSS, indexing="ij")
+    rows, columns = np.meshgrid(np.linspace(-1, 1, RIBBON_NODES), _ACROSS, indexing="ij")
     wanted = _WITHIN * np.stack([rows, columns], axis=-1)
     return np.asarray(LinearNDInterpolator(places * scale, mesh.points)(wanted * scale))
 
@@ -150,9 +160,7 @@ def _middle(nodes: Float) -> Float:
     return np.asarray(nodes[:, nodes.shape[1] // 2])
 
 
-def align_nodes(
-    ribbons: list[Float | None], pixel: float, settings: SliceSettings
-) -> list[Float | None]:
+def align_nodes(ribbons: list[Float | None], pixel: float) -> list[Float | None]:
     """Move nodes (X, Z, 2) along each slice to where those of the slice inside belong.
 
     From the middle slice, on which they are at equal distances, outwards.
@@ -169,7 +177,7 @@ def align_nodes(
             where = np.linspace(0, 1, len(nodes))
             if inside is not None:
                 lines = pixel * _middle(inside), pixel * _middle(nodes)
-                where = match_lines(*lines, settings.match_stretch)
+                where = match_lines(*lines, MATCH_STRETCH)
             aligned[number] = inside = _nodes_at(nodes, where)
     return aligned
 
@@ -226,39 +234,39 @@ def moves_between(first: Float, second: Float, where: Float) -> Float:
     return np.asarray(np.einsum("nk,nkd->nd", weight, (second - first)[nearest]))
 
 
-def keep_whole(outline: Float, nodes: Float, pixel: float, settings: SliceSettings) -> None:
+def keep_whole(outline: Float, nodes: Float, pixel: float) -> None:
     """Thicken, in place, where a slice's ribbon is so thin that later smoothing would break it.
 
     ``outline`` (I, J) is the signed distance, mm, ``nodes`` (X, Z, 2) are in pixels.
     """
     middle = _middle(nodes)[_TIP:-_TIP]
-    reach = settings.least_half / pixel
+    reach = LEAST_HALF_THICKNESS / pixel
     low = np.maximum(np.floor(middle.min(axis=0) - reach).astype(int), 0)
     high = np.ceil(middle.max(axis=0) + reach).astype(int) + 1
     part = outline[low[0] : high[0], low[1] : high[1]]
-    index = np.argwhere(part < settings.least_half)
+    index = np.argwhere(part < LEAST_HALF_THICKNESS)
     along = _along(middle)
     at = np.linspace(0, along[-1], max(round(2 * along[-1]), 2))
     line = np.stack([np.interp(at, along, middle[:, k]) for k in (0, 1)], axis=1)
     gap = np.asarray(cKDTree(line).query(index + low, distance_upper_bound=reach)[0])
     near = np.isfinite(gap)
     chosen = tuple(index[near].T)
-    part[chosen] = np.maximum(part[chosen], settings.least_half - pixel * gap[near])
+    part[chosen] = np.maximum(part[chosen], LEAST_HALF_THICKNESS - pixel * gap[near])
 
 
-def part_turns(outline: Float, nodes: Float, pixel: float, settings: SliceSettings) -> None:
+def part_turns(outline: Float, nodes: Float, pixel: float) -> None:
     """Widen, in place, gaps between turns of a slice's ribbon that later smoothing would close.
 
     ``outline`` (I, J) is the signed distance, mm, ``nodes`` (X, Z, 2) are in pixels.
     """
-    near = np.argwhere(np.abs(outline) < settings.touch)
+    near = np.argwhere(np.abs(outline) < TOUCH_DISTANCE)
     row = cKDTree(nodes.reshape(-1, 2)).query(near)[1] // nodes.shape[1]
     place = np.full(outline.shape, np.nan)
     place[tuple(near.T)] = pixel * _along(_middle(nodes))[row]
     between = np.zeros(outline.shape, dtype=bool)
-    between[:-1] |= np.abs(np.diff(place, axis=0)) > settings.turn_length
-    between[:, :-1] |= np.abs(np.diff(place, axis=1)) > settings.turn_length
+    between[:-1] |= np.abs(np.diff(place, axis=0)) > TURN_LENGTH
+    between[:, :-1] |= np.abs(np.diff(place, axis=1)) > TURN_LENGTH
     between &= outline < pixel
     if between.any():
         gap = pixel * ndimage.distance_transform_edt(~between)
-        np.minimum(outline, gap - settings.slit, out=outline)
+        np.minimum(outline, gap - SLIT_HALF_WIDTH, out=outline)

@@ -13,6 +13,15 @@ from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import CheckSettings
 from hipsta_bids.types import Finding, Float, Sheet
 
+#: Distance along the axis within which rows are compared, mm.
+ROW_DIP_REACH = 8.0
+#: Edges are compared with themselves at these distances along the axis on both sides, mm.
+EDGE_REACH = (2.5, 3.5, 5.0)
+#: Thickness is compared with that at these distances along the axis on both sides, mm.
+RIDGE_REACH = (1.0, 2.0, 3.0)
+#: Number of neighboring columns of a row over which thickness is averaged for that.
+RIDGE_COLUMNS = 9
+
 _INWARD = 7
 """The way into the sheet goes from an edge to this part of the columns beside it."""
 
@@ -26,7 +35,7 @@ def check_rows(sheet: Sheet, settings: CheckSettings) -> list[Finding]:
     lengths = np.linalg.norm(np.diff(middle, axis=0), axis=-1).sum(axis=0)
     jumps = np.abs(np.diff(lengths)) / np.minimum(lengths[1:], lengths[:-1])
     jumps[[0, -1]] /= 2  # a plane may cut the sheet where it flares
-    dips = 1 - lengths / _wider(lengths, middle, settings.row_dip_reach)
+    dips = 1 - lengths / _wider(lengths, middle, ROW_DIP_REACH)
     found = []
     for reason, change, limit, what in (
         ("extent-jump", jumps, settings.flag_row_jump, "changes by {} from one row to the next"),
@@ -59,7 +68,7 @@ def check_edges(whole: Sheet, settings: CheckSettings) -> list[Finding]:
     for name, edge, beside in (("medial", 0, inner), ("lateral", -1, -1 - inner)):
         rim, inward = middle[edge], middle[beside] - middle[edge]
         best = (0.0, 0.0, settings.flag_edge[0], 0, 0)
-        for reach, limit in zip(settings.edge_reach, settings.flag_edge, strict=True):
+        for reach, limit in zip(EDGE_REACH, settings.flag_edge, strict=True):
             k = max(round(reach / step), 1)
             if 2 * k >= count:
                 continue
@@ -133,9 +142,9 @@ def check_ridges(sheet: Sheet, thickness: Float, settings: CheckSettings) -> lis
         ("thickness-ridge", 1, settings.flag_ridge, "thicker"),
         ("thickness-groove", -1, settings.flag_groove, "thinner"),
     ):
-        bands = _bands(sign * thickness, limits, _row_step(middle), settings)
+        bands = _bands(sign * thickness, limits, _row_step(middle))
         excess, size, (column, row) = max(bands, default=(0.0, 0.0, (0, 0)))
-        half = settings.ridge_columns // 2
+        half = RIDGE_COLUMNS // 2
         found.append(
             Finding(
                 reason=reason,
@@ -151,16 +160,16 @@ def check_ridges(sheet: Sheet, thickness: Float, settings: CheckSettings) -> lis
 
 
 def _bands(
-    thickness: Float, limits: tuple[float, ...], step: float, settings: CheckSettings
+    thickness: Float, limits: tuple[float, ...], step: float
 ) -> Iterator[tuple[float, float, tuple[int, int]]]:
     """Thickest band at each distance: times the limit, mm above both sides, and column."""
-    for reach, limit in zip(settings.ridge_reach, limits, strict=True):
+    for reach, limit in zip(RIDGE_REACH, limits, strict=True):
         k = max(round(reach / step), 1)
         if 2 * k >= thickness.shape[1]:
             continue
         sides = np.maximum(thickness[:, : -2 * k], thickness[:, 2 * k :])
         above = np.nan_to_num(thickness[:, k:-k] - sides)
-        band = ndimage.uniform_filter1d(above, settings.ridge_columns, axis=0)
+        band = ndimage.uniform_filter1d(above, RIDGE_COLUMNS, axis=0)
         at = np.unravel_index(band.argmax(), band.shape)
         size = max(float(band[at]), 0.0)
         yield size / limit, size, (int(at[0]), int(at[1]) + k)

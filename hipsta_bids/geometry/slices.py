@@ -25,6 +25,7 @@ from hipsta_bids.geometry.digital import (
     voxel_points,
 )
 from hipsta_bids.geometry.outlines import (
+    DISTANCE_REACH,
     Stack,
     cut_rings,
     drop_doubles,
@@ -44,6 +45,26 @@ from hipsta_bids.protocols.protocol import LATERAL_END, MEDIAL_END
 from hipsta_bids.settings import SliceSettings
 from hipsta_bids.types import Bool, Float
 
+#: Half width of the ramp across the outline, mm.
+RAMP_HALF_WIDTH = 0.2
+#: Paths of the ribbon's nodes through the slices: from 0 (through their places in the slices) to
+#: 1 (cubic B-splines with these as control points: half the variance of noise is left).
+PATH_SMOOTHING = 1.0
+#: Standard deviation of the window of the registration of slices, mm.
+FLOW_WINDOW = 1.0
+#: Added to the mean squared slope in a window, which is 1 where outlines fill it: keeps
+#: displacements small where the outlines do not tell them.
+FLOW_RIDGE = 0.02
+#: Standard deviation of the Gaussian on displacements after each iteration, mm.
+FLOW_SMOOTHING = 0.5
+#: Iterations of the registration per level.
+FLOW_ITERATIONS = 5
+#: What lies less deep than this inside an end plane is taken from inside, where the sheet's
+#: labels end at the plane, mm.
+HIDDEN_DEPTH = 0.1
+#: There, and beyond the last slice, shapes go on changing at this fraction of their pace.
+EXTRAPOLATION = 0.5
+
 _LEVELS = (2, 1)
 """Sizes of pixels in the registration, from coarse to those of the segmentation."""
 
@@ -59,17 +80,17 @@ def register_slices(outlines: Stack, pixel: float, settings: SliceSettings) -> S
     for level in _LEVELS:
         small = _shrunk(outlines, settings.upsampling * level)
         flow = _doubled(flow, small.shape[1:])
-        for _ in range(settings.flow_iterations):
-            flow = _improved(small, flow, pixel * level, settings)
+        for _ in range(FLOW_ITERATIONS):
+            flow = _improved(small, flow, pixel * level)
     return np.asarray(settings.upsampling * flow, dtype=np.float32)
 
 
-def _improved(images: Stack, flow: Stack, pixel: float, settings: SliceSettings) -> Stack:
+def _improved(images: Stack, flow: Stack, pixel: float) -> Stack:
     """Take one step of Gauss and Newton in a window around each pixel."""
     first, second = _moved(images[:-1], -0.5 * flow), _moved(images[1:], 0.5 * flow)
     slope_i, slope_j = np.gradient((0.5 / pixel) * (first + second), axis=(1, 2))
     error = (first - second) / pixel
-    window = (settings.flow_window / pixel,) * 2
+    window = (FLOW_WINDOW / pixel,) * 2
     ii, ij, jj, ei, ej = (
         ndimage.gaussian_filter(product, (0, *window), truncate=2.5)
         for product in (
@@ -81,10 +102,10 @@ def _improved(images: Stack, flow: Stack, pixel: float, settings: SliceSettings)
         )
     )
     # Along a straight edge only the shift across it is known; the ridge chooses the shortest.
-    ii, jj = ii + settings.flow_ridge, jj + settings.flow_ridge
+    ii, jj = ii + FLOW_RIDGE, jj + FLOW_RIDGE
     det = ii * jj - ij * ij
     step = np.stack([(jj * ei - ij * ej) / det, (ii * ej - ij * ei) / det])
-    width = settings.flow_smoothing / pixel
+    width = FLOW_SMOOTHING / pixel
     return np.asarray(ndimage.gaussian_filter(flow + step, (0, 0, width, width)), dtype=np.float32)
 
 
@@ -150,7 +171,7 @@ class _SliceStack:
         ``level`` (N,) counts slices, ``where`` (2, N) fine pixels.
         """
         last = len(self.outlines) - 1
-        level = level + (self.settings.extrapolation - 1) * (level - np.clip(level, 0, last))
+        level = level + (EXTRAPOLATION - 1) * (level - np.clip(level, 0, last))
         below = np.clip(np.floor(level), 0, last - 1)
         share = level - below
         coarse = self.flows.shape[2] / self.outlines.shape[1]
@@ -169,9 +190,9 @@ class _SliceStack:
             return np.asarray((1 - share[at]) * before + share[at] * after, dtype=np.float32)
 
         distance = mixed(self.outlines, np.ones(len(level), dtype=bool))
-        near = distance > -self.settings.edge
+        near = distance > -RAMP_HALF_WIDTH
         medial, lateral = (mixed(images, near) for images in self.ends)
-        distance[near] = np.minimum(distance[near], keep_apart(medial, lateral, self.settings))
+        distance[near] = np.minimum(distance[near], keep_apart(medial, lateral))
         return distance
 
     def _departure(self, below: Stack, share: Stack, middle: Stack) -> Stack:
@@ -182,7 +203,7 @@ class _SliceStack:
         (Catmull & Rom 1974, Computer Aided Geometric Design:317-326), both written in second
         differences.
         """
-        s = self.settings.path_smoothing
+        s = PATH_SMOOTHING
         departure = np.zeros_like(middle)
         share = np.clip(share, 0, 1)  # beyond the last slice
         for level, near in ((below, 1 - share), (below + 1, share)):
@@ -210,16 +231,16 @@ def sample_slices(body: Body, points: Float, settings: SliceSettings) -> Stack:
     body = _in_own_order(body)
     pixel = float(np.linalg.norm(body.affine[:3, :3], axis=0)[1:].mean())
     labeled = _labeled_ends(body)
-    part = _bounds(body, settings.reach / pixel, labeled)
+    part = _bounds(body, DISTANCE_REACH / pixel, labeled)
     tissue = body.tissue[part].copy()
     for step, depth, known in zip((1, -1), _depths(body, part), labeled, strict=True):
         if not known:
-            _extrapolate(tissue[::step], (depth < settings.hidden_depth)[::step], pixel, settings)
+            _extrapolate(tissue[::step], (depth < HIDDEN_DEPTH)[::step], pixel, settings)
     stack = _stacked(tissue, pixel, settings)
     voxels = body.to_voxels(points) - low_corner(part)
     where = ((voxels[:, 1:] + 0.5) * settings.upsampling - 0.5).astype(np.float32).T
     distance = stack.blend(voxels[:, 0].astype(np.float32), where)
-    return np.asarray(np.clip(distance / (2 * settings.edge) + 0.5, 0, 1), dtype=np.float32)
+    return np.asarray(np.clip(distance / (2 * RAMP_HALF_WIDTH) + 0.5, 0, 1), dtype=np.float32)
 
 
 def _in_own_order(body: Body) -> Body:
@@ -261,25 +282,24 @@ def _stacked(tissue: NDArray[np.uint8], pixel: float, settings: SliceSettings) -
         ]
     )
     fine = pixel / settings.upsampling
-    outlines = np.minimum(outlines, keep_apart(ends[0], ends[1], settings))
-    outlines = cut_rings(outlines, fine, settings)
+    outlines = np.minimum(outlines, keep_apart(ends[0], ends[1]))
+    outlines = cut_rings(outlines, fine)
     ranks = [ranks_of(image, settings.upsampling) for image in tissue]
     for outline, rank in zip(outlines, ranks, strict=True):
-        drop_doubles(outline, rank, settings)
+        drop_doubles(outline, rank)
     ribbons = [
-        ribbon_nodes(outline, rank, fine, settings)
-        for outline, rank in zip(outlines, ranks, strict=True)
+        ribbon_nodes(outline, rank, fine) for outline, rank in zip(outlines, ranks, strict=True)
     ]
     for outline, nodes in zip(outlines, ribbons, strict=True):
         if nodes is not None:
-            keep_whole(outline, nodes, fine, settings)
-            part_turns(outline, nodes, fine, settings)
+            keep_whole(outline, nodes, fine)
+            part_turns(outline, nodes, fine)
     if any(nodes is None for nodes in ribbons):
         flows = register_slices(outlines, pixel, settings)
     else:
         flows = np.zeros((2, len(outlines) - 1, *tissue.shape[1:]), dtype=np.float32)
     bends = np.zeros((2, len(outlines), *flows.shape[2:]), dtype=np.float32)
-    _align(flows, bends, align_nodes(ribbons, fine, settings), settings)
+    _align(flows, bends, align_nodes(ribbons, fine), settings)
     return _SliceStack(outlines=outlines, ends=ends, flows=flows, bends=bends, settings=settings)
 
 

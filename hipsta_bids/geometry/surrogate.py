@@ -22,6 +22,16 @@ from hipsta_bids.geometry.grid import in_plane_voxel
 from hipsta_bids.settings import SheetSettings, SurrogateSettings
 from hipsta_bids.types import Bool, Float
 
+#: Distance of points in the equidistant sampling, mm.
+SAMPLING_STEP = 0.5
+#: Standard deviation of the Gaussian that straightens the steps of the medial axis, mm.
+AXIS_SMOOTHING = 0.5
+#: Smaller holes in a slice are filled, mm2.
+HOLE_AREA = 3.0
+#: The medial axis forks towards the corners of the edges: so much of its ends is replaced by a
+#: straight line, multiples of half the thickness there.
+FORK_LENGTH = 1.5
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SurrogateProfile:
@@ -85,7 +95,7 @@ def surrogate_profiles(
 
     return (
         profile("proportional", along[-1] * (nodes + 1) / 2),
-        profile("equidistant", np.arange(settings.step, along[-1], settings.step)),
+        profile("equidistant", np.arange(SAMPLING_STEP, along[-1], SAMPLING_STEP)),
     )
 
 
@@ -153,7 +163,7 @@ def _one_piece(inside: Bool, position: float, settings: SurrogateSettings) -> Bo
     # Pixels that touch by corners only separate inside, and connect outside.
     outside, count = ndimage.label(~largest, structure=np.ones((3, 3)))
     small = np.bincount(outside.ravel(), minlength=count + 1) * settings.pixel**2
-    hole = small < settings.hole_area
+    hole = small < HOLE_AREA
     hole[0] = False
     if count - hole.sum() > 1:
         raise GeometryError(
@@ -174,7 +184,7 @@ def _medial_axis(cut: _Slice, position: float, settings: SurrogateSettings) -> F
     along = _path_lengths(path, 1.0)
     middle = (along > 0.2 * along[-1]) & (along < 0.8 * along[-1])  # without forks
     width = float(np.median(half[middle])) if middle.any() else 0.0
-    trim = settings.fork * width
+    trim = FORK_LENGTH * width
     kept = (along >= trim) & (along <= along[-1] - trim)
     if along[-1] < 4 * trim or not width:
         raise GeometryError(
@@ -182,7 +192,7 @@ def _medial_axis(cut: _Slice, position: float, settings: SurrogateSettings) -> F
             " slice, or look at its labels",
             reason="surrogate-short",
         )
-    sigma = settings.axis_smoothing / settings.pixel
+    sigma = AXIS_SMOOTHING / settings.pixel
     smooth = ndimage.gaussian_filter1d(path, sigma, axis=0, mode="nearest")[kept]
     back = min(max(int(2 * width), 2), len(smooth) - 1)
     start = _to_the_edge(cut, smooth[0], smooth[0] - smooth[back])[::-1]

@@ -36,6 +36,10 @@ from hipsta_bids.geometry.grid import Field
 from hipsta_bids.settings import MeasureSettings, TopologySettings
 from hipsta_bids.types import Bool, Float, Sheet, position_text
 
+#: A column is marked as repaired up to this much farther from a cut than what is nearest to the
+#: cut, mm.
+STUMP_REACH = 0.7
+
 Locate = Callable[[Float], str]
 """Function that names the subfields at (N, 3) points, RAS mm."""
 Contact = Callable[[Float], bool]
@@ -433,7 +437,7 @@ def _changed_nodes(
     number = cuts[tuple(where.T)]
     distance, _ = cKDTree(points).query(face)
     nearest = np.asarray(ndimage.minimum(distance, number, np.arange(number.max() + 1)))
-    stumps = nearest[number] + settings.stump_reach
+    stumps = nearest[number] + STUMP_REACH
     return np.vstack([changed, face]), np.concatenate([radius, stumps])
 
 

@@ -14,6 +14,13 @@ from hipsta_bids.geometry.mesh import lateral_triangles, triangle_areas, unique_
 from hipsta_bids.settings import BoundarySettings
 from hipsta_bids.types import Bool, Float, Int, Surface
 
+#: Least diffusion where curves are moved to the middle of the edges of the sheet.
+LEAST_DIFFUSION = 0.1
+#: Smoothing steps of the curvature tensor.
+CURVATURE_SMOOTHING = 2
+#: LaPy's curvature over curvature x mean edge length (measured on cylinders).
+LAPY_CURVATURE = 0.3
+
 
 class _Mesh(TriaMesh):  # type: ignore[misc]  # LaPy is untyped
     """LaPy's mesh, with two methods of LaPy 1.7 replaced.
@@ -79,13 +86,13 @@ class Wall:
         the surface is convex.
         """
         mesh = _Mesh(self.vertices, self.triangles)
-        across, along, least, _ = mesh.curvature_tria(settings.curvature_smoothing)
-        bend = -least / (settings.lapy_curvature * float(self.lengths.mean()))
+        across, along, least, _ = mesh.curvature_tria(CURVATURE_SMOOTHING)
+        bend = -least / (LAPY_CURVATURE * float(self.lengths.mean()))
         excess = np.maximum(bend - settings.sharp_bend, 0)
         slowed = np.exp(-settings.anisotropy * excess)
         first, second = (
             Laplace(mesh, settings.solver, (across, along, np.stack([np.ones_like(s), s], axis=1)))
-            for s in (slowed, np.maximum(slowed, settings.least_diffusion))
+            for s in (slowed, np.maximum(slowed, LEAST_DIFFUSION))
         )
         return first, second
 

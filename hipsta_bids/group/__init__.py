@@ -1,7 +1,7 @@
 """Group level: registration of profiles, point-wise models, classification.
 
 Called as a function, ``hipsta_bids.group(maps, table, formula)``, it fits a model to arrays: see
-:func:`hipsta_bids.group.models.group`.
+:func:`hipsta_bids.group.questions.models.group`.
 """
 
 import sys
@@ -13,8 +13,8 @@ class _Package(ModuleType):
     """A package that can be called: a function of its name would be hidden by it."""
 
     def __call__(self, *given: Any, **named: Any) -> Any:  # noqa: ANN401  (of what is called)
-        """Fit a model to arrays, see :func:`hipsta_bids.group.models.group`."""
-        from hipsta_bids.group.models import group  # noqa: PLC0415  (most imports need no model)
+        """Fit a model to arrays, see :func:`hipsta_bids.group.questions.models.group`."""
+        from hipsta_bids.group.questions.models import group  # noqa: PLC0415  (most imports need no model)
 
         return group(*given, **named)
 

@@ -251,8 +251,7 @@ def read_ends(path: Path) -> list[EndRow]:
             fault = f"lacks {', '.join(lacking)}" if rows else "has no rows"
         raise InputError(
             f"{path}: {fault}; its columns are {', '.join((*_NAMES, *_POINT))}, and if needed "
-            f"session, {', '.join(_NORMAL)}",
-            reason="ends-columns",
+            f"session, {', '.join(_NORMAL)}"
         )
     return [_row(f"{path}, line {number}", row) for number, row in enumerate(rows, 2)]
 
@@ -264,12 +263,12 @@ def _row(where: str, row: dict[str, str]) -> EndRow:
     hemi = cells["hemi"].upper()
     if hemi not in HEMIS or not subject or subject == files.MISSING:
         what = f"hemi {cells['hemi']!r} is not L or R" if subject else "it has no participant_id"
-        raise InputError(f"{where}: {what}; correct it", reason="ends-row")
+        raise InputError(f"{where}: {what}; correct it", reason="unreadable-table")
     end: GivenEnd | HipstaError
     try:
         end = _given(cells)
     except ValueError as error:
-        end = InputError(f"{where}: {error}", reason="ends-row")
+        end = InputError(f"{where}: {error}", reason="unreadable-table")
     return EndRow(
         subject=subject,
         session=session if session not in ("", files.MISSING) else None,
@@ -345,12 +344,12 @@ def _attached(
             problem = problem or InputError(
                 f"{row.where}: sub-{item.subject} has several sessions; name one in a column "
                 "session",
-                reason="ends-row",
+                reason="unreadable-table",
             )
         elif row.end.end in ends:
             problem = problem or InputError(
                 f"{row.where}: a second {row.end.end} end of this hemisphere; keep one",
-                reason="ends-row",
+                reason="unreadable-table",
             )
         else:
             ends[row.end.end] = row.end

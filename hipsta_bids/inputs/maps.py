@@ -50,20 +50,18 @@ def read_regions(path: Path, shape: tuple[int, int]) -> Regions:
     if rows and (lacking or unknown):
         fault = f"lacks {', '.join(lacking)}" if lacking else f"has unknown {', '.join(unknown)}"
         raise InputError(
-            f"{path}: {fault}; its columns are {', '.join(COLUMNS)} (and any of the sheet table)",
-            reason="roi-columns",
+            f"{path}: {fault}; its columns are {', '.join(COLUMNS)} (and any of the sheet table)"
         )
     drawn = [row for row in rows if row["region"].strip() not in ("", files.MISSING)]
     if not drawn:
-        raise InputError(f"{path}: no point belongs to a region; draw one", reason="roi-empty")
+        raise InputError(f"{path}: no point belongs to a region; draw one")
     nodes = _nodes(path, drawn, shape)
     names = [row["region"].strip() for row in drawn]
     seen = Counter(zip(names, *nodes.T.tolist(), strict=True))
     (name, x, y), times = seen.most_common(1)[0]
     if times > 1:
         raise InputError(
-            f"{path}: point x={x + 1}, y={y + 1} occurs {times} times in region {name}; keep one",
-            reason="roi-duplicate",
+            f"{path}: point x={x + 1}, y={y + 1} occurs {times} times in region {name}; keep one"
         )
     regions = tuple(dict.fromkeys(names))
     member = np.zeros((len(regions), *shape), dtype=bool)
@@ -86,8 +84,7 @@ def _nodes(
         what = "is no pair of whole numbers" if wrong else "lies off the sheet"
         raise InputError(
             f"{path}: point x={first['x']}, y={first['y']} {what} ({count} in all); x runs from 1"
-            f" to {shape[0]}, y from 1 to {shape[1]}",
-            reason="roi-point",
+            f" to {shape[0]}, y from 1 to {shape[1]}"
         )
     return np.array([[int(row["x"]) - 1, int(row["y"]) - 1] for row in rows], dtype=np.intp)
 
@@ -109,8 +106,7 @@ def check_pattern(option: str, name: str, pattern: str) -> None:
     if unknown:
         known = ", ".join(f"{{{field}}}" for field in PLACEHOLDERS)
         raise UsageError(
-            f"{option} {name}: {min(unknown)!r} is not understood; placeholders are {known}",
-            reason="usage",
+            f"{option} {name}: {min(unknown)!r} is not understood; placeholders are {known}"
         )
 
 
@@ -180,15 +176,15 @@ def map_requests(
     taken = {row.desc for row in (*OUTPUTS, *EXTRA_OUTPUTS)} | {"x", "y", *(m.name for m in MAPS)}
     for name, pattern in patterns:
         if not name.isalnum() or not name.isascii():
-            raise UsageError(f"--map: {name!r} is not a name of letters and digits", reason="usage")
+            raise UsageError(f"--map: {name!r} is not a name of letters and digits")
         if name in taken or names.count(name) > 1:
             why = "belongs to other outputs" if name in taken else "occurs twice"
-            raise UsageError(f"--map: the name {name} {why}; choose another one", reason="usage")
+            raise UsageError(f"--map: the name {name} {why}; choose another one")
         check_pattern("--map", name, pattern)
     for option, choices in (("sampling", samplings), ("interpolation", interpolations)):
         lost = [name for name, _ in choices if name is not None and name not in names]
         if lost:
-            raise UsageError(f"--map-{option}: there is no --map {lost[0]}=...", reason="usage")
+            raise UsageError(f"--map-{option}: there is no --map {lost[0]}=...")
     where = {None: "depth", **dict(samplings)}
     how = {None: "linear", **dict(interpolations)}
     return tuple(

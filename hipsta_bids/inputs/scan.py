@@ -236,17 +236,12 @@ def list_folder(path: Path) -> tuple[list[str], list[str]]:
                 if not entry.name.startswith("."):
                     (folders if _is_folder(entry) else files).append(entry.name)
     except FileNotFoundError as error:
-        raise InputError(
-            f"{path}: no such folder; check the path", reason="missing-folder"
-        ) from error
+        raise InputError(f"{path}: no such folder; check the path") from error
     except NotADirectoryError as error:
-        raise InputError(
-            f"{path}: is a file, but a folder is needed", reason="not-a-folder"
-        ) from error
+        raise InputError(f"{path}: is a file, but a folder is needed") from error
     except OSError as error:
         raise InputError(
-            f"{path}: cannot list the folder ({error.strerror}); check its permissions",
-            reason="unreadable-folder",
+            f"{path}: cannot list the folder ({error.strerror}); check its permissions"
         ) from error
     return sorted(folders), sorted(files)
 
@@ -515,12 +510,10 @@ def _from_index(bids_dir: Path, database_dir: Path) -> frozenset[str]:
         first_line = str(error).partition("\n")[0]
         raise InputError(
             f"{database_dir}: pybids cannot use this database ({first_line}); "
-            "give an empty folder, and it will be made",
-            reason="unreadable-database",
+            "give an empty folder, and it will be made"
         ) from error
     if made_for.resolve() != bids_dir.resolve():
         raise InputError(
-            f"{database_dir}: this database was made for {made_for}; give an empty folder",
-            reason="unreadable-database",
+            f"{database_dir}: this database was made for {made_for}; give an empty folder"
         )
     return subjects

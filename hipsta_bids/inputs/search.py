@@ -284,8 +284,7 @@ def _check_analysis(found: list[HemisphereInput], request: InputRequest) -> None
     ]
     if request.fs_analysis and missing and len(missing) == len(asked):
         raise UsageError(
-            f"--fs-analysis {request.fs_analysis}: no hemisphere has it ({missing[0]})",
-            reason="unknown-analysis",
+            f"--fs-analysis {request.fs_analysis}: no hemisphere has it ({missing[0]})"
         )
 
 
@@ -306,8 +305,7 @@ def _nothing(
     if not sources:
         return NothingToDoError(
             f"{request.bids_dir}: no derivatives/* or sourcedata/* with sub-* folders; "
-            f"name the dataset with the segmentations: -d NAME=PATH{unused}",
-            reason="no-segmentation",
+            f"name the dataset with the segmentations: -d NAME=PATH{unused}"
         )
     if restricted:
         subjects = {
@@ -317,13 +315,11 @@ def _nothing(
         }
         return NothingToDoError(
             f"no hippocampal segmentation matches {' '.join(restricted)} in {searched} "
-            f"(which hold {_count(sorted(subjects), 'subject')}; looked for {_LOOKED_FOR}){unused}",
-            reason="no-match",
+            f"(which hold {_count(sorted(subjects), 'subject')}; looked for {_LOOKED_FOR}){unused}"
         )
     return NothingToDoError(
         f"no hippocampal segmentation in {searched} (looked for {_LOOKED_FOR}); "
-        f"name another dataset: -d NAME=PATH{unused}",
-        reason="no-segmentation",
+        f"name another dataset: -d NAME=PATH{unused}"
     )
 
 

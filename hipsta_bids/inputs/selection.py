@@ -139,10 +139,7 @@ def make_selection(request: InputRequest) -> Selection:
     """Prepare what the user asked for."""
     wrong = [hemi for hemi in request.hemis if hemi not in HEMIS]
     if wrong or not request.hemis:
-        raise UsageError(
-            f"--hemi {' '.join(map(str, wrong))}: choose among {', '.join(HEMIS)}",
-            reason="bad-hemisphere",
-        )
+        raise UsageError(f"--hemi {' '.join(map(str, wrong))}: choose among {', '.join(HEMIS)}")
     choice = request.protocol or None
     return Selection(
         subjects=_labels(
@@ -179,8 +176,7 @@ def _labels(labels: Iterable[str], prefix: str, option: str) -> frozenset[str]:
     if wrong:
         raise UsageError(
             f"{option} {' '.join(wrong)}: labels consist of letters and digits "
-            f"(with or without {prefix!r})",
-            reason="bad-label",
+            f"(with or without {prefix!r})"
         )
     return bare
 
@@ -191,27 +187,21 @@ def _rules(path: Path) -> dict[str, _Wanted]:
         contents = json.loads(path.read_text("utf-8"))
     except OSError as error:
         raise InputError(
-            f"{path}: cannot read the filter file ({error.strerror}); check the path",
-            reason="unreadable-filter",
+            f"{path}: cannot read the filter file ({error.strerror}); check the path"
         ) from error
     except (ValueError, RecursionError) as error:
-        raise InputError(
-            f"{path}: the filter file is not JSON ({error})", reason="unreadable-filter"
-        ) from error
+        raise InputError(f"{path}: the filter file is not JSON ({error})") from error
     query = contents.get(_QUERY, {}) if isinstance(contents, dict) else None
     if not isinstance(query, dict):
         raise UsageError(
-            f'{path}: the filter file is not of the form {{"{_QUERY}": {{ENTITY: VALUE}}}}',
-            reason="bad-filter",
+            f'{path}: the filter file is not of the form {{"{_QUERY}": {{ENTITY: VALUE}}}}'
         )
     known = _entities()
     for key in query:
         if key not in known:
             near = difflib.get_close_matches(key, known, n=1)
             hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise UsageError(
-                f"{path}: {key!r} in {_QUERY!r} is not a BIDS entity{hint}", reason="bad-filter"
-            )
+            raise UsageError(f"{path}: {key!r} in {_QUERY!r} is not a BIDS entity{hint}")
     return {key: _rule(value) for key, value in query.items()}
 
 

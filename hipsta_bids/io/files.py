@@ -131,8 +131,7 @@ def check_scratch(folder: Path | None = None) -> None:
     except FileNotFoundError as error:
         raise OutputError(
             "no folder for temporary files can be written; set TMPDIR to one (in a container,"
-            " mount one at /tmp)",
-            reason="no-scratch",
+            " mount one at /tmp)"
         ) from error
     remove_left_scratch(Path(tempfile.gettempdir()))
 
@@ -252,7 +251,7 @@ def read_tsv(path: Path) -> list[dict[str, str]]:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file; check its name", reason="no-file") from error
+        raise InputError(f"{path}: no such file; check its name") from error
     except UnicodeDecodeError as error:
         raise InputError(
             f"{path}: not readable as a table: no UTF-8 text; save it as that (not as Excel's"

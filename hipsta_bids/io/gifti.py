@@ -182,8 +182,7 @@ def _surface_models(path: Path, image: Cifti2Image) -> dict[str, Cifti2BrainMode
             continue
         if hemi in found:
             raise InputError(
-                f"{path}: has several surfaces of hemisphere {hemi}; give a file with one",
-                reason="several-maps",
+                f"{path}: has several surfaces of hemisphere {hemi}; give a file with one"
             )
         found[hemi] = model
     return found
@@ -193,14 +192,11 @@ def _from_cifti(path: Path, hemi: str) -> PointMap:
     """Read the map of one side; vertices that the file leaves out are missing."""
     image = _load(path, Cifti2Image)
     if image.ndim != 2 or image.shape[0] != 1:  # noqa: PLR2004 -- maps by vertices
-        raise InputError(
-            f"{path}: holds {image.shape[0]} maps; give a file with one", reason="several-maps"
-        )
+        raise InputError(f"{path}: holds {image.shape[0]} maps; give a file with one")
     model = _surface_models(path, image).get(hemi)
     if model is None:
         raise InputError(
-            f"{path}: has no surface of hemisphere {hemi}; leave {{hemi}} out of the pattern",
-            reason="unreadable-map",
+            f"{path}: has no surface of hemisphere {hemi}; leave {{hemi}} out of the pattern"
         )
     first, count = model.index_offset, model.index_count
     try:
@@ -224,9 +220,7 @@ def read_map(path: Path, name: str, hemi: str) -> PointMap:
     arrays = [array for array in image.darrays if array.data.dtype.kind in "fiu"]
     arrays = [array for array in arrays if array.data.ndim == 1]
     if len(arrays) != 1:
-        raise InputError(
-            f"{path}: holds {len(arrays)} maps; give a file with one", reason="several-maps"
-        )
+        raise InputError(f"{path}: holds {len(arrays)} maps; give a file with one")
     pairs = entities(path.name)
     unit = dict(arrays[0].meta).get("Units") or _UNITS.get(pairs["suffix"], ARBITRARY)
     return PointMap(values=_finite(arrays[0].data), unit=str(unit))
@@ -244,17 +238,14 @@ def _from_table(path: Path, name: str) -> PointMap:
     column = name if name in columns else others[0] if len(others) == 1 else None
     if column is None:
         what = f"columns {', '.join(others)}" if others else "no column of values"
-        raise InputError(
-            f"{path}: has {what}; name the map after one of them", reason="several-maps"
-        )
+        raise InputError(f"{path}: has {what}; name the map after one of them")
     try:
         values = [np.nan if row[column] == files.MISSING else float(row[column]) for row in rows]
         nodes = _nodes(rows) if {"x", "y"} <= set(columns) else None
     except ValueError as error:
         raise InputError(
             f"{path}: column {column} has cells that are no numbers ({error}); mark missing ones"
-            " n/a",
-            reason="unreadable-map",
+            " n/a"
         ) from error
     return PointMap(values=_finite(values), unit=ARBITRARY, nodes=nodes, name=column)
 
@@ -276,10 +267,7 @@ def read_mesh(path: Path) -> Mesh:
         for intent in ("POINTSET", "TRIANGLE")
     ]
     if any(len(arrays) != 1 for arrays in found):
-        raise InputError(
-            f"{path}: is no surface (points and triangles); give a .surf.gii file",
-            reason="unreadable-surface",
-        )
+        raise InputError(f"{path}: is no surface (points and triangles); give a .surf.gii file")
     points, triangles = (arrays[0].data for arrays in found)
     mesh = Mesh(
         points=np.asarray(points, dtype=np.float64),
@@ -287,8 +275,7 @@ def read_mesh(path: Path) -> Mesh:
     )
     if mesh.triangles.min(initial=0) < 0 or mesh.triangles.max(initial=-1) >= len(mesh.points):
         raise InputError(
-            f"{path}: has triangles between vertices that do not exist; write it again",
-            reason="unreadable-surface",
+            f"{path}: has triangles between vertices that do not exist; write it again"
         )
     return mesh
 
@@ -303,9 +290,7 @@ def structure_side(path: Path) -> str | None:
 
 def _unreadable(path: Path, what: str, error: Exception) -> InputError:
     first = str(error).partition("\n")[0]
-    return InputError(
-        f"{path}: not readable as {what} ({first}); write it again", reason="unreadable-map"
-    )
+    return InputError(f"{path}: not readable as {what} ({first}); write it again")
 
 
 def _load(path: Path, kind: type[Image]) -> Image:
@@ -316,9 +301,7 @@ def _load(path: Path, kind: type[Image]) -> Image:
         raise _unreadable(path, what, error) from error
     if not isinstance(image, kind):
         raise InputError(
-            f"{path}: is no {what} file; maps are .shape.gii, .func.gii, .dscalar.nii or .tsv"
-            " files",
-            reason="unreadable-map",
+            f"{path}: is no {what} file; maps are .shape.gii, .func.gii, .dscalar.nii or .tsv files"
         )
     return image
 

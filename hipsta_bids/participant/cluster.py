@@ -52,7 +52,7 @@ class Cluster:
 def check_cluster(cluster: Cluster) -> None:
     """Check that Dask is there."""
     if cluster.scheduler is not None and cluster.slurm is not None:
-        raise UsageError("give --dask-scheduler or --slurm, not both", reason="usage")
+        raise UsageError("give --dask-scheduler or --slurm, not both")
     try:
         # Workers that come and go are no news; what was lost is reported per job.
         import_module("dask").config.set({"logging.distributed": "error"})
@@ -62,8 +62,7 @@ def check_cluster(cluster: Cluster) -> None:
     except ModuleNotFoundError as error:
         option = "--dask-scheduler" if cluster.slurm is None else "--slurm"
         raise UsageError(
-            f"{option}: {error.name} is not installed; pip install 'hipsta_bids[cluster]'",
-            reason="no-dask",
+            f"{option}: {error.name} is not installed; pip install 'hipsta_bids[cluster]'"
         ) from error
 
 
@@ -92,8 +91,7 @@ def _connect(cluster: Cluster, plan: WorkerPlan, stack: contextlib.ExitStack) ->
     except (OSError, ValueError) as error:
         raise UsageError(
             f"--dask-scheduler {address}: no answer ({error}); give its address as"
-            " tcp://HOST:PORT, or the file that `dask scheduler --scheduler-file` writes",
-            reason="no-scheduler",
+            " tcp://HOST:PORT, or the file that `dask scheduler --scheduler-file` writes"
         ) from error
 
 
@@ -128,13 +126,10 @@ def _check_script(script: str) -> None:
         )
     except FileNotFoundError as error:
         raise UsageError(
-            "--slurm: there is no sbatch here; run this where jobs can be submitted",
-            reason="no-slurm",
+            "--slurm: there is no sbatch here; run this where jobs can be submitted"
         ) from error
     except subprocess.CalledProcessError as error:
-        raise UsageError(
-            f"--slurm: sbatch refuses ({' '.join(error.stderr.split())})", reason="no-slurm"
-        ) from error
+        raise UsageError(f"--slurm: sbatch refuses ({' '.join(error.stderr.split())})") from error
 
 
 def _work_off(client: Any, plan: WorkerPlan, jobs: Iterable[Any]) -> Generator[tuple[Any, Any]]:  # noqa: ANN401  (Dask is optional)
@@ -172,18 +167,14 @@ def _result(future: Any) -> Any:  # noqa: ANN401  (Dask is optional)
         raise error
     raise UsageError(
         f"Dask's workers cannot do this job ({type(error).__name__}: {error}); they need"
-        f" hipsta_bids {__version__} and the same folders",
-        reason="workers-differ",
+        f" hipsta_bids {__version__} and the same folders"
     ) from error
 
 
 def _answer(version: str, plan: WorkerPlan, job: Any) -> Any:  # noqa: ANN401  (jobs are the caller's)
     """Run in a Dask worker: let a separate process do the job."""
     if version != __version__:
-        raise UsageError(
-            f"Dask's workers have hipsta_bids {__version__}, this run has {version}",
-            reason="workers-differ",
-        )
+        raise UsageError(f"Dask's workers have hipsta_bids {__version__}, this run has {version}")
     # Dask's workers are daemons, which may have no children: those would outlive them. Ours do not.
     multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]  # noqa: SLF001
     worker = _take(plan)
@@ -223,8 +214,7 @@ class Shard:
     def __post_init__(self) -> None:
         if not 1 <= self.index <= self.count:
             raise UsageError(
-                f"--shard {self.index}/{self.count}: parts are numbered from 1 to {self.count}",
-                reason="bad-shard",
+                f"--shard {self.index}/{self.count}: parts are numbered from 1 to {self.count}"
             )
 
     @property
@@ -245,8 +235,7 @@ def parse_shard(text: str, environment: Mapping[str, str]) -> Shard:
     if match is None:
         raise UsageError(
             f"--shard {text}: write I/N, such as 3/100 for the third of 100 parts, or"
-            f" {FROM_SLURM} in an array job",
-            reason="bad-shard",
+            f" {FROM_SLURM} in an array job"
         )
     return Shard(index=int(match[1]), count=int(match[2]))
 
@@ -259,14 +248,12 @@ def _from_array(environment: Mapping[str, str]) -> Shard:
         )
     except (KeyError, ValueError):
         raise UsageError(
-            f"--shard {FROM_SLURM}: this is no array job (sbatch --array=1-N); write I/N",
-            reason="no-array",
+            f"--shard {FROM_SLURM}: this is no array job (sbatch --array=1-N); write I/N"
         ) from None
     if last - first != step * (count - 1):
         # As when some tasks are run again: parts would not be those of the first time.
         raise UsageError(
             f"--shard {FROM_SLURM}: the array's numbers leave gaps; to run some parts of N again"
-            f" write --shard ${_ARRAY}ID/N",
-            reason="array-with-gaps",
+            f" write --shard ${_ARRAY}ID/N"
         )
     return Shard(index=(task - first) // step + 1, count=count)

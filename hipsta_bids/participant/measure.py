@@ -195,7 +195,7 @@ def find_all(evidence: Evidence) -> list[Finding]:
     return [
         *map(_of_repair, solid.repairs),
         *map(_whole, rows),
-        *check_image(body, checks),
+        *check_image(body),
         *check_cavities(body, checks),
         *check_labels(body, checks),
         *check_cross_sections(solid.field, body, checks, solid.touched & (solid.field.values < 0)),
@@ -293,7 +293,7 @@ def unfold(volume: LabelVolume, hemi: str, settings: Settings, clock: Clock) -> 
             resample_body(body, hemi, settings.grid, settings.slices),
             settings.topology,
             name_subfields(body),
-            find_contacts(body, settings.topology),
+            find_contacts(body),
         )
         surface = extract_surface(solid.field, settings.surface)
         across = check_voxels_across(surface, body, settings.checks)
@@ -386,10 +386,7 @@ def measure_hemisphere(
     evidence = unfold(volume, hemi, settings, clock)
     sheet = evidence.sheet
     with clock("measures"):
-        repairs = [
-            add_consequence(_of_repair(repair), sheet, settings.checks)
-            for repair in evidence.solid.repairs
-        ]
+        repairs = [add_consequence(_of_repair(repair), sheet) for repair in evidence.solid.repairs]
         layers, folded_layers = _layers(sheet, settings)
         findings = [*_find(volume, hemi, evidence), *folded_layers]
         maps = measure_maps(evidence)
@@ -433,7 +430,7 @@ def _find(volume: LabelVolume, hemi: str, evidence: Evidence) -> list[Finding]:
 
 def _flags(evidence: Evidence, findings: list[Finding]) -> tuple[Flag, ...]:
     place = partial(name_place, body=evidence.body)
-    return tuple(raise_flags(findings, evidence.sheet, place, evidence.settings.checks))
+    return tuple(raise_flags(findings, evidence.sheet, place))
 
 
 def find_body(volume: LabelVolume, settings: Settings) -> BodyMask | None:

@@ -94,9 +94,9 @@ def resample(
     """
     if not out.name.endswith((TABLE, *METRICS, DENSE_SCALARS)):
         ends = ", ".join((*METRICS, DENSE_SCALARS))
-        raise UsageError(f"{out}: results end with {ends} or {TABLE}", reason="usage")
+        raise UsageError(f"{out}: results end with {ends} or {TABLE}")
     if out.resolve() in {path.resolve() for path in (*paths, *surfaces)}:
-        raise UsageError(f"{out}: is an input; choose another name", reason="usage")
+        raise UsageError(f"{out}: is an input; choose another name")
     known = {_hemi(path): _unfolded(path) for path in surfaces}
     across = {one.hemi: one.values for path in sheets for one in _read(path, column)}
     x, y, _ = sheet_levels(settings, "whole")
@@ -109,8 +109,7 @@ def resample(
         flat = known.get(one.hemi, known.get(None))
         if flat is None:
             raise InputError(
-                f"{one.path}: there is no unfolded surface of side {one.hemi}; add it to --surface",
-                reason="no-surface",
+                f"{one.path}: there is no unfolded surface of side {one.hemi}; add it to --surface"
             )
         places = across.get(one.hemi)
         if places is not None and (
@@ -118,8 +117,7 @@ def resample(
         ):
             raise InputError(
                 f"--sheet: has to have {nodes[0]} x {nodes[1]} points from -1 to 1; give the"
-                " sheet's desc-proximodistal map, or the --settings of the results",
-                reason="mixed-grids",
+                " sheet's desc-proximodistal map, or the --settings of the results"
             )
         between = Correspondence(flat, settings, None if places is None else places.reshape(nodes))
         ours = len(one.values) == nodes[0] * nodes[1] and one.nodes in (None, nodes)
@@ -127,8 +125,7 @@ def resample(
             raise InputError(
                 f"{one.path}: has {len(one.values)} points, the whole sheet {nodes[0]} x"
                 f" {nodes[1]}, and the surface {len(flat.points)}; give the surface of its density,"
-                " or the --settings of the results",
-                reason="mixed-grids",
+                " or the --settings of the results"
             )
         if moved and ours != vertices:
             raise _several(f"{one.path}: is not on the same points as {paths[0]}")
@@ -153,9 +150,7 @@ def _write(out: Path, maps: Mapping[str, SheetMap], *, to_nodes: bool) -> None:
         files.write_bytes(out, gifti.cifti_bytes(sides, [first.name]))
         return
     if others:
-        raise UsageError(
-            f"{out}: holds one side; name a {DENSE_SCALARS} file for both", reason="usage"
-        )
+        raise UsageError(f"{out}: holds one side; name a {DENSE_SCALARS} file for both")
     if out.suffix != TABLE:
         content = gifti.shape_bytes(
             flat[first.hemi], hemi=first.hemi, name=first.name, unit=first.unit
@@ -163,9 +158,7 @@ def _write(out: Path, maps: Mapping[str, SheetMap], *, to_nodes: bool) -> None:
         files.write_bytes(out, content)
         return
     if not to_nodes:
-        raise UsageError(
-            f"{out}: tables are of sheets; name a {METRICS[0]} file for vertices", reason="usage"
-        )
+        raise UsageError(f"{out}: tables are of sheets; name a {METRICS[0]} file for vertices")
     write_nodes(out, [first.name], first.values[..., None])
 
 
@@ -176,8 +169,7 @@ def _read(path: Path, column: str) -> list[SheetMap]:
     if "seg" in pairs and region != "whole":  # HippUnfold's names have no seg
         raise InputError(
             f"{path}: is of region {region}, which does not reach both ends of HippUnfold's"
-            " surface; measure with --region whole",
-            reason="not-whole",
+            " surface; measure with --region whole"
         )
     if path.name.endswith(DENSE_SCALARS):
         hemis = gifti.cifti_sides(path)
@@ -226,11 +218,10 @@ def _unfolded(path: Path) -> Mesh:
     if not (inside and covers and flat.flat):
         raise InputError(
             f"{path}: is no unfolded surface of HippUnfold's (space-unfold, label-hipp): flat, with"
-            " x from -40 to 0 mm and y from -200 to -180 mm",
-            reason="not-unfolded",
+            " x from -40 to 0 mm and y from -200 to -180 mm"
         )
     return flat
 
 
 def _several(problem: str) -> InputError:
-    return InputError(f"{problem}; give one map of each side", reason="several-maps")
+    return InputError(f"{problem}; give one map of each side")

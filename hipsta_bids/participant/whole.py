@@ -200,7 +200,7 @@ def measure_whole(
                 "flag_margins": flag_margins(findings),
             },
             flags=(
-                *raise_flags(findings, sheet, lambda at: name_place(at, body), settings.checks),
+                *raise_flags(findings, sheet, lambda at: name_place(at, body)),
                 *(replace(f, message=f"the body alone: {f.message}") for f in own.flags),
             ),
             mesh=mesh,

@@ -117,8 +117,7 @@ class CohortPlan:
             if value not in known:
                 raise UsageError(
                     f"phantom: {name} {value!r} is unknown; choose from {', '.join(known)}"
-                    f"{did_you_mean([value], known)}",
-                    reason="phantom-region" if name == "region" else "phantom-setting",
+                    f"{did_you_mean([value], known)}"
                 )
         problem = None
         if self.cortex and KINDS[self.kind].power != 1:
@@ -135,7 +134,7 @@ class CohortPlan:
         if self.site and not (self.site.isascii() and self.site.isalnum()):
             problem = f"site {self.site!r}: labels have letters and digits only"
         if problem is not None:
-            raise UsageError(f"phantom: {problem}", reason="phantom-setting")
+            raise UsageError(f"phantom: {problem}")
 
 
 @dataclass(frozen=True, kw_only=True)

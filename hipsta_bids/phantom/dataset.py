@@ -186,10 +186,7 @@ def refuse_taken(out: Path, what: str = "phantoms") -> None:
     except OSError as error:
         raise files.output_error(out, error) from error
     if taken and not (out / TRUTH_TABLE).exists():
-        raise UsageError(
-            f"{out}: holds something other than {what}; choose a new folder",
-            reason="folder-taken",
-        )
+        raise UsageError(f"{out}: holds something other than {what}; choose a new folder")
     files.check_writable(out)
 
 

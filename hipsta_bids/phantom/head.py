@@ -79,8 +79,7 @@ class HeadSpec:
         if not all(low <= self.thickness - less <= high for less in (0.0, self.thinning)):
             raise SettingsError(
                 f"phantom: a wall of {self.thickness:g} mm, {self.thinning:g} mm thinner in the "
-                f"head, is outside of {low:g} to {high:g} mm; choose others",
-                reason="phantom-setting",
+                f"head, is outside of {low:g} to {high:g} mm; choose others"
             )
 
 

@@ -197,8 +197,7 @@ def encode(volume: LabelVolume) -> NDArray[np.int32]:
     if np.any((codes == 0) & (volume.tissue != Tissue.BACKGROUND)):
         raise ProtocolError(
             f"protocol {volume.protocol.name} has no code for some tissues of this volume; "
-            "write it in the protocol it was made with",
-            reason="phantom-scheme",
+            "write it in the protocol it was made with"
         )
     return codes
 
@@ -223,8 +222,7 @@ def _label_table(protocol: Protocol) -> NDArray[np.intp]:
         if part is Part.BODY and None in sheet:
             raise ProtocolError(
                 f"phantom: protocol {protocol.name} has no label for some subfield of the sheet; "
-                "choose another protocol",
-                reason="phantom-scheme",
+                "choose another protocol"
             )
         cortex = [label_for(protocol, tissue, part) for tissue in CORTEX]
         layers = [None if own is None else layer or own for own in sheet]

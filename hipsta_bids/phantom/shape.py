@@ -153,8 +153,7 @@ class PhantomSpec:
         if self.layer_thickness >= thinnest:
             raise bad(
                 f"layer_thickness {self.layer_thickness:g} mm fills the wall, which is "
-                f"{thinnest:g} mm at its thinnest; make the layer thinner",
-                "phantom-layer",
+                f"{thinnest:g} mm at its thinnest; make the layer thinner"
             )
 
     @property
@@ -172,9 +171,9 @@ class PhantomSpec:
         return Bend(medial=medial, lateral=lateral, power=preset.power)
 
 
-def bad(problem: str, reason: str = "phantom-setting") -> SettingsError:
+def bad(problem: str) -> SettingsError:
     """Error for a phantom that cannot be."""
-    return SettingsError(f"phantom: {problem}", reason=reason)
+    return SettingsError(f"phantom: {problem}")
 
 
 def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
@@ -452,8 +451,7 @@ class Body:
             raise bad(
                 f"the wall folds: half its thickness of up to {self.thickest:g} mm "
                 f"reaches the smallest radius of curvature, {1.0 / sharpest:.2f} mm; "
-                "make it thinner or bend it less",
-                "phantom-folds",
+                "make it thinner or bend it less"
             )
         inward = np.max(-np.sign(spec.bend) * self.curve.position(s)[:, 0]) + self.thickest / 2.0
         turned = abs(spec.bend) * (spec.length + 2.0 * spec.end_length)
@@ -461,8 +459,7 @@ class Body:
             raise bad(
                 f"the long axis bends too sharply ({spec.bend:g} 1/mm) for a cross-"
                 f"section that reaches {inward:.1f} mm towards its center and a length of "
-                f"{spec.length + 2.0 * spec.end_length:g} mm with head and tail; bend it less",
-                "phantom-folds",
+                f"{spec.length + 2.0 * spec.end_length:g} mm with head and tail; bend it less"
             )
 
     def _refuse_overlap(self) -> None:
@@ -480,15 +477,14 @@ class Body:
             if astray.any():
                 raise bad(
                     f"turns of the wall overlap near u = {u.ravel()[astray][0]:.2f}; "
-                    "make it thinner, narrower or bend it less",
-                    "phantom-overlap",
+                    "make it thinner, narrower or bend it less"
                 )
 
 
 def placement(hemi: str, pose: Float | None) -> tuple[Float, Float]:
     """Body to scanner: an orthogonal (3, 3) matrix and a shift (3,) in RAS mm."""
     if hemi not in ("L", "R"):
-        raise bad(f"hemi {hemi!r} is unknown; choose L or R", "phantom-hemi")
+        raise bad(f"hemi {hemi!r} is unknown; choose L or R")
     cos, sin = np.cos(PITCH), np.sin(PITCH)
     mirror = np.diag([1.0 if hemi == "L" else -1.0, 1.0, 1.0])
     # Columns: where lateral, superior and anterior point in a left hemisphere.
@@ -507,6 +503,5 @@ def check_rotation(matrix: Float) -> None:
     if not error < _RIGID_TOLERANCE or np.linalg.det(matrix) < 0.0:
         raise bad(
             "the pose or grid rotation is not rigid; give a rotation matrix without "
-            "scaling or mirroring",
-            "phantom-pose",
+            "scaling or mirroring"
         )

@@ -102,8 +102,7 @@ def load_protocol(name_or_path: str | Path) -> Protocol:
         raise ProtocolError(
             f"no protocol is called {name_or_path!r}"
             f"{did_you_mean(name_or_path, protocol_names())}; "
-            f"bundled: {', '.join(protocol_names())} (a file's name has to end in .toml)",
-            reason="unknown-scheme",
+            f"bundled: {', '.join(protocol_names())} (a file's name has to end in .toml)"
         )
     return _load_bundled(name_or_path)
 
@@ -140,13 +139,11 @@ def _load_file(path: Path) -> Protocol:
         table = tomllib.loads(path.read_text("utf-8"))
     except OSError as error:
         raise ProtocolError(
-            f"{path}: cannot read the protocol ({error.strerror}); check the path",
-            reason="unreadable-scheme",
+            f"{path}: cannot read the protocol ({error.strerror}); check the path"
         ) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ProtocolError(
-            f"{path}: not a TOML file ({error}); start from a bundled protocol",
-            reason="unreadable-scheme",
+            f"{path}: not a TOML file ({error}); start from a bundled protocol"
         ) from error
     return parse_protocol(table, origin=str(path))
 
@@ -156,8 +153,8 @@ def parse_protocol(table: Mapping[str, Any], *, origin: str) -> Protocol:
     try:
         protocol = Protocol.model_validate(table)
     except ValidationError as error:
-        _, mistake = first_mistake(error, Protocol)
-        raise ProtocolError(f"{origin}: {mistake}", reason="invalid-scheme") from error
+        mistake = first_mistake(error, Protocol)
+        raise ProtocolError(f"{origin}: {mistake}") from error
     _check_agreement(protocol, origin=origin)
     return protocol
 
@@ -197,7 +194,7 @@ def _check_agreement(protocol: Protocol, *, origin: str) -> None:
     }
     for problem, wrong in problems.items():
         if wrong:
-            raise ProtocolError(f"{origin}: {problem}", reason="invalid-scheme")
+            raise ProtocolError(f"{origin}: {problem}")
 
 
 @dataclass(frozen=True, kw_only=True)

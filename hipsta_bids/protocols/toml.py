@@ -43,11 +43,6 @@ _EXPECTED = {
     "value_error": "{error}",
 }
 
-#: Reasons of mistakes in settings that are not merely out of range.
-_REASONS = {"extra_forbidden": "unknown-setting"} | {
-    kind: "bad-setting" for kind in ("missing", *_EXPECTED) if kind.endswith(("_type", "missing"))
-}
-
 
 class TomlTable(BaseModel):
     """A table of a TOML file; nothing is converted but whole numbers to floats."""
@@ -96,8 +91,8 @@ def did_you_mean(name: str, names: Iterable[str]) -> str:
     return f" (did you mean {near[0]!r}?)" if near else ""
 
 
-def first_mistake(error: ValidationError, kind: type[BaseModel]) -> tuple[str, str]:
-    """Return pydantic's type of the first mistake, unknown keys before others, and say it."""
+def first_mistake(error: ValidationError, kind: type[BaseModel]) -> str:
+    """Return what is wrong first, unknown keys before all else."""
     # A mistyped key is also a missing one, but says more.
     mistake = min(error.errors(), key=lambda found: found["type"] != "extra_forbidden")
     position, given, words = mistake["loc"], mistake["input"], mistake["type"]
@@ -106,13 +101,13 @@ def first_mistake(error: ValidationError, kind: type[BaseModel]) -> tuple[str, s
     if words == "extra_forbidden":
         known = _table_at(kind, position[:-1]).model_fields
         hint = did_you_mean(str(position[-1]), known) or f"; known here: {', '.join(known)}"
-        return words, f"{table}{colon}unknown key {key}{hint}"
+        return f"{table}{colon}unknown key {key}{hint}"
     if words == "missing":
-        return words, f"{table}{colon}key {key} is missing"
+        return f"{table}{colon}key {key} is missing"
     expected = _EXPECTED.get(words, "{msg}").format(msg=mistake["msg"], **mistake.get("ctx", {}))
     if isinstance(given, Mapping | BaseModel):  # a rule on several of its values
-        return words, f"{name}: {expected}".removeprefix(": ")
-    return words, f"{name} is {given!r}, but has to be {expected}"
+        return f"{name}: {expected}".removeprefix(": ")
+    return f"{name} is {given!r}, but has to be {expected}"
 
 
 def _name(position: Iterable[str | int]) -> str:
@@ -140,13 +135,11 @@ def read_settings(path: Path | None, kind: type[Table]) -> Table:
             values = tomllib.load(file)
     except OSError as error:
         raise SettingsError(
-            f"{path}: settings cannot be read ({error.strerror}); check the path",
-            reason="settings-unreadable",
+            f"{path}: settings cannot be read ({error.strerror}); check the path"
         ) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise SettingsError(
-            f"{path}: not a TOML file ({error}); start from `hipsta-bids settings`",
-            reason="settings-not-toml",
+            f"{path}: not a TOML file ({error}); start from `hipsta-bids settings`"
         ) from error
     return settings_from(values, kind, where=str(path))
 
@@ -156,9 +149,8 @@ def settings_from(values: Mapping[str, Any], kind: type[Table], *, where: str) -
     try:
         return kind.model_validate(values)
     except ValidationError as error:
-        found, mistake = first_mistake(error, kind)
-        reason = _REASONS.get(found, "setting-out-of-range")
-        raise SettingsError(f"{where}: {mistake}", reason=reason) from error
+        mistake = first_mistake(error, kind)
+        raise SettingsError(f"{where}: {mistake}", reason="setting-out-of-range") from error
 
 
 def resolve(settings: BaseModel) -> dict[str, Any]:

@@ -19,7 +19,6 @@ from hipsta_bids.reports.maps import make_sprites, read_maps
 from hipsta_bids.reports.page import number, render
 from hipsta_bids.reports.results import Hemisphere, find_results
 from hipsta_bids.reports.verdict import RATINGS, Verdict, verdict_of
-from hipsta_bids.settings import Settings
 from hipsta_bids.types import Float, Status
 
 #: Least number of hemispheres whose range is shown.
@@ -111,8 +110,7 @@ class Cohort:
     @cached_property
     def verdicts(self) -> Mapping[str, Verdict]:
         """What each hemisphere's page says first, by title of the hemisphere."""
-        checks = Settings().checks.model_dump() | dict(self.settings.get("checks") or {})
-        return {h.place.name.title: verdict_of(h, checks["flag_reach"]) for h in self.hemispheres}
+        return {h.place.name.title: verdict_of(h) for h in self.hemispheres}
 
     @cached_property
     def ranking(self) -> list[Hemisphere]:

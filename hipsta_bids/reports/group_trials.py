@@ -98,7 +98,7 @@ def power(results: GroupResults) -> Mapping[str, Any] | None:
         "settings": settings["power"],
         "dropout": f"{100 * settings['power']['dropout']:g}",
         "affected": f"{100 * settings['power']['affected']:g}",
-        "most": f"{settings['power']['most']:,}",
+        "most": f"{effect['most']:,}",
         "alpha_point": f"{effect['alpha_point']:.2g}",
         "correction": settings["multiplicity"],
         "followed": effect["kind"] == "slowing"
@@ -144,7 +144,6 @@ def norms(results: GroupResults) -> Mapping[str, Any] | None:
             }
             for row in records(table)
         ],
-        "folds": results.record["settings"]["norms"]["folds"],
         "rows": rows,
         "adapted": any(site["new"] for site in about["sites"]),
         "far": far,

@@ -241,8 +241,7 @@ def _surface_points(place: ResultPlace, name: str, shape: tuple[int, ...]) -> Fl
     if len(points) != shape[0] * shape[1]:
         raise InputError(
             f"{path}: has {len(points)} vertices, the sheet {shape[0]} x {shape[1]} nodes; run the"
-            " participant level again with --force",
-            reason="unreadable-surface",
+            " participant level again with --force"
         )
     return points.reshape(*shape, 3)
 

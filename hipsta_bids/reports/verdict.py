@@ -20,7 +20,7 @@ import numpy as np
 
 from hipsta_bids.derivatives.hemisphere import read_sheet
 from hipsta_bids.errors import InputError
-from hipsta_bids.geometry.findings import spread_over
+from hipsta_bids.geometry.findings import FLAG_REACH, spread_over
 from hipsta_bids.geometry.measures import layer_area, node_shares
 from hipsta_bids.reports.page import reason_sections
 from hipsta_bids.reports.results import Finding, Hemisphere
@@ -103,14 +103,14 @@ class Verdict:
     severity: float
 
 
-def verdict_of(hemisphere: Hemisphere, reach: float = 1.0) -> Verdict:
+def verdict_of(hemisphere: Hemisphere, reach: float = FLAG_REACH) -> Verdict:
     """Decide from the quality record, and from the tables where it lacks a consequence.
 
     Parameters
     ----------
     hemisphere : Hemisphere
     reach : float
-        Columns within this distance of a point are concerned, mm (``checks.flag_reach``).
+        Columns within this distance of a point are concerned, mm.
 
     Returns
     -------

@@ -9,7 +9,7 @@ import pytest
 
 import hipsta_bids as hb
 
-MODULES = ("hipsta_bids.api.maps", "hipsta_bids.api.plots", "hipsta_bids.group.models")
+MODULES = ("hipsta_bids.api.maps", "hipsta_bids.api.plots", "hipsta_bids.group.questions.models")
 
 
 @pytest.mark.parametrize("module", MODULES)
@@ -42,7 +42,7 @@ def test_every_name_is_there_and_documented(name):
     found = getattr(hb, name)
     assert name in dir(hb)
     assert callable(found)
-    target = import_module("hipsta_bids.group.models").group if name == "group" else found
+    target = import_module("hipsta_bids.group.questions.models").group if name == "group" else found
     for section in ("Parameters", "Returns", "Raises", "Examples"):
         assert f"\n    {section}\n    ---" in target.__doc__
 

@@ -170,7 +170,6 @@ def test_parts_are_told_as_they_are_done():
         ("in out participant --region bodi", "did you mean body?"),
         ("in out group --correction permutaton-max", "did you mean permutation-max?"),
         ("in out group --asymetry", "did you mean --asymmetry?"),
-        ("validate --suite acuracy", "did you mean accuracy?"),
         ("phantom x --region CA1-anteriro", "did you mean CA1-anterior?"),
         ("phantom x --layout freesurfr", "did you mean freesurfer?"),
         ("phantom x --kind spirale", "did you mean spiral?"),

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from hipsta_bids.cli import commands, main
+from hipsta_bids.cli import main
 from hipsta_bids.derivatives.names import HemisphereName, output_path
 from hipsta_bids.errors import ExitCode
 from hipsta_bids.phantom import Hemisphere, PhantomSpec, write_dataset
@@ -128,12 +128,12 @@ def test_nothing_to_do(tmp_path, capsys):
     assert capsys.readouterr().err.count("\n") == 1
 
 
-@pytest.mark.parametrize("suites", ["group", "defects group"])
-def test_a_suite_may_be_called_as_a_level(suites, monkeypatch):
-    given = []
-    monkeypatch.setattr(commands, "run_validation", lambda rest: given.extend(rest) or ExitCode.OK)
-    assert main.main(["validate", "--suite", *suites.split()]) == ExitCode.OK
-    assert given == ["--suite", *suites.split()]
+def test_validation_is_run_from_a_checkout(capsys):
+    assert main.main(["validate", "--suite", "group"]) == ExitCode.USAGE
+    message = capsys.readouterr().err
+    assert "run it from a checkout" in message
+    assert "`python -m validation --suite group`" in message
+    assert message.count("\n") == 1
 
 
 def test_a_dataset_may_be_called_surrogate(bids_dir, tmp_path, monkeypatch):

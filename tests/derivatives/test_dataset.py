@@ -72,6 +72,13 @@ def test_damaged_settings_are_other_settings(tmp_path, damage):
         dataset.settle_settings(tmp_path, Settings())
 
 
+def test_settings_that_are_gone_are_those_of_another_version(tmp_path):
+    earlier = {"hash": "0", "version": "0.0.9", "settings": {"body": {"plane_tilt": 10.0}}}
+    files.write_json(tmp_path / "desc-settings.json", earlier)
+    with pytest.raises(SettingsError, match=r"results of version 0\.0\.9.*new output folder"):
+        dataset.settle_settings(tmp_path, Settings())
+
+
 def test_apptainer_and_the_address_in_the_package_are_named(tmp_path, monkeypatch):
     monkeypatch.setenv("HIPSTA_BIDS_CONTAINER_TYPE", "docker")  # of the image it was made from
     monkeypatch.setenv("APPTAINER_CONTAINER", "/images/hipsta_bids.sif")

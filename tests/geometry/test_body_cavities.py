@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from geometry_cases import resampled, short_phantom, solid_of
 
+from hipsta_bids.geometry import completion
 from hipsta_bids.geometry.body import extract_body
 from hipsta_bids.geometry.digital import to_ras
 from hipsta_bids.protocols.load import load_protocol
@@ -43,10 +44,10 @@ def test_a_narrow_cavity_becomes_a_part_of_the_layer(volume, content):
     np.testing.assert_array_equal(found, hole)
 
 
-def test_a_wide_cavity_is_divided_between_both_sides(volume):
+def test_a_wide_cavity_is_divided_between_both_sides(volume, monkeypatch):
     hole = within(volume, 0.9, PHANTOM.body.place(0.7, 0.5, -1.0))
-    narrow = BODY.changed(cavity_radius=0.4)
-    whole, body = (extract_body(v, narrow) for v in (volume, without(volume, hole)))
+    monkeypatch.setattr(completion, "CAVITY_RADIUS", 0.4)
+    whole, body = (extract_body(v, BODY) for v in (volume, without(volume, hole)))
     (cavity,) = body.cavities.wide
     assert len(cavity) == hole.sum()
     before, after = (b.tissue[hole] > 0 for b in (whole, body))

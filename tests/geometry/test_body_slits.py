@@ -10,7 +10,7 @@ from hipsta_bids.geometry.body import extract_body
 from hipsta_bids.geometry.completion import fill_pits, fill_slits
 from hipsta_bids.protocols.protocol import Tissue
 from hipsta_bids.settings import BodySettings, TopologySettings
-from hipsta_bids.validation.damage import Site, make_defect
+from validation.damage import Site, make_defect
 
 BODY = BodySettings()
 VOXEL = 0.4

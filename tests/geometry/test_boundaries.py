@@ -8,6 +8,7 @@ from geometry_cases import resampled, short_phantom, solid_of
 from scipy.spatial import cKDTree
 
 from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry import boundaries
 from hipsta_bids.geometry.body import extract_body
 from hipsta_bids.geometry.boundaries import find_boundaries, middle_lines
 from hipsta_bids.geometry.fem import volume_laplace
@@ -195,10 +196,11 @@ def test_the_eigenfunction_is_overruled_where_the_rules_disagree(arc):
         assert gap.mean() < 0.5
 
 
-def test_strips_that_swallow_the_sides_are_refused(arc):
-    wide = SETTINGS.changed(first_strip=6.0, least_strip=6.0)
+def test_strips_that_swallow_the_sides_are_refused(arc, monkeypatch):
+    monkeypatch.setattr(boundaries, "FIRST_STRIP", 6.0)
+    monkeypatch.setattr(boundaries, "LEAST_STRIP", 6.0)
     with pytest.raises(GeometryError, match=r"do not separate the interior.*RAS") as caught:
-        find_boundaries(arc.surface, arc.laplace, arc.body, wide)
+        find_boundaries(arc.surface, arc.laplace, arc.body, SETTINGS)
     assert caught.value.reason == "boundaries"
 
 

@@ -7,6 +7,7 @@ import pytest
 from geometry_cases import resampled, short_phantom
 from sheet_cases import plates
 
+from hipsta_bids.geometry import sheet_checks
 from hipsta_bids.geometry.body import Body, extract_body
 from hipsta_bids.geometry.checks import check_cross_sections
 from hipsta_bids.geometry.grid import Field
@@ -147,10 +148,11 @@ def test_rows_that_jump_or_dip(widths, wanted):
         assert place_of(flag)[1] == pytest.approx(0.8 * 10, abs=0.8)  # mm, one row
 
 
-def test_dips_are_sought_within_a_reach():
+def test_dips_are_sought_within_a_reach(monkeypatch):
     widths = 20 - 6 * np.exp(-(((np.arange(21) - 10) / 3.0) ** 2))
     assert raised(check_rows(rows_of(widths), CHECKS)) != []
-    assert raised(check_rows(rows_of(widths), CHECKS.changed(row_dip_reach=2.0))) == []
+    monkeypatch.setattr(sheet_checks, "ROW_DIP_REACH", 2.0)
+    assert raised(check_rows(rows_of(widths), CHECKS)) == []
 
 
 def notched(depth, rows, edge):

@@ -14,7 +14,7 @@ CHORDS = 3e-4  # chords of pi / 40 instead of arcs: lengths are short by (pi / 4
 
 
 def cut(sheet):
-    return cut_sections(sheet, measure_thickness(sheet).mean(axis=0), MEASURES)
+    return cut_sections(sheet, measure_thickness(sheet).mean(axis=0))
 
 
 @given(st.floats(2.5, 8.0), st.floats(0.5, 3.0))

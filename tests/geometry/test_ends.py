@@ -5,9 +5,11 @@ import pytest
 from geometry_cases import degrees_between, rigid, rotation, short_phantom
 
 from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry import automatic_ends
 from hipsta_bids.geometry import ends as ends_mod
+from hipsta_bids.geometry import ends as geometry_ends
 from hipsta_bids.geometry.body import extract_body
-from hipsta_bids.geometry.ends import find_end_planes
+from hipsta_bids.geometry.ends import PLANE_TILT, find_end_planes
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.protocols.protocol import Part, Tissue
 from hipsta_bids.settings import BodySettings
@@ -66,7 +68,7 @@ def test_a_tilt_of_one_step_between_thick_slices_is_found_roughly():
 
 
 @pytest.mark.parametrize("share", [0.15, 0.5, 0.85])
-def test_one_slice_with_labels_of_both_sides_tilts_the_plane_little(share):
+def test_one_slice_with_labels_of_both_sides_tilts_the_plane_little(share, monkeypatch):
     """It allows for any tilt up to that from its edge to the far edge of the next slice."""
     volume = rod([0, 1, 0], [0, 1, 0], voxel=(0.4, 2.0, 0.4))
     part = volume.part.copy()
@@ -76,13 +78,14 @@ def test_one_slice_with_labels_of_both_sides_tilts_the_plane_little(share):
         tissue=volume.tissue, part=part, affine=volume.affine, protocol=volume.protocol
     )
     along = np.array([0.0, 1.0, 0.0])
-    assert degrees_between(ends_of(mixed).posterior.normal, along) < BODY.plane_tilt
+    assert degrees_between(ends_of(mixed).posterior.normal, along) < PLANE_TILT
     # The plane goes through that slice, within half of its thickness.
     level = volume.affine[1, 1] * first + volume.affine[1, 3]
     assert abs(ends_of(mixed).posterior.point @ along - level) < 1.0
     if share == 0.5:  # where it allows for most, the plane keeps to the slices
-        free = ends_of(mixed, BODY.changed(plane_prior=1e-4)).posterior.normal
         tilt = degrees_between(ends_of(mixed).posterior.normal, along)
+        monkeypatch.setattr(geometry_ends, "PLANE_PRIOR", 1e-4)
+        free = ends_of(mixed).posterior.normal
         assert degrees_between(free, along) > 1.2 * tilt
 
 
@@ -272,7 +275,7 @@ def test_the_body_ends_where_its_core_vanishes_in_the_tail():
     assert posterior_end(ends) == pytest.approx(12 * 0.5, abs=0.2)
 
 
-def test_remnants_of_the_core_do_not_count():
+def test_remnants_of_the_core_do_not_count(monkeypatch):
     few, more = (slices(4, 12, count=n) | slices(12) for n in (5, 15))
     # Where the smoothed profile rises from a quarter to all, half is passed 0.4 mm earlier.
     assert posterior_end(ends_round_core(few)) == pytest.approx(12 * 0.5 - 0.4, abs=0.4)
@@ -280,8 +283,8 @@ def test_remnants_of_the_core_do_not_count():
     # Even odds where there is half of it: the end lies in between, not at either.
     half = ends_round_core(slices(4, 12, count=10) | slices(12))
     assert 4 * 0.5 + 1.0 < posterior_end(half) < 12 * 0.5 - 1.0
-    lower = ends_round_core(few, settings=BodySettings(core_share=0.1))
-    assert posterior_end(lower) == pytest.approx(4 * 0.5, abs=0.4)
+    monkeypatch.setattr(automatic_ends, "CORE_SHARE", 0.1)
+    assert posterior_end(ends_round_core(few)) == pytest.approx(4 * 0.5, abs=0.4)
 
 
 @pytest.mark.parametrize("core", [{}, slices(0), slices(0, 50)], ids=["none", "all", "no head"])
@@ -412,7 +415,7 @@ def test_rounding_does_not_decide_which_thick_slices_tell_the_plane():
     below, above = np.vstack(parts[:2]), np.vstack(parts[2:])
     step = np.array([0.0, 0.0, 2.0])
     planes = [
-        ends_mod._plane_along_slices(below * (1 + shift), above * (1 + shift), step, BodySettings())
+        ends_mod._plane_along_slices(below * (1 + shift), above * (1 + shift), step)
         for shift in (-1e-9, 0.0, 1e-9)
     ]
     for point, normal in planes[1:]:

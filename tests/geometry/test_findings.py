@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from sheet_cases import plates, sheet_of
 
+from hipsta_bids.geometry import findings
 from hipsta_bids.geometry.findings import (
     add_consequence,
     consequence_text,
@@ -12,10 +13,7 @@ from hipsta_bids.geometry.findings import (
     spread_over,
 )
 from hipsta_bids.geometry.measures import column_area, measure_thickness
-from hipsta_bids.settings import CheckSettings
 from hipsta_bids.types import Finding
-
-CHECKS = CheckSettings()
 
 
 def finding(value=2.0, limit=1.0, **others):
@@ -41,17 +39,17 @@ def test_margins_are_the_largest_by_reason():
 
 
 def test_only_what_is_beyond_its_limit_becomes_a_flag():
-    assert raise_flags([finding(1.0)], plates(), str, CHECKS) == []
-    (flag,) = raise_flags([finding(1.1)], plates(), str, CHECKS)
+    assert raise_flags([finding(1.0)], plates(), str) == []
+    (flag,) = raise_flags([finding(1.1)], plates(), str)
     assert (flag.message, flag.value, flag.limit) == ("odd: look", 1.1, 1.0)
 
 
 @pytest.mark.parametrize("size", [0.6, -0.6])
-def test_a_flag_says_what_it_does_to_the_mean(size):
+def test_a_flag_says_what_it_does_to_the_mean(size, monkeypatch):
     """Columns measure 0.3 x 0.4 mm: those within 0.05 mm of the finding are its own."""
     sheet, points = thicker(size)
-    settings = CHECKS.changed(flag_reach=0.05)
-    (flag,) = raise_flags([finding(points=points)], sheet, lambda at: f"P{len(at)}", settings)
+    monkeypatch.setattr(findings, "FLAG_REACH", 0.05)
+    (flag,) = raise_flags([finding(points=points)], sheet, lambda at: f"P{len(at)}")
     assert flag.share == pytest.approx(15 / 861)
     mean = np.average(measure_thickness(sheet), weights=column_area(sheet))
     assert flag.change == pytest.approx(mean - 1.7)  # mm, the other columns
@@ -62,21 +60,22 @@ def test_a_flag_says_what_it_does_to_the_mean(size):
     )
 
 
-def test_columns_are_concerned_within_the_reach():
+def test_columns_are_concerned_within_the_reach(monkeypatch):
     sheet, points = thicker(0.0)
-    shares = [
-        add_consequence(finding(points=points), sheet, CHECKS.changed(flag_reach=reach)).share
-        for reach in (0.05, 0.35, 20.0)
-    ]
+    shares = []
+    for reach in (0.05, 0.35, 20.0):
+        monkeypatch.setattr(findings, "FLAG_REACH", reach)
+        shares.append(add_consequence(finding(points=points), sheet).share)
     # 0.3 mm apart along x and 0.4 mm along y: one more column on both sides of each row.
     assert shares == pytest.approx([15 / 861, 21 / 861, 1.0])
 
 
-def test_what_concerns_all_columns_or_none_says_so():
+def test_what_concerns_all_columns_or_none_says_so(monkeypatch):
     sheet, points = thicker(0.0)
-    everywhere = add_consequence(finding(points=points), sheet, CHECKS.changed(flag_reach=20.0))
+    monkeypatch.setattr(findings, "FLAG_REACH", 20.0)
+    everywhere = add_consequence(finding(points=points), sheet)
     assert consequence_text(everywhere) == "; it concerns all columns"
-    beside = add_consequence(finding(points=points + 50.0), sheet, CHECKS)
+    beside = add_consequence(finding(points=points + 50.0), sheet)
     assert consequence_text(beside) == "; no measured column lies near"
     assert not consequence_text(finding())
     whole = finding(share=1.0, change=-0.2)

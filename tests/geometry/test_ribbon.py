@@ -7,8 +7,12 @@ import pytest
 from geometry_cases import plain_body, straight_ends
 from scipy import ndimage
 
-from hipsta_bids.geometry.outlines import cut_rings, outline_slice
+from hipsta_bids.geometry import slices
+from hipsta_bids.geometry.outlines import DISTANCE_REACH, SLIT_HALF_WIDTH, cut_rings, outline_slice
 from hipsta_bids.geometry.ribbon import (
+    LEAST_HALF_THICKNESS,
+    MATCH_STRETCH,
+    RIBBON_NODES,
     align_nodes,
     keep_whole,
     match_lines,
@@ -34,12 +38,12 @@ def arc(*, turn=0.0, opening=2.0, wall=WALL, radius=RADIUS, fine=FINE):
     angle = (np.arctan2(y, x) - turn) % (2 * np.pi)
     held = np.clip(angle, 0.5 * opening, 2 * np.pi - 0.5 * opening) + turn
     gap = np.hypot(x - radius * np.cos(held), y - radius * np.sin(held))
-    return np.clip(0.5 * wall - gap, -SETTINGS.reach, SETTINGS.reach), angle
+    return np.clip(0.5 * wall - gap, -DISTANCE_REACH, DISTANCE_REACH), angle
 
 
 def arc_nodes(**how):
     outline, angle = arc(**how)
-    return ribbon_nodes(outline, np.where(outline > 0, angle, np.nan), FINE, SETTINGS)
+    return ribbon_nodes(outline, np.where(outline > 0, angle, np.nan), FINE)
 
 
 def polar(nodes):
@@ -50,7 +54,7 @@ def polar(nodes):
 
 def test_nodes_of_an_arc_lie_on_its_radii():
     nodes = arc_nodes()
-    assert nodes.shape == (SETTINGS.ribbon_nodes, 5, 2)
+    assert nodes.shape == (RIBBON_NODES, 5, 2)
     radius, angle = polar(nodes)
     inner = slice(10, -10)  # the round ends are no part of the annulus
     # Vertices are a pixel apart; half of it on a chord of 5 mm is 1 um, on the contour 5 um.
@@ -68,16 +72,16 @@ def test_walls_keep_their_sides_from_slice_to_slice():
 
 
 def test_what_is_no_ribbon_has_no_nodes():
-    empty = np.full((30, 30), -SETTINGS.reach)
-    assert ribbon_nodes(empty, np.full((30, 30), np.nan), FINE, SETTINGS) is None
+    empty = np.full((30, 30), -DISTANCE_REACH)
+    assert ribbon_nodes(empty, np.full((30, 30), np.nan), FINE) is None
     empty[15, 15] = 0.05  # less than a pixel
-    assert ribbon_nodes(empty, np.full((30, 30), np.nan), FINE, SETTINGS) is None
+    assert ribbon_nodes(empty, np.full((30, 30), np.nan), FINE) is None
 
 
 def test_a_line_matches_itself_evenly():
     line = np.column_stack([np.linspace(0, 20, 81), np.sin(np.linspace(0, 6, 81))])
     share = np.linalg.norm(np.diff(line, axis=0), axis=1).cumsum() / 20
-    where = match_lines(line, line, SETTINGS.match_stretch)
+    where = match_lines(line, line, MATCH_STRETCH)
     # Places on the second line are a fourth of a node apart.
     np.testing.assert_allclose(where[1:], share / share[-1], atol=0.5 / 80)
 
@@ -87,7 +91,7 @@ def test_corners_are_matched_with_corners():
     first = np.column_stack([np.linspace(0, 20, 81).clip(max=10), np.linspace(0, 20, 81) - 10])
     first[:, 1] = first[:, 1].clip(min=0)
     second = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 20.0]])
-    where = match_lines(first, second, SETTINGS.match_stretch)
+    where = match_lines(first, second, MATCH_STRETCH)
     assert (np.diff(where) >= 0).all()
     assert where[0] == 0
     assert where[-1] == 1
@@ -96,7 +100,7 @@ def test_corners_are_matched_with_corners():
 
 def test_nodes_of_a_turned_arc_belong_to_the_nearest():
     """Its middle turns by 0.8 mm; ends belong to ends."""
-    aligned = align_nodes([arc_nodes(), None, arc_nodes(), arc_nodes(turn=0.16)], FINE, SETTINGS)
+    aligned = align_nodes([arc_nodes(), None, arc_nodes(), arc_nodes(turn=0.16)], FINE)
     assert aligned[1] is None
     (_, before), (_, after) = (polar(nodes[:, 2]) for nodes in aligned[2:])
     shift = after - before
@@ -120,7 +124,7 @@ def test_a_ring_is_cut_where_the_slices_beside_are_open(turn):
     ring, angle = arc(turn=turn, opening=0.0)
     ribbon, _ = arc(turn=turn, opening=0.8)
     stack = np.stack([ribbon, ring, ribbon]).astype(np.float32)
-    found = cut_rings(stack, FINE, SETTINGS)
+    found = cut_rings(stack, FINE)
     assert holes(stack[1]) == 1
     assert holes(found[1]) == 0
     assert (found[[0, 2]] == stack[[0, 2]]).all()
@@ -128,13 +132,13 @@ def test_a_ring_is_cut_where_the_slices_beside_are_open(turn):
     assert np.abs((angle[lost] + np.pi) % (2 * np.pi) - np.pi).max() < 0.4
     # A gap of twice the half width, across the wall; whole pixels add up to one on each side.
     width = lost.sum() * FINE**2 / WALL
-    assert 2 * SETTINGS.slit - FINE < width < 2 * SETTINGS.slit + 2 * FINE
+    assert 2 * SLIT_HALF_WIDTH - FINE < width < 2 * SLIT_HALF_WIDTH + 2 * FINE
 
 
 def test_a_ring_alone_is_cut_where_it_is_thin():
     ring, angle = arc(opening=0.0)
     thin = np.minimum(ring, np.where(np.cos(angle - 2.0) > 0.95, 0.1, 9.0)).astype(np.float32)
-    lost = (cut_rings(thin[None], FINE, SETTINGS)[0] <= 0) & (thin > 0)
+    lost = (cut_rings(thin[None], FINE)[0] <= 0) & (thin > 0)
     assert np.cos(angle[lost] - 2.0).min() > 0.85
 
 
@@ -144,26 +148,26 @@ def test_a_thin_part_of_a_ribbon_is_thickened_and_the_rest_stays():
     x, y = (np.indices(outline.shape) + 0.5) * FINE - CENTER
     line = 0.17 - np.abs(np.hypot(x, y) - RADIUS)
     narrow = np.where(thin, np.minimum(outline, line), outline)
-    nodes = ribbon_nodes(narrow, np.where(narrow > 0, angle, np.nan), FINE, SETTINGS)
+    nodes = ribbon_nodes(narrow, np.where(narrow > 0, angle, np.nan), FINE)
     found = narrow.copy()
-    keep_whole(found, nodes, FINE, SETTINGS)
+    keep_whole(found, nodes, FINE)
     core = np.cos(angle - np.pi) > 0.95
-    expected = SETTINGS.least_half - np.abs(np.hypot(x, y) - RADIUS)
+    expected = LEAST_HALF_THICKNESS - np.abs(np.hypot(x, y) - RADIUS)
     near = core & (expected > 0.05)
     assert near.sum() > 20
     # The mid-line of the nodes lies within a fourth of a pixel of the circle.
     np.testing.assert_allclose(found[near], expected[near], atol=0.05)
     assert (found >= narrow).all()
     assert (
-        found[~thin & (narrow > SETTINGS.least_half)]
-        == narrow[~thin & (narrow > SETTINGS.least_half)]
+        found[~thin & (narrow > LEAST_HALF_THICKNESS)]
+        == narrow[~thin & (narrow > LEAST_HALF_THICKNESS)]
     ).all()
     whole = outline.copy()
-    keep_whole(whole, arc_nodes(), FINE, SETTINGS)
+    keep_whole(whole, arc_nodes(), FINE)
     np.testing.assert_array_equal(whole, outline)
 
 
-def radius_at(settings, z, radii):
+def radius_at(z, radii):
     """Mean radius, mm, of the outer wall of an arc, between slices 2 mm apart with such radii."""
     pixel, step = 0.4, 2.0
     size = round(SIZE * FINE / pixel)
@@ -179,16 +183,16 @@ def radius_at(settings, z, radii):
     out = np.arange(2.0, 8.0, 0.02)
     x, y = (CENTER + way(angles)[:, None] * out for way in (np.cos, np.sin))
     points = np.stack([x, y, np.full(x.shape, z)], axis=-1).reshape(-1, 3)
-    inside = (sample_slices(body, points, settings) > 0.5).reshape(x.shape)
+    inside = (sample_slices(body, points, SETTINGS) > 0.5).reshape(x.shape)
     return float((out[0] + 0.02 * inside.shape[1] - 0.02 * inside[:, ::-1].argmax(axis=1)).mean())
 
 
 @pytest.mark.parametrize("smoothing", [0.0, 1.0])
-def test_the_ribbon_follows_a_smooth_path_through_the_slices(smoothing):
+def test_the_ribbon_follows_a_smooth_path_through_the_slices(smoothing, monkeypatch):
     """Cubic paths through, or B-splines over, radii that are 0.8 mm more in one slice."""
     radii = [4.6, 4.6, 5.4, 4.6, 4.6]
-    settings = SETTINGS.changed(path_smoothing=smoothing)
-    found = np.array([radius_at(settings, z, radii) for z in (4.0, 3.0, 2.0)]) - 0.5 * WALL
+    monkeypatch.setattr(slices, "PATH_SMOOTHING", smoothing)
+    found = np.array([radius_at(z, radii) for z in (4.0, 3.0, 2.0)]) - 0.5 * WALL
     # Catmull-Rom halfway: (-1, 9, 9, -1) / 16; B-spline: (1, 4, 1) / 6 and (1, 23, 23, 1) / 48.
     shares = np.array([1, 9 / 16, 0]) if smoothing == 0 else np.array([4 / 6, 23 / 48, 1 / 6])
     # Voxels of 0.4 mm, smoothed in the slice, and moves that are averaged over near nodes.
@@ -200,14 +204,14 @@ def test_turns_are_parted_and_a_single_ribbon_stays():
     opening = (WALL + 0.2) / RADIUS
     outline, angle = arc(opening=opening)
     kept, far = outline.copy(), np.cos(angle) < 0
-    part_turns(outline, arc_nodes(opening=opening), FINE, SETTINGS)
+    part_turns(outline, arc_nodes(opening=opening), FINE)
     assert (outline[far] == kept[far]).all()
     across = np.flatnonzero(np.abs(np.arange(SIZE) + 0.5 - (CENTER + RADIUS) / FINE) < 1)
     gap = (outline[across][:, 30:60] <= 0).sum(axis=1).mean() * FINE
-    assert gap == pytest.approx(2 * SETTINGS.slit, abs=FINE)
+    assert gap == pytest.approx(2 * SLIT_HALF_WIDTH, abs=FINE)
     single, _ = arc()
     alone = single.copy()
-    part_turns(alone, arc_nodes(), FINE, SETTINGS)
+    part_turns(alone, arc_nodes(), FINE)
     assert (alone == single).all()
 
 
@@ -315,6 +319,6 @@ def test_outlines_of_labels_give_nodes_too():
     labels = np.where(angle < np.pi, Tissue.SUBICULUM, Tissue.CA3) * (outline > 0)
     drawn = outline_slice(labels.astype(np.uint8), 0.4, SETTINGS)
     _, fine = arc()
-    nodes = ribbon_nodes(drawn, np.where(drawn > 0, fine, np.nan), FINE, SETTINGS)
+    nodes = ribbon_nodes(drawn, np.where(drawn > 0, fine, np.nan), FINE)
     radius, _ = polar(nodes)
     assert np.abs(radius[10:-10, -1] - radius[10:-10, 0]).mean() == pytest.approx(WALL, abs=0.05)

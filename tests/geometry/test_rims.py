@@ -17,7 +17,7 @@ def found(request):
     """A case, its wall, and its rim paths."""
     case = request.getfixturevalue(request.param)
     wall = Wall(case.surface, case.body, SETTINGS)
-    paths, depths = rim_paths(wall, case.laplace, case.body, SETTINGS)
+    paths, depths = rim_paths(wall, case.laplace, case.body)
     return case, wall, paths, depths
 
 
@@ -61,9 +61,9 @@ def test_depth_grows_from_the_rim_inward(found):
 def test_guided_and_centered_curves_run_along_the_rims(found):
     case, wall, paths, depths = found
     thickness = mean_wall_thickness(case.surface)
-    guided = guided_curves(wall, paths, depths, thickness, SETTINGS)
+    guided = guided_curves(wall, paths, depths, thickness)
     assert guided is not None
-    centered = center_curves(wall, guided, thickness, SETTINGS)
+    centered = center_curves(wall, guided, thickness)
     for u, curve in zip((0, 1), centered, strict=True):
         other = gap_to_rim(case, curve, 1 - u).mean()
         here = gap_to_rim(case, curve, u).mean()
@@ -73,4 +73,4 @@ def test_guided_and_centered_curves_run_along_the_rims(found):
 def test_zones_without_two_sides_give_no_curves(found):
     case, wall, paths, depths = found
     thickness = 5 * mean_wall_thickness(case.surface)
-    assert guided_curves(wall, paths, depths, thickness, SETTINGS) is None
+    assert guided_curves(wall, paths, depths, thickness) is None

@@ -8,7 +8,7 @@ from geometry_cases import plain_body, solve_case, straight_ends
 from scipy import ndimage
 
 from hipsta_bids.geometry.measures import measure_thickness
-from hipsta_bids.geometry.outlines import outline_slice
+from hipsta_bids.geometry.outlines import DISTANCE_REACH, SLIT_HALF_WIDTH, outline_slice
 from hipsta_bids.geometry.slices import (
     has_thick_slices,
     register_slices,
@@ -62,7 +62,7 @@ def test_a_slanting_edge_lies_between_the_pixels():
 def test_an_empty_slice_is_outside_everywhere():
     empty = outline(np.zeros((8, 9), dtype=np.uint8))
     assert empty.shape == (16, 18)
-    assert (empty == -SETTINGS.reach).all()
+    assert (empty == -DISTANCE_REACH).all()
 
 
 @pytest.mark.parametrize(
@@ -112,7 +112,7 @@ def disc(center, radius, size=100):
     """Signed distance from a circle, mm, clipped as outlines are."""
     grid = np.indices((size, size)) * FINE
     gap = np.hypot(grid[0] - center[0], grid[1] - center[1])
-    return np.clip(radius - gap, -SETTINGS.reach, SETTINGS.reach).astype(np.float32)
+    return np.clip(radius - gap, -DISTANCE_REACH, DISTANCE_REACH).astype(np.float32)
 
 
 def test_equal_slices_do_not_move():
@@ -218,7 +218,7 @@ def test_the_ends_of_the_ribbon_are_kept_apart():
         # Of twice the slit's half width, at the border of the labels; the ramp of 0.2 mm and the
         # fine pixels of 0.2 mm blunt its bottom.
         assert gap.mean() == pytest.approx(12.0, abs=0.1)
-        assert len(gap) * 0.05 == pytest.approx(2 * SETTINGS.slit, abs=0.2)
+        assert len(gap) * 0.05 == pytest.approx(2 * SLIT_HALF_WIDTH, abs=0.2)
         assert inside.sum() + len(gap) == len(y)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry import surrogate
 from hipsta_bids.geometry.body import extract_body
 from hipsta_bids.geometry.surrogate import agreement, compare_nearby, draw_slice, surrogate_profiles
 from hipsta_bids.phantom import Phantom, PhantomSpec
@@ -72,9 +73,10 @@ def test_it_runs_from_medial_to_lateral_at_the_given_place():
         assert np.nanmean(v) == pytest.approx(0.4, abs=0.03)
 
 
-def test_samplings_are_proportional_and_equidistant():
+def test_samplings_are_proportional_and_equidistant(monkeypatch):
     _, body = drawn(spec())
-    even, steps = profiles(body, step=0.7)
+    monkeypatch.setattr(surrogate, "SAMPLING_STEP", 0.7)
+    even, steps = profiles(body)
     nodes = (np.linspace(-0.9, 0.9, 41) + 1) / 2
     np.testing.assert_allclose(even.fraction, nodes, rtol=1e-12)
     np.testing.assert_allclose(np.diff(steps.distance), 0.7, rtol=1e-12)
@@ -92,7 +94,7 @@ def test_the_pixels_hardly_matter():
     assert np.abs(coarse.thickness - fine.thickness)[3:-3].mean() < 0.02  # mm, a fifth of a pixel
 
 
-def test_small_holes_are_filled_and_loops_refused():
+def test_small_holes_are_filled_and_loops_refused(monkeypatch):
     phantom, body = drawn(spec())
     index, points = body.inside_points()
 
@@ -105,18 +107,20 @@ def test_small_holes_are_filled_and_loops_refused():
     whole, _ = profiles(body)
     holed, _ = profiles(without(0.5))  # 0.8 mm2
     np.testing.assert_allclose(holed.thickness, whole.thickness, atol=0.05)
+    monkeypatch.setattr(surrogate, "HOLE_AREA", 0.1)
     with pytest.raises(GeometryError, match="closes on itself") as error:
-        profiles(without(0.5), hole_area=0.1)
+        profiles(without(0.5))
     assert error.value.reason == "surrogate-loop"
 
 
-def test_slices_without_labels_or_without_a_line_are_refused():
+def test_slices_without_labels_or_without_a_line_are_refused(monkeypatch):
     _, body = drawn(spec())
     with pytest.raises(GeometryError) as error:
         draw_slice(replace(body, tissue=np.zeros_like(body.tissue)), 0.5, SETTINGS.surrogate)
     assert error.value.reason == "surrogate-empty"
+    monkeypatch.setattr(surrogate, "FORK_LENGTH", 6.0)
     with pytest.raises(GeometryError) as error:
-        profiles(body, fork=6.0)
+        profiles(body)
     assert error.value.reason == "surrogate-short"
 
 

@@ -8,6 +8,7 @@ from geometry_cases import field_of, ribbon_mask, solid_of, straight_grid
 from scipy import ndimage
 
 from hipsta_bids.errors import GeometryError
+from hipsta_bids.geometry import digital
 from hipsta_bids.geometry.digital import euler_number
 from hipsta_bids.geometry.grid import Field
 from hipsta_bids.geometry.mesh import extract_surface
@@ -138,21 +139,23 @@ def with_hole_at_the_edge():
     return mask
 
 
-def test_a_strip_beside_a_hole_is_not_severed():
+def test_a_strip_beside_a_hole_is_not_severed(monkeypatch):
     """The strip costs less than the hole; but a cut would leave a notch in the ribbon."""
     mask = with_hole_at_the_edge()
     repair = only_repair(repaired(mask), "fill")
     at = np.radians(79.5)
     assert distance(repair, (MIDDLE + 12 * np.cos(at), MIDDLE + 12 * np.sin(at), 14)) < 2.5
-    careless = repaired(mask, sever_factor=1.0)
+    monkeypatch.setattr(digital, "SEVER_FACTOR", 1.0)
+    careless = repaired(mask)
     assert only_repair(careless, "cut").cost < repair.cost
 
 
-def test_a_cut_that_severs_the_ribbon_is_large_where_nothing_else_helps():
-    only_cuts = {"sever_along": -1.0, "sever_factor": 1.001}
+def test_a_cut_that_severs_the_ribbon_is_large_where_nothing_else_helps(monkeypatch):
     mask, *_ = with_bridge()
-    assert only_repair(repaired(mask, flag_cut_cost=1e9, **only_cuts), "cut").large
     assert not only_repair(repaired(mask, flag_cut_cost=1e9), "cut").large
+    monkeypatch.setattr(digital, "SEVER_ALONG", -1.0)
+    monkeypatch.setattr(digital, "SEVER_FACTOR", 1.001)
+    assert only_repair(repaired(mask, flag_cut_cost=1e9), "cut").large
 
 
 def test_a_cap_in_two_pieces_becomes_one():

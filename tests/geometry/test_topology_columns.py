@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hipsta_bids.geometry.grid import Field, WedgeGrid
-from hipsta_bids.geometry.topology import SolidField, repaired_columns
+from hipsta_bids.geometry.topology import STUMP_REACH, SolidField, repaired_columns
 from hipsta_bids.settings import MeasureSettings
 from hipsta_bids.types import Sheet
 
@@ -97,9 +97,9 @@ def test_a_cut_marks_what_its_stump_stands_on(height):
     found = marked(make_solid(stumps=[point for point in bar if point != cut], removed=[cut]))
     assert (7, 5) in found
     # The farther face of the cut stands a node above it; from there the sphere that touches the
-    # wall plus ``stump_reach`` reaches this far along the wall, and columns half their distance.
+    # wall plus ``STUMP_REACH`` reaches this far along the wall, and columns half their distance.
     farthest = height + SPACING
-    reach = np.sqrt((farthest + SETTINGS.stump_reach) ** 2 - farthest**2) + 0.5 * np.sqrt(2)
+    reach = np.sqrt((farthest + STUMP_REACH) ** 2 - farthest**2) + 0.5 * np.sqrt(2)
     assert all(np.hypot(i - 7, j - 5) <= reach for i, j in found)
     # Round the bar alike on all sides.
     assert found == {(14 - i, j) for i, j in found} == {(i, 10 - j) for i, j in found}

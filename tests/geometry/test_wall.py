@@ -6,7 +6,7 @@ from geometry_cases import cylinder
 from lapy import Solver, TriaMesh
 
 from hipsta_bids.geometry.mesh import edge_graph, lateral_triangles
-from hipsta_bids.geometry.wall import Wall, _Mesh, end_to_end
+from hipsta_bids.geometry.wall import CURVATURE_SMOOTHING, LAPY_CURVATURE, Wall, _Mesh, end_to_end
 from hipsta_bids.settings import BoundarySettings
 
 SETTINGS = BoundarySettings()
@@ -31,7 +31,7 @@ def lapy_curvature(radius, edge, *, outward=True):
     """Both curvatures, the direction of the second, and the mean edge, away from the ends."""
     points, triangles = cylinder(radius, edge, outward=outward)
     _, direction, least, most = TriaMesh(points, triangles).curvature_tria(
-        smoothit=SETTINGS.curvature_smoothing
+        smoothit=CURVATURE_SMOOTHING
     )
     sides = np.roll(points[triangles], 1, axis=1) - points[triangles]
     middle = points[triangles].mean(axis=1)[:, 2]
@@ -45,7 +45,7 @@ def lapy_curvature(radius, edge, *, outward=True):
 def test_lapys_curvature_is_the_setting_times_curvature_times_edge(radius, edge):
     least, most, _, mean_edge = lapy_curvature(radius, edge)
     # Convex is negative on outward triangles. Regular triangles give 1 / (2 sqrt 3) = 0.289.
-    assert -least * radius / mean_edge == pytest.approx(SETTINGS.lapy_curvature, rel=0.06)
+    assert -least * radius / mean_edge == pytest.approx(LAPY_CURVATURE, rel=0.06)
     assert abs(most) < 0.02 * abs(least)
 
 
@@ -60,13 +60,11 @@ def test_directions_do_not_depend_on_arbitrary_signs():
     points, triangles = cylinder(2.0, 0.35, outward=True)
     middle = points[triangles].mean(axis=1)[:, 2]
     inner = (middle > 3) & (middle < 5)
-    first = _Mesh(points, triangles).curvature_tria(SETTINGS.curvature_smoothing)
-    again = _Mesh(points, np.roll(triangles, 1, axis=1)).curvature_tria(
-        SETTINGS.curvature_smoothing
-    )
+    first = _Mesh(points, triangles).curvature_tria(CURVATURE_SMOOTHING)
+    again = _Mesh(points, np.roll(triangles, 1, axis=1)).curvature_tria(CURVATURE_SMOOTHING)
     assert (np.abs(first[1][inner, 2]) > 0.99).all()
     np.testing.assert_allclose(np.abs((first[0] * again[0]).sum(axis=1)[inner]), 1.0, atol=1e-9)
-    lapy = TriaMesh(points, triangles).curvature_tria(SETTINGS.curvature_smoothing)
+    lapy = TriaMesh(points, triangles).curvature_tria(CURVATURE_SMOOTHING)
     for ours, theirs in zip(first[2:], lapy[2:], strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-12)
 

@@ -10,7 +10,7 @@ from hipsta_bids.derivatives.hemisphere import ResultPlace, format_column
 from hipsta_bids.derivatives.names import HemisphereName
 from hipsta_bids.io import files
 from hipsta_bids.settings import Settings, SheetSettings
-from hipsta_bids.validation.group import SimulationPlan, simulate_cohort
+from validation.group import SimulationPlan, simulate_cohort
 
 NODES = (21, 7)
 PLAN = SimulationPlan(

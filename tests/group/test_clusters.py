@@ -6,20 +6,19 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from hipsta_bids.group.clusters import (
-    Cluster,
-    Frame,
+from hipsta_bids.group.design.formula import Contrast
+from hipsta_bids.group.design.settings import GlmSettings, MultiplicitySettings
+from hipsta_bids.group.output.columns import Cluster, Frame, find_clusters, peak_table
+from hipsta_bids.group.stats import clusters
+from hipsta_bids.group.stats.clusters import (
+    TFCE_STEP,
     enhance,
-    find_clusters,
     label_regions,
     mesh_edges,
-    peak_table,
     sheet_edges,
 )
-from hipsta_bids.group.formula import Contrast
-from hipsta_bids.group.glm import fit_points
-from hipsta_bids.group.inference import Discoveries, MapKey, control_fdr, discover
-from hipsta_bids.group.settings import GlmSettings, MultiplicitySettings
+from hipsta_bids.group.stats.glm import fit_points
+from hipsta_bids.group.stats.inference import Discoveries, MapKey, control_fdr, discover
 from hipsta_bids.io.gifti import sheet_triangles
 
 SHAPE = (12, 8)
@@ -72,29 +71,28 @@ def test_regions_of_a_grid_are_those_of_scipy(neighbors):
 @pytest.mark.parametrize("neighbors", [4, 8])
 def test_enhancement_is_its_definition(neighbors):
     """Height by height, each sign and each map by itself, with regions of scipy."""
-    settings = MultiplicitySettings(neighbors=neighbors)
     t = np.random.default_rng(0).normal(0, 2, (3, *SHAPE))
     t[0, :2] = np.nan
     t[1] = 0.05  # below the first height
     expected = np.zeros(t.shape)
     for sign in (1, -1):
         for own, values in zip(expected, sign * np.nan_to_num(t), strict=True):
-            height = settings.tfce_step
+            height = TFCE_STEP
             while (above := values >= height).any():
                 labels, _ = ndimage.label(above, structure(neighbors))
                 extent = np.bincount(labels.ravel())[labels]
-                own[:] += sign * above * extent**0.5 * height**2 * settings.tfce_step
-                height += settings.tfce_step
-    found = enhance(t.reshape(3, -1), sheet_edges(*SHAPE, neighbors), settings)
+                own[:] += sign * above * extent**0.5 * height**2 * TFCE_STEP
+                height += TFCE_STEP
+    found = enhance(t.reshape(3, -1), sheet_edges(*SHAPE, neighbors))
     np.testing.assert_allclose(found, expected.reshape(3, -1), rtol=1e-12)  # order of sums
 
 
-def test_enhancement_of_a_plateau_is_the_sum_of_its_heights():
+def test_enhancement_of_a_plateau_is_the_sum_of_its_heights(monkeypatch):
     sheet = np.zeros((6, 5))
     sheet[1:3, 1:4] = 1.0  # six points of height 1
     sheet[4, 0] = -0.5
-    settings = MultiplicitySettings(tfce_step=0.25)
-    raised = enhance(sheet.reshape(1, -1), sheet_edges(6, 5), settings).reshape(6, 5)
+    monkeypatch.setattr(clusters, "TFCE_STEP", 0.25)
+    raised = enhance(sheet.reshape(1, -1), sheet_edges(6, 5)).reshape(6, 5)
     heights = np.array([0.25, 0.5, 0.75, 1.0])
     assert raised[1, 1] == pytest.approx(np.sqrt(6) * (heights**2).sum() * 0.25)
     assert raised[4, 0] == pytest.approx(-(heights[:2] ** 2).sum() * 0.25)
@@ -105,8 +103,7 @@ def test_enhancement_of_a_plateau_is_the_sum_of_its_heights():
 def test_enhancement_reaches_the_height_that_a_point_has(count):
     """Sums of steps are rounded: a tenth, ten times, is less than 1 and counts as ten heights."""
     heights = np.cumsum(np.full(count, 0.1))
-    settings = MultiplicitySettings(tfce_step=0.1)
-    (found,) = enhance(heights[None, -1:], np.zeros((0, 2), dtype=int), settings)
+    (found,) = enhance(heights[None, -1:], np.zeros((0, 2), dtype=int))
     assert found.item() == pytest.approx((heights**2).sum() * 0.1, rel=1e-12)  # order of sums
 
 

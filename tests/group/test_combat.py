@@ -4,11 +4,19 @@ import numpy as np
 import pytest
 from statsmodels.regression.mixed_linear_model import MixedLM
 
-from hipsta_bids.group.combat import Visits, extend_effects, fit_effects, harmonize
-from hipsta_bids.group.settings import GroupSettings
+from hipsta_bids.group.design.settings import GroupSettings
+from hipsta_bids.group.stats import combat
+from hipsta_bids.group.stats.combat import Visits, extend_effects, fit_effects, harmonize
 
-SETTINGS = GroupSettings().changed(harmonization={"tolerance": 1e-13, "iterations": 1000})
+SETTINGS = GroupSettings()
 SHIFTS, SCALES = np.array([0.4, -0.3, 0.1, 0.0]), np.array([1.4, 0.7, 1.0, 1.1])
+
+
+@pytest.fixture(autouse=True)
+def _to_the_end(monkeypatch):
+    """Estimate to rounding, as the published formulas are compared with."""
+    monkeypatch.setattr(combat, "POSTERIOR_TOLERANCE", 1e-13)
+    monkeypatch.setattr(combat, "POSTERIOR_STEPS", 1000)
 
 
 def cohort(n=160, points=12, visits=1, seed=0):
@@ -160,7 +168,7 @@ def test_new_people_of_known_sites_are_treated_alike(visits_each):
         old, new = np.arange(0, 150), np.arange(150, 200)
     effects, _ = fit_effects(values[old], visits.take(old), 4, SETTINGS, pooled=True)
     everyone = harmonize(values, visits, effects)
-    wide, _ = extend_effects(effects, values[new], visits.take(new), SETTINGS, pooled=True)
+    wide, _ = extend_effects(effects, values[new], visits.take(new), pooled=True)
     np.testing.assert_allclose(
         harmonize(values[new], visits.take(new), wide), everyone[new], rtol=1e-12
     )
@@ -172,7 +180,7 @@ def test_a_new_site_gets_the_scale_of_the_old_ones():
     moved = values.copy()
     moved[new] = 2 * moved[new] + 1
     effects, _ = fit_effects(values[old], visits.take(old), 3, SETTINGS, pooled=True)
-    wide, moments = extend_effects(effects, moved[new], visits.take(new), SETTINGS, pooled=True)
+    wide, moments = extend_effects(effects, moved[new], visits.take(new), pooled=True)
     np.testing.assert_array_equal(wide.shift[:3], effects.shift)
     found = harmonize(moved[new], visits.take(new), wide)
     residual = (found - effects.mean - visits.columns[new] @ effects.slopes) / effects.sd

@@ -4,7 +4,7 @@ import pandas as pd
 import pytest
 
 from hipsta_bids.errors import InputError
-from hipsta_bids.group.covariates import read_covariates, read_icv, relocate
+from hipsta_bids.group.cohort.covariates import read_covariates, read_icv, relocate
 from hipsta_bids.io import files
 
 VISITS = pd.DataFrame(
@@ -36,9 +36,8 @@ def test_tables_without_participants_or_with_one_twice_are_refused(tmp_path):
     with pytest.raises(InputError, match="no column participant_id"):
         read_covariates(VISITS, tmp_path, [bad])
     twice = write(tmp_path / "b.tsv", "participant_id age\nsub-1 3\n1 4\n")
-    with pytest.raises(InputError, match="sub-1 occur more than once") as caught:
+    with pytest.raises(InputError, match="sub-1 occur more than once"):
         read_covariates(VISITS, tmp_path, [twice])
-    assert caught.value.reason == "duplicate-rows"
     # Those who are not in the cohort may stand there as they like.
     others = write(tmp_path / "c.tsv", "participant_id age\nsub-8 3\nsub-8 4\n")
     assert read_covariates(VISITS, tmp_path, [others])["age"].isna().all()

@@ -14,14 +14,14 @@ from matplotlib.text import Text
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from hipsta_bids.group.analysis import Analysis
-from hipsta_bids.group.classify import Area, calibrate, roc_curve
-from hipsta_bids.group.figures import draw_calibration, draw_roc, draw_sections, encode
-from hipsta_bids.group.inference import Discoveries, MapKey
-from hipsta_bids.group.panels import Seen, draw_measure
-from hipsta_bids.group.settings import ClassificationSettings
-from hipsta_bids.group.shapes import AverageShape
-from hipsta_bids.group.views import across, draw_mesh, laid_out, look
+from hipsta_bids.group.design.settings import ClassificationSettings
+from hipsta_bids.group.output.figures import draw_calibration, draw_roc, draw_sections, encode
+from hipsta_bids.group.output.panels import Seen, draw_measure
+from hipsta_bids.group.output.results import Analysis
+from hipsta_bids.group.output.shapes import AverageShape
+from hipsta_bids.group.output.views import across, draw_mesh, laid_out, look
+from hipsta_bids.group.stats.classify import Area, calibrate, roc_curve
+from hipsta_bids.group.stats.inference import Discoveries, MapKey
 from hipsta_bids.io.gifti import sheet_triangles
 from hipsta_bids.reports.maps import new_figure
 from hipsta_bids.types import Mesh

@@ -5,9 +5,9 @@ import pytest
 from scipy import stats
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.formula import Contrast
-from hipsta_bids.group.glm import f_limits, fit_measures, fit_points, t_limits
-from hipsta_bids.group.settings import GlmSettings
+from hipsta_bids.group.design.formula import Contrast
+from hipsta_bids.group.design.settings import GlmSettings
+from hipsta_bids.group.stats.glm import f_limits, fit_measures, fit_points, t_limits
 
 SETTINGS = GlmSettings()
 HC3 = GlmSettings(covariance="hc3")
@@ -185,7 +185,7 @@ def test_result_depends_neither_on_units_nor_on_how_points_are_batched(monkeypat
     random, matrix, maps = random_case(3)
     maps[random.random(maps.shape) < 0.1] = np.nan
     whole = fit_points(maps, matrix, single(3), SETTINGS)
-    monkeypatch.setattr("hipsta_bids.group.glm._CHUNK", 500)
+    monkeypatch.setattr("hipsta_bids.group.stats.glm._CHUNK", 500)
     scaled = fit_points(maps * 1e3, matrix * [1, 1, 1e4], single(3), SETTINGS)
     for one, other in zip(whole.tests[1:], scaled.tests[1:], strict=True):
         np.testing.assert_allclose(one.statistic, other.statistic, rtol=1e-8)  # rounding
@@ -246,14 +246,13 @@ def test_limits_are_roots_of_the_distributions():
 def test_refuses_what_cannot_be_fitted():
     _, matrix, maps = random_case(6)
     cases = {
-        "design-shape": (maps[:-1], matrix, single(3)),
-        "design-rank": (maps, matrix[:, [0, 1, 1]], single(3)),
-        "contrast-shape": (maps, matrix, single(2)),
-        "design-missing": (maps, np.where(matrix == matrix[3, 2], np.nan, matrix), single(3)),
+        "both need as many rows": (maps[:-1], matrix, single(3)),
+        "not independent": (maps, matrix[:, [0, 1, 1]], single(3)),
+        "has 2 weights": (maps, matrix, single(2)),
+        "has missing values": (maps, np.where(matrix == matrix[3, 2], np.nan, matrix), single(3)),
     }
-    for reason, case in cases.items():
-        with pytest.raises(ModelError) as caught:
+    for message, case in cases.items():
+        with pytest.raises(ModelError, match=message):
             fit_points(*case, SETTINGS)
-        assert caught.value.reason == reason
     with pytest.raises(ModelError, match="redundant"):
         Contrast("twice", np.array([[0.0, 1.0], [0.0, 2.0]]))

@@ -12,10 +12,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from hipsta_bids.errors import HipstaError, ModelError, UsageError
-from hipsta_bids.group.formula import model_from_shortcut, parse_model
-from hipsta_bids.group.grammar import closed_formula
-from hipsta_bids.group.model import build_design
-from hipsta_bids.group.settings import DesignSettings
+from hipsta_bids.group.design.formula import model_from_shortcut, parse_model
+from hipsta_bids.group.design.grammar import closed_formula
+from hipsta_bids.group.design.model import build_design
+from hipsta_bids.group.design.settings import DesignSettings
 
 N = 40
 AGE = np.linspace(50.0, 89.0, N)
@@ -132,7 +132,6 @@ def test_part_that_is_not_allowed_is_named(formula, part, tmp_path, monkeypatch)
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UsageError, match="is not allowed; allowed are") as caught:
         design(formula)
-    assert caught.value.reason == "formula-language"
     assert part in str(caught.value).partition(" is not allowed")[0]
     assert "log2, poly" in str(caught.value)
     assert not list(tmp_path.iterdir())

@@ -19,8 +19,8 @@ from small_cohorts import (
 from hipsta_bids.cli.main import main
 from hipsta_bids.derivatives.dataset import identity, update_status
 from hipsta_bids.derivatives.names import HemisphereName
-from hipsta_bids.group import write
-from hipsta_bids.group.exclusions import is_listed
+from hipsta_bids.group.cohort.exclusions import is_listed
+from hipsta_bids.group.output import write
 from hipsta_bids.io import files
 
 #: What keeps runs short that look at the model only.

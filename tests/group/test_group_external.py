@@ -28,10 +28,10 @@ from small_cohorts import (
 )
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.group import write
-from hipsta_bids.group.formula import Contrast
-from hipsta_bids.group.glm import fit_points
-from hipsta_bids.group.settings import GlmSettings
+from hipsta_bids.group.design.formula import Contrast
+from hipsta_bids.group.design.settings import GlmSettings
+from hipsta_bids.group.output import write
+from hipsta_bids.group.stats.glm import fit_points
 from hipsta_bids.io import files
 from hipsta_bids.reports.group import group_page
 

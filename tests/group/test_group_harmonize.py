@@ -20,14 +20,15 @@ from small_cohorts import (
 )
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.group import write
-from hipsta_bids.group.comparison import Comparison
-from hipsta_bids.group.data import Cohort, Measures, SideMaps
-from hipsta_bids.group.figures import draw_sites
-from hipsta_bids.group.formula import Contrast, model_from_shortcut, parse_model
-from hipsta_bids.group.glm import fit_points
-from hipsta_bids.group.harmonize import harmonize_cohort, plan_sites
-from hipsta_bids.group.settings import GlmSettings, GroupSettings
+from hipsta_bids.group.cohort.data import Cohort, Measures
+from hipsta_bids.group.design.formula import Contrast, model_from_shortcut, parse_model
+from hipsta_bids.group.design.model import Comparison
+from hipsta_bids.group.design.settings import GlmSettings, GroupSettings
+from hipsta_bids.group.output import write
+from hipsta_bids.group.output.figures import draw_sites
+from hipsta_bids.group.questions.harmonize import harmonize_cohort, plan_sites
+from hipsta_bids.group.stats.arrays import SideMaps
+from hipsta_bids.group.stats.glm import fit_points
 from hipsta_bids.io import files
 from hipsta_bids.reports.group import group_page
 

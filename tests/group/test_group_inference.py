@@ -20,10 +20,10 @@ from small_cohorts import (
 )
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.group import write
-from hipsta_bids.group.inference import control_fdr
+from hipsta_bids.group.output import write
+from hipsta_bids.group.stats.inference import control_fdr
 from hipsta_bids.reports.group import group_page
-from hipsta_bids.validation.group import simulate_cohort
+from validation.group import simulate_cohort
 
 ALIGNED = ["--align", "none"]
 PLAIN = [*ALIGNED, "--no-classification"]

@@ -10,10 +10,10 @@ from small_cohorts import NODES, PLAN, place_of, table, write_dataset
 from hipsta_bids.cli.main import main
 from hipsta_bids.errors import InputError
 from hipsta_bids.geometry.sampling import SampledMap
-from hipsta_bids.group import write
-from hipsta_bids.group.formula import left_side
-from hipsta_bids.group.read import choose_measures
-from hipsta_bids.group.tables import COLUMNS
+from hipsta_bids.group.cohort.read import choose_measures
+from hipsta_bids.group.design.formula import left_side
+from hipsta_bids.group.output import write
+from hipsta_bids.group.output.tables import COLUMNS
 from hipsta_bids.inputs.scan import MapSource
 from hipsta_bids.io import files
 from hipsta_bids.participant.maps import write_map

@@ -13,12 +13,11 @@ from scipy import stats
 from small_cohorts import NODES, place_of, read_participants, table, write_participants
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.group import norming
-from hipsta_bids.group.norms import _digest, load_norms
-from hipsta_bids.group.registration import mean_profiles, register_to
-from hipsta_bids.group.settings import RegistrationSettings
-from hipsta_bids.group.tables import COLUMNS
-from hipsta_bids.group.warps import templates_from_json
+from hipsta_bids.group.design.settings import RegistrationSettings
+from hipsta_bids.group.output.saved import _digest, load_norms, templates_from_json
+from hipsta_bids.group.output.tables import COLUMNS
+from hipsta_bids.group.questions import norming
+from hipsta_bids.group.stats.registration import mean_profiles, register_to
 from hipsta_bids.io import files
 from hipsta_bids.reports.group import group_page
 
@@ -37,11 +36,7 @@ def _no_figures(request, monkeypatch):
 def reference(tmp_path_factory):
     folder = tmp_path_factory.mktemp("ref")
     data, out = write_people(folder, {"A": 62, "B": 48}, 1)
-    quick = folder / "group.toml"
-    quick.write_text("[norms]\nchecked_points = 40\n")
     options = [
-        "--settings",
-        str(quick),
         "--fit-norms",
         "--measures",
         "thickness",

@@ -27,7 +27,7 @@ from selenium.webdriver.common.keys import Keys
 from small_cohorts import NODES, table, write_dataset
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.group import figures, write
+from hipsta_bids.group.output import figures, write
 from hipsta_bids.io import files
 from hipsta_bids.reports import group as page_module
 from hipsta_bids.reports.display import ORIENTATION

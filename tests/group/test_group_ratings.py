@@ -6,8 +6,8 @@ import pytest
 from small_cohorts import place_of, write_dataset
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.group import write
-from hipsta_bids.group.collect import GroupRequest, collect_sheets
+from hipsta_bids.group.cohort.collect import GroupRequest, collect_sheets
+from hipsta_bids.group.output import write
 from hipsta_bids.io import files
 from hipsta_bids.reports.group import write_group_report
 

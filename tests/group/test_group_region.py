@@ -7,7 +7,7 @@ from small_cohorts import PLAN, place_of, write_dataset
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.derivatives.dataset import identity, update_status
-from hipsta_bids.group.collect import GroupRequest, collect_sheets
+from hipsta_bids.group.cohort.collect import GroupRequest, collect_sheets
 from hipsta_bids.io import files
 
 QUICK = ["group", "--align", "none", "--measures", "thickness", "--formula", "group", "--contrast"]
@@ -18,7 +18,7 @@ EXTENDED = ["--region", "extended"]
 @pytest.fixture
 def study(tmp_path, monkeypatch):
     """All participants, measured with the neighboring cortex."""
-    monkeypatch.setattr("hipsta_bids.group.run.draw", lambda *_, **__: ())
+    monkeypatch.setattr("hipsta_bids.group.questions.compare.draw", lambda *_, **__: ())
     data, out = write_dataset(tmp_path, region="extended")
     return [str(data), str(out)], out
 

@@ -12,13 +12,15 @@ from pyarrow import parquet
 from small_cohorts import GROUPS, NODES, PLAN, place_of, table, write_dataset
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.group import analysis, read, run, write
-from hipsta_bids.group.collect import GroupRequest
-from hipsta_bids.group.formula import Contrast
-from hipsta_bids.group.glm import fit_points
-from hipsta_bids.group.model import ModelRequest
-from hipsta_bids.group.settings import GlmSettings
-from hipsta_bids.group.tables import COLUMNS
+from hipsta_bids.group.cohort import read
+from hipsta_bids.group.cohort.collect import GroupRequest
+from hipsta_bids.group.design.formula import Contrast
+from hipsta_bids.group.design.model import ModelRequest
+from hipsta_bids.group.design.settings import GlmSettings
+from hipsta_bids.group.output import write
+from hipsta_bids.group.output.tables import COLUMNS
+from hipsta_bids.group.questions import analysis, study
+from hipsta_bids.group.stats.glm import fit_points
 from hipsta_bids.io import files
 
 MODEL = "group-age-sex"
@@ -244,13 +246,13 @@ def test_formula_contrast_reference_and_options(dataset, quick):
 
 @pytest.mark.parametrize("problem", [None, "kept.html: not made (no space)"])
 def test_the_page_is_named_unless_it_could_not_be_made(tmp_path, monkeypatch, problem):
-    monkeypatch.setattr(run, "write_group_report", lambda *_: problem)
+    monkeypatch.setattr(study, "write_group_report", lambda *_: problem)
     sheets = GroupRequest(roots=(tmp_path,))
-    given = run.GroupOptions(
+    given = study.GroupOptions(
         bids_dir=tmp_path, out_dir=tmp_path, sheets=sheets, model=ModelRequest()
     )
     page = tmp_path / "group" / "kept.html"
-    assert run.make_page(given, "kept") == (None if problem else page, problem)
+    assert study.make_page(given, "kept") == (None if problem else page, problem)
 
 
 def test_flagged_hemispheres_are_told(dataset, quick, capsys):

@@ -15,7 +15,7 @@ from small_cohorts import (
 )
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.group import write
+from hipsta_bids.group.output import write
 from hipsta_bids.io import files
 
 SIDES = {"L": ("lh", "left"), "R": ("rh", "right")}

@@ -10,7 +10,7 @@ from small_cohorts import NODES, PLAN, write_dataset
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.geometry.sheet import sheet_levels
-from hipsta_bids.group import figures, write
+from hipsta_bids.group.output import figures, write
 from hipsta_bids.protocols import body_ends, rows_beyond
 from hipsta_bids.reports.display import parts_of
 from hipsta_bids.reports.group import group_page

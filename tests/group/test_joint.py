@@ -7,12 +7,12 @@ from scipy import stats
 from small_cohorts import table, write_dataset
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.group import write
-from hipsta_bids.group.clusters import sheet_edges
-from hipsta_bids.group.formula import Contrast
-from hipsta_bids.group.glm import fit_points
-from hipsta_bids.group.inference import JointPart, PermutationPart, combine_evidence, permute
-from hipsta_bids.group.settings import GlmSettings, MultiplicitySettings
+from hipsta_bids.group.design.formula import Contrast
+from hipsta_bids.group.design.settings import GlmSettings, MultiplicitySettings
+from hipsta_bids.group.output import write
+from hipsta_bids.group.stats.clusters import sheet_edges
+from hipsta_bids.group.stats.glm import fit_points
+from hipsta_bids.group.stats.inference import JointPart, PermutationPart, combine_evidence, permute
 from hipsta_bids.reports.group import group_page
 
 SHEET = (6, 4)

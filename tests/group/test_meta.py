@@ -6,8 +6,8 @@ from scipy.optimize import minimize_scalar
 from statsmodels.regression.linear_model import OLS
 from statsmodels.stats.meta_analysis import combine_effects
 
-from hipsta_bids.group.meta import SiteFit, combine, join, meta_analyze
-from hipsta_bids.group.settings import MetaSettings
+from hipsta_bids.group.design.settings import MetaSettings
+from hipsta_bids.group.stats.meta import SiteFit, combine, join, meta_analyze
 
 #: Trials of the BCG vaccine (Colditz et al. 1994): cases and others among the vaccinated, and among
 #: controls, as in Viechtbauer (2010), J Stat Softw 36(3), table 1.

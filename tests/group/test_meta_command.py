@@ -11,7 +11,8 @@ from page_outline import Outline
 from small_cohorts import place_of, write_dataset
 
 from hipsta_bids.cli.main import main
-from hipsta_bids.group import analysis, consortium, write
+from hipsta_bids.group.output import write
+from hipsta_bids.group.questions import analysis, consortium
 from hipsta_bids.io import files
 
 SITES = {

@@ -8,9 +8,13 @@ import pytest
 from scipy import stats
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.formula import listed, model_from_shortcut, parse_expression, parse_model
-from hipsta_bids.group.glm import fit_points
-from hipsta_bids.group.model import (
+from hipsta_bids.group.design.formula import (
+    listed,
+    model_from_shortcut,
+    parse_expression,
+    parse_model,
+)
+from hipsta_bids.group.design.model import (
     ModelRequest,
     build_design,
     default_formula,
@@ -18,7 +22,8 @@ from hipsta_bids.group.model import (
     folder_name,
     model_document,
 )
-from hipsta_bids.group.settings import DesignSettings, GlmSettings, GroupSettings
+from hipsta_bids.group.design.settings import DesignSettings, GlmSettings, GroupSettings
+from hipsta_bids.group.stats.glm import fit_points
 
 SETTINGS = DesignSettings()
 DEFAULTS = GroupSettings()
@@ -140,12 +145,11 @@ REFUSALS = {
 
 
 @pytest.mark.filterwarnings("ignore:divide by zero")
-@pytest.mark.parametrize("reason", REFUSALS)
-def test_says_what_keeps_a_model_from_being_fitted(reason):
-    formula, changes, references, says = REFUSALS[reason]
+@pytest.mark.parametrize("problem", REFUSALS)
+def test_says_what_keeps_a_model_from_being_fitted(problem):
+    formula, changes, references, says = REFUSALS[problem]
     with pytest.raises(ModelError, match=says) as caught:
         design(formula, table=damaged(**changes), references=references)
-    assert caught.value.reason == reason
     assert "\n" not in str(caught.value)
 
 
@@ -237,9 +241,8 @@ def test_refuses_models_that_say_something_else():
         document(glm | {"Contrasts": None}),
     ]
     for case in cases:
-        with pytest.raises(ModelError) as caught:
+        with pytest.raises(ModelError, match=r"^model"):
             parse_model(case)
-        assert caught.value.reason == "model-file"
 
 
 @pytest.mark.parametrize(

@@ -1,14 +1,20 @@
 """The models on arrays: ``hipsta_bids.group``."""
 
+import json
+
 import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
+from small_cohorts import read_participants, write_dataset, write_participants
 from statsmodels.regression.linear_model import OLS
 from statsmodels.stats.multitest import multipletests
 
 import hipsta_bids as hb
-import hipsta_bids.group.glm
+import hipsta_bids.group.design.settings
+import hipsta_bids.group.output.write
+import hipsta_bids.group.stats.glm
+from hipsta_bids.cli.main import main
 from hipsta_bids.errors import ModelError
 
 N, SHAPE = 24, (6, 5)
@@ -35,7 +41,7 @@ LABELED = xr.DataArray(
 def test_the_folder_of_that_name_stays_a_package():
     assert hb.group is hipsta_bids.group
     assert callable(hb.group)
-    assert hipsta_bids.group.glm.fit_points is not None
+    assert hipsta_bids.group.stats.glm.fit_points is not None
 
 
 def test_statistics_are_those_of_statsmodels():
@@ -105,7 +111,9 @@ def test_vertices_are_tested_like_points_of_a_sheet():
 
 def test_permutations_take_the_neighbors_that_are_given():
     table = TABLE.assign(group=np.where(TABLE.group == "AD", "AD", "CN"))
-    settings = hb.group.settings.GroupSettings().changed(multiplicity={"permutations": 200})
+    settings = hipsta_bids.group.design.settings.GroupSettings().changed(
+        multiplicity={"permutations": 200}
+    )
     more = {"correction": "permutation-tfce", "settings": settings}
     sheet = hb.group(MAPS["L"], table, "group", **more)
     assert sheet.significant[0, 0, :3].mean() > 0.8
@@ -145,3 +153,64 @@ def test_wrong_models_are_refused():
         hb.group(MAPS, TABLE, "group + ages")
     with pytest.raises(ValueError, match="occurs twice"):
         hb.group(LABELED, pd.concat([TABLE, TABLE]), "age")
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    """A cohort of two small hemispheres a participant, with more columns than it needs."""
+    data, out = write_dataset(tmp_path_factory.mktemp("designs"))
+    columns = ("participant_id", "group", "age", "sex", "site", "dose", "married")
+    rows = [
+        [*row, "ABC"[i % 3], str(i % 4 * 5), ("no", "yes")[i % 5 > 2]]
+        for i, row in enumerate(read_participants(data))
+    ]
+    write_participants(data, rows, columns)
+    return data, out
+
+
+DESIGNS = (
+    ("group",),
+    ("group + age",),
+    ("group + age + sex",),
+    ("age + group",),
+    ("age + sex",),
+    ("group * age",),
+    ("group:age + group",),
+    ("C(group) + age",),
+    ("group + site",),
+    ("site + sex",),
+    ("group + poly(age, 2)",),
+    ('group + cr(age, df=3, constraints="center")',),
+    ("group + C(dose)",),
+    ("0 + group + age",),
+    ("group + married",),
+    ("group + age", ("older = age",)),
+    ("group + age", ("AD-CN = group[AD] - group[CN]",)),
+    ("group + age", (), ("group=AD",)),
+    ("group * sex", (), ("group=AD", "sex=M")),
+    ("group + site", ("B-C = site[B] - site[C]",), ("site=C",)),
+)
+
+
+@pytest.mark.parametrize("design", DESIGNS, ids=str)
+def test_the_command_and_the_function_have_the_same_design(folders, design, monkeypatch):
+    monkeypatch.setattr(hipsta_bids.group.output.write, "draw_figures", lambda *_: iter(()))
+    data, out = folders
+    formula, contrasts, references = (*design, (), ())[:3]
+    options = ["--formula", formula, "--measures", "volume", "--name", "same", "--no-reports"]
+    options += [word for contrast in contrasts for word in ("--contrast", contrast)]
+    options += [word for level in references for word in ("--reference", level)]
+    assert main([str(data), str(out), "group", *options]) == 0
+    record = json.loads((out / "group" / "same" / "analysis.json").read_text())
+    table = pd.read_csv(data / "participants.tsv", sep="\t")
+    fit = hb.group(
+        RANDOM.normal(2, 0.2, (len(table), 2, 2)),
+        table,
+        formula,
+        contrasts=contrasts,
+        references=dict(level.split("=") for level in references),
+    )
+    assert list(fit.design.columns) == record["columns"]
+    assert dict(fit.design.references) == record["references"]
+    weights = {contrast.name: contrast.weights.tolist() for contrast in fit.design.contrasts}
+    assert weights == record["contrasts"]

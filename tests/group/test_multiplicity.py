@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hipsta_bids.group.inference import control_fdr
+from hipsta_bids.group.stats.inference import control_fdr
 
 #: Example of Benjamini and Hochberg (1995), used again in the paper of 2006.
 P = np.concatenate(

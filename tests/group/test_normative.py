@@ -6,8 +6,8 @@ from scipy import stats
 from statsmodels.regression.linear_model import OLS
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.normative import w_scores
-from hipsta_bids.group.settings import GlmSettings
+from hipsta_bids.group.design.settings import GlmSettings
+from hipsta_bids.group.stats.norms import w_scores
 
 SETTINGS = GlmSettings()
 
@@ -90,10 +90,9 @@ def test_refusals():
     few = np.arange(50) < 6
     same = matrix.copy()
     same[reference, 2] = 1.0
-    for reason, arguments in {
-        "group-size": (maps, matrix, few),
-        "design-rank": (maps, same, reference),
+    for message, arguments in {
+        "reference subjects are too few": (maps, matrix, few),
+        "not independent": (maps, same, reference),
     }.items():
-        with pytest.raises(ModelError) as caught:
+        with pytest.raises(ModelError, match=message):
             w_scores(*arguments, SETTINGS)
-        assert caught.value.reason == reason

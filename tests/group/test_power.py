@@ -6,7 +6,8 @@ from scipy import stats
 from statsmodels.stats.power import TTestIndPower
 
 from hipsta_bids.errors import ModelError, UsageError
-from hipsta_bids.group.power import (
+from hipsta_bids.group.design.settings import GroupSettings
+from hipsta_bids.group.stats.trials import (
     Reference,
     TrialEffect,
     participants_needed,
@@ -14,7 +15,6 @@ from hipsta_bids.group.power import (
     power_of,
     sample_size,
 )
-from hipsta_bids.group.settings import GroupSettings
 
 SETTINGS = GroupSettings()
 REFERENCE = Reference(

@@ -8,8 +8,9 @@ from statsmodels.formula.api import ols
 from statsmodels.stats.anova import anova_lm
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.data import Cohort
-from hipsta_bids.group.reference import repeatability, retest_cohort
+from hipsta_bids.group.cohort.data import Cohort
+from hipsta_bids.group.questions.reference import retest_cohort
+from hipsta_bids.group.stats.trials import repeatability
 
 #: Six targets and four judges, table 2 of Shrout and Fleiss (1979).
 JUDGED = [[9, 2, 5, 8], [6, 1, 3, 2], [8, 4, 6, 8], [7, 1, 2, 6], [10, 5, 6, 9], [6, 2, 4, 7]]

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hipsta_bids.group.settings import ShapeSettings
-from hipsta_bids.group.shapes import align_rigidly, average_shape
+from hipsta_bids.group.design.settings import ShapeSettings
+from hipsta_bids.group.output.shapes import align_rigidly, average_shape
 
 SETTINGS = ShapeSettings()
 NODES = (15, 6)
@@ -43,7 +43,7 @@ def one_group(n):
 def test_copies_of_one_shape_are_averaged_to_that_shape():
     random = np.random.default_rng(0)
     copies = np.array([moved(sheet(), random) for _ in range(12)])
-    found = average_shape(copies, identity(12), one_group(12), SETTINGS)
+    found = average_shape(copies, identity(12), one_group(12))
     # The mean settles to 1e-6 mm.
     np.testing.assert_allclose(distances(found.mean), distances(sheet()), atol=1e-5)
     np.testing.assert_allclose(found.by_group["a"], found.mean, atol=1e-12)
@@ -57,7 +57,7 @@ def test_size_is_kept_and_groups_are_laid_upon_each_other():
     sizes = np.repeat([1.0, 1.2], 10)
     shapes = np.array([moved(size * sheet(), random) for size in sizes])
     groups = {"small": sizes == 1.0, "large": sizes > 1.0}
-    found = average_shape(shapes, identity(20), groups, SETTINGS)
+    found = average_shape(shapes, identity(20), groups)
     for name, size in (("small", 1.0), ("large", 1.2)):
         own = distances(found.by_group[name])
         np.testing.assert_allclose(own, size * distances(sheet()), atol=1e-4)
@@ -74,14 +74,14 @@ def test_mirror_images_are_not_mirrored():
         [moved(sheet() * [-1, 1, 1] if i == 0 else sheet(), random) for i in range(9)]
     )
     middle = shapes[:, 1].reshape(9, -1, 3)
-    turns, _, _ = align_rigidly(middle, SETTINGS)
+    turns, _, _ = align_rigidly(middle)
     np.testing.assert_allclose(np.linalg.det(turns), 1, atol=1e-9)
 
 
 def test_rotations_are_the_identity_on_average():
     random = np.random.default_rng(3)
     shapes = np.array([moved(sheet(), random) for _ in range(15)])[:, 1].reshape(15, -1, 3)
-    turns, _, _ = align_rigidly(shapes, SETTINGS)
+    turns, _, _ = align_rigidly(shapes)
     left, _, right = np.linalg.svd(turns.mean(axis=0))
     np.testing.assert_allclose(left @ right, np.eye(3), atol=1e-6)
 
@@ -91,7 +91,7 @@ def test_missing_points_do_not_move_the_others():
     shapes = np.array([moved(sheet(), random) for _ in range(8)])
     shapes[2, :, :3, 0] = np.nan
     shapes[:, :, -1, -1] = np.nan  # nobody has it
-    found = average_shape(shapes, identity(8), one_group(8), SETTINGS)
+    found = average_shape(shapes, identity(8), one_group(8))
     known = np.isfinite(found.mean).all(axis=-1)
     assert not known[:, -1, -1].any()
     assert known.sum() == 3 * (NODES[0] * NODES[1] - 1)
@@ -104,11 +104,11 @@ def test_nodes_are_those_of_registration():
     grid = np.linspace(0, 1, NODES[0])
     shapes = np.array([moved(sheet(), random) for _ in range(6)])
     shift = grid + 0.05 * np.sin(np.pi * grid)
-    found = average_shape(shapes, np.tile(shift, (6, 1)), one_group(6), SETTINGS)
+    found = average_shape(shapes, np.tile(shift, (6, 1)), one_group(6))
     # The node at 0.5 shows what lies before it: the tube's angle there is smaller.
     x = np.interp(0.5, shift, grid)
     place = np.array([np.interp(x, grid, sheet()[1, :, 0, i]) for i in range(3)])
-    plain = average_shape(shapes, identity(6), one_group(6), SETTINGS).mean[1, :, 0]
+    plain = average_shape(shapes, identity(6), one_group(6)).mean[1, :, 0]
     expected = np.linalg.norm(place - sheet()[1, 0, 0])
     got = np.linalg.norm(found.mean[1, NODES[0] // 2, 0] - plain[0])
     # Chords between nodes are shorter than arcs, and alignment sees another surface.

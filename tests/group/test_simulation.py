@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hipsta_bids.group.registration import mean_profiles, register
-from hipsta_bids.group.settings import GroupSettings, RegistrationSettings
-from hipsta_bids.group.warps import warp_values
-from hipsta_bids.validation.group import SimulationPlan, analyze, run_simulation, simulate_cohort
+from hipsta_bids.group.design.settings import GroupSettings, RegistrationSettings
+from hipsta_bids.group.stats.registration import mean_profiles, register
+from hipsta_bids.group.stats.warps import warp_values
+from validation.group import SimulationPlan, analyze, run_simulation, simulate_cohort
 
 PLAN = SimulationPlan()
 REGISTERED = GroupSettings()

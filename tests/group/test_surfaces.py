@@ -14,7 +14,7 @@ from hippunfold_like import (
 from nibabel.cifti2 import BrainModelAxis, Cifti2Image, ScalarAxis
 
 from hipsta_bids.errors import InputError, NothingToDoError, UsageError
-from hipsta_bids.group.surfaces import find_maps, map_patterns, read_maps
+from hipsta_bids.group.cohort.external import find_maps, map_patterns, read_maps
 from hipsta_bids.io import files
 from hipsta_bids.io.gifti import read_map, read_mesh
 
@@ -117,9 +117,8 @@ def test_named_surface_and_its_refusals(tmp_path):
 def test_maps_of_different_densities_are_refused(tmp_path):
     for subject, count in (("1", 50), ("2", 50), ("3", 40)):
         write_map(tmp_path / f"sub-{subject}_hemi-L.shape.gii", np.zeros(count))
-    with pytest.raises(InputError, match=r"2 with 50 .*; 1 with 40 \(.*sub-3_hemi-L") as caught:
+    with pytest.raises(InputError, match=r"2 with 50 .*; 1 with 40 \(.*sub-3_hemi-L"):
         find_and_read(tmp_path, "sub-{subject}_hemi-{hemi}.shape.gii")
-    assert caught.value.reason == "mixed-grids"
 
 
 def test_several_files_or_none(tmp_path):

@@ -89,7 +89,7 @@ def test_a_subject_of_the_tutorial_is_measured_as_printed(tmp_path, monkeypatch,
 
 def test_the_participants_of_the_page_about_own_data_can_be_compared(tmp_path, monkeypatch, capsys):
     """On maps that are made up, with its table and its command."""
-    monkeypatch.setattr("hipsta_bids.group.write.draw_figures", lambda *_: iter(()))
+    monkeypatch.setattr("hipsta_bids.group.output.write.draw_figures", lambda *_: iter(()))
     data, out = write_dataset(tmp_path)
     (data / "participants.tsv").write_text(participants())
     known = table(data / "participants.tsv").participant_id

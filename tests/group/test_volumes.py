@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from hipsta_bids.errors import InputError
-from hipsta_bids.group.volumes import VolumeTable, join_volumes, read_volumes, table_beside
+from hipsta_bids.group.cohort.external import VolumeTable, join_volumes, read_volumes, table_beside
 
 FREESURFER = """\
 Hippocampal_tail 563.290157

@@ -10,10 +10,11 @@ from statsmodels.regression.linear_model import OLS, WLS
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.derivatives.hemisphere import format_column
-from hipsta_bids.group import write
-from hipsta_bids.group.formula import Contrast
-from hipsta_bids.group.glm import fit_points, uncertainty_weights
-from hipsta_bids.group.settings import GlmSettings
+from hipsta_bids.group.design.formula import Contrast
+from hipsta_bids.group.design.settings import GlmSettings
+from hipsta_bids.group.output import write
+from hipsta_bids.group.stats import glm
+from hipsta_bids.group.stats.glm import LEAST_BETWEEN, fit_points, uncertainty_weights
 from hipsta_bids.io import files
 
 SETTINGS = GlmSettings(weights="uncertainty")
@@ -38,7 +39,7 @@ def by_hand(y, matrix, sd):
     leverage = plain.get_influence().hat_matrix_diag
     freedom = len(y) - matrix.shape[1]
     between = (np.sum(plain.resid**2) - np.sum(sd**2 * (1 - leverage))) / freedom
-    between = max(between, SETTINGS.least_between * plain.scale)
+    between = max(between, LEAST_BETWEEN * plain.scale)
     weights = 1 / (between + sd**2)
     return WLS(y, matrix, weights=weights / weights.mean()).fit(cov_type="HC3", use_t=True)
 
@@ -73,12 +74,12 @@ def test_equal_errors_are_no_weights():
     np.testing.assert_allclose(same.sigma, plain.sigma, rtol=1e-9)
 
 
-def test_variance_between_subjects_is_found():
+def test_variance_between_subjects_is_found(monkeypatch):
     """Of many points: the estimate of moments has no bias."""
     _, matrix, maps, errors = case(3, points=4000, copies=1000, ratio=2.0)
     basis = np.linalg.qr(matrix)[0]
-    settings = GlmSettings(weights="uncertainty", least_between=0.01)
-    weights = uncertainty_weights(maps, errors, basis, settings)
+    monkeypatch.setattr(glm, "LEAST_BETWEEN", 0.01)
+    weights = uncertainty_weights(maps, errors, basis, SETTINGS)
     # of two subjects with known errors: 1 / w = c (t2 + s2)
     a, b = errors[:, 0].argmin(), errors[:, 0].argmax()
     ratio = weights[a] / weights[b]

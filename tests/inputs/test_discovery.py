@@ -76,9 +76,8 @@ def test_a_closed_dataset_hides_nothing_else(tmp_path, close):
     found = search(tmp_path)
     assert subjects(found) == ["01"]
     assert list(reasons(found, tmp_path)) == ["derivatives/b"]
-    with pytest.raises(InputError, match=r"derivatives/b: cannot list") as caught:
+    with pytest.raises(InputError, match=r"derivatives/b: cannot list"):
         search(tmp_path, derivatives={"x": closed})
-    assert caught.value.reason == "unreadable-folder"
 
 
 def test_closed_folders_below_a_named_one_hide_nothing_else(tmp_path, close):

@@ -119,19 +119,16 @@ def test_a_dataset_given_twice_is_searched_once(tmp_path):
 
 
 @pytest.mark.parametrize("option", ["bids_dir", "derivatives", "freesurfer_dir"])
-@pytest.mark.parametrize(
-    ("kind", "reason"), [("missing", "missing-folder"), ("file", "not-a-folder")]
-)
-def test_folders_that_the_user_gave_have_to_exist(tmp_path, option, kind, reason):
+@pytest.mark.parametrize("kind", ["missing", "file"])
+def test_folders_that_the_user_gave_have_to_exist(tmp_path, option, kind):
     bad = tmp_path / "bad"
     if kind == "file":
         bad.touch()
     options = {"bids_dir": tmp_path / "bids"}
     options["bids_dir"].mkdir()
     options[option] = {"x": bad} if option == "derivatives" else bad
-    with pytest.raises(InputError, match=str(bad)) as caught:
+    with pytest.raises(InputError, match=str(bad)):
         find(**options)
-    assert caught.value.reason == reason
 
 
 def test_a_folder_that_cannot_be_listed(tmp_path, monkeypatch):
@@ -148,9 +145,8 @@ def test_a_folder_that_cannot_be_listed(tmp_path, monkeypatch):
     monkeypatch.setattr(scan.os, "scandir", scandir)
     # By default nobody asked for it; named by the user, it has to be readable.
     assert len(find(tmp_path)) == 2
-    with pytest.raises(InputError, match=r"cannot list the folder.*Permission denied") as caught:
+    with pytest.raises(InputError, match=r"cannot list the folder.*Permission denied"):
         find(tmp_path, derivatives={"x": closed})
-    assert caught.value.reason == "unreadable-folder"
 
 
 @pytest.mark.parametrize(
@@ -202,31 +198,28 @@ def test_labels_that_match_nothing(tmp_path, options, message):
     freesurfer(tmp_path / "derivatives" / "fs", "sub-01", "sub-02")
     with pytest.raises(NothingToDoError, match=message) as caught:
         find(tmp_path, **options)
-    assert caught.value.reason == "no-match"
     assert "\n" not in str(caught.value)
 
 
 def test_a_dataset_without_segmentations_says_what_was_looked_for(tmp_path):
     touch(tmp_path / "derivatives" / "fs" / "sub-01" / "mri", "aseg.mgz")
-    with pytest.raises(NothingToDoError, match=r"derivatives/fs.*looked for FreeSurfer's") as e:
+    with pytest.raises(NothingToDoError, match=r"derivatives/fs.*looked for FreeSurfer's"):
         find(tmp_path)
-    assert e.value.reason == "no-segmentation"
 
 
 @pytest.mark.parametrize(
-    ("options", "reason"),
+    ("options", "message"),
     [
-        ({"participant_labels": ("sub_01",)}, "bad-label"),
-        ({"session_labels": ("",)}, "bad-label"),
-        ({"hemis": ("left",)}, "bad-hemisphere"),
-        ({"hemis": ()}, "bad-hemisphere"),
+        ({"participant_labels": ("sub_01",)}, "--participant-label"),
+        ({"session_labels": ("",)}, "--session"),
+        ({"hemis": ("left",)}, "--hemi"),
+        ({"hemis": ()}, "--hemi"),
     ],
 )
-def test_impossible_labels_are_usage_errors(tmp_path, options, reason):
+def test_impossible_labels_are_usage_errors(tmp_path, options, message):
     freesurfer(tmp_path / "derivatives" / "fs", "sub-01")
-    with pytest.raises(UsageError, match="--") as caught:
+    with pytest.raises(UsageError, match=message):
         find(tmp_path, **options)
-    assert caught.value.reason == reason
 
 
 def filtered(root, query, **options):
@@ -424,9 +417,8 @@ def test_a_pybids_database_is_made_and_used(tmp_path):
         assert dataset_notes(request, items) == ("no segmentation found for 1 participant (09)",)
         assert list(database.iterdir())
     other = InputRequest(bids_dir=tmp_path, bids_database_dir=database)
-    with pytest.raises(InputError, match="was made for") as caught:
+    with pytest.raises(InputError, match="was made for"):
         dataset_notes(other, items)
-    assert caught.value.reason == "unreadable-database"
     next(database.iterdir()).write_text("garbage", encoding="utf-8")
     with pytest.raises(InputError, match="cannot use this database"):
         dataset_notes(request, items)

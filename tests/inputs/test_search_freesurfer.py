@@ -141,9 +141,8 @@ def test_fs_analysis_chooses(tmp_path, wanted, taken):
 
 
 def test_an_analysis_that_no_hemisphere_has_is_a_usage_error(tmp_path):
-    with pytest.raises(UsageError, match=r"--fs-analysis T3.*found T1\.v22") as caught:
+    with pytest.raises(UsageError, match=r"--fs-analysis T3.*found T1\.v22"):
         one(tmp_path, f"{FULL}.mgz", fs_analysis="T3")
-    assert caught.value.reason == "unknown-analysis"
 
 
 def test_a_hemisphere_without_the_analysis_fails_alone(tmp_path):

@@ -74,9 +74,8 @@ def test_of_several_images_t2_comes_first_and_others_are_not_chosen_between(tmp_
 @pytest.mark.parametrize("name", ["hs", "hsfCA123", "HSF"])
 def test_a_mode_that_is_not_known_is_an_error(tmp_path, name):
     put(tmp_path, *both(HSF))
-    with pytest.raises(ProtocolError, match=r"did you mean .hsf|bundled: .*hsf, hsfCA23") as caught:
+    with pytest.raises(ProtocolError, match=r"did you mean .hsf|bundled: .*hsf, hsfCA23"):
         find(tmp_path, protocol=name)
-    assert caught.value.reason == "unknown-scheme"
 
 
 def test_a_users_file_describes_a_tool_that_it_names(tmp_path):

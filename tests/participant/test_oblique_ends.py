@@ -13,8 +13,8 @@ from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.settings import BodySettings, Settings
 from hipsta_bids.types import Status
-from hipsta_bids.validation.damage import Site, make_defect
-from hipsta_bids.validation.ends import cut_obliquely
+from validation.damage import Site, make_defect
+from validation.ends import cut_obliquely
 
 PHANTOM = Phantom(PhantomSpec(kind="arc", thickness=2.0, length=18.0, end_length=4.0))
 

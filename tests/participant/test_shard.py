@@ -86,7 +86,7 @@ def command(monkeypatch, tmp_path):
         wanted = request.participant_labels or tuple(ACTS)
         found = tuple(item for item in items if item.subject in wanted)
         if not found:
-            raise NothingToDoError("none", reason="no-match")
+            raise NothingToDoError("none")
         return Findings(items=found)
 
     monkeypatch.setattr(search, "find_inputs", find)

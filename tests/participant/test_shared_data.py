@@ -20,8 +20,8 @@ from hipsta_bids.participant import run as runner
 from hipsta_bids.participant.measure import measure_hemisphere
 from hipsta_bids.participant.pool import run_jobs
 from hipsta_bids.settings import Settings
-from hipsta_bids.validation.cases import measure_body
-from hipsta_bids.validation.damage import Site, make_defect
+from validation.cases import measure_body
+from validation.damage import Site, make_defect
 
 DATA = Path(__file__).parents[2] / ".." / "shared" / "data" / "cobralab"
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="shared test data not found")

@@ -12,7 +12,7 @@ from hipsta_bids.inputs.labels import read_label_volume
 from hipsta_bids.inputs.scan import HemisphereInput
 from hipsta_bids.inputs.search import InputRequest, find_hemispheres
 from hipsta_bids.protocols.load import load_protocol
-from hipsta_bids.validation import hippunfold
+from validation import hippunfold
 
 DATA = (Path(__file__).parents[2] / ".." / "shared" / "data" / "hippunfold").resolve()
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="shared test data not found")

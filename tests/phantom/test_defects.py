@@ -6,7 +6,7 @@ from measured_phantoms import LENGTH, measured, spiral
 
 from hipsta_bids.errors import SettingsError
 from hipsta_bids.protocols.protocol import Part, Tissue
-from hipsta_bids.validation.damage import DEFECTS, Site, make_defect
+from validation.damage import DEFECTS, Site, make_defect
 
 #: One size at which every kind changes something.
 SIZES = {"salt": 0.05, "wrong-voxels": 2.0, "cut-short": 6.0, "at-border": 1.0, "waist": 0.5}

@@ -98,19 +98,18 @@ def test_thickness_varies_as_asked(axis, low):
 
 
 @pytest.mark.parametrize(
-    ("changes", "message", "reason"),
+    ("changes", "message"),
     [
-        ({"kind": "tight", "thickness": 3.3}, "wall folds", "phantom-folds"),
-        ({"kind": "arc", "width": 26.0}, "turns of the wall overlap", "phantom-overlap"),
-        ({"kind": "spiral", "width": 45.0, "thickness": 3.0}, "overlap", "phantom-overlap"),
-        ({"kind": "slab", "bend": 0.1}, "long axis bends too sharply", "phantom-folds"),
-        ({"kind": "arc", "bend": 0.09, "length": 40.0}, "too sharply", "phantom-folds"),
+        ({"kind": "tight", "thickness": 3.3}, "wall folds"),
+        ({"kind": "arc", "width": 26.0}, "turns of the wall overlap"),
+        ({"kind": "spiral", "width": 45.0, "thickness": 3.0}, "overlap"),
+        ({"kind": "slab", "bend": 0.1}, "long axis bends too sharply"),
+        ({"kind": "arc", "bend": 0.09, "length": 40.0}, "too sharply"),
     ],
 )
-def test_impossible_shapes_are_refused(changes, message, reason):
-    with pytest.raises(SettingsError, match=message) as caught:
+def test_impossible_shapes_are_refused(changes, message):
+    with pytest.raises(SettingsError, match=message):
         Body(PhantomSpec(**changes))
-    assert caught.value.reason == reason
 
 
 def test_overlap_begins_where_a_ring_closes():

@@ -243,7 +243,6 @@ def test_a_mistake_in_a_file_is_named(tmp_path, old, new, message):
     path = write(tmp_path, MINIMAL.replace(old, new))
     with pytest.raises(ProtocolError, match=message) as caught:
         load_protocol(path)
-    assert caught.value.reason == "invalid-scheme"
     assert str(path) in str(caught.value)
 
 
@@ -254,17 +253,15 @@ def test_a_file_with_neither_sheet_nor_parts_is_refused(tmp_path):
 
 
 def test_a_file_that_is_missing_or_not_toml(tmp_path):
-    with pytest.raises(ProtocolError, match="cannot read the protocol") as caught:
+    with pytest.raises(ProtocolError, match="cannot read the protocol"):
         load_protocol(tmp_path / "absent.toml")
-    assert caught.value.reason == "unreadable-scheme"
     with pytest.raises(ProtocolError, match="not a TOML file"):
         load_protocol(write(tmp_path, "name = "))
 
 
 def test_an_unknown_name_suggests_the_nearest():
-    with pytest.raises(ProtocolError, match="did you mean 'hippunfold'") as caught:
+    with pytest.raises(ProtocolError, match="did you mean 'hippunfold'"):
         load_protocol("hipunfold")
-    assert caught.value.reason == "unknown-scheme"
 
 
 def test_translate_follows_the_table():

@@ -275,7 +275,7 @@ def test_links_follow_the_table_as_it_was_left_or_severity_without_it(review, vi
 
 
 def test_ratings_are_saved_loaded_and_taken_by_the_group_level(review, browser, out):
-    from hipsta_bids.group.collect import GroupRequest, collect_sheets  # noqa: PLC0415
+    from hipsta_bids.group.cohort.collect import GroupRequest, collect_sheets  # noqa: PLC0415
 
     review("report.html")
     assert not one(browser, "#save").is_enabled()

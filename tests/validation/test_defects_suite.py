@@ -6,9 +6,9 @@ import pytest
 
 from hipsta_bids.errors import GeometryError
 from hipsta_bids.types import Status
-from hipsta_bids.validation import defects
-from hipsta_bids.validation.cases import Refusal, measure_reference
-from hipsta_bids.validation.defects import Damage, Trial, compare, measure_trial
+from validation import defects
+from validation.cases import Refusal, measure_reference
+from validation.defects import Damage, Trial, compare, measure_trial
 
 SPIRAL = defects.SPECS[0]
 

@@ -7,9 +7,9 @@ import pytest
 
 from hipsta_bids.geometry import ends as geometry_ends
 from hipsta_bids.settings import Settings
-from hipsta_bids.validation import ends
-from hipsta_bids.validation.cases import Refusal, measure_body
-from hipsta_bids.validation.ends import ENDS, FOUND, KEPT, Found, Job, Oblique, find_ends
+from validation import ends
+from validation.cases import Refusal, measure_body
+from validation.ends import ENDS, FOUND, KEPT, Found, Job, Oblique, find_ends
 
 JOB = Job(body=ends.PHANTOMS[0], copies=((0.4, 0.5, 0.0), (2.0, 0.0, 8.0)))
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from hipsta_bids.cli.commands import validate_parser
-from hipsta_bids.validation import group
+from validation import group
+from validation.__main__ import build_parser
 
 GOOD = {
     "FDR": 0.02,
@@ -75,5 +75,5 @@ def test_measures_together_keep_the_family_wise_error_and_find_more(monkeypatch)
 
 
 def test_group_is_short_for_its_suite():
-    assert validate_parser().parse_args(["--group"]).suite == ["group"]
-    assert validate_parser().parse_args([]).suite == []
+    assert build_parser().parse_args(["--group"]).suite == ["group"]
+    assert build_parser().parse_args([]).suite == []

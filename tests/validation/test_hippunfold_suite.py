@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hipsta_bids.validation.cases import Refusal
-from hipsta_bids.validation.hippunfold import (
+from validation.cases import Refusal
+from validation.hippunfold import (
     DRAWN,
     OWN,
     Pair,
@@ -16,7 +16,7 @@ from hipsta_bids.validation.hippunfold import (
     _whole_rows,
     run,
 )
-from hipsta_bids.validation.report import page
+from validation.report import page
 
 RANDOM = np.random.default_rng(3)
 THEIRS = RANDOM.uniform(1.0, 2.0, (41, 21))

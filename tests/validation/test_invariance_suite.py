@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from hipsta_bids.inputs.search import InputRequest, find_hemispheres
-from hipsta_bids.validation import invariance
-from hipsta_bids.validation.cases import Refusal
+from validation import invariance
+from validation.cases import Refusal
 
 DATA = (Path(__file__).parents[2] / ".." / "shared" / "data" / "cobralab").resolve()
 

@@ -7,11 +7,11 @@ import pytest
 
 from hipsta_bids.geometry import body as geometry_body
 from hipsta_bids.protocols.protocol import Tissue
-from hipsta_bids.validation import mending
-from hipsta_bids.validation.cases import Refusal, attempt, measure_reference
-from hipsta_bids.validation.damage import make_defect
-from hipsta_bids.validation.defects import VOXEL, site_of
-from hipsta_bids.validation.mending import CAVITIES, RAGGED, UNCUS, Trial, measure_trial
+from validation import mending
+from validation.cases import Refusal, attempt, measure_reference
+from validation.damage import make_defect
+from validation.defects import VOXEL, site_of
+from validation.mending import CAVITIES, RAGGED, UNCUS, Trial, measure_trial
 
 ARC = mending.LAYERED[0]
 

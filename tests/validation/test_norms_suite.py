@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hipsta_bids.validation import norms
+from validation import norms
 
 
 def test_people_are_what_is_said_of_them():

@@ -9,10 +9,10 @@ from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.settings import Settings
 from hipsta_bids.types import Status
-from hipsta_bids.validation import population
-from hipsta_bids.validation.cases import Refusal
-from hipsta_bids.validation.defects import PLAN, Damage
-from hipsta_bids.validation.population import (
+from validation import population
+from validation.cases import Refusal
+from validation.defects import PLAN, Damage
+from validation.population import (
     CALIBRATED,
     Member,
     Specimen,

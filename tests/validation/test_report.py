@@ -9,11 +9,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from hipsta_bids.cli import main
 from hipsta_bids.errors import ExitCode
-from hipsta_bids.validation import accuracy, cases, thick_slices
-from hipsta_bids.validation.cases import Refusal
-from hipsta_bids.validation.report import (
+from validation import __main__ as command
+from validation import accuracy, cases, thick_slices
+from validation.cases import Refusal
+from validation.report import (
     QUESTIONS,
     SUITES,
     WITH_LABELS,
@@ -75,8 +75,8 @@ def one_suite(monkeypatch):
         calls.append(full)
         return Suite(name="toy", title="Toys", text="Why.", tables=(TABLE,), pictures=(PICTURE,))
 
-    monkeypatch.setitem(sys.modules, "hipsta_bids.validation.toys", SimpleNamespace(run=run))
-    monkeypatch.setattr("hipsta_bids.validation.report.SUITES", {"toy": "toys:run"})
+    monkeypatch.setitem(sys.modules, "validation.toys", SimpleNamespace(run=run))
+    monkeypatch.setattr("validation.report.SUITES", {"toy": "toys:run"})
     return calls
 
 
@@ -172,7 +172,7 @@ def test_figures_are_png_and_the_same_each_time():
 
 
 def test_command_writes_the_report(tmp_path, capsys, one_suite):
-    assert main.main(["validate", "--full", "--out", str(tmp_path / "a b")]) == ExitCode.OK
+    assert command.main(["--full", "--out", str(tmp_path / "a b")]) == ExitCode.OK
     said = capsys.readouterr().out.splitlines()
     assert said[0] == "Toys: 1 of 2 targets met"
     assert said[1] == f"targets missed: 1; report: {tmp_path / 'a b' / 'validation.md'}"
@@ -184,12 +184,12 @@ def test_command_writes_the_report(tmp_path, capsys, one_suite):
 
 
 def test_command_is_quick_by_default(tmp_path, one_suite):
-    assert main.main(["validate", "--out", str(tmp_path)]) == ExitCode.OK
+    assert command.main(["--out", str(tmp_path)]) == ExitCode.OK
     assert one_suite == [False]
 
 
 def test_unknown_suites_are_refused(tmp_path, capsys):
-    code = main.main(["validate", "--suite", "speed", "--out", str(tmp_path)])
+    code = command.main(["--suite", "speed", "--out", str(tmp_path)])
     assert code == ExitCode.USAGE
     assert "suite 'speed' is unknown; choose from accuracy" in capsys.readouterr().err
 
@@ -197,7 +197,7 @@ def test_unknown_suites_are_refused(tmp_path, capsys):
 @pytest.mark.usefixtures("one_suite")
 def test_a_file_in_the_way_is_an_output_error(tmp_path):
     (tmp_path / "out").write_text("taken")
-    assert main.main(["validate", "--out", str(tmp_path / "out")]) == ExitCode.NOT_WRITABLE
+    assert command.main(["--out", str(tmp_path / "out")]) == ExitCode.NOT_WRITABLE
 
 
 @pytest.mark.parametrize("name", SUITES)
@@ -205,7 +205,7 @@ def test_every_suite_can_be_imported(name):
     from importlib import import_module  # noqa: PLC0415
 
     module, function = SUITES[name].split(":")
-    run = getattr(import_module(f"hipsta_bids.validation.{module}"), function)
+    run = getattr(import_module(f"validation.{module}"), function)
     assert len(signature(run).parameters) == 1 + (name in WITH_LABELS)
 
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from hipsta_bids.phantom import PhantomSpec
-from hipsta_bids.validation import surrogate
-from hipsta_bids.validation.cases import Refusal
-from hipsta_bids.validation.report import render
-from hipsta_bids.validation.surrogate import Compared
+from validation import surrogate
+from validation.cases import Refusal
+from validation.report import render
+from validation.surrogate import Compared
 
 SHORT = PhantomSpec(kind="arc", thickness=2.0, variation=0.3, length=8.0)
 

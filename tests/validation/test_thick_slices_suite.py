@@ -7,9 +7,9 @@ import pytest
 
 from hipsta_bids.protocols.load import load_protocol
 from hipsta_bids.types import LabelVolume
-from hipsta_bids.validation import thick_slices
-from hipsta_bids.validation.cases import Refusal
-from hipsta_bids.validation.thick_slices import Outcome, Trial, reslice
+from validation import thick_slices
+from validation.cases import Refusal
+from validation.thick_slices import Outcome, Trial, reslice
 
 AXIS = np.array([0.0, 1.0, 0.0])
 

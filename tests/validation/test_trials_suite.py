@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from hipsta_bids.validation import trials
-from hipsta_bids.validation.trials import DESIGNS, simulate_design
+from validation import trials
+from validation.trials import DESIGNS, simulate_design
 
 
 @pytest.mark.parametrize("design", [DESIGNS[3], DESIGNS[6]], ids=["retest", "dropouts"])

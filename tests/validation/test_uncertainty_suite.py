@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from hipsta_bids.participant.uncertainty import Uncertainty
-from hipsta_bids.validation.cases import Measured, Refusal
-from hipsta_bids.validation.uncertainty import VOXELS, _posed, _uncertainty_row
+from validation.cases import Measured, Refusal
+from validation.uncertainty import VOXELS, _posed, _uncertainty_row
 
 SPREAD = np.linspace(0.02, 0.2, 861).reshape(41, 21)
 

@@ -9,9 +9,9 @@ import pytest
 from hipsta_bids.phantom import Phantom, PhantomSpec
 from hipsta_bids.phantom.shape import PITCH
 from hipsta_bids.protocols.load import load_protocol
-from hipsta_bids.validation.accuracy import ROWS, Row, _poses, _thickness_table, rate
-from hipsta_bids.validation.accuracy import _limits_table as limit_table
-from hipsta_bids.validation.cases import (
+from validation.accuracy import ROWS, Row, _poses, _thickness_table, rate
+from validation.accuracy import _limits_table as limit_table
+from validation.cases import (
     CURVATURES,
     GAUSSIAN_CURVATURES,
     Case,
@@ -24,7 +24,7 @@ from hipsta_bids.validation.cases import (
     measure_case,
     random_motion,
 )
-from hipsta_bids.validation.invariance import _motion_table, _pair_table
+from validation.invariance import _motion_table, _pair_table
 
 SMALL = PhantomSpec(length=8.0, end_length=2.0, variation=0.2)
 

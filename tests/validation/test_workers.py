@@ -4,7 +4,7 @@ import pytest
 from validation_jobs import work
 
 from hipsta_bids.participant.pool import processors
-from hipsta_bids.validation.cases import Refusal, run_cases
+from validation.cases import Refusal, run_cases
 
 pytestmark = pytest.mark.usefixtures("workers")
 

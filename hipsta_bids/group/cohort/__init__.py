@@ -1,0 +1,1 @@
+"""Who and what is compared: found, read, joined and chosen."""

@@ -1,0 +1,342 @@
+"""Which hemispheres of the participant level enter the group level, and which are left out, why."""
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from sys import intern
+from typing import Any
+
+import pandas as pd
+
+from hipsta_bids.derivatives import hemisphere
+from hipsta_bids.derivatives.dataset import NOT_FINISHED, name_of, read_status
+from hipsta_bids.derivatives.names import DATASET_FILES, HemisphereName
+from hipsta_bids.errors import InputError, NothingToDoError
+from hipsta_bids.group.cohort.covariates import relocate
+from hipsta_bids.group.cohort.exclusions import SHOWN, Choices, QualityCondition, read_choices
+from hipsta_bids.io import files
+from hipsta_bids.io.foreign import checked_foreign
+from hipsta_bids.protocols.toml import settings_hash
+from hipsta_bids.settings import Settings, SheetSettings
+from hipsta_bids.types import PARTICIPANT, SESSION, Status
+
+
+@dataclass(frozen=True, kw_only=True)
+class GroupRequest:
+    """What the user asked for."""
+
+    roots: tuple[Path, ...]
+    """Output datasets of the participant level."""
+    seg: str | None = None
+    """Segmentation protocol; ``None`` if there is but one."""
+    region: str = "body"
+    """What was measured: ``body``, ``extended`` or ``entorhinal``."""
+    subjects: tuple[str, ...] = ()
+    """Labels without ``sub-``; empty is all."""
+    excluded: tuple[str, ...] = ()
+    """Labels to leave out."""
+    sessions: tuple[str, ...] = ()
+    """Labels without ``ses-``; empty is all."""
+    exclude_flagged: bool = False
+    exclude_quality: QualityCondition | None = None
+    exclude_table: Path | None = None
+    """Participants, or single sessions and hemispheres, to leave out."""
+    ratings: Path | None = None
+    """Ratings of hemispheres, saved from the report."""
+    segmentations: tuple[Path, ...] = ()
+    """Where segmentations are now, if they have moved since they were measured."""
+
+    def wants(self, subject: str, session: str | None) -> bool:
+        """Tell whether a visit is asked for, by its labels."""
+        return (
+            (not self.subjects or subject in self.subjects)
+            and subject not in self.excluded
+            and (not self.sessions or session in self.sessions)
+        )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SheetRecord:
+    """One complete hemisphere."""
+
+    place: hemisphere.ResultPlace
+    settings_hash: str
+    version: str
+    source: str
+    """Address of the segmentation."""
+    flagged: bool = False
+    """Whether the participant level asks to look before use."""
+
+
+@dataclass(frozen=True)
+class Exclusion:
+    """One hemisphere, or visit, that is left out."""
+
+    participant: str
+    session: str | None
+    hemi: str
+    reason: str
+    message: str
+
+    @classmethod
+    def of_sheet(cls, name: HemisphereName, reason: str, message: str) -> "Exclusion":
+        """Leave out one hemisphere."""
+        session = f"ses-{name.session}" if name.session else None
+        return cls(f"sub-{name.subject}", session, name.hemi, reason, message)
+
+
+def exclude_visits(table: pd.DataFrame, left_out: Mapping[str, tuple[str, str]]) -> list[Exclusion]:
+    """Leave out visits of a table; the index names them, as it does their reasons and messages."""
+    rows = table.loc[list(left_out), [PARTICIPANT, SESSION]].itertuples(name=None)
+    return [
+        Exclusion(participant, session, files.MISSING, *left_out[visit])
+        for visit, participant, session in rows
+    ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Collection:
+    """What was found."""
+
+    grid: SheetSettings
+    """Of the sheets."""
+    settings_hash: str
+    """Of all settings of the participant level."""
+    records: tuple[SheetRecord, ...] = ()
+    """Sorted by subject, session, hemisphere."""
+    exclusions: tuple[Exclusion, ...] = ()
+    versions: tuple[str, ...] = ()
+    ratings: Mapping[str, int] | None = None
+    """Numbers of hemispheres by rating, if there is a table of these."""
+    notes: tuple[str, ...] = ()
+    """What to know, one line each."""
+    warnings: tuple[str, ...] = ()
+    """What may make results wrong, one line each."""
+
+
+def collect_sheets(request: GroupRequest, *, may_lack: bool = False) -> Collection:
+    """Find all complete hemispheres of one protocol, made with the same settings."""
+    for folder in request.segmentations:
+        if not folder.is_dir():
+            raise InputError(f"{folder}: no such folder; check --segmentations")
+    roots = [root for root in request.roots if root.is_dir() or not may_lack]
+    everything = [place for root in roots for place in _wanted_results(root, request)]
+    found = [place for place in everything if place.name.region == request.region]
+    notes = _other_regions(everything, request)
+    if may_lack and not found:
+        return Collection(
+            grid=SheetSettings(), settings_hash=settings_hash(Settings()), notes=notes
+        )
+    seg = _one_protocol(found, everything, request)
+    found = [place for place in found if place.name.seg == seg]
+    _refuse_twice(found)
+    choices = read_choices(request.exclude_table, request.ratings)
+    kept: list[SheetRecord] = []
+    left_out: list[Exclusion] = []
+    for place in sorted(found, key=_key):
+        entry = _judge(place, request, choices)
+        if isinstance(entry, Exclusion):
+            left_out.append(entry)
+        else:
+            kept.append(entry)
+    _refuse_unfinished(request, seg, choices)
+    if not kept:
+        reasons = ", ".join(f"{n} {why}" for why, n in Counter(e.reason for e in left_out).items())
+        raise NothingToDoError(
+            f"{request.roots[0]}: no hemisphere is left for the group level ({reasons})"
+        )
+    digest = _one_settings(kept)
+    return Collection(
+        records=tuple(kept),
+        exclusions=tuple(left_out),
+        grid=grid_of(kept[0].place.root),
+        settings_hash=digest,
+        versions=tuple(sorted({record.version for record in kept})),
+        ratings=choices.counts((place.name, _digest(place)) for place in found),
+        notes=(
+            *notes,
+            *choices.excluded.notes((place.name, _digest(place)) for place in everything),
+            *choices.rated.notes((place.name, _digest(place)) for place in everything),
+        ),
+        warnings=_several_versions(kept),
+    )
+
+
+def _digest(place: hemisphere.ResultPlace) -> str | None:
+    """Hash of a hemisphere's input and settings, if its record has one."""
+    digest = hemisphere.read_record(place).get("input_hash")
+    return None if digest is None else str(digest)
+
+
+def _several_versions(kept: Sequence[SheetRecord]) -> tuple[str, ...]:
+    """Say which hemispheres another version has measured: versions may give other numbers."""
+    counts = Counter(record.version for record in kept)
+    if len(counts) < 2:  # noqa: PLR2004 -- one is as it should be
+        return ()
+    usual = counts.most_common(1)[0][0]
+    others = [record.place.name.stem for record in kept if record.version != usual]
+    more = f" and {len(others) - SHOWN} more" if len(others) > SHOWN else ""
+    found = ", ".join(f"{version} ({n})" for version, n in sorted(counts.items()))
+    text = (
+        f"hemispheres were measured by several versions, {found}; measure"
+        f" {', '.join(others[:SHOWN])}{more} with {usual}: a version may change numbers"
+    )
+    return (text,)
+
+
+def wanted_by(request: GroupRequest) -> Callable[[str, str | None, str], bool]:
+    """Tell whether a hemisphere is asked for, and not in a table of those to leave out."""
+    choices = read_choices(request.exclude_table, request.ratings)
+
+    def is_wanted(subject: str, session: str | None, hemi: str) -> bool:
+        name = HemisphereName(subject=subject, session=session, hemi=hemi, seg="")
+        return request.wants(subject, session) and not choices.reason_to_leave_out(name, None)
+
+    return is_wanted
+
+
+def _wanted_results(root: Path, request: GroupRequest) -> list[hemisphere.ResultPlace]:
+    if not root.is_dir():
+        raise InputError(f"{root}: no such folder; run the participant level first")
+    return [
+        place
+        for place in hemisphere.list_results(root)
+        if request.wants(place.name.subject, place.name.session)
+    ]
+
+
+def _other_regions(
+    everything: Sequence[hemisphere.ResultPlace], request: GroupRequest
+) -> tuple[str, ...]:
+    """Say which results are left out because another region was asked for."""
+    counts = Counter(
+        place.name.region for place in everything if request.seg in {None, place.name.seg}
+    )
+    return tuple(
+        f"{count} hemispheres of region {region} are not in this analysis;"
+        f" --region {region} takes them"
+        for region, count in sorted(counts.items())
+        if region != request.region
+    )
+
+
+def _key(place: hemisphere.ResultPlace) -> tuple[str, str, str]:
+    return place.name.subject, place.name.session or "", place.name.hemi
+
+
+def _one_protocol(
+    found: Sequence[hemisphere.ResultPlace],
+    everything: Sequence[hemisphere.ResultPlace],
+    request: GroupRequest,
+) -> str:
+    counts = Counter(place.name.seg for place in found)
+    if not counts or request.seg not in {None, *counts}:
+        asked = f" with --seg {request.seg}" if request.seg else " as asked for"
+        asked += f" --region {request.region}" if request.region != "body" else ""
+        kinds = sorted({(place.name.seg, place.name.region) for place in everything})
+        there = [seg if region == "body" else f"{seg} --region {region}" for seg, region in kinds]
+        hint = f"there is {', '.join(there)}" if there else "run the participant level first"
+        raise NothingToDoError(f"{request.roots[0]}: no hemisphere{asked}; {hint}")
+    if request.seg is None and len(counts) > 1:
+        names = ", ".join(f"{name} ({n})" for name, n in sorted(counts.items()))
+        raise InputError(
+            f"{request.roots[0]}: hemispheres of several protocols, {names}; choose one by --seg"
+        )
+    return request.seg or next(iter(counts))
+
+
+def _refuse_twice(found: Sequence[hemisphere.ResultPlace]) -> None:
+    first: dict[tuple[str, str, str], Path] = {}
+    for place in found:
+        other = first.setdefault(_key(place), place.root)
+        if other != place.root:
+            raise InputError(
+                f"{place.name.stem} is in {other} and in {place.root}; participants of different"
+                " sites need different labels"
+            )
+
+
+def _judge(
+    place: hemisphere.ResultPlace, request: GroupRequest, choices: Choices
+) -> SheetRecord | Exclusion:
+    record = hemisphere.read_record(place)
+    status = record.get("status")
+    reason, message = record.get("reason") or str(status), record.get("message") or ""
+    unwanted = choices.reason_to_leave_out(place.name, record.get("input_hash"))
+    if unwanted is not None:
+        reason, message = unwanted
+    elif status == Status.FAILED:
+        reason = f"failed: {reason}"
+    elif request.exclude_flagged and status == Status.FLAGGED:
+        reason = f"flagged: {reason}"
+    elif request.exclude_quality is not None and request.exclude_quality.holds(_metrics(record)):
+        reason, message = "quality", request.exclude_quality.text
+    else:
+        inputs = record.get("inputs") or [{}]
+        return SheetRecord(
+            place=place,
+            settings_hash=intern(str(record.get("settings_hash"))),
+            version=intern(str(record.get("version"))),
+            source=relocate(str(inputs[0].get("file", "")), request.segmentations),
+            flagged=status == Status.FLAGGED,
+        )
+    return Exclusion.of_sheet(place.name, reason, message)
+
+
+def _metrics(record: Mapping[str, Any]) -> dict[str, Any]:
+    """List what conditions can name: numbers and words of the record and of its metrics."""
+    metrics = record.get("metrics") or {}
+    both = {**metrics, **{name: record.get(name) for name in ("status", "undefined_columns")}}
+    return {k: v for k, v in both.items() if not isinstance(v, (list, dict))}
+
+
+def _refuse_unfinished(request: GroupRequest, seg: str, choices: Choices) -> None:
+    """Refuse a run of the participant level that was interrupted: the rest might differ."""
+    pending = []
+    for root in request.roots:
+        for row in read_status(root):
+            name = name_of(row)
+            asked = request.wants(name.subject, name.session)
+            listed = choices.reason_to_leave_out(name, None) is not None
+            same = (name.seg, name.region) == (seg, request.region)
+            if row.get("reason") == NOT_FINISHED and same and asked and not listed:
+                pending.append(name.stem)
+    if pending:
+        shown = ", ".join(pending[:SHOWN]) + (" ..." if len(pending) > SHOWN else "")
+        raise InputError(
+            f"{request.roots[0]}: the participant level has not finished {len(pending)} hemispheres"
+            f" ({shown}); complete it by the same command, or list them in --exclude",
+            reason=NOT_FINISHED,
+        )
+
+
+def _one_settings(kept: Sequence[SheetRecord]) -> str:
+    counts = Counter(record.settings_hash for record in kept)
+    if len(counts) > 1:
+        examples = {record.settings_hash: record.place for record in reversed(kept)}
+        parts = [
+            f"{n} with {digest[:8]} (as {examples[digest].name.stem} in {examples[digest].root})"
+            for digest, n in counts.most_common()
+        ]
+        raise InputError(
+            f"hemispheres were measured with different settings: {'; '.join(parts)}; measure all"
+            " with the same"
+        )
+    return next(iter(counts))
+
+
+def grid_of(root: Path) -> SheetSettings:
+    """Read the grid of the sheets of an output dataset."""
+    path = root / DATASET_FILES["settings"]
+    settings = files.read_json(path).get("settings")
+    grid = settings.get("sheet") if isinstance(settings, Mapping) else None
+    if isinstance(grid, Mapping):  # other versions may have had more settings
+        grid = {name: grid[name] for name in SheetSettings.model_fields if name in grid}
+    try:
+        return checked_foreign(grid, SheetSettings)
+    except ValueError as error:
+        raise InputError(
+            f"{path}: no settings of a sheet: {error}; run the participant level again",
+            reason="bad-json",
+        ) from error

@@ -1,0 +1,181 @@
+"""Values passed between reading, analyzing and writing at the group level."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from hipsta_bids.errors import ModelError
+from hipsta_bids.group.design.formula import listed
+from hipsta_bids.group.design.model import BOTH, Comparison, asymmetry, asymmetry_name
+from hipsta_bids.group.stats.arrays import Bool, Float, Int, SideMaps
+from hipsta_bids.types import PARTICIPANT, SESSION
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measures:
+    """What the model is fitted to."""
+
+    maps: tuple[str, ...]
+    """Maps of the sheet, by the names of their columns or by those that a user gave."""
+    summaries: tuple[str, ...] | None = None
+    """Summary measures; ``None`` for all."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Cohort:
+    """All that the models are fitted to."""
+
+    table: pd.DataFrame
+    """One row per visit: participant, session and covariates; the index names the visits."""
+    sides: Mapping[str, SideMaps]
+    """By hemisphere, ``L`` and ``R``; only those that occur."""
+    x: Float
+    """(x,) sheet coordinates of the nodes, medial to lateral, -1..1."""
+    y: Float
+    """(y,) sheet coordinates of the nodes, posterior to anterior, -1..1."""
+    units: Mapping[str, str]
+    """Units of maps and summary columns."""
+
+    def take(self, keep: NDArray[np.bool_]) -> "Cohort":
+        """Keep some visits; ``keep`` has one value per visit."""
+        return replace(
+            self,
+            table=self.table[keep],
+            sides={hemi: side.take(keep) for hemi, side in self.sides.items()},
+        )
+
+
+def summary_values(cohort: Cohort, hemi: str, only: Sequence[str] | None = None) -> pd.DataFrame:
+    """Summary measures by visit.
+
+    One row per visit of the cohort's table, NaN where missing.
+    """
+    if hemi == BOTH:
+        left, right = (summary_values(cohort, side, only) for side in BOTH)
+        return (left + right) / 2
+    side = cohort.sides[hemi]
+    table = side.summary.set_axis(cohort.table.index[side.rows])
+    chosen = table if only is None else table[[name for name in only if name in table.columns]]
+    return chosen.reindex(cohort.table.index)
+
+
+def hemispheres(cohort: Cohort) -> list[str]:
+    """Hemispheres that are there, and both together if both are."""
+    own = list(cohort.sides)
+    return [*own, BOTH] if len(own) == len(BOTH) else own
+
+
+def participants_with(known: Bool, who: NDArray[np.object_]) -> Int:
+    """Count those (columns,) of whom any row (rows, columns) is known."""
+    names, numbers = np.unique(who.astype(str), return_inverse=True)
+    if len(names) == len(who):
+        return np.asarray(known.sum(axis=0), dtype=np.int64)
+    order = np.argsort(numbers, kind="stable")
+    starts = np.searchsorted(numbers[order], np.arange(len(names)))
+    return np.asarray(
+        np.logical_or.reduceat(known[order], starts, axis=0).sum(axis=0), dtype=np.int64
+    )
+
+
+def choose_visits(cohort: Cohort, comparison: Comparison) -> tuple[Cohort, Mapping[str, str]]:
+    """Keep the visits that are compared."""
+    table = cohort.table
+    if comparison.longitudinal:
+        return cohort, {}
+    if comparison.pair is None:
+        keep = ~table[PARTICIPANT].duplicated().to_numpy()
+        why = pd.Series("the first session of each participant is analyzed", index=table.index)
+    else:
+        known = sorted(table[SESSION].dropna().unique())
+        if unknown := sorted(set(comparison.pair) - set(known)):
+            raise ModelError(
+                f"there is no session {listed(unknown)}, only {listed(known) or 'none'}"
+            )
+        asked = table[SESSION].isin(comparison.pair)
+        both = asked.groupby(table[PARTICIPANT]).transform("sum") == len(comparison.pair)
+        keep = (asked & both).to_numpy()
+        why = pd.Series("the other session of the pair is missing", index=table.index)
+        why[~asked] = f"sessions {' and '.join(comparison.pair)} are compared"
+        if not keep.any():
+            raise ModelError(
+                f"no participant has both sessions {' and '.join(comparison.pair)}; choose two"
+                " others"
+            )
+    return cohort.take(keep), dict(why[~keep])
+
+
+def modeled_table(table: pd.DataFrame, comparison: Comparison) -> pd.DataFrame:
+    """Rows of the model: visits, or participants with the covariates of their first session."""
+    if comparison.pair is None:
+        return table
+    first = table[table[SESSION] == comparison.pair[0]]
+    return first.set_axis(first[PARTICIPANT])
+
+
+def compare_sessions(cohort: Cohort, comparison: Comparison) -> Cohort:
+    """Take differences of two sessions, if that is what is compared."""
+    if comparison.pair is None:
+        return cohort
+    table = modeled_table(cohort.table, comparison)
+    if not cohort.sides:
+        return replace(cohort, table=table)
+    row_of = {participant: row for row, participant in enumerate(table.index)}
+    sides = {}
+    for hemi, side in cohort.sides.items():
+        visits = cohort.table.iloc[side.rows]
+        rows = np.array([row_of[participant] for participant in visits[PARTICIPANT]])
+        first, second = (
+            np.flatnonzero((visits[SESSION] == session).to_numpy()) for session in comparison.pair
+        )
+        common, a, b = np.intersect1d(rows[first], rows[second], return_indices=True)
+        if len(common):
+            sides[hemi] = _change(side, common, first[a], second[b])
+    if not sides:
+        raise ModelError(
+            f"no hemisphere was measured in both sessions {' and '.join(comparison.pair)}"
+        )
+    return replace(cohort, table=table, sides=sides)
+
+
+def _change(side: SideMaps, rows: Int, first: Int, second: Int) -> SideMaps:
+    summary = side.summary.iloc[second].to_numpy() - side.summary.iloc[first].to_numpy()
+    return replace(
+        side,
+        rows=rows,
+        maps={name: m[second] - m[first] for name, m in side.maps.items()},
+        subfield=side.subfield[first],
+        summary=pd.DataFrame(summary, columns=side.summary.columns),
+    )
+
+
+def asymmetry_maps(cohort: Cohort, measures: Sequence[str], relative: Sequence[str]) -> SideMaps:
+    """Left minus right at each point, of those who have both."""
+    if set(cohort.sides) != set(BOTH):
+        raise ModelError(f"asymmetry: hemisphere {', '.join(cohort.sides)} only; both are needed")
+    left, right = (cohort.sides[hemi] for hemi in BOTH)
+    if left.shape != right.shape:
+        raise ModelError(
+            f"asymmetry: maps of {', '.join(measures)} have different numbers of points left and"
+            " right"
+        )
+    rows, a, b = np.intersect1d(left.rows, right.rows, return_indices=True)
+    if not len(rows):
+        raise ModelError("asymmetry: no participant has both hemispheres")
+    names = tuple(dict.fromkeys((*left.names, *right.names)))
+    codes = np.array([*(names.index(name) for name in left.names), -1], dtype=np.int8)
+    return SideMaps(
+        rows=rows,
+        maps={
+            asymmetry_name(name): asymmetry(
+                left.maps[name][a], right.maps[name][b], relative=name in relative
+            )
+            for name in measures
+        },
+        subfield=codes[left.subfield[a]],
+        names=names,
+        summary=pd.DataFrame(index=range(len(rows))),
+        mesh=left.mesh,
+    )

@@ -1,0 +1,250 @@
+"""Which hemispheres a person leaves out: tables, ratings, and conditions on quality metrics."""
+
+import ast
+import difflib
+import operator
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from hipsta_bids.derivatives.names import HemisphereName
+from hipsta_bids.errors import InputError, UsageError
+from hipsta_bids.io import files
+from hipsta_bids.reports.verdict import RATINGS
+
+#: Number of names that a note lists.
+SHOWN = 4
+_RATING, _HASH = "rating", "input_hash"
+_NO_RATING = "unrated"
+_ALLOWED = "may hold comparisons, and, or, not, + - * / only"
+_LONGEST = 500  # characters of a condition
+_OPERATORS: Mapping[type[ast.AST], Callable[[Any, Any], Any]] = {
+    ast.Lt: operator.lt,
+    ast.LtE: operator.le,
+    ast.Gt: operator.gt,
+    ast.GtE: operator.ge,
+    ast.Eq: operator.eq,
+    ast.NotEq: operator.ne,
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class UserTable:
+    """Rows about participants, or single sessions and hemispheres."""
+
+    path: Path | None = None
+    """``None`` if there is no table."""
+    rows: tuple[Mapping[str, str], ...] = ()
+
+    @cached_property
+    def _by_subject(self) -> Mapping[str, list[Mapping[str, str]]]:
+        found: dict[str, list[Mapping[str, str]]] = {}
+        for row in self.rows:
+            cell = row.get("participant_id", files.MISSING).removeprefix("sub-")
+            found.setdefault("" if cell == files.MISSING else cell, []).append(row)
+        return found
+
+    def about(self, name: HemisphereName) -> list[Mapping[str, str]]:
+        """List rows that mean a hemisphere; those without a participant mean all."""
+        rows = [*self._by_subject.get(name.subject, ()), *self._by_subject.get("", ())]
+        return [row for row in rows if is_listed(name, row)]
+
+    def applying(self, name: HemisphereName, digest: str | None) -> list[Mapping[str, str]]:
+        """List rows that mean a hemisphere with this hash of its input, if both are known."""
+        return [row for row in self.about(name) if _is_current(row, digest)]
+
+    def notes(self, found: Iterable[tuple[HemisphereName, str | None]]) -> list[str]:
+        """Note rows that match no hemisphere, as by a misspelled label, or earlier labels.
+
+        Those ``found`` are of all protocols and regions, as rows of a saved table may be.
+        """
+        if self.path is None:
+            return []
+        if not self.rows:
+            return [f"{self.path}: has no rows that count; it changes nothing"]
+        meant, old = set(), []
+        for name, digest in found:
+            rows = self.about(name)
+            meant |= {id(row) for row in rows}
+            if any(not _is_current(row, digest) for row in rows):
+                old.append(name.stem)
+        lost = [row["participant_id"] for row in self.rows if id(row) not in meant]
+        notes = [f"{self.path}: matches no hemisphere here: {_some(lost)}"] if lost else []
+        if old:
+            notes.append(
+                f"{self.path}: not applied to hemispheres whose labels have changed since they were"
+                f" rated: {_some(old)}; rate them again"
+            )
+        return notes
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Choices:
+    """What a person says about hemispheres."""
+
+    excluded: UserTable
+    """To leave out."""
+    rated: UserTable
+    """To use or to leave out."""
+
+    def reason_to_leave_out(
+        self, name: HemisphereName, digest: str | None
+    ) -> tuple[str, str] | None:
+        """Return reason and message if a hemisphere is left out, given the hash of its input."""
+        for row in self.excluded.applying(name, digest):
+            return "listed", row.get("reason") or _note(row, "in the table of --exclude")
+        for row in self.rated.applying(name, digest):
+            if row[_RATING] == RATINGS[-1]:
+                return "rated", _note(row, f"rated {RATINGS[-1]}")
+        return None
+
+    def counts(self, found: Iterable[tuple[HemisphereName, str | None]]) -> dict[str, int] | None:
+        """Count hemispheres by rating, the strictest of several; ``None`` without a table."""
+        if self.rated.path is None:
+            return None
+        counts = dict.fromkeys((*RATINGS, _NO_RATING), 0)
+        for name, digest in found:
+            given = {row[_RATING] for row in self.rated.applying(name, digest)}
+            counts[next((word for word in reversed(RATINGS) if word in given), _NO_RATING)] += 1
+        return counts
+
+
+def read_choices(exclusions: Path | None, ratings: Path | None) -> Choices:
+    """Read the user's tables; one of ratings may stand for one of exclusions.
+
+    InputError if a table lacks a column, or has another rating than `RATINGS`.
+    """
+    excluded = [] if exclusions is None else _read(exclusions, ())
+    rated = [] if ratings is None else _read(ratings, (_RATING,))
+    return Choices(
+        excluded=UserTable(
+            exclusions,
+            tuple(row for row in excluded if row.get(_RATING, RATINGS[-1]) == RATINGS[-1]),
+        ),
+        rated=UserTable(ratings, tuple(rated)),
+    )
+
+
+def _read(path: Path, needed: Sequence[str]) -> list[dict[str, str]]:
+    rows = files.read_tsv(path)
+    lacking = [name for name in ("participant_id", *needed) if rows and name not in rows[0]]
+    if lacking:
+        raise InputError(
+            f"{path}: no column {lacking[0]}; it may have session_id, hemi, protocol, region,"
+            f" {_HASH}, {'note' if needed else 'reason'} besides",
+            reason="bad-table",
+        )
+    for line, row in enumerate(rows, start=2):
+        word = row.get(_RATING, files.MISSING)
+        if word not in {*RATINGS, files.MISSING, ""}:
+            raise InputError(
+                f"{path}: line {line}: {word!r} is no rating; {', '.join(RATINGS)} are",
+                reason="bad-table",
+            )
+    return rows
+
+
+def _some(names: Sequence[str]) -> str:
+    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    return f"{', '.join(names[:SHOWN])}{more}"
+
+
+def _note(row: Mapping[str, str], default: str) -> str:
+    note = row.get("note", files.MISSING)
+    return default if note in {files.MISSING, ""} else note
+
+
+def _is_current(row: Mapping[str, str], digest: str | None) -> bool:
+    return digest is None or row.get(_HASH, files.MISSING) in {files.MISSING, "", digest}
+
+
+def is_listed(name: HemisphereName, row: Mapping[str, str]) -> bool:
+    """Whether a row of the user's table means this hemisphere; empty cells mean any.
+
+    One without a protocol, of other programs' maps, is meant by rows of any protocol and region.
+    """
+    own = {"participant_id": name.subject, "session_id": name.session or "", "hemi": name.hemi}
+    own |= {"protocol": name.seg, "region": name.region} if name.seg else {}
+    for key, value in own.items():
+        cell = row.get(key, files.MISSING).removeprefix("sub-").removeprefix("ses-")
+        if cell not in {files.MISSING, "", value}:
+            return False
+    return True
+
+
+class QualityCondition:
+    """A condition on quality metrics, such as ``filled_fraction > 0.01 or voxels_across < 3``."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text[:_LONGEST]
+        if len(text) > _LONGEST:
+            raise self._refusal(f"... is too long; {_LONGEST} characters are the limit")
+        try:
+            self._tree = ast.parse(text.strip(), mode="eval").body
+        except (SyntaxError, ValueError) as error:  # ValueError: a null byte
+            raise self._refusal("cannot be read; write it as filled_fraction > 0.01") from error
+
+    def holds(self, metrics: Mapping[str, Any]) -> bool:
+        """Evaluate the condition; comparisons with missing metrics do not hold."""
+        return self._true(self._tree, metrics)
+
+    def _true(self, node: ast.expr, metrics: Mapping[str, Any]) -> bool:
+        value = self._value(node, metrics)
+        if not isinstance(value, (bool, type(None))):
+            raise self._refusal("has a part that compares nothing; write filled_fraction > 0.01")
+        return bool(value)
+
+    def _value(self, node: ast.expr, metrics: Mapping[str, Any]) -> Any:  # noqa: ANN401 -- of the metric
+        value: Any = None
+        match node:
+            case ast.Constant():
+                value = node.value
+            case ast.Name(id=name):
+                value = self._metric(name, metrics)
+            case ast.Compare():
+                values = [self._value(part, metrics) for part in (node.left, *node.comparators)]
+                pairs = zip(node.ops, pairwise(values), strict=True)
+                value = all(self._act(sign, a, b) for sign, (a, b) in pairs)
+            case ast.BoolOp(op=ast.And()):
+                value = all(self._true(part, metrics) for part in node.values)
+            case ast.BoolOp():
+                value = any(self._true(part, metrics) for part in node.values)
+            case ast.UnaryOp(op=ast.Not()):
+                value = not self._true(node.operand, metrics)
+            case ast.UnaryOp(op=ast.USub()):
+                value = self._act(ast.Sub(), 0, self._value(node.operand, metrics))
+            case ast.BinOp():
+                a, b = self._value(node.left, metrics), self._value(node.right, metrics)
+                value = self._act(node.op, a, b)
+            case _:
+                raise self._refusal(_ALLOWED)
+        return value
+
+    def _act(self, sign: ast.AST, a: Any, b: Any) -> Any:  # noqa: ANN401 -- as above
+        if type(sign) not in _OPERATORS:
+            raise self._refusal(_ALLOWED)
+        if a is None or b is None:
+            return None
+        if isinstance(sign, ast.operator) and (isinstance(a, str) or isinstance(b, str)):
+            raise self._refusal(f"cannot combine {a!r} and {b!r}")
+        try:
+            return _OPERATORS[type(sign)](a, b)
+        except (TypeError, ZeroDivisionError) as error:
+            raise self._refusal(f"cannot combine {a!r} and {b!r}") from error
+
+    def _metric(self, name: str, metrics: Mapping[str, Any]) -> Any:  # noqa: ANN401 -- as above
+        if name not in metrics:
+            near = difflib.get_close_matches(name, metrics, n=1)
+            hint = f"did you mean {near[0]}?" if near else "see the desc-qc_metrics.json files"
+            raise self._refusal(f"has {name!r}, which is no quality metric; {hint}")
+        return metrics[name]
+
+    def _refusal(self, what: str) -> UsageError:
+        return UsageError(f"--exclude-qc {self.text!r} {what}")

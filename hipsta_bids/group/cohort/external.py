@@ -1,0 +1,514 @@
+"""Other programs' maps with corresponding points (``--maps``): their files, visits and surfaces."""
+
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from hipsta_bids.errors import InputError, NothingToDoError, UsageError
+from hipsta_bids.geometry.catalog import MAPS, why_impossible
+from hipsta_bids.group.cohort.collect import SheetRecord
+from hipsta_bids.group.cohort.covariates import locate_sources
+from hipsta_bids.group.cohort.data import Cohort
+from hipsta_bids.group.cohort.read import CURVATURE, THICKNESS, VOLUME, Measured, visit_name
+from hipsta_bids.group.stats.arrays import SideMaps
+from hipsta_bids.inputs import ashs, freesurfer
+from hipsta_bids.inputs.maps import Found, check_pattern, fields_of, fill, find, scan
+from hipsta_bids.io import files
+from hipsta_bids.io.files import entities
+from hipsta_bids.io.gifti import DENSE_SCALARS, PointMap, cifti_sides, read_map, read_mesh
+from hipsta_bids.types import Mesh, VisitKey
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapPattern:
+    """A map that every hemisphere may have."""
+
+    name: str
+    pattern: str
+    """Path with placeholders, absolute or relative to the BIDS dataset; may have wildcards."""
+    surface: str | None = None
+    """The same for the surface to draw it on."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExternalFiles:
+    """The files of one map."""
+
+    request: MapPattern
+    root: Path
+    """Folder that patterns are relative to."""
+    files: Mapping[str, Mapping[VisitKey, Path]]
+    """By hemisphere and visit."""
+
+    @property
+    def visits(self) -> set[VisitKey]:
+        """Visits with a map of either hemisphere."""
+        return {visit for side in self.files.values() for visit in side}
+
+
+def map_patterns(
+    patterns: Sequence[tuple[str, str]],
+    surfaces: Sequence[tuple[str | None, str]],
+    taken: Sequence[str],
+) -> tuple[MapPattern, ...]:
+    """Combine and check the options about maps; a surface without a name is for all others."""
+    names = [name for name, _ in patterns]
+    for name, pattern in patterns:
+        if not (name.isalnum() and name.isascii() and name[0].isalpha()):
+            raise UsageError(f"--maps: {name!r} is not a name of letters and digits")
+        if name in taken or names.count(name) > 1:
+            why = "belongs to the sheets" if name in taken else "occurs twice"
+            raise UsageError(
+                f"--maps: the name {name} {why}; choose another one, such as other{name}"
+            )
+        check_pattern("--maps", name, pattern)
+        fields = fields_of(pattern)
+        one_side = fields & {"hemi", "side"} or pattern.endswith(DENSE_SCALARS)
+        if "subject" not in fields or not one_side:
+            raise UsageError(
+                f"--maps {name}: the pattern needs {{subject}}, and {{hemi}} or {{side}} unless it"
+                f" ends with {DENSE_SCALARS}"
+            )
+    if lost := [name for name, _ in surfaces if name is not None and name not in names]:
+        raise UsageError(f"--maps-surface: there is no --maps {lost[0]}=...")
+    for whose, pattern in surfaces:
+        check_pattern("--maps-surface", whose or "", pattern)
+    chosen = dict(surfaces)
+    return tuple(
+        MapPattern(name=name, pattern=pattern, surface=chosen.get(name, chosen.get(None)))
+        for name, pattern in patterns
+    )
+
+
+def taken_names(*, with_sheets: bool) -> tuple[str, ...]:
+    """Names that are taken by the maps of the sheets."""
+    return tuple(row.name for row in MAPS) if with_sheets else ()
+
+
+def find_maps(
+    request: MapPattern,
+    root: Path,
+    known: Iterable[VisitKey],
+    is_wanted: Callable[[str, str | None, str], bool],
+) -> ExternalFiles:
+    """Find the files of one map."""
+    sessions: dict[str, list[str | None]] = {}
+    for subject, session in known:
+        sessions.setdefault(subject, []).append(session)
+    found: dict[str, dict[VisitKey, Path]] = {}
+    for one in scan(request.pattern, root):
+        hemis = [one.hemi] if one.hemi else cifti_sides(one.path)
+        for hemi, session in product(hemis, _sessions(one, sessions)):
+            if not is_wanted(one.subject, session, hemi):
+                continue
+            first = found.setdefault(hemi, {}).setdefault((one.subject, session), one.path)
+            if first != one.path:
+                raise InputError(
+                    f"--maps {request.name}: {first} and {one.path} are both for sub-{one.subject}"
+                    f" hemi-{hemi}; make the pattern match one of them",
+                    reason="several-files",
+                )
+    if not found:
+        raise NothingToDoError(
+            f"--maps {request.name}: no file matches {request.pattern} (in {root})"
+        )
+    return ExternalFiles(
+        request=request, root=root, files={hemi: found[hemi] for hemi in "LR" if hemi in found}
+    )
+
+
+def _sessions(one: Found, known: Mapping[str, Sequence[str | None]]) -> Sequence[str | None]:
+    """Sessions that a file is for."""
+    own = known.get(one.subject)
+    if own is None:
+        return [one.session]
+    if one.session is None:
+        return own
+    return [one.session] if one.session in own else []
+
+
+def read_maps(
+    found: ExternalFiles, visits: Sequence[VisitKey], grid: tuple[int, int], *, with_sheets: bool
+) -> tuple[dict[str, SideMaps], str, list[str]]:
+    """Read one map of all hemispheres, by rows of visits, its unit, and notes of impossible ones.
+
+    On the regular grid of sheets there is no mesh; without sheets, files may have their own grid.
+    """
+    row_of = {visit: row for row, visit in enumerate(visits)}
+    name, sides, units, notes = found.request.name, {}, [], list[str]()
+    for hemi, path_of in found.files.items():
+        own = sorted(path_of, key=row_of.__getitem__)
+        paths = [path_of[visit] for visit in own]
+        maps = [read_map(path, name, hemi) for path in paths]
+        _refuse_mixed(name, hemi, paths, maps)
+        # The curvature of other programs may be huge at single vertices of good maps.
+        why = [why_impossible(name, m.values) if name == THICKNESS else None for m in maps]
+        lost = [(path, text) for path, text in zip(paths, why, strict=True) if text]
+        notes += [f"{path}: {text}; left out" for path, text in lost]
+        if len(lost) == len(maps):
+            raise InputError(f"--maps {name}: {notes[-1]}, as are all")
+        own = [visit for visit, text in zip(own, why, strict=True) if not text]
+        maps = [one for one, text in zip(maps, why, strict=True) if not text]
+        first, points = maps[0], len(maps[0].values)
+        nodes = first.nodes if first.nodes is not None and not with_sheets else grid
+        mesh = None if first.nodes == nodes else _mesh(found, hemi, points)
+        if mesh is None and points != nodes[0] * nodes[1]:
+            raise InputError(
+                f"--maps {name}, hemisphere {hemi}: no surface of {points} vertices lies beside"
+                f" {paths[0]}, and sheets have {nodes[0]} x {nodes[1]} points; name one by"
+                " --maps-surface"
+            )
+        shape = nodes if mesh is None else (points, 1)
+        values = np.stack([one.values.reshape(shape) for one in maps])  # noqa: PD011  (no table)
+        sides[hemi] = SideMaps(
+            rows=np.array([row_of[visit] for visit in own], dtype=np.int64),
+            maps={name: values},
+            subfield=np.full(values.shape, -1, dtype=np.int8),
+            names=(),
+            summary=pd.DataFrame(index=range(len(own))),
+            mesh=mesh,
+        )
+        units.append(first.unit)
+    return sides, units[0], notes
+
+
+def _refuse_mixed(name: str, hemi: str, paths: Sequence[Path], maps: Sequence[PointMap]) -> None:
+    counts = Counter(len(one.values) for one in maps)
+    if len(counts) > 1:
+        examples = {len(one.values): path for path, one in zip(paths, maps, strict=True)}
+        parts = [f"{n} with {points} ({examples[points]})" for points, n in counts.most_common()]
+        raise InputError(
+            f"--maps {name}, hemisphere {hemi}: maps have different numbers of points:"
+            f" {'; '.join(parts)}; use one density"
+        )
+
+
+def _mesh(found: ExternalFiles, hemi: str, points: int) -> Mesh | None:
+    """Read the surface that the user named, or else that beside the first map that has one."""
+    if found.request.surface is not None:
+        return _named_surface(found, hemi, points)
+    paths = found.files[hemi].values()
+    meshes = (read_mesh(one) for path in paths for one in _surfaces_beside(path, hemi))
+    return next((mesh for mesh in meshes if len(mesh.points) == points), None)
+
+
+def _named_surface(found: ExternalFiles, hemi: str, points: int) -> Mesh:
+    request = found.request
+    pattern = request.surface or ""
+    names = dict.fromkeys(
+        fill(pattern, subject, session, hemi) for subject, session in found.files[hemi]
+    )
+    for name in names:
+        for path in find(name, found.root) or find(name, Path()):
+            mesh = read_mesh(path)
+            if len(mesh.points) != points:
+                raise InputError(
+                    f"--maps-surface {path}: has {len(mesh.points)} vertices, the maps"
+                    f" {request.name} of hemisphere {hemi} have {points} points"
+                )
+            return mesh
+    raise InputError(
+        f"--maps-surface: no file {next(iter(names))}; it serves to draw {request.name}"
+    )
+
+
+def _surfaces_beside(path: Path, hemi: str) -> list[Path]:
+    """HippUnfold's unfolded surface: beside the map, or in version 2 in ``surf/``."""
+    own = {**entities(path.name), "hemi": hemi}
+    keys = ("sub", "ses", "hemi", "den", "label")
+    folders = path.parent, path.parent.parent / "surf"
+    pattern = "*space-unfold*_midthickness.surf.gii"
+    found = {one: entities(one.name) for folder in folders for one in sorted(folder.glob(pattern))}
+    # Sheets of this program have an unfolded surface too, but their maps have their grid.
+    return [
+        one
+        for one, other in found.items()
+        if "seg" not in other and all(own.get(key) == other.get(key) for key in keys)
+    ]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ExternalCohorts:
+    """Maps of other programs."""
+
+    measured: Measured
+    """Sheets, with the maps that lie on their grid."""
+    others: Mapping[str, Cohort]
+    """Maps with points of their own, by name; the covariates are the visits only."""
+    notes: tuple[str, ...]
+
+
+def find_all(
+    requests: Sequence[MapPattern],
+    root: Path,
+    known: Sequence[VisitKey],
+    is_wanted: Callable[[str, str | None, str], bool],
+) -> tuple[list[ExternalFiles], list[VisitKey]]:
+    """Find the files of all maps, and who has them or a sheet."""
+    found = [find_maps(request, root, known, is_wanted) for request in requests]
+    visits: set[VisitKey] = set(known).union(*(one.visits for one in found))
+    return found, sorted(visits, key=lambda visit: (visit[0], visit[1] or ""))
+
+
+def add_external(
+    measured: Measured, found: Iterable[ExternalFiles], visits: Sequence[VisitKey]
+) -> ExternalCohorts:
+    """Read other programs' maps, and add those on the grid of the sheets to the sheets.
+
+    Without sheets, maps on a grid replace them if there is a curvature to register them by.
+    """
+    grid, with_sheets = (len(measured.x), len(measured.y)), bool(measured.sides)
+    maps, units, notes = {}, dict(measured.units), []
+    for one in found:
+        name = one.request.name
+        maps[name], units[name], left_out = read_maps(one, visits, grid, with_sheets=with_sheets)
+        notes += left_out
+        counts = ", ".join(f"{len(side.rows)} {hemi}" for hemi, side in maps[name].items())
+        points = ", ".join(str(np.prod(side.shape)) for side in maps[name].values())
+        notes.append(f"maps {name}: {counts} of {len(visits)} visits, {points} points")
+    measured = replace(measured, units=units)
+    flat = {
+        name: sides
+        for name, sides in maps.items()
+        if all(side.mesh is None for side in sides.values())
+    }
+    if not with_sheets:
+        curvature = flat.get(CURVATURE, {})
+        nodes = _nodes(curvature) if curvature else None
+        flat = {name: sides for name, sides in flat.items() if _nodes(sides) == nodes}
+        sheets = {hemi: replace(side, maps={}) for hemi, side in curvature.items()}
+        measured = replace(_on_grid(measured, nodes) if nodes else measured, sides=sheets)
+    sides = {hemi: _with_maps(side, hemi, flat) for hemi, side in measured.sides.items()}
+    others = {}
+    for name, own in maps.items():
+        if name not in flat:
+            on_mesh = any(side.mesh is not None for side in own.values())
+            axes = measured if on_mesh else _on_grid(measured, _nodes(own))
+            table = measured.visits
+            others[name] = Cohort(table=table, sides=own, x=axes.x, y=axes.y, units=units)
+    if others:
+        notes.append(f"maps {', '.join(others)}: not registered, their points are to correspond")
+    return ExternalCohorts(
+        measured=replace(measured, sides=sides), others=others, notes=tuple(notes)
+    )
+
+
+def _nodes(sides: Mapping[str, SideMaps]) -> tuple[int, int]:
+    return next(iter(sides.values())).shape
+
+
+def _on_grid(measured: Measured, nodes: tuple[int, int]) -> Measured:
+    """Coordinates of another number of nodes between the same ends."""
+    x, y = (
+        np.linspace(axis[0], axis[-1], count)
+        for axis, count in zip((measured.x, measured.y), nodes, strict=True)
+    )
+    return replace(measured, x=x, y=y)
+
+
+def _with_maps(side: SideMaps, hemi: str, maps: Mapping[str, Mapping[str, SideMaps]]) -> SideMaps:
+    """Add maps of the same grid to those of the sheets; they are registered with them."""
+    added = {}
+    for name, sides in maps.items():
+        added[name] = np.full((len(side.rows), *side.shape), np.nan)
+        if hemi in sides:
+            _, own, other = np.intersect1d(side.rows, sides[hemi].rows, return_indices=True)
+            added[name][own] = sides[hemi].maps[name][other]
+    return replace(side, maps={**side.maps, **added})
+
+
+#: Volume that no structure reaches, mm^3: 10 liters.
+_MOST = 1e7
+#: Unit of all of them.
+UNIT = "mm^3"
+Volumes = Mapping[str, Mapping[str, float]]
+"""In mm^3 by hemisphere (L, R) and structure."""
+_SIDES = {"left": "L", "right": "R", "lh": "L", "rh": "R", "L": "L", "R": "R"}
+_FREESURFER = re.compile(r"(?P<side>[lr]h)\.hippoSfVolumes.*\.txt")
+
+
+@dataclass(frozen=True, kw_only=True)
+class VolumeTable:
+    """A table of one visit."""
+
+    name: str
+    """Name in those of its measures: the program, or the user's word."""
+    visit: str
+    """Row of the covariates."""
+    path: Path
+    hemi: str | None = None
+    """The only hemisphere to take; ``None`` for all that are there."""
+
+
+def table_beside(segmentation: Path) -> tuple[str, Path] | None:
+    """Find the table that belongs to a segmentation."""
+    for name, beside in _BESIDE.items():
+        path = beside(segmentation)
+        if path is not None and path.is_file():
+            return name, path
+    return None
+
+
+def _hippunfold(segmentation: Path) -> Path | None:
+    """Find the table of the same space and atlas."""
+    own = entities(segmentation.name)
+    if own.get("desc") != "subfields":
+        return None
+    keys = ("sub", "ses", "space", "atlas")
+    found = [
+        path
+        for path in sorted(segmentation.parent.glob("sub-*_volumes.tsv"))
+        if all(entities(path.name).get(key) == own.get(key) for key in keys)
+    ]
+    return found[0] if found else None
+
+
+_BESIDE: Mapping[str, Callable[[Path], Path | None]] = {
+    "freesurfer": freesurfer.volume_table,
+    "ashs": ashs.volume_table,
+    "hippunfold": _hippunfold,
+}
+
+
+def read_volumes(path: Path) -> Volumes:
+    """Read one table of any program."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+        found: dict[str, dict[str, float]] = {}
+        for hemi, structure, volume in _entries(path, text):
+            found.setdefault(hemi, {})[re.sub(r"\W+", "_", structure)] = volume
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(
+            f"{path}: not readable as a table of volumes ({error}); FreeSurfer's hippoSfVolumes,"
+            " ASHS's and HippUnfold's _volumes are known"
+        ) from error
+    return found
+
+
+def _entries(path: Path, text: str) -> Iterator[tuple[str, str, float]]:
+    lines = [line.split() for line in text.splitlines() if line.strip()]
+    if not lines:
+        raise ValueError("it is empty")
+    if match := _FREESURFER.fullmatch(path.name):
+        for name, volume in lines:
+            yield _SIDES[match["side"]], name, _volume(volume)
+    elif path.suffix == ".tsv":
+        header, *rows = [line.split("\t") for line in text.splitlines() if line.strip()]
+        for row in rows:
+            cells = dict(zip(header, row, strict=True))
+            hemi = _SIDES[cells.pop("hemi")]
+            cells.pop("subject", None)
+            for name, volume in cells.items():
+                yield hemi, name, _volume(volume)
+    else:
+        for _, side, name, _, volume in lines:
+            yield _SIDES[side], name, _volume(volume)
+
+
+def _volume(text: str) -> float:
+    if text in {files.MISSING, "nan", "NaN"}:
+        return float("nan")
+    value = float(text)
+    if not 0 <= value < _MOST:
+        raise ValueError(f"{text} is no volume")
+    return value
+
+
+def join_volumes(
+    tables: Iterable[VolumeTable], visits: pd.Index, *, strict: Sequence[str] = ()
+) -> tuple[dict[str, pd.DataFrame], list[str]]:
+    """Read tables into one measure per structure, by hemisphere; NaN where missing."""
+    cells: dict[str, dict[str, dict[str, float]]] = {}
+    origin: dict[tuple[str, str, str], Path] = {}
+    notes = []
+    for table in tables:
+        try:
+            volumes = read_volumes(table.path)
+        except InputError as error:
+            if table.name in strict:
+                raise
+            notes.append(f"volumes of {table.visit} are left out: {error}")
+            continue
+        for hemi, structures in volumes.items():
+            if table.hemi not in {None, hemi}:
+                continue
+            for structure, volume in structures.items():
+                column = f"{VOLUME}{table.name}_{structure}"
+                first = origin.setdefault((hemi, column, table.visit), table.path)
+                if first != table.path:
+                    raise InputError(
+                        f"volumes {table.name}: both {first} and {table.path} have {structure} of"
+                        f" {table.visit}; make the pattern match one of them",
+                        reason="several-files",
+                    )
+                cells.setdefault(hemi, {}).setdefault(column, {})[table.visit] = volume
+    frames = {
+        hemi: pd.DataFrame(cells[hemi], index=visits, dtype=np.float64) for hemi in sorted(cells)
+    }
+    return frames, notes
+
+
+def check_volumes(patterns: Sequence[tuple[str, str]]) -> None:
+    """Refuse wrong names and patterns of volume tables."""
+    names = [name for name, _ in patterns]
+    for name, pattern in patterns:
+        if not (name.isalnum() and name.isascii()) or names.count(name) > 1:
+            why = "occurs twice" if names.count(name) > 1 else "has more than letters and digits"
+            raise UsageError(f"--volumes: the name {name!r} {why}")
+        check_pattern("--volumes", name, pattern)
+        if "subject" not in fields_of(pattern):
+            raise UsageError(f"--volumes {name}: the pattern needs {{subject}}")
+
+
+def add_volumes(
+    measured: Measured,
+    records: Sequence[SheetRecord],
+    patterns: Sequence[tuple[str, str]],
+    root: Path,
+) -> tuple[Measured, list[str]]:
+    """Add volumes found beside the segmentations, and from the user's patterns, as summaries."""
+    named = [name for name, _ in patterns]
+    tables = [table for table in _beside(records) if table.name not in named]
+    for name, pattern in patterns:
+        tables += _matching(name, pattern, root, measured)
+    frames, notes = join_volumes(tables, measured.visits.index, strict=named)
+    sides = {
+        hemi: side.with_summary(frames[hemi].iloc[side.rows]) if hemi in frames else side
+        for hemi, side in measured.sides.items()
+    }
+    units = {str(column): UNIT for frame in frames.values() for column in frame.columns}
+    for name in dict.fromkeys(table.name for table in tables):
+        count = len({table.path for table in tables if table.name == name})
+        notes.append(f"volumes {name}: {count} tables")
+    return replace(measured, sides=sides, units={**measured.units, **units}), notes
+
+
+def _beside(records: Sequence[SheetRecord]) -> Iterator[VolumeTable]:
+    paths = locate_sources([r.source for r in records], [r.place.root for r in records])
+    for record, path in zip(records, paths, strict=True):
+        found = None if path is None else table_beside(path)
+        if found is not None:
+            name, table = found
+            own = record.place.name
+            visit = visit_name(own.subject, own.session)
+            yield VolumeTable(name=name, visit=visit, path=table, hemi=own.hemi)
+
+
+def _matching(name: str, pattern: str, root: Path, measured: Measured) -> list[VolumeTable]:
+    found = [(visit_name(one.subject, one.session), one) for one in scan(pattern, root)]
+    tables = [
+        VolumeTable(name=name, visit=visit, path=one.path, hemi=one.hemi)
+        for visit, one in found
+        if visit in measured.visits.index
+    ]
+    if not tables:
+        raise NothingToDoError(
+            f"--volumes {name}: no file matches {pattern} (in {root}) for any participant here"
+        )
+    return tables

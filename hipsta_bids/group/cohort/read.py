@@ -1,0 +1,303 @@
+"""Reads the participant level's tables of many hemispheres into arrays, for chosen measures."""
+
+import difflib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy.ndimage import uniform_filter
+
+from hipsta_bids.derivatives import hemisphere
+from hipsta_bids.errors import InputError
+from hipsta_bids.geometry.catalog import MAPS, why_impossible
+from hipsta_bids.geometry.sheet import sheet_levels
+from hipsta_bids.group.cohort.collect import Exclusion, SheetRecord
+from hipsta_bids.group.cohort.data import Measures
+from hipsta_bids.group.design.settings import GroupSettings
+from hipsta_bids.group.stats.arrays import MOST_KEPT, Float, SideMaps, blocks
+from hipsta_bids.protocols import EXPERIMENTAL
+from hipsta_bids.settings import SheetSettings
+from hipsta_bids.types import PARTICIPANT, SESSION, VisitKey
+
+#: Map that registration rests on.
+CURVATURE = "curvature"
+#: Maps that are analyzed unless others are asked for.
+THICKNESS = "thickness"
+DEFAULT = (THICKNESS, CURVATURE)
+#: Names of all maps in the sheet tables.
+SHEET_MAPS = tuple(row.name for row in MAPS)
+#: Prefix of the names of volumes from other programs.
+VOLUME = "volume_"
+#: Unit of sampled maps whose own unit is not known.
+ARBITRARY = "arbitrary"
+#: Share of the sheets that need a value at a point, where sheets have rims without values.
+LEAST_SHARE = 0.5
+#: Number of measures that a message lists.
+_SHOWN = 12
+_ROWS = 1000  # of summaries that are words at once
+
+
+def choose_measures(
+    wanted: Sequence[str], records: Sequence[SheetRecord], others: Sequence[str] = ()
+) -> Measures:
+    """Tell maps from summary measures."""
+    if not wanted:
+        return Measures(maps=(*(DEFAULT if records else ()), *others))
+    summaries = _summary_names(records)
+    known = [*(SHEET_MAPS if records else ()), *others, *_sampled(records), *summaries]
+    maps, numbers = [], []
+    for name in wanted:
+        if name in others or (records and name in SHEET_MAPS) or _is_sampled(name, records):
+            maps.append(name)
+        elif name in summaries or name.startswith(VOLUME):
+            numbers.append(name)
+        else:
+            more = " ..." if len(known) > _SHOWN else ""
+            raise _unknown(name, known, f"there are {', '.join(known[:_SHOWN])}{more}")
+    return Measures(maps=tuple(maps), summaries=tuple(numbers) or None)
+
+
+def check_summaries(measures: Measures, sides: Mapping[str, SideMaps]) -> None:
+    """Refuse summary measures that no hemisphere has."""
+    known = sorted({str(name) for side in sides.values() for name in side.summary.columns})
+    for name in measures.summaries or ():
+        if name not in known:
+            raise _unknown(name, known, "are its tables there?")
+
+
+def _unknown(name: str, known: Sequence[str], hint: str) -> InputError:
+    if near := difflib.get_close_matches(name, known, n=1):
+        hint = f"did you mean {near[0]}?"
+    return InputError(f"no measure is called {name!r}; {hint}")
+
+
+def _is_sampled(name: str, records: Sequence[SheetRecord]) -> bool:
+    return any(_sampled_table(record, name).is_file() for record in records)
+
+
+def _sampled(records: Sequence[SheetRecord]) -> list[str]:
+    """Names of the sampled maps of the first hemisphere."""
+    if not records:
+        return []
+    pattern = records[0].place.path("map_table", "*")
+    start, _, end = pattern.name.partition("*")
+    found = pattern.parent.glob(pattern.name)
+    return sorted(path.name.removeprefix(start).removesuffix(end) for path in found)
+
+
+def _summary_names(records: Sequence[SheetRecord]) -> tuple[str, ...]:
+    return tuple(hemisphere.read_summary(records[0].place)) if records else ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measured:
+    """Sheets and summaries, before covariates are known."""
+
+    visits: pd.DataFrame
+    """Participant and session, one row per visit; the index has the names of visits."""
+    sides: Mapping[str, SideMaps]
+    x: Float
+    y: Float
+    units: Mapping[str, str]
+    sources: Mapping[str, tuple[str, Path]]
+    """Address of one segmentation, and the dataset whose record has it, of visits with sheets."""
+    damaged: tuple[Exclusion, ...] = ()
+    """Hemispheres left out because maps are empty, or maps or summaries impossible."""
+
+
+def read_sheets(
+    records: Sequence[SheetRecord],
+    grid: SheetSettings,
+    maps: Sequence[str],
+    visits: Sequence[VisitKey] | None = None,
+    *,
+    rules: GroupSettings,
+    error_window: int = 0,
+) -> Measured:
+    """Read all sheets and summaries, and the SDs of the maps if they have a window.
+
+    Hemispheres with empty or impossible maps or summaries are left out by ``rules``.
+    """
+    if error_window:
+        _check_errors(records, maps)
+    region = records[0].place.name.region if records else "body"
+    x, y = node_coordinates(grid, region)
+    shape = len(x), len(y)
+    visits = visits_of(records) if visits is None else visits
+    row_of = {visit: row for row, visit in enumerate(visits)}
+    names = tuple(dict.fromkeys((*maps, CURVATURE)))
+    sides = {}
+    damaged: list[Exclusion] = []
+    for hemi in "LR":
+        own = [record for record in records if record.place.name.hemi == hemi]
+        rows = [row_of[r.place.name.subject, r.place.name.session] for r in own]
+        if own:
+            side = _read_side(own, np.array(rows, dtype=np.int64), shape, names)
+            columns = {str(name): one.to_numpy() for name, one in side.summary.items()}
+            doubtful = {name: one for name, one in columns.items() if why_impossible(name, one)}
+            why = [_damage(side, i, doubtful, rules) for i in range(len(own))]
+            found = [
+                Exclusion.of_sheet(record.place.name, "damaged-map", text)
+                for record, text in zip(own, why, strict=True)
+                if text
+            ]
+            if len(found) == len(own):
+                raise InputError(
+                    f"hemisphere {hemi}: no sheet can be used; {found[0].participant}:"
+                    f" {found[0].message}"
+                )
+            damaged += found
+            sides[hemi] = side.sheets(np.array([not text for text in why]))
+            own = [r for r, text in zip(own, why, strict=True) if not text]
+            if region in EXPERIMENTAL:
+                for values in sides[hemi].maps.values():
+                    leave_rare(values)
+        if own and error_window:
+            errors = _read_errors(own, shape, maps, error_window)
+            sides[hemi] = replace(sides[hemi], errors=errors)
+    table = pd.DataFrame(
+        {
+            PARTICIPANT: [f"sub-{subject}" for subject, _ in visits],
+            SESSION: pd.array([s and f"ses-{s}" for _, s in visits], dtype=object),
+        },
+        index=[visit_name(*visit) for visit in visits],
+    )
+    return Measured(
+        visits=table,
+        sides=sides,
+        x=x,
+        y=y,
+        units=(hemisphere.read_units(records[0].place) if records else {})
+        | {n: ARBITRARY for n in names if n not in SHEET_MAPS},
+        sources={
+            visit_name(r.place.name.subject, r.place.name.session): (r.source, r.place.root)
+            for r in reversed(records)
+        },
+        damaged=tuple(damaged),
+    )
+
+
+def leave_rare(values: Float) -> None:
+    """Take points that few sheets have out of a map (sheets, x, y): beside rims, a selection."""
+    known = np.isfinite(values)
+    some = known.any(axis=(1, 2))  # other volumes may lack in a participant
+    values[:, known[some].sum(axis=0) < LEAST_SHARE * some.sum()] = np.nan
+
+
+def _damage(
+    side: SideMaps, i: int, doubtful: Mapping[str, Float], rules: GroupSettings
+) -> str | None:
+    """Say why a hemisphere cannot be used, if it cannot, by maps and ``doubtful`` summaries."""
+    curvature = side.maps[CURVATURE][i]
+    gap = float((~np.isfinite(curvature)).all(axis=1).mean())
+    if gap > rules.registration.max_gap:
+        return f"{gap:.0%} of the curvature profile has no value"
+    if THICKNESS in side.maps and not np.isfinite(side.maps[THICKNESS][i]).any():
+        return "no point of the thickness map has a value"
+    values = [(name, one[i]) for name, one in side.maps.items()]
+    values += [(name, column[i : i + 1]) for name, column in doubtful.items()]
+    found = (why_impossible(name, one) for name, one in values)
+    return next((text for text in found if text), None)
+
+
+def _check_errors(records: Sequence[SheetRecord], maps: Sequence[str]) -> None:
+    """Refuse weights by uncertainty where an SD is missing."""
+    if others := [name for name in maps if name not in SHEET_MAPS]:
+        raise InputError(
+            f"--weights uncertainty: there are no SDs of {', '.join(others)}; leave these maps"
+            " out by --measures, or the weights"
+        )
+    lacking = [r.place.name.stem for r in records if not r.place.path("uncertainty").is_file()]
+    if lacking:
+        shown = ", ".join(lacking[:_SHOWN]) + (" ..." if len(lacking) > _SHOWN else "")
+        raise InputError(
+            f"--weights uncertainty: {len(lacking)} of {len(records)} hemispheres have no SD maps"
+            f" ({shown}); run the participant level again with --uncertainty 8, or leave them"
+            " out by --exclude"
+        )
+
+
+def _read_errors(
+    records: Sequence[SheetRecord], shape: tuple[int, int], maps: Sequence[str], window: int
+) -> dict[str, Float]:
+    """(sheets, x, y) SD of each map, from squares averaged over ``window`` nodes on both axes."""
+    columns = [hemisphere.spread_name(name) for name in maps]
+    tables = [
+        hemisphere.read_sheet(r.place.path("uncertainty"), columns, shape=shape) for r in records
+    ]
+    errors = {}
+    for name in maps:
+        squares = np.stack([t[hemisphere.spread_name(name)] for t in tables]) ** 2
+        known = np.isfinite(squares)
+        total, count = (
+            uniform_filter(values, (1, window, window), mode="nearest")
+            for values in (np.where(known, squares, 0.0), known.astype(np.float64))
+        )
+        mean = total / np.where(known, count, 1.0)
+        errors[name] = np.where(known, np.sqrt(np.maximum(mean, 0.0)), np.nan)
+    return errors
+
+
+def visits_of(records: Sequence[SheetRecord]) -> list[VisitKey]:
+    """List subjects and sessions that have sheets, each once."""
+    return list(dict.fromkeys((r.place.name.subject, r.place.name.session) for r in records))
+
+
+def node_coordinates(grid: SheetSettings, region: str) -> tuple[Float, Float]:
+    """Coordinates of the nodes along x and y, without rounding errors that tables would show."""
+    x, y, _ = sheet_levels(grid, region)
+    return x.round(10) + 0.0, y.round(10) + 0.0
+
+
+def visit_name(subject: str, session: str | None) -> str:
+    """Name a visit as the covariates' rows; labels have no prefixes."""
+    return f"sub-{subject}_ses-{session}" if session else f"sub-{subject}"
+
+
+def _read_side(
+    records: Sequence[SheetRecord],
+    rows: np.ndarray[Any, Any],
+    shape: tuple[int, int],
+    names: Sequence[str],
+) -> SideMaps:
+    precision = np.float64 if len(records) <= MOST_KEPT else np.float32
+    maps = {name: np.full((len(records), *shape), np.nan, precision) for name in names}
+    measured = [name for name in names if name in SHEET_MAPS]
+    sampled = [name for name in names if name not in SHEET_MAPS]
+    subfield = np.empty((len(records), *shape), dtype=np.int8)
+    codes: dict[str, int] = {}
+    for i, record in enumerate(records):
+        columns = hemisphere.read_sheet(record.place.path("sheet"), measured, ["subfield"], shape)
+        for name in sampled:
+            path = _sampled_table(record, name)
+            if path.is_file():
+                columns |= hemisphere.read_sheet(path, [name], shape=shape)
+        for name in maps.keys() & columns.keys():
+            maps[name][i] = columns[name]
+        subfield[i] = _encode(columns["subfield"], codes)
+    summary = pd.concat(
+        [
+            pd.DataFrame(
+                [hemisphere.read_summary(record.place) for record in records[part]],
+                dtype=np.float64,
+            )
+            for part in blocks(len(records), _ROWS)
+        ],
+        ignore_index=True,
+    )
+    return SideMaps(rows=rows, maps=maps, subfield=subfield, names=tuple(codes), summary=summary)
+
+
+def _sampled_table(record: SheetRecord, name: str) -> Path:
+    """Table of the sampled map of a column: ``bold_3`` is the third of ``bold``."""
+    return record.place.path("map_table", name.partition("_")[0])
+
+
+def _encode(words: np.ndarray[Any, Any], codes: dict[str, int]) -> np.ndarray[Any, Any]:
+    """Replace names by numbers, new names at the end; -1 where missing."""
+    numbers, names = pd.factorize(words.ravel())
+    known = np.array([codes.setdefault(name, len(codes)) if name else -1 for name in names])
+    return np.asarray(known[numbers], dtype=np.int8).reshape(words.shape)

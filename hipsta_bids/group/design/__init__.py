@@ -1,0 +1,1 @@
+"""Formulas, contrasts, comparisons and settings of the group level."""

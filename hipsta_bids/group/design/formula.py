@@ -1,0 +1,530 @@
+"""What is fitted and tested, by BIDS Stats Models 1.0.0 or a formula, and the variables of it."""
+
+import difflib
+import re
+import unicodedata
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from formulaic import Formula
+from numpy.typing import NDArray
+
+from hipsta_bids.errors import ModelError
+from hipsta_bids.group.design.grammar import CONTEXT, closed_formula
+from hipsta_bids.group.design.settings import DesignSettings, GroupSettings
+from hipsta_bids.types import Float, Int64
+
+#: A column with text is taken for a damaged number if more of it than this is numbers.
+NUMERIC_SHARE = 0.5
+#: A note names other columns of three to this many different numbers, fitted as a line.
+FEW_VALUES = 5
+
+_VERSION = "1.0.0"
+#: A weight and a name such as ``age``, ``group[CU]`` or ``group[T.CU]:age``; with blanks, columns
+#: are in backticks.
+_TERM = re.compile(
+    r"\s*(?P<sign>[+-])?\s*(?:(?P<weight>\d+\.?\d*|\.\d+)\s*\*?\s*)?"
+    r"(?P<name>(?:[^\W\d]|`[^`]+`)(?:[\w.:]|`[^`]+`|\[[^\]]*\]|\([^)]*\))*)"
+)
+#: Outside of brackets, where it belongs to a level such as ``group[>=24]``.
+_EQUALS = re.compile(r"=(?![^\[]*\])")
+
+#: Texts that mean a missing value, besides what pandas takes for one.
+_MISSING = ("n/a", "NA", "N/A", "nan", "NaN", "")
+#: Numbers from here on overflow when they are squared and summed.
+_LARGEST = 1e100
+#: Name of the constant.
+INTERCEPT = "Intercept"
+#: Rows that a message names.
+_NAMED = 8
+#: Two values are the same on a line and as a factor.
+_LEAST_LINE = 3
+#: Whole numbers as spreadsheets may write them, and dates.
+_WHOLE = re.compile(r"(-?\d+)\.0+")
+_DATE = re.compile(r"\d{4}-\d{1,2}-\d{1,2}\b.*|\d{1,2}[./]\d{1,2}[./]\d{2,4}")
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """One hypothesis: that ``weights @ coefficients`` is zero."""
+
+    name: str
+    weights: Float
+    """(rows, columns of the design); one row is tested by t, several together by F."""
+
+    def __post_init__(self) -> None:
+        weights = np.atleast_2d(np.array(self.weights, dtype=np.float64))
+        if np.linalg.matrix_rank(weights) < weights.shape[0]:
+            raise ModelError(
+                f"contrast {self.name!r}: its rows say the same thing twice, or one is all zero;"
+                " leave out the redundant row"
+            )
+        weights.flags.writeable = False
+        object.__setattr__(self, "weights", weights)
+
+    @property
+    def n_rows(self) -> int:
+        """Degrees of freedom of the hypothesis."""
+        return int(self.weights.shape[0])
+
+
+@dataclass(frozen=True)
+class ContrastSpec:
+    """A contrast by the names of what it combines."""
+
+    name: str
+    conditions: tuple[str, ...]
+    """Columns of the design, or levels such as ``group[CU]``: then means of the model there."""
+    weights: tuple[tuple[float, ...], ...]
+    """Rows; one for t, several for F."""
+    test: str
+    """``t`` or ``F``."""
+
+
+@dataclass(frozen=True)
+class ModelSpec:
+    """One linear model."""
+
+    name: str
+    formula: str
+    """Right-hand side, in formulaic's grammar."""
+    contrasts: tuple[ContrastSpec, ...]
+    dummy: str | None
+    """Also test each column by itself, with this test."""
+    measures: tuple[str, ...] = ()
+    """Left-hand side: what the model is fitted to; empty for the default."""
+
+
+def model_from_shortcut(formula: str, contrasts: Sequence[str], name: str) -> dict[str, Any]:
+    """Write the BIDS Stats Model that says the same as a formula and contrasts."""
+    node: dict[str, Any] = {
+        "Level": "Dataset",
+        "Name": name,
+        "GroupBy": ["contrast"],
+        "Model": {"Type": "glm", "X": [1], "Formula": formula},
+    }
+    if contrasts:
+        node["Contrasts"] = [_contrast_json(text) for text in contrasts]
+    else:
+        node["DummyContrasts"] = {"Test": "t"}
+    return {"Name": name, "BIDSModelVersion": _VERSION, "Nodes": [node]}
+
+
+def parse_model(document: Mapping[str, Any]) -> ModelSpec:
+    """Read a BIDS Stats Model: one node at dataset level, with ``Model.X`` or ``Model.Formula``."""
+    nodes = document.get("Nodes")
+    if not isinstance(nodes, list) or len(nodes) != 1 or not isinstance(nodes[0], Mapping):
+        raise _refusal("needs exactly one node, at dataset level")
+    node = nodes[0]
+    if str(node.get("Level", "")).lower() != "dataset":
+        raise _refusal(f"has a node at level {node.get('Level')!r}; only Dataset is supported")
+    if node.get("Transformations"):
+        raise _refusal("has transformations; write them into the formula instead, as log(age)")
+    model = node.get("Model")
+    if not isinstance(model, Mapping) or str(model.get("Type", "glm")).lower() != "glm":
+        raise _refusal("needs a Model of Type glm")
+    dummy = node.get("DummyContrasts")
+    contrasts = node.get("Contrasts", [])
+    if not isinstance(contrasts, list):
+        raise _refusal("has Contrasts that are no list")
+    specs = tuple(_parse_contrast(one) for one in contrasts)
+    names = [spec.name for spec in specs]
+    if twice := sorted({one for one in names if names.count(one) > 1}):
+        raise _refusal(f"has contrasts of the same name: {', '.join(twice)}")
+    labels = [file_label(one) for one in names]
+    if same := [one for one in names if labels.count(file_label(one)) > 1]:
+        raise _refusal(
+            f"has contrasts whose files would have one name: {listed(same)}; give one"
+            " a name, as other=group[A]:age"
+        )
+    return ModelSpec(
+        name=str(node.get("Name") or document.get("Name") or "model"),
+        formula=_formula(model),
+        measures=left_side(str(model.get("Formula") or "")),
+        contrasts=specs,
+        dummy=str(dummy.get("Test", "t")) if isinstance(dummy, Mapping) else None,
+    )
+
+
+def left_side(formula: str) -> tuple[str, ...]:
+    """Names on the left of the tilde, as in ``thickness + curvature ~ group``."""
+    left, tilde, right = formula.partition("~")
+    if not tilde or not left.strip():
+        return ()
+    names = tuple(dict.fromkeys(name.strip() for name in left.split("+")))
+    if "~" in right or not all(name.isidentifier() for name in names):
+        raise ModelError(
+            f"formula {formula!r}: on the left of ~ stand names of measures, joined by +, as"
+            " thickness + curvature"
+        )
+    return names
+
+
+def parse_expression(text: str) -> dict[str, float]:
+    """Read a linear combination, such as ``0.5*a + 0.5*b - group[CU]``."""
+    weights: dict[str, float] = {}
+    position = 0
+    while position < len(text.rstrip()):
+        found = _TERM.match(text, position)
+        if found is None or (position and found["sign"] is None):
+            raise ModelError(
+                f"contrast {text!r}: cannot read {text[position:].strip()!r}; write it as"
+                " group[A]-group[B] or 0.5*age, and names with blanks in backticks"
+            )
+        weight = float(found["weight"] or 1) * (-1 if found["sign"] == "-" else 1)
+        name = found["name"].replace("`", "")
+        weights[name] = weights.get(name, 0.0) + weight
+        position = found.end()
+    if not weights:
+        raise ModelError("contrast: empty; name what to compare")
+    return weights
+
+
+def _contrast_json(text: str) -> dict[str, Any]:
+    *given, body = _EQUALS.split(text)
+    rows = [parse_expression(row) for row in re.split(r",(?![^\[(]*[\])])", body)]
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    weights = [[row.get(name, 0.0) for name in names] for row in rows]
+    return {
+        "Name": "=".join(given).strip() or body.strip(),
+        "ConditionList": names,
+        "Weights": weights[0] if len(rows) == 1 else weights,
+        "Test": "t" if len(rows) == 1 else "F",
+    }
+
+
+def _parse_contrast(contrast: Mapping[str, Any]) -> ContrastSpec:
+    if not isinstance(contrast, Mapping) or not contrast.get("Name"):
+        raise _refusal("has a contrast without a name")
+    name = str(contrast["Name"])
+    test = str(contrast.get("Test", "t"))
+    if test not in {"t", "F"}:
+        raise _refusal(f"has contrast {name!r} with test {test!r}; use t or F")
+    try:
+        conditions = tuple(map(str, contrast.get("ConditionList", ())))
+        given = contrast.get("Weights", [1] * len(conditions))
+        rows = given if given and isinstance(given[0], list) else [given]
+        weights = tuple(tuple(map(_number, row)) for row in rows)
+    except (TypeError, ValueError, LookupError, ZeroDivisionError):
+        raise _refusal(f"has contrast {name!r} without lists of names and numbers") from None
+    if not conditions or any(len(row) != len(conditions) for row in weights):
+        raise _refusal(f"has contrast {name!r} with {len(conditions)} conditions and other weights")
+    if test == "t" and len(weights) > 1:
+        raise _refusal(f"has contrast {name!r} with several rows; its test must be F")
+    return ContrastSpec(name, conditions, weights, test)
+
+
+def _number(value: object) -> float:
+    """Weights may be fractions such as ``1/3``."""
+    above, _, below = str(value).partition("/")
+    number = float(above) / float(below or 1)
+    if not np.isfinite(number):
+        raise ValueError(number)
+    return number
+
+
+def _formula(model: Mapping[str, Any]) -> str:
+    if text := model.get("Formula"):
+        return str(text).rpartition("~")[2].strip()
+    terms = model.get("X")
+    if not isinstance(terms, list) or not terms:
+        raise _refusal("needs Model.X or Model.Formula")
+    names = [str(term) for term in terms if str(term) != "1"]
+    if bad := [name for name in names if not re.fullmatch(r"[\w.*: ]+", name)]:
+        raise _refusal(f"has {bad[0]!r} in X; use names of columns, or a Formula")
+    return " + ".join(["1" if len(names) < len(terms) else "0", *names])
+
+
+def _refusal(what: str) -> ModelError:
+    return ModelError(f"model file {what} (BIDS Stats Models {_VERSION})")
+
+
+def file_label(text: str) -> str:
+    """Write a name in ASCII letters and digits, as BIDS has it; other scripts as ``u5973``."""
+    letters = unicodedata.normalize("NFKD", text.replace("+", " plus "))
+    plain = "".join(c if c.isascii() else f"u{ord(c):x}" * c.isalpha() for c in letters)
+    words = "".join(c if c.isalnum() else " " for c in plain).split()
+    return "".join(word[:1].upper() + word[1:] for word in words)
+
+
+def check_names(names: Iterable[str], columns: pd.Index) -> None:
+    """Refuse names that the table does not have."""
+    known = [str(column) for column in columns]
+    for name in names:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1)
+            hint = f"did you mean {near[0]}?" if near else f"the table has {listed(known)}"
+            raise ModelError(f"model: the table has no column {name!r}; {hint}")
+
+
+def with_factors(table: pd.DataFrame, settings: GroupSettings) -> pd.DataFrame:
+    """Make factors, of pandas' type, of the columns that are some by their name."""
+    known = (*settings.design.factors, *settings.model.group_columns)
+    names = {name.casefold() for name in known}
+    chosen = [
+        column
+        for column in table.columns
+        if str(column).casefold() in names
+        and not isinstance(table[column].dtype, pd.CategoricalDtype)
+    ]
+    return table.assign(**{str(column): as_factor(table[column]) for column in chosen})
+
+
+def as_factor(values: pd.Series) -> pd.Series:
+    """Take values for names, whatever they look like; ``1.0`` is ``1``."""
+    if pd.api.types.is_bool_dtype(values):
+        return values.map({True: "yes", False: "no"}).astype("category")
+    text = values.astype(object).where(values.notna(), None)
+    text = text.map(lambda value: None if value is None else level_name(value))
+    return text.where(~text.isin(_MISSING), None).astype("category")
+
+
+def level_name(value: object) -> str:
+    """Write a level of a factor."""
+    text = str(value).strip()
+    whole = _WHOLE.fullmatch(text)
+    return whole[1] if whole else text
+
+
+def typed(values: pd.Series) -> pd.Series:
+    """Return numbers as floats, text and factors as text, and what is missing as missing."""
+    if isinstance(values.dtype, pd.CategoricalDtype):
+        return values.astype(object).where(values.notna(), None)
+    if pd.api.types.is_bool_dtype(values):
+        return values.map({True: "yes", False: "no"}).astype(object)
+    if pd.api.types.is_numeric_dtype(values):
+        numbers = values.astype(np.float64)
+        return numbers.where(np.isfinite(numbers))
+    text = values.astype(object).where(values.notna(), None)
+    text = text.map(lambda value: None if value is None else str(value).strip())
+    text = text.where(~text.isin(_MISSING), None)
+    present = text.notna()
+    numbers = pd.to_numeric(text, errors="coerce").astype(np.float64)
+    if present.any() and numbers[present].notna().all():
+        too_large = present & ~(numbers.abs() < _LARGEST)
+        if too_large.any():
+            raise ModelError(
+                f"model: column {values.name!r} holds numbers that are too large for rows"
+                f" {listed(values.index[too_large])}; correct them, or mark them n/a"
+            )
+        return numbers
+    if numbers[present].notna().mean() > NUMERIC_SHARE:
+        bad = present & numbers.isna()
+        raise ModelError(
+            f"model: column {values.name!r} holds numbers but for rows {_cells(text[bad])};"
+            " correct them, or mark them n/a"
+        )
+    _refuse_spellings(text[present])
+    return text
+
+
+def level_labels(values: pd.Series) -> pd.Series:
+    """Names of levels, whatever they look like; ``None`` where missing."""
+    names = typed(values).astype(object)
+    texts = names.map(lambda one: f"{one:g}" if isinstance(one, float) else str(one))
+    return texts.where(names.notna(), None)
+
+
+def columns_of(
+    table: pd.DataFrame,
+    formula: str,
+    levels: Mapping[str, Sequence[str]],
+    where: str,
+) -> tuple[Float, tuple[str, ...], Int64]:
+    """Make columns of a formula with given levels, without intercept; and rows that have all."""
+    closed = closed_formula(formula)
+    names = sorted(closed.names)
+    if not names:
+        return np.empty((len(table), 0)), (), np.arange(len(table))
+    check_names(names, table.columns)
+    used = pd.DataFrame(
+        {n: level_labels(table[n]) if n in levels else typed(table[n]) for n in names}
+    )
+    complete = used.notna().all(axis=1).to_numpy()
+    used = used[complete].copy()
+    for name, known in levels.items():
+        if unknown := sorted(set(used[name]) - set(known)):
+            raise ModelError(
+                f"{where}has no {name!r} {listed(unknown)}, only {listed(known)}; leave these"
+                " participants out, or harmonize anew"
+            )
+        used[name] = pd.Categorical(used[name], categories=list(known))
+    if text := [name for name in names if name not in levels and used[name].dtype == object]:
+        raise ModelError(f"{where}{listed(text)} should be numbers, as where it was made")
+    made = Formula(closed.text).get_model_matrix(used, na_action="raise", context=dict(CONTEXT))
+    inside = [str(name) for name in made.columns if str(name) != INTERCEPT]
+    return made[inside].to_numpy(np.float64), tuple(inside), np.flatnonzero(complete)
+
+
+def _refuse_spellings(text: pd.Series) -> None:
+    """Refuse what is meant for numbers but is not written so: decimal commas, and dates."""
+    points = pd.to_numeric(text.str.replace(",", ".", n=1, regex=False), errors="coerce")
+    for written, what, remedy in (
+        (points.notna(), "decimal commas", "write 70.5 for 70,5"),
+        (text.str.fullmatch(_DATE), "dates", "give years or days, as numbers"),
+    ):
+        if len(text) and written.mean() > NUMERIC_SHARE:
+            raise ModelError(
+                f"model: column {text.name!r} holds {what}, as {_cells(text[written][:1])};"
+                f" {remedy}"
+            )
+
+
+def check_numbers(values: pd.Series, settings: DesignSettings) -> None:
+    """Refuse codes for missing values that are far from all others, and values out of all range."""
+    present = values[values.notna()]
+    codes = present.isin(settings.missing_codes)
+    rest = present[~codes]
+    if codes.any() and len(rest):
+        low, high = float(rest.min()), float(rest.max())
+        gap = np.maximum(low - present, present - high)
+        far = codes & (gap > high - low)
+        if far.any():
+            raise ModelError(
+                f"model: column {values.name!r} has {_cells(present[far])} where all others are"
+                f" {low:g} to {high:g}: a code for missing values? mark them n/a (or change the"
+                " setting design.missing_codes)"
+            )
+    if not len(present):
+        return
+    quartiles = np.quantile(present, [0.25, 0.5, 0.75])
+    reach = settings.farthest * (quartiles[2] - quartiles[0])
+    far = (present - quartiles[1]).abs() > reach
+    if reach > 0 and far.any():
+        raise ModelError(
+            f"model: column {values.name!r} has {_cells(present[far])} where half of the others are"
+            f" {quartiles[0]:.4g} to {quartiles[2]:.4g}; correct them, or mark them n/a"
+        )
+
+
+def _cells(values: pd.Series) -> str:
+    """List rows with what stands in them."""
+    shown = [f"{value:g}" if isinstance(value, float) else repr(value) for value in values]
+    return listed(f"{row} ({cell})" for row, cell in zip(values.index, shown, strict=True))
+
+
+def check_spelling(levels: Mapping[str, int], name: str) -> None:
+    """Refuse levels of a factor that differ in case or blanks only.
+
+    Which of them is meant is for a person to say: merged silently, a typing error would pass.
+    """
+    alike: dict[str, list[str]] = {}
+    for level in levels:
+        alike.setdefault("".join(level.split()).casefold(), []).append(level)
+    for found in alike.values():
+        if len(found) > 1:
+            words = ", ".join(f"{level!r} ({levels[level]})" for level in sorted(found))
+            raise ModelError(
+                f"model: levels of {name!r} differ in capitals or blanks only: {words}; write them"
+                " alike"
+            )
+
+
+def coding_note(values: pd.Series) -> str | None:
+    """Say that few different numbers are fitted as a line, as perhaps they should not."""
+    found = sorted(values.unique())
+    if not _LEAST_LINE <= len(found) <= FEW_VALUES:
+        return None
+    return (
+        f"{values.name} has {len(found)} different values ({', '.join(f'{x:g}' for x in found)})"
+        f" and is fitted as a line; if these are codes, write C({values.name}) in --formula, or"
+        " give their Levels in participants.json"
+    )
+
+
+def rows_by_lack(used: pd.DataFrame, complete: NDArray[np.bool_]) -> dict[str, tuple[str, ...]]:
+    """Group incomplete rows by the first variable that they lack."""
+    result: dict[str, list[str]] = {}
+    lacking = used.isna().to_numpy()
+    for row in np.flatnonzero(~complete).tolist():
+        name = str(used.columns[int(np.argmax(lacking[row]))])
+        result.setdefault(name, []).append(str(used.index[row]))
+    return {name: tuple(rows) for name, rows in result.items()}
+
+
+def check_left(used: pd.DataFrame, dropped: Mapping[str, tuple[str, ...]]) -> None:
+    """Refuse a model that leaves no row; says what the rows lack."""
+    if not len(used):
+        lack = ", ".join(f"{name} ({len(rows)})" for name, rows in dropped.items())
+        why = f"; missing are {lack}" if lack else ""
+        raise ModelError(f"model: no row has all variables{why}")
+
+
+def set_levels(
+    used: pd.DataFrame, references: Mapping[str, str], settings: DesignSettings
+) -> dict[str, list[str]]:
+    """Make factors of text columns in place."""
+    chosen = {}
+    for column in used.columns:
+        name = str(column)
+        if pd.api.types.is_numeric_dtype(used[name]):
+            check_numbers(used[name], settings)
+            _check_varies(used[name], name)
+        else:
+            chosen[name] = _levels(used[name], name, references.get(name), settings)
+            used[name] = pd.Categorical(used[name], categories=chosen[name])
+    if unknown := sorted(set(references) - set(chosen)):
+        raise ModelError(
+            f"model: reference level given for {listed(unknown)}, which is no factor of the model"
+        )
+    return chosen
+
+
+def _check_varies(values: pd.Series, name: str) -> None:
+    numbers = values.to_numpy(dtype=np.float64)
+    if numbers.min() == numbers.max():
+        raise ModelError(
+            f"model: {name!r} is {numbers[0]:g} in all {len(numbers)} complete rows; leave it out"
+        )
+
+
+def _levels(
+    values: pd.Series, name: str, reference: str | None, settings: DesignSettings
+) -> list[str]:
+    """Levels of a factor, reference first."""
+    counts = {str(level): int(count) for level, count in values.value_counts().items()}
+    check_spelling(counts, name)
+    levels = sorted(counts, key=in_order)
+    numbers = pd.to_numeric(pd.Series(levels), errors="coerce")
+    codes = [one for one, n in zip(levels, numbers, strict=True) if n in settings.missing_codes]
+    if codes and numbers.isna().any():
+        raise ModelError(
+            f"model: column {name!r} has {', '.join(f'{code} ({counts[code]})' for code in codes)}"
+            " among words: a code for missing values? mark them n/a (or change the setting"
+            " design.missing_codes)"
+        )
+    first = levels[0] if reference is None else reference
+    if first not in levels:
+        raise ModelError(
+            f"model: {name!r} has no level {first!r} in the complete rows, only {listed(levels)}"
+        )
+    if len(levels) == 1:
+        raise ModelError(
+            f"model: all {len(values)} complete rows have {name!r} {first}; leave it out"
+        )
+    small = [f"{level} ({counts[level]})" for level in levels if counts[level] < settings.min_level]
+    if small:
+        raise ModelError(
+            f"model: too few complete rows in {name!r}: {listed(small)}; at least"
+            f" {settings.min_level} are needed"
+        )
+    levels.remove(first)
+    return [first, *levels]
+
+
+def in_order(level: str) -> tuple[float, str]:
+    """Sort levels as numbers where they are some, before names."""
+    try:
+        return float(level), level
+    except ValueError:
+        return np.inf, level
+
+
+def listed(items: Iterable[object]) -> str:
+    """Join names for a message, not too many."""
+    texts = [str(item) for item in items]
+    more = f" and {len(texts) - _NAMED} more" if len(texts) > _NAMED else ""
+    return ", ".join(texts[:_NAMED]) + more

@@ -1,0 +1,245 @@
+"""The closed language of formulas: what may stand in one, checked before anything is evaluated.
+
+formulaic evaluates as Python what stands in the parentheses of a function. So a formula is first
+taken apart into names of columns, numbers, operators, and calls of known functions that hold
+arithmetic and plain options. formulaic gets what these parts are put together to, nothing else.
+"""
+
+import ast
+import keyword
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import NoReturn
+
+import numpy as np
+
+from hipsta_bids.errors import UsageError
+
+#: Functions of each value.
+_VALUE = frozenset({"I", "abs", "exp", "log", "log10", "log2", "sqrt"})
+#: Functions of a whole column; options may follow.
+_COLUMN = frozenset({"bs", "center", "cr", "poly", "scale"})
+#: Ways in which ``C`` codes a factor, as ``contr.sum`` or ``contr.treatment("CN")``.
+_CODINGS = frozenset({"diff", "helmert", "poly", "sum", "treatment"})
+
+#: Functions that formulaic does not have.
+CONTEXT: Mapping[str, object] = MappingProxyType({"abs": np.abs, "sqrt": np.sqrt})
+
+_ALLOWED = (
+    "allowed are names of columns (others than words in backticks), 0, 1, + - * : / **, parentheses"
+    f" and {', '.join(['C', *sorted(_VALUE | _COLUMN)])}"
+)
+_TOKEN = re.compile(
+    r"\s*(?:(?P<quoted>`[^`\n]+`)|(?P<string>\"[^\"\\\n]*\"|'[^'\\\n]*')"
+    r"|(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>[^\W\d]\w*)"
+    r"|(?P<sign>\*\*|[-+*/:(),=\[\].]))"
+)
+_OPERATORS = frozenset({"+", "-", "*", "/", ":", "**"})
+_PLACEHOLDER = "quoted_column_"
+
+_LONGEST = 2000  # characters
+_DEEPEST = 20  # parentheses within parentheses
+_HIGHEST_POWER = 9  # of a sum of terms
+_MOST_COLUMNS = 50  # of a spline or polynomial
+
+
+@dataclass(frozen=True)
+class _Token:
+    kind: str
+    text: str
+
+
+@dataclass(frozen=True)
+class ClosedFormula:
+    """The right-hand side of a formula that holds nothing but what is allowed."""
+
+    text: str
+    """The formula, put together from its checked parts."""
+    names: tuple[str, ...]
+    """Columns that it needs, without backticks, in the order of their first use."""
+    factors: frozenset[str] = frozenset()
+    """Those of them that stand in ``C`` only."""
+
+
+def closed_formula(text: str) -> ClosedFormula:
+    """Check the right-hand side of a formula; UsageError names what is not allowed, and what is."""
+    names: dict[str, None] = {}
+    plain: set[str] = set()
+    parts: list[str] = []
+    tokens = _tokens(text)
+    position, after_operand = 0, False
+    while position < len(tokens):
+        token = tokens[position]
+        end = position + 1
+        is_call = token.kind == "name" and end < len(tokens) and tokens[end].text == "("
+        is_operand = token.kind in {"name", "quoted", "number"}
+        if after_operand and (is_operand or token.text == "("):
+            _refuse(text, f"{tokens[position - 1].text} {token.text}")
+        if is_call:
+            end = _call_end(tokens, position)
+            inside = _check_call(text, tokens[position:end])
+            names |= dict.fromkeys(inside)
+            plain |= set(inside) if token.text != "C" else set()
+        elif token.kind == "number":
+            is_power = position > 0 and tokens[position - 1].text == "**"
+            powers = [str(power) for power in range(1, _HIGHEST_POWER + 1)]
+            if token.text not in (powers if is_power else ["0", "1"]):
+                _refuse(text, token.text)
+        elif token.kind in {"name", "quoted"}:
+            names[_column(text, token)] = None
+            plain.add(_column(text, token))
+        elif token.text not in _OPERATORS | {"(", ")"}:
+            _refuse(text, token.text)
+        after_operand = is_operand or token.text == ")"
+        parts.append("".join(part.text for part in tokens[position:end]))
+        position = end
+    return ClosedFormula(" ".join(parts), tuple(names), frozenset(names) - plain)
+
+
+def _refuse(text: str, part: str) -> NoReturn:
+    """Say that a part of a formula is not allowed."""
+    raise UsageError(
+        f"formula {_shortened(text)!r}: {_shortened(part)!r} is not allowed; {_ALLOWED}"
+    )
+
+
+def _shortened(text: str, most: int = 200) -> str:
+    return text if len(text) <= most else f"{text[:most]}..."
+
+
+def _tokens(text: str) -> list[_Token]:
+    """Take a formula apart."""
+    if len(text) > _LONGEST:
+        _refuse(text, f"a formula of {len(text)} characters")
+    tokens: list[_Token] = []
+    position, depth, stop = 0, 0, len(text.rstrip())
+    while position < stop:
+        found = _TOKEN.match(text, position)
+        if found is None:
+            _refuse(text, text[position:].split(maxsplit=1)[0])
+        kind = str(found.lastgroup)
+        tokens.append(_Token(kind, found[kind]))
+        depth += {"(": 1, ")": -1}.get(found[kind], 0)
+        if not 0 <= depth <= _DEEPEST:
+            _refuse(text, text[: found.end()].strip())
+        position = found.end()
+    if depth:
+        _refuse(text, "( without )")
+    return tokens
+
+
+def _call_end(tokens: Sequence[_Token], start: int) -> int:
+    """Position after the parenthesis that closes a call."""
+    depth, end = 0, start + 1
+    while True:
+        depth += {"(": 1, ")": -1}.get(tokens[end].text, 0)
+        end += 1
+        if depth == 0:
+            return end
+
+
+def _column(text: str, token: _Token) -> str:
+    """Name of a column; Python's own words have a meaning unless they are quoted."""
+    if keyword.iskeyword(token.text):
+        _refuse(text, token.text)
+    return token.text.strip("`")
+
+
+def _check_call(text: str, tokens: Sequence[_Token]) -> list[str]:
+    """Check the call of a function, and list the columns in it."""
+    quoted = [token.text for token in tokens if token.kind == "quoted"]
+    if any(token.text.startswith(_PLACEHOLDER) for token in tokens):
+        _refuse(text, _PLACEHOLDER)
+    numbers = iter(range(len(quoted)))
+    source = " ".join(
+        f"{_PLACEHOLDER}{next(numbers)}" if token.kind == "quoted" else token.text
+        for token in tokens
+    )
+    try:
+        tree = ast.parse(source, mode="eval").body
+    except SyntaxError:
+        _refuse(text, " ".join(token.text for token in tokens))
+    return _Call(text, quoted).columns(tree)
+
+
+@dataclass(frozen=True)
+class _Call:
+    """Walks through the syntax tree of a call; what no rule names is refused."""
+
+    text: str
+    quoted: Sequence[str]
+
+    def columns(self, node: ast.expr) -> list[str]:
+        """Columns in arithmetic or in a call."""
+        names: list[str] = []
+        inner: list[ast.expr] = []
+        match node:
+            case ast.Name(id=name):
+                names = [self._name(name)]
+            case ast.Constant(value=int() | float()) if not isinstance(node.value, bool):
+                pass
+            case ast.UnaryOp(op=ast.UAdd() | ast.USub(), operand=part):
+                inner = [part]
+            case ast.BinOp(op=ast.Add() | ast.Sub() | ast.Mult() | ast.Div(), left=a, right=b):
+                inner = [a, b]
+            case ast.BinOp(op=ast.Pow(), left=base, right=ast.Constant() as power) if (
+                not isinstance(base, ast.Constant) and self._is_number(power, _HIGHEST_POWER)
+            ):
+                inner = [base]
+            case ast.Call(func=ast.Name(id=name), args=[part], keywords=[]) if name in _VALUE:
+                inner = [part]
+            case ast.Call(func=ast.Name(id=name), args=[part, *more]) if name in _COLUMN:
+                self._check_options(more, node.keywords)
+                inner = [part]
+            case ast.Call(func=ast.Name(id="C"), args=[ast.Name(id=name), *more]):
+                given = [option for option in node.keywords if option.arg == "contrasts"]
+                for coding in [*more, *(option.value for option in given)]:
+                    self._check_coding(coding)
+                self._check_options([], [one for one in node.keywords if one not in given])
+                names = [self._name(name)]
+            case _:
+                self._refuse(node)
+        return [*names, *(name for part in inner for name in self.columns(part))]
+
+    def _name(self, name: str) -> str:
+        number = name.removeprefix(_PLACEHOLDER)
+        return name if number == name else self.quoted[int(number)].strip("`")
+
+    def _check_coding(self, node: ast.expr) -> None:
+        if isinstance(node, ast.Call):
+            self._check_options(node.args, node.keywords)
+            node = node.func
+        match node:
+            case ast.Attribute(value=ast.Name(id="contr"), attr=name) if name in _CODINGS:
+                return
+        self._refuse(node)
+
+    def _check_options(self, nodes: Sequence[ast.expr], named: Sequence[ast.keyword]) -> None:
+        """Options are texts, truth values, numbers, and lists of them."""
+        for option in named:
+            if option.arg is None or option.arg.startswith("_"):  # formulaic's own
+                self._refuse(option.value)
+        for node in [*nodes, *(option.value for option in named)]:
+            match node:
+                case ast.List(elts=parts) | ast.Tuple(elts=parts):
+                    self._check_options(parts, [])
+                case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int() | float())):
+                    pass
+                case ast.Constant(value=int()) if not self._is_number(node, _MOST_COLUMNS):
+                    self._refuse(node)
+                case ast.Constant(value=str() | bool() | int() | float()):
+                    pass
+                case _:
+                    self._refuse(node)
+
+    @staticmethod
+    def _is_number(node: ast.Constant, most: int) -> bool:
+        return isinstance(node.value, int | float) and abs(node.value) <= most
+
+    def _refuse(self, node: ast.AST) -> NoReturn:
+        part = ast.unparse(node)
+        for number, name in enumerate(self.quoted):
+            part = part.replace(f"{_PLACEHOLDER}{number}", name)
+        _refuse(self.text, part)

@@ -1,0 +1,532 @@
+"""Which model is fitted, the user's or the paper's default, and its design matrix."""
+
+import difflib
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from formulaic import Formula
+from scipy.linalg import null_space
+
+from hipsta_bids.errors import ModelError, UsageError
+from hipsta_bids.group.design.formula import (
+    INTERCEPT,
+    Contrast,
+    ContrastSpec,
+    ModelSpec,
+    as_factor,
+    check_left,
+    check_names,
+    check_spelling,
+    coding_note,
+    in_order,
+    left_side,
+    level_name,
+    listed,
+    model_from_shortcut,
+    parse_model,
+    rows_by_lack,
+    set_levels,
+    typed,
+)
+from hipsta_bids.group.design.grammar import CONTEXT, closed_formula
+from hipsta_bids.group.design.settings import DefaultModelSettings, DesignSettings, GroupSettings
+from hipsta_bids.io import files
+from hipsta_bids.types import PARTICIPANT, SESSION, Float, Int64
+
+#: A column is a combination of others if less than this fraction of its length is its own.
+DEPENDENCE = 1e-9
+
+#: How a contrast asks whether a variable bends, and the ages that the default model may bend.
+_NONLINEAR = "nonlinear"
+#: Age at the first visit, where that of each visit is known.
+FIRST_AGE = "age_first"
+_AGES = ("age", FIRST_AGE)
+_HEADS = DefaultModelSettings.model_fields["icv_columns"].default
+_OLDEST = 130.0  # years
+#: A line is in the span of columns if it is off by less, in standard deviations.
+_EXACT = 1e-6
+#: Both sides of a participant, in names of hemispheres.
+BOTH = "LR"
+
+
+@dataclass(frozen=True)
+class Groups:
+    """The column that tells groups, and their order."""
+
+    column: str
+    levels: tuple[str, ...]
+    """The reference first, the others in the order of the alphabet."""
+
+    @property
+    def reference(self) -> str:
+        """The level that the others are compared with."""
+        return self.levels[0]
+
+    def contrasts(self) -> list[str]:
+        """Each other level against the reference: positive where the reference has more."""
+        first = f"{self.column}[{self.reference}]"
+        return [
+            f"{self.reference}-{level} = {first} - {self.column}[{level}]"
+            for level in self.levels[1:]
+        ]
+
+
+def find_groups(
+    table: pd.DataFrame, settings: GroupSettings, reference: str | None = None
+) -> Groups | None:
+    """Find the column of groups and their reference level."""
+    by_name = {str(column).casefold(): str(column) for column in table.columns}
+    for wanted in settings.model.group_columns:
+        column = by_name.get(wanted.casefold())
+        values = typed(table[column]).dropna() if column else None
+        if column is None or values is None or values.nunique() < 2:  # noqa: PLR2004 -- two groups
+            continue
+        counts = Counter(level_name(value) for value in values)
+        check_spelling(counts, column)
+        first = reference or _reference(counts, settings.model)
+        if first not in counts:
+            raise ModelError(
+                f"model: no participant has {column!r} {first!r}; there are"
+                f" {', '.join(sorted(counts))}"
+            )
+        others = sorted((level for level in counts if level != first), key=in_order)
+        return Groups(column, (first, *others))
+    return None
+
+
+def _reference(counts: Counter[str], settings: DefaultModelSettings) -> str:
+    by_name = {level.casefold().rstrip("s"): level for level in sorted(counts)}
+    for name in settings.reference_levels:
+        if name.casefold().rstrip("s") in by_name:
+            return by_name[name.casefold().rstrip("s")]
+    return min(counts, key=lambda level: (-counts[level], level))
+
+
+def default_formula(
+    table: pd.DataFrame,
+    groups: Groups | None,
+    settings: GroupSettings,
+    *,
+    covariates: Sequence[str] | None = None,
+    time: str | None = None,
+) -> str:
+    """Spell the right-hand side: the groups, and each covariate that varies."""
+    first = " * ".join(name for name in (groups.column if groups else None, time) if name)
+    names = settings.model.covariates if covariates is None else covariates
+    by_name = {str(column).casefold(): str(column) for column in table.columns}
+    terms = [first or "1"]
+    for name in (by_name[name.casefold()] for name in names if name.casefold() in by_name):
+        if len(typed(table[name]).dropna().unique()) > 1:
+            shape = settings.model.age if name.casefold() in _AGES else "linear"
+            bent = {"quadratic": f"poly({name}, 2)"}
+            bent["spline"] = f'cr({name}, df=3, constraints="center")'
+            terms.append(bent.get(shape, name))
+    return " + ".join(terms)
+
+
+def default_contrasts(
+    groups: Groups | None, time: str | None, nonlinear: Sequence[str] = ()
+) -> list[str]:
+    """Contrasts of the default model.
+
+    Groups, changes over time in each, their differences, and whether covariates bend.
+    """
+    bends = [f"{name} nonlinear = {_NONLINEAR}({name})" for name in nonlinear]
+    if groups is None:
+        return [*([time] if time else []), *bends]
+    found = [*groups.contrasts(), *bends]
+    if time is None:
+        return found
+    slopes = {level: f"{groups.column}[T.{level}]:{time}" for level in groups.levels[1:]}
+    found.append(f"{time} in {groups.reference} = {time}")
+    for level, slope in slopes.items():
+        found.append(f"{time} in {level} = {time} + {slope}")
+        found.append(f"{time} in {groups.reference}-{level} = -1*{slope}")
+    return found
+
+
+def empty_covariates(table: pd.DataFrame, settings: GroupSettings) -> list[str]:
+    """Name covariates of the default model whose column holds nothing."""
+    wanted = {name.casefold() for name in settings.model.covariates}
+    named = [str(name) for name in table.columns if str(name).casefold() in wanted]
+    return [name for name in named if typed(table[name]).isna().all()]
+
+
+@dataclass(frozen=True)
+class VisitTime:
+    """Visits with their time, for longitudinal models."""
+
+    table: pd.DataFrame
+    column: str | None
+    """Column of the time; None if it is not known."""
+    covariates: tuple[str, ...]
+    """Names of covariates of the default model, with age at the first visit."""
+
+
+def asymmetry(left: Float, right: Float, *, relative: bool) -> Float:
+    """Left minus right, on sheets whose axes mean the same on both sides."""
+    difference: Float = left - right
+    if relative:
+        mean = (left + right) / 2
+        difference = difference / np.where(mean > 0, mean, np.nan)
+    return difference
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """Which sessions and sides of a participant are compared; by default the first session."""
+
+    longitudinal: bool = False
+    """All sessions, by a mixed model."""
+    pair: tuple[str, str] | None = None
+    """Two sessions, with ``ses-``: the second minus the first is analyzed."""
+    asymmetry: bool = False
+    """Also left minus right."""
+    normative: tuple[str, str] | None = None
+    """Factor and level of the group against which each participant is scored."""
+
+    @property
+    def suffix(self) -> str:
+        """What tells folders of results of the same formula apart."""
+        if self.pair:
+            return f"_change-{'-'.join(one.removeprefix('ses-') for one in self.pair)}"
+        return "_longitudinal" if self.longitudinal else ""
+
+    def __post_init__(self) -> None:
+        if self.longitudinal and self.pair:
+            raise UsageError("give --longitudinal (all sessions) or --paired (two), not both")
+        if self.longitudinal and self.normative:
+            raise UsageError(
+                "w-scores need one visit per participant, as others of the same participant would"
+                " be in the reference; leave --longitudinal out, or use --paired"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelRequest:
+    """Which model; all empty is the default."""
+
+    file: Path | None = None
+    """BIDS Stats Model."""
+    formula: str | None = None
+    contrasts: tuple[str, ...] = ()
+    references: tuple[tuple[str, str], ...] = ()
+    """Reference level by factor."""
+    name: str | None = None
+    """Folder of the results; else made from the formula."""
+
+
+def wanted_measures(request: ModelRequest, listed: tuple[str, ...]) -> tuple[str, ...]:
+    """Names of the measures that are asked for, by option or on the left of a formula."""
+    if request.file is not None:
+        left = parse_model(files.read_json(request.file)).measures
+    else:
+        left = left_side(request.formula or "")
+    if listed and left and set(listed) != set(left):
+        raise UsageError(
+            f"--measures {' '.join(listed)} and {' + '.join(left)} ~ in the formula differ; give"
+            " one"
+        )
+    return listed or left
+
+
+def choose_model(
+    request: ModelRequest,
+    table: pd.DataFrame,
+    settings: GroupSettings,
+    *,
+    comparison: Comparison | None = None,
+    visits: VisitTime | None = None,
+) -> tuple[Mapping[str, Any], ModelSpec, Groups | None, dict[str, str]]:
+    """Return the model as a BIDS Stats Model and read, the groups, and reference levels.
+
+    The reference of the groups is the user's, else that which ``find_groups`` finds; it is the
+    reference of their column in the design too, if the formula has it.
+    """
+    references = dict(request.references)
+    groups = find_groups(table, settings)
+    if groups is not None and groups.column in references:
+        groups = find_groups(table, settings, references[groups.column])
+    document = model_document(
+        request, table, groups, settings, comparison=comparison, visits=visits
+    )
+    model = parse_model(document)
+    if groups is not None and groups.column in closed_formula(model.formula).names:
+        references.setdefault(groups.column, groups.reference)
+    return document, model, groups, references
+
+
+def model_document(
+    request: ModelRequest,
+    table: pd.DataFrame,
+    groups: Groups | None,
+    settings: GroupSettings,
+    *,
+    comparison: Comparison | None = None,
+    visits: VisitTime | None = None,
+) -> Mapping[str, Any]:
+    """Give the model as a BIDS Stats Model."""
+    if request.file is not None:
+        if request.formula or request.contrasts:
+            raise UsageError("give --model or --formula, not both")
+        return files.read_json(request.file)
+    if request.formula is not None:
+        if not request.formula.rpartition("~")[2].strip():
+            raise UsageError("--formula is empty; write it as group + age")
+        formula = request.formula
+        contrasts = list(request.contrasts)
+        if not contrasts and groups is not None and groups.column in formula:
+            contrasts = groups.contrasts()
+        return model_from_shortcut(formula, contrasts, request.name or folder_name(formula))
+    comparison = comparison or Comparison()
+    within = comparison.longitudinal or comparison.pair or comparison.asymmetry
+    if groups is None and not within:
+        own = [str(name) for name in table.columns if name not in {PARTICIPANT, SESSION}]
+        there = f"there are {listed(own)}" if own else "BIDS_DIR has no participants.tsv"
+        raise ModelError(
+            f"no column tells groups ({', '.join(settings.model.group_columns)}) with two levels;"
+            f' {there}; or give a model by --formula "age + sex" --contrast age'
+        )
+    time = visits.column if visits else None
+    if comparison.longitudinal and time is None:
+        raise ModelError(
+            "the default longitudinal model needs the time of each session: a column"
+            f" {', '.join(settings.longitudinal.time_columns)}, acq_time or age in sessions.tsv"
+        )
+    covariates = visits.covariates if visits else settings.model.covariates
+    formula = default_formula(table, groups, settings, covariates=covariates, time=time)
+    bent = [name for name in closed_formula(formula).names if name.casefold() in _AGES]
+    bent = [] if settings.model.age == "linear" else bent
+    contrasts = list(request.contrasts) or default_contrasts(groups, time, bent)
+    return model_from_shortcut(formula, contrasts, request.name or folder_name(formula))
+
+
+def folder_name(formula: str, measures: tuple[str, ...] = ()) -> str:
+    """Spell measures and a formula as the name of a folder; products must not look like sums."""
+    right = formula.rpartition("~")[2].replace("*", " x ").replace(":", " by ")
+    right = right.replace(" - ", " without ")
+    words = "".join(c if c.isalnum() else " " for c in right).split()
+    return "_".join(part for part in ("-".join(measures), "-".join(words) or "model") if part)
+
+
+@dataclass(frozen=True)
+class Design:
+    """A design matrix for complete rows, and its contrasts."""
+
+    matrix: Float
+    """(rows, columns)"""
+    columns: tuple[str, ...]
+    rows: Int64
+    """Positions in the table of the rows that are complete."""
+    dropped: Mapping[str, tuple[str, ...]]
+    """Labels of rows left out, by the variable that they lack (the first one)."""
+    references: Mapping[str, str]
+    """Reference level of each factor."""
+    contrasts: tuple[Contrast, ...]
+    notes: Mapping[str, str] = field(default_factory=dict)
+    """What to know about the coding of variables, by their names."""
+    levels: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    """Levels of each factor, the reference first."""
+
+
+def build_design(
+    table: pd.DataFrame, model: ModelSpec, settings: DesignSettings, references: Mapping[str, str]
+) -> Design:
+    """Make the design matrix of a model, or say what keeps it from being fitted."""
+    closed = closed_formula(model.formula)
+    formula = _read_formula(closed.text)
+    names = sorted(closed.names)
+    check_names(names, table.columns)
+    used = table[names].copy()
+    for name in names:
+        column = as_factor(used[name]) if name in closed.factors else used[name]
+        used[name] = typed(column)
+    complete = used.notna().all(axis=1).to_numpy()
+    dropped = rows_by_lack(used, complete)
+    used = used.loc[complete].copy()
+    check_left(used, dropped)
+    numeric = used.select_dtypes("number")
+    notes = {name: coding_note(numeric[name]) for name in map(str, numeric.columns)}
+    chosen = set_levels(used, references, settings)
+    for name in map(str, numeric.columns):
+        _check_possible(numeric[name], name.casefold())
+    try:
+        with np.errstate(invalid="ignore", divide="ignore"):  # rows without a value are told below
+            made = formula.get_model_matrix(used, na_action="ignore", context=dict(CONTEXT))
+    except Exception as error:  # formulaic raises all kinds where a formula makes no sense
+        raise ModelError(
+            f"formula {model.formula!r}: {str(error).partition(chr(10))[0]}"
+        ) from error
+    columns = tuple(str(column) for column in made.columns)
+    matrix: Float = np.asarray(made, dtype=np.float64)
+    _check_matrix(matrix, columns, used.index, settings)
+    terms = _Terms(columns, used, made.model_spec, chosen, matrix)
+    specs = (*model.contrasts, *_dummies(columns, model.dummy))
+    return Design(
+        matrix=matrix,
+        columns=columns,
+        rows=np.flatnonzero(complete),
+        dropped=dropped,
+        references={name: levels[0] for name, levels in chosen.items()},
+        contrasts=tuple(terms.contrast(spec) for spec in specs),
+        notes={name: note for name, note in notes.items() if note},
+        levels=chosen,
+    )
+
+
+@dataclass(frozen=True)
+class _Terms:
+    """What contrasts can name, as rows of weights of the columns."""
+
+    columns: tuple[str, ...]
+    table: pd.DataFrame
+    spec: Any
+    levels: Mapping[str, list[str]]
+    matrix: Float
+
+    def contrast(self, spec: ContrastSpec) -> Contrast:
+        variable = re.fullmatch(rf"{_NONLINEAR}\(`?([^`]+)`?\)", spec.conditions[0])
+        if variable and len(spec.conditions) == 1:
+            return Contrast(spec.name, self._nonlinear(variable[1], spec.name))
+        rows = np.array([self._row(name, spec.name) for name in spec.conditions])
+        weights: Float = np.array(spec.weights) @ rows
+        return Contrast(spec.name, weights)
+
+    def _nonlinear(self, variable: str, contrast: str) -> Float:
+        """Weights that are zero where the columns of a variable make a line of it.
+
+        If ``line`` are the coefficients that give the variable itself, these are the directions of
+        its coefficients at right angles to ``line``. A single one is scaled to the coefficient of
+        the square.
+        """
+        own = [
+            column
+            for structure in self.spec.structure
+            if closed_formula(str(structure.term)).names == (variable,)
+            for column in structure.columns
+        ]
+        places = [i for i, column in enumerate(self.columns) if column in own]
+        if variable not in self.table or len(places) < 2:  # noqa: PLR2004 -- a line is one
+            raise ModelError(
+                f"contrast {contrast!r}: {variable!r} is in the formula as a line at most; write it"
+                f" as poly({variable}, 2) or cr({variable}, df=3)"
+            )
+        values = self.table[variable].to_numpy(dtype=np.float64)
+        spread = float(values.std())
+        values = (values - values.mean()) / spread
+        powers = np.column_stack([values, values**2])
+        found = np.linalg.lstsq(self.matrix, powers, rcond=None)[0]
+        if np.abs(self.matrix @ found[:, 0] - values).max() > _EXACT:
+            raise ModelError(
+                f"contrast {contrast!r}: no line of {variable!r} is in the formula to compare with"
+            )
+        line, square = found[places].T
+        across = null_space(line[None]).T
+        if len(across) == 1:
+            across = across / float(across[0] @ square) / spread**2
+        weights = np.zeros((len(across), len(self.columns)))
+        weights[:, places] = across
+        return weights
+
+    def _row(self, name: str, contrast: str) -> Float:
+        if name in self.columns:
+            return np.asarray(np.eye(len(self.columns))[self.columns.index(name)])
+        factor, level = self._split(name)
+        if factor is None:
+            known = [
+                *self.columns,
+                *(f"{f}[{x}]" for f, levels in self.levels.items() for x in levels),
+            ]
+            near = difflib.get_close_matches(name, known, n=1)
+            hint = f"did you mean {near[0]}?" if near else f"known are {listed(known)}"
+            raise ModelError(f"contrast {contrast!r}: nothing is called {name!r}; {hint}")
+        # The mean of the model over all rows if every one had this level.
+        moved = self.table.copy()
+        moved[factor] = pd.Categorical([level] * len(moved), categories=self.levels[factor])
+        matrix = self.spec.get_model_matrix(moved, context=dict(CONTEXT))
+        return np.asarray(np.asarray(matrix, dtype=np.float64).mean(axis=0))
+
+    def _split(self, name: str) -> tuple[str | None, str]:
+        """Factor and level of ``factor[level]`` or ``factor.level``."""
+        for factor, levels in self.levels.items():
+            for level in levels:
+                if name in {f"{factor}[{level}]", f"{factor}.{level}"}:
+                    return factor, level
+        return None, ""
+
+
+def _check_possible(values: pd.Series, name: str) -> None:
+    """Refuse ages, and volumes of heads, that nobody has."""
+    if name not in {*_AGES, *_HEADS}:
+        return
+    numbers = values.to_numpy(dtype=np.float64)
+    first, middle = np.quantile(numbers, [0.25, 0.5])
+    bad = numbers <= 0 if name in _HEADS else numbers < 0
+    bad &= first > 0  # else they are differences from a mean
+    if name in _AGES:  # in months, say, most are larger
+        bad |= (numbers > _OLDEST) & (middle <= _OLDEST)
+    if bad.any():
+        found = listed(f"{row} ({value:g})" for row, value in values[bad].items())
+        raise ModelError(
+            f"model: column {values.name!r} has {found}, which nobody has; correct them, or mark"
+            " them n/a"
+        )
+
+
+def _dummies(columns: tuple[str, ...], test: str | None) -> list[ContrastSpec]:
+    if test is None:
+        return []
+    return [ContrastSpec(one, (one,), ((1.0,),), test) for one in columns if one != INTERCEPT]
+
+
+def _read_formula(text: str) -> Formula:
+    try:
+        return Formula(text)
+    except Exception as error:  # formulaic raises all kinds where a formula makes no sense
+        raise ModelError(
+            f"formula {text!r} cannot be read; write it as group + age, and names with blanks in"
+            " backticks"
+        ) from error
+
+
+def _check_matrix(
+    matrix: Float, columns: tuple[str, ...], rows: pd.Index, settings: DesignSettings
+) -> None:
+    bad = np.flatnonzero(~np.isfinite(matrix).all(axis=1))
+    if len(bad):
+        raise ModelError(
+            f"model: the formula has no value for rows {listed(rows.take(bad))}; a logarithm of"
+            " zero or less?"
+        )
+    if len(matrix) - len(columns) < settings.min_residual_df:
+        raise ModelError(
+            f"model: {len(matrix)} complete rows are too few for {len(columns)} columns; at least"
+            f" {len(columns) + settings.min_residual_df} are needed"
+        )
+    lengths = np.linalg.norm(matrix, axis=0)
+    if (lengths == 0).any():
+        raise ModelError(
+            f"model: no row has {columns[int(np.argmin(lengths))]!r}; leave it out of the formula"
+        )
+    unit = matrix / lengths
+    for last in range(1, len(columns)):
+        before = unit[:, :last]
+        weights = np.linalg.lstsq(before, unit[:, last], rcond=None)[0]
+        rest = float(np.linalg.norm(unit[:, last] - before @ weights))
+        if rest < DEPENDENCE:
+            involved = [columns[i] for i in np.flatnonzero(np.abs(weights) > DEPENDENCE)]
+            raise ModelError(
+                f"model: column {columns[last]!r} is a combination of {listed(involved)}; leave one"
+                " of them out"
+            )
+
+
+def asymmetry_name(measure: str) -> str:
+    """Name of the map of left minus right."""
+    return f"{measure}_asymmetry"

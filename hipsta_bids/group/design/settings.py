@@ -1,0 +1,336 @@
+"""Every number that changes a result of the group level: default, range, unit, meaning."""
+
+from pathlib import Path
+from typing import Annotated, Literal, get_args
+
+from pydantic import (
+    Field,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    Strict,
+)
+
+from hipsta_bids.protocols import toml
+
+#: Numbers of either sign; TOML has lists.
+Codes = Annotated[tuple[float, ...], Strict(strict=False)]
+Splines = Annotated[int, Field(ge=4)]
+AtLeastTwo = Annotated[int, Field(ge=2)]
+#: How to allow for many tests, as the command line spells it.
+Correction = Literal["fdr2", "bh", "permutation-tfce", "permutation-max"]
+CORRECTIONS: tuple[str, ...] = get_args(Correction)
+
+
+class RegistrationSettings(toml.SettingsTable):
+    """Registration of curvature profiles along x.
+
+    The numbers of splines, components and iterations are those of the paper (Diers et al. 2023,
+    appendix B) and of R's ``registr``; the method ``penalized`` has its own.
+    """
+
+    align: Literal["registr", "penalized", "none"] = "registr"
+    """``registr`` (Wrobel et al. 2018), ``penalized`` (finer warps, held back by a penalty that is
+    estimated) or ``none``."""
+    standardize: bool = True
+    """Subtract each profile's mean and divide it by its own standard deviation, so that curvature
+    that is larger everywhere is not taken for a displacement; R's ``registr`` does not."""
+    template_splines: Splines = 8
+    """Cubic B-splines of the template (Kt)."""
+    warp_splines: Splines = 4
+    """Cubic B-splines of a warp (Kh); 4 leave two numbers free."""
+    components: PositiveInt = 1
+    """Principal components by which a profile may differ from the mean one (npc)."""
+    center: bool = True
+    """Keep the mean warp at identity in each iteration; else all maps drift together. R's
+    ``registr`` does not."""
+    iterations: NonNegativeInt = 10
+    """Most turns of template and warps."""
+    min_subjects: PositiveInt = 10
+    """Fewer profiles than this give no template."""
+    max_gap: toml.Fraction = 0.2
+    """Profiles are filled along x if at most this fraction of them is missing."""
+    extreme: NonNegativeFloat = 4.0
+    """Flag warps whose mean displacement is above the median by more than this many robust
+    SDs."""
+    group_permutations: PositiveInt = 1999
+    """Permutations of participants for the difference of displacements between groups."""
+
+
+class DesignSettings(toml.SettingsTable):
+    """When a model is refused before it is fitted."""
+
+    min_level: PositiveInt = 3
+    """Fewer subjects in a level of a factor are too few."""
+    min_residual_df: PositiveInt = 3
+    """Fewer subjects beyond the columns are too few."""
+    factors: toml.Texts = (
+        *("group", "diagnosis", "dx", "diagnostic_group", "arm", "cohort", "study"),
+        *("sex", "gender", "ethnicity", "race"),
+        *("site", "site_id", "scanner", "scanner_id", "center", "center_id", "vendor"),
+    )
+    """Columns whose values are names, in any case of letters, even if they are written as numbers;
+    others are if the ``Levels`` of the table's sidecar have all their values."""
+    missing_codes: Codes = (
+        *(-9.0, -99.0, -999.0, -9999.0, -99999.0),
+        *(99.0, 999.0, 9999.0, 99999.0, 777.0, 7777.0, 888.0, 8888.0),
+    )
+    """Numbers that often stand for missing ones; refused where they are farther from all other
+    values than these are from each other."""
+    farthest: PositiveFloat = 1e4
+    """Numbers farther than this from the median, in ranges between quartiles, are refused."""
+
+
+class DefaultModelSettings(toml.SettingsTable):
+    """What is fitted when no model is given."""
+
+    group_columns: toml.Texts = ("group", "diagnosis", "dx", "diagnostic_group")
+    """The first of these columns, in any case of letters, tells the groups."""
+    reference_levels: toml.Texts = ("CN", "CU", "HC", "NC", "CTRL", "control", "healthy")
+    """The first of these, in any case and singular or plural, is the reference level of the
+    groups; else the most frequent one is."""
+    covariates: toml.Texts = ("age", "sex", "site")
+    """Further columns of the model, where the table has them and they vary."""
+    age: Literal["linear", "quadratic", "spline"] = "linear"
+    """How age stands in the model: as a line, with its square, or as a natural cubic spline of
+    three columns."""
+    icv_columns: toml.Texts = ("icv", "etiv", "tiv", "intracranial_volume")
+    """The first of these columns is the covariate of volumes; else what FreeSurfer or ASHS
+    estimated."""
+
+
+class GlmSettings(toml.SettingsTable):
+    """The linear model at each point."""
+
+    covariance: Literal["ordinary", "hc3"] = "ordinary"
+    """Of the coefficients: ``ordinary`` (equal variances) or ``hc3`` (any variances; MacKinnon and
+    White 1985)."""
+    weights: Literal["none", "uncertainty"] = "none"
+    """``uncertainty``: maps count by 1 / (variance between participants + squared SD of the
+    measurement), from ``--uncertainty`` of the participant level, with HC3 standard errors; summary
+    measures are not weighted."""
+    confidence: toml.OpenFraction = 0.95
+    """Coverage of two-sided confidence limits, fraction."""
+    min_residual_df: PositiveInt = 3
+    """Points with fewer residual degrees of freedom are left out."""
+
+
+class LongitudinalSettings(toml.SettingsTable):
+    """Repeated sessions of the same participants."""
+
+    random: Literal["auto", "intercept", "slope"] = "auto"
+    """What participants have of their own: an ``intercept``, or also a ``slope`` over time;
+    ``auto`` takes slopes where ``slope_participants`` have three visits. Without them tests of
+    changes take differences between participants for noise, and find too much."""
+    slope_participants: PositiveInt = 10
+    """Participants with three visits or more that ``auto`` wants for slopes."""
+    time_columns: toml.Texts = ("time", "years", "months", "days")
+    """The first of these columns, in any case, that varies between sessions is the time; else it
+    is made, in years since the first session, from ``acq_time`` or age."""
+    confidence: toml.OpenFraction = 0.95
+    """Coverage of two-sided confidence limits, fraction."""
+
+
+class MultiplicitySettings(toml.SettingsTable):
+    """How many tests are allowed for."""
+
+    method: Correction = "fdr2"
+    """``fdr2`` (two-stage false discovery rate, Benjamini, Krieger and Yekutieli 2006; the
+    paper's), ``bh`` (Benjamini and Hochberg 1995), or family-wise error by permutation:
+    ``permutation-tfce`` (threshold-free cluster enhancement) or ``permutation-max`` (largest t)."""
+    scope: Literal["map", "hemispheres"] = "map"
+    """What is one family: each ``map`` (measure, contrast and hemisphere), or both ``hemispheres``
+    together."""
+    alpha: toml.OpenFraction = 0.05
+    """False discovery rate, or family-wise error rate of permutation tests."""
+    permutations: AtLeastTwo = 5000
+    """Permutations, the unpermuted data included."""
+    seed: NonNegativeInt = 0
+    """Of the permutations."""
+    blocks: str = ""
+    """Column whose levels participants are permuted within, as of sites; empty is all."""
+    visits: Literal["auto", "whole", "within", "flip"] = "auto"
+    """What is permuted of repeated visits: ``whole`` participants with all their visits, where they
+    have as many; visits ``within`` participants; or signs that ``flip``, of all visits of a
+    participant together. ``auto`` chooses by the contrast."""
+    neighbors: Literal[4, 8] = 8
+    """Neighbors of a point on the sheet, 4 or 8."""
+
+
+class JointSettings(toml.SettingsTable):
+    """Tests of several measures together, by permutation (non-parametric combination)."""
+
+    measures: toml.Texts = ()
+    """Maps that are tested together at each point; empty is no such test."""
+    combine: Literal["fisher", "tippett"] = "fisher"
+    """``fisher`` adds up the evidence of all measures, ``tippett`` takes the strongest (Winkler et
+    al. 2016)."""
+    sides: bool = False
+    """Whether the left and the right map of a measure are combined too, point by point."""
+
+
+class HarmonizationSettings(toml.SettingsTable):
+    """ComBat: effects of sites or scanners, taken out of maps and summary measures."""
+
+    column: str = ""
+    """Column whose levels are harmonized, as ``site``; empty is none."""
+    least_participants: Annotated[int, Field(ge=3)] = 10
+    """Sites with fewer participants are refused: the mean of ten is known to a third of an SD."""
+    explained: toml.OpenFraction = 0.8
+    """A note names columns of the model of whose variance sites explain more than this."""
+    pooling: bool = True
+    """Points of a map inform each other about a site (empirical Bayes); summary measures never
+    do."""
+
+
+class AsymmetrySettings(toml.SettingsTable):
+    """Differences between left and right."""
+
+    relative: toml.Texts = ("thickness",)
+    """Maps, of positive measures, whose difference is taken over the mean of both sides; that of
+    others is in their own unit."""
+
+
+class ShapeSettings(toml.SettingsTable):
+    """Average surfaces; no statistic depends on them."""
+
+    most: PositiveInt = 500
+    """Sheets per hemisphere that are averaged, spread evenly over all; bounds time and memory."""
+
+
+class ClassificationSettings(toml.SettingsTable):
+    """Logistic models and how well they tell groups apart."""
+
+    base: toml.Texts = ("volume",)
+    """Summary measures and covariates of the base model."""
+    added: toml.Texts = (
+        "thickness_mean",
+        "extent_x",
+        "extent_y",
+        "circumference_mean",
+        "interior_exterior_ratio_mean",
+        "area_interior",
+        "area_mid",
+        "area_exterior",
+        "shape_index_mean",
+        "curvature_mean",
+    )
+    """Summary measures that are added to it, each by itself, where they were measured."""
+    confidence: toml.OpenFraction = 0.95
+    """Coverage of two-sided confidence limits, fraction."""
+    folds: AtLeastTwo = 10
+    """Folds of the cross-validation, or as many as the smaller group has members."""
+    repeats: PositiveInt = 20
+    """Repetitions of the cross-validation."""
+    seed: NonNegativeInt = 0
+    """Of the cross-validation."""
+    least_calibrated: AtLeastTwo = 100
+    """Calibration is judged where both groups have this many: a rule of thumb, below which its
+    curve and slope are too uncertain (Snell et al. 2021)."""
+
+
+class RetestSettings(toml.SettingsTable):
+    """Agreement of repeated sessions."""
+
+    confidence: toml.OpenFraction = 0.95
+    """Coverage of two-sided confidence limits, fraction."""
+    min_participants: Annotated[int, Field(ge=3)] = 5
+    """Fewer participants with all sessions are too few, also at a point."""
+
+
+class PowerSettings(toml.SettingsTable):
+    """Participants that a trial of two arms of equal size needs."""
+
+    power: toml.OpenFraction = 0.8
+    """Chance to find the effect."""
+    dropout: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    """Share of those enrolled that has left before the last visit, at a constant hazard; the visits
+    before are in the mixed model of several visits."""
+    alpha: toml.OpenFraction = 0.05
+    """Two-sided level of the test of a summary measure, one of which is the end point. Maps hold
+    the false discovery rate ``multiplicity.alpha``."""
+    affected: toml.OpenFraction = 0.1
+    """Share of the points of a map that differ, as it decides on the level at each of them."""
+    months_per_time: PositiveFloat = 12.0
+    """Months per unit of a column of time that is not called years, months or days."""
+
+
+class NormSettings(toml.SettingsTable):
+    """Norms of a reference cohort, and scores of new people."""
+
+    age: str = "age"
+    """Column of age, in years."""
+    sex: str = "sex"
+    """Column of sex."""
+    site: str = "site"
+    """Column of the site or scanner; its values are names."""
+    knots: Annotated[int, Field(ge=3)] = 5
+    """Knots of the natural cubic spline of age, at equal shares of the participants."""
+    edge: Annotated[int, Field(ge=3)] = 5
+    """Norms reach from the age that has this place from below to that from above, rounded to years
+    outward, so that they tell the age of no single person."""
+    least_participants: Annotated[int, Field(ge=50)] = 100
+    """Smaller reference cohorts are refused."""
+    least_site: Annotated[int, Field(ge=10)] = 15
+    """Participants that a site of the reference needs; a point needs half as many with a value."""
+    least_controls: Annotated[int, Field(ge=25)] = 25
+    """Controls that a new site needs; a point needs half as many with a value."""
+    seed: NonNegativeInt = 0
+    """Of the folds."""
+    charts: toml.Texts = ("thickness_mean", "volume", "curvature_mean", "area_mid", "extent_y")
+    """Summary measures that get a chart."""
+
+
+class ExchangeSettings(toml.SettingsTable):
+    """What a summary for other sites may say."""
+
+    min_cell: Annotated[int, Field(ge=3)] = 5
+    """Fewest participants in a group, a level of a factor, or a cell of two factors."""
+    min_residual_df: PositiveInt = 10
+    """Fewest participants beyond the columns of the model."""
+    max_leverage: toml.OpenFraction = 0.5
+    """Largest share of a fitted value that comes from one participant's own value."""
+
+
+class MetaSettings(toml.SettingsTable):
+    """Summaries of several sites become one result."""
+
+    model: Literal["joint", "two-stage"] = "joint"
+    """``joint``: the model of all participants with a constant per site, from the sites'
+    coefficients and their covariances (Becker and Wu 2007); ``two-stage``: the mean of the sites'
+    estimates, each with its own residual variance and slopes of covariates."""
+    random: Literal["reml", "dl"] = "reml"
+    """Variance between sites: ``reml`` (restricted maximum likelihood, with t tests; in two stages
+    those of Knapp and Hartung 2003, with no standard error below that without their correction) or
+    ``dl`` (DerSimonian and Laird 1986, in two stages with normal tests)."""
+    min_sites: Annotated[int, Field(ge=2)] = 2
+    """Fewest sites with an estimate at a point."""
+    confidence: toml.OpenFraction = 0.95
+    """Coverage of two-sided confidence and prediction limits, fraction."""
+
+
+class GroupSettings(toml.SettingsTable):
+    """All settings of the group level."""
+
+    registration: RegistrationSettings = RegistrationSettings()
+    model: DefaultModelSettings = DefaultModelSettings()
+    design: DesignSettings = DesignSettings()
+    glm: GlmSettings = GlmSettings()
+    longitudinal: LongitudinalSettings = LongitudinalSettings()
+    harmonization: HarmonizationSettings = HarmonizationSettings()
+    asymmetry: AsymmetrySettings = AsymmetrySettings()
+    multiplicity: MultiplicitySettings = MultiplicitySettings()
+    joint: JointSettings = JointSettings()
+    shapes: ShapeSettings = ShapeSettings()
+    classification: ClassificationSettings = ClassificationSettings()
+    retest: RetestSettings = RetestSettings()
+    power: PowerSettings = PowerSettings()
+    norms: NormSettings = NormSettings()
+    exchange: ExchangeSettings = ExchangeSettings()
+    meta: MetaSettings = MetaSettings()
+
+
+def load_group_settings(path: Path | None) -> GroupSettings:
+    """Read settings of the group level; see :func:`hipsta_bids.settings.load_settings`."""
+    return toml.read_settings(path, GroupSettings)

@@ -1,0 +1,1 @@
+"""Tables, figures, texts and files of results."""

@@ -1,0 +1,181 @@
+"""Columns of the tables of tests: places of points, tests, effects, clusters and peaks."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from hipsta_bids.group.cohort.data import Cohort
+from hipsta_bids.group.stats.arrays import Bool, Float, Int
+from hipsta_bids.group.stats.clusters import label_regions
+from hipsta_bids.group.stats.glm import FittedMaps, PointTest
+from hipsta_bids.io.files import MISSING
+from hipsta_bids.reports.display import parts_of
+
+if TYPE_CHECKING:
+    from hipsta_bids.group.stats.inference import Discoveries, MapKey
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """Where the points of a map are."""
+
+    number: Mapping[str, Int]
+    """By column: ``node_x`` and ``node_y`` on the sheet, from 1; ``vertex`` on a mesh, from 0."""
+    position: Mapping[str, NDArray[Any]]
+    """By column: ``x`` (medial to lateral) and ``y`` (posterior to anterior) on the sheet, in the
+    body -1..1, and ``part`` where there is more than the body; ``surface_x``, ``surface_y`` and
+    ``surface_z`` on a mesh."""
+    subfield: NDArray[np.str_]
+    """(points,) names."""
+
+    @property
+    def columns(self) -> dict[str, Any]:
+        """Columns of tables of points."""
+        return {**self.number, **self.position, "subfield": self.subfield}
+
+    def at(self, point: int) -> dict[str, Any]:
+        """Say where a point is, in tables of peaks; a node of the sheet by its coordinates."""
+        number = self.number if "vertex" in self.number else {}
+        where = {**number, **self.position, "subfield": self.subfield}
+        return {name: values[point] for name, values in where.items()}
+
+    @classmethod
+    def of_sheet(cls, x: Float, y: Float, subfield: NDArray[np.str_]) -> "Frame":
+        """Points of a grid; ``subfield`` (x, y)."""
+        i, j = np.indices(subfield.shape).reshape(2, -1)
+        parts = parts_of(y)
+        position = {"x": x[i], "y": y[j]} | ({} if parts is None else {"part": parts[j]})
+        return cls({"node_x": i + 1, "node_y": j + 1}, position, subfield.ravel())
+
+
+def frame_of(cohort: Cohort, one: FittedMaps) -> Frame:
+    """Locate points, and name the subfield in which most participants have them."""
+    subfield = np.array([*one.maps.names, MISSING])[one.subfield]
+    if (mesh := one.maps.mesh) is None:
+        return Frame.of_sheet(cohort.x, cohort.y, subfield)
+    position = {f"surface_{axis}": mesh.points[:, i] for i, axis in enumerate("xyz")}
+    return Frame({"vertex": np.arange(len(mesh.points))}, position, subfield.ravel())
+
+
+def test_columns(test: PointTest) -> dict[str, Float]:
+    """Columns of a test in tables of points; of an F test without estimate."""
+    none = np.full(test.p.shape, np.nan)
+    single = test.kind == "t"
+    return {
+        "estimate": test.estimate[0] if single else none,
+        "se": test.se[0] if single else none,
+        "statistic": test.statistic,
+        "df": test.df,
+        "p": test.p,
+    }
+
+
+def effect_columns(test: PointTest) -> dict[str, str | Float]:
+    """Columns of the effect size: Cohen's d for t, else partial eta squared."""
+    single = test.kind == "t"
+    limits = test.cohen_d_limits if single else test.eta_squared_limits
+    return {
+        "effect": "cohen_d" if single else "partial_eta_squared",
+        "effect_size": test.effect,
+        "effect_low": limits[0],
+        "effect_high": limits[1],
+    }
+
+
+def point_columns(test: PointTest, found: "Discoveries", frame: Frame, n: Int) -> dict[str, object]:
+    """Columns of a map of statistics, with the participants (points,) of each point."""
+    return {
+        **frame.columns,
+        "n": n,
+        **test_columns(test),
+        "p_corrected": found.adjusted,
+        "significant": found.rejected,
+        "cohen_d": test.cohen_d,
+        "cohen_d_low": test.cohen_d_limits[0],
+        "cohen_d_high": test.cohen_d_limits[1],
+        "eta_squared": test.eta_squared,
+        "eta_squared_low": test.eta_squared_limits[0],
+        "eta_squared_high": test.eta_squared_limits[1],
+    }
+
+
+def overview_row(name: str, key: "MapKey", found: "Discoveries") -> dict[str, object]:
+    """Say of a map in the file ``name`` how many points survive, and at which p."""
+    return {
+        "measure": key.measure,
+        "contrast": key.contrast,
+        "hemi": key.hemi,
+        "file": name,
+        "n_tests": found.n_tests,
+        "n_significant": int(found.rejected.sum()),
+        "p_cutoff": found.cutoff,
+        "lenient": found.lenient,
+    }
+
+
+def peak_table(test: PointTest, found: "Discoveries", frame: Frame, edges: Int) -> pd.DataFrame:
+    """List the peak of each significant cluster, largest first; of the whole map if there is none.
+
+    Effect sizes are Cohen's d for t, else partial eta squared.
+    """
+    values = {**test_columns(test), "p_corrected": found.adjusted.ravel(), **effect_columns(test)}
+    del values["estimate"], values["se"]
+    return pd.DataFrame(
+        [
+            {
+                "contrast": test.contrast.name,
+                "test": test.kind,
+                **frame.at(one.peak),
+                **{
+                    name: own if isinstance(own, str) else own[one.peak]
+                    for name, own in values.items()
+                },
+                **one.columns,
+            }
+            for one in find_clusters(found.rejected.ravel(), test.statistic, frame.subfield, edges)
+        ]
+    )
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Adjacent points that survive, with effects of one sign."""
+
+    extent: int
+    """Points."""
+    peak: int
+    """Point with the largest statistic."""
+    shares: Mapping[str, float]
+    """Fraction of the points in each subfield."""
+
+    @property
+    def columns(self) -> dict[str, object]:
+        """Columns of tables of peaks."""
+        shares = (f"{name} {share:.0%}" for name, share in self.shares.items())
+        return {"extent": self.extent, "shares": "; ".join(shares)}
+
+
+def find_clusters(
+    significant: Bool, statistic: Float, subfield: NDArray[np.str_], edges: Int
+) -> list[Cluster]:
+    """Find connected regions of one sign among points, largest first.
+
+    Without any, the peak of the whole map, if it has one, is a cluster of no points.
+    """
+    clusters = []
+    for sign in (1, -1):
+        labels, count = label_regions(significant & (sign * statistic > 0), edges)
+        for number in range(1, count + 1):
+            members = np.flatnonzero(labels == number)
+            peak = int(members[np.argmax(np.abs(statistic[members]))])
+            own = subfield[members]
+            names, counts = np.unique(own[own != MISSING], return_counts=True)
+            shares = dict(zip(names.tolist(), (counts / len(members)).tolist(), strict=True))
+            clusters.append(Cluster(len(members), peak, shares))
+    if not clusters and np.isfinite(statistic).any():
+        return [Cluster(0, int(np.nanargmax(np.abs(statistic))), {})]
+    return sorted(clusters, key=lambda cluster: -cluster.extent)

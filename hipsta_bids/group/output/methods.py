@@ -1,0 +1,528 @@
+"""A methods and results paragraph with the numbers of one analysis filled in."""
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+
+from hipsta_bids import __version__
+from hipsta_bids.derivatives.dataset import references
+from hipsta_bids.group.cohort.data import Cohort
+from hipsta_bids.group.cohort.read import LEAST_SHARE
+from hipsta_bids.group.design.settings import (
+    GroupSettings,
+    MultiplicitySettings,
+    RetestSettings,
+)
+from hipsta_bids.group.output.results import Analysis, RetestCohort, Scores
+from hipsta_bids.group.output.saved import NormsFile
+from hipsta_bids.group.stats.clusters import TFCE_EXTENT, TFCE_HEIGHT
+from hipsta_bids.group.stats.exchangeability import exchange_text
+from hipsta_bids.group.stats.inference import PERMUTATIONS, control_fdr, row_blocks
+from hipsta_bids.group.stats.norms import CENTILE_FOLDS, LEVELS, SHAPE_LEVEL
+from hipsta_bids.group.stats.trials import THINNING, TrialEffect, point_level
+from hipsta_bids.protocols import EXPERIMENTAL
+from hipsta_bids.types import PARTICIPANT
+
+#: Level at which slopes are said to differ.
+_LEVEL = 0.05
+
+#: What was measured, by region.
+_MEASURED = {
+    "body": "the hippocampus",
+    "extended": "the hippocampus and the neighboring cortex",
+    "entorhinal": "the cortex beside the hippocampus",
+    "headbody": "the head and the body of the hippocampus on one sheet (experimental)",
+    "whole": "the whole hippocampus on one sheet (experimental)",
+}
+
+_FAMILIES = {"map": "each map", "hemispheres": "both hemispheres together"}
+#: Procedures that hold false discovery rates.
+PROCEDURES: Mapping[str, str] = {
+    "bh": "the procedure of Benjamini and Hochberg",
+    "fdr2": "the two-stage procedure of Benjamini, Krieger and Yekutieli",
+}
+
+
+class Citations:
+    """Numbers works in the order in which a text names them."""
+
+    def __init__(self) -> None:
+        self._keys: list[str] = []
+
+    def __call__(self, key: str) -> str:
+        """Return the number of a work in brackets."""
+        if key not in self._keys:
+            self._keys.append(key)
+        return f"[{self._keys.index(key) + 1}]"
+
+    def page(self, paragraphs: Sequence[str], region: str = "body") -> str:
+        """Return the text with its references; the first paragraph says what was measured."""
+        what = _MEASURED["body"]
+        first = paragraphs[0].replace(what, _MEASURED.get(region, what), 1)
+        known = references()
+        works = "\n".join(f"{i}. {known[key]}" for i, key in enumerate(self._keys, start=1))
+        use = "This text may be used freely, as it stands or changed."
+        parts = ["# Methods and findings", use, first, *paragraphs[1:], "# References", works]
+        return "\n\n".join(parts) + "\n"
+
+
+def methods_text(
+    cohort: Cohort,
+    analysis: Analysis,
+    settings: GroupSettings,
+    n_out: int,
+    *,
+    others: Sequence[str] = (),
+    region: str = "body",
+    ratings: Mapping[str, int] | None = None,
+) -> str:
+    """Word what was done and what came out."""
+    cite = Citations()
+    paragraphs = [_sample(cohort, analysis, n_out, cite("method"), others)]
+    if ratings is not None:
+        counts = ", ".join(f"{n} {rating}" for rating, n in ratings.items())
+        paragraphs[0] += (
+            f" Hemispheres were rated on their report pages ({counts}); those rated exclude were"
+            " left out."
+        )
+    aligned = [_registration(analysis, settings, cite)] if analysis.sides else []
+    if others:
+        aligned.append(
+            f"Maps of other programs ({', '.join(others)}) were taken as they are, point by point,"
+            " without registration."
+        )
+    if aligned:
+        paragraphs.append(" ".join(aligned))
+    if region in EXPERIMENTAL and analysis.fitted:
+        paragraphs.append(_rims(analysis))
+    paragraphs += _harmonization(analysis, cite)
+    paragraphs.append(_models(analysis, settings, cite))
+    paragraphs += [_joint(settings, cite)] if settings.joint.measures else []
+    if analysis.comparison.asymmetry:
+        paragraphs.append(_asymmetry(analysis, settings, cite))
+    if analysis.scores is not None:
+        paragraphs.append(_normative(analysis.scores, settings, cite("normative")))
+    if analysis.pairs:
+        paragraphs.append(_classification(analysis, settings, cite))
+    if analysis.found:
+        paragraphs.append(_findings(analysis))
+    if analysis.skipped:
+        paragraphs.append("\n".join(["Left out:", "", *(f"- {one}" for one in analysis.skipped)]))
+    return cite.page(paragraphs, region)
+
+
+def _sample(
+    cohort: Cohort, analysis: Analysis, n_out: int, method: str, others: Sequence[str]
+) -> str:
+    rows = analysis.design.rows
+    table = analysis.compared.table.iloc[rows]
+    people = cohort.table[PARTICIPANT].nunique()
+    visits = f" ({len(cohort.table)} visits)" if len(cohort.table) > people else ""
+    names = [name.replace("_", " ") for name in (*analysis.measured.maps, *others)]
+    maps = ", ".join(f"map of {name}" for name in names) or "summaries"
+    text = (
+        f"Measures of the hippocampus {method} ({maps}) of"
+        f" {people} participants{visits} were analyzed with hipsta_bids {__version__};"
+        f" {analysis.n_participants} had all variables of the model"
+    )
+    if analysis.groups is not None:
+        members = table[analysis.groups.column][~table[PARTICIPANT].duplicated()]
+        counts = Counter(members.dropna().astype(str))
+        text += f" ({', '.join(f'{counts[g]} {g}' for g in analysis.groups.levels)})"
+    if sheets := ", ".join(f"{len(one.used)} {hemi}" for hemi, one in analysis.fitted.items()):
+        text += f", with hemispheres {sheets}"
+    return f"{text}. {n_out} hemispheres or visits were left out; the table of exclusions says why."
+
+
+def _registration(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], str]) -> str:
+    how = settings.registration
+    if how.align == "none":
+        return "Maps were not registered to each other."
+    method = f"alternating fits of a template and of monotone B-spline warps {cite('registr')}"
+    if how.align == "penalized":
+        method += ", with a penalty on local stretch that was estimated from the data"
+    shares = "; ".join(
+        f"{hemi}: {side.registration.explained_before:.0%} to"
+        f" {side.registration.explained_after:.0%}"
+        for hemi, side in analysis.sides.items()
+    )
+    extreme = sum(int(side.registration.extreme.sum()) for side in analysis.sides.values())
+    own = ", each less its mean and over its standard deviation," if how.standardize else ""
+    groups = "; ".join(
+        f"{hemi}: {side.difference.largest:.2f} nodes, p = {side.difference.p:.2g}"
+        for hemi, side in analysis.sides.items()
+        if side.difference is not None
+    )
+    moved = (
+        " The largest difference of mean displacement between groups, with its p-value corrected"
+        f" for all positions by {how.group_permutations} permutations of participants, was"
+        f" {groups}."
+        if groups
+        else ""
+    )
+    return (
+        f"Curvature profiles from medial to lateral (means from posterior to anterior){own} were"
+        f" registered by {method}, and the warps were applied to all maps. The share of the"
+        f" variance of the profiles that their mean explains went from {shares}.{moved}"
+        f" Warps out of line with the others: {extreme}."
+    )
+
+
+def _rims(analysis: Analysis) -> str:
+    """Say how points are handled that some participants lack."""
+    fits = [fit for one in analysis.fitted.values() for fit in one.fits.values()]
+    n = np.concatenate([fit.n[np.isfinite(fit.tests[0].p)] for fit in fits])
+    span = f" ({n.min()} to {n.max()} per point)" if len(n) else ""
+    return (
+        "Sheets have no values within 1 mm of edges, ends and filled holes, which differ between"
+        f" participants; points that fewer than {LEAST_SHARE:.0%} have were left out. None was"
+        f" imputed: a point was tested by those who have a value{span}. Profiles for registration"
+        " are means of known values, interpolated where a whole position has none."
+    )
+
+
+def _harmonization(analysis: Analysis, cite: Callable[[str], str]) -> list[str]:
+    done = analysis.harmonization
+    if done is None:
+        return []
+    plan = done.plan
+    counts = ", ".join(f"{site} {n}" for site, n in plan.counts.items())
+    sources = f"{cite('johnson')}, {cite('combat')}"
+    kept = f"`{plan.kept.formula}`" if plan.kept.names else "no variable"
+    if plan.icv is not None:
+        kept += f", for volumes also {plan.icv}"
+    text = (
+        f"Effects of {plan.column} ({counts} participants) were taken out of"
+        f"{' the registered' if analysis.sides else ''} maps and summary measures by ComBat"
+        f" {sources}: at each point, a shift and a scale of the residuals of a linear model that"
+        f" keeps {kept}. The two were pooled over the points of a map by empirical Bayes, and"
+        " estimated for each summary measure by itself; missing values were left out point by"
+        " point."
+    )
+    if plan.visits.participant is not None:
+        text += (
+            " Participants had random intercepts, which were kept, so that the scale is that of"
+            f" differences within participants {cite('beer')}."
+        )
+    if plan.saved is not None:
+        known = sum(site in plan.saved.sites for site in plan.counts)
+        text += f" Parameters of {known} of these were those of an earlier analysis"
+        text += f"; those of {', '.join(plan.estimated)} were new." if plan.estimated else "."
+    if plan.estimated and not analysis.comparison.pair:
+        lost = len(plan.counts) - 1
+        text += (
+            f" As the shifts were estimated from the same participants, {plan.column} is also a"
+            f" factor of the model, which has {lost} degree{'s' if lost > 1 else ''} of freedom"
+            f" less: without, tests would reject too often {cite('nygaard')}."
+        )
+    if analysis.pairs and analysis.groups and done.leaks(analysis.groups.column):
+        text += (
+            " Classifiers were given the measures before harmonization, since parameters that"
+            " were estimated with the groups known would tell something about who is left out."
+        )
+    return [text]
+
+
+def _models(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], str]) -> str:
+    names = ", ".join(contrast.name for contrast in analysis.design.contrasts)
+    levels = ", ".join(f"{name} {level}" for name, level in analysis.design.references.items())
+    errors = " with HC3 standard errors" if settings.glm.covariance == "hc3" else ""
+    kind, what, d = "linear model", "", "estimate over residual standard deviation"
+    if settings.glm.weights != "none":
+        errors = (
+            " by weighted least squares, with weights 1 / (variance between participants + squared"
+            f" standard deviation of the measurement), the former estimated by moments"
+            f" {cite('moments')}, and HC3 standard errors"
+        )
+    if analysis.comparison.pair:
+        first, second = analysis.comparison.pair
+        what = f" to the change from {first} to {second}, with the covariates of {first}"
+    if analysis.comparison.longitudinal:
+        visits = analysis.row_model.visits
+        own = "intercepts and slopes" if visits is not None and visits.slopes else "intercepts"
+        kind = f"linear mixed model with {own} of participants"
+        errors = (
+            " by restricted maximum likelihood, with Satterthwaite's degrees of freedom"
+            f" {cite('mixed')}{_slopes(analysis, cite)}"
+        )
+        d = "estimate over the standard deviation of single visits"
+    corrected = _correction(settings.multiplicity, cite, analysis)
+    adjusted = any(one.formula != analysis.model.formula for one in analysis.measures)
+    volumes = ", volumes also with intracranial volume" if adjusted else ""
+    return (
+        f"At each point of the sheet a {kind} `{analysis.model.formula}` was fitted{what}{errors}"
+        f" (reference levels: {levels or 'none'}); contrasts: {names}."
+        f" {corrected} Effect sizes are"
+        f" Cohen's d ({d}) or partial eta squared, with"
+        f" {settings.glm.confidence:.0%} confidence limits from non-central distributions. Summary"
+        f" measures were tested in the same model{volumes}; their"
+        " false discovery rate was held over all measures, sides and models of a contrast."
+        f"{_nonlinear(analysis, settings)}"
+    )
+
+
+def _slopes(analysis: Analysis, cite: Callable[[str], str]) -> str:
+    """Say at how many points slopes vary, and where they could not be told from none."""
+    fits = [fit for one in analysis.fitted.values() for fit in one.fits.values()]
+    p = np.concatenate([fit.slopes_p for fit in fits if fit.slopes_p is not None] or [np.empty(0)])
+    tested = int(np.isfinite(p).sum())
+    if not tested:
+        return ""
+    return (
+        f". Slopes differed between participants at {np.sum(p < _LEVEL) / tested:.0%} of the points"
+        f" (p < {_LEVEL:g}, uncorrected; ratio of restricted likelihoods against an equal mixture"
+        f" of chi squared with 1 and 2 degrees of freedom {cite('mixture')}), and were left out of"
+        f" the model at {np.sum(p == 1) / tested:.0%}, where their variance was zero"
+    )
+
+
+def _nonlinear(analysis: Analysis, settings: GroupSettings) -> str:
+    """Say how age was modeled, and in how many summary measures it bends."""
+    names = [one.name for one in analysis.design.contrasts if one.name.endswith(" nonlinear")]
+    if not names or settings.model.age == "linear":
+        return ""
+    how = "its square" if settings.model.age == "quadratic" else "a natural cubic spline"
+    p = [
+        test.p for one in analysis.measures for test in one.fit.tests if test.contrast.name in names
+    ]
+    found = control_fdr(np.concatenate(p or [np.empty(0)]), settings.multiplicity.alpha)
+    return (
+        f" Age was in the model with {how}; the contrast {names[0]} tests whether that differs from"
+        f" a line, as it did in {int(found.rejected.sum())} of {found.n_tests} tests of summary"
+        " measures (false discovery rate)."
+    )
+
+
+def _correction(how: MultiplicitySettings, cite: Callable[[str], str], analysis: Analysis) -> str:
+    family = _FAMILIES[how.scope]
+    if how.method in PERMUTATIONS:
+        statistic = "the largest absolute statistic"
+        if how.method == "permutation-tfce":
+            statistic = (
+                f"the largest threshold-free cluster enhancement {cite('tfce')} (extent"
+                f" {TFCE_EXTENT:g}, height {TFCE_HEIGHT:g})"
+            )
+        inside = f" within levels of {how.blocks}" if how.blocks else ""
+        shuffled = (
+            "the residuals of the model without the contrast (Freedman and Lane's; of signs, where"
+            " a mean was tested"
+        )
+        visits, end = analysis.row_model.visits, ""
+        if visits is not None:
+            shuffled = (
+                "the residuals of the linear model without the contrast (Freedman and Lane's;"
+                f" repeated visits {cite('repeated')}"
+            )
+            design = analysis.design
+            blocks = row_blocks(analysis.row_model, analysis.compared.table, how)
+            visits = replace(visits, blocks=blocks)
+            end = exchange_text(design.matrix, design.contrasts, visits, how.visits)
+        return (
+            f"The family-wise error rate was held at {how.alpha:g} by {statistic} in"
+            f" {how.permutations} permutations{inside} of {shuffled}; seed"
+            f" {how.seed}) {cite('permutation')}, for {family}.{end}"
+        )
+    return f"{discovery_text(how, cite)}."
+
+
+def discovery_text(how: MultiplicitySettings, cite: Callable[[str], str]) -> str:
+    """Word how the false discovery rate was held."""
+    return (
+        f"The false discovery rate was held at {how.alpha:g} by {PROCEDURES[how.method]}"
+        f" {cite(how.method)}, for {_FAMILIES[how.scope]}"
+    )
+
+
+def _joint(settings: GroupSettings, cite: Callable[[str], str]) -> str:
+    how, joint = settings.multiplicity, settings.joint
+    by = (
+        "minus twice the sum of the logarithms of their two-sided p-values (Fisher)"
+        if joint.combine == "fisher"
+        else "the smallest of their two-sided p-values (Tippett)"
+    )
+    statistic = "the combined evidence"
+    if how.method == "permutation-tfce":
+        statistic = f"its threshold-free cluster enhancement {cite('tfce')}"
+    family = "" if joint.sides else " of each side" if how.scope == "map" else " of both sides"
+    names = " and ".join(name.replace("_", " ") for name in joint.measures)
+    return (
+        f"Maps of {names}{', of the left and the right side,' if joint.sides else ''} were also"
+        f" tested together by non-parametric combination {cite('joint')}. At each point the"
+        f" evidence is {by}, as the normal quantile of its two-sided p-value for independent maps."
+        f" In each of {how.permutations} permutations of residuals (Freedman and Lane's; seed"
+        f" {how.seed}) {cite('permutation')} all maps were shuffled alike, so that their"
+        f" dependence is kept. The largest value of {statistic} in each holds the"
+        f" family-wise error rate at {how.alpha:g} over the points{family}. The null hypothesis of"
+        " a point is that none of the maps has an effect there; the effect sizes of each map say"
+        " where a finding comes from."
+    )
+
+
+def norms_text(
+    file: NormsFile,
+    *,
+    who: str,
+    coverage: pd.DataFrame | None,
+    new: Sequence[str],
+    controls: tuple[str, str] | None,
+) -> str:
+    """Word how norms were made, or how people were scored by them.
+
+    ``who`` was in it; ``coverage`` is that of norms that were made; ``new`` sites come last.
+    """
+    cite = Citations()
+    ages = f"{file.knots[0]:g} to {file.knots[-1]:g} years"
+    first = f"Measures of the hippocampus {cite('method')} of {who} were "
+    if coverage is not None:
+        first += f"taken as norms for ages of {ages} with hipsta_bids {__version__}."
+    else:
+        first += (
+            f"compared with norms of {file.participants} participants of {ages} from"
+            f" {len(file.sites) - len(new)} sites (hipsta_bids {__version__}; norms made by"
+            f" {file.version})."
+        )
+    if file.template is not None:
+        whose = "each other" if coverage is not None else "the template of the norms"
+        first += f" Sheets were registered to {whose} by curvature profiles {cite('registr')}."
+    model = (
+        f"Norms have a mean with a natural cubic spline of age ({len(file.knots)} knots) and"
+        f" constants for {'sex and ' if file.sexes else ''}site, and an SD whose logarithm is"
+        f" linear in age with a constant for each site {cite('gamlss')}, at each point and for each"
+        f" summary measure. Where a likelihood-ratio test (p < {SHAPE_LEVEL:g}) rejected a"
+        f" normal distribution, residuals have a sinh-arcsinh distribution {cite('shash')}, as in"
+        f" {cite('warped')}. Deviations z are normal quantiles of the probability of a value, which"
+        " allows for how well shift and scale of the site are known (Student's t)."
+    )
+    paragraphs = [first, model]
+    if coverage is not None:
+        of_maps = coverage["n_points"] > 1
+        kinds = {"points of maps": coverage[of_maps], "summary measures": coverage[~of_maps]}
+        parts = []
+        for what, own in kinds.items():
+            below = [own[name].mean() for name in own.columns if name.startswith("below_")]
+            if len(own):
+                parts.append(f"{', '.join(f'{100 * one:.1f}' for one in below)} % of {what}")
+        levels = ", ".join(f"{100 * one:g}" for one in LEVELS)
+        paragraphs.append(
+            f"In {CENTILE_FOLDS}-fold cross-validation {' and '.join(parts)} lay below centiles"
+            f" {levels}."
+        )
+    if new:
+        counts = ", ".join(f"{site} ({file.sites[site]})" for site in new)
+        paragraphs.append(
+            "Shift and scale of sites without norms were estimated from their controls"
+            f" {'='.join(controls or ())}: {counts}. All else was kept."
+        )
+    return cite.page(paragraphs, file.region)
+
+
+def _asymmetry(analysis: Analysis, settings: GroupSettings, cite: Citations) -> str:
+    unit = "their own unit"
+    if (relative := settings.asymmetry.relative) and not analysis.comparison.pair:
+        ratio = f"{' and '.join(relative)} as (L - R) / ((L + R) / 2) {cite('asymmetry')}"
+        unit = f"{unit}, but of {ratio}"
+    return (
+        "Left minus right was taken at each point of the registered sheets, which are numbered"
+        f" alike on both sides, in {unit}. The contrast `mean` tests it over all participants."
+    )
+
+
+def _normative(scores: Scores, settings: GroupSettings, source: str) -> str:
+    return (
+        f"Each participant was scored against {scores.n_reference} with {scores.factor}"
+        f" {scores.level}: w is the difference from what a linear model `{scores.formula}` of these"
+        f" expects, over its residual standard deviation {source}. Members of the reference group"
+        " were scored by the model without themselves. Points count as low or high where the"
+        " two-sided p, with the uncertainty of the model, is below"
+        f" {1 - settings.glm.confidence:.2g}."
+    )
+
+
+def _classification(analysis: Analysis, settings: GroupSettings, cite: Citations) -> str:
+    how = settings.classification
+    delong, firth, snell = map(cite, ("delong", "firth", "snell"))
+    separated = sum(pair.comparison.separated for _, _, pair in analysis.pairs)
+    by_firth = (
+        f" {separated} comparisons were separated and fitted by Firth's method {firth}."
+        if separated
+        else f" No comparison was separated (else Firth's method {firth} is used)."
+    )
+    return (
+        f"Pairs of groups were told apart by logistic models of {' + '.join(how.base)}, and of the"
+        " same with one measure added; a likelihood-ratio test compares the two, on the same"
+        f" participants. Areas under the curve have DeLong intervals {delong}, and are also given"
+        f" from {how.folds}-fold stratified cross-validation repeated {how.repeats} times (seed"
+        f" {how.seed}).{by_firth} Calibration is judged where both groups have"
+        f" {how.least_calibrated} members or more {snell}."
+    )
+
+
+def _findings(analysis: Analysis) -> str:
+    parts = []
+    for key, found in analysis.found.items():
+        count = int(found.rejected.sum())
+        text = f"{key.measure}, {key.contrast}, {key.hemi}: {count} of {found.n_tests} points"
+        if count and np.isfinite(found.cutoff):
+            text += f" (p up to {found.cutoff:.2g})"
+        if found.lenient:
+            text += " - this cut-off is above the level, as happens with widespread effects"
+        parts.append(text)
+    return "Points that survive: " + "; ".join(parts) + "."
+
+
+Cite = Callable[[str], str]
+"""Numbers a work by its key."""
+
+
+def power_text(
+    effect: TrialEffect,
+    settings: GroupSettings,
+    source: Callable[[Cite], str],
+    cite: Cite,
+) -> str:
+    """Word what was asked, and how it was answered; ``source`` words what variances rest on."""
+    plan, how = settings.power, settings.multiplicity
+    months = ", ".join(f"{month:g}" for month in effect.visits)
+    question = f"{100 * effect.share:g} % of the change over time is prevented"
+    if effect.kind == THINNING:
+        question = f"the arms differ by {100 * effect.share:g} % of the mean"
+        question += f" after {effect.duration:g} months" if effect.visits else ""
+    end = "A participant's value is the end point."
+    if effect.visits:
+        end = (
+            f"The end point is the slope over visits at months {months}; its variance is that of"
+            " true slopes between participants plus the variance within participants over the sum"
+            f" of squared times {cite('ard')}."
+        )
+    lost = f", if {100 * plan.dropout:g} % drop out" if plan.dropout else ""
+    if lost and effect.visits:
+        lost += " at a constant hazard and are analyzed with the visits before"
+    return (
+        f"Sample sizes are those of a trial of two arms of equal size in which {question}, with a"
+        f" power of {plan.power:g}{lost}. {end} Means, changes and variances are those of"
+        f" {source(cite)}. Power is that of Student's two-sided t test (non-central t), at the"
+        f" level {plan.alpha:g} for a summary measure, without correction, since a trial has one"
+        f" primary end point. At single points the level is {point_level(settings):.2g}: at that"
+        f" level {PROCEDURES[how.method]} {cite(how.method)} holds the false discovery rate at"
+        f" {how.alpha:g} if"
+        f" {100 * plan.affected:g} % of the points of a map differ and are found with this power"
+        f" on average {cite('jung')} {cite('liu')}. Of many measures the one that needs fewest"
+        " does so partly by chance; its number is too small on average."
+    )
+
+
+def retest_text(one: RetestCohort, settings: RetestSettings, cite: Callable[[str], str]) -> str:
+    """Word how agreement was measured."""
+    return (
+        f"Agreement between {len(one.sessions)} sessions of {len(one.participants)} participants"
+        " was estimated at each point of the maps and for each summary measure. The"
+        " within-subject standard deviation is the root of the mean variance of a participant's"
+        f" values {cite('bland')}; a change beyond 1.96 √2 times this is unlikely to be measurement"
+        f" alone (minimal detectable change {cite('weir')}). The intraclass correlation is"
+        " ICC(2,1), of two-way random effects, absolute agreement and single measurements"
+        f" {cite('shrout')}, with {settings.confidence:.0%} limits {cite('mcgraw')}. It depends on"
+        " how much these participants differ; the within-subject standard deviation does not."
+    )

@@ -1,0 +1,293 @@
+"""What an analysis found: the values that tables, figures and pages are made of."""
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from hipsta_bids.group.cohort import data
+from hipsta_bids.group.design.formula import ModelSpec
+from hipsta_bids.group.design.grammar import closed_formula
+from hipsta_bids.group.design.model import Comparison, Design, Groups
+from hipsta_bids.group.output.saved import SavedEffects, templates_to_json
+from hipsta_bids.group.stats import arrays
+from hipsta_bids.group.stats.arrays import Bool, Float, Int
+from hipsta_bids.group.stats.classify import PairComparison
+from hipsta_bids.group.stats.combat import ARRAYS, SiteEffects, SiteMoments, Visits
+from hipsta_bids.group.stats.glm import FittedMaps, PointTest, PointwiseFit, RowModel
+from hipsta_bids.group.stats.inference import Discoveries, MapKey
+from hipsta_bids.group.stats.norms import NormativeScores
+from hipsta_bids.group.stats.registration import (
+    GroupShift,
+    Registration,
+    ShiftDifference,
+)
+from hipsta_bids.io.foreign import as_nested
+from hipsta_bids.types import PARTICIPANT, SESSION
+
+#: Group of all, where there are no groups.
+ALL = "all"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Kept:
+    """Columns whose effects are kept."""
+
+    matrix: Float
+    """(visits, columns) without an intercept; NaN where a variable is missing."""
+    names: tuple[str, ...]
+    formula: str
+    levels: Mapping[str, Sequence[str]]
+    portable: bool = True
+    """Whether the columns of other people can be made from the formula."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SitePlan:
+    """What is taken out, and what is kept."""
+
+    column: str
+    sites: tuple[str, ...]
+    """Known ones of a file first."""
+    estimated: tuple[str, ...]
+    """Sites whose effects are estimated from this cohort."""
+    counts: Mapping[str, int]
+    """Participants by site whose visits are harmonized."""
+    visits: Visits
+    """Rows of the cohort's table."""
+    kept: Kept
+    icv: str | None
+    """Column that volumes keep besides."""
+    icv_values: Float
+    """(visits,) NaN where not known or not used."""
+    explained: Mapping[str, float]
+    """Share of the variance of each column that sites explain."""
+    saved: SavedEffects | None
+    lost: int
+    """Visits without a site or a variable that is kept."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Harmonization:
+    """Effects of sites on all maps and summary measures of a cohort."""
+
+    plan: SitePlan
+    cohort: data.Cohort
+    """Visits after it."""
+    maps: Mapping[tuple[str, str], tuple[SiteEffects, SiteMoments]]
+    """By hemisphere and measure."""
+    summaries: Mapping[tuple[str, str], tuple[SiteEffects, SiteMoments]]
+    """By hemisphere and measure, each a single point."""
+    notes: tuple[str, ...]
+    """What to know, one line each."""
+
+    def leaks(self, groups: str) -> bool:
+        """Tell whether values of participants depend on their groups.
+
+        A classifier has to tell the groups of people whose groups are not known, so that it
+        cannot have them among what is kept, nor sites that were estimated with them.
+        """
+        return bool(self.plan.estimated) or groups in closed_formula(self.plan.kept.formula).names
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScoredMaps:
+    """Scores of one hemisphere."""
+
+    rows: Int
+    """(sheets,) rows of the cohort's table."""
+    reference: NDArray[np.bool_]
+    """(sheets,) who belongs to the reference group."""
+    scores: Mapping[str, NormativeScores]
+    """By measure; points in the order of the sheet."""
+    subfield: Int
+    """(x, y) most frequent subfield, position in ``names``."""
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Scores:
+    """All scores against one reference group."""
+
+    factor: str
+    level: str
+    formula: str
+    """Covariates that are adjusted for."""
+    n_reference: int
+    sides: Mapping[str, ScoredMaps]
+    """By hemisphere; empty without maps."""
+    table: pd.DataFrame
+    """One row per participant, hemisphere and summary measure or region of a map."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MeasureFit:
+    """One model of summary measures; the points of the fit are measures."""
+
+    hemi: str
+    """``L``, ``R``, or ``LR`` for the mean of both."""
+    measures: tuple[str, ...]
+    formula: str
+    fit: PointwiseFit
+    participants: Int
+    """(measures,) with a value; the fit counts visits."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SideResult:
+    """Sheets of one hemisphere, registered."""
+
+    registration: Registration
+    registered: arrays.SideMaps
+    """Maps of all visits that were chosen."""
+    shifts: Mapping[str, GroupShift]
+    """Shifts by group; empty without groups."""
+    difference: ShiftDifference | None
+    """Between the groups, if there are groups."""
+
+
+def templates_of(sides: Mapping[str, SideResult]) -> dict[str, Any] | None:
+    """Write the templates of registration for ``template.json``; ``None`` without registration."""
+    found = {hemi: side.registration.template for hemi, side in sides.items()}
+    known = {hemi: template for hemi, template in found.items() if template is not None}
+    return templates_to_json(known) if known else None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Analysis:
+    """Results of one model."""
+
+    model: ModelSpec
+    comparison: Comparison
+    design: Design
+    groups: Groups | None
+    sides: Mapping[str, SideResult]
+    """Registered sheets by hemisphere."""
+    harmonization: Harmonization | None
+    """Effects of sites that were taken out after registration, if this was asked for."""
+    measured: data.Measures
+    """What the model was fitted to."""
+    compared: data.Cohort
+    """Rows of the model's table with registered maps; of two sessions, their differences."""
+    row_model: RowModel
+    """What was fitted to each row."""
+    fitted: Mapping[str, FittedMaps]
+    """Fitted maps by hemisphere; ``LR`` is left minus right."""
+    found: Mapping[MapKey, Discoveries]
+    unregistered: Mapping[MapKey, Discoveries]
+    """The same of maps that were not registered; empty without registration, with permutations,
+    which are too slow to do twice, and with harmonization from a file."""
+    scores: Scores | None
+    """Scores of participants against a reference group, if there is one."""
+    measures: Sequence[MeasureFit]
+    pairs: Sequence[tuple[str, str, PairComparison]]
+    """Hemisphere, added measure, and result."""
+    skipped: Sequence[str]
+    """What was left out, and why; one line each."""
+
+    @property
+    def n_participants(self) -> int:
+        """Number of participants in the model; some may have several rows."""
+        return int(self.compared.table[PARTICIPANT].iloc[self.design.rows].nunique())
+
+
+def tested_maps(analysis: Analysis) -> Iterator[tuple[MapKey, PointTest, Discoveries]]:
+    """Tests of all maps, with what survives correction."""
+    for hemi, one in analysis.fitted.items():
+        for measure, fit in one.fits.items():
+            for test in fit.tests:
+                key = MapKey(measure, test.contrast.name, hemi)
+                yield key, test, analysis.found[key]
+
+
+def rows_of(analysis: Analysis, one: FittedMaps) -> pd.DataFrame:
+    """Rows of the model's table of the sheets that were used."""
+    return analysis.compared.table.iloc[one.maps.rows[one.used]]
+
+
+def members_of(analysis: Analysis, table: pd.DataFrame) -> Mapping[str, NDArray[np.bool_]]:
+    """Tell which rows belong to each group; all to one where there are no groups."""
+    if analysis.groups is None:
+        return {ALL: np.ones(len(table), dtype=bool)}
+    names = table[analysis.groups.column]
+    return {level: (names == level).to_numpy() for level in analysis.groups.levels}
+
+
+def profiles_of(maps: Mapping[str, Float], name: str, own: Bool) -> Float:
+    """(sheets, x) means over y of some sheets of a map."""
+    return np.concatenate(
+        [arrays.mean_of_known(part, 2) for part in arrays.parts_of_sheets(maps, name, own)]
+    )
+
+
+def digests(registrations: Mapping[str, Registration]) -> dict[str, str]:
+    """Digest of the template by hemisphere, or ``none`` without registration."""
+    found = {}
+    for hemi, one in registrations.items():
+        found[hemi] = "none"
+        if one.template is not None:
+            text = json.dumps(templates_to_json({hemi: one.template}), sort_keys=True)
+            found[hemi] = hashlib.sha256(text.encode()).hexdigest()
+    return found
+
+
+def harmonization_record(done: Harmonization, groups: Groups | None) -> dict[str, Any]:
+    """Record what was taken out and kept."""
+    plan = done.plan
+    return {
+        "column": plan.column,
+        "participants": dict(plan.counts),
+        "estimated": list(plan.estimated),
+        "formula": plan.kept.formula,
+        "kept": list(plan.kept.names),
+        "explained": dict(plan.explained),
+        "icv": plan.icv,
+        "repeated": plan.visits.participant is not None,
+        "classified": groups is not None and not done.leaks(groups.column),
+    }
+
+
+def effects_of(parts: Sequence[Harmonization], templates: Mapping[str, str]) -> SavedEffects | None:
+    """Collect parameters for other people; ``None`` if they have no meaning there."""
+    plan = parts[0].plan
+    if not plan.kept.portable:
+        return None
+    known = plan.saved.sites if plan.saved else {}
+    return SavedEffects(
+        column=plan.column,
+        formula=plan.kept.formula,
+        levels={name: list(known) for name, known in plan.kept.levels.items()},
+        columns=list(plan.kept.names),
+        sites={one: known.get(one, plan.counts.get(one, 0)) for one in plan.sites},
+        repeated=plan.visits.participant is not None,
+        icv=plan.icv,
+        templates=dict(templates),
+        maps=as_nested({k: found[0] for part in parts for k, found in part.maps.items()}, ARRAYS),
+        summaries=as_nested({k: found[0] for k, found in parts[0].summaries.items()}, ARRAYS),
+    )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RetestCohort:
+    """Participants who have all sessions."""
+
+    cohort: data.Cohort
+    """Their visits."""
+    participants: tuple[str, ...]
+    sessions: tuple[str, ...]
+    left_out: Mapping[str, str]
+    """By visit, what is missing."""
+
+    def arrange(self, values: Float, rows: Int) -> Float:
+        """Arrange values of visits as (participants, sessions, points); NaN where missing."""
+        visits = self.cohort.table.iloc[rows]
+        filled = np.full((len(self.participants), len(self.sessions), values.shape[1]), np.nan)
+        who = np.searchsorted(self.participants, visits[PARTICIPANT].astype(str))
+        when = np.searchsorted(self.sessions, visits[SESSION].astype(str))
+        filled[who, when] = values
+        return filled

@@ -1,0 +1,299 @@
+"""Files that later analyses use: templates, effects of sites, and norms."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+import pandas as pd
+from pydantic import AfterValidator, ConfigDict, Field, model_validator
+
+from hipsta_bids import __version__
+from hipsta_bids.errors import ModelError
+from hipsta_bids.group.design.grammar import closed_formula
+from hipsta_bids.group.stats.arrays import Key
+from hipsta_bids.group.stats.combat import ARRAYS, SiteEffects
+from hipsta_bids.group.stats.norms import LEVELS, NORM_ARRAYS, Norms, People
+from hipsta_bids.group.stats.warps import DEGREE, Template
+from hipsta_bids.io import files, foreign
+from hipsta_bids.protocols.toml import Fraction, TomlTable
+
+#: Fields of a template that are arrays, and the one that JSON has no infinity for.
+_TEMPLATE_ARRAYS, _INFINITE = ("knots", "mean", "components", "center"), "warp_variance"
+_FLAT = frozenset({"mean", "sd", "ratio"})
+
+
+class SavedEffects(TomlTable):
+    """Parameters of an analysis as a file, for other people of the same sites, or of new ones."""
+
+    model_config = ConfigDict(alias_generator=str.capitalize, validate_by_name=True)
+
+    file: Annotated[str, Field(exclude=True)] = ""
+    """Where it was read, for messages."""
+    description: str = "effects of sites on maps and summary measures (ComBat)"
+    format: Literal[1] = 1
+    version: str = __version__
+    column: str
+    formula: str
+    """What they kept."""
+    levels: dict[str, list[str]]
+    columns: list[str]
+    sites: dict[str, int]
+    """Participants by site."""
+    repeated: bool
+    """Whether participants had several visits."""
+    icv: str | None
+    """Column that volumes kept besides."""
+    templates: dict[str, str]
+    """Digest of the template of registration by hemisphere."""
+    maps: foreign.Nested
+    summaries: foreign.Nested
+    """Each is a single point."""
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        """Refuse arrays that do not fit each other."""
+        closed_formula(self.formula)
+        _ = self.effects_on_maps, self.effects_on_summaries
+        return self
+
+    @cached_property
+    def effects_on_maps(self) -> Mapping[Key, SiteEffects]:
+        """Effects by hemisphere and measure."""
+        return self._effects(self.maps)
+
+    @cached_property
+    def effects_on_summaries(self) -> Mapping[Key, SiteEffects]:
+        """Effects by hemisphere and measure."""
+        return self._effects(self.summaries)
+
+    def _effects(self, nested: foreign.Nested) -> dict[Key, SiteEffects]:
+        rows = {"slopes": {len(self.columns), len(self.columns) + (self.icv is not None)}}
+        found = {}
+        for hemi, measures in nested.items():
+            for measure, entry in measures.items():
+                try:
+                    own = {name: np.array(entry.get(name, ()), np.float64) for name in ARRAYS}
+                except (TypeError, ValueError) as error:
+                    raise ValueError(f"no numbers of {measure}, {hemi}: {error}") from error
+                points = len(own["mean"])
+                own["slopes"] = own["slopes"].reshape(-1, points)  # without columns: (0,)
+                for name, values in own.items():
+                    counts = rows.get(name, {len(self.sites)})
+                    known = {(points,)} if name in _FLAT else {(row, points) for row in counts}
+                    if values.shape not in known:
+                        raise ValueError(f"{name} of {measure}, {hemi}, has {values.shape}")
+                    if np.isinf(values).any():
+                        raise ValueError(f"{name} of {measure}, {hemi}, is infinite")
+                    if name in {"sd", "scale"} and (values <= 0).any():
+                        raise ValueError(f"{name} of {measure}, {hemi}, is not positive")
+                found[hemi, measure] = SiteEffects(**own)
+        return found
+
+
+def load_effects(path: Path) -> SavedEffects:
+    """Read ``harmonization.json``; nothing in it is run.
+
+    ModelError if it is too large, of another format, or its parts do not fit each other.
+    """
+    try:
+        return foreign.read_foreign(path, SavedEffects, most=_LARGEST).model_copy(
+            update={"file": str(path)}
+        )
+    except ValueError as error:
+        raise damaged(str(path), str(error)) from error
+
+
+def damaged(where: str, what: str) -> ModelError:
+    """Say that a file cannot be used."""
+    return ModelError(
+        f"{where}: not a file of harmonization ({what}); use the harmonization.json of another"
+        " analysis"
+    )
+
+
+#: Bytes of the largest file that is read.
+_LARGEST = 1_000_000_000
+_Age = Annotated[foreign.Number, Field(ge=-1000, le=1000)]  # charts have a row for each year
+
+
+class NormArrays(TomlTable):
+    """The arrays of :class:`Norms`; null where nothing is known."""
+
+    mean: list[foreign.Known]
+    spread: Annotated[list[foreign.Known], Field(min_length=2, max_length=2)]
+    shape: Annotated[list[foreign.Known], Field(min_length=2, max_length=2)]
+    shift: list[foreign.Known]
+    scale: list[list[Annotated[foreign.Number, Field(gt=0)] | None]]
+    n: list[list[Annotated[int, Field(ge=0)]]]
+
+
+class NormsFile(TomlTable):
+    """Norms of a reference cohort, and what new people have to agree with; sums only."""
+
+    description: foreign.Text
+    format: Literal[1]
+    hash: foreign.Text
+    """Of all else."""
+    version: foreign.Text
+    """Of hipsta_bids, at the group level."""
+    versions: list[foreign.Text]
+    """Of hipsta_bids, at the participant level."""
+    seg: foreign.Text
+    region: foreign.Text
+    settings_hash: foreign.Text
+    """Of the settings of the participant level."""
+    registration: dict[str, Any]
+    """Settings of registration."""
+    template: dict[str, Any] | None
+    """As in ``template.json``; ``None`` without registration."""
+    x: list[foreign.Number]
+    y: list[foreign.Number]
+    """Coordinates of the nodes of the sheet."""
+    age: foreign.Text
+    sex: foreign.Text
+    site: foreign.Text
+    """Columns."""
+    knots: Annotated[list[_Age], Field(min_length=3, max_length=50)]
+    """Of the spline of age; the outer ones are the range."""
+    sexes: list[foreign.Text]
+    """Levels; empty where sex was not known."""
+    sites: Annotated[dict[foreign.Text, Annotated[int, Field(ge=1)]], Field(min_length=1)]
+    """Participants by site."""
+    participants: Annotated[int, Field(ge=1)]
+    norms: dict[Literal["L", "R", "LR"], dict[foreign.Text, NormArrays]]
+    """By hemisphere and measure; summary measures are single points."""
+
+    @property
+    def middle(self) -> People:
+        """Somebody of the age of the middle knot, halfway between the sexes."""
+        age, n = self.knots[len(self.knots) // 2], max(len(self.sexes), 1)
+        sex = np.full((1, n - 1), 1 / n)
+        return People(age=np.array([age]), sex=sex, site=np.zeros(1, dtype=np.int64))
+
+    def centiles(self, norms: Norms) -> pd.DataFrame:
+        """List centiles of a summary measure at each year, by sex, at the average site."""
+        ages = np.arange(self.knots[0], self.knots[-1] + 1)
+        blocks = []
+        for number, sex in enumerate(self.sexes or [files.MISSING]):
+            kind = np.tile(np.eye(max(len(self.sexes), 1))[number, 1:], (len(ages), 1))
+            people = People(age=ages, sex=kind, site=np.zeros(len(ages), dtype=np.int64))
+            values = norms.centiles(people, LEVELS)[:, :, 0]
+            columns = {f"p{100 * one:g}": row for one, row in zip(LEVELS, values, strict=True)}
+            blocks.append(pd.DataFrame({"sex": sex, "age": ages, **columns}))
+        return pd.concat(blocks)
+
+    def arrays(self) -> dict[Key, Norms]:
+        """Norms by hemisphere and measure; ValueError if these do not fit, or are others."""
+        knots = np.array(self.knots, dtype=np.float64)
+        if not (np.diff(knots) > 0).all():
+            raise ValueError("knots of age do not ascend")
+        rows = {"mean": len(knots) + max(len(self.sexes) - 1, 0), "spread": 2, "shape": 2}
+        found = {}
+        for hemi, measures in self.norms.items():
+            for measure, entry in measures.items():
+                lengths = {len(row) for _, value in entry for row in value}
+                if len(lengths) != 1 or any(
+                    len(value) != rows.get(name, len(self.sites)) for name, value in entry
+                ):
+                    raise ValueError(f"numbers of {measure}, {hemi}, that do not fit each other")
+                own = {name: np.array(value, dtype=np.float64) for name, value in entry}
+                found[str(hemi), measure] = Norms(knots=knots, **{**own, "n": own["n"].astype(int)})
+        if self.hash != _digest(self.model_dump()):
+            raise ValueError("changed after it was written")
+        return found
+
+
+def save_norms(path: Path, file: NormsFile, norms: Mapping[Key, Norms]) -> None:
+    """Write norms, to be read by :func:`load_norms`."""
+    content = {**file.model_dump(), "norms": foreign.as_nested(norms, NORM_ARRAYS)}
+    files.write_json(path, {**content, "hash": _digest(content)})
+
+
+def _digest(content: Mapping[str, Any]) -> str:
+    text = json.dumps({**content, "hash": ""}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def load_norms(path: Path) -> tuple[NormsFile, dict[Key, Norms]]:
+    """Read what :func:`save_norms` wrote; nothing in it is run.
+
+    ModelError if it is too large, changed, of another format, or its parts do not fit each other.
+    """
+    try:
+        file = foreign.read_foreign(path, NormsFile, most=_LARGEST)
+        return file, file.arrays()
+    except (ValueError, RecursionError) as error:
+        raise ModelError(
+            f"{path}: not a file of norms ({error}); use the norms.json of --fit-norms"
+        ) from error
+
+
+def _rising(values: list[float]) -> list[float]:
+    if (np.diff(values) < 0).any():
+        raise ValueError("numbers that rise")
+    return values
+
+
+_Rising = Annotated[list[Fraction], Field(max_length=1000), AfterValidator(_rising)]
+
+
+def templates_to_json(templates: Mapping[str, Template]) -> dict[str, Any]:
+    """Write templates by hemisphere as a JSON object."""
+    entries = {}
+    for hemi, template in templates.items():
+        entry = {
+            name: value.tolist() if name in _TEMPLATE_ARRAYS else value
+            for name, value in asdict(template).items()
+        }
+        if not np.isfinite(template.warp_variance):
+            entry[_INFINITE] = None
+        entries[hemi] = entry
+    return {"Description": "template of curvature profiles along x", "Hemispheres": entries}
+
+
+class _SavedTemplate(TomlTable):
+    """A template in a file, which may be other people's and hold anything."""
+
+    knots: _Rising
+    mean: list[foreign.Number]
+    components: list[list[foreign.Number]]
+    noise: Annotated[foreign.Number, Field(gt=0)]
+    scale: Annotated[foreign.Number, Field(gt=0)] | None
+    align: Literal["registr", "penalized"]
+    warp_variance: Annotated[foreign.Number, Field(gt=0)] | None
+    turns: Annotated[int, Field(ge=0, le=1000)]
+    center: Annotated[_Rising, Field(min_length=2)]
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        """Refuse numbers that do not fit each other."""
+        rows = {len(row) for row in self.components}
+        sizes = {len(self.knots) + DEGREE + 1, len(self.mean), len(self.components)}
+        if len(sizes) > 1 or len(rows) != 1 or not 0 < rows.pop() <= len(self.mean):
+            raise ValueError("knots, mean and components do not fit each other")
+        if not np.allclose([self.center[0], 1 - self.center[-1]], 0):
+            raise ValueError("center does not go from 0 to 1")
+        return self
+
+
+def templates_from_json(content: Mapping[str, Any], where: str) -> dict[str, Template]:
+    """Read what :func:`templates_to_json` wrote."""
+    try:
+        found = {}
+        for hemi, entry in content["Hemispheres"].items():
+            values = dict(foreign.checked_foreign(entry, _SavedTemplate))
+            values |= {name: np.array(values[name], dtype=np.float64) for name in _TEMPLATE_ARRAYS}
+            if values[_INFINITE] is None:
+                values[_INFINITE] = np.inf
+            found[str(hemi)] = Template(**values)
+    except (KeyError, AttributeError, TypeError, ValueError) as error:
+        what = error if isinstance(error, ValueError) else "it has no Hemispheres"
+        raise ModelError(
+            f"{where}: not a template: {what}; use the template.json of another analysis"
+        ) from error
+    return found

@@ -1,0 +1,403 @@
+"""Results as tables, and the meaning of their columns."""
+
+import tomllib
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from hipsta_bids.group.cohort.data import Cohort, hemispheres, participants_with, summary_values
+from hipsta_bids.group.design.formula import file_label
+from hipsta_bids.group.design.settings import GroupSettings
+from hipsta_bids.group.output import results
+from hipsta_bids.group.output.columns import (
+    effect_columns,
+    frame_of,
+    overview_row,
+    peak_table,
+    point_columns,
+    test_columns,
+)
+from hipsta_bids.group.stats.arrays import Float, describe_known, mean_of_known
+from hipsta_bids.group.stats.classify import ClassifierResult
+from hipsta_bids.group.stats.clusters import edges_of
+from hipsta_bids.group.stats.inference import control_fdr
+from hipsta_bids.group.stats.registration import ShiftDifference
+from hipsta_bids.types import PARTICIPANT, SESSION
+
+Named = tuple[str, pd.DataFrame]
+"""File name without extension, and table."""
+Columns = Mapping[str, Any]
+CurveOf = Callable[[ClassifierResult], Columns]
+
+_MEANINGS = tomllib.loads((files("hipsta_bids.group.output") / "columns.toml").read_text("utf-8"))
+#: Meaning of every column; the unit is that of the measure unless said.
+COLUMNS: Mapping[str, str] = _MEANINGS["group"]
+#: The same of a meta-analysis.
+META_COLUMNS: Mapping[str, str] = COLUMNS | _MEANINGS["meta"]
+#: The same of measures that are tested together.
+JOINT_COLUMNS: Mapping[str, str] = COLUMNS | _MEANINGS["joint"]
+
+
+def result_tables(
+    cohort: Cohort, analysis: results.Analysis, settings: GroupSettings
+) -> Iterator[Named]:
+    """Make all tables of one model."""
+    grouped = analysis.groups is not None
+    if analysis.fitted:
+        yield "peaks", _stacked(_peaks(cohort, analysis, settings))
+        yield "means", _stacked(_means(cohort, analysis))
+    if analysis.found:
+        yield "maps", _overview(analysis)
+    if analysis.sides:
+        yield from _registration_tables(cohort, analysis)
+    yield from _sites("sites", cohort, analysis)
+    if analysis.measures:
+        yield "measures", with_fdr(_stacked(_measures(cohort, analysis)), settings)
+        if grouped:
+            yield "descriptives", _stacked(_descriptives(analysis))
+    if analysis.scores is not None and len(analysis.scores.table):
+        yield "wscores", analysis.scores.table
+    if analysis.pairs:
+        yield "classification", _classification(analysis, settings)
+        yield "roc", _stacked(_curves(analysis, _roc))
+        if any(pair.comparison.full.calibration.judged for *_, pair in analysis.pairs):
+            yield "calibration", _stacked(_curves(analysis, _calibration))
+    yield from _statistics(cohort, analysis)
+
+
+def point_tables(
+    name: str, cohort: Cohort, analysis: results.Analysis, settings: GroupSettings
+) -> Iterator[Named]:
+    """Make the tables of maps that lie on a surface of their own."""
+    yield f"{name}_peaks", _stacked(_peaks(cohort, analysis, settings))
+    if analysis.scores is not None:
+        yield f"{name}_wscores", analysis.scores.table
+    yield from _sites(f"{name}_sites", cohort, analysis)
+    yield f"{name}_means", _stacked(_means(cohort, analysis))
+    yield from _statistics(cohort, analysis)
+
+
+def design_table(analysis: results.Analysis) -> pd.DataFrame:
+    """Return the design matrix with participants and sessions."""
+    names = analysis.compared.table.iloc[analysis.design.rows][[PARTICIPANT, SESSION]]
+    matrix = pd.DataFrame(
+        analysis.design.matrix, columns=list(analysis.design.columns), index=names.index
+    )
+    return pd.concat([names, matrix], axis=1)
+
+
+def map_name(hemi: str, measure: str, contrast: str) -> str:
+    """Name the files of one map of statistics, without suffix and extension."""
+    label = file_label(contrast) or "contrast"
+    # BIDS knows L and R only: what is made of both has no hemisphere in its name.
+    side = f"hemi-{hemi}_" if hemi in {"L", "R"} else ""
+    return f"{side}contrast-{label}_desc-{entity_label(measure)}_statmap"
+
+
+def entity_label(measure: str) -> str:
+    """Write a measure as the value of an entity: ``mean_x`` as ``meanX``."""
+    return measure[:1] + file_label(measure)[1:]
+
+
+def _stacked(blocks: Iterable[Columns]) -> pd.DataFrame:
+    """Put blocks of rows under each other; single values hold for all rows of a block."""
+    return pd.concat([pd.DataFrame(block) for block in blocks], ignore_index=True)
+
+
+def _statistics(cohort: Cohort, analysis: results.Analysis) -> Iterator[Named]:
+    for key, test, found in results.tested_maps(analysis):
+        one = analysis.fitted[key.hemi]
+        columns = point_columns(test, found, frame_of(cohort, one), one.fits[key.measure].n)
+        yield map_name(key.hemi, key.measure, key.contrast), pd.DataFrame(columns)
+
+
+def _peaks(
+    cohort: Cohort, analysis: results.Analysis, settings: GroupSettings
+) -> Iterator[Columns]:
+    for key, test, found in results.tested_maps(analysis):
+        one = analysis.fitted[key.hemi]
+        edges = edges_of(one.maps, settings.multiplicity.neighbors)
+        peaks = peak_table(test, found, frame_of(cohort, one), edges)
+        yield {"measure": key.measure, "hemi": key.hemi, **peaks}
+
+
+def _means(cohort: Cohort, analysis: results.Analysis) -> Iterator[Columns]:
+    """Means and standard deviations of groups at each point of the maps that were fitted."""
+    for hemi, one in analysis.fitted.items():
+        frame = frame_of(cohort, one)
+        rows = results.rows_of(analysis, one)
+        people = rows[PARTICIPANT].to_numpy()
+        members = results.members_of(analysis, rows)
+        for measure in one.fits:
+            for group, own in members.items():
+                known, mean, sd = describe_known(one.parts(measure, own))
+                yield {
+                    "measure": measure,
+                    "unit": cohort.units.get(measure, "1"),
+                    "hemi": hemi,
+                    "group": group,
+                    **frame.number,
+                    **frame.position,
+                    "n": participants_with(known, people[own]),
+                    "mean": mean,
+                    "sd": sd,
+                }
+
+
+def _profiles(cohort: Cohort, analysis: results.Analysis) -> Iterator[Columns]:
+    for hemi, side in analysis.sides.items():
+        for registered, source in ((False, cohort.sides[hemi]), (True, side.registered)):
+            members = results.members_of(analysis, cohort.table.iloc[source.rows])
+            for measure in source.maps:
+                for group, own in members.items():
+                    values = results.profiles_of(source.maps, measure, own)
+                    known, mean, sd = describe_known([values])
+                    count = known.sum(axis=0)
+                    yield {
+                        "measure": measure,
+                        "unit": cohort.units.get(measure, "1"),
+                        "hemi": hemi,
+                        "registered": registered,
+                        "group": group,
+                        "node_x": np.arange(len(cohort.x)) + 1,
+                        "n": count,
+                        "mean": mean,
+                        "mean_se": sd / np.sqrt(np.maximum(count, 1)),
+                    }
+
+
+def _overview(analysis: results.Analysis) -> pd.DataFrame:
+    """One row per map: how many points survive, and at which p."""
+    return pd.DataFrame(
+        [
+            overview_row(map_name(key.hemi, key.measure, key.contrast), key, found)
+            for key, found in analysis.found.items()
+        ]
+    )
+
+
+def _measures(cohort: Cohort, analysis: results.Analysis) -> Iterator[Columns]:
+    for one in analysis.measures:
+        for test in one.fit.tests:
+            yield {
+                "hemi": one.hemi,
+                "measure": one.measures,
+                "unit": [cohort.units.get(name, "1") for name in one.measures],
+                "model": one.formula,
+                "contrast": test.contrast.name,
+                "test": test.kind,
+                "n": one.participants,
+                "visits": one.fit.n,
+                **test_columns(test),
+                "p_fdr": np.nan,
+                **effect_columns(test),
+            }
+
+
+def with_fdr(table: pd.DataFrame, settings: GroupSettings) -> pd.DataFrame:
+    """Correct the tests of one contrast for the number of measures, sides and models."""
+    how = settings.multiplicity
+    method = "bh" if how.method == "bh" else "fdr2"
+    for _, rows in table.groupby("contrast", sort=False):
+        found = control_fdr(rows["p"].to_numpy(dtype=np.float64), how.alpha, method)
+        table.loc[rows.index, "p_fdr"] = found.adjusted
+    return table
+
+
+def _descriptives(analysis: results.Analysis) -> Iterator[Columns]:
+    """Describe the first visit of each participant in the model."""
+    cohort = analysis.compared
+    in_model = analysis.design.rows
+    first = in_model[~cohort.table[PARTICIPANT].iloc[in_model].duplicated().to_numpy()]
+    members = results.members_of(analysis, cohort.table.iloc[first])
+    for hemi in hemispheres(cohort):
+        values = summary_values(cohort, hemi, analysis.measured.summaries)
+        values = values.iloc[first]
+        for group, rows in members.items():
+            own = values[rows]
+            yield {
+                "hemi": hemi,
+                "group": group,
+                "measure": own.columns,
+                "unit": [cohort.units.get(str(name), "1") for name in own.columns],
+                "n": own.notna().sum().to_numpy(),
+                "mean": own.mean().to_numpy(),
+                "sd": own.std().to_numpy(),
+            }
+
+
+def _registration_tables(cohort: Cohort, analysis: results.Analysis) -> Iterator[Named]:
+    yield from registration_tables(cohort, analysis.sides)
+    if analysis.unregistered:
+        yield "alignment", _alignment(analysis)
+    yield "profiles", _stacked(_profiles(cohort, analysis))
+    if analysis.groups is not None:
+        yield "shifts", _stacked(_shifts(analysis))
+
+
+def registration_tables(cohort: Cohort, sides: Mapping[str, results.SideResult]) -> Iterator[Named]:
+    """Make the tables of registration and of its warps."""
+    rows = [
+        {
+            "hemi": hemi,
+            "n": len(side.registration.warps),
+            "explained_before": side.registration.explained_before,
+            "explained_after": side.registration.explained_after,
+            "iterations": side.registration.iterations,
+            "converged": side.registration.converged,
+            **_difference(side.difference),
+        }
+        for hemi, side in sides.items()
+    ]
+    yield "registration", pd.DataFrame(rows)
+    yield "warps", _stacked(_warps(cohort, sides))
+
+
+def _difference(found: ShiftDifference | None) -> Columns:
+    if found is None:
+        return {}
+    return {"difference": found.largest, "difference_node": found.node + 1, "difference_p": found.p}
+
+
+def _alignment(analysis: results.Analysis) -> pd.DataFrame:
+    """One row per map: points that survive with and without registration."""
+    rows = []
+    for key, found in analysis.found.items():
+        other = analysis.unregistered.get(key)
+        if other is not None:
+            rows.append(
+                {
+                    "measure": key.measure,
+                    "contrast": key.contrast,
+                    "hemi": key.hemi,
+                    "n_tests": found.n_tests,
+                    "n_significant": int(found.rejected.sum()),
+                    "n_unregistered": int(other.rejected.sum()),
+                    "n_both": int((found.rejected & other.rejected).sum()),
+                }
+            )
+    return pd.DataFrame(rows)
+
+
+def _warps(cohort: Cohort, sides: Mapping[str, results.SideResult]) -> Iterator[Columns]:
+    for hemi, side in sides.items():
+        visits = cohort.table.iloc[side.registered.rows]
+        warps = side.registration.warps
+        yield {
+            PARTICIPANT: visits[PARTICIPANT].to_numpy(),
+            SESSION: visits[SESSION].to_numpy(),
+            "hemi": hemi,
+            "displacement": side.registration.displacement,
+            "extreme": side.registration.extreme,
+            **{f"node_{i + 1}": warps[:, i] for i in range(warps.shape[1])},
+        }
+
+
+def _shifts(analysis: results.Analysis) -> Iterator[Columns]:
+    for hemi, side in analysis.sides.items():
+        for group, shift in side.shifts.items():
+            yield {
+                "hemi": hemi,
+                "group": group,
+                "node_x": np.arange(len(shift.mean)) + 1,
+                "n": shift.n,
+                "shift": shift.mean,
+                "shift_se": shift.se,
+            }
+
+
+def _sites(name: str, cohort: Cohort, analysis: results.Analysis) -> Iterator[Named]:
+    done = analysis.harmonization
+    if done is not None and (rows := list(_site_rows(done, cohort.units))):
+        yield name, pd.DataFrame(rows)
+
+
+def _site_rows(done: results.Harmonization, units: Mapping[str, str]) -> Iterator[Columns]:
+    """List shifts and scales of sites: means over the points of a map, or of a summary measure."""
+    for kind, part in (("map", done.maps), ("summary", done.summaries)):
+        for (hemi, measure), (effects, moments) in part.items():
+            shift, after = effects.shift * effects.sd, moments.after(effects)
+            for number, site in enumerate(done.plan.sites):
+                if moments.n[number].any():
+                    yield {
+                        "measure": measure,
+                        "unit": units.get(measure, "1"),
+                        "kind": kind,
+                        "hemi": hemi,
+                        "site": site,
+                        "estimated": site in done.plan.estimated,
+                        "n": int(moments.n[number].max()),
+                        "site_shift": _mean_known(shift[number]),
+                        "site_shift_rms": _root_mean_square(shift[number]),
+                        "site_scale": _mean_known(effects.scale[number]),
+                        "offset_before": _root_mean_square(moments.mean[number]),
+                        "offset_after": _root_mean_square(after.mean[number]),
+                        "spread_before": _mean_known(moments.sd[number]),
+                        "spread_after": _mean_known(after.sd[number]),
+                    }
+
+
+def _mean_known(values: Float) -> float:
+    return float(mean_of_known(values, 0))
+
+
+def _root_mean_square(values: Float) -> float:
+    return float(np.sqrt(mean_of_known(values**2, 0)))
+
+
+def _curves(analysis: results.Analysis, curve: CurveOf) -> Iterator[Columns]:
+    """Curves of both models of each comparison."""
+    for hemi, measure, pair in analysis.pairs:
+        what = {"hemi": hemi, "control": pair.control, "case": pair.case, "added": measure}
+        for classifier, result in (("base", pair.comparison.base), ("full", pair.comparison.full)):
+            yield {**what, "classifier": classifier, **curve(result)}
+
+
+def _roc(result: ClassifierResult) -> Columns:
+    return dict(zip(("false_positives", "true_positives"), result.curve, strict=True))
+
+
+def _calibration(result: ClassifierResult) -> Columns:
+    found = result.calibration
+    return {"predicted": found.predicted, "observed": found.observed}
+
+
+def _classification(analysis: results.Analysis, settings: GroupSettings) -> pd.DataFrame:
+    rows: list[dict[str, object]] = []
+    for hemi, measure, pair in analysis.pairs:
+        found = pair.comparison
+        rows.append(
+            {
+                "hemi": hemi,
+                "control": pair.control,
+                "case": pair.case,
+                "base": " + ".join(settings.classification.base),
+                "added": measure,
+                "n": found.n,
+                "n_cases": found.n_cases,
+                "n_incomplete": pair.n_incomplete,
+                **_areas("base", found.base),
+                **_areas("full", found.full),
+                "calibration_intercept": found.full.calibration.intercept,
+                "calibration_slope": found.full.calibration.slope,
+                "brier": found.full.calibration.brier,
+                "likelihood_ratio": found.likelihood_ratio,
+                "lr_df": found.df,
+                "p": found.p,
+                "separated": found.separated,
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def _areas(which: str, result: ClassifierResult) -> dict[str, float]:
+    return {
+        f"auc_{which}": result.auc.area,
+        f"auc_{which}_low": result.auc.low,
+        f"auc_{which}_high": result.auc.high,
+        f"auc_{which}_cv": result.cross_validation.auc,
+        f"auc_{which}_cv_sd": result.cross_validation.auc_sd,
+    }

@@ -1,0 +1,484 @@
+"""Writes the results of one model, all or none: tables, maps, surfaces, figures and text."""
+
+import contextlib
+import gc
+import logging
+import os
+import re
+import shutil
+import warnings
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+from pyarrow import parquet
+
+from hipsta_bids.derivatives.names import DATASET_FILES
+from hipsta_bids.group.cohort.collect import Exclusion
+from hipsta_bids.group.cohort.data import Cohort
+from hipsta_bids.group.design.settings import GroupSettings
+from hipsta_bids.group.output import results, tables
+from hipsta_bids.group.output.figures import Drawing, draw_figures, encode
+from hipsta_bids.group.output.joint import JointMap, draw_joint, joint_peaks, joint_points
+from hipsta_bids.group.output.methods import methods_text
+from hipsta_bids.group.output.shapes import AverageShape
+from hipsta_bids.group.stats.arrays import Float, Int, SideMaps, blocks, return_memory, some_sheets
+from hipsta_bids.group.stats.glm import FittedMaps, PointTest
+from hipsta_bids.group.stats.inference import Discoveries, MapKey
+from hipsta_bids.io import files, gifti
+from hipsta_bids.progress import tell
+from hipsta_bids.reports.group_tables import JOINT
+from hipsta_bids.types import PARTICIPANT, SESSION
+
+_LOGGER = logging.getLogger(__name__)
+
+#: Folder of all models, in the output dataset.
+GROUP_FOLDER = DATASET_FILES["group"]
+#: Name of the surface of the sheets.
+SHEET = "sheet"
+#: Values per row group of maps, and participants per row group of scores; bounds the memory.
+_BLOCK, _ROWS_OF_SCORES = 500_000, 500
+_ROWS = 10_000  # of tables that are spelled at once
+
+_WORD = pa.dictionary(pa.int32(), pa.string())
+_SUFFIXES = {
+    "": "as measured",
+    "_registered": "after registration",
+    "_harmonized": "after registration and harmonization",
+}
+
+Columns = dict[str, pa.Array]
+
+
+def model_folder(root: Path, name: str) -> contextlib.AbstractContextManager[Path]:
+    """Make the folder of a model, whole or not at all."""
+    return whole_folder(root / GROUP_FOLDER / name)
+
+
+@contextlib.contextmanager
+def whole_folder(path: Path) -> Iterator[Path]:
+    """Make a folder to write into, which is renamed to its final name if all went well."""
+    parent, name = path.parent, path.name
+    aside = parent / f".{name}.{os.getpid()}.tmp"
+    files.make_folder(parent)
+    try:
+        aside.mkdir()
+        try:
+            yield aside
+            _replace(aside, path)
+        except BaseException:
+            shutil.rmtree(aside, ignore_errors=True)
+            raise
+        # What runs that were killed have left.
+        for left in parent.glob(f".{name}.*.tmp"):
+            shutil.rmtree(left, ignore_errors=True)
+    except OSError as error:
+        raise files.output_error(path, error) from error
+
+
+def _replace(aside: Path, final: Path) -> None:
+    """Rename over an earlier folder, which cannot be done in one step."""
+    old = final.with_name(f".{final.name}.old.{os.getpid()}.tmp")
+    if final.exists():
+        final.rename(old)
+    aside.rename(final)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def write_results(
+    folder: Path,
+    cohort: Cohort,
+    analysis: results.Analysis,
+    settings: GroupSettings,
+    exclusions: Sequence[Exclusion],
+    *,
+    others: Mapping[str, tuple[Cohort, results.Analysis]],
+    joint: Sequence[JointMap] = (),
+    region: str = "body",
+    ratings: Mapping[str, int] | None = None,
+) -> None:
+    """Write tables, maps and text."""
+    for name, table in tables.result_tables(cohort, analysis, settings):
+        write_table(folder, name, table)
+    for name, other in others.items():
+        for title, table in tables.point_tables(name, *other, settings):
+            write_table(folder, title, table)
+    write_exclusions(folder, exclusions)
+    rows_of_model = analysis.compared.table.iloc[analysis.design.rows]
+    write_table(folder, "covariates", rows_of_model, described=False)
+    write_table(folder, "design", tables.design_table(analysis), described=False)
+    registered = {hemi: side.registered for hemi, side in analysis.sides.items()}
+    if registered or others:
+        points = {name: other for name, (other, _) in others.items()}
+        states = [cohort.sides, registered]
+        if analysis.harmonization is not None:
+            states.append(analysis.harmonization.cohort.sides)
+        _write_maps(folder / "maps.parquet", cohort, states if registered else [], points)
+    if templates := results.templates_of(analysis.sides):
+        files.write_json(folder / "template.json", templates)
+    if analysis.harmonization is not None:
+        done = [analysis.harmonization, *(other.harmonization for _, other in others.values())]
+        how = results.digests({hemi: side.registration for hemi, side in analysis.sides.items()})
+        if effects := results.effects_of([one for one in done if one is not None], how):
+            files.write_json(folder / "harmonization.json", effects.model_dump(by_alias=True))
+    for own, one in ((cohort, analysis), *others.values()):
+        _write_surfaces(folder, own, one)
+        write_stats(folder, stats_of(results.tested_maps(one)))
+        found = {} if one.scores is None else one.scores.sides
+        write_scores(folder, own, one.compared.table, found, letter="w", sheets=bool(one.sides))
+    _write_joint(folder, joint, settings)
+    text = methods_text(
+        cohort,
+        analysis,
+        settings,
+        len(exclusions),
+        others=tuple(others),
+        region=region,
+        ratings=ratings,
+    )
+    files.write_text(folder / "methods.md", text)
+
+
+def write_exclusions(folder: Path, exclusions: Sequence[Exclusion]) -> None:
+    """Write who is not in the analysis, and why."""
+    columns = {"participant": PARTICIPANT, "session": SESSION}
+    excluded = pd.DataFrame(exclusions, columns=[*columns, "hemi", "reason", "message"])
+    write_table(folder, "excluded", excluded.rename(columns=columns))
+
+
+def draw(
+    folder: Path,
+    cohort: Cohort,
+    analysis: results.Analysis,
+    shapes: Mapping[str, AverageShape],
+    *,
+    others: Mapping[str, tuple[Cohort, results.Analysis]],
+    joint: Sequence[JointMap] = (),
+) -> list[str]:
+    """Draw the figures of all models, and say what is wrong with them."""
+    every = ((cohort, analysis, shapes), *((*one, {}) for one in others.values()))
+    drawings = [figure for one in every for figure in draw_figures(*one)]
+    if joint:
+        drawings.append((f"{JOINT}_maps", partial(draw_joint, joint, shapes, {})))
+    return write_figures(folder, drawings)
+
+
+def write_figures(folder: Path, drawings: Iterable[tuple[str, Drawing]]) -> list[str]:
+    """Draw figures by name, and say which are missing or lack letters; one line each."""
+    tell("figures")
+    return_memory()
+    problems, missing = [], set()
+    gc.freeze()  # what is there need not be looked at whenever a figure's memory is taken back
+    for number, (name, drawing) in enumerate(drawings, start=1):
+        tell("figures", number)
+        try:
+            with warnings.catch_warnings(record=True) as warned:
+                warnings.simplefilter("always")
+                encoded = encode(name, drawing)
+        except Exception as error:  # results are worth more than figures
+            _LOGGER.exception("figure %s", name)
+            problems.append(f"figure {name}: not drawn ({type(error).__name__}: {error})")
+            continue
+        for warning in warned:
+            missing |= set(re.findall(r"^Glyph (\d+) ", str(warning.message)))
+        for title, content in encoded:
+            files.write_bytes(folder / "figures" / title, content)
+        gc.collect()
+    gc.unfreeze()
+    if missing:
+        letters = "".join(sorted(chr(int(number)) for number in missing))
+        problems.append(f"figures: PDF and PNG show boxes for {letters}; SVG has them as text")
+    return problems
+
+
+def write_table(
+    folder: Path,
+    name: str,
+    table: pd.DataFrame,
+    *,
+    described: bool = True,
+    meaning: Mapping[str, str] = tables.COLUMNS,
+) -> None:
+    """Write a table, with a sidecar unless the columns are the user's or the model's."""
+    columns = [str(column) for column in table.columns]
+    lines = ["\t".join(columns)]
+    for part in blocks(len(table), _ROWS):
+        rows = zip(*(_cells(values.iloc[part]) for _, values in table.items()), strict=True)
+        lines += map("\t".join, rows)
+    files.write_text(folder / f"{name}.tsv", "\n".join(lines) + "\n")
+    if described:
+        meanings = {
+            column: meaning.get(column)
+            or f"registered coordinate of node {column.removeprefix('node_')}, 0..1"
+            for column in columns
+        }
+        sidecar = {column: {"Description": meaning} for column, meaning in meanings.items()}
+        files.write_json(folder / f"{name}.json", sidecar)
+
+
+def _cells(values: pd.Series) -> list[str]:
+    """Spell a column, numbers all at once."""
+    numbers = values.to_numpy()
+    if numbers.dtype.kind == "f" and len(numbers):
+        text = "\t".join(["%.10g"] * len(numbers)) % tuple(numbers.tolist())
+        return text.replace("nan", files.MISSING).split("\t")
+    return [_cell(value) for value in values.tolist()]
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, str):
+        return " ".join(value.split()) or files.MISSING
+    if isinstance(value, (bool, np.bool_)):
+        return "true" if value else "false"
+    if value is None or value is pd.NA or value != value:  # noqa: PLR0124 -- NaN is not itself
+        return files.MISSING
+    return format(value, ".10g") if isinstance(value, float) else str(value)
+
+
+def _write_maps(
+    path: Path,
+    cohort: Cohort,
+    states: Sequence[Mapping[str, SideMaps]],
+    others: Mapping[str, Cohort],
+) -> None:
+    """Write all analyzed maps as one Parquet file: a row per visit, hemisphere and point.
+
+    The states of the sheets are those before and after each step; none without sheets.
+    """
+    fields = [pa.field(name, _WORD) for name in (PARTICIPANT, SESSION, "hemi")]
+    about = {"description": f"{SHEET}, or the name of maps with points of their own"}
+    fields.append(pa.field("surface", _WORD, metadata=about))
+    about = {"description": "point of the surface, the first is 0; on the sheet y is the faster"}
+    fields.append(pa.field("vertex", pa.int32(), metadata=about))
+    about = {"description": "node of the sheet, the first is 1"}
+    fields += [pa.field(f"node_{axis}", pa.int16(), metadata=about) for axis in "xy"]
+    about = {"description": "coordinate on the sheet, -1 to 1", "unit": "1"}
+    fields += [pa.field(axis, pa.float32(), metadata=about) for axis in "xy"]
+    measures = list(next(iter(states[0].values())).maps) if states else []
+    for suffix, text in list(_SUFFIXES.items())[: len(states)]:
+        if suffix != "_harmonized":
+            fields.append(pa.field(f"subfield{suffix}", _WORD, metadata={"description": text}))
+        fields += [_number(f"{name}{suffix}", cohort, name, text) for name in measures]
+    fields += [_number(name, other, name, "as given") for name, other in others.items()]
+    about = {
+        "description": "one row per visit, hemisphere and point; x from medial to lateral, y"
+        " from posterior to anterior; a column is empty where the surface lacks the measure"
+    }
+    rows = _map_blocks(cohort, states, others)
+    _write_parquet(path, pa.schema(fields, metadata=about), rows)
+
+
+def _number(column: str, cohort: Cohort, measure: str, text: str) -> pa.Field:
+    about = {"unit": cohort.units.get(measure, "1"), "description": f"{measure}, {text}"}
+    return pa.field(column, pa.float32(), metadata=about)
+
+
+def _write_parquet(path: Path, schema: pa.Schema, rows: Iterable[Columns]) -> None:
+    """Write blocks of columns; those that a block lacks are empty.
+
+    Measured values hardly repeat: a dictionary of them takes longer than it saves.
+    """
+    repeated = [one.name for one in schema if one.name in "xy" or not pa.types.is_float32(one.type)]
+    try:
+        with parquet.ParquetWriter(
+            path, schema, compression="zstd", use_dictionary=repeated
+        ) as writer:
+            for columns in rows:
+                count = len(columns["hemi"])
+                arrays = [
+                    columns[field.name] if field.name in columns else pa.nulls(count, field.type)
+                    for field in schema
+                ]
+                writer.write_table(pa.table(arrays, schema=schema))
+    except OSError as error:
+        raise files.output_error(path, error) from error
+
+
+def _map_blocks(
+    cohort: Cohort, states: Sequence[Mapping[str, SideMaps]], others: Mapping[str, Cohort]
+) -> Iterator[Columns]:
+    surfaces = [(SHEET, cohort, sides) for sides in states[:1]]
+    surfaces += [(name, other, other.sides) for name, other in others.items()]
+    for surface, own, sides in surfaces:
+        for hemi, side in sides.items():
+            points = int(np.prod(side.shape))
+            for part in blocks(len(side.rows), max(_BLOCK // points, 1)):
+                rows = side.rows[part]
+                columns = _visit_columns(own.table, rows, points, hemi=hemi, surface=surface)
+                vertices = np.tile(np.arange(points, dtype=np.int32), len(rows))
+                columns["vertex"] = pa.array(vertices)
+                if side.mesh is None:
+                    columns |= _node_columns(own, side.shape, len(rows))
+                if surface == SHEET:
+                    for suffix, state in zip(_SUFFIXES, states, strict=False):
+                        columns[f"subfield{suffix}"] = _subfields(state[hemi], part)
+                        own_maps = some_sheets(state[hemi].maps, part)
+                        columns |= _value_columns(own_maps, slice(None), suffix)
+                else:
+                    columns |= _value_columns(side.maps, part)
+                yield columns
+
+
+def _visit_columns(table: pd.DataFrame, rows: Int, points: int, **words: str) -> Columns:
+    """Participants and sessions of all points of some rows, and words that all have."""
+    visits = table.iloc[rows]
+    texts = {
+        PARTICIPANT: visits[PARTICIPANT].tolist(),
+        SESSION: [s if isinstance(s, str) else None for s in visits[SESSION]],
+        **{name: [word] * len(rows) for name, word in words.items()},
+    }
+    index = pa.array(np.repeat(np.arange(len(rows), dtype=np.int32), points))
+    return {
+        name: pa.array(values, pa.string()).dictionary_encode().take(index)
+        for name, values in texts.items()
+    }
+
+
+def _node_columns(cohort: Cohort, shape: tuple[int, int], n_rows: int) -> Columns:
+    """Nodes of the sheet and their coordinates, for some rows."""
+    x, y = np.divmod(np.tile(np.arange(shape[0] * shape[1]), n_rows), shape[1])
+    return {
+        "node_x": pa.array((x + 1).astype(np.int16)),
+        "node_y": pa.array((y + 1).astype(np.int16)),
+        "x": pa.array(cohort.x[x].astype(np.float32)),
+        "y": pa.array(cohort.y[y].astype(np.float32)),
+    }
+
+
+def _value_columns(maps: Mapping[str, Float], part: slice, suffix: str = "") -> Columns:
+    return {
+        f"{name}{suffix}": pa.array(values[part].ravel(), pa.float32(), from_pandas=True)
+        for name, values in maps.items()
+    }
+
+
+def _subfields(side: SideMaps, part: slice) -> pa.Array:
+    codes = side.subfield[part].ravel().astype(np.int32)
+    indices = pa.array(codes, pa.int32(), mask=codes < 0)
+    return pa.DictionaryArray.from_arrays(indices, pa.array(side.names, pa.string()))
+
+
+def _write_surfaces(folder: Path, cohort: Cohort, analysis: results.Analysis) -> None:
+    """Write the surfaces to draw statistics on."""
+    for hemi, one in analysis.fitted.items():
+        if hemi in cohort.sides:
+            write_surface(folder, cohort, one, hemi)
+
+
+#: Maps of one contrast by the value of ``stat-``.
+_Stats = dict[str, Float]
+
+
+def stats_of(
+    tested: Iterable[tuple[MapKey, PointTest, Discoveries]],
+) -> dict[MapKey, _Stats]:
+    """Collect statistics, effect sizes and corrected p-values."""
+    return {
+        key: {
+            test.kind: test.statistic,
+            **({"d": test.cohen_d} if test.kind == "t" else {"eta2": test.eta_squared}),
+            "pcorrected": found.adjusted,
+        }
+        for key, test, found in tested
+    }
+
+
+def write_stats(folder: Path, maps: Mapping[MapKey, _Stats]) -> None:
+    """Write maps of statistics as GIFTI, and those of both sides as one CIFTI file."""
+    together: dict[str, dict[str, _Stats]] = {}
+    for key, stats in maps.items():
+        for stat, values in stats.items():
+            stem = tables.map_name(key.hemi, key.measure, key.contrast)
+            stem = stem.replace("_desc-", f"_stat-{stat}_desc-")
+            # Left minus right, and both, lie on the left sheet; the name has no hemisphere.
+            hemi = key.hemi if key.hemi in {"L", "R"} else "L"
+            content = gifti.shape_bytes(values, hemi=hemi, name=stem, unit="1")
+            files.write_bytes(folder / f"{stem}.shape.gii", content)
+        if key.hemi in {"L", "R"}:
+            name = tables.map_name("", key.measure, key.contrast)
+            together.setdefault(name, {})[key.hemi] = stats
+    for name, sides in together.items():
+        names = list(next(iter(sides.values())))
+        both = {hemi: np.stack([own[stat] for stat in names]) for hemi, own in sides.items()}
+        files.write_bytes(folder / f"{name}.dscalar.nii", gifti.cifti_bytes(both, names))
+
+
+def _write_joint(folder: Path, joint: Sequence[JointMap], settings: GroupSettings) -> None:
+    """Write tests of several measures together."""
+    if not joint:
+        return
+    write_table(
+        folder, f"{JOINT}_peaks", joint_peaks(joint, settings), meaning=tables.JOINT_COLUMNS
+    )
+    for one in joint:
+        name = tables.map_name(one.key.hemi, one.key.measure, one.key.contrast)
+        parts = {
+            f"p_{title.replace(' ', '_')}": f"p-value of {title} alone, not corrected"
+            for title in one.parts
+        }
+        write_table(folder, name, joint_points(one), meaning={**tables.JOINT_COLUMNS, **parts})
+    write_stats(
+        folder,
+        {one.key: {"z": one.test.statistic, "pcorrected": one.found.adjusted} for one in joint},
+    )
+
+
+def write_surface(folder: Path, cohort: Cohort, one: FittedMaps, hemi: str) -> None:
+    """Write the unfolded sheet, or the surface of other programs' maps."""
+    if one.maps.mesh is not None:
+        space, secondary = next(iter(one.maps.maps)), None
+        points, triangles = one.maps.mesh.points, one.maps.mesh.triangles.astype(np.int32)
+    else:
+        space, secondary = "unfold", "MidThickness"
+        nx, ny = len(cohort.x), len(cohort.y)
+        points = np.zeros((nx * ny, 3))
+        points[:, 0], points[:, 1] = np.repeat(cohort.x, ny), np.tile(cohort.y, nx)
+        triangles = gifti.sheet_triangles(nx, ny)
+    flat = one.maps.mesh is None or one.maps.mesh.flat
+    content = gifti.surface_bytes(points, triangles, hemi=hemi, secondary=secondary, unfolded=flat)
+    files.write_bytes(folder / f"hemi-{hemi}_space-{space}_midthickness.surf.gii", content)
+
+
+def write_scores(
+    folder: Path,
+    cohort: Cohort,
+    table: pd.DataFrame,
+    sides: Mapping[str, results.ScoredMaps],
+    *,
+    letter: str,
+    sheets: bool,
+) -> None:
+    """Write each participant's scores as maps; those of the sheet also as one Parquet file."""
+    for hemi, side in sides.items():
+        names = [str(name) for name in table.index[side.rows]]
+        for measure, found in side.scores.items():
+            content = gifti.maps_bytes(found.w.T, hemi=hemi, names=names, series=False)
+            name = (
+                f"hemi-{hemi}_stat-{letter}_desc-{tables.entity_label(measure)}_statmap.shape.gii"
+            )
+            files.write_bytes(folder / name, content)
+    if not (sheets and sides):
+        return
+    shape = len(cohort.x), len(cohort.y)
+    measures = list(next(iter(sides.values())).scores)
+    about = {"unit": "1"}
+    fields = [pa.field(name, _WORD) for name in (PARTICIPANT, SESSION, "hemi")]
+    fields += [pa.field(name, pa.int16()) for name in ("node_x", "node_y")]
+    fields += [pa.field(f"{name}_{letter}", pa.float32(), metadata=about) for name in measures]
+    about = {
+        "description": f"{letter}-scores, one row per participant, hemisphere and node of the"
+        " registered sheet; nodes along x from medial to lateral, y from posterior to anterior"
+    }
+    rows = (
+        {
+            **_visit_columns(table, side.rows[part], shape[0] * shape[1], hemi=hemi),
+            **_node_columns(cohort, shape, len(side.rows[part])),
+            **_value_columns({n: one.w for n, one in side.scores.items()}, part, f"_{letter}"),
+        }
+        for hemi, side in sides.items()
+        for part in blocks(len(side.rows), _ROWS_OF_SCORES)
+    )
+    _write_parquet(folder / f"{letter}scores.parquet", pa.schema(fields, metadata=about), rows)

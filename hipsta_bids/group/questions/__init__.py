@@ -1,0 +1,1 @@
+"""From a cohort to results: one module for each question of the group level."""

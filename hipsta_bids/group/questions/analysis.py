@@ -1,0 +1,463 @@
+"""The group level from sheets and covariates to results."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import product
+
+import numpy as np
+from scipy import special
+
+from hipsta_bids.errors import ModelError
+from hipsta_bids.group.cohort.data import (
+    Cohort,
+    Measures,
+    asymmetry_maps,
+    compare_sessions,
+    modeled_table,
+)
+from hipsta_bids.group.cohort.read import leave_rare
+from hipsta_bids.group.design.formula import ModelSpec
+from hipsta_bids.group.design.grammar import closed_formula
+from hipsta_bids.group.design.model import (
+    BOTH,
+    Comparison,
+    Design,
+    Groups,
+    asymmetry_name,
+    build_design,
+)
+from hipsta_bids.group.design.settings import GlmSettings, GroupSettings
+from hipsta_bids.group.output.joint import JointMap
+from hipsta_bids.group.output.results import (
+    Analysis,
+    Harmonization,
+    SideResult,
+    SitePlan,
+    members_of,
+    rows_of,
+)
+from hipsta_bids.group.output.saved import SavedEffects
+from hipsta_bids.group.questions.harmonize import (
+    harmonize_cohort,
+    plan_sites,
+    without_tests_of_sites,
+)
+from hipsta_bids.group.questions.scores import score_cohort
+from hipsta_bids.group.questions.summaries import classify_groups, fit_summaries
+from hipsta_bids.group.stats.arrays import (
+    MOST_KEPT,
+    Float,
+    SideMaps,
+    WarpedLabels,
+    WarpedMaps,
+    describe_known,
+    return_memory,
+)
+from hipsta_bids.group.stats.clusters import edges_of
+from hipsta_bids.group.stats.glm import FittedMaps, RowModel, fit_maps, with_mean
+from hipsta_bids.group.stats.inference import (
+    PERMUTATIONS,
+    Discoveries,
+    MapKey,
+    check_permutations,
+    correct,
+    correct_joint,
+)
+from hipsta_bids.group.stats.mixed import longitudinal_model
+from hipsta_bids.group.stats.registration import (
+    GroupShift,
+    Registration,
+    mean_profiles,
+    register,
+    register_to,
+    shift_by_group,
+    shift_difference,
+)
+from hipsta_bids.group.stats.warps import Template, warp_labels, warp_values
+from hipsta_bids.progress import each, tell
+from hipsta_bids.reports.display import parts_of
+from hipsta_bids.reports.group_tables import (
+    BOTH_SIDES,
+    JOINT,
+    SIDES,
+)
+from hipsta_bids.types import PARTICIPANT
+
+#: Ratio of variances of a difference, true to that with equal ones, of which a note is made: then
+#: 9 % of tests of nothing have p below 0.05.
+_UNEQUAL = 1.3
+
+
+def analyze_cohort(
+    cohort: Cohort,
+    model: ModelSpec,
+    groups: Groups | None,
+    settings: GroupSettings,
+    *,
+    measures: Measures,
+    references: Mapping[str, str],
+    comparison: Comparison | None = None,
+    time: str | None = None,
+    icv: str | None = None,
+    templates: Mapping[str, Template] | None = None,
+    site_effects: SavedEffects | None = None,
+) -> Analysis:
+    """Register, fit a model at each point and to each summary measure, and classify.
+
+    Parameters
+    ----------
+    cohort : Cohort
+        The visits that are compared.
+    model : ModelSpec
+        Formula and contrasts.
+    groups : Groups or None
+        For classification and for figures by group.
+    settings : GroupSettings
+        All of the group level.
+    measures : Measures
+        What to fit the model to.
+    references : mapping of str to str
+        Reference levels of factors, as ``choose_model`` gives them.
+    comparison : Comparison, optional
+        Which sessions and sides; by default one visit per participant.
+    time : str, optional
+        Column of the time of visits, for random slopes.
+    icv : str, optional
+        Column of intracranial volume, for volumes.
+    templates : mapping of str to Template, optional
+        By hemisphere; else they are made from this cohort.
+    site_effects : SavedEffects, optional
+        Parameters of harmonization of another cohort.
+
+    Raises
+    ------
+    ModelError
+        If the model cannot be fitted to these data.
+    """
+    comparison = comparison or Comparison()
+    table = modeled_table(cohort.table, comparison)
+    plan = plan_sites(
+        cohort,
+        model,
+        settings,
+        references=references,
+        comparison=comparison,
+        icv=icv,
+        saved=site_effects,
+    )
+    design = build_design(table, model, settings.design, references)
+    if plan is not None:
+        design = without_tests_of_sites(plan, design, model, comparison)
+    if comparison.pair or not design.contrasts:
+        design = replace(design, contrasts=with_mean(design))
+
+    rows_of: Callable[[Design], RowModel] = RowModel
+    if comparison.longitudinal:
+        rows_of = partial(longitudinal_model, table=table, time=time, settings=settings)
+    rows = rows_of(design)
+    check_permutations(settings)
+    _check_weights(comparison, settings)
+    sides = {
+        hemi: register_side(cohort, hemi, groups=groups, settings=settings, templates=templates)
+        for hemi in each("registration", list(cohort.sides) if measures.maps else [])
+    }
+    registered = {hemi: side.registered for hemi, side in sides.items()} or cohort.sides
+    measured = replace(cohort, sides=registered)
+    fit = partial(
+        _fit_cohort,
+        plan=plan,
+        measures=measures,
+        rows=rows,
+        comparison=comparison,
+        settings=settings,
+    )
+    how = {hemi: side.registration for hemi, side in sides.items()}
+    done, compared, fitted, found = fit(measured, registrations=how)
+    unregistered: Mapping[MapKey, Discoveries] = {}
+    # Effects of sites from a file are those of registered nodes.
+    again = settings.registration.align != "none" and (plan is None or plan.saved is None)
+    if again and settings.multiplicity.method not in PERMUTATIONS:
+        unregistered = fit(cohort)[3]
+    scores = score_cohort(
+        compared,
+        model,
+        comparison.normative,
+        settings,
+        measures=measures,
+        references=references,
+    )
+    tell("summary measures")
+    summaries, notes = fit_summaries(
+        compared,
+        model,
+        design,
+        settings,
+        only=measures.summaries,
+        references=references,
+        icv=icv,
+        rows_of=rows_of,
+    )
+    told = compared
+    if done is not None and groups is not None and done.leaks(groups.column):
+        told = compare_sessions(measured, comparison)
+    once = told.take(~table[PARTICIPANT].duplicated().to_numpy())
+    pairs, more = classify_groups(once, groups, settings) if groups else ([], [])
+    return Analysis(
+        model=model,
+        comparison=comparison,
+        design=design,
+        groups=groups,
+        sides=sides,
+        harmonization=done,
+        measured=measures,
+        compared=compared,
+        row_model=rows,
+        fitted=fitted,
+        found=found,
+        unregistered=unregistered,
+        scores=scores,
+        measures=summaries,
+        pairs=pairs,
+        skipped=[*(done.notes if done else ()), *notes, *more],
+    )
+
+
+def analyze_points(cohort: Cohort, analysis: Analysis, settings: GroupSettings) -> Analysis:
+    """Fit the model of an analysis to further maps, which are not registered."""
+    maps = tuple(dict.fromkeys(name for side in cohort.sides.values() for name in side.maps))
+    measured, done = Measures(maps=maps, summaries=()), analysis.harmonization
+    done, compared, fitted, found = _fit_cohort(
+        cohort,
+        plan=None if done is None else done.plan,
+        measures=measured,
+        rows=analysis.row_model,
+        comparison=analysis.comparison,
+        settings=settings,
+    )
+    scores = score_cohort(
+        compared,
+        analysis.model,
+        analysis.comparison.normative,
+        settings,
+        measures=measured,
+        references=analysis.design.references,
+    )
+    return replace(
+        analysis,
+        sides={},
+        harmonization=done,
+        measured=measured,
+        compared=compared,
+        fitted=fitted,
+        found=found,
+        unregistered={},
+        measures=(),
+        pairs=(),
+        scores=scores,
+        skipped=(),
+    )
+
+
+def _check_weights(comparison: Comparison, settings: GroupSettings) -> None:
+    """Refuse weights where there is no rule for them."""
+    others = {
+        "--longitudinal": comparison.longitudinal,
+        "--paired": comparison.pair,
+        "--asymmetry": comparison.asymmetry,
+        "--normative": comparison.normative,
+        "permutations": settings.multiplicity.method in PERMUTATIONS,
+        "--joint": settings.joint.measures,
+    }
+    wrong = [name for name, given in others.items() if given]
+    if settings.glm.weights != "none" and wrong:
+        raise ModelError(
+            f"--weights {settings.glm.weights}: not together with {', '.join(wrong)}; leave one out"
+        )
+
+
+def _fit_cohort(
+    cohort: Cohort,
+    *,
+    plan: SitePlan | None,
+    measures: Measures,
+    rows: RowModel,
+    comparison: Comparison,
+    settings: GroupSettings,
+    registrations: Mapping[str, Registration] | None = None,
+) -> tuple[Harmonization | None, Cohort, dict[str, FittedMaps], dict[MapKey, Discoveries]]:
+    """Harmonize, compare sessions, and fit each hemisphere, and left minus right if asked for."""
+    done, maps = None, measures.maps
+    if plan is not None:
+        done = harmonize_cohort(cohort, plan, settings, measures, registrations or {})
+    compared = compare_sessions(cohort if done is None else done.cohort, comparison)
+    fitted = {
+        hemi: fit_maps(hemi, side.only(maps), rows, settings)
+        for hemi, side in each("models", list(compared.sides.items()) if maps else [])
+    }
+    if comparison.asymmetry and maps:
+        # A change may be zero or of any sign: nothing to divide by.
+        relative = () if comparison.pair else settings.asymmetry.relative
+        both = asymmetry_maps(compared, maps, relative)
+        contrasts = with_mean(rows.design)
+        fitted[BOTH] = fit_maps(BOTH, both, rows, settings, contrasts=contrasts)
+    return done, compared, fitted, correct(fitted, rows, compared.table, settings)
+
+
+def register_side(
+    cohort: Cohort,
+    hemi: str,
+    *,
+    groups: Groups | None,
+    settings: GroupSettings,
+    templates: Mapping[str, Template] | None,
+) -> SideResult:
+    """Register the sheets of one hemisphere, to a template or to each other."""
+    side = cohort.sides[hemi]
+    profiles = mean_profiles(side.maps["curvature"], settings.registration)
+    if templates is None:
+        registration = register(profiles, settings.registration)
+    else:
+        registration = register_to(profiles, templates[hemi], settings.registration)
+    shifts: Mapping[str, GroupShift] = {}
+    difference = None
+    if groups is not None:
+        names = cohort.table[groups.column].iloc[side.rows]
+        known = names.notna().to_numpy()
+        grouped = replace(registration, warps=registration.warps[known])
+        members = names[known].astype(str).to_numpy(dtype=np.str_)
+        shifts = shift_by_group(grouped, members)
+        if registration.template is not None:
+            difference = shift_difference(
+                grouped,
+                members,
+                cohort.table[PARTICIPANT].iloc[side.rows][known].to_numpy(),
+                permutations=settings.registration.group_permutations,
+                seed=settings.multiplicity.seed,
+            )
+    return_memory()
+    return SideResult(
+        registration=registration,
+        registered=_register_maps(side, registration.warps, parts_of(cohort.y) is not None),
+        shifts=shifts,
+        difference=difference,
+    )
+
+
+def _register_maps(side: SideMaps, warps: Float, rims: bool) -> SideMaps:
+    """Carry all maps of sheets; a point beside ``rims`` that came to be known of few is none."""
+    kept = len(warps) <= MOST_KEPT
+    maps, errors = (WarpedMaps(one, warps, warp_values) for one in (side.maps, side.errors))
+    labels = WarpedLabels(side.subfield[:], warps, warp_labels)
+    registered = dict(maps) if kept or rims else maps
+    for values in registered.values() if rims else ():
+        leave_rare(values)
+    return replace(
+        side,
+        maps=registered,
+        errors=dict(errors) if kept else errors,
+        subfield=labels[:] if kept else labels,
+    )
+
+
+def unequal_spread(analysis: Analysis, settings: GlmSettings) -> Iterator[str]:
+    """Say which pairs of groups differ in size and SD so that ordinary tests find too much.
+
+    One line per group, about the map in which it differs most from the first.
+    """
+    groups, worst = analysis.groups, dict[str, tuple[float, str]]()
+    named = groups is not None and groups.column in closed_formula(analysis.model.formula).names
+    ordinary = (settings.covariance, settings.weights) == ("ordinary", "none")
+    if not (named and ordinary) or analysis.comparison.longitudinal:
+        return
+    for hemi, one in analysis.fitted.items():
+        members = members_of(analysis, rows_of(analysis, one))
+        sizes = {group: int(own.sum()) for group, own in members.items() if own.sum() > 1}
+        for measure in one.fits:
+            sds = {g: describe_known(one.parts(measure, members[g]))[2] for g in sizes}
+            (first, n), *others = sizes.items()
+            for group, m in others:
+                squares, other = sds[first] ** 2, sds[group] ** 2
+                pooled = ((n - 1) * squares + (m - 1) * other) / (n + m - 2) * (1 / n + 1 / m)
+                ratio = float(np.nansum(squares / n + other / m) / np.nansum(pooled))
+                if ratio > max(_UNEQUAL, worst.get(group, (0.0,))[0]):
+                    worst[group] = ratio, f"{first} ({n}) and {group} ({m}), {measure}, {hemi}"
+    for ratio, where in worst.values():
+        share = 2 * special.ndtr(special.ndtri(0.025) / np.sqrt(ratio))
+        yield (
+            f"{where}: the smaller group varies more, so that about {share:.0%} of tests of nothing"
+            ' have p below 0.05; glm.covariance = "hc3" in --settings allows for that if each group'
+            " has 20 or more"
+        )
+
+
+def check_joint(known: Sequence[str], comparison: Comparison, settings: GroupSettings) -> None:
+    """Refuse measures that cannot be tested together, before anything is fitted."""
+    known = [*known, *(asymmetry_name(name) for name in known if comparison.asymmetry)]
+    names, sides = settings.joint.measures, settings.joint.sides
+    what = None
+    if unknown := [name for name in names if name not in known]:
+        what = f"no map is called {unknown[0]!r}; there are {', '.join(known)}"
+    elif names and JOINT in known:
+        what = f"a map is called {JOINT}, as its results would be; give it another name"
+    elif len(set(names)) < len(names):
+        what = "a measure is named twice; leave it out"
+    elif len(names) < 1 + (not sides) and (names or sides):
+        what = "name two measures, or one and --joint-sides"
+    if what is not None:
+        raise ModelError(f"--joint {' '.join(names)}".strip() + f": {what}")
+
+
+def combine_maps(analyses: Sequence[Analysis], settings: GroupSettings) -> dict[MapKey, JointMap]:
+    """Test the measures of the setting ``joint`` together; empty without any.
+
+    The first analysis has the model; further ones may have maps of other programs.
+    """
+    names, sides = settings.joint.measures, settings.joint.sides
+    if not names:
+        return {}
+    fits = {
+        (m, hemi): one for each in analyses for hemi, one in each.fitted.items() for m in one.fits
+    }
+    cohort = next(
+        each.compared
+        for each in analyses
+        if any(names[0] in one.fits for one in each.fitted.values())
+    )
+    groups: dict[MapKey, dict[str, tuple[FittedMaps, str]]] = {}
+    contrasts = {}
+    for hemis in [("L", "R")] if sides else [("L",), ("R",), (BOTH,)]:
+        if not all((name, hemi) in fits for hemi, name in product(hemis, names)):
+            continue
+        parts = {
+            name if len(hemis) == 1 else f"{name} {SIDES[hemi]}": (fits[name, hemi], name)
+            for hemi, name in product(hemis, names)
+        }
+        _check_points(names, [one for one, _ in parts.values()])
+        for test in fits[names[0], hemis[0]].fits[names[0]].tests:
+            key = MapKey(JOINT, test.contrast.name, BOTH_SIDES if len(hemis) > 1 else hemis[0])
+            groups[key], contrasts[test.contrast.name] = parts, test.contrast
+    if not groups:
+        raise ModelError(f"--joint {' '.join(names)}: no side has them all; leave one out")
+    model = analyses[0].row_model
+    found = correct_joint(groups, contrasts, model, analyses[0].compared.table, settings)
+    return {
+        key: JointMap(key=key, parts=groups[key], cohort=cohort, test=test, found=own)
+        for key, (test, own) in found.items()
+    }
+
+
+def _check_points(names: Sequence[str], parts: Sequence[FittedMaps]) -> None:
+    """Refuse maps whose points do not correspond."""
+    first, *others = [one.maps for one in parts]
+    same = [
+        one.shape == first.shape
+        and np.array_equal(edges_of(one, 4), edges_of(first, 4))  # the triangles of meshes
+        for one in others
+    ]
+    if not all(same):
+        counts = ", ".join(str(np.prod(one.maps.shape)) for one in parts)
+        raise ModelError(
+            f"--joint {' '.join(names)}: maps lie on different surfaces ({counts} points); choose"
+            " maps of one surface" + (", or leave --joint-sides out" if len(names) == 1 else "")
+        )

@@ -1,0 +1,239 @@
+"""Comparisons of groups, from files to files."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from hipsta_bids.derivatives import dataset
+from hipsta_bids.group.cohort import collect
+from hipsta_bids.group.design.model import (
+    choose_model,
+    empty_covariates,
+    folder_name,
+    wanted_measures,
+)
+from hipsta_bids.group.design.settings import GroupSettings
+from hipsta_bids.group.output.results import Analysis, harmonization_record
+from hipsta_bids.group.output.saved import load_effects
+from hipsta_bids.group.output.shapes import average_shapes, write_shapes
+from hipsta_bids.group.output.write import draw, write_results
+from hipsta_bids.group.questions import study
+from hipsta_bids.group.questions.analysis import (
+    analyze_cohort,
+    analyze_points,
+    check_joint,
+    combine_maps,
+    unequal_spread,
+)
+from hipsta_bids.group.questions.exchange import SUMMARY, summarize, write_summary
+from hipsta_bids.io import files
+from hipsta_bids.progress import tell
+
+
+def run_group(options: study.GroupOptions, settings: GroupSettings) -> study.GroupResult:
+    """Collect sheets and covariates, analyze them, and write all results or none.
+
+    Parameters
+    ----------
+    options : GroupOptions
+        Files, model.
+    settings : GroupSettings
+        What changes results.
+
+    Returns
+    -------
+    GroupResult
+
+    Raises
+    ------
+    HipstaError
+        If inputs, model or output folder do not allow it.
+    """
+    dataset.check_own_dataset(options.out_dir)
+    return study.with_page(options, _analyze(options, settings))
+
+
+def _analyze(options: study.GroupOptions, settings: GroupSettings) -> study.GroupResult:
+    """Analyze and write all but the page, for which the memory that it takes is free again."""
+    tell("reading")
+    inputs = study.read_inputs(options, settings)
+    check_joint([*inputs.measures.maps, *inputs.others], options.comparison, settings)
+    cohort = inputs.cohort
+    document, model, groups, references = choose_model(
+        options.model,
+        cohort.table,
+        settings,
+        comparison=options.comparison,
+        visits=inputs.time,
+    )
+    templates = study.read_templates(options.template, cohort)
+    analysis = analyze_cohort(
+        cohort,
+        model,
+        groups,
+        settings,
+        measures=inputs.measures,
+        references=references,
+        comparison=options.comparison,
+        time=inputs.time.column if inputs.time else None,
+        icv=inputs.icv,
+        templates=templates,
+        site_effects=load_effects(options.harmonize_model) if options.harmonize_model else None,
+    )
+    others = {
+        name: (other, analyze_points(other, analysis, settings))
+        for name, other in inputs.others.items()
+    }
+    found = dict(analysis.found)
+    for _, other in others.values():
+        found |= other.found
+    joint = combine_maps([analysis, *(other for _, other in others.values())], settings)
+    found |= {key: one.found for key, one in joint.items()}
+    tested = tuple(joint.values())
+    analysis = replace(analysis, found=found)
+    exclusions = [*inputs.exclusions, *_incomplete(analysis)]
+    wanted = wanted_measures(options.model, options.measures)
+    notes = [*inputs.notes, *_notes(options, inputs, analysis, settings)]
+    summary = _summary(options, inputs, analysis, settings, notes)
+    tell("average surfaces")
+    shapes = average_shapes(inputs.found.records, cohort, analysis, settings)
+    # One is enough from here on, and all may take much memory.
+    inputs = replace(inputs, found=replace(inputs.found, records=inputs.found.records[:1]))
+
+    def fill(folder: Path) -> dict[str, Any]:
+        write_results(
+            folder,
+            cohort,
+            analysis,
+            settings,
+            exclusions,
+            others=others,
+            joint=tested,
+            region=options.sheets.region,
+            ratings=inputs.found.ratings,
+        )
+        files.write_json(folder / "model.json", document)
+        if summary is not None:
+            write_summary(folder / SUMMARY, summary)
+        write_shapes(folder, shapes)
+        if analysis.sides and inputs.found.records and not shapes:
+            notes.append("no average surfaces: those of the participant level are missing")
+        notes.extend(draw(folder, cohort, analysis, shapes, others=others, joint=tested))
+        return _record(analysis, inputs.found.ratings)
+
+    return study.write_folder(
+        options,
+        folder_name(model.formula, wanted) + options.comparison.suffix,
+        inputs,
+        settings,
+        notes=notes,
+        counts=(analysis.n_participants, len(exclusions)),
+        fill=fill,
+    )
+
+
+def _summary(
+    options: study.GroupOptions,
+    inputs: study.GroupInputs,
+    analysis: Analysis,
+    settings: GroupSettings,
+    notes: list[str],
+) -> dict[str, Any] | None:
+    """Make the summary for other sites, if it is asked for."""
+    if options.export_summary is None:
+        return None
+    found = inputs.found
+    summary, more = summarize(
+        inputs.cohort,
+        analysis,
+        settings,
+        site=options.export_summary or options.bids_dir.resolve().name,
+        inputs={
+            "versions": list(found.versions),
+            "seg": found.records[0].place.name.seg if found.records else "none",
+            "region": options.sheets.region,
+            "settings_hash": found.settings_hash,
+        },
+    )
+    notes += more
+    return summary
+
+
+def _notes(
+    options: study.GroupOptions,
+    inputs: study.GroupInputs,
+    analysis: Analysis,
+    settings: GroupSettings,
+) -> list[str]:
+    """List what a reader of the results should know, one line each."""
+    found, notes = inputs.found, list(analysis.skipped)
+    time = inputs.time.column if inputs.time else None
+    notes += [note for name, note in analysis.design.notes.items() if name != time]
+    if options.model.formula is None and options.model.file is None:
+        notes += [
+            f"{name} is n/a for all, and not in the model; fill it in, or do not read much into"
+            f" differences that {name} might explain"
+            for name in empty_covariates(inputs.cohort.table, settings)
+        ]
+    if later := sum(one.reason == "later-session" for one in inputs.exclusions):
+        notes.append(
+            f"{later} later sessions are not in it; --longitudinal takes all, --paired two"
+        )
+    if flagged := sum(record.flagged for record in found.records):
+        notes.append(
+            f"{flagged} flagged hemispheres are in it; look at them, or use --exclude-flagged"
+        )
+    if separated := sum(pair.comparison.separated for _, _, pair in analysis.pairs):
+        notes.append(
+            f"{separated} of {len(analysis.pairs)} comparisons of classifiers are separated, and"
+            " fitted by Firth's method"
+        )
+    for key, discoveries in analysis.found.items():
+        if discoveries.lenient:
+            notes.append(
+                f"{key.measure}, {key.contrast}, {key.hemi}: p up to {discoveries.cutoff:.3g}"
+                " survives, above the level; effects are widespread"
+            )
+    notes += unequal_spread(analysis, settings.glm)
+    for hemi, side in analysis.sides.items():
+        if not side.registration.converged:
+            notes.append(f"hemisphere {hemi}: registration had not settled when it ended")
+        if side.registration.extreme.any():
+            notes.append(
+                f"hemisphere {hemi}: extreme warps: {int(side.registration.extreme.sum())}, see"
+                " warps.tsv"
+            )
+    return notes
+
+
+def _record(analysis: Analysis, ratings: Mapping[str, int] | None) -> dict[str, Any]:
+    """Record what was fitted to what."""
+    return {
+        "harmonization": None
+        if analysis.harmonization is None
+        else harmonization_record(analysis.harmonization, analysis.groups),
+        "measures": {"maps": analysis.measured.maps, "summaries": analysis.measured.summaries},
+        "formula": analysis.model.formula,
+        "columns": analysis.design.columns,
+        "references": analysis.design.references,
+        "contrasts": {c.name: c.weights.tolist() for c in analysis.design.contrasts},
+        "comparison": asdict(analysis.comparison),
+        "groups": None if analysis.groups is None else asdict(analysis.groups),
+        "participants": analysis.n_participants,
+        "rows": len(analysis.design.rows),
+        "ratings": ratings,
+        "hemispheres": {hemi: len(one.used) for hemi, one in analysis.fitted.items()},
+    }
+
+
+def _incomplete(analysis: Analysis) -> list[collect.Exclusion]:
+    """Visits that lack a variable of the model."""
+    table = analysis.compared.table
+    return [
+        one
+        for variable, visits in analysis.design.dropped.items()
+        for one in collect.exclude_visits(
+            table, dict.fromkeys(visits, ("incomplete", f"{variable} is missing"))
+        )
+    ]

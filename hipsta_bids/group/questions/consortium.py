@@ -1,0 +1,255 @@
+"""The meta-analysis from files to files: summaries of sites become tables, maps and a page."""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from hipsta_bids import __version__
+from hipsta_bids.derivatives.names import META, META_REPORT
+from hipsta_bids.errors import OutputError, UsageError
+from hipsta_bids.group.cohort.data import Cohort
+from hipsta_bids.group.design.settings import GroupSettings
+from hipsta_bids.group.output import write
+from hipsta_bids.group.output.figures import Drawing
+from hipsta_bids.group.output.methods import Citations, discovery_text
+from hipsta_bids.group.output.panels import Row, contrasts, draw_pages
+from hipsta_bids.group.output.tables import META_COLUMNS
+from hipsta_bids.group.questions.exchange import SiteSummary, read_summary
+from hipsta_bids.group.questions.sites import Meta, analyze_sites, check_agreement, meta_tables
+from hipsta_bids.group.stats.arrays import SideMaps
+from hipsta_bids.group.stats.glm import FittedMaps, PointTest
+from hipsta_bids.group.stats.inference import PERMUTATIONS
+from hipsta_bids.group.stats.meta import FIXED, RANDOM
+from hipsta_bids.io import files
+from hipsta_bids.protocols.toml import resolve
+from hipsta_bids.reports.meta import write_meta_report
+
+
+@dataclass(frozen=True, kw_only=True)
+class MetaOptions:
+    """What the user asked for."""
+
+    sites: tuple[tuple[str | None, Path], ...]
+    """Summaries, perhaps with other names than those in them."""
+    out_dir: Path
+    command: tuple[str, ...] = ()
+
+
+def run_meta(options: MetaOptions, settings: GroupSettings) -> tuple[Path, list[str]]:
+    """Combine the summaries of sites; returns the page and what should be known."""
+    if settings.multiplicity.method in PERMUTATIONS:
+        raise UsageError(
+            "meta: there is nobody to permute in summaries; use --correction fdr2 or bh"
+        )
+    sites = _read(options.sites)
+    notes = check_agreement(sites)
+    meta = analyze_sites(sites, settings)
+    folder = options.out_dir / META
+    if folder.exists() and not (folder / "meta.json").exists():
+        raise OutputError(
+            f"{folder}: is no earlier meta-analysis; choose another output folder",
+            reason="not-writable",
+        )
+    with write.whole_folder(folder) as aside:
+        for name, table in meta_tables(meta):
+            write.write_table(aside, name, table, described=name != "sites", meaning=META_COLUMNS)
+        _write_maps(aside, meta)
+        notes += write.write_figures(aside, _figures(meta))
+        files.write_text(aside / "methods.md", _methods(meta))
+        files.write_json(aside / "meta.json", _record(meta, options, notes))
+    write_meta_report(options.out_dir)
+    return options.out_dir / META_REPORT, notes
+
+
+def _read(given: Sequence[tuple[str | None, Path]]) -> list[SiteSummary]:
+    """Read summaries, and refuse any that would count twice."""
+    sites: list[SiteSummary] = []
+    seen: dict[str, str] = {}
+    for name, path in given:
+        site = read_summary(path)
+        content = site.model_dump_json(exclude={"site"})
+        site = site if name is None else site.model_copy(update={"site": name})
+        if content in seen:
+            raise UsageError(
+                f"meta: {site.site} and {seen[content]} are the same summary; give each site once"
+            )
+        if site.site in seen.values():
+            raise UsageError(
+                f"meta: two sites are called {site.site}; name them, as a={path} b=..."
+            )
+        seen[content] = site.site
+        sites.append(site)
+    if len(sites) < 2:  # noqa: PLR2004 -- sites
+        raise UsageError("meta: give the summaries of two sites or more")
+    return sites
+
+
+def _write_maps(folder: Path, meta: Meta) -> None:
+    """Write maps of both models as GIFTI and CIFTI, and the sheets to draw them on."""
+    tests = (one for item in meta.of("map") for one in meta.tests(item))
+    write.write_stats(
+        folder, write.stats_of((key, test, meta.found[key]) for key, test, _ in tests)
+    )
+    cohort = _cohort(meta)
+    for hemi in dict.fromkeys(item.model.hemi for item in meta.of("map")):
+        write.write_surface(folder, cohort, _place(meta, hemi, cohort), hemi)
+
+
+def _cohort(meta: Meta) -> Cohort:
+    """Coordinates of the sheet, without anybody."""
+    first = meta.sites[0]
+    return Cohort(
+        table=pd.DataFrame(), sides={}, x=np.array(first.x), y=np.array(first.y), units={}
+    )
+
+
+def _figures(meta: Meta) -> Iterator[tuple[str, Drawing]]:
+    """List figures of maps, one per measure, for :func:`write_figures`."""
+    maps, cohort = list(meta.of("map")), _cohort(meta)
+    tests: dict[str, dict[str, list[PointTest]]] = {}
+    for item in maps:
+        measures = tests.setdefault(item.model.hemi, {})
+        measures.setdefault(item.model.measures[0], []).extend(
+            test for _, test, _ in meta.tests(item)
+        )
+    places = {hemi: _place(meta, hemi, cohort) for hemi in tests}
+    like = {item.label(RANDOM): item.label(FIXED) for item in maps}
+    for measure in dict.fromkeys(item.model.measures[0] for item in maps):
+        sides = {hemi: one for hemi, one in places.items() if measure in tests[hemi]}
+        blocks = list(contrasts(tests, meta.found, measure, like))
+        own = [item for item in maps if item.model.measures[0] == measure]
+        for number, contrast in enumerate(dict.fromkeys(item.contrast for item in own)):
+            row = Row(
+                kind="heterogeneity",
+                index=number,
+                title=f"Heterogeneity, {contrast}",
+                label="I² [%]",
+                scale={"cmap": "cividis", "vmin": 0.0, "vmax": 100.0},
+                values={
+                    item.model.hemi: 100 * item.result.random.i2
+                    for item in own
+                    if item.contrast == contrast
+                },
+            )
+            blocks[2 * number + 1].append(row)
+        yield f"{measure}_maps", partial(draw_pages, cohort, sides, {}, {}, blocks)
+
+
+def _place(meta: Meta, hemi: str, cohort: Cohort) -> FittedMaps:
+    """Locate the points of maps of one hemisphere, of which there are no sheets."""
+    shape, nobody = (len(cohort.x), len(cohort.y)), np.zeros(0, dtype=np.int64)
+    words = meta.frame[hemi].subfield
+    names = tuple(name for name in dict.fromkeys(words) if name != files.MISSING)
+    subfield = np.array([names.index(word) if word in names else -1 for word in words])
+    maps = SideMaps(
+        rows=nobody,
+        maps={},
+        subfield=np.zeros((0, *shape), dtype=np.int8),
+        names=names,
+        summary=pd.DataFrame(),
+    )
+    return FittedMaps(
+        maps=maps, used=nobody, rows=nobody, subfield=subfield.reshape(shape), fits={}
+    )
+
+
+def _record(meta: Meta, options: MetaOptions, notes: Sequence[str]) -> dict[str, Any]:
+    """Record what was combined, and how."""
+    first = meta.sites[0]
+    return {
+        "command": list(options.command),
+        "version": __version__,
+        "inputs": {
+            "datasets": [str(path.resolve()) for _, path in options.sites],
+            "settings_hash": first.settings_hash,
+            "versions": sorted({version for site in meta.sites for version in site.versions}),
+            "seg": first.seg,
+            "region": first.region,
+            "template_hash": first.template_hash,
+        },
+        "formula": first.models[0].formula,
+        "columns": first.models[0].columns,
+        "contrasts": first.models[0].contrasts,
+        "groups": {"levels": list(first.groups)},
+        "comparison": {},
+        "participants": meta.people,
+        "sites": [site.site for site in meta.sites],
+        "notes": notes,
+        "settings": {
+            name: values
+            for name, values in resolve(meta.settings).items()
+            if name in {"meta", "multiplicity"}
+        },
+    }
+
+
+def _methods(meta: Meta) -> str:
+    """Word what was done and what came out."""
+    how, sites = meta.settings.meta, meta.sites
+    cite = Citations()
+    counts = Counter[str]()
+    for site in sites:
+        counts.update(site.groups)
+    groups = f" ({', '.join(f'{n} {name}' for name, n in counts.items())})" if counts else ""
+    aligned = (
+        "Maps were not registered to each other."
+        if sites[0].template is None
+        else "All sites registered their maps to one template of curvature profiles (hash"
+        f" {sites[0].template_hash})."
+    )
+    joint = how.model == "joint"
+    fixed = "The fixed effect is the mean of the sites' estimates, weighted by inverse variances."
+    if joint:
+        fixed = (
+            "The fixed effect is that of the model of all participants with a constant per site,"
+            f" from the sites' coefficients and their covariances {cite('join')}; contrasts that"
+            " include the constant are combined by inverse variances."
+        )
+    if how.random == "dl":
+        random = f"the moments of DerSimonian and Laird {cite('dl')}, tests are normal"
+    elif joint:
+        random = (
+            f"restricted maximum likelihood {cite('reml')} in the same model with a random slope of"
+            " the site, tests and limits are those of t with one degree of freedom less than there"
+            " are sites"
+        )
+    else:
+        random = (
+            f"restricted maximum likelihood {cite('reml')}, tests and limits are those of Knapp and"
+            f" Hartung {cite('knapp-hartung')}, with standard errors not smaller than without their"
+            f" correction {cite('modified')}"
+        )
+    what = (
+        f"Measures of the hippocampus {cite('method')} of {meta.people} participants{groups} at"
+        f" {len(sites)} sites were combined with hipsta_bids {__version__}; no values of"
+        f" participants left a site. Each site fitted the linear model"
+        f" `{sites[0].models[0].formula}` at each point of the sheet and to each summary measure."
+    )
+    effects = (
+        f"{fixed} In the random-effects model, true effects differ between sites; their variance"
+        f" (tau²) was estimated by {random}. Heterogeneity is described by Cochran's Q and I²"
+        f" {cite('i2')}, and by limits of the effect at a further site {cite('prediction')}."
+    )
+    if meta.items[0].result.without:
+        effects += " All was repeated without each of the sites."
+    errors = (
+        f"{discovery_text(meta.settings.multiplicity, cite)}, and for all summary measures of a"
+        " contrast together. Effect sizes are Cohen's d: the estimate over"
+        f" the residual standard deviation within sites, with {how.confidence:.0%} confidence"
+        " limits."
+    )
+    paragraphs = [f"{what} {aligned}", effects, errors]
+    survivors = [
+        f"{key.measure}, {key.contrast}, {key.hemi}: {int(found.rejected.sum())} of"
+        f" {found.n_tests} points"
+        for key, found in meta.found.items()
+    ]
+    if survivors:
+        paragraphs.append(f"Points that survive: {'; '.join(survivors)}.")
+    return cite.page(paragraphs, sites[0].region)

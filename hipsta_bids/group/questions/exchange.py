@@ -1,0 +1,410 @@
+"""What a site sends to others about one analysis, and how it is read: sums over participants only.
+
+A summary is one JSON file. All of its numbers are about the same participants, so that no
+difference of two of them is about one person.
+"""
+
+import hashlib
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import pandas as pd
+from pydantic import Field
+
+from hipsta_bids import __version__
+from hipsta_bids.errors import InputError, ModelError
+from hipsta_bids.group.cohort.data import Cohort, summary_values
+from hipsta_bids.group.design.formula import typed
+from hipsta_bids.group.design.grammar import closed_formula
+from hipsta_bids.group.design.model import Design, build_design
+from hipsta_bids.group.design.settings import ExchangeSettings, GroupSettings
+from hipsta_bids.group.output.results import Analysis, templates_of
+from hipsta_bids.group.stats.arrays import Float, Int
+from hipsta_bids.group.stats.glm import FittedMaps, PointTest, fit_points, with_mean
+from hipsta_bids.group.stats.meta import SiteFit
+from hipsta_bids.io import files
+from hipsta_bids.io.foreign import Known, Number, Text, read_foreign, rounded
+from hipsta_bids.protocols.toml import TomlTable
+
+#: File of a summary, in the folder of an analysis.
+SUMMARY = "summary.json"
+#: Changes when readers of earlier versions would misread a summary.
+_FORMAT = 1
+_AXES = "x from medial to lateral, y from posterior to anterior, on both sides"
+#: Summaries larger than this many bytes are not read.
+_MOST_BYTES = 50_000_000
+#: Sums in another order, and rounding to these digits, differ by less.
+_ROUNDING = 1e-5
+_LEAST = 1e-15  # eigenvalue of a covariance, relative to the largest
+#: Functions whose columns depend on who is in the table.
+_OF_THE_SAMPLE = re.compile(r"(?<![\w.])(bs|center|cr|poly|scale)\s*\(")
+Word = Annotated[str, Field(min_length=1, max_length=60, pattern=r"^[\w][\w .+-]*$")]
+Name = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^\w[\w .:+-]*$")]
+Numbers = list[Number]
+
+
+class ModelSummary(TomlTable):
+    """One model at each point of a map, or for summary measures."""
+
+    kind: Literal["map", "summary"]
+    """What the points are: those of the sheet, or summary measures."""
+    hemi: Literal["L", "R", "LR"]
+    measures: Annotated[list[Name], Field(min_length=1)]
+    units: list[Text]
+    formula: Text
+    columns: Annotated[list[Text], Field(min_length=1, max_length=200)]
+    df: Annotated[int, Field(ge=1)]
+    """Residual degrees of freedom."""
+    covariance: list[Numbers]
+    """(columns, columns) of the coefficients, over the residual variance."""
+    contrasts: Annotated[dict[Text, Numbers], Field(min_length=1)]
+    """Weights of the columns."""
+    coefficients: list[Known]
+    """(columns, points); null where a participant lacks a value."""
+    sd: Known
+    """(points,) residual standard deviation."""
+    estimate: dict[Text, Known]
+    """(points,) by contrast."""
+    se: dict[Text, Known]
+    """(points,) by contrast."""
+    subfield: list[Text | None] | None = None
+    """(points,) of a map, most frequent."""
+
+    @property
+    def title(self) -> str:
+        """Name in messages."""
+        what = self.measures[0] if self.kind == "map" else f"summary measures ({self.formula})"
+        return f"{what}, {self.hemi}"
+
+    @property
+    def intercept(self) -> int | None:
+        """Position of the constant."""
+        return self.columns.index("Intercept") if "Intercept" in self.columns else None
+
+    @cached_property
+    def fit(self) -> SiteFit:
+        """The numbers as arrays."""
+        return SiteFit(
+            coefficients=np.array(self.coefficients, dtype=np.float64),
+            covariance=np.array(self.covariance, dtype=np.float64),
+            sd=np.array(self.sd, dtype=np.float64),
+            df=self.df,
+        )
+
+    def check(self, points: int, participants: int) -> str | None:
+        """Say what does not fit together, if anything."""
+        count = len(self.columns)
+        points = points if self.kind == "map" else len(self.measures)
+        rows: list[Sequence[object]] = [self.sd, *self.coefficients]
+        rows += [*self.estimate.values(), *self.se.values()]
+        rows += [] if self.subfield is None else [self.subfield]
+        if any(len(row) != points for row in rows) or len(self.coefficients) != count:
+            return f"numbers of points that are not {points}"
+        square: list[Sequence[object]] = [self.covariance, *self.covariance]
+        square += self.contrasts.values()
+        if any(len(row) != count for row in square) or len(self.units) != len(self.measures):
+            return f"numbers of columns that are not {count}"
+        if self.df != participants - count:
+            return "other degrees of freedom than participants"
+        if not self.contrasts.keys() == self.estimate.keys() == self.se.keys():
+            return "contrasts without estimates"
+        fit = self.fit
+        sizes = np.linalg.eigvalsh(fit.covariance)
+        if not (np.allclose(fit.covariance, fit.covariance.T) and sizes[0] > _LEAST * sizes[-1]):
+            return "a covariance of coefficients that is none"
+        return self._wrong_contrast(fit)
+
+    def _wrong_contrast(self, fit: SiteFit) -> str | None:
+        for name, row in self.contrasts.items():
+            weights = np.array(row, dtype=np.float64)
+            for kept, made in (
+                (self.estimate[name], fit.estimate(weights)),
+                (self.se[name], fit.se(weights)),
+            ):
+                size = _ROUNDING * float(np.abs(np.nan_to_num(made)).max(initial=0.0))
+                known = np.array(kept, dtype=np.float64)
+                if not np.allclose(known, made, rtol=_ROUNDING, atol=size, equal_nan=True):
+                    return f"estimates of {name} that are not those of its coefficients"
+        return None
+
+
+class SiteSummary(TomlTable):
+    """The content of a summary."""
+
+    description: Text
+    format: Literal[1]
+    site: Word
+    version: Text
+    """Of hipsta_bids, at the group level."""
+    versions: list[Text]
+    """Of hipsta_bids, at the participant level."""
+    seg: Text
+    region: Text
+    settings_hash: Text
+    """Of the settings of the participant level."""
+    axes: Text
+    x: Annotated[Numbers, Field(min_length=2, max_length=2000)]
+    """Coordinates of the nodes of the sheet, medial to lateral."""
+    y: Annotated[Numbers, Field(min_length=2, max_length=2000)]
+    """Posterior to anterior."""
+    asymmetry: list[Text]
+    """Measures whose left minus right is relative."""
+    change: bool
+    """Whether rows are changes between two sessions."""
+    align: Text
+    template: dict[str, Any] | None
+    """Template of registration, as in ``template.json``; ``None`` without registration."""
+    participants: Annotated[int, Field(ge=1)]
+    groups: dict[Text, Annotated[int, Field(ge=0)]]
+    """Participants by group, the reference first; empty without groups."""
+    factors: dict[Text, dict[Text, Annotated[int, Field(ge=0)]]]
+    """Participants by level of each factor of the model, the reference level first."""
+    covariates: dict[Text, dict[Literal["mean", "sd"], Number]]
+    """Of the numbers of the model."""
+    models: Annotated[list[ModelSummary], Field(min_length=1, max_length=500)]
+
+    @property
+    def template_hash(self) -> str:
+        """Hash of the template, or ``none``."""
+        if self.template is None:
+            return "none"
+        text = json.dumps(self.template, sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def write_summary(path: Path, summary: Mapping[str, Any]) -> None:
+    """Write a summary, one entry per line."""
+    lines = [f"{json.dumps(key)}: {json.dumps(value)}" for key, value in summary.items()]
+    files.write_text(path, "{\n" + ",\n".join(lines) + "\n}\n")
+
+
+def read_summary(path: Path) -> SiteSummary:
+    """Read and check a summary of another site, which may hold anything."""
+    path = path / SUMMARY if path.is_dir() else path
+    if not path.exists():
+        raise InputError(f"{path}: no summary; it is written by `group --export-summary`")
+    try:
+        summary = read_foreign(path, SiteSummary, most=_MOST_BYTES)
+        _ = summary.template_hash
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not a summary: {error}; ask the site for it again") from error
+    for model in summary.models:
+        points = len(summary.x) * len(summary.y)
+        if problem := model.check(points, summary.participants):
+            raise InputError(f"{path}: {model.title} has {problem}; ask the site for it again")
+    return summary
+
+
+def summarize(
+    cohort: Cohort,
+    analysis: Analysis,
+    settings: GroupSettings,
+    *,
+    site: str,
+    inputs: Mapping[str, Any],
+) -> tuple[dict[str, Any], list[str]]:
+    """Make the summary of an analysis of linear models, and note what it leaves out.
+
+    The cohort has coordinates and units; ``inputs`` are ``seg``, ``region``, ``settings_hash`` and
+    ``versions`` of the sheets. ModelError if so few participants are behind a number that it could
+    be traced to one of them.
+    """
+    _check_model(analysis, settings)
+    compared = analysis.compared
+    rows: Int = analysis.design.rows
+    for side in compared.sides.values():
+        rows = np.intersect1d(rows, side.rows)
+    notes = []
+    if lacking := len(analysis.design.rows) - len(rows):
+        notes.append(f"{SUMMARY}: without {lacking} participants who lack a hemisphere")
+    table = compared.table.iloc[rows]
+    designs = {}
+    for formula in dict.fromkeys((analysis.model.formula, *(m.formula for m in analysis.measures))):
+        # Anew, since contrasts may hold means over all participants.
+        spec = replace(analysis.model, formula=formula)
+        made = build_design(table, spec, settings.design, analysis.design.references)
+        if len(made.rows) == len(rows):
+            designs[formula] = replace(made, contrasts=with_mean(made))
+        else:
+            lacking = len(rows) - len(made.rows)
+            notes.append(f"{SUMMARY}: without {formula}: {lacking} participants lack a variable")
+    people = {name: typed(table[name]) for name in analysis.design.references}
+    factors = {
+        name: _counts(people[name], first) for name, first in analysis.design.references.items()
+    }
+    groups = {}
+    if analysis.groups is not None:
+        groups = _counts(table[analysis.groups.column], analysis.groups.reference)
+    for design in designs.values():
+        _check_people({**factors, "group": groups}, design, settings.exchange)
+    models = list(_models(compared, analysis, rows, designs, settings))
+    if not models:
+        raise ModelError(
+            "--export-summary: nothing to export; maps of other programs are not in a summary"
+        )
+    for model in models:
+        model["units"] = [cohort.units.get(name, "1") for name in model["measures"]]
+        if lost := model["sd"].count(None):
+            what = "points" if model["kind"] == "map" else "measures"
+            notes.append(
+                f"{SUMMARY}: {model['measures'][0] if what == 'points' else 'summaries'},"
+                f" {model['hemi']}: without {lost} {what} that are not known of all participants"
+            )
+    numbers = {
+        name: typed(table[name]).astype(np.float64)
+        for name in closed_formula(analysis.model.formula).names
+        if name not in factors
+    }
+    return {
+        "description": "results of one site for a meta-analysis with hipsta_bids; no values of"
+        " single participants",
+        "format": _FORMAT,
+        "site": site,
+        "version": __version__,
+        **inputs,
+        "axes": _AXES,
+        "x": cohort.x.tolist(),
+        "y": cohort.y.tolist(),
+        "asymmetry": [] if analysis.comparison.pair else list(settings.asymmetry.relative),
+        "change": analysis.comparison.pair is not None,
+        "align": settings.registration.align,
+        "template": files.plain(templates_of(analysis.sides)),
+        "participants": len(rows),
+        "groups": groups,
+        "factors": factors,
+        "covariates": {
+            name: {"mean": rounded(values.mean()), "sd": rounded(values.std())}
+            for name, values in numbers.items()
+        },
+        "models": models,
+    }, notes
+
+
+def _counts(values: pd.Series, first: str) -> dict[str, int]:
+    """Count participants by level, the reference first."""
+    counts = values.dropna().astype(str).value_counts()
+    return {
+        level: int(counts[level]) for level in sorted(counts.index, key=lambda x: (x != first, x))
+    }
+
+
+def _check_model(analysis: Analysis, settings: GroupSettings) -> None:
+    """Refuse models whose coefficients other sites could not use."""
+    problem = None
+    if analysis.comparison.longitudinal:
+        problem = "of --longitudinal cannot be combined; use --paired"
+    elif analysis.harmonization is not None:
+        problem = "of harmonized values cannot be combined; leave --harmonize out"
+    elif settings.glm.covariance != "ordinary" or settings.glm.weights != "none":
+        problem = "with HC3 standard errors or weights cannot be combined; leave these out"
+    elif found := _OF_THE_SAMPLE.search(analysis.model.formula):
+        problem = (
+            f"with {found[1]}() has other columns at each site; write numbers that are the same"
+            " everywhere, as I((age - 65) / 10)"
+        )
+    elif not any(contrast.n_rows == 1 for contrast in analysis.design.contrasts):
+        problem = "has no contrast of one row; F tests cannot be combined"
+    if problem is not None:
+        raise ModelError(f"--export-summary: a model {problem}")
+
+
+def _check_people(
+    counts: Mapping[str, Mapping[str, int]], design: Design, limits: ExchangeSettings
+) -> None:
+    """Refuse numbers that are about few participants, or hang on one."""
+    matrix, least = design.matrix, limits.min_cell
+    cells = {f"{name} {level}": n for name, own in counts.items() for level, n in own.items()}
+    for name, column in zip(design.columns, matrix.T, strict=True):
+        if set(np.unique(column)) == {0.0, 1.0}:
+            cells |= {f"{name} = {i}": int((column == i).sum()) for i in (0, 1)}
+    small = [f"{name} ({n})" for name, n in cells.items() if n < least]
+    leverage = float(np.max(np.sum(np.linalg.qr(matrix)[0] ** 2, axis=1), initial=0.0))
+    problem = None
+    if small:
+        problem = f"too few participants for {', '.join(small)}; at least {least} are needed"
+    elif len(matrix) - matrix.shape[1] < limits.min_residual_df:
+        problem = (
+            f"{len(matrix)} participants are too few for {matrix.shape[1]} columns; at least"
+            f" {matrix.shape[1] + limits.min_residual_df} are needed"
+        )
+    elif leverage > limits.max_leverage:
+        problem = (
+            f"one participant determines its own fitted value by {leverage:.0%}; look for an"
+            " extreme value of a covariate"
+        )
+    if problem is not None:
+        raise ModelError(f"--export-summary: {problem}")
+
+
+def _models(
+    compared: Cohort,
+    analysis: Analysis,
+    rows: Int,
+    designs: Mapping[str, Design],
+    settings: GroupSettings,
+) -> Iterator[dict[str, Any]]:
+    """Models of maps, and of summary measures, of the participants in ``rows``."""
+    formula = analysis.model.formula
+    for hemi, one in analysis.fitted.items():
+        places = np.searchsorted(one.maps.rows, rows)
+        for measure, fit in one.fits.items():
+            values = one.maps.maps[measure][places].reshape(len(rows), -1)
+            yield {
+                "kind": "map",
+                "hemi": hemi,
+                "measures": [measure],
+                "formula": formula,
+                "subfield": _subfields(one),
+                **_model(values, designs[formula], fit.tests, settings),
+            }
+    for fitted in analysis.measures:
+        if fitted.formula not in designs:
+            continue
+        table = summary_values(compared, fitted.hemi, analysis.measured.summaries).iloc[rows]
+        # Also those that do not vary here, so that all sites have the same measures.
+        adjusted = fitted.formula != formula
+        names = [str(c) for c in table if not adjusted or str(c).startswith("volume")]
+        values = table[names].to_numpy(dtype=np.float64)
+        yield {
+            "kind": "summary",
+            "hemi": fitted.hemi,
+            "measures": names,
+            "formula": fitted.formula,
+            **_model(values, designs[fitted.formula], fitted.fit.tests, settings),
+        }
+
+
+def _subfields(one: FittedMaps) -> list[str | None]:
+    names = [*one.maps.names, None]
+    return [names[number] for number in one.subfield.ravel().tolist()]
+
+
+def _model(
+    values: Float, design: Design, tests: Sequence[PointTest], settings: GroupSettings
+) -> dict[str, Any]:
+    """Fit the model where all participants have a value, and spell the results."""
+    names = [test.contrast.name for test in tests]
+    contrasts = [one for one in design.contrasts if one.n_rows == 1 and one.name in names]
+    complete = np.isfinite(values).all(axis=0)
+    fit = fit_points(np.where(complete, values, 0.0), design.matrix, contrasts, settings.glm)
+    there = complete & np.isfinite(fit.sigma)
+
+    def known(numbers: Float) -> list[Any]:
+        return rounded(np.where(there, numbers, np.nan))  # type: ignore[no-any-return]
+
+    return {
+        "columns": list(design.columns),
+        "df": len(design.matrix) - len(design.columns),
+        "covariance": rounded(np.linalg.inv(design.matrix.T @ design.matrix)),
+        "contrasts": {one.name: one.weights[0].tolist() for one in contrasts},
+        "coefficients": known(fit.coefficients),
+        "sd": known(fit.sigma),
+        "estimate": {test.contrast.name: known(test.estimate[0]) for test in fit.tests},
+        "se": {test.contrast.name: known(test.se[0]) for test in fit.tests},
+    }

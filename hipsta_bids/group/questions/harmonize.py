@@ -1,0 +1,387 @@
+"""Harmonization of a cohort: which sites, what is kept, and what cannot be told apart."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from formulaic import Formula
+
+from hipsta_bids.errors import ModelError
+from hipsta_bids.group.cohort.data import Cohort, Measures, modeled_table
+from hipsta_bids.group.design.formula import (
+    INTERCEPT,
+    ModelSpec,
+    check_names,
+    columns_of,
+    level_labels,
+    listed,
+    typed,
+)
+from hipsta_bids.group.design.grammar import closed_formula
+from hipsta_bids.group.design.model import DEPENDENCE, Comparison, Design, build_design
+from hipsta_bids.group.design.settings import GroupSettings
+from hipsta_bids.group.output.results import Harmonization, Kept, SitePlan, digests
+from hipsta_bids.group.output.saved import SavedEffects, damaged
+from hipsta_bids.group.questions.scores import without_variable
+from hipsta_bids.group.stats import combat
+from hipsta_bids.group.stats.arrays import Bool, Float
+from hipsta_bids.group.stats.registration import Registration
+from hipsta_bids.types import PARTICIPANT, SESSION
+
+#: Share of a contrast's weights that counts as rounding.
+_UNTOUCHED = 1e-8
+
+
+def plan_sites(
+    cohort: Cohort,
+    model: ModelSpec,
+    settings: GroupSettings,
+    *,
+    references: Mapping[str, str],
+    comparison: Comparison,
+    icv: str | None,
+    saved: SavedEffects | None,
+) -> SitePlan | None:
+    """Say what is harmonized, or refuse what cannot be told apart; ``None`` if nothing is asked.
+
+    All terms of the model without the site are kept; in changes between two sessions, also their
+    interactions with the session. Of an earlier analysis, its own terms are. ModelError if sites
+    are too small, or explain a column of the model.
+    """
+    column = saved.column if saved else settings.harmonization.column
+    if not column:
+        return None
+    check_names([column], cohort.table.columns)
+    _check_terms(model, column)
+    if comparison.pair:
+        _check_constant(cohort.table, column)
+    if saved:
+        kept = _saved_columns(cohort.table, saved)
+    else:
+        kept = _own_columns(cohort, column, model, settings, (references, comparison))
+    labels = level_labels(cohort.table[column])
+    usable = labels.notna().to_numpy() & np.isfinite(kept.matrix).all(axis=1)
+    old = tuple(saved.sites) if saved else ()
+    present = set(labels[usable])
+    new = tuple(sorted(present - set(old)))
+    sites = (*old, *new)
+    people = cohort.table[PARTICIPANT].to_numpy()
+    counts = {one: len(set(people[usable & (labels == one).to_numpy()])) for one in sites}
+    counts = {one: n for one, n in counts.items() if n}
+    _check_sizes(column, new, counts, settings, alone=saved is None)
+    site = np.where(usable, pd.Categorical(labels, categories=sites).codes, -1).astype(np.int64)
+    member = np.eye(len(sites))[site[usable]]
+    explained = _explained(column, member, kept, usable, refuse=saved is None)
+    several = pd.Series(people[usable]).duplicated().any() if saved is None else saved.repeated
+    volume = saved.icv if saved else icv
+    volume, values = _icv(cohort.table, usable, volume, kept.formula)
+    if saved and saved.icv and volume is None:
+        raise ModelError(
+            f"{saved.file}: volumes kept {saved.icv} there, which not all have here; complete it"
+        )
+    return SitePlan(
+        column=column,
+        sites=sites,
+        estimated=new,
+        counts=counts,
+        visits=combat.Visits(
+            site=site,
+            columns=kept.matrix,
+            participant=np.unique(people, return_inverse=True)[1] if several else None,
+        ),
+        kept=kept,
+        icv=volume,
+        icv_values=values,
+        explained=explained,
+        saved=saved,
+        lost=int((~usable).sum()),
+    )
+
+
+def _saved_columns(table: pd.DataFrame, saved: SavedEffects) -> Kept:
+    """Make the columns of an earlier analysis for these visits."""
+    matrix, names, complete = columns_of(table, saved.formula, saved.levels, f"{saved.file}: ")
+    if list(names) != saved.columns:
+        raise damaged(saved.file, f"columns {listed(saved.columns)}, not {listed(names)}")
+    values = np.full((len(table), len(names)), np.nan)
+    values[complete] = matrix
+    return Kept(matrix=values, names=names, formula=saved.formula, levels=saved.levels)
+
+
+def _own_columns(
+    cohort: Cohort,
+    column: str,
+    model: ModelSpec,
+    settings: GroupSettings,
+    context: tuple[Mapping[str, str], Comparison],
+) -> Kept:
+    """Make the columns of the model without the site; of two sessions, with their interactions."""
+    references, comparison = context
+    table = modeled_table(cohort.table, comparison)
+    formula = without_variable(model.formula, column).removeprefix("1 + ")
+    known = closed_formula(formula).names
+    spec = replace(model, formula=formula, contrasts=(), dummy=None)
+    chosen = {name: text for name, text in references.items() if name in known}
+    design = build_design(table, spec, settings.design, chosen)
+    own = [i for i, name in enumerate(design.columns) if name != INTERCEPT]
+    names = tuple(design.columns[i] for i in own)
+    values = np.full((len(table), len(names)), np.nan)
+    values[design.rows] = design.matrix[:, own]
+    portable = not comparison.pair and _is_portable(table, formula, design)
+    if comparison.pair:
+        session = comparison.pair[1]
+        values = values[table.index.get_indexer(pd.Index(cohort.table[PARTICIPANT]))]
+        later = (cohort.table[SESSION] == session).to_numpy(np.float64)[:, None]
+        values = np.hstack([values, later, later * values])
+        names = (*names, session, *(f"{name} x {session}" for name in names))
+    return Kept(
+        matrix=values, names=names, formula=formula, levels=design.levels, portable=portable
+    )
+
+
+def _check_terms(model: ModelSpec, column: str) -> None:
+    """Refuse interactions with the site."""
+    for term in Formula(closed_formula(model.formula).text):
+        names = closed_formula(str(term)).names
+        if column in names and len(names) > 1:
+            raise ModelError(
+                f"--harmonize {column}: the model has {term}, so that part of an effect is of"
+                " sites and to be kept; leave this term or --harmonize out"
+            )
+
+
+def _check_constant(table: pd.DataFrame, column: str) -> None:
+    """Refuse changes between two sessions of people who changed the site."""
+    pairs = table[[PARTICIPANT, column]].drop_duplicates()[PARTICIPANT]
+    several = pairs[pairs.duplicated()].unique()
+    if len(several):
+        raise ModelError(
+            f"--harmonize {column}: {listed(several)} changed {column} between the"
+            f" sessions, so that changes depend on effects of {column} that the model of changes"
+            " cannot have; use --longitudinal"
+        )
+
+
+def _check_sizes(
+    column: str,
+    new: Sequence[str],
+    counts: Mapping[str, int],
+    settings: GroupSettings,
+    *,
+    alone: bool,
+) -> None:
+    least = settings.harmonization.least_participants
+    if alone and len(new) < 2:  # noqa: PLR2004 -- one is like all
+        raise ModelError(
+            f"--harmonize {column}: all participants with the variables of the model have"
+            f" {column} {listed(new) or 'n/a'}; leave it out"
+        )
+    if small := [f"{one} ({counts[one]})" for one in new if counts[one] < least]:
+        raise ModelError(
+            f"--harmonize {column}: too few participants in {listed(small)}; at least {least} are"
+            " needed to tell a site from its participants: leave these out by --exclude, or join"
+            f" similar ones in a column of their own"
+        )
+
+
+def _explained(
+    column: str,
+    member: Float,
+    kept: Kept,
+    usable: Bool,
+    *,
+    refuse: bool,
+) -> dict[str, float]:
+    """Share of the variance of each column that sites explain; refuses what they explain wholly."""
+    there = member[:, member.any(axis=0)]
+    basis = np.linalg.qr(there)[0]
+    found: dict[str, float] = {}
+    for name, values in zip(kept.names, kept.matrix[usable].T, strict=True):
+        around = values - values.mean()
+        total = float(around @ around)
+        inside = around - there @ np.linalg.lstsq(there, around, rcond=None)[0]
+        found[name] = 1 - float(inside @ inside) / total if total > 0 else 0.0
+        rest = values - basis @ (basis.T @ values)
+        rest -= basis @ (basis.T @ rest)
+        length = float(np.linalg.norm(rest))
+        if length <= DEPENDENCE * float(np.linalg.norm(values)):
+            if refuse:
+                raise ModelError(
+                    f"--harmonize {column}: {column} and {name} cannot be told apart, since {name}"
+                    f" does not vary within {column}s (given the other variables); compare sites"
+                    " that have all groups, or leave --harmonize out"
+                )
+            continue
+        basis = np.column_stack([basis, rest / length])
+    return found
+
+
+def _is_portable(table: pd.DataFrame, formula: str, design: Design) -> bool:
+    """Tell whether columns of some people alone are the same as among all; splines' are not."""
+    half = design.rows[::2]
+    matrix, names, _ = columns_of(table.iloc[half], formula, design.levels, "")
+    own = [name for name in design.columns if name != INTERCEPT]
+    among = design.matrix[::2][:, [design.columns.index(name) for name in own]]
+    return list(names) == own and bool(np.allclose(matrix, among, rtol=1e-9, atol=1e-12))
+
+
+def _icv(
+    table: pd.DataFrame,
+    usable: Bool,
+    icv: str | None,
+    formula: str,
+) -> tuple[str | None, Float]:
+    """Find intracranial volume, which models of volumes adjust for, if all have it."""
+    values = np.full(len(table), np.nan)
+    if icv is None or icv in closed_formula(formula).names:
+        return None, values
+    check_names([icv], table.columns)
+    column = typed(table[icv])
+    if not pd.api.types.is_numeric_dtype(column):
+        return None, values
+    values = column.to_numpy(np.float64)
+    own = values[usable]
+    return (icv if np.isfinite(own).all() and np.ptp(own) > 0 else None), values
+
+
+def without_tests_of_sites(
+    plan: SitePlan, design: Design, model: ModelSpec, comparison: Comparison
+) -> Design:
+    """Refuse a model that counts as free what was spent on sites, or is asked to test it.
+
+    Tests of single columns that are about sites are left out where no contrast was named. A test
+    after it would take shifts that were estimated from the same data for known, and reject too
+    often where groups are not balanced over sites (Nygaard et al. 2016,
+    doi:10.1093/biostatistics/kxv027). With the sites in the model, it pays for them.
+    """
+    if comparison.pair or not plan.estimated:
+        return design
+    member = np.eye(len(plan.sites))[plan.visits.site[design.rows]]
+    both = np.hstack([design.matrix, member])
+    if np.linalg.matrix_rank(both) > np.linalg.matrix_rank(design.matrix):
+        raise ModelError(
+            f"--harmonize {plan.column}: the model has to have {plan.column} as a factor, since"
+            " its effects are estimated from the same participants; add"
+            f" + C({plan.column}) to the formula"
+        )
+    taken = np.linalg.pinv(design.matrix) @ (member - member.mean(axis=0))
+    about = [
+        one.name
+        for one in design.contrasts
+        if np.abs(one.weights @ taken).max() > _UNTOUCHED * np.abs(one.weights).max()
+    ]
+    named = {spec.name for spec in model.contrasts}
+    if about and (named.intersection(about) or len(about) == len(design.contrasts)):
+        raise ModelError(
+            f"--harmonize {plan.column}: contrast {about[0]} is about what it takes out;"
+            " harmonize sites or scanners, and choose contrasts of others by --contrast"
+        )
+    kept = tuple(one for one in design.contrasts if one.name not in about)
+    return replace(design, contrasts=kept)
+
+
+def harmonize_cohort(
+    cohort: Cohort,
+    plan: SitePlan,
+    settings: GroupSettings,
+    measures: Measures,
+    registrations: Mapping[str, Registration],
+) -> Harmonization:
+    """Estimate or take effects of sites, and take them out of maps and summary measures."""
+    if plan.saved and registrations:
+        _check_templates(plan.saved, registrations)
+    maps: dict[tuple[str, str], tuple[combat.SiteEffects, combat.SiteMoments]] = {}
+    summaries: dict[tuple[str, str], tuple[combat.SiteEffects, combat.SiteMoments]] = {}
+    sides, unknown = {}, set()
+    for hemi, side in cohort.sides.items():
+        visits = plan.visits.take(side.rows)
+        changed, errors = dict(side.maps), dict(side.errors)
+        for measure in measures.maps:
+            values = side.maps[measure].reshape(len(side.rows), -1)
+            found = _effects(values, visits, plan, settings, (hemi, measure))
+            maps[hemi, measure] = found
+            changed[measure] = combat.harmonize(values, visits, found[0]).reshape(
+                side.maps[measure].shape
+            )
+            if measure in errors:
+                scale = found[0].scale[visits.site].reshape(errors[measure].shape)
+                errors[measure] = errors[measure] / scale
+        summary = side.summary.astype(np.float64)
+        for name in summary.columns:
+            values = summary[[name]].to_numpy()
+            own = _with_icv(visits, plan, side.rows) if name.startswith("volume") else visits
+            if plan.saved and (hemi, name) not in plan.saved.effects_on_summaries:
+                unknown.add(name)
+                summary[name] = np.nan
+            elif len(np.unique(values[np.isfinite(values)])) > 1:
+                found = _effects(values, own, plan, settings, (hemi, name), summary=True)
+                summaries[hemi, name] = found
+                summary[name] = combat.harmonize(values, own, found[0])[:, 0]
+        sides[hemi] = replace(side, maps=changed, errors=errors, summary=summary)
+    return Harmonization(
+        plan=plan,
+        cohort=replace(cohort, sides=sides),
+        maps={(hemi, name): maps[hemi, name] for name in measures.maps for hemi in sides},
+        summaries=summaries,
+        notes=tuple(_notes(plan, settings, unknown)),
+    )
+
+
+def _with_icv(visits: combat.Visits, plan: SitePlan, rows: Any) -> combat.Visits:  # noqa: ANN401  (an array)
+    if plan.icv is None:
+        return visits
+    icv = plan.icv_values[rows]
+    columns = np.column_stack([visits.columns, icv])
+    return replace(visits, site=np.where(np.isfinite(icv), visits.site, -1), columns=columns)
+
+
+def _effects(
+    values: Float,
+    visits: combat.Visits,
+    plan: SitePlan,
+    settings: GroupSettings,
+    key: tuple[str, str],
+    *,
+    summary: bool = False,
+) -> tuple[combat.SiteEffects, combat.SiteMoments]:
+    pooled = settings.harmonization.pooling and not summary
+    if plan.saved is None:
+        return combat.fit_effects(values, visits, len(plan.sites), settings, pooled=pooled)
+    known = plan.saved.effects_on_summaries if summary else plan.saved.effects_on_maps
+    if key not in known:
+        raise ModelError(
+            f"{plan.saved.file}: has no map of {key[1]} of hemisphere {key[0]}; choose others by"
+            " --measures, or harmonize anew"
+        )
+    if len(known[key].mean) != values.shape[1]:
+        raise ModelError(
+            f"{plan.saved.file}: its map of {key[1]} has {len(known[key].mean)} points, those of"
+            f" these participants {values.shape[1]}; use the same grid"
+        )
+    return combat.extend_effects(known[key], values, visits, pooled=pooled)
+
+
+def _notes(plan: SitePlan, settings: GroupSettings, unknown: set[str]) -> Iterator[str]:
+    if plan.lost:
+        yield f"{plan.lost} visits lack {plan.column} or what is kept, and are not harmonized"
+    for name, share in plan.explained.items():
+        if share > settings.harmonization.explained:
+            yield f"{plan.column} explains {share:.0%} of {name}: its effect is poorly known"
+    if unknown and plan.saved:
+        yield f"{plan.saved.file} has not these measures, which are left out: {listed(unknown)}"
+    if plan.saved is None and not plan.kept.portable:
+        yield "harmonization.json is not written: this model's columns depend on all participants"
+
+
+def _check_templates(saved: SavedEffects, registrations: Mapping[str, Registration]) -> None:
+    """Refuse parameters of points that are others here."""
+    for hemi, digest in digests(registrations).items():
+        if saved.templates.get(hemi) != digest:
+            none = saved.templates.get(hemi) == "none"
+            how = "--align none" if none else "--template with the template.json beside it"
+            raise ModelError(
+                f"{saved.file}: hemisphere {hemi} was registered to another template there; give"
+                f" {how}"
+            )

@@ -1,0 +1,330 @@
+"""The models of the group level on arrays, without files: ``hipsta_bids.group``."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike, NDArray
+
+from hipsta_bids.group.design.formula import with_factors
+from hipsta_bids.group.design.model import Design, ModelRequest, build_design, choose_model
+from hipsta_bids.group.design.settings import GroupSettings, load_group_settings
+from hipsta_bids.group.stats.arrays import Bool, Float, SideMaps
+from hipsta_bids.group.stats.glm import FittedMaps, PointTest, RowModel, fit_maps
+from hipsta_bids.group.stats.inference import Discoveries, MapKey, correct
+from hipsta_bids.types import PARTICIPANT, Mesh
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+_Number = TypeVar("_Number", np.float64, np.bool_)
+_GRID, _VERTICES = 3, 2  # axes of the maps of a side, participants included
+#: Arrays of the results: what they hold, and whether in the unit of the maps.
+_ARRAYS = {
+    "estimate": ("value of the contrast; of several rows (F) missing", True),
+    "se": ("standard error of the estimate", True),
+    "statistic": ("t, or F", False),
+    "df": ("residual degrees of freedom", False),
+    "p": ("two-sided, of each point alone", False),
+    "p_corrected": ("corrected for the number of points", False),
+    "effect": ("Cohen's d, or of F partial eta squared", False),
+}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class GroupFit:
+    """A linear model at every point, its contrasts, and what survives."""
+
+    measure: str
+    unit: str
+    design: Design
+    """Matrix, its columns, the rows that are complete, and those left out with what they lack."""
+    fitted: Mapping[str, FittedMaps]
+    """By side."""
+    found: Mapping[MapKey, Discoveries]
+    axes: Mapping[str, Float]
+    """Coordinates of the points, by axis; empty where they are not known."""
+
+    @property
+    def sides(self) -> tuple[str, ...]:
+        """Sides, in the order of the first axis of :attr:`maps`."""
+        return tuple(self.fitted)
+
+    @property
+    def contrasts(self) -> tuple[str, ...]:
+        """Contrasts, in the order of the second axis of :attr:`maps`."""
+        return tuple(contrast.name for contrast in self.design.contrasts)
+
+    def test(self, side: str, contrast: str) -> PointTest:
+        """Return the test of one contrast at all points, with limits of the effect sizes."""
+        return self._tests(side)[self.contrasts.index(contrast)]
+
+    def _tests(self, side: str) -> tuple[PointTest, ...]:
+        return self.fitted[side].fits[self.measure].tests
+
+    def _found(self, side: str, test: PointTest) -> Discoveries:
+        return self.found[MapKey(self.measure, test.contrast.name, side)]
+
+    @cached_property
+    def maps(self) -> Mapping[str, Float]:
+        """Arrays (side, contrast, x, y), or (side, contrast, vertex); NaN where nothing is tested.
+
+        ``estimate`` and ``se`` in the unit of the maps, ``statistic`` (t or F), ``df``, ``p``,
+        ``p_corrected``, and ``effect`` (Cohen's d, or partial eta squared of F).
+        """
+        return {name: self._stacked(partial(self._values, name)) for name in _ARRAYS}
+
+    @cached_property
+    def significant(self) -> Bool:
+        """Points that survive the correction, in the shape of :attr:`maps`."""
+        return self._stacked(lambda side, test: self._found(side, test).rejected)
+
+    def _values(self, name: str, side: str, test: PointTest) -> Float:
+        if name == "p_corrected":
+            return self._found(side, test).adjusted
+        if name in {"estimate", "se"}:
+            rows = getattr(test, name)
+            return rows[0] if test.kind == "t" else np.full(rows.shape[1], np.nan)
+        return np.asarray(getattr(test, name))
+
+    def _stacked(self, values: Callable[[str, PointTest], NDArray[_Number]]) -> NDArray[_Number]:
+        array = np.array([[values(one, test) for test in self._tests(one)] for one in self.sides])
+        maps = self.fitted[self.sides[0]].maps
+        inner = maps.shape if maps.mesh is None and maps.shape[1] > 1 else maps.shape[:1]
+        return array.reshape(*array.shape[:2], *inner)
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """One row per side and contrast: points that survive, and the largest effect."""
+        rows = []
+        for i, side in enumerate(self.sides):
+            for j, test in enumerate(self._tests(side)):
+                found = self._found(side, test)
+                effects = self.maps["effect"][i, j]
+                known = np.isfinite(effects).any()
+                rows.append(
+                    {
+                        "side": side,
+                        "contrast": test.contrast.name,
+                        "test": test.kind,
+                        "participants": len(self.fitted[side].rows),
+                        "points": int(np.isfinite(test.p).sum()),
+                        "significant": int(found.rejected.sum()),
+                        "alpha": found.alpha,
+                        "largest_effect": effects.flat[np.nanargmax(np.abs(effects))]
+                        if known
+                        else np.nan,
+                    }
+                )
+        return pd.DataFrame(rows)
+
+    @cached_property
+    def dataset(self) -> "xr.Dataset":
+        """The maps as a dataset of xarray, by side, contrast and points."""
+        from hipsta_bids.io.xarrays import make_dataset  # noqa: PLC0415  (an optional extra)
+
+        inner = ("x", "y") if self.significant.ndim > _GRID else ("vertex",)
+        axes = ("side", "contrast", *inner)
+        variables: dict[str, Any] = {
+            name: (axes, values, {"long_name": words, "units": self.unit if own else "1"})
+            for (name, (words, own)), values in zip(
+                _ARRAYS.items(), self.maps.values(), strict=True
+            )
+        }
+        variables["significant"] = (axes, self.significant, {"long_name": "survives"})
+        coordinates: dict[str, Any] = {
+            "side": (["side"], list(self.sides), {}),
+            "contrast": (["contrast"], list(self.contrasts), {}),
+        }
+        coordinates |= {name: ([name], values, {}) for name, values in self.axes.items()}
+        return make_dataset(variables, coordinates, {"measure": self.measure})
+
+
+def group(
+    maps: Any,  # noqa: ANN401  (arrays, or labeled arrays of an optional library)
+    table: pd.DataFrame,
+    formula: str,
+    *,
+    contrasts: Sequence[str] = (),
+    references: Mapping[str, str] | None = None,
+    correction: str | None = None,
+    triangles: ArrayLike | None = None,
+    settings: GroupSettings | str | Path | None = None,
+) -> GroupFit:
+    """Fit one linear model at every point of maps, and correct for the number of points.
+
+    The model is that of ``hipsta-bids ... group``, with one row per participant. Maps are taken as
+    they are: registration, repeated visits, exclusions and the classification are the command's.
+
+    Parameters
+    ----------
+    maps
+        (participants, x, y) on the sheet, or (participants, vertices) on another surface, NaN for
+        missing; a mapping of such arrays by side, which are corrected together or not as the
+        setting ``multiplicity.scope`` says; or an array of xarray with the axes ``participant``,
+        perhaps ``side``, and x and y or vertices, as :func:`hipsta_bids.load` gives.
+    table : DataFrame
+        One row per participant, in the order of the maps. With an array of xarray, rows are found
+        by the column ``participant_id``, and may be in any order.
+    formula : str
+        Such as ``"group + age + sex"``; names are columns of the table.
+    contrasts : sequence of str
+        Such as ``"CN-AD = group[CN] - group[AD]"``. Without any, groups in the formula are compared
+        with their reference, and else each column of the design is tested.
+    references : mapping, optional
+        Reference level by factor.
+    correction : {"fdr2", "bh", "permutation-tfce", "permutation-max"}, optional
+        Instead of that of the settings (``fdr2``).
+    triangles : array, optional
+        (faces, 3) of maps on vertices: neighbors, for cluster enhancement.
+    settings : GroupSettings, str or Path, optional
+        Settings of the group level, or a TOML file with some.
+
+    Returns
+    -------
+    GroupFit
+        ``maps`` and ``significant`` as arrays by side and contrast, ``dataset`` with coordinates,
+        ``table`` with one row per side and contrast, ``design``.
+
+    Raises
+    ------
+    ValueError
+        If maps and table do not fit.
+    ModelError
+        With the reason why the model cannot be fitted.
+
+    Examples
+    --------
+    Twenty participants; in the second group the wall of two of ten columns is .5 mm thinner:
+
+    >>> import numpy as np, pandas as pd
+    >>> import hipsta_bids as hb
+    >>> random = np.random.default_rng(1)
+    >>> table = pd.DataFrame({"group": ["CN"] * 10 + ["AD"] * 10, "age": random.normal(70, 5, 20)})
+    >>> maps = random.normal(2.0, 0.1, (20, 10, 4))
+    >>> maps[10:, :2] -= 0.5
+    >>> fit = hb.group(maps, table, "group + age")
+    >>> fit.contrasts
+    ('CN-AD',)
+    >>> fit.significant.shape  # side, contrast, x, y
+    (1, 1, 10, 4)
+    >>> fit.significant[0, 0, :2].sum(), fit.significant[0, 0, 2:].sum()
+    (np.int64(8), np.int64(1))
+    >>> print(f"{fit.maps['estimate'][0, 0, :2].mean():.1f} mm")
+    0.5 mm
+    """
+    sides, axes, table, measure, unit = _arranged(maps, table, triangles)
+    request = ModelRequest(
+        formula=formula,
+        contrasts=tuple(contrasts),
+        references=tuple((references or {}).items()),
+    )
+    if isinstance(settings, str | Path) or settings is None:
+        settings = load_group_settings(None if settings is None else Path(settings))
+    if correction is not None:
+        settings = settings.changed(multiplicity={"method": correction})
+    if (
+        settings.multiplicity.method == "permutation-tfce"
+        and triangles is None
+        and any(values.ndim == _VERTICES for values in sides.values())
+    ):
+        raise ValueError("clusters of vertices need triangles, (faces, 3)")
+    table = with_factors(table, settings)
+    _, spec, _, levels = choose_model(request, table, settings)
+    design = build_design(table, spec, settings.design, levels)
+    model = RowModel(design)
+    own = {side: _side(values, measure, triangles) for side, values in sides.items()}
+    fitted = {side: fit_maps(side, one, model, settings) for side, one in own.items()}
+    return GroupFit(
+        measure=measure,
+        unit=unit,
+        design=design,
+        fitted=fitted,
+        found=correct(fitted, model, table, settings),
+        axes=axes,
+    )
+
+
+def _arranged(
+    maps: Any,  # noqa: ANN401  (as above)
+    table: pd.DataFrame,
+    triangles: ArrayLike | None,
+) -> tuple[dict[str, Float], dict[str, Float], pd.DataFrame, str, str]:
+    """Arrays by side, coordinates, rows in the same order, and name and unit of the measure."""
+    axes: dict[str, Float] = {}
+    measure, unit = "maps", "1"
+    if isinstance(maps, Mapping):
+        sides = {str(side): np.asarray(values, np.float64) for side, values in maps.items()}
+    elif hasattr(maps, "dims"):
+        sides, axes, names = _of_labeled(maps)
+        measure, unit = str(maps.name or measure), str(maps.attrs.get("units", unit))
+        if names is not None and PARTICIPANT in table:
+            if table[PARTICIPANT].duplicated().any():
+                raise ValueError(
+                    f"table: a {PARTICIPANT} occurs twice; keep one row per participant"
+                )
+            table = table.set_index(PARTICIPANT, drop=False).reindex(names)
+    else:
+        sides = {"both": np.asarray(maps, np.float64)}
+    for side, values in sides.items():
+        if values.ndim not in ({_GRID, _VERTICES} if triangles is None else {_VERTICES}):
+            raise ValueError(
+                f"maps of side {side} have shape {values.shape}; they need one row per participant,"
+                " and then x and y, or vertices"
+            )
+        if len(values) != len(table):
+            raise ValueError(
+                f"{len(values)} maps of side {side}, {len(table)} rows in the table; both need one"
+                " per participant, in the same order"
+            )
+    if len({values.shape for values in sides.values()}) > 1:
+        raise ValueError("maps of both sides need the same points")
+    return sides, axes, table, measure, unit
+
+
+def _of_labeled(
+    maps: Any,  # noqa: ANN401  (of xarray)
+) -> tuple[dict[str, Float], dict[str, Float], list[str] | None]:
+    """Arrays by side, coordinates, and names of participants of an array of xarray."""
+    single = [name for name in ("session", "side") if maps.sizes.get(name) == 1]
+    side = str(maps.coords["side"].to_numpy().ravel()[0]) if "side" in maps.coords else "both"
+    maps = maps.squeeze(single, drop=True)
+    if "participant" not in maps.dims or "session" in maps.dims:
+        raise ValueError(
+            f"maps have the axes {', '.join(map(str, maps.dims))}; they need participant, one"
+            " session, and points"
+        )
+    names = maps.coords["participant"].to_numpy().tolist() if "participant" in maps.coords else None
+    if "side" in maps.dims:
+        found = [str(one) for one in maps.coords["side"].to_numpy()]
+        arrays = {one: maps.sel(side=one) for one in found}
+    else:
+        arrays = {side: maps}
+    order = [name for name in ("x", "y") if name in maps.dims]
+    sides = {
+        one: np.asarray(values.transpose("participant", *order, ...), dtype=np.float64)
+        for one, values in arrays.items()
+    }
+    axes = {name: maps.coords[name].to_numpy() for name in order if name in maps.coords}
+    return sides, axes, names
+
+
+def _side(values: Float, measure: str, triangles: ArrayLike | None) -> SideMaps:
+    count = len(values)
+    maps = values if values.ndim == _GRID else values[:, :, None]
+    mesh = None
+    if triangles is not None:
+        faces = np.asarray(triangles, dtype=np.int64)
+        mesh = Mesh(points=np.full((maps.shape[1], 3), np.nan), triangles=faces)
+    return SideMaps(
+        rows=np.arange(count),
+        maps={measure: maps},
+        subfield=np.full(maps.shape, -1, dtype=np.int8),
+        names=(),
+        summary=pd.DataFrame(index=range(count)),
+        mesh=mesh,
+    )

@@ -1,0 +1,526 @@
+"""Norms from files to files: fitted to a reference cohort, or for the scores of new people."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy import special
+
+from hipsta_bids import __version__
+from hipsta_bids.derivatives import dataset
+from hipsta_bids.errors import ModelError
+from hipsta_bids.group.cohort.data import Cohort
+from hipsta_bids.group.cohort.layers import layers
+from hipsta_bids.group.design.formula import check_names, level_labels, listed, typed
+from hipsta_bids.group.design.model import BOTH, FIRST_AGE, Comparison
+from hipsta_bids.group.design.settings import GroupSettings, NormSettings
+from hipsta_bids.group.output import write
+from hipsta_bids.group.output.figures import Drawing, deviation_rows, draw_norms, norm_rows
+from hipsta_bids.group.output.methods import norms_text
+from hipsta_bids.group.output.panels import draw_maps
+from hipsta_bids.group.output.results import ScoredMaps
+from hipsta_bids.group.output.saved import NormsFile, load_norms, save_norms, templates_from_json
+from hipsta_bids.group.questions.reference import points_of
+from hipsta_bids.group.questions.scores import map_rows, score_rows
+from hipsta_bids.group.questions.study import (
+    GroupInputs,
+    GroupOptions,
+    GroupResult,
+    Study,
+    folder_of,
+    members,
+    read_templates,
+)
+from hipsta_bids.group.stats.arrays import Bool, Float, Int, Key
+from hipsta_bids.group.stats.glm import most_frequent
+from hipsta_bids.group.stats.norms import (
+    CENTILE_FOLDS,
+    LEVELS,
+    NormativeScores,
+    Norms,
+    People,
+    choose_knots,
+    fit_norms,
+)
+from hipsta_bids.group.stats.warps import Template
+from hipsta_bids.io import files
+from hipsta_bids.progress import tell
+from hipsta_bids.protocols.toml import resolve
+from hipsta_bids.types import PARTICIPANT
+
+#: Points of each map, spread evenly, that are cross-validated.
+CHECKED_POINTS = 200
+
+_NO_SITE = "unnamed"  # of everybody, where there is no column of sites
+
+Values = Mapping[Key, tuple[Int, Float]]
+"""Rows of the table, and (rows, points); summary measures are single points."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Made:
+    """What is written."""
+
+    path: Path | None
+    """Norms that score; ``None`` where norms are fitted."""
+    controls: tuple[str, str] | None
+    file: NormsFile
+    norms: Mapping[Key, Norms]
+    people: People
+    cohorts: Mapping[str, Cohort]
+    """With registered sheets; with other programs' maps by their names."""
+    found: Values
+    tables: dict[str, pd.DataFrame]
+    known: int
+    """Sites that the norms had before."""
+    scored: Mapping[str, Mapping[str, ScoredMaps]] = field(default_factory=dict)
+    """By cohort and hemisphere; empty where norms were fitted."""
+    adapted: Bool | None = None
+    """(visits,) controls from whom a site was estimated; ``None`` where norms were fitted."""
+
+
+def run_norms(
+    options: GroupOptions,
+    settings: GroupSettings,
+    *,
+    path: Path | None = None,
+    among: tuple[str, str] | None = None,
+    controls: tuple[str, str] | None = None,
+) -> GroupResult:
+    """Fit norms, or score people by them, and write all results or none.
+
+    Parameters
+    ----------
+    options : GroupOptions
+        Files.
+    settings : GroupSettings
+        What changes results.
+    path : Path, optional
+        Norms that score; without, norms are fitted.
+    among : (str, str), optional
+        Column and level of the participants; all without.
+    controls : (str, str), optional
+        Column and level of the controls, who estimate shift and scale of new sites.
+    """
+    dataset.check_own_dataset(options.out_dir)
+    if path is not None:
+        return _score_people(options, path, settings, among, controls)
+    study = Study.read(options, among, settings)
+    file, people = _planned(study)
+    template, tables, cohorts, found = _registered(
+        study, read_templates(options.template, study.cohort)
+    )
+    tell("norms")
+    file = file.model_copy(update={"template": template})
+    norms, tables["coverage"] = _fit(found, people, file, settings.norms)
+    known = len(file.sites)
+    return _write(study, _Made(None, None, file, norms, people, cohorts, found, tables, known), ())
+
+
+def _score_people(
+    options: GroupOptions,
+    path: Path,
+    settings: GroupSettings,
+    among: tuple[str, str] | None,
+    controls: tuple[str, str] | None,
+) -> GroupResult:
+    """Score people by the norms of a file."""
+    file, norms = load_norms(path)
+    known = len(file.sites)
+    measures = options.measures or tuple({m: 0 for _, m in norms})
+    every = Comparison(longitudinal=True)  # each visit has a score
+    options = replace(options, measures=measures, comparison=every)
+    settings = settings.changed(registration=file.registration)
+    study = Study.read(options, among, settings)
+    notes, table = _check(file, path, study.inputs), study.cohort.table
+    again = table.duplicated([PARTICIPANT, *({file.site} & set(table.columns))])
+    if again.any() and FIRST_AGE not in table:
+        notes.append(
+            f"{file.age} is the same in all sessions of a participant; give that of each session in"
+            " sessions.tsv, as later visits are scored for too young an age"
+        )
+    people = _people(study, file)
+    if not people.known.any():
+        why = "; ".join(dict.fromkeys(message for _, message in study.left_out.values()))
+        raise ModelError(f"{path}: nobody here can be scored: {why}")
+    everyone = members(table, controls, "--controls")
+    references = everyone & (controls is not None) & ~again.to_numpy()
+    file = _with_new_sites(study, path, file, people, references, controls=controls)
+    templates = None if file.template is None else templates_from_json(file.template, str(path))
+    _, tables, cohorts, found = _registered(study, templates)
+    found = {key: own for key, own in found.items() if key in norms}
+    adapted = references & people.known & (people.site >= known)
+    tell("norms")
+    extended = {}
+    for key, (rows, own) in found.items():
+        if norms[key].mean.shape[1] != own.shape[1]:
+            points = f"{norms[key].mean.shape[1]} points, these people {own.shape[1]}"
+            raise ModelError(f"{path}: norms of {listed(key)} have {points}")
+        at, least = adapted[rows], settings.norms.least_controls // 2
+        extended[key] = norms[key].extended(own[at], people.take(rows[at]), len(file.sites), least)
+    scored = {
+        name: _score_maps(one, found, extended, people, adapted) for name, one in cohorts.items()
+    }
+    made = _Made(
+        path, controls, file, extended, people, cohorts, found, tables, known, scored, adapted
+    )
+    tables["zscores"] = pd.concat(_score_rows(made, adapted, settings), ignore_index=True)
+    return _write(study, made, notes)
+
+
+def _registered(
+    study: Study, templates: Mapping[str, Template] | None
+) -> tuple[dict[str, Any] | None, dict[str, pd.DataFrame], dict[str, Cohort], Values]:
+    """Register maps, and collect them and summary measures of each side and of the mean of both."""
+    inputs = study.inputs
+    template, cohorts, tables = study.register(templates)
+    wanted = {*inputs.measures.maps, *inputs.others}
+    for name, cohort in cohorts.items():
+        sides = {
+            hemi: side.only([name for name in side.maps if name in wanted])
+            for hemi, side in cohort.sides.items()
+        }
+        cohorts[name] = replace(cohort, sides=sides)
+    found = {
+        (layer.hemi, layer.measure): (layer.rows, layer.data)
+        for layer in layers(cohorts, inputs.measures.maps, inputs.measures.summaries)
+    }
+    return template, tables, cohorts, found
+
+
+def _write(study: Study, made: _Made, notes: Iterable[str]) -> GroupResult:
+    """Write all results; charts are of the measures that the settings name."""
+    file, people, cohort = made.file, made.people, study.cohort
+    settings = study.settings
+    charts = [
+        file.centiles(norms).assign(hemi=hemi, measure=name, unit=cohort.units.get(name, "1"))
+        for (hemi, name), norms in made.norms.items()
+        if name in settings.norms.charts and hemi != BOTH
+    ]
+    if charts:
+        table = pd.concat(charts, ignore_index=True)
+        first = ["hemi", "measure", "unit"]
+        made.tables["centiles"] = table[[*first, *table.columns.drop(first)]]
+    among = f" ({' '.join(study.among)})" if study.among else ""
+    visits = cohort.table[people.known]
+    once = ~visits[PARTICIPANT].duplicated().to_numpy()
+    who = f"{once.sum()} participants{among}"
+    text = norms_text(
+        file,
+        who=who if once.all() else f"{who}, at {len(once)} visits,",
+        coverage=made.tables.get("coverage"),
+        new=list(file.sites)[made.known :],
+        controls=made.controls,
+    )
+
+    def fill(folder: Path) -> list[str]:
+        save_norms(folder / "norms.json", file, made.norms)
+        for surface, one in made.cohorts.items():
+            for hemi, side in one.sides.items():
+                if side.maps:
+                    write.write_surface(folder, one, points_of(side), hemi)
+            if found := made.scored.get(surface):
+                write.write_scores(folder, one, one.table, found, letter="z", sheets=not surface)
+        files.write_text(folder / "methods.md", text)
+        return write.write_figures(folder, _figures(made))
+
+    counts = np.bincount(people.site[people.known][once], minlength=len(file.sites)).tolist()
+    record = {
+        "hemispheres": {hemi: len(side.rows) for hemi, side in cohort.sides.items()},
+        "norms": {
+            "file": made.path and str(made.path),
+            "participants": file.participants,
+            "ages": [file.knots[0], file.knots[-1]],
+            "sites": [
+                {"site": site, "n": n, "here": counts[i], "new": i >= made.known}
+                for i, (site, n) in enumerate(file.sites.items())
+            ],
+            "controls": made.controls,
+            "folds": CENTILE_FOLDS,
+        },
+        "among": study.among,
+    }
+    name = folder_of(["norms" if made.path is None else "scores"], study.among)
+    notes = [*notes]
+    if later := sum(one.reason == "later-session" for one in study.inputs.exclusions):
+        notes.append(f"{later} later sessions are not in the norms, which take first ones")
+    if file.site not in cohort.table:
+        notes.append(f"no column {file.site!r}: all are taken to be at one, {_NO_SITE!r}")
+    return study.write(name, notes, visits=visits, tables=made.tables, record=record, fill=fill)
+
+
+def _protocol(inputs: GroupInputs) -> tuple[str, str]:
+    """Segmentation protocol and region of the sheets, if there are sheets."""
+    records = inputs.found.records
+    return (records[0].place.name.seg, records[0].place.name.region) if records else ("none",) * 2
+
+
+def _planned(study: Study) -> tuple[NormsFile, People]:
+    """Say what norms are about, before they are fitted, and of whom.
+
+    Refuses a cohort that is too small, or whose sexes are those of sites.
+    """
+    cohort, inputs, settings = study.cohort, study.inputs, study.settings
+    how, found, table = settings.norms, inputs.found, cohort.table
+    check_names([how.age], table.columns)
+    sites, complete = _site_labels(table, how.site), np.ones(len(table), dtype=bool)
+    sexes = level_labels(table[how.sex]) if how.sex in table else None
+    for labels in (sites, sexes):
+        complete &= True if labels is None else labels.notna().to_numpy()
+    knots = choose_knots(_ages(table, how.age)[complete], how)
+    file = NormsFile(
+        description="norms of maps and summary measures by age, sex and site",
+        format=1,
+        hash="",
+        version=__version__,
+        versions=list(found.versions),
+        seg=_protocol(inputs)[0],
+        region=_protocol(inputs)[1],
+        settings_hash=found.settings_hash,
+        registration=resolve(settings)["registration"],
+        template=None,
+        x=cohort.x.tolist(),
+        y=cohort.y.tolist(),
+        age=how.age,
+        sex=how.sex,
+        site=how.site,
+        knots=knots.tolist(),
+        sexes=[] if sexes is None else sorted(set(sexes.dropna())),
+        sites=dict.fromkeys(sorted(set(sites.dropna())), 1),
+        participants=1,
+        norms={},
+    )
+    people = _people(study, file)
+    known = people.known
+    numbers = np.bincount(people.site[known], minlength=len(file.sites)).tolist()
+    counts = dict(zip(file.sites, numbers, strict=True))
+    if small := [f"{site} ({n})" for site, n in counts.items() if n < how.least_site]:
+        raise ModelError(
+            f"--fit-norms: too few participants at {file.site} {listed(small)}; each needs"
+            f" {how.least_site}: leave these out by --exclude, or join those of one scanner"
+        )
+    both = np.hstack([np.eye(len(counts))[people.site[known]], people.sex[known]])
+    if np.linalg.matrix_rank(both) < both.shape[1]:
+        raise ModelError(
+            f"--fit-norms: {file.sex} does not vary within {file.site}, so that their effects"
+            " cannot be told apart; add sites with both"
+        )
+    return file.model_copy(update={"sites": counts, "participants": int(known.sum())}), people
+
+
+def _ages(table: pd.DataFrame, column: str) -> Float:
+    ages = typed(table[column])
+    if not pd.api.types.is_numeric_dtype(ages):
+        raise ModelError(f"norms: column {column!r} has to hold years")
+    return ages.to_numpy(dtype=np.float64)
+
+
+def _site_labels(table: pd.DataFrame, column: str) -> pd.Series:
+    if column not in table:
+        return pd.Series(_NO_SITE, index=table.index, dtype=object)
+    return level_labels(table[column])
+
+
+def _people(study: Study, file: NormsFile) -> People:
+    """Describe visits as norms have to know them, new sites last; others are left out."""
+    table, _settings = study.cohort.table, study.settings
+    check_names([file.age, *([file.sex] if file.sexes else [])], table.columns)
+    age, labels = _ages(table, file.age), _site_labels(table, file.site)
+    low, high = file.knots[0], file.knots[-1]
+    reach = f"outside of the norms' {low:g} to {high:g} years"
+    sex = np.zeros((len(table), max(len(file.sexes) - 1, 0)))
+    lacks = {file.age: np.isnan(age), file.site: labels.isna().to_numpy()}
+    problems = {("norms-age", reach): (age < low) | (age > high)}
+    if file.sexes:
+        levels = level_labels(table[file.sex])
+        lacks[file.sex] = levels.isna().to_numpy()
+        strange = levels.notna() & ~levels.isin(file.sexes)
+        problems["norms-sex", f"{file.sex} is none of {listed(file.sexes)}"] = strange.to_numpy()
+        for i, level in enumerate(file.sexes[1:]):
+            sex[:, i] = levels == level
+    problems |= {("incomplete", f"{name} is missing"): where for name, where in lacks.items()}
+    for why, where in problems.items():
+        study.left_out.update(dict.fromkeys(map(str, table.index[where]), why))
+    usable = ~np.any(list(problems.values()), axis=0)
+    sites = [*file.sites, *sorted(set(labels[usable]) - set(file.sites))]
+    site = np.where(usable, pd.Categorical(labels, categories=sites).codes, -1).astype(np.int64)
+    return People(age=age, sex=sex, site=site)
+
+
+def _check(file: NormsFile, path: Path, inputs: GroupInputs) -> list[str]:
+    """Refuse people who were measured in another way; note what may differ."""
+    cohort, found = inputs.cohort, inputs.found
+    same = all(
+        len(a) == len(b) and np.allclose(a, b) for a, b in ((file.x, cohort.x), (file.y, cohort.y))
+    )
+    here = f"{len(cohort.x)} by {len(cohort.y)} nodes"
+    there = here if same else f"others, {len(file.x)} by {len(file.y)} nodes"
+    seg, region = _protocol(inputs)
+    for what, own, wanted in (
+        ("segmentation protocol", seg, file.seg),
+        ("region", region, file.region),
+        ("hash of the participant level's settings", found.settings_hash, file.settings_hash),
+        ("grid of the sheet", here, there),
+    ):
+        if own != wanted:
+            raise ModelError(
+                f"{path}: {what}: {wanted}, but here {own}; measure people as the reference"
+                " cohort of the norms was"
+            )
+    known = {measure for measures in file.norms.values() for measure in measures}
+    asked = [*inputs.measures.maps, *inputs.others, *(inputs.measures.summaries or ())]
+    if unknown := [name for name in asked if name not in known]:
+        raise ModelError(
+            f"{path}: has no norms of {listed(unknown)}, only of {listed(sorted(known))};"
+            " choose by --measures"
+        )
+    if set(found.versions) - set(file.versions):
+        note = (
+            f"the norms are of maps of hipsta_bids {listed(file.versions)}, these people were"
+            f" measured with {listed(found.versions)}; a version may change numbers"
+        )
+        return [note]
+    return []
+
+
+def _with_new_sites(
+    study: Study,
+    path: Path,
+    file: NormsFile,
+    people: People,
+    references: Bool,
+    *,
+    controls: tuple[str, str] | None,
+) -> NormsFile:
+    """Add the names of new sites, if they have controls enough."""
+    table, settings = study.cohort.table, study.settings
+    least, sites = settings.norms.least_controls, dict(file.sites)
+    labels = _site_labels(table, file.site).to_numpy()
+    for number in range(len(sites), int(people.site.max(initial=-1)) + 1):
+        own = people.site == number
+        site, count = str(labels[own][0]), int((own & references).sum())
+        if count < least:
+            which = "=".join(controls) if controls else "(--controls COLUMN=LEVEL)"
+            raise ModelError(
+                f"{path}: {file.site} {site!r} is none of the norms'"
+                f" ({listed(list(file.sites))}) and has {count} controls {which} within the range"
+                f" of ages; {least} are needed to tell a site from its people"
+            )
+        sites[site] = count
+    return file.model_copy(update={"sites": sites})
+
+
+def _fit(
+    values: Values, people: People, file: NormsFile, how: NormSettings
+) -> tuple[dict[Key, Norms], pd.DataFrame]:
+    """Fit all norms, and tell by cross-validation how many lie below each centile."""
+    n_sites, knots = len(file.sites), np.array(file.knots)
+    # Folds are spread evenly over sites.
+    order = np.lexsort((np.random.default_rng(how.seed).random(len(people.site)), people.site))
+    fold = np.empty(len(order), dtype=np.int64)
+    fold[order] = np.arange(len(order)) % CENTILE_FOLDS
+    norms, rows = {}, []
+    for (hemi, measure), (visits, own) in values.items():
+        who = people.take(visits)
+        fitted = fit_norms(own, who, n_sites, knots, how)
+        known = np.isfinite(fitted.mean).all(axis=0)
+        if not known.any():
+            continue  # constant, or of too few people
+        norms[hemi, measure] = fitted
+        some = own[:, :: -(-own.shape[1] // CHECKED_POINTS)]
+        z = np.full(some.shape, np.nan)
+        for left in range(CENTILE_FOLDS):
+            out = fold[visits] == left
+            rest = fit_norms(some[~out], who.take(~out), n_sites, knots, how)
+            z[out] = rest.score(some[out], who.take(out))
+        scores = z[np.isfinite(z)]
+        below = {f"below_{100 * one:g}": np.mean(scores < special.ndtri(one)) for one in LEVELS}
+        rows.append(
+            {
+                "hemi": hemi,
+                "measure": measure,
+                "n": int(fitted.n.sum(axis=0).max()),
+                "n_points": int(known.sum()),
+                "transformed": float(np.any(fitted.shape[:, known] != 0, axis=0).mean()),
+                **below,
+            }
+        )
+    return norms, pd.DataFrame(rows)
+
+
+def _score_maps(
+    cohort: Cohort, values: Values, norms: Mapping[Key, Norms], people: People, adapted: Bool
+) -> dict[str, ScoredMaps]:
+    """Score the maps of each hemisphere."""
+    scored = {}
+    for hemi, side in cohort.sides.items():
+        scores = {}
+        for measure in side.maps:
+            if (hemi, measure) not in norms:
+                continue
+            one = norms[hemi, measure]
+            z = one.score(values[hemi, measure][1], people.take(side.rows))
+            scores[measure] = NormativeScores(z, 2 * special.ndtr(-np.abs(z)))
+        if scores:
+            scored[hemi] = ScoredMaps(
+                rows=side.rows,
+                reference=adapted[side.rows],
+                scores=scores,
+                subfield=most_frequent(side.subfield[:], len(side.names)),
+                names=side.names,
+            )
+    return scored
+
+
+def _score_rows(made: _Made, adapted: Bool, settings: GroupSettings) -> Iterator[pd.DataFrame]:
+    """List scores: of maps over regions, of summary measures also centiles."""
+    maps = set()
+    for name, found in made.scored.items():
+        maps |= {(hemi, measure) for hemi, one in found.items() for measure in one.scores}
+        for rows in map_rows(made.cohorts[name], found, settings):
+            table = rows.drop(columns="p").rename(columns={"w": "z", "reference": "adapted"})
+            yield table[table["z"].notna()].assign(centile=np.nan)
+    for (hemi, measure), (visits, own) in made.found.items():
+        if (hemi, measure) not in maps:
+            known = visits[made.people.known[visits] & np.isfinite(own[:, 0])]
+            z = made.norms[hemi, measure].score(own[known], made.people.take(known))[:, 0]
+            columns = {"adapted": adapted[known], "z": z, "low": np.nan, "high": np.nan}
+            what = {"hemi": hemi, "measure": measure, "region": None, **columns}
+            yield score_rows(made.cohorts[""], known, **what, centile=100 * special.ndtr(z))
+
+
+def _figures(made: _Made) -> Iterator[tuple[str, Drawing]]:
+    """List charts of summary measures, and maps."""
+    if "centiles" in made.tables:
+        for measure, own in made.tables["centiles"].groupby("measure", sort=False):
+            yield f"{measure}_norms", partial(draw_norms, own, _dots(made, own))
+    for surface, cohort in made.cohorts.items():
+        for measure in dict.fromkeys(n for side in cohort.sides.values() for n in side.maps):
+            sides = {h: one for h, one in cohort.sides.items() if (h, measure) in made.norms}
+            places = {hemi: points_of(one) for hemi, one in sides.items()}
+            unit = cohort.units.get(measure, "1")
+            middle = made.file.middle
+            means = {hemi: made.norms[hemi, measure].expected(middle) for hemi in sides}
+            rows = norm_rows(means, float(middle.age[0]), measure, unit)
+            if made.adapted is not None:
+                rows = deviation_rows(made.scored[surface], measure)
+            yield f"{measure}_normmaps", partial(draw_maps, cohort, places, list(rows))
+
+
+def _dots(made: _Made, lines: pd.DataFrame) -> pd.DataFrame:
+    """Collect values of new people as they would be at the average site."""
+    sexes, blocks = made.file.sexes or [files.MISSING], []
+    for key in lines[["hemi", "measure"]].drop_duplicates().itertuples(index=False, name=None):
+        rows, own = made.found[key]
+        rows, own = (rows, own) if made.adapted is not None else (rows[:0], own[:0])
+        who = made.people.take(rows)
+        level = (who.sex @ np.arange(1, len(sexes))).astype(np.int64)
+        what = {"hemi": key[0], "sex": np.array(sexes)[level], "age": who.age}
+        moved = made.norms[key].average_site(own, who)[:, 0]
+        adapted = np.zeros(0, bool) if made.adapted is None else made.adapted
+        blocks.append(pd.DataFrame({**what, "value": moved, "adapted": adapted}))
+    return pd.concat(blocks, ignore_index=True).dropna()

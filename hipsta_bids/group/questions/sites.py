@@ -1,0 +1,414 @@
+"""The results of several sites together: what survives, tables, and forest plots as numbers."""
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from textwrap import shorten
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from hipsta_bids.errors import ModelError
+from hipsta_bids.group.design.formula import Contrast, listed
+from hipsta_bids.group.design.settings import GroupSettings
+from hipsta_bids.group.output import tables
+from hipsta_bids.group.output.columns import (
+    Frame,
+    effect_columns,
+    overview_row,
+    peak_table,
+    point_columns,
+    test_columns,
+)
+from hipsta_bids.group.questions.exchange import ModelSummary, SiteSummary
+from hipsta_bids.group.stats.arrays import Float
+from hipsta_bids.group.stats.clusters import sheet_edges
+from hipsta_bids.group.stats.glm import MEAN, PointTest
+from hipsta_bids.group.stats.inference import Discoveries, MapKey, discover
+from hipsta_bids.group.stats.meta import Combined, MetaResult, combine, meta_analyze
+from hipsta_bids.io import files
+
+#: Peaks of a map that get a forest plot.
+_MOST_PEAKS = 6
+_SAME_PEAK = 2  # nodes
+_PREDICTION = "prediction"
+#: What to do where a mean of the sample is in a contrast, as age is in those of an interaction.
+_BY_COLUMNS = "write the contrast by columns, as -1*group[T.AD]"
+_LONGEST = 200  # characters of what two sites have
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Item:
+    """One contrast of one model."""
+
+    number: int
+    """Position of the model in the summaries."""
+    model: ModelSummary
+    """Of the first site."""
+    contrast: str
+    result: MetaResult
+
+    def label(self, effects: str) -> str:
+        """Name of the contrast by fixed or random effects."""
+        return f"{self.contrast} ({effects})"
+
+    def key(self, effects: str) -> MapKey:
+        """Name of a map."""
+        return MapKey(self.model.measures[0], self.label(effects), self.model.hemi)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Meta:
+    """Everything that is written."""
+
+    sites: list[SiteSummary]
+    items: list[Item]
+    found: Mapping[MapKey, Discoveries]
+    frame: Mapping[str, Frame]
+    """Points by hemisphere."""
+    settings: GroupSettings
+
+    def tests(self, item: Item) -> Iterator[tuple[MapKey, PointTest, Combined]]:
+        """A combined estimate as tests; Cohen's d is over the residual SD within sites."""
+        sd, none = item.result.sd, np.full(len(item.result.sd), np.nan)
+        for effects, one in item.result.models.items():
+            limits = one.limits(self.settings.meta.confidence)
+            test = PointTest(
+                contrast=Contrast(item.label(effects), np.ones(1)),
+                statistic=one.statistic,
+                p=one.p,
+                df=one.df,
+                estimate=one.estimate[None],
+                se=one.se[None],
+                cohen_d=one.estimate / sd,
+                cohen_d_limits=np.stack(limits) / sd,
+                eta_squared=none,
+                eta_squared_limits=np.stack([none, none]),
+            )
+            yield item.key(effects), test, one
+
+    def of(self, kind: str) -> Iterator[Item]:
+        """Contrasts of maps, or of summary measures."""
+        return (item for item in self.items if item.model.kind == kind)
+
+    @property
+    def people(self) -> int:
+        """Participants of all sites."""
+        return sum(site.participants for site in self.sites)
+
+    def counts(self, item: Item) -> Float:
+        """(points,) participants of the sites that have an estimate."""
+        sizes = np.array([[site.participants] for site in self.sites])
+        return np.asarray(np.sum(np.isfinite(item.result.estimates) * sizes, axis=0))
+
+
+def check_agreement(sites: Sequence[SiteSummary]) -> list[str]:
+    """Refuse summaries that are not about the same; note what may differ but should be known.
+
+    ModelError in one line that names the site that differs from most, and the item.
+    """
+    items: dict[str, Callable[[SiteSummary], object]] = {
+        "segmentation protocol": lambda site: site.seg,
+        "region": lambda site: site.region,
+        "hash of the participant level's settings": lambda site: site.settings_hash,
+        "direction of the axes": lambda site: site.axes,
+        "grid of the sheet": lambda site: f"{_few(site.x)} by {_few(site.y)}",
+        "what a row of the model is": lambda site: "a change" if site.change else "a visit",
+        "registration": lambda site: site.align,
+        "hash of the template of registration": lambda site: site.template_hash,
+        "measures with a relative asymmetry": lambda site: ", ".join(site.asymmetry),
+        "reference levels": lambda site: ", ".join(
+            f"{name} {next(iter(levels), '')}" for name, levels in site.factors.items()
+        ),
+    }
+    for item, value in items.items():
+        _agree(sites, item, [str(value(site)) for site in sites])
+    _agree_on_measures(sites)
+    for number, model in enumerate(sites[0].models):
+        title = model.title
+        _agree(sites, f"{title}: columns", [", ".join(s.models[number].columns) for s in sites])
+        _agree(sites, f"{title}: contrasts", [", ".join(s.models[number].contrasts) for s in sites])
+        for name in model.contrasts:
+            # The mean is that of a site's own participants, whatever their age.
+            rows = [site.models[number].contrasts[name] for site in sites if name != MEAN]
+            if rows:
+                words = [", ".join(f"{weight:.6g}" for weight in row) for row in rows]
+                item = f"{title}: weights of {name} on {', '.join(model.columns)}"
+                _agree(sites, item, words, _BY_COLUMNS)
+    several = len({site.version for site in sites}) > 1
+    return ["sites used several versions of hipsta_bids, see sites.tsv"] if several else []
+
+
+def _agree(
+    sites: Sequence[SiteSummary],
+    item: str,
+    values: Sequence[str],
+    remedy: str = "all sites need the same",
+) -> None:
+    usual = Counter(values).most_common(1)[0][0]
+    for site, own in zip(sites, values, strict=True):
+        if own != usual:
+            other = sites[values.index(usual)].site
+            raise ModelError(
+                f"site {site.site}: {item}: {shorten(own, _LONGEST)}, but at {other}"
+                f" {shorten(usual, _LONGEST)}; {remedy}"
+            )
+
+
+def _agree_on_measures(sites: Sequence[SiteSummary]) -> None:
+    """Refuse sites that lack a map or summary measure of others."""
+    own = [
+        [
+            f"{name}, {model.hemi} ({'map' if model.kind == 'map' else model.formula})"
+            for model in site.models
+            for name in model.measures
+        ]
+        for site in sites
+    ]
+    every = list(dict.fromkeys(name for names in own for name in names))
+    for site, names in zip(sites, own, strict=True):
+        if lacking := [name for name in every if name not in names]:
+            raise ModelError(
+                f"site {site.site}: lacks {listed(lacking)}; give all sites the same --measures"
+            )
+    titles = ["; ".join(model.title for model in site.models) for site in sites]
+    _agree(sites, "order of results", titles)
+
+
+def _few(values: Sequence[float]) -> str:
+    return f"{len(values)} nodes from {values[0]:.4g} to {values[-1]:.4g}" if values else "none"
+
+
+@np.errstate(over="ignore", divide="ignore", invalid="ignore")  # of numbers as others sent them
+def analyze_sites(sites: list[SiteSummary], settings: GroupSettings) -> Meta:
+    """Combine each contrast of each model, and tell which points survive."""
+    items = [
+        Item(
+            number=number,
+            model=model,
+            contrast=contrast,
+            result=meta_analyze(
+                [site.models[number].fit for site in sites],
+                [np.array(site.models[number].contrasts[contrast]) for site in sites],
+                model.intercept,
+                settings.meta,
+            ),
+        )
+        for number, model in enumerate(sites[0].models)
+        for contrast in model.contrasts
+    ]
+    maps = [item for item in items if item.model.kind == "map"]
+    found = discover(
+        {item.key(name): one.p for item in maps for name, one in item.result.models.items()},
+        settings.multiplicity,
+    )
+    frames: dict[str, Frame] = {
+        item.model.hemi: _frame(sites, item.number) for item in reversed(maps)
+    }
+    return Meta(sites=sites, items=items, found=found, frame=frames, settings=settings)
+
+
+def _frame(sites: Sequence[SiteSummary], number: int) -> Frame:
+    """Locate points, in the subfield that most participants have there."""
+    first = sites[0]
+    votes: list[Counter[str]] = [Counter() for _ in range(len(first.x) * len(first.y))]
+    for site in sites:
+        for vote, name in zip(votes, site.models[number].subfield or [], strict=False):
+            vote[name or files.MISSING] += site.participants
+    names = [vote.most_common(1)[0][0] if vote else files.MISSING for vote in votes]
+    shape = len(first.x), len(first.y)
+    return Frame.of_sheet(np.array(first.x), np.array(first.y), np.array(names).reshape(shape))
+
+
+def meta_tables(meta: Meta) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Make all tables."""
+    confidence = meta.settings.meta.confidence
+    yield "sites", _sites(meta)
+    edges = sheet_edges(
+        len(meta.sites[0].x), len(meta.sites[0].y), meta.settings.multiplicity.neighbors
+    )
+    rows, peaks, forests = [], [], []
+    for item in meta.of("map"):
+        frame = meta.frame[item.model.hemi]
+        own = []
+        for key, test, one in meta.tests(item):
+            found = meta.found[key]
+            stem = tables.map_name(key.hemi, key.measure, key.contrast)
+            rows.append(overview_row(stem, key, found))
+            low, high = one.limits(confidence)
+            columns = {
+                **point_columns(test, found, frame, meta.counts(item).astype(int)),
+                "n_sites": item.result.random.sites.astype(int),
+                "estimate_low": low,
+                "estimate_high": high,
+                **_between(item),
+            }
+            yield stem, pd.DataFrame(columns)
+            table = peak_table(test, found, frame, edges)
+            peaks.append(table.assign(measure=key.measure, hemi=key.hemi))
+            own.append(table)
+        forests += [_forest(meta, item, point) for point in _points(own, frame)]
+    if rows:
+        yield "maps", pd.DataFrame(rows)
+        table = pd.concat(peaks, ignore_index=True)
+        yield "peaks", table[["measure", "hemi", *table.columns.drop(["measure", "hemi"])]]
+    if list(meta.of("summary")):
+        yield "measures", _summaries(meta)
+    for item in meta.of("summary"):
+        known = np.flatnonzero(np.isfinite(item.result.random.estimate))
+        forests += [_forest(meta, item, int(point)) for point in known]
+    if forests:
+        yield (
+            "forest",
+            pd.concat([table.assign(plot=number) for number, table in enumerate(forests, start=1)]),
+        )
+    if left := list(_left_out(meta)):
+        yield "leave_one_out", pd.DataFrame(left)
+
+
+def _sites(meta: Meta) -> pd.DataFrame:
+    rows = []
+    for site in meta.sites:
+        levels = {f"{k}_{level}": n for k, own in site.factors.items() for level, n in own.items()}
+        numbers = {
+            f"{k}_{what}": v for k, own in site.covariates.items() for what, v in own.items()
+        }
+        people = {"site": site.site, "n": site.participants, **levels, **numbers}
+        about = {"version": site.version, "template": site.template_hash}
+        rows.append({**people, "df": site.models[0].df, **about})
+    return pd.DataFrame(rows)
+
+
+def _between(item: Item) -> dict[str, Float]:
+    random = item.result.random
+    return {"tau2": random.tau2, "q": random.q, "q_p": random.q_p, "i2": random.i2}
+
+
+def _points(peaks: Sequence[pd.DataFrame], frame: Frame) -> list[int]:
+    """Peaks of a map by either model, the largest statistics first; else the strongest point."""
+    table = pd.concat(peaks, ignore_index=True)
+    if not len(table):
+        return []
+    own = table[table["extent"] > 0] if (table["extent"] > 0).any() else table.tail(1)
+    own = own.reindex(own["statistic"].abs().sort_values(ascending=False, kind="stable").index)
+    x, y = (frame.position[axis].tolist() for axis in "xy")
+    at = {place: point for point, place in enumerate(zip(x, y, strict=True))}
+    nodes = np.stack([frame.number["node_x"], frame.number["node_y"]])
+    kept: list[int] = []
+    for place in zip(own["x"].tolist(), own["y"].tolist(), strict=True):
+        away = np.abs(nodes[:, kept] - nodes[:, [at[place]]]).max(axis=0)
+        # Both models have the same cluster's peak there, or nearly.
+        if (away > _SAME_PEAK).all():
+            kept.append(at[place])
+    return kept[:_MOST_PEAKS]
+
+
+def _forest(meta: Meta, item: Item, point: int) -> pd.DataFrame:
+    """Everything in a forest plot: a row per site, and one per combined estimate."""
+    result, confidence = item.result, meta.settings.meta.confidence
+    is_map = item.model.kind == "map"
+    what: dict[str, Any] = {
+        "measure": item.model.measures[0 if is_map else point],
+        "unit": item.model.units[0 if is_map else point],
+        "hemi": item.model.hemi,
+        "model": item.model.formula,
+        "contrast": item.contrast,
+    }
+    if is_map:
+        frame = meta.frame[item.model.hemi]
+        what |= {name: own[point] for name, own in frame.position.items()}
+        what["subfield"] = frame.subfield[point]
+    rows: list[dict[str, Any]] = []
+    for number, site in enumerate(meta.sites):
+        df = np.full(result.sd.shape, site.models[item.number].df, dtype=np.float64)
+        own = Combined(estimate=result.estimates[number], se=result.ses[number], df=df)
+        row = {"site": site.site, "kind": "site", "n": site.participants}
+        row |= _row(own, point, confidence) | {"weight": result.random.weights[number, point]}
+        if result.without:
+            rest = _row(result.without[number].random, point, confidence)
+            del rest["se"]
+            row |= {f"without_{k.removeprefix('estimate_')}": v for k, v in rest.items()}
+        rows.append(row)
+    n = int(meta.counts(item)[point])
+    for name, one in result.models.items():
+        rows.append({"site": name, "kind": name, "n": n, **_row(one, point, confidence)})
+    rows[-1] |= {name: values[point] for name, values in _between(item).items()}
+    low, high = result.random.prediction(confidence)
+    limits = {"estimate_low": low[point], "estimate_high": high[point]}
+    rows.append({"site": _PREDICTION, "kind": _PREDICTION, **limits})
+    return pd.DataFrame([{**what, **row} for row in rows])
+
+
+def _row(one: Combined, point: int, confidence: float) -> dict[str, float]:
+    low, high = one.limits(confidence)
+    return {
+        "estimate": one.estimate[point],
+        "se": one.se[point],
+        "estimate_low": low[point],
+        "estimate_high": high[point],
+        "p": one.p[point],
+    }
+
+
+def _summaries(meta: Meta) -> pd.DataFrame:
+    """List summary measures by fixed and random effects; the latter also by DerSimonian-Laird."""
+    confidence, least = meta.settings.meta.confidence, meta.settings.meta.min_sites
+    parts = []
+    for item in meta.of("summary"):
+        other = combine(item.result.estimates, item.result.ses**2, "dl", least=least)
+        for key, test, one in meta.tests(item):
+            low, high = one.limits(confidence)
+            parts.append(
+                pd.DataFrame(
+                    {
+                        "hemi": item.model.hemi,
+                        "measure": item.model.measures,
+                        "unit": item.model.units,
+                        "model": item.model.formula,
+                        "contrast": key.contrast,
+                        "test": "t",
+                        "n": meta.counts(item).astype(int),
+                        "visits": meta.counts(item).astype(int),
+                        "n_sites": item.result.random.sites.astype(int),
+                        **test_columns(test),
+                        "p_fdr": np.nan,
+                        "estimate_low": low,
+                        "estimate_high": high,
+                        **effect_columns(test),
+                        **_between(item),
+                        "estimate_dl": other.estimate,
+                        "se_dl": other.se,
+                        "p_dl": other.p,
+                    }
+                )
+            )
+    table = pd.concat(parts, ignore_index=True)
+    table = table[table["estimate"].notna()]
+    return tables.with_fdr(table, meta.settings)
+
+
+def _left_out(meta: Meta) -> Iterator[dict[str, Any]]:
+    """Count what survives without each site, and how far estimates move."""
+    maps = [item for item in meta.of("map") if item.result.without]
+    for number, site in enumerate(meta.sites if maps else ()):
+        rest = {
+            item.key(name): one
+            for item in maps
+            for name, one in item.result.without[number].models.items()
+        }
+        found = discover({key: one.p for key, one in rest.items()}, meta.settings.multiplicity)
+        for item in maps:
+            for name, all_sites in item.result.models.items():
+                key = item.key(name)
+                moved = np.abs(rest[key].estimate - all_sites.estimate) / item.result.sd
+                both = found[key].rejected & meta.found[key].rejected
+                yield {
+                    "measure": key.measure,
+                    "contrast": key.contrast,
+                    "hemi": key.hemi,
+                    "site": site.site,
+                    "n_significant": int(found[key].rejected.sum()),
+                    "n_kept": int(both.sum()),
+                    "largest_change": float(np.nan_to_num(moved).max(initial=0.0)),
+                }

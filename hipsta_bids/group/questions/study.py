@@ -1,0 +1,426 @@
+"""A study: what was read for a question of the group level, and how its results are written."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from hipsta_bids import __version__
+from hipsta_bids.derivatives import dataset
+from hipsta_bids.derivatives.names import group_report
+from hipsta_bids.errors import InputError, ModelError
+from hipsta_bids.group.cohort import collect
+from hipsta_bids.group.cohort.covariates import add_icv, add_time, read_covariates
+from hipsta_bids.group.cohort.data import Cohort, Measures, choose_visits
+from hipsta_bids.group.cohort.external import (
+    ExternalCohorts,
+    MapPattern,
+    add_external,
+    add_volumes,
+    check_volumes,
+    find_all,
+    map_patterns,
+    taken_names,
+)
+from hipsta_bids.group.cohort.read import (
+    Measured,
+    check_summaries,
+    choose_measures,
+    read_sheets,
+    visits_of,
+)
+from hipsta_bids.group.design.formula import check_names, listed, with_factors
+from hipsta_bids.group.design.model import (
+    Comparison,
+    ModelRequest,
+    VisitTime,
+    wanted_measures,
+)
+from hipsta_bids.group.design.settings import GroupSettings
+from hipsta_bids.group.output import write
+from hipsta_bids.group.output.results import templates_of
+from hipsta_bids.group.output.saved import templates_from_json
+from hipsta_bids.group.output.tables import registration_tables
+from hipsta_bids.group.questions import analysis
+from hipsta_bids.group.stats.arrays import Bool
+from hipsta_bids.group.stats.warps import Template
+from hipsta_bids.io import files
+from hipsta_bids.progress import each, tell
+from hipsta_bids.protocols.toml import resolve
+from hipsta_bids.reports.group import write_group_report
+from hipsta_bids.types import PARTICIPANT
+
+#: Squared SDs are averaged over this many nodes along both axes, odd: from 8 copies, each is
+#: known to a third only.
+#: Squared SDs are averaged over this many nodes along both axes, odd: from 8 copies, each is
+#: known to a third only.
+ERROR_WINDOW = 5
+
+
+#: Hemispheres that notes name.
+_SHOWN = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class GroupOptions:
+    """What the user asked for."""
+
+    bids_dir: Path
+    out_dir: Path
+    sheets: collect.GroupRequest
+    model: ModelRequest
+    covariates: tuple[Path, ...] = ()
+    maps: tuple[tuple[str, str], ...] = ()
+    """Names and patterns of other programs' maps."""
+    surfaces: tuple[tuple[str | None, str], ...] = ()
+    """Patterns of the surfaces to draw these on, for one or for all."""
+    volumes: tuple[tuple[str, str], ...] = ()
+    """Names and patterns of other programs' tables of volumes."""
+    measures: tuple[str, ...] = ()
+    """What to fit the model to; empty for the default or the formula's left-hand side."""
+    template: Path | None = None
+    harmonize_model: Path | None = None
+    """Parameters of the harmonization of another analysis."""
+    comparison: Comparison = field(default_factory=Comparison)
+    export_summary: str | None = None
+    """Name of this site in a summary for others, empty for that of the folder; ``None`` for no
+    summary."""
+    reports: bool = True
+    """Whether a page is made."""
+    command: tuple[str, ...] = ()
+    """The command line, for the record."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class GroupInputs:
+    """What was read."""
+
+    found: collect.Collection
+    """Hemispheres that were measured."""
+    cohort: Cohort
+    """Visits that are compared, with covariates and sheets."""
+    others: Mapping[str, Cohort]
+    """The same visits with other programs' maps, by the names of these."""
+    measures: Measures
+    """Measures of the sheets."""
+    icv: str | None
+    """Column of intracranial volume."""
+    time: VisitTime | None
+    exclusions: tuple[collect.Exclusion, ...]
+    """Of hemispheres, and of sessions that are not compared."""
+    notes: tuple[str, ...]
+    """What to know, one line each."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GroupResult:
+    """What was done."""
+
+    folder: Path
+    n_participants: int
+    """In the model."""
+    n_excluded: int
+    """Hemispheres and visits."""
+    notes: tuple[str, ...]
+    """What to know, one line each."""
+    warnings: tuple[str, ...]
+    """What may make results wrong, one line each."""
+    page: Path | None = None
+    """To look at; ``None`` if there is none."""
+    problem: str | None = None
+    """Why the page could not be made."""
+
+
+def write_folder(
+    options: GroupOptions,
+    name: str,
+    inputs: GroupInputs,
+    settings: GroupSettings,
+    *,
+    notes: list[str],
+    counts: tuple[int, int],
+    fill: Callable[[Path], Mapping[str, Any]],
+) -> GroupResult:
+    """Write all results or none.
+
+    ``fill`` writes into the folder, adds to the notes, and returns what is recorded; ``counts`` are
+    of participants and of what is left out.
+    """
+    found, region = inputs.found, options.sheets.region
+    name = options.model.name or (name if region == "body" else f"{name}_{region}")
+    _describe_dataset(options)
+    with write.model_folder(options.out_dir, name) as folder:
+        tell("tables and maps")
+        record = {
+            "command": list(options.command),
+            "version": __version__,
+            "inputs": {
+                "datasets": [str(root.resolve()) for root in options.sheets.roots],
+                "settings_hash": found.settings_hash,
+                "versions": found.versions,
+                "seg": found.records[0].place.name.seg if found.records else None,
+                "region": region,
+                "maps": dict(options.maps),
+                "volumes": dict(options.volumes),
+                "covariates": [str(path) for path in options.covariates],
+                "template": options.template and str(options.template),
+                "harmonization": options.harmonize_model and str(options.harmonize_model),
+            },
+            **fill(folder),
+            "notes": [*found.warnings, *notes],
+            "settings": resolve(settings),
+        }
+        files.write_json(folder / "analysis.json", record)
+    return GroupResult(
+        folder=options.out_dir / write.GROUP_FOLDER / name,
+        n_participants=counts[0],
+        n_excluded=counts[1],
+        notes=tuple(notes),
+        warnings=found.warnings,
+    )
+
+
+def read_inputs(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
+    """Find and read sheets, other maps, volumes and covariates."""
+    check_volumes(options.volumes)
+    found = collect.collect_sheets(options.sheets, may_lack=bool(options.maps))
+    taken = taken_names(with_sheets=bool(found.records))
+    requests = map_patterns(options.maps, options.surfaces, taken)
+    wanted = wanted_measures(options.model, options.measures)
+    measures = choose_measures(wanted, found.records, [one.name for one in requests])
+    external = _read_maps(options, found, requests, measures, settings)
+    measured, volume_notes = add_volumes(
+        external.measured, found.records, options.volumes, options.bids_dir
+    )
+    check_summaries(measures, measured.sides)
+    everybody = Cohort(
+        table=with_factors(
+            read_covariates(measured.visits, options.bids_dir, options.covariates), settings
+        ),
+        sides=measured.sides,
+        x=measured.x,
+        y=measured.y,
+        units=measured.units,
+    )
+    # A visit may have lost both of its hemispheres.
+    sides = [side for one in (everybody, *external.others.values()) for side in one.sides.values()]
+    there = np.isin(np.arange(len(everybody.table)), np.concatenate([one.rows for one in sides]))
+    cohort, reasons = choose_visits(everybody.take(there), options.comparison)
+    keep = everybody.table.index.isin(cohort.table.index)
+    table, icv = add_icv(cohort.table, measured.sources, settings)
+    cohort = replace(cohort, table=table)
+    time = None
+    if options.comparison.longitudinal:
+        time = add_time(cohort.table, settings)
+        cohort = replace(cohort, table=time.table)
+    own = tuple(name for name in measures.maps if name not in external.others)
+    other = "other-session" if options.comparison.pair else "later-session"
+    return GroupInputs(
+        found=found,
+        cohort=cohort,
+        others={
+            name: replace(other.take(keep), table=cohort.table)
+            for name, other in external.others.items()
+        },
+        measures=replace(measures, maps=own),
+        icv=icv,
+        time=time,
+        exclusions=(
+            *found.exclusions,
+            *measured.damaged,
+            *collect.exclude_visits(
+                measured.visits, {visit: (other, message) for visit, message in reasons.items()}
+            ),
+        ),
+        notes=(*found.notes, *external.notes, *volume_notes, *_damaged(measured)),
+    )
+
+
+def _read_maps(
+    options: GroupOptions,
+    found: collect.Collection,
+    requests: Sequence[MapPattern],
+    measures: Measures,
+    rules: GroupSettings,
+) -> ExternalCohorts:
+    """Read the maps that are asked for, of the sheets and of other programs."""
+    error_window = 0 if rules.glm.weights == "none" else ERROR_WINDOW
+    asked = [one for one in requests if one.name in measures.maps]
+    files_of, visits = find_all(
+        asked, options.bids_dir, visits_of(found.records), collect.wanted_by(options.sheets)
+    )
+    names = {one.name for one in requests}
+    own = [name for name in measures.maps if name not in names]
+    if error_window and asked:
+        names_of = ", ".join(one.name for one in asked)
+        raise InputError(
+            f"--weights uncertainty: there are no SDs of {names_of}; leave --maps or the"
+            " weights out"
+        )
+    measured = read_sheets(
+        found.records, found.grid, own, visits, rules=rules, error_window=error_window
+    )
+    return add_external(measured, files_of, visits)
+
+
+def _damaged(measured: Measured) -> tuple[str, ...]:
+    shown = [
+        f"{one.participant}{f' {one.session}' if one.session else ''}, hemisphere {one.hemi}, is"
+        f" left out: {one.message}; measure it again"
+        for one in measured.damaged[:_SHOWN]
+    ]
+    more = len(measured.damaged) - _SHOWN
+    return (*shown, f"{more} more are left out alike, see excluded.tsv") if more > 0 else (*shown,)
+
+
+def with_page(options: GroupOptions, result: GroupResult) -> GroupResult:
+    """Add the page to results that were written."""
+    page, problem = make_page(options, result.folder.name)
+    return replace(result, page=page, problem=problem)
+
+
+def make_page(options: GroupOptions, name: str) -> tuple[Path | None, str | None]:
+    """Make the page, and say why if it is not there."""
+    path = options.out_dir / group_report(name)
+    if not options.reports:
+        files.remove([path])  # it would be that of an earlier analysis of this name
+        return None, None
+    tell("page")
+    problem = write_group_report(options.out_dir, name)
+    return (path if problem is None else None), problem
+
+
+def _describe_dataset(options: GroupOptions) -> None:
+    """Describe the output dataset, if the participant level has not."""
+    files.make_folder(options.out_dir)
+    if not (options.out_dir / "dataset_description.json").exists():
+        roots = [root for root in options.sheets.roots if root != options.out_dir]
+        roots += [options.bids_dir] if options.maps else []
+        names = dataset.source_names((root.resolve().name, root) for root in roots)
+        dataset.write_description(options.out_dir, names)
+    dataset.write_notes(options.out_dir)
+
+
+def read_templates(path: Path | None, cohort: Cohort) -> Mapping[str, Template] | None:
+    """Read the templates of an earlier analysis, if one is named."""
+    if path is None:
+        return None
+    content = files.read_json(path)
+    content = content.get("template") or content  # in the summary of another site
+    templates = templates_from_json(content, str(path))
+    if missing := sorted(set(cohort.sides) - set(templates)):
+        raise ModelError(f"{path}: has no template of hemisphere {', '.join(missing)}")
+    return templates
+
+
+def folder_of(parts: Sequence[str], among: tuple[str, str] | None) -> str:
+    """Name a folder of results by what was asked, and of whom."""
+    words = (*parts, *(among or ())[1:])
+    return "_".join("".join(c if c.isalnum() else "-" for c in word) for word in words)
+
+
+def members(table: pd.DataFrame, among: tuple[str, str] | None, option: str = "--among") -> Bool:
+    """Tell whose visits are asked for."""
+    if among is None:
+        return np.ones(len(table), dtype=bool)
+    column, level = among
+    check_names([column], table.columns)
+    values = table[column].map(lambda value: None if value is None else str(value))
+    keep = (values == level).to_numpy()
+    if not keep.any():
+        raise ModelError(
+            f"{option} {column}={level}: no participant has it; there are"
+            f" {listed(sorted(values.dropna().unique()))}"
+        )
+    return np.asarray(keep, dtype=bool)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Study:
+    """What was read, and the visits that a question other than a comparison is about."""
+
+    options: GroupOptions
+    settings: GroupSettings
+    inputs: GroupInputs
+    among: tuple[str, str] | None
+    """Column and level of the participants; all without."""
+    keep: Bool
+    """Of the visits that were read."""
+    cohort: Cohort
+    """Of those that are kept."""
+    left_out: dict[str, tuple[str, str]]
+    """Reason and message by visit."""
+
+    @classmethod
+    def read(
+        cls, options: GroupOptions, among: tuple[str, str] | None, settings: GroupSettings
+    ) -> "Study":
+        """Read all visits, and keep those that are asked for."""
+        tell("reading")
+        inputs = read_inputs(options, settings)
+        keep = members(inputs.cohort.table, among)
+        why = "not-asked", "another level than --among"
+        return cls(
+            options=options,
+            settings=settings,
+            inputs=inputs,
+            among=among,
+            keep=keep,
+            cohort=inputs.cohort.take(keep),
+            left_out=dict.fromkeys(map(str, inputs.cohort.table.index[~keep]), why),
+        )
+
+    def register(
+        self, templates: Mapping[str, Template] | None
+    ) -> tuple[dict[str, Any] | None, dict[str, Cohort], dict[str, pd.DataFrame]]:
+        """Register sheets: templates for a file, cohorts (other maps by name), and tables."""
+        cohort = self.cohort
+        with_maps = list(cohort.sides) if self.inputs.measures.maps else []
+        sides = {
+            hemi: analysis.register_side(
+                cohort, hemi, groups=None, settings=self.settings, templates=templates
+            )
+            for hemi in each("registration", with_maps)
+        }
+        registered = {hemi: side.registered for hemi, side in sides.items()} or cohort.sides
+        others = {name: other.take(self.keep) for name, other in self.inputs.others.items()}
+        cohorts = {"": replace(cohort, sides=registered), **others}
+        tables = dict(registration_tables(cohort, sides)) if sides else {}
+        return templates_of(sides), cohorts, tables
+
+    def write(
+        self,
+        name: str,
+        notes: Iterable[str],
+        *,
+        visits: pd.DataFrame,
+        tables: Mapping[str, pd.DataFrame],
+        record: Mapping[str, Any],
+        fill: Callable[[Path], list[str]],
+    ) -> GroupResult:
+        """Write what these questions share, and a page; ``fill`` writes all else, and notes."""
+        excluded = collect.exclude_visits(self.inputs.cohort.table, self.left_out)
+        excluded = [*self.inputs.exclusions, *excluded]
+        told, people = [*self.inputs.notes, *notes], int(visits[PARTICIPANT].nunique())
+
+        def everything(folder: Path) -> dict[str, Any]:
+            for title, table in tables.items():
+                write.write_table(folder, title, table)
+            write.write_exclusions(folder, excluded)
+            write.write_table(folder, "covariates", visits, described=False)
+            told.extend(fill(folder))
+            return {"participants": people, "rows": len(visits), **record}
+
+        result = write_folder(
+            self.options,
+            name,
+            self.inputs,
+            self.settings,
+            notes=told,
+            counts=(people, len(excluded)),
+            fill=everything,
+        )
+        return with_page(self.options, result)

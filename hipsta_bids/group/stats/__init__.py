@@ -1,0 +1,1 @@
+"""Statistics of arrays: nothing here knows files, folders or participants."""

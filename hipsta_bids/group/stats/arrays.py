@@ -1,0 +1,174 @@
+"""Maps of one hemisphere as arrays, in blocks that fit in memory."""
+
+import contextlib
+import ctypes
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from hipsta_bids.types import Mesh
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+Bool = NDArray[np.bool_]
+Key = tuple[str, str]
+"""Hemisphere and measure."""
+#: More sheets of a side are kept in single precision, whose rounding is less than a hundredth of
+#: that of the tables, and registered whenever they are asked for, to save memory.
+MOST_KEPT = 10_000
+#: Sheets in memory at once, where each counts on its own.
+SHEETS = 4000
+
+
+@dataclass(frozen=True, eq=False)
+class WarpedMaps(Mapping[str, Float]):
+    """Maps (sheets, x, y) that are registered whenever they are asked for."""
+
+    source: Mapping[str, Float]
+    warps: Float
+    carry: Callable[[Float, Float], Float]
+
+    def __getitem__(self, name: str) -> Float:
+        return self.carry(self.source[name], self.warps)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.source)
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+
+@dataclass(frozen=True, eq=False)
+class WarpedLabels:
+    """Labels (sheets, x, y) that are registered whenever some are asked for."""
+
+    source: NDArray[np.int8]
+    warps: Float
+    carry: Callable[[NDArray[np.int8], Float], NDArray[np.int8]]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Sheets, x, y."""
+        return self.source.shape
+
+    def __getitem__(self, own: slice | Bool | Int) -> NDArray[np.int8]:
+        return self.carry(self.source[own], self.warps[own])
+
+
+def some_sheets(maps: Mapping[str, Float], own: slice | Bool) -> Mapping[str, Float]:
+    """Keep some sheets of maps."""
+    if isinstance(maps, WarpedMaps):
+        return WarpedMaps(some_sheets(maps.source, own), maps.warps[own], maps.carry)
+    return {name: values[own] for name, values in maps.items()}
+
+
+def sheets_of(maps: Mapping[str, Float], name: str, own: Bool | Int) -> Float:
+    """Take some sheets of one map; only these are registered, if need be."""
+    if isinstance(maps, WarpedMaps):
+        return maps.carry(maps.source[name][own], maps.warps[own])
+    return maps[name][own]
+
+
+def parts_of_sheets(maps: Mapping[str, Float], name: str, own: Bool | Int) -> Iterator[Float]:
+    """Take sheets of one map, some at a time; the order is kept."""
+    rows = np.flatnonzero(own) if own.dtype == np.bool_ else own
+    return (sheets_of(maps, name, rows[part]) for part in blocks(len(rows), SHEETS))
+
+
+def blocks(count: int, size: int) -> Iterator[slice]:
+    """Cut rows into blocks, one at least, to bound memory."""
+    return (slice(start, start + size) for start in range(0, max(count, 1), size))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SideMaps:
+    """Sheets of one hemisphere of all visits that have it."""
+
+    rows: Int
+    """(sheets,) row of each in the cohort's table, ascending."""
+    maps: Mapping[str, Float]
+    """(sheets, x, y) per measure; NaN is missing."""
+    subfield: NDArray[np.int8] | WarpedLabels
+    """(sheets, x, y) index into ``names``; -1 is missing."""
+    names: tuple[str, ...]
+    """Abbreviations of subfields."""
+    summary: pd.DataFrame
+    """One row per sheet: the columns of the participant level's summaries, as numbers."""
+    errors: Mapping[str, Float] = field(default_factory=dict)
+    """(sheets, x, y) SD of the measurement per measure, where it was asked for."""
+    mesh: Mesh | None = None
+    """Surface of the points if they are not on the grid: x are its vertices then, and y is 1."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Nodes along x and y."""
+        return self.subfield.shape[1], self.subfield.shape[2]
+
+    def only(self, measures: Sequence[str]) -> "SideMaps":
+        """Keep some maps."""
+        if set(measures) == set(self.maps):
+            return self
+        return replace(self, maps={name: self.maps[name] for name in measures})
+
+    def with_summary(self, columns: pd.DataFrame) -> "SideMaps":
+        """Add summary measures."""
+        joined = pd.concat([self.summary, columns.set_axis(self.summary.index)], axis=1)
+        return replace(self, summary=joined)
+
+    def take(self, keep: NDArray[np.bool_]) -> "SideMaps":
+        """Keep some rows of the cohort's table, which are renumbered."""
+        own = self.sheets(keep[self.rows])
+        return replace(own, rows=(np.cumsum(keep) - 1)[own.rows])
+
+    def sheets(self, own: NDArray[np.bool_]) -> "SideMaps":
+        """Keep some sheets; of all, no copy is made."""
+        if own.all():
+            return self
+        return replace(
+            self,
+            rows=self.rows[own],
+            maps=some_sheets(self.maps, own),
+            errors=some_sheets(self.errors, own),
+            subfield=self.subfield[own],
+            summary=self.summary[own].reset_index(drop=True),
+        )
+
+
+def return_memory() -> None:
+    """Give memory that is free back to the system: glibc keeps what lies between pieces in use."""
+    with contextlib.suppress(AttributeError):  # other C libraries have no such function
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+def mean_of_known(values: Float, axis: int) -> Float:
+    """Mean without what is missing; NaN where nothing is known."""
+    known = np.isfinite(values)
+    count = known.sum(axis=axis)
+    total = values.sum(axis=axis, dtype=np.float64, where=known)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def describe_known(parts: Iterable[Float]) -> tuple[Bool, Float, Float]:
+    """Tell what is known of a table in parts, (rows, columns), and mean and SD of its columns.
+
+    Means and sums of squares of parts are put together as by Chan et al. (1983).
+    """
+    known, count, mean, squares = [], np.zeros(1, np.int64), np.zeros(1), np.zeros(1)
+    for values in parts:
+        known.append(np.isfinite(values))
+        n = known[-1].sum(axis=0)
+        both = np.maximum(count + n, 1)
+        own = np.nan_to_num(mean_of_known(values, 0))
+        squares = squares + np.sum((values - own) ** 2, axis=0, dtype=np.float64, where=known[-1])
+        squares += (own - mean) ** 2 * count * n / both
+        mean = mean + (own - mean) * n / both
+        count = count + n
+    spread = np.sqrt(squares / np.maximum(count - 1, 1))
+    return (
+        np.concatenate(known),
+        np.where(count > 0, mean, np.nan),
+        np.where(count > 1, spread, np.nan),
+    )

@@ -1,0 +1,538 @@
+"""The general linear model at every point of a map, and for single measures."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import special
+from scipy.optimize import elementwise
+from statsmodels.regression.linear_model import OLS
+
+from hipsta_bids.errors import ModelError
+from hipsta_bids.group.design.formula import Contrast
+from hipsta_bids.group.design.model import Design
+from hipsta_bids.group.design.settings import GlmSettings, GroupSettings
+from hipsta_bids.group.stats.arrays import Bool, Float, Int, SideMaps, parts_of_sheets, sheets_of
+from hipsta_bids.group.stats.exchangeability import Visits
+
+#: Least variance between participants for these weights, share of the residual variance, so that
+#: a few maps do not decide alone where SDs are too large.
+LEAST_BETWEEN = 0.5
+#: Points are left out where the missing values take away all but this fraction of what the data
+#: say about a direction of the coefficients.
+MIN_INFORMATION = 1e-8
+
+#: Contrast of what all rows have in common.
+MEAN = "mean"
+#: Values in memory at once; bounds the temporaries, and does not change a result.
+_CHUNK = 4_000_000
+#: SciPy's inverse is exact to some 1e-5 only; the root is looked for this far around it.
+_BRACKET = 0.01
+#: SciPy's inverse for F goes no farther than 10000; beyond it the root is looked for between a
+#: tenth of this and this many times the numerator's sum.
+_FARTHEST, _WIDEST = 9990.0, 20.0
+
+
+def t_limits(t: Float, df: Float, confidence: float) -> tuple[Float, Float]:
+    """Limits of the non-centrality of t statistics (Steiger 2004).
+
+    At the lower and upper limit, ``t`` is the upper and lower ``(1 - confidence) / 2`` quantile.
+    """
+    tail = (1 - confidence) / 2
+
+    def limit(probability: float) -> Float:
+        def excess(center: Float, t: Float, df: Float) -> Float:
+            return np.asarray(special.nctdtr(df, center, t) - probability)
+
+        return _root(excess, special.nctdtrinc(df, probability, t), t, df)
+
+    return limit(1 - tail), limit(tail)
+
+
+def f_limits(f: Float, df1: int, df2: Float, confidence: float) -> tuple[Float, Float]:
+    """Limits of the non-centrality of F statistics, as :func:`t_limits`."""
+    tail = (1 - confidence) / 2
+    first = float(df1)
+
+    def limit(probability: float) -> Float:
+        def excess(center: Float, f: Float, df: Float) -> Float:
+            at = np.maximum(center, 0.0)
+            return np.asarray(special.ncfdtr(first, df, at, f) - probability)
+
+        reachable = special.fdtr(first, df2, f) > probability
+        inside = np.where(reachable, f, np.nan)
+        start = special.ncfdtrinc(first, df2, probability, inside)
+        root = np.maximum(_root(excess, start, inside, df2), 0.0)
+        far = start >= _FARTHEST
+        if far.any():
+            wide = (np.full(far.sum(), _FARTHEST / 10), _WIDEST * first * inside[far])
+            found = elementwise.find_root(excess, wide, args=(inside[far], df2[far]))
+            root[far] = np.where(found.success, found.x, np.nan)
+        return np.where(reachable | np.isnan(f), root, 0.0)
+
+    return limit(1 - tail), limit(tail)
+
+
+def _root(function: Callable[..., Float], near: ArrayLike, statistic: Float, df: Float) -> Float:
+    """Polish approximate roots; keep those that cannot be bracketed."""
+    start: Float = np.asarray(near, dtype=np.float64)
+    reach = _BRACKET * (1 + np.abs(start))
+    found = elementwise.find_root(function, (start - reach, start + reach), args=(statistic, df))
+    return np.where(found.success, found.x, start)
+
+
+@dataclass(frozen=True)
+class PointTest:
+    """One contrast at each point; NaN where the model could not be fitted."""
+
+    contrast: Contrast
+    statistic: Float
+    """(points,) t, or F for contrasts of several rows."""
+    p: Float
+    """(points,) two-sided."""
+    df: Float
+    """(points,) residual degrees of freedom."""
+    estimate: Float
+    """(rows, points) in units of the map."""
+    se: Float
+    """(rows, points) standard errors."""
+    cohen_d: Float
+    """(points,) estimate over residual standard deviation; NaN for several rows."""
+    cohen_d_limits: Float
+    """(2, points)"""
+    eta_squared: Float
+    """(points,) partial: share of the variance that the covariates leave."""
+    eta_squared_limits: Float
+    """(2, points)"""
+
+    @property
+    def kind(self) -> str:
+        """``t`` or ``F``."""
+        return "t" if self.contrast.n_rows == 1 else "F"
+
+    @property
+    def effect(self) -> Float:
+        """(points,) Cohen's d, or of F partial eta squared."""
+        return self.cohen_d if self.kind == "t" else self.eta_squared
+
+
+@dataclass(frozen=True)
+class PointwiseFit:
+    """A linear or mixed model at each point."""
+
+    coefficients: Float
+    """(columns, points) in units of the map per unit of the column."""
+    sigma: Float
+    """(points,) residual standard deviation; of a mixed model that of single visits."""
+    n: Int
+    """(points,) rows with a value."""
+    tests: tuple[PointTest, ...]
+    """In the order of the contrasts."""
+    variances: Mapping[str, Float] = field(default_factory=dict)
+    """(points,) components of a mixed model: ``residual`` within participants, ``participant``
+    between them (with random slopes, at the mean time), and ``slope`` per squared unit of time."""
+    slopes_p: Float | None = None
+    """(points,) p-value of random slopes, where they are fitted."""
+
+
+@dataclass(frozen=True)
+class PointBlock:
+    """The fit at some points, in coordinates in which the complete design is orthonormal."""
+
+    scores: Float
+    """(points, columns)"""
+    covariance: Float
+    """(points, columns, columns)"""
+    sigma: Float
+    """(points,) NaN where the model cannot be fitted."""
+    n: Int
+    """(points,) subjects with a value."""
+
+
+def fit_points(
+    maps: Float,
+    matrix: Float,
+    contrasts: Sequence[Contrast],
+    settings: GlmSettings,
+    errors: Float | None = None,
+) -> PointwiseFit:
+    """Fit the same linear model to each column of a table, with values missing anywhere.
+
+    ``errors`` are the SDs of the measurements, (subjects, points); values weigh by
+    :func:`uncertainty_weights` then, those without an SD are left out, and standard errors are HC3.
+    """
+    check_design(maps, matrix, contrasts)
+    basis, triangle = np.linalg.qr(matrix)
+    back = np.linalg.inv(triangle)
+    blocks = [
+        fit_block(
+            np.asarray(maps[:, part], dtype=np.float64),
+            basis,
+            settings,
+            errors if errors is None else errors[:, part],
+        )
+        for part in chunks(maps.shape, matrix.shape[1])
+    ]
+    names = ("scores", "covariance", "sigma", "n")
+    fit = PointBlock(*(np.concatenate([getattr(one, name) for one in blocks]) for name in names))
+    df = np.where(np.isfinite(fit.sigma), fit.n - matrix.shape[1], np.nan)
+    tests = tuple(
+        _test(contrast, contrast.weights @ back, fit, df, settings.confidence)
+        for contrast in contrasts
+    )
+    return PointwiseFit(back @ fit.scores.T, fit.sigma, fit.n, tests)
+
+
+def check_design(maps: Float, matrix: Float, contrasts: Sequence[Contrast]) -> None:
+    """Refuse a design that cannot be fitted, as where some rows have no maps."""
+    if maps.ndim != 2 or matrix.ndim != 2 or maps.shape[0] != matrix.shape[0]:  # noqa: PLR2004 -- tables
+        raise ModelError(
+            f"model: maps of shape {maps.shape} do not fit a design of shape {matrix.shape};"
+            " both need as many rows"
+        )
+    if not np.isfinite(matrix).all():
+        raise ModelError("model: the design has missing values; keep complete rows only")
+    if np.linalg.matrix_rank(matrix) < matrix.shape[1]:
+        raise ModelError(
+            f"model: the design's {matrix.shape[1]} columns are not independent, given"
+            f" {matrix.shape[0]} rows; leave one out"
+        )
+    for contrast in contrasts:
+        if contrast.weights.shape[1] != matrix.shape[1]:
+            raise ModelError(
+                f"contrast {contrast.name!r} has {contrast.weights.shape[1]} weights, the design"
+                f" {matrix.shape[1]} columns"
+            )
+
+
+def products_of(matrix: Float) -> Float:
+    """(rows, columns * columns) products of the values of each row."""
+    return (matrix[:, :, None] * matrix[:, None, :]).reshape(len(matrix), -1)
+
+
+def sum_by(numbers: Int, values: Float) -> Float:
+    """Sum rows of values (rows, ...) by numbers from 0 on, each of which occurs."""
+    order = np.argsort(numbers, kind="stable")
+    starts = np.searchsorted(numbers[order], np.arange(numbers.max() + 1))
+    return np.asarray(np.add.reduceat(values[order], starts, axis=0))
+
+
+def chunks(shape: tuple[int, ...], columns: int) -> Iterator[slice]:
+    """Split points into ranges that fit into memory together."""
+    step = max(1, _CHUNK // (shape[0] * columns))
+    return (slice(start, start + step) for start in range(0, max(shape[1], 1), step))
+
+
+def uncertainty_weights(maps: Float, errors: Float, basis: Float, settings: GlmSettings) -> Float:
+    """Weights 1 / (t2 + s2), mean 1, of values (subjects, points) with error variances s2.
+
+    t2 is the variance between subjects at a point: the residual variance of the unweighted fit,
+    less what the errors explain of it, (sum of squared residuals - sum s2 (1 - leverage)) /
+    (n - columns), by the method of moments (Hedges and Olkin 1985, Statistical Methods for
+    Meta-Analysis, chapter 9; with covariates Raudenbush 2009). Rough SDs are no matter, since tests
+    have HC3 standard errors. 0 where a value or SD is missing.
+    """
+    present = np.isfinite(maps) & np.isfinite(errors)
+    ordinary = settings.changed(covariance="ordinary")
+    plain = fit_block(np.where(present, maps, np.nan), basis, ordinary)
+    squared = np.where(present, errors, 0.0) ** 2
+    spread = (squared.T @ products_of(basis)).reshape(plain.covariance.shape)
+    variance = plain.sigma**2
+    inverse = plain.covariance / variance[:, None, None]
+    explained = squared.sum(axis=0) - np.einsum("pij,pij->p", inverse, spread)
+    freedom = np.maximum(plain.n - basis.shape[1], 1)
+    between = np.maximum(variance - explained / freedom, LEAST_BETWEEN * variance)
+    weights = np.where(present & np.isfinite(between), 1 / (between + squared), 0.0)
+    total = weights.sum(axis=0)
+    return np.asarray(weights * np.where(total > 0, plain.n / np.where(total > 0, total, 1), 0))
+
+
+def fit_block(
+    maps: Float, basis: Float, settings: GlmSettings, errors: Float | None = None
+) -> PointBlock:
+    """Solve least squares at some points, by normal equations in orthonormal coordinates.
+
+    There the equations of a complete point are the identity, and those of others stay well
+    conditioned unless the missing subjects really carried a column.
+    """
+    present = np.isfinite(maps)
+    weights = None
+    if errors is not None:
+        weights = uncertainty_weights(maps, errors, basis, settings)
+        present = weights > 0
+    values = np.where(present, maps, 0.0)
+    n = present.sum(axis=0)
+    columns = basis.shape[1]
+    if weights is None and present.all():
+        inverse = np.repeat(np.eye(columns)[None], maps.shape[1], axis=0)
+        usable = n - columns >= settings.min_residual_df
+    else:
+        shares = present.astype(np.float64) if weights is None else weights
+        information = (shares.T @ products_of(basis)).reshape(-1, columns, columns)
+        usable = np.linalg.eigvalsh(information)[:, 0] > MIN_INFORMATION
+        usable &= n - columns >= settings.min_residual_df
+        information[~usable] = np.eye(columns)
+        inverse = np.asarray(np.linalg.inv(information), dtype=np.float64)
+    weighted = values if weights is None else weights * values
+    scores = np.einsum("pij,jp->pi", inverse, basis.T @ weighted)
+    residuals = np.where(present, values - basis @ scores.T, 0.0)
+    squares = np.einsum(
+        "sp,sp->p", residuals, residuals if weights is None else weights * residuals
+    )
+    total = np.einsum("sp,sp->p", values, weighted)
+    usable &= squares > total * np.finfo(np.float64).eps  # else the model leaves rounding only
+    sigma = np.sqrt(squares / np.where(usable, n - columns, 1))
+    sigma[~usable] = np.nan
+    if settings.covariance == "hc3" or weights is not None:
+        covariance = _hc3(residuals, basis, inverse, present, weights)
+    else:
+        covariance = inverse * (sigma**2)[:, None, None]
+    return PointBlock(
+        scores=np.where(usable[:, None], scores, np.nan),
+        covariance=np.where(usable[:, None, None], covariance, np.nan),
+        sigma=sigma,
+        n=n,
+    )
+
+
+def _hc3(
+    residuals: Float, basis: Float, inverse: Float, present: Bool, weights: Float | None
+) -> Float:
+    """Sandwich covariance with residuals over (1 - leverage) (MacKinnon and White 1985).
+
+    NaN where one subject alone determines a coefficient.
+    """
+    leverage = np.einsum("psi,si->sp", basis @ inverse, basis)
+    if weights is not None:
+        leverage, residuals = weights * leverage, weights * residuals
+    alone = (1 - leverage < np.sqrt(np.finfo(np.float64).eps)) & present
+    weights = np.where(alone, np.nan, residuals / np.where(alone, 1.0, 1 - leverage)) ** 2
+    meat = (weights.T @ products_of(basis)).reshape(inverse.shape)
+    sandwich: Float = inverse @ meat @ inverse
+    return sandwich
+
+
+def _test(
+    contrast: Contrast, rotated: Float, fit: PointBlock, df: Float, confidence: float
+) -> PointTest:
+    """Wald test of a contrast at each point."""
+    estimate = fit.scores @ rotated.T
+    spread = rotated @ fit.covariance @ rotated.T
+    se = np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
+    statistic = estimate[:, 0] / se[:, 0] if contrast.n_rows == 1 else _wald(estimate, spread)
+    where = {"df": df, "estimate": estimate.T, "se": se.T, "sigma": fit.sigma}
+    return with_effects(contrast, statistic, **where, confidence=confidence)
+
+
+def with_effects(
+    contrast: Contrast,
+    statistic: Float,
+    *,
+    df: Float,
+    estimate: Float,
+    se: Float,
+    sigma: Float,
+    confidence: float,
+    p: Float | None = None,
+) -> PointTest:
+    """Add p-values, Cohen's d (of t) and partial eta squared, with limits, to t or F."""
+    rows = contrast.n_rows
+    if rows == 1:
+        tail = 2 * special.stdtr(df, -np.abs(statistic))
+        squared = statistic**2
+        cohen_d = estimate[0] / sigma
+        d_limits = np.stack(t_limits(statistic, df, confidence)) * (se[0] / sigma)
+    else:
+        tail = special.fdtrc(float(rows), df, statistic)
+        squared = statistic
+        cohen_d = np.full(len(df), np.nan)
+        d_limits = np.full((2, len(df)), np.nan)
+    eta_limits = np.stack(f_limits(squared, rows, df, confidence))
+    return PointTest(
+        contrast=contrast,
+        statistic=statistic,
+        p=np.asarray(tail if p is None else p, dtype=np.float64),
+        df=df,
+        estimate=estimate,
+        se=se,
+        cohen_d=cohen_d,
+        cohen_d_limits=d_limits,
+        eta_squared=squared * rows / (squared * rows + df),
+        eta_squared_limits=eta_limits / (eta_limits + df),
+    )
+
+
+def _wald(estimate: Float, spread: Float) -> Float:
+    """F statistic of several combinations at once, at each point."""
+    rows = estimate.shape[1]
+    valid = np.asarray(np.isfinite(spread).all(axis=(1, 2)))
+    safe = np.where(valid[:, None, None], spread, np.eye(rows))
+    solved = np.linalg.solve(safe, estimate[:, :, None])[:, :, 0]
+    return np.where(valid, np.sum(estimate * solved, axis=1) / rows, np.nan)
+
+
+def fit_measures(
+    values: Float, matrix: Float, contrasts: Sequence[Contrast], settings: GlmSettings
+) -> PointwiseFit:
+    """Fit the model of :func:`fit_points` by statsmodels, one column of values after the other.
+
+    A column is left out by the same rules, and effect sizes are the same.
+    """
+    check_design(values, matrix, contrasts)
+    block = fit_block(values, np.linalg.qr(matrix)[0], settings)
+    tested: Bool = np.asarray(np.isfinite(block.covariance).all(axis=(1, 2)))
+    n_points = values.shape[1]
+    coefficients = np.full((matrix.shape[1], n_points), np.nan)
+    sigma, df = np.full((2, n_points), np.nan)
+    # Per contrast: statistic, p, estimates of the rows, and their standard errors.
+    tables = [np.full((2 + 2 * contrast.n_rows, n_points), np.nan) for contrast in contrasts]
+    kind = "HC3" if settings.covariance == "hc3" else "nonrobust"
+    for i in np.flatnonzero(np.isfinite(block.sigma)):
+        own = np.isfinite(values[:, i])
+        found = OLS(values[own, i], matrix[own]).fit(cov_type=kind, use_t=True)
+        coefficients[:, i], sigma[i], df[i] = found.params, np.sqrt(found.scale), found.df_resid
+        for table, contrast in zip(tables, contrasts, strict=True):
+            rows = found.t_test(contrast.weights)
+            whole = rows if contrast.n_rows == 1 else found.f_test(contrast.weights)
+            values_of = (whole.statistic, whole.pvalue, rows.effect, rows.sd)
+            table[:, i] = np.concatenate([np.ravel(one) for one in values_of])
+            if not tested[i]:
+                table[[0, 1, *range(2 + contrast.n_rows, len(table))], i] = np.nan
+    tests = tuple(
+        with_effects(
+            contrast,
+            table[0],
+            p=table[1],
+            df=df,
+            estimate=table[2 : 2 + contrast.n_rows],
+            se=table[2 + contrast.n_rows :],
+            sigma=sigma,
+            confidence=settings.confidence,
+        )
+        for contrast, table in zip(contrasts, tables, strict=True)
+    )
+    return PointwiseFit(coefficients, sigma, block.n, tests)
+
+
+@dataclass(frozen=True, eq=False)
+class RowModel:
+    """A linear model of independent rows of a design."""
+
+    design: Design
+
+    @property
+    def visits(self) -> Visits | None:
+        """Whose each row is, where participants have several."""
+        return None
+
+    def fit(
+        self, values: Float, rows: Int, contrasts: tuple[Contrast, ...], settings: GroupSettings
+    ) -> PointwiseFit:
+        """Fit some rows of the design at each point."""
+        return fit_points(values, self.design.matrix[rows], contrasts, settings.glm)
+
+    def fit_measures(
+        self, values: Float, rows: Int, contrasts: tuple[Contrast, ...], settings: GroupSettings
+    ) -> PointwiseFit:
+        """Fit some rows of the design to each summary measure."""
+        return fit_measures(values, self.design.matrix[rows], contrasts, settings.glm)
+
+
+def with_mean(design: Design) -> tuple[Contrast, ...]:
+    """Contrasts of a design, with that of the model's mean over all rows in front."""
+    mean = Contrast(MEAN, design.matrix.mean(axis=0))
+    same = [
+        one
+        for one in design.contrasts
+        if one.name == MEAN or (one.n_rows == 1 and np.allclose(one.weights, mean.weights))
+    ]
+    return design.contrasts if same else (mean, *design.contrasts)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FittedMaps:
+    """What was fitted, and the fit."""
+
+    maps: SideMaps
+    """Of all rows of the model's table that have them."""
+    used: Int
+    """Sheets that the model is fitted to, as places in ``maps``."""
+    rows: Int
+    """Rows of the design of the sheets used."""
+    subfield: Int
+    """(x, y) most frequent subfield, position in ``maps.names``; -1 where there is none."""
+    fits: Mapping[str, PointwiseFit]
+    """By measure."""
+
+    def values(self, measure: str) -> Float:
+        """(sheets, points) of one measure, of all sheets used."""
+        if len(self.used) == len(self.maps.rows):
+            return _values(self.maps.maps[measure], self.used)
+        return sheets_of(self.maps.maps, measure, self.used).reshape(len(self.used), -1)
+
+    def parts(self, measure: str, own: Bool) -> Iterator[Float]:
+        """(sheets, points) of one measure, of some of the sheets used, a part at a time."""
+        for part in parts_of_sheets(self.maps.maps, measure, self.used[own]):
+            yield part.reshape(len(part), -1)
+
+
+def fit_maps(
+    hemi: str,
+    side: SideMaps,
+    model: RowModel,
+    settings: GroupSettings,
+    *,
+    contrasts: tuple[Contrast, ...] | None = None,
+) -> FittedMaps:
+    """Fit a model at each point of all maps of a hemisphere."""
+    _, used, rows = np.intersect1d(
+        side.rows, model.design.rows, assume_unique=True, return_indices=True
+    )
+    tested = model.design.contrasts if contrasts is None else contrasts
+    fits = {}
+    try:
+        for name in side.maps:
+            # Maps of a large cohort are made here: without a name, one is gone before the next.
+            if settings.glm.weights == "none":
+                fits[name] = model.fit(_values(side.maps[name], used), rows, tested, settings)
+            else:
+                errors = _values(side.errors[name], used)
+                matrix = model.design.matrix[rows]
+                fits[name] = fit_points(
+                    _values(side.maps[name], used), matrix, tested, settings.glm, errors
+                )
+    except ModelError as error:
+        raise ModelError(f"hemisphere {hemi}: {error}") from error
+    for name, fit in fits.items():
+        if not np.isfinite(fit.sigma).any():
+            raise ModelError(
+                f"hemisphere {hemi}: no point of the {name} maps has enough values for the model;"
+                " look at the sheets, or use a smaller model"
+            )
+        if fit.tests and not any(np.isfinite(test.se).any() for test in fit.tests):
+            raise ModelError(
+                f"hemisphere {hemi}: a participant who alone determines a coefficient of the model"
+                f" leaves no HC3 standard error at any point of the {name} maps; use a smaller"
+                " model, or leave glm.covariance or the weights out"
+            )
+    return FittedMaps(
+        maps=side,
+        used=np.asarray(used, dtype=np.int64),
+        rows=np.asarray(rows, dtype=np.int64),
+        subfield=most_frequent(side.subfield[used], len(side.names)),
+        fits=fits,
+    )
+
+
+def _values(maps: Float, used: Int) -> Float:
+    own = maps if len(used) == len(maps) else maps[used]
+    return own.reshape(len(used), -1)
+
+
+def most_frequent(labels: NDArray[np.int8], count: int) -> Int:
+    """Most frequent label at each point."""
+    if not count:
+        return np.full(labels.shape[1:], -1, dtype=np.int64)
+    votes = np.stack([(labels == label).sum(axis=0) for label in range(count)])
+    return np.where(votes.max(axis=0) > 0, votes.argmax(axis=0), -1).astype(np.int64)

@@ -1,0 +1,507 @@
+"""What survives when many points are tested: false discovery rate, or permutations of residuals."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextvars import ContextVar
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy import special
+from statsmodels.stats.multitest import multipletests
+
+from hipsta_bids.errors import ModelError
+from hipsta_bids.group.design.formula import Contrast, check_names, listed
+from hipsta_bids.group.design.settings import GlmSettings, GroupSettings, MultiplicitySettings
+from hipsta_bids.group.stats import exchangeability
+from hipsta_bids.group.stats.arrays import Bool, Float, Int
+from hipsta_bids.group.stats.clusters import edges_of, enhance
+from hipsta_bids.group.stats.glm import FittedMaps, RowModel, fit_points
+from hipsta_bids.progress import tell
+
+#: Share of the smallest p that serves as cut-off when nothing is rejected.
+BELOW_ALL = 0.1
+#: Methods that hold the family-wise error rate.
+PERMUTATIONS = ("permutation-tfce", "permutation-max")
+#: Permutations whose maps a processor has in memory at once, and random numbers for them, if these
+#: are more; does not change a result.
+_BATCH, _KEYS = 50, 1_000_000
+#: Processors that permute; does not change a result.
+PROCESSORS: ContextVar[int] = ContextVar("processors", default=1)
+#: Sums in another order differ by less, relatively.
+_ROUNDING = 1e-9
+#: The method that does without cluster enhancement.
+_MAXIMUM = "permutation-max"
+
+
+@dataclass(frozen=True)
+class PermutationTest:
+    """Corrected p-values; the family is all points of all parts."""
+
+    p_uncorrected: Float
+    """(points,) of each point alone."""
+    p_max: Float
+    """(points,) of the statistic itself (maximum over the sheet)."""
+    p_enhanced: Float
+    """(points,) of the cluster-enhanced statistic; NaN with ``permutation-max``."""
+    statistic: Float
+    """(points,) t, or F."""
+
+
+@dataclass(frozen=True, eq=False)
+class PermutationPart:
+    """Maps of one sheet, as of one hemisphere."""
+
+    maps: Float
+    """(subjects, points) NaN is missing."""
+    matrix: Float
+    """(subjects, columns) design of full column rank."""
+    subjects: Int
+    """(subjects,) which ones of the whole sample they are: the same subject is shuffled in the
+    same way in all parts."""
+    edges: Int
+    """(edges, 2) neighbors among the points."""
+    visits: exchangeability.Visits | None = None
+    """Whose each row is, where they are visits of which participants have several."""
+
+
+@dataclass(frozen=True, eq=False)
+class JointPart:
+    """Maps of several measures, or sides, at the same points, whose evidence is combined."""
+
+    parts: Sequence[PermutationPart]
+    combine: str
+    """As the setting ``joint.combine``."""
+
+
+def permute(
+    parts: Sequence[PermutationPart | JointPart],
+    contrast: Contrast,
+    *,
+    settings: MultiplicitySettings,
+    blocks: Int | None = None,
+    family: tuple[int, int] | None = None,
+) -> list[PermutationTest]:
+    """Permutation test of one contrast at all points (Freedman and Lane 1983).
+
+    What the covariates explain is subtracted, the residuals are shuffled between subjects, and
+    the whole model is fitted to them again (Winkler et al. 2014). If the contrast tests what
+    all subjects have in common (an intercept), signs are flipped instead of subjects shuffled.
+    Of repeated visits participants change places with all their visits, or visits with each other,
+    or the signs of all visits of a participant are flipped, as the contrast allows
+    (:func:`hipsta_bids.group.stats.exchangeability.choose_exchange`; Winkler et al. 2015).
+
+    Missing values count as what the covariates predict, which shrinks an effect; degrees of
+    freedom are those of the subjects present. ``family`` is the number of this one, from 0, and of
+    how many, to tell how far all are; without it nothing is told.
+
+    Measures of a joint part are shuffled alike, which keeps their dependence, and combined at each
+    point by :func:`combine_evidence` (non-parametric combination; Winkler et al. 2016).
+    """
+    runs = [_Run.build(part, contrast, settings, blocks) for part in parts]
+    parts_alone = [one.part for run in runs for one in run.members]
+    who = [one.subjects for one in parts_alone]
+    who += [one.visits.people for one in parts_alone if one.visits]
+    n_subjects = 1 + max(int(numbers.max()) for numbers in who)
+    batch = min(_BATCH, max(_KEYS // n_subjects, 1))
+
+    def reached(start: int) -> list[Float]:
+        """Count what reaches the observed statistics, with the keys of a batch by its number."""
+        bits = np.random.PCG64(settings.seed).advance((start - 1) * n_subjects)
+        count = min(batch, settings.permutations - start)
+        keys = np.random.Generator(bits).random((count, n_subjects))
+        maps = [run.shuffled(keys) for run in runs]
+        highest = np.max([_maximum(t) for t, _ in maps], axis=0)
+        highest_enhanced = np.max([_maximum(enhanced) for _, enhanced in maps], axis=0)
+        pairs = zip(runs, maps, strict=True)
+        return [run.reached(t, highest, highest_enhanced) for run, (t, _) in pairs]
+
+    starts = range(1, settings.permutations, batch)
+    with ThreadPoolExecutor(PROCESSORS.get()) as pool:
+        for start, counts in zip(starts, pool.map(reached, starts), strict=True):
+            if family is not None:
+                done = family[0] * settings.permutations + start - 1
+                tell("permutations", done, family[1] * settings.permutations)
+            for run, own in zip(runs, counts, strict=True):
+                run.counts[:] += own
+    return [run.result() for run in runs]
+
+
+def combine_evidence(p: Float, how: str) -> Float:
+    """Combine p-values (measures, ...) into z: the normal quantile of their two-sided p together.
+
+    ``fisher`` sums minus twice their logarithms (chi squared; Fisher 1932), ``tippett`` takes the
+    smallest (Tippett 1931). That p holds if they are independent; as what is permuted, z only has
+    to rise with the evidence. It is not negative, and NaN where any p is.
+    """
+    limits = np.finfo(np.float64)
+    count, p = len(p), np.clip(p, limits.tiny, 1 - limits.eps)
+    if how == "fisher":
+        joined = special.chdtrc(2 * count, -2 * np.log(p).sum(axis=0))
+    else:
+        joined = -np.expm1(count * np.log1p(-p.min(axis=0)))
+    return np.asarray(np.abs(special.ndtri(np.clip(joined, limits.tiny, 1) / 2)), dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class _Member:
+    """One map of a run, with the design split into what is tested and what is not."""
+
+    part: PermutationPart
+    """With the blocks in its visits."""
+    blocks: Int | None
+    exchange: exchangeability.Exchange | None
+    """Of visits."""
+    basis: Float
+    """(subjects, columns) orthonormal, tested ones first."""
+    rows: int
+    residuals: Float
+    """(subjects, points) what the columns not tested leave; zero where missing."""
+    squares: Float
+    df: Float
+    """(points,) NaN where there is nothing to test."""
+    flips: bool
+    """Whether the columns not tested cannot make a constant: then it is tested, by signs."""
+
+    @classmethod
+    def build(
+        cls,
+        part: PermutationPart,
+        contrast: Contrast,
+        settings: MultiplicitySettings,
+        blocks: Int | None,
+    ) -> "_Member":
+        maps, matrix = part.maps, part.matrix
+        tested, rest = exchangeability.split(matrix, contrast)
+        present = np.isfinite(maps)
+        residuals = np.where(present, maps, 0.0)
+        if rest.shape[1]:
+            fitted = rest @ fit_points(maps, rest, (), GlmSettings()).coefficients
+            residuals = np.nan_to_num(np.where(present, maps - fitted, 0.0))
+        squares = np.einsum("sp,sp->p", residuals, residuals)
+        df = present.sum(axis=0) - matrix.shape[1]
+        own = None if blocks is None else blocks[part.subjects]
+        exchange = None
+        if part.visits is not None:
+            visits = replace(part.visits, blocks=own)
+            part = replace(part, visits=visits)
+            exchange = exchangeability.choose_exchange(matrix, contrast, visits, settings.visits)
+        flips = not exchangeability.spans(rest, np.ones(len(rest)))
+        if own is not None and not (flips if exchange is None else exchange == "flip"):
+            weights = matrix @ np.linalg.pinv(contrast.weights)
+            varies = exchangeability.varies_inside(weights, own)
+            if part.visits is not None and exchange == "whole":
+                varies = exchangeability.varies_between(weights, part.visits)
+            if not varies:  # shuffling cannot break it up
+                raise ModelError(
+                    f"permutation: {contrast.name} does not vary inside the blocks, so that"
+                    " shuffling there says nothing about it; leave --blocks out, or choose larger"
+                    " blocks"
+                )
+        usable = (df > 0) & (squares > 0)
+        return cls(
+            part=part,
+            blocks=own,
+            exchange=exchange,
+            basis=np.column_stack([tested, rest]),
+            rows=contrast.n_rows,
+            residuals=residuals,
+            squares=squares,
+            df=np.where(usable, df, np.nan),
+            flips=flips,
+        )
+
+    def shuffled(self, keys: Float) -> Float:
+        """Permuted designs (batch, columns, subjects) that are given by keys of subjects."""
+        basis, own, visits = self.basis, keys[:, self.part.subjects], self.part.visits
+        bases: Iterable[Float] = (exchangeability.shuffle(basis, self.blocks, key) for key in own)
+        if visits is not None and self.exchange is not None:
+            pairs = zip(keys, own, strict=True)
+            bases = (visits.shuffle(basis, self.exchange, *pair) for pair in pairs)
+        elif self.flips:
+            bases = (exchangeability.flip(basis, key) for key in own)
+        designs = np.empty((len(keys), *basis.T.shape))
+        for design, one in zip(designs, bases, strict=True):
+            design[:] = one.T
+        return designs
+
+    def statistics(self, bases: Float) -> Float:
+        """Signed t, or square root of F, (batch, points) of bases (batch, columns, subjects)."""
+        # One product of large matrices is many times as fast as one for each basis.
+        scores = (bases.reshape(-1, bases.shape[2]) @ self.residuals).reshape(*bases.shape[:2], -1)
+        noise = self.squares - np.einsum("bcp,bcp->bp", scores, scores)
+        tested = scores[:, : self.rows]
+        gained = np.einsum("bcp,bcp->bp", tested, tested) / self.rows
+        # Rounding only may take the noise below zero, where the model fits perfectly.
+        t = np.sqrt(gained * self.df / np.maximum(noise, np.finfo(np.float64).eps * self.squares))
+        return np.asarray(np.copysign(t, tested[:, 0]) if self.rows == 1 else t, dtype=np.float64)
+
+    def p_values(self, t: Float) -> Float:
+        """Two-sided p-values of these statistics."""
+        if self.rows == 1:
+            return np.asarray(2 * special.stdtr(self.df, -np.abs(t)), dtype=np.float64)
+        return np.asarray(special.fdtrc(self.rows, self.df, t**2), dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class _Run:
+    """One part, with its counts of what reached the observed statistics."""
+
+    members: Sequence[_Member]
+    """One map, or several that are combined."""
+    combine: str | None
+    contrast: Contrast
+    settings: MultiplicitySettings
+    observed: Float
+    enhanced: Float
+    counts: Float
+    """(3, points) of each point alone, of the maximum, and of the enhanced maximum."""
+
+    @classmethod
+    def build(
+        cls,
+        part: PermutationPart | JointPart,
+        contrast: Contrast,
+        settings: MultiplicitySettings,
+        blocks: Int | None,
+    ) -> "_Run":
+        own = part.parts if isinstance(part, JointPart) else [part]
+        combine = part.combine if isinstance(part, JointPart) else None
+        members = [_Member.build(one, contrast, settings, blocks) for one in own]
+        observed = _together(members, [one.basis.T[None] for one in members], combine)
+        enhanced = _enhanced(observed, own[0].edges, settings)
+        counts = np.ones((3, observed.shape[1]))
+        return cls(members, combine, contrast, settings, observed, enhanced, counts)
+
+    def shuffled(self, keys: Float) -> tuple[Float, Float]:
+        """Statistics, and enhanced ones, of the permutations that are given by keys of subjects."""
+        bases = [member.shuffled(keys) for member in self.members]
+        t = _together(self.members, bases, self.combine)
+        return t, _enhanced(t, self.members[0].part.edges, self.settings)
+
+    def reached(self, t: Float, highest: Float, highest_enhanced: Float) -> Float:
+        """Count (3, points) permutations that reach what was observed."""
+        pairs = ((t, self.observed), (highest, self.observed), (highest_enhanced, self.enhanced))
+        return np.stack([_at_least(*pair).sum(axis=0, dtype=np.float64) for pair in pairs])
+
+    def result(self) -> PermutationTest:
+        """Turn counts into p-values."""
+        t = self.observed[0]
+        p = np.where(np.isnan(t), np.nan, self.counts / self.settings.permutations)
+        if self.settings.method == _MAXIMUM:
+            p[2] = np.nan
+        as_it_is = self.contrast.n_rows == 1 or self.combine is not None
+        return PermutationTest(p[0], p[1], p[2], t if as_it_is else t**2)
+
+
+def _together(members: Sequence[_Member], bases: Sequence[Float], how: str | None) -> Float:
+    """Return the statistics of one map, or of several combined, by designs."""
+    own = [one.statistics(basis) for one, basis in zip(members, bases, strict=True)]
+    if how is None:
+        return own[0]
+    pairs = zip(members, own, strict=True)
+    return combine_evidence(np.stack([one.p_values(t) for one, t in pairs]), how)
+
+
+def _enhanced(t: Float, edges: Int, settings: MultiplicitySettings) -> Float:
+    """Cluster enhancement, zero where the method does without."""
+    return np.zeros_like(t) if settings.method == _MAXIMUM else enhance(t, edges)
+
+
+def _maximum(values: Float) -> Float:
+    """Largest size on each map."""
+    return np.asarray(np.nanmax(np.abs(values), axis=1, keepdims=True, initial=0.0))
+
+
+def _at_least(values: Float, observed: Float) -> NDArray[np.bool_]:
+    """Whether values reach those observed, but for rounding."""
+    return np.abs(values) >= np.abs(observed) * (1 - _ROUNDING)
+
+
+@dataclass(frozen=True)
+class Discoveries:
+    """Tests that survive, in the shape of the p-values."""
+
+    adjusted: Float
+    """Compare with ``alpha``; of false discovery rates it holds for this level. NaN where there
+    was no test."""
+    rejected: Bool
+    cutoff: float
+    """Largest raw p that is rejected; a tenth of the smallest p if none is (the convention of
+    FreeSurfer's ``lme_mass_FDR``), so that nothing lies at or below it; NaN without tests,
+    and where clusters decide."""
+    n_tests: int
+    alpha: float
+
+    @property
+    def lenient(self) -> bool:
+        """Whether raw p-values above ``alpha`` pass, as they may when effects are widespread."""
+        return bool(self.rejected.any()) and self.cutoff > self.alpha
+
+
+def control_fdr(p: Float, alpha: float, method: str = "fdr2") -> Discoveries:
+    """Control the false discovery rate of tests; NaN is no test.
+
+    ``bh`` is the step-up procedure of Benjamini and Hochberg (1995), ``fdr2`` the two-stage one of
+    Benjamini, Krieger and Yekutieli (2006): the first stage, at ``alpha / (1 + alpha)``, estimates
+    how many null hypotheses are true, and the second allows for that number only.
+    """
+    valid = np.isfinite(p)
+    tests = p[valid]
+    adjusted, rejected, cutoff = np.full(p.shape, np.nan), np.zeros(p.shape, dtype=bool), np.nan
+    if len(tests):
+        name = "fdr_bh" if method == "bh" else "fdr_tsbky"
+        rejected[valid], adjusted[valid], *_ = multipletests(tests, alpha, name)
+        cutoff = tests[rejected[valid]].max() if rejected.any() else tests.min() * BELOW_ALL
+    return Discoveries(adjusted, rejected, float(cutoff), len(tests), alpha)
+
+
+@dataclass(frozen=True, order=True)
+class MapKey:
+    """Which map of statistics."""
+
+    measure: str
+    contrast: str
+    hemi: str
+
+
+def families(maps: Iterable[MapKey], scope: str) -> list[list[MapKey]]:
+    """Group maps whose points are tested together."""
+    found: dict[tuple[str, ...], list[MapKey]] = {}
+    for key in maps:
+        family = (key.measure, key.contrast, *(() if scope == "hemispheres" else (key.hemi,)))
+        found.setdefault(family, []).append(key)
+    return list(found.values())
+
+
+def discover(
+    maps: Mapping[MapKey, Float], settings: MultiplicitySettings
+) -> dict[MapKey, Discoveries]:
+    """Control the false discovery rate of several maps (points,), in families."""
+    found = {}
+    for keys in families(maps, settings.scope):
+        p = np.concatenate([maps[key] for key in keys])
+        together = control_fdr(p, settings.alpha, settings.method)
+        ends = np.cumsum([len(maps[key]) for key in keys])[:-1]
+        adjusted, rejected = np.split(together.adjusted, ends), np.split(together.rejected, ends)
+        for key, values, flags in zip(keys, adjusted, rejected, strict=True):
+            found[key] = replace(together, adjusted=values, rejected=flags)
+    return {key: found[key] for key in maps}
+
+
+def correct_joint(
+    groups: Mapping[MapKey, Mapping[str, tuple[FittedMaps, str]]],
+    contrasts: Mapping[str, Contrast],
+    model: RowModel,
+    table: pd.DataFrame,
+    settings: GroupSettings,
+) -> dict[MapKey, tuple[PermutationTest, Discoveries]]:
+    """Test maps together that have the same points: fits and measures by title, by result."""
+    how = settings.multiplicity
+    if how.method not in PERMUTATIONS:
+        how = how.changed(method=_MAXIMUM)
+
+    def part(key: MapKey) -> JointPart:
+        own = [_part(*one, model, how) for one in groups[key].values()]
+        return JointPart(own, settings.joint.combine)
+
+    tested = {key: contrasts[key.contrast] for key in groups}
+    return _permuted(tested, part, row_blocks(model, table, how), how)
+
+
+def _permuted(
+    tested: Mapping[MapKey, Contrast],
+    part: Callable[[MapKey], PermutationPart | JointPart],
+    blocks: Int | None,
+    how: MultiplicitySettings,
+    raw: Mapping[MapKey, Float] | None = None,
+) -> dict[MapKey, tuple[PermutationTest, Discoveries]]:
+    """Permute families of maps; ``raw`` are p-values of points for cut-offs, if others are told."""
+    found: dict[MapKey, tuple[PermutationTest, Discoveries]] = {}
+    together = families(tested, how.scope)
+    enhanced = how.method == "permutation-tfce"
+    for number, keys in enumerate(together):
+        results = permute(
+            [part(key) for key in keys],
+            tested[keys[0]],
+            settings=how,
+            blocks=blocks,
+            family=(number, len(together)),
+        )
+        corrected = [one.p_enhanced if enhanced else one.p_max for one in results]
+        rejected = [p <= how.alpha for p in corrected]
+        n_tests = sum(int(np.isfinite(p).sum()) for p in corrected)
+        cutoff = np.nan
+        if n_tests and not enhanced:
+            own = [one.p_uncorrected for one in results] if raw is None else [raw[k] for k in keys]
+            p, survive = np.concatenate(own), np.concatenate(rejected)
+            cutoff = p[survive].max() if survive.any() else np.nanmin(p) * BELOW_ALL
+        for key, one, p, flags in zip(keys, results, corrected, rejected, strict=True):
+            found[key] = one, Discoveries(p, flags, float(cutoff), n_tests, how.alpha)
+    return found
+
+
+def _part(
+    one: FittedMaps, measure: str, model: RowModel, how: MultiplicitySettings
+) -> PermutationPart:
+    return PermutationPart(
+        maps=one.values(measure),
+        matrix=model.design.matrix[one.rows],
+        subjects=one.rows,
+        edges=edges_of(one.maps, how.neighbors),
+        visits=None if model.visits is None else model.visits.take(one.rows),
+    )
+
+
+def correct(
+    fitted: Mapping[str, FittedMaps], model: RowModel, table: pd.DataFrame, settings: GroupSettings
+) -> dict[MapKey, Discoveries]:
+    """Tell which points survive, in families."""
+    how = settings.multiplicity
+    tests = {
+        MapKey(measure, test.contrast.name, hemi): test
+        for hemi, one in fitted.items()
+        for measure, fit in one.fits.items()
+        for test in fit.tests
+    }
+    if how.method not in PERMUTATIONS:
+        return discover({key: test.p for key, test in tests.items()}, how)
+    check_permutations(settings)
+    found = _permuted(
+        {key: test.contrast for key, test in tests.items()},
+        lambda key: _part(fitted[key.hemi], key.measure, model, how),
+        row_blocks(model, table, how),
+        how,
+        {key: test.p for key, test in tests.items()},
+    )
+    return {key: found[key][1] for key in tests}
+
+
+def check_permutations(settings: GroupSettings) -> None:
+    """Refuse permutations where rows cannot be exchanged."""
+    if settings.multiplicity.method not in PERMUTATIONS and not settings.joint.measures:
+        return
+    if settings.glm.covariance != "ordinary":
+        raise ModelError("permutations assume equal variances; set glm.covariance to ordinary")
+
+
+def row_blocks(model: RowModel, table: pd.DataFrame, how: MultiplicitySettings) -> Int | None:
+    """Return the number of each row's block, or None without blocks."""
+    if not how.blocks:
+        return None
+    check_names([how.blocks], table.columns)
+    own = table[how.blocks].iloc[model.design.rows]
+    if own.isna().any():
+        raise ModelError(
+            f"permutations: column {how.blocks!r} of --blocks is missing for"
+            f" {listed(own.index[own.isna()])}"
+        )
+    blocks = np.unique(own.astype(str), return_inverse=True)[1]
+    people = None if model.visits is None else model.visits.people
+    if people is not None and len(np.unique([people, blocks], axis=1).T) > len(np.unique(people)):
+        raise ModelError(
+            f"permutations: {how.blocks!r} of --blocks changes between visits of a participant;"
+            " choose a column that does not"
+        )
+    return np.asarray(blocks, dtype=np.int64)

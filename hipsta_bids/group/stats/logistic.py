@@ -1,0 +1,276 @@
+"""Logistic models: by maximum likelihood, or by Firth's method where they separate the groups."""
+
+import warnings
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import optimize, special
+from statsmodels.discrete.discrete_model import Logit
+
+from hipsta_bids.errors import ModelError
+from hipsta_bids.group.stats.arrays import Bool, Float
+from hipsta_bids.group.stats.glm import products_of
+
+#: Most steps of a fit.
+FIT_STEPS = 100
+#: Most steps of a fit by Firth's method, which takes hundreds where groups are far apart.
+FIRTH_STEPS = 2000
+#: Steps end when they promise to raise the log likelihood by less than this.
+FIT_TOLERANCE = 1e-16
+
+#: Largest sum of margins, per subject, that still counts as rounding of the linear program.
+_NO_MARGIN = 1e-7
+#: Most steps of Newton's method, which takes some eight, and the length of the last; columns have
+#: a mean square of one.
+_NEWTON_STEPS, _SETTLED = 25, 1e-8
+#: Members of sets that are worked on together, which the processor's cache holds.
+_BLOCK = 100_000
+#: Maximum likelihood has converged when coefficients of unit columns change by less.
+_CONVERGED = 1e-10
+#: Longest step of Firth's method, in standard deviations of a column, as in ``logistf``.
+_LONGEST_STEP = 5.0
+#: A step must gain at least this share of what the slope promises, or it is halved.
+_SHARE = 0.1
+#: Log likelihoods differ by rounding by no more than this, relatively.
+_ROUNDING = 1e-12
+#: Steps of Firth's method by the information, before those of Newton's method.
+_FISHER_STEPS = 20
+#: Step of derivatives, least curvature and flattest direction of Firth's method, where one is that
+#: of the information.
+_DIFFERENCE, _LEAST_BEND, _FLATTEST = 1e-4, 1e-3, 1e-12
+#: Halvings of a step that does not gain.
+_HALVINGS = 30
+#: Directions of a training set with less than this share of the largest are no columns.
+RANK = 1e-9
+
+
+@dataclass(frozen=True)
+class LogisticFit:
+    """One logistic model."""
+
+    coefficients: Float
+    """Log odds per unit of each column."""
+    se: Float
+    """From the inverse of Fisher's information at the estimate."""
+    log_likelihood: float
+    """With Firth the penalized one: half the log determinant of the information comes on top."""
+    firth: bool
+    """Whether Firth's penalty was used."""
+
+
+def is_separated(matrix: Float, case: Bool) -> bool:
+    """Whether a combination of the columns tells the groups apart without overlap.
+
+    Then maximum-likelihood estimates are infinite (Albert and Anderson 1984). Found exactly, by
+    a linear program (Konis 2007): the largest sum of margins under which none is negative.
+    """
+    scale = np.abs(matrix).max(axis=0)
+    margins = np.where(case, 1.0, -1.0)[:, None] * matrix / np.where(scale > 0, scale, 1.0)
+    solution = optimize.linprog(
+        -margins.sum(axis=0), A_ub=-margins, b_ub=np.zeros(len(margins)), bounds=(-1, 1)
+    )
+    return bool(margins.sum(axis=0) @ solution.x > _NO_MARGIN * len(margins))
+
+
+def fit_logistic(
+    matrix: Float,
+    case: Bool,
+    *,
+    firth: bool,
+    free: Bool | None = None,
+) -> LogisticFit:
+    """Fit a logistic regression by maximum likelihood (statsmodels), or by Firth's method.
+
+    Of Firth's, columns that are not ``free`` stay zero but count in the penalty, as the penalized
+    likelihood-ratio test needs it (Heinze and Schemper 2002).
+    """
+    scale = _scales(matrix)
+    scaled = matrix / scale
+    if firth:
+        everybody = np.ones((1, len(case)))
+        beta, value = firth_maxima(scaled, case, everybody, free)
+        covariance = np.linalg.inv(_Sets.of(scaled, case, everybody).information(beta)[0])
+        return LogisticFit(
+            coefficients=beta[0] / scale,
+            se=np.sqrt(np.diagonal(covariance)) / scale,
+            # The penalty is that of the columns as given.
+            log_likelihood=float(value[0]) + float(np.log(scale).sum()),
+            firth=True,
+        )
+    model = Logit(case.astype(np.float64), scaled, check_rank=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of separation, which the caller looks for
+        try:
+            found = model.fit(
+                method="newton",
+                maxiter=FIT_STEPS,
+                tol=_CONVERGED,
+                disp=False,
+                warn_convergence=False,
+            )
+        except np.linalg.LinAlgError as error:
+            raise _no_convergence(FIT_STEPS) from error
+    if not found.mle_retvals["converged"]:
+        raise _no_convergence(FIT_STEPS)
+    return LogisticFit(found.params / scale, found.bse / scale, float(found.llf), firth=False)
+
+
+def fit_overlapping_or_firth(matrix: Float, case: Bool) -> LogisticFit:
+    """Fit by maximum likelihood if the groups overlap, else by Firth's method."""
+    separated = not overlaps(matrix, case) and is_separated(matrix, case)
+    return fit_logistic(matrix, case, firth=separated)
+
+
+def overlaps(matrix: Float, case: Bool) -> bool:
+    """Whether maximum likelihood converges, which it does not if the groups are separated.
+
+    Where it does not, :func:`is_separated` decides.
+    """
+    return bool(maxima(orthonormal(matrix), case, np.ones((1, len(case))))[1][0])
+
+
+def orthonormal(matrix: Float) -> Float:
+    """Give an orthonormal basis of the columns, times the root of the number of rows."""
+    basis, size, _ = np.linalg.svd(matrix / _scales(matrix), full_matrices=False)
+    return np.asarray(basis[:, size > RANK * size[0]] * np.sqrt(len(matrix)), dtype=np.float64)
+
+
+def maxima(basis: Float, case: Bool, kept: Float, start: Float | None = None) -> tuple[Float, Bool]:
+    """Maximize the likelihood in several sets of subjects at once, by Newton's method.
+
+    ``kept`` is (sets, subjects), 1 for members. Gives coefficients (sets, columns), and in which
+    sets the steps converged: with separated groups each step is about as long as the one before.
+    """
+    columns = basis.shape[1]
+    products = products_of(basis)
+    beta = np.tile(np.zeros(columns) if start is None else start, (len(kept), 1))
+    settled = np.zeros(len(kept), dtype=bool)
+    lost = np.zeros(len(kept), dtype=bool)
+    starts = range(0, len(case), max(_BLOCK // len(kept), 1))
+    blocks = [slice(first, first + starts.step) for first in starts]
+    for number in range(_NEWTON_STEPS):
+        information, score = np.zeros((len(kept), columns**2)), np.zeros(beta.shape)
+        for own in blocks:
+            # All sets begin at the same place.
+            with np.errstate(over="ignore"):
+                chance = 1 / (1 + np.exp((beta if number else beta[:1]) @ -basis[own].T))
+            score += (kept[:, own] * (case[own] - chance)) @ basis[own]
+            information += (kept[:, own] * (chance * (1 - chance))) @ products[own]
+        information = information.reshape(-1, columns, columns)
+        size = np.linalg.eigvalsh(information)
+        lost |= ~(size[:, 0] > RANK * size[:, -1])
+        information[lost] = np.eye(columns)
+        step = np.linalg.solve(information, score[:, :, None])[:, :, 0]
+        beta[~lost] += step[~lost]
+        settled = ~lost & (np.abs(step).max(axis=1) < _SETTLED)
+        if (settled | lost).all():
+            break
+    return beta, settled
+
+
+def _no_convergence(limit: int) -> ModelError:
+    return ModelError(
+        f"logistic model: no convergence in {limit} steps; the groups may be separated, or columns"
+        " nearly the same"
+    )
+
+
+def _scales(matrix: Float) -> Float:
+    """Take standard deviations of columns, and the size of those that are constant."""
+    spread = matrix.std(axis=0)
+    size = np.maximum(np.abs(matrix).max(axis=0), 1e-300)
+    return np.asarray(np.where(spread > 0, spread, size), dtype=np.float64)
+
+
+def firth_maxima(
+    matrix: Float,
+    case: Bool,
+    kept: Float,
+    free: Bool | None = None,
+) -> tuple[Float, Float]:
+    """Penalize the likelihood by the root of the information's determinant (Firth 1993).
+
+    This is Jeffreys' prior: estimates are finite under separation, and less biased. ``kept`` is
+    (sets, subjects), 1 for members. Gives coefficients (sets, columns), and the penalized log
+    likelihood of each set.
+    """
+    free = np.ones(matrix.shape[1], dtype=bool) if free is None else free
+    sets = _Sets.of(matrix, case, kept)
+    beta = np.zeros((len(kept), matrix.shape[1]))
+    value = sets.penalized(beta)
+    active = np.arange(len(kept))
+    for number in range(FIRTH_STEPS):
+        own = replace(sets, kept=kept[active])
+        step, promised = own.step(beta[active], free, bent=number >= _FISHER_STEPS)
+        for halving in range(_HALVINGS):
+            new = own.penalized(beta[active] + step)
+            least = _SHARE * promised / 2**halving - _ROUNDING * (1 + np.abs(value[active]))
+            short = new < value[active] + least
+            if not short.any():
+                break
+            step[short] /= 2
+        beta[active] += step
+        value[active] = new
+        active = active[promised >= FIT_TOLERANCE]
+        if not len(active):
+            return beta, value
+    raise _no_convergence(FIRTH_STEPS)
+
+
+@dataclass(frozen=True)
+class _Sets:
+    """The penalized likelihood of several sets of subjects, at coefficients (sets, columns)."""
+
+    matrix: Float
+    products: Float
+    """(subjects, columns * columns) of each subject's values."""
+    case: Bool
+    kept: Float
+
+    @classmethod
+    def of(cls, matrix: Float, case: Bool, kept: Float) -> "_Sets":
+        return cls(matrix, products_of(matrix), case, kept)
+
+    def information(self, beta: Float) -> Float:
+        chance = special.expit(beta @ self.matrix.T)
+        found = (self.kept * chance * (1 - chance)) @ self.products
+        return np.asarray(found.reshape(len(beta), *[self.matrix.shape[1]] * 2), dtype=np.float64)
+
+    def penalized(self, beta: Float) -> Float:
+        """Penalized log likelihood."""
+        margins = np.where(self.case, 1.0, -1.0) * (beta @ self.matrix.T)
+        penalty = 0.5 * np.linalg.slogdet(self.information(beta))[1]
+        return np.asarray((self.kept * special.log_expit(margins)).sum(axis=1) + penalty)
+
+    def slope(self, beta: Float) -> Float:
+        """Slope of the penalized log likelihood."""
+        chance = special.expit(beta @ self.matrix.T)
+        inverse = np.linalg.pinv(self.information(beta), hermitian=True)
+        leverage = inverse.reshape(len(beta), -1) @ self.products.T
+        residual = self.case - chance + chance * (1 - chance) * leverage * (0.5 - chance)
+        return np.asarray((self.kept * residual) @ self.matrix, dtype=np.float64)
+
+    def step(self, beta: Float, free: Bool, *, bent: bool) -> tuple[Float, Float]:
+        """Next step by the information, or by Newton's method, and the gain the slope promises.
+
+        The penalty bends as much as the likelihood where groups are far apart, so that steps by the
+        information alone may take thousands. For Newton's, the slope is differentiated along
+        directions in which the information is one.
+        """
+        size, axes = np.linalg.eigh(self.information(beta)[:, free][:, :, free])
+        directions = np.zeros((*beta.shape, size.shape[1]))
+        directions[:, free] = axes / np.sqrt(np.maximum(size, _FLATTEST * size[:, -1:]))[:, None]
+        gradient = np.einsum("sck,sc->sk", directions, self.slope(beta))
+        along = gradient
+        if bent:
+            moved = [_DIFFERENCE * one for one in np.moveaxis(directions, 2, 0)]
+            changes = [self.slope(beta + one) - self.slope(beta - one) for one in moved]
+            bend = np.einsum("sck,lsc->slk", directions, changes) / (-2 * _DIFFERENCE)
+            curvature, turned = np.linalg.eigh((bend + np.swapaxes(bend, 1, 2)) / 2)
+            along = np.einsum("slk,sl->sk", turned, gradient)
+            along = along / np.maximum(np.abs(curvature), _LEAST_BEND)
+            along = np.einsum("slk,sk->sl", turned, along)
+        step = np.einsum("sck,sk->sc", directions, along)
+        longest = np.maximum(np.abs(step).max(axis=1), 1e-300)
+        share = np.minimum(1.0, _LONGEST_STEP / longest)
+        return step * share[:, None], np.sum(gradient * along, axis=1) * share

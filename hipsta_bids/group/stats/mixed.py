@@ -1,0 +1,437 @@
+"""Repeated sessions: mixed models at each point."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy import special
+
+from hipsta_bids.errors import ModelError
+from hipsta_bids.group.design.formula import Contrast
+from hipsta_bids.group.design.model import Design
+from hipsta_bids.group.design.settings import GroupSettings, LongitudinalSettings
+from hipsta_bids.group.stats import glm, random_slope
+from hipsta_bids.group.stats.arrays import Bool, Float, Int
+from hipsta_bids.group.stats.exchangeability import Visits
+from hipsta_bids.types import PARTICIPANT
+
+#: Largest correlation between a participant's sessions that is looked for.
+MAX_CORRELATION = 0.999
+#: Correlations at which the likelihood is looked at first.
+CORRELATIONS = 40
+#: Halvings of the interval that holds the best one.
+HALVINGS = 50
+
+#: Sessions of one participant that tell a slope from noise.
+_SLOPE_SESSIONS = 3
+#: A gain in minus twice the restricted likelihood by slopes that is none.
+_NO_GAIN = 1e-6
+#: Degrees of freedom of t statistics that differ by less are the same.
+_SAME_DF = 1e-8
+
+
+@dataclass(frozen=True)
+class State:
+    """Generalized least squares at one ratio of variances per point."""
+
+    scores: Float
+    """(points, columns) coefficients."""
+    inverse: Float
+    """(points, columns, columns) of X' V^-1 X."""
+    information_first: Float
+    """(points, columns, columns) derivative of X' V^-1 X for the ratio."""
+    residual: tuple[Float, Float, Float]
+    """(points,) generalized sum of squared residuals, its first and second derivative."""
+    penalty: tuple[Float, Float, Float]
+    """(points,) log |V| + log |X' V^-1 X|, its first and second derivative."""
+
+
+@dataclass(frozen=True)
+class Sums:
+    """What the likelihood depends on: sums of products of columns, the values being the last."""
+
+    n: Int
+    """(points,) sessions."""
+    repeated: Bool
+    """(points,) whether any participant has two."""
+    squares: Float
+    """(points, columns + 1, columns + 1) over sessions."""
+    sizes: Float
+    """(sizes,) numbers of sessions of a participant that occur."""
+    people: Float
+    """(sizes, points) participants with that number."""
+    own_squares: Float
+    """(sizes, points, columns + 1, columns + 1) of each participant's sums, over participants."""
+
+    def where(self, usable: Bool) -> "Sums":
+        """Replace points that cannot be fitted by harmless ones."""
+        size = self.squares.shape[1]
+        kept = usable[:, None, None]
+        return replace(
+            self,
+            n=np.where(usable, self.n, size + 1),
+            squares=np.where(kept, self.squares, np.eye(size)),
+            own_squares=np.where(kept, self.own_squares, 0.0),
+        )
+
+    def at(self, ratio: Float) -> State:
+        """Fit with one ratio per point."""
+        sizes = self.sizes[:, None]
+        spread = 1 + sizes * ratio
+        take = (ratio / spread, 1 / spread**2, -2 * sizes / spread**3)
+        off, first, second = (-np.einsum("kp,kpij->pij", one, self.own_squares) for one in take)
+        whole = self.squares + off
+        inverse = np.linalg.inv(whole[:, :-1, :-1])
+        scores = np.einsum("pij,pj->pi", inverse, whole[:, :-1, -1])
+        # What is left of the values: minus the scores times the columns, plus the values.
+        left = np.column_stack([-scores, np.ones(len(scores))])
+        moved = np.einsum("pij,pj->pi", first, left)
+        change = np.einsum("pij,pj->pi", inverse, moved[:, :-1])
+        ahead, bent = (np.einsum("pij,pj->pi", one, left) for one in (whole, second))
+        residual_second = np.einsum("pi,pi->p", left, bent)
+        residual_second -= 2 * np.einsum("pi,pi->p", change, moved[:, :-1])
+        relative = inverse @ first[:, :-1, :-1]
+        bend = inverse @ second[:, :-1, :-1] - relative @ relative
+        share = sizes / spread
+        log_spread = np.sum(self.people * np.log(spread), axis=0)
+        return State(
+            scores=scores,
+            inverse=inverse,
+            information_first=first[:, :-1, :-1],
+            residual=(
+                np.einsum("pi,pi->p", left, ahead),
+                np.einsum("pi,pi->p", left, moved),
+                residual_second,
+            ),
+            penalty=(
+                log_spread - np.linalg.slogdet(inverse)[1],
+                np.sum(self.people * share, axis=0) + np.trace(relative, axis1=1, axis2=2),
+                np.trace(bend, axis1=1, axis2=2) - np.sum(self.people * share**2, axis=0),
+            ),
+        )
+
+
+def collect_sums(maps: Float, basis: Float, participants: Int) -> Sums:
+    """Sum over sessions and participants."""
+    present = np.isfinite(maps)
+    counts = glm.sum_by(participants, present.astype(np.float64))
+    columns = np.empty((*maps.shape, basis.shape[1] + 1))
+    columns[..., :-1] = present[:, :, None] * basis[:, None, :]
+    columns[..., -1] = np.where(present, maps, 0.0)
+    own = glm.sum_by(participants, columns)
+    sizes = np.unique(np.maximum(counts, 1.0))
+    chosen = [np.where(counts == size, 1.0, 0.0) for size in sizes]
+
+    def squares(rows: Float, weight: Float) -> Float:
+        weighted = np.moveaxis(rows * weight[:, :, None], 0, 2)
+        return np.asarray(weighted @ np.swapaxes(rows, 0, 1))
+
+    return Sums(
+        n=present.sum(axis=0),
+        repeated=np.asarray((counts > 1).any(axis=0)),
+        squares=squares(columns, np.ones(maps.shape)),
+        sizes=sizes,
+        people=np.array([who.sum(axis=0) for who in chosen]),
+        own_squares=np.array([squares(own, who) for who in chosen]),
+    )
+
+
+def best_ratio(sums: Sums) -> Float:
+    """Ratio r of variances that maximizes the restricted likelihood at each point.
+
+    The best of a grid of correlations r / (1 + r), then halving of the interval around it by the
+    sign of the derivative.
+    """
+    freedom = sums.n - sums.squares.shape[1] + 1
+    grid = np.linspace(0.0, MAX_CORRELATION, CORRELATIONS)
+    losses = []
+    for ratio in grid / (1 - grid):
+        state = sums.at(np.full(len(sums.n), ratio))
+        losses.append(freedom * np.log(state.residual[0]) + state.penalty[0])
+    best = np.argmin(losses, axis=0)
+
+    def rising(correlation: Float) -> Float:
+        state = sums.at(correlation / (1 - correlation))
+        return np.asarray(freedom * state.residual[1] / state.residual[0] + state.penalty[1])
+
+    low, high = grid[np.maximum(best - 1, 0)], grid[np.minimum(best + 1, len(grid) - 1)]
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        beyond = rising(middle) > 0
+        low, high = np.where(beyond, low, middle), np.where(beyond, middle, high)
+    # Where the loss rises from zero on, the lower limit never leaves it.
+    return np.asarray(low / (1 - low))
+
+
+def fit_mixed(
+    maps: Float,
+    matrix: Float,
+    participants: Sequence[str] | NDArray[np.str_],
+    contrasts: Sequence[Contrast],
+    settings: LongitudinalSettings,
+    *,
+    times: Float | None = None,
+) -> glm.PointwiseFit:
+    """Fit ``value = matrix @ coefficients + participant + residual`` at each point.
+
+    With times, participants also have a slope of their own, correlated with the intercept, except
+    at points whose restricted likelihood slopes do not raise: there intercepts alone are fitted.
+    Whether slopes vary is tested by the ratio of restricted likelihoods, whose distribution is an
+    equal mixture of chi squared with 1 and 2 degrees of freedom (Stram and Lee 1994).
+
+    By restricted maximum likelihood, which for one random intercept depends on one number: the
+    ratio of the two variances. It is found for all points at once. Degrees of freedom are
+    Satterthwaite's, from the curvature of the likelihood at the optimum, as in R's ``lmerTest``
+    (Kuznetsova et al. 2017); where no variance between participants is found they are those of
+    the linear model. Several rows are tested by F: the mean of the squared t of combinations that
+    are independent, with the degrees of freedom that give F its expectation (Fai and Cornelius
+    1996).
+    """
+    glm.check_design(maps, matrix, contrasts)
+    _, numbers, counts = np.unique(
+        np.asarray(participants), return_inverse=True, return_counts=True
+    )
+    if counts.max() == 1:
+        raise ModelError("longitudinal model: no participant has two sessions; use a linear model")
+    if times is not None and counts.max() < _SLOPE_SESSIONS:
+        raise ModelError(
+            "longitudinal model: no participant has three sessions, so that slopes cannot be"
+            " separated from noise; use random intercepts"
+        )
+    basis, triangle = np.linalg.qr(matrix)
+    back = np.linalg.inv(triangle)
+    rotated = tuple(contrast.weights @ back for contrast in contrasts)
+    parts = []
+    for points in glm.chunks(maps.shape, matrix.shape[1]):
+        values = np.asarray(maps[:, points], dtype=np.float64)
+        part = _fit(values, basis, numbers, rotated)
+        if times is not None:
+            full = _fit_slopes(values, basis, numbers, rotated, times=times)
+            part = _larger_where_better(part, full)
+        parts.append(part)
+    whole = {name: np.concatenate([part[name] for part in parts], axis=-1) for name in parts[0]}
+    # The standard deviation of single visits: effect sizes are those of independent rows.
+    sigma = np.sqrt(whole["residual"] + whole["participant"])
+    return glm.PointwiseFit(
+        coefficients=back @ whole["scores"],
+        sigma=sigma,
+        n=whole["n"].astype(np.int64),
+        tests=tuple(_tests(contrasts, whole, sigma, settings.confidence)),
+        variances={name: whole[name] for name in ("residual", "participant", "slope")},
+        slopes_p=whole.get("slopes_p"),
+    )
+
+
+def _larger_where_better(
+    intercepts: dict[str, Float], slopes: dict[str, Float]
+) -> dict[str, Float]:
+    """Join the fits of some points: with slopes, except where the likelihood gains nothing."""
+    gain = intercepts["loss"] - slopes["loss"]
+    none = gain < _NO_GAIN
+    found = {name: np.where(none, intercepts[name], own) for name, own in slopes.items()}
+    found["slope"] = np.where(none, 0.0, slopes["slope"])
+    gain = np.where(gain < 0, 0.0, gain)
+    found["slopes_p"] = (special.chdtrc(1, gain) + special.chdtrc(2, gain)) / 2
+    return found
+
+
+def _tests(
+    contrasts: Sequence[Contrast], whole: Mapping[str, Float], sigma: Float, confidence: float
+) -> Iterator[glm.PointTest]:
+    """Test contrasts, whose rows follow each other in what was fitted."""
+    start = 0
+    for contrast in contrasts:
+        rows = slice(start, start + contrast.n_rows)
+        start = rows.stop
+        estimate, se, t, df = (whole[name][rows] for name in ("estimate", "se", "t", "df"))
+        single = contrast.n_rows == 1
+        where = {"df": df[0] if single else _denominator(df), "estimate": estimate, "se": se}
+        statistic = t[0] if single else np.mean(t**2, axis=0)
+        yield glm.with_effects(contrast, statistic, **where, sigma=sigma, confidence=confidence)
+
+
+def _denominator(df: Float) -> Float:
+    """Denominator's degrees of freedom of F from those (rows, points) of its t statistics."""
+    rows, least = len(df), 2.0  # F has no expectation below
+    expected = np.sum(df / np.where(df > least, df - least, np.nan), axis=0)
+    found = np.asarray(2 * expected / (expected - rows), dtype=np.float64)
+    found = np.where(np.ptp(df, axis=0) < _SAME_DF, df.mean(axis=0), found)
+    return np.where(np.isfinite(df).all(axis=0) & np.isnan(found), least, found)
+
+
+def _tested(
+    rotated: Sequence[Float], scores: Float, inverse: Float, variance: Float
+) -> tuple[Float, dict[str, Float]]:
+    """Rows that make those of each contrast independent, and estimates of these; points last.
+
+    Rows are (rows, points, columns), scores (points, columns), the inverse (points, columns,
+    columns).
+    """
+    given, turned = [], []
+    for rows in rotated:
+        own = np.broadcast_to(rows[:, None], (len(rows), *inverse.shape[:2]))
+        given.append(own)
+        if len(rows) > 1:
+            axes = np.linalg.eigh(rows @ inverse @ rows.T)[1]
+            own = np.einsum("pjk,ji->kpi", axes, rows)
+        turned.append(own)
+    both = np.concatenate(given), np.concatenate(turned)
+    (estimate, se), (other, root) = (
+        (
+            np.einsum("cpj,pj->cp", rows, scores),
+            np.sqrt(random_slope.forms(inverse, rows) * variance),
+        )
+        for rows in both
+    )
+    found = {"scores": scores.T, "residual": variance, "estimate": estimate, "se": se}
+    return both[1], found | {"t": other / root}
+
+
+def _fit(
+    maps: Float,
+    basis: Float,
+    participants: Int,
+    rotated: Sequence[Float],
+) -> dict[str, Float]:
+    """Fit intercepts at some points; points last."""
+    sums = collect_sums(maps, basis, participants)
+    columns = basis.shape[1]
+    usable = np.linalg.eigvalsh(sums.squares[:, :-1, :-1])[:, 0] > glm.MIN_INFORMATION
+    usable &= (sums.n > columns + 1) & sums.repeated
+    sums = sums.where(usable)
+    ratio = best_ratio(sums)
+    state = sums.at(ratio)
+    freedom = sums.n - columns
+    variance = state.residual[0] / freedom
+    turned, found = _tested(rotated, state.scores, state.inverse, variance)
+    form = random_slope.forms(state.inverse, turned)
+    slope = -random_slope.forms(state.inverse @ state.information_first @ state.inverse, turned)
+    df = _satterthwaite(form, slope, freedom, ratio, state)
+    blank = np.where(usable, 1.0, np.nan)
+    found |= {
+        "participant": variance * ratio,
+        "df": df,
+        "loss": freedom * np.log(state.residual[0]) + state.penalty[0],
+    }
+    found = {name: values * blank for name, values in found.items()}
+    return found | {"slope": np.full(len(blank), np.nan), "n": sums.n.astype(np.float64)}
+
+
+def _fit_slopes(
+    maps: Float,
+    basis: Float,
+    participants: Int,
+    rotated: Sequence[Float],
+    *,
+    times: Float,
+) -> dict[str, Float]:
+    """Fit intercepts and slopes at some points; points last."""
+    unit = float(times.std())
+    standard = (times - times.mean()) / unit
+    sums = random_slope.collect_slope_sums(maps, basis, participants, standard)
+    usable = np.linalg.eigvalsh(sums.squares)[:, 0] > glm.MIN_INFORMATION
+    usable &= sums.moments[0].max(axis=1) >= _SLOPE_SESSIONS
+    usable &= sums.n > basis.shape[1] + _SLOPE_SESSIONS
+    kept = sums.take(np.flatnonzero(usable))
+    triangles = random_slope.best_triangles(kept)
+    state = random_slope.solve_slopes(kept, triangles)
+    variance = state.residual / (kept.n - basis.shape[1])
+    turned, found = _tested(rotated, state.scores, state.inverse, variance)
+    found |= {
+        "participant": variance * triangles[:, 0] ** 2,
+        "slope": variance * np.sum(triangles[:, 1:] ** 2, axis=1) / unit**2,
+        "df": random_slope.slope_freedom(kept, triangles, turned),
+        "loss": (kept.n - basis.shape[1]) * np.log(state.residual) + state.penalty,
+    }
+
+    def spread(values: Float) -> Float:
+        full = np.full((*values.shape[:-1], len(usable)), np.nan)
+        full[..., usable] = values
+        return full
+
+    spaced = {name: spread(values) for name, values in found.items()}
+    return spaced | {"n": sums.n.astype(np.float64)}
+
+
+def _satterthwaite(form: Float, slope: Float, freedom: Int, ratio: Float, state: State) -> Float:
+    """Degrees of freedom of contrasts: 2 f^2 / Var(f), f the estimated variance of one.
+
+    With s the logarithm of the residual variance and r the ratio, f = exp(s) form(r), so its
+    gradient is f (1, slope / form); the covariance of (s, r) is twice the inverse of the Hessian
+    of minus twice the restricted likelihood, whose entry for s is the residual ``freedom``.
+    """
+    variance = state.residual[0] / freedom
+    mixed, second = -state.residual[1] / variance, state.penalty[2] + state.residual[2] / variance
+    determinant = freedom * second - mixed**2
+    safe = (ratio > 0) & (determinant > 0)
+    relative = slope / form
+    spread = second - 2 * mixed * relative + freedom * relative**2
+    found = np.where(safe, determinant, 1.0) / np.where(safe, spread, 1.0)
+    return np.where(safe, found, freedom.astype(np.float64))
+
+
+@dataclass(frozen=True, eq=False)
+class RepeatedRows(glm.RowModel):
+    """A mixed model of a design in which participants have several rows."""
+
+    participants: NDArray[np.str_]
+    """(rows,)"""
+    times: Float | None
+    """(rows,) of each visit, if known."""
+    slopes: bool
+    """Whether participants have slopes over time, or intercepts only."""
+
+    @property
+    def visits(self) -> Visits | None:
+        """Whose each row is, and when."""
+        people = np.unique(self.participants, return_inverse=True)[1]
+        return Visits(np.asarray(people, dtype=np.int64), self.times, self.slopes)
+
+    def fit(
+        self, values: Float, rows: Int, contrasts: tuple[Contrast, ...], settings: GroupSettings
+    ) -> glm.PointwiseFit:
+        """Fit some rows of the design at each point."""
+        return fit_mixed(
+            values,
+            self.design.matrix[rows],
+            self.participants[rows],
+            contrasts,
+            settings.longitudinal,
+            times=self.times[rows] if self.times is not None and self.slopes else None,
+        )
+
+    def fit_measures(
+        self, values: Float, rows: Int, contrasts: tuple[Contrast, ...], settings: GroupSettings
+    ) -> glm.PointwiseFit:
+        """Fit some rows of the design to each summary measure, as if it were a point."""
+        return self.fit(values, rows, contrasts, settings)
+
+
+def longitudinal_model(
+    design: Design, table: pd.DataFrame, time: str | None, settings: GroupSettings
+) -> RepeatedRows:
+    """Assign visits to participants, with their times if slopes are random."""
+    if settings.glm.covariance != "ordinary":
+        raise ModelError(
+            "longitudinal model: it assumes equal variances; set glm.covariance to ordinary"
+        )
+    own = table.iloc[design.rows]
+    times = None if time is None else own[time].to_numpy(dtype=np.float64)
+    visits = own[PARTICIPANT].value_counts()
+    several = int((visits >= _SLOPE_SESSIONS).sum())
+    enough = times is not None and several >= settings.longitudinal.slope_participants
+    random = settings.longitudinal.random
+    slopes = random == "slope" or (random == "auto" and enough)
+    if slopes and times is None:
+        raise ModelError(
+            "longitudinal model: random slopes need the time of each session; give a column"
+            f" {settings.longitudinal.time_columns[0]} or acq_time in sessions.tsv"
+        )
+    if times is not None and not np.isfinite(times).all():
+        if slopes:
+            lacking = ", ".join(map(str, own.index[~np.isfinite(times)][:8]))
+            raise ModelError(f"longitudinal model: no {time} of {lacking}")
+        times = None
+    return RepeatedRows(design, own[PARTICIPANT].to_numpy(dtype=np.str_), times, slopes)

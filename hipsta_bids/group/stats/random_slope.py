@@ -1,0 +1,251 @@
+"""Random intercepts and slopes per participant at many points, by restricted likelihood.
+
+The covariance of a participant's intercept and slope, over the residual variance, is L L' with a
+lower triangle L of three numbers (as in R's ``lme4``). With A = Z'Z of a participant, the inverse
+of V = I + Z L L' Z' takes W = L (I + L' A L)^-1 L' between the sums Z' x of its sessions off a sum
+of squares.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from hipsta_bids.group.stats.arrays import Float, Int
+from hipsta_bids.group.stats.glm import products_of, sum_by
+
+#: Most steps of the fit with random slopes.
+SLOPE_STEPS = 60
+#: They end when minus twice the likelihood falls by less than this.
+SLOPE_TOLERANCE = 1e-8
+
+#: Step of numerical derivatives of the three numbers; times have a standard deviation of 1.
+_STEP = 1e-4
+#: Damping of the first step, its factor, and when to give up.
+_DAMPING, _FACTOR, _MOST_DAMPING = 1e-3, 6.0, 1e8
+#: A slope of the loss below this is an optimum.
+_FLAT = 1e-6
+#: Directions in which the likelihood bends less than this share of the most say nothing.
+_BENT = 1e-6
+
+
+@dataclass(frozen=True)
+class SlopeSums:
+    """What the likelihood needs to know of the data.
+
+    Where nothing is missing, all points share moments and columns, which then have one point.
+    """
+
+    n: Int
+    """(points,)"""
+    squares: Float
+    """(points, columns, columns)"""
+    products: Float
+    """(points, columns)"""
+    total: Float
+    """(points,)"""
+    moments: Float
+    """(3, points or 1, participants) sessions, sums of times and of their squares."""
+    own_columns: Float
+    """(2, points or 1, participants, columns) sums of columns, plain and times time."""
+    own_values: Float
+    """(2, points, participants) the same of the values."""
+
+    def take(self, points: Int) -> "SlopeSums":
+        """Keep some points."""
+        shared = self.moments.shape[1] == 1
+        return SlopeSums(
+            self.n[points],
+            self.squares[points],
+            self.products[points],
+            self.total[points],
+            self.moments if shared else self.moments[:, points],
+            self.own_columns if shared else self.own_columns[:, points],
+            self.own_values[:, points],
+        )
+
+
+@dataclass(frozen=True)
+class SlopeState:
+    """Generalized least squares at given triangles."""
+
+    scores: Float
+    """(points, columns)"""
+    inverse: Float
+    """(points, columns, columns) covariance of the scores over the residual variance."""
+    residual: Float
+    """(points,) generalized sum of squared residuals."""
+    penalty: Float
+    """(points,) log |V| + log |X' V^-1 X|."""
+
+
+def collect_slope_sums(maps: Float, basis: Float, participants: Int, times: Float) -> SlopeSums:
+    """Sum over each participant's sessions."""
+    present = np.isfinite(maps)
+    weight = present.astype(np.float64)
+    values = np.where(present, maps, 0.0)
+    powers = np.stack([np.ones_like(times), times, times**2])
+    columns = basis.shape[1]
+
+    def per_person(table: Float) -> Float:
+        return np.moveaxis(sum_by(participants, table), 0, 1)
+
+    shown = weight[:, :1] if present.all() else weight
+    return SlopeSums(
+        n=present.sum(axis=0),
+        squares=(weight.T @ products_of(basis)).reshape(-1, columns, columns),
+        products=values.T @ basis,
+        total=np.einsum("sp,sp->p", values, values),
+        moments=np.stack([per_person(shown * power[:, None]) for power in powers]),
+        own_columns=np.stack(
+            [
+                per_person((shown * power[:, None])[:, :, None] * basis[:, None, :])
+                for power in powers[:2]
+            ]
+        ),
+        own_values=np.stack([per_person(values * power[:, None]) for power in powers[:2]]),
+    )
+
+
+def solve_slopes(sums: SlopeSums, triangles: Float) -> SlopeState:
+    """Fit with one triangle (intercept, covariance, slope) per point."""
+    a, b, c = triangles.T[:, :, None]
+    n, s, q = sums.moments
+    first = 1 + a**2 * n + 2 * a * b * s + b**2 * q
+    cross = c * (a * s + b * q)
+    second = 1 + c**2 * q
+    determinant = first * second - cross**2
+    plain = a**2 * second / determinant
+    mixed = a * (b * second - c * cross) / determinant
+    timed = (b**2 * second - 2 * b * c * cross + c**2 * first) / determinant
+    (x, z), (y, t) = sums.own_columns, sums.own_values
+    weighted = plain * y + mixed * t, mixed * y + timed * t
+    information = sums.squares - _products(x, z, plain, mixed, timed)
+    right = sums.products - _sums(x, weighted[0]) - _sums(z, weighted[1])
+    inverse = np.linalg.inv(information)
+    scores = np.einsum("pij,pj->pi", inverse, right)
+    residual = sums.total - np.sum(weighted[0] * y + weighted[1] * t, axis=1)
+    residual -= np.einsum("pi,pi->p", scores, right)
+    penalty = np.log(determinant).sum(axis=1) + np.linalg.slogdet(information)[1]
+    return SlopeState(scores, np.asarray(inverse, dtype=np.float64), residual, penalty)
+
+
+def _products(x: Float, z: Float, plain: Float, mixed: Float, timed: Float) -> Float:
+    """Sum products of columns over participants, weighted (points, columns, columns)."""
+    if len(x) != 1:
+        left = np.swapaxes(x, 1, 2) @ (plain[:, :, None] * x + mixed[:, :, None] * z)
+        return left + np.swapaxes(z, 1, 2) @ (mixed[:, :, None] * x + timed[:, :, None] * z)
+    columns = x.shape[2]
+    squares = [(u[0][:, :, None] * v[0][:, None, :]) for u, v in ((x, x), (x, z), (z, z))]
+    squares[1] = squares[1] + np.swapaxes(squares[1], 1, 2)
+    total = sum(
+        weight @ square.reshape(len(square), -1)
+        for weight, square in zip((plain, mixed, timed), squares, strict=True)
+    )
+    return np.asarray(total, dtype=np.float64).reshape(-1, columns, columns)
+
+
+def _sums(x: Float, values: Float) -> Float:
+    """Sum columns times values over participants (points, columns)."""
+    if len(x) != 1:
+        return np.asarray((values[:, None, :] @ x)[:, 0])
+    return np.asarray(values @ x[0])
+
+
+def best_triangles(sums: SlopeSums) -> Float:
+    """Triangles (points, 3) that maximize the restricted likelihood.
+
+    The best of a few starts, then damped Newton steps with numerical derivatives.
+    """
+    starts = [np.array(start) for start in product((0.2, 1.0, 3.0), (0.0,), (0.05, 0.3, 1.0))]
+    losses = [_loss(sums, np.tile(start, (len(sums.n), 1))) for start in starts]
+    best: Float = np.array(starts)[np.argmin(losses, axis=0)]
+    active = np.arange(len(sums.n))
+    damping = np.full(len(best), _DAMPING)
+    for _ in range(SLOPE_STEPS):
+        part = sums.take(active)
+        value, gradient, hessian = _derivatives(part, best[active])
+        size, axes = np.linalg.eigh(hessian)
+        bent = np.abs(size) + damping[active, None] * np.abs(size).max(axis=1, keepdims=True)
+        along = np.einsum("pij,pi->pj", axes, gradient) / np.maximum(bent, 1e-12)
+        step = -np.einsum("pij,pj->pi", axes, along)
+        trial = best[active] + step
+        gain = value - _loss(part, trial)
+        better = gain > 0
+        best[active[better]] = trial[better]
+        damping[active] *= np.where(better, 1 / _FACTOR, _FACTOR)
+        done = np.abs(gradient).max(axis=1) < _FLAT
+        done |= better & (gain < SLOPE_TOLERANCE)
+        active = active[~done & (damping[active] < _MOST_DAMPING)]
+        if not len(active):
+            break
+    return best
+
+
+def slope_freedom(sums: SlopeSums, triangles: Float, rows: Float) -> Float:
+    """Satterthwaite's degrees of freedom of rows of weights, (rows, points, columns).
+
+    From the Hessian of minus twice the restricted likelihood for the logarithm of the residual
+    variance and the triangle; directions without curvature, as at a bound, are left out, as in
+    R's ``lmerTest``.
+    """
+    freedom = sums.n - sums.squares.shape[1]
+    base = solve_slopes(sums, triangles)
+    variance = base.residual / freedom
+    shifts = _STEP * np.eye(3)
+    hessian = np.empty((len(triangles), 4, 4))
+    hessian[:, 0, 0] = freedom
+    slopes = []
+    for i in range(3):
+        up, down = (solve_slopes(sums, triangles + sign * shifts[i]) for sign in (1, -1))
+        hessian[:, 0, i + 1] = -(up.residual - down.residual) / (2 * _STEP) / variance
+        hessian[:, i + 1, 0] = hessian[:, 0, i + 1]
+        slopes.append((forms(up.inverse, rows) - forms(down.inverse, rows)) / (2 * _STEP))
+
+    def fixed_variance(at: Float) -> Float:
+        state = solve_slopes(sums, at)
+        return np.asarray(state.penalty + state.residual / variance)
+
+    hessian[:, 1:, 1:] = _second(fixed_variance, triangles)
+    form = forms(base.inverse, rows)
+    gradient = np.stack([np.ones_like(form), *(slope / form for slope in slopes)], axis=-1)
+    size, axes = np.linalg.eigh(hessian)
+    valid = size > _BENT * size[:, -1:]
+    inverse = np.where(valid, 1 / np.where(valid, size, 1.0), 0.0)
+    turned = np.einsum("cpi,pij->cpj", gradient, axes)
+    return np.asarray(1 / np.einsum("cpj,pj->cp", turned**2, inverse), dtype=np.float64)
+
+
+def forms(inverse: Float, rows: Float) -> Float:
+    """Variances of rows of weights (rows, points, columns) over the residual variance."""
+    return np.asarray(np.einsum("cpi,pij,cpj->cp", rows, inverse, rows))
+
+
+def _loss(sums: SlopeSums, triangles: Float) -> Float:
+    """Minus twice the restricted likelihood, but for a constant."""
+    state = solve_slopes(sums, triangles)
+    freedom = sums.n - sums.squares.shape[1]
+    return np.asarray(freedom * np.log(state.residual) + state.penalty)
+
+
+def _derivatives(sums: SlopeSums, at: Float) -> tuple[Float, Float, Float]:
+    """Loss, gradient and Hessian by central differences."""
+    shifts = _STEP * np.eye(3)
+    ups = np.stack([_loss(sums, at + shift) for shift in shifts], axis=1)
+    downs = np.stack([_loss(sums, at - shift) for shift in shifts], axis=1)
+    hessian = _second(lambda point: _loss(sums, point), at)
+    return _loss(sums, at), (ups - downs) / (2 * _STEP), hessian
+
+
+def _second(function: Callable[[Float], Float], at: Float) -> Float:
+    """Second derivatives for the three numbers, by central differences of a wider step."""
+    step = 10 * _STEP
+    shifts = step * np.eye(3)
+    result = np.empty((len(at), 3, 3))
+    for i in range(3):
+        for j in range(i + 1):
+            signs = ((1, 1), (1, -1), (-1, 1), (-1, -1))
+            corners = [p * q * function(at + p * shifts[i] + q * shifts[j]) for p, q in signs]
+            result[:, i, j] = result[:, j, i] = np.sum(corners, axis=0) / (4 * step**2)
+    return result

@@ -1,0 +1,349 @@
+"""Registration of curvature profiles, so that a grid node means the same position in all."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from hipsta_bids.errors import ModelError
+from hipsta_bids.group.design.formula import Contrast
+from hipsta_bids.group.design.settings import MultiplicitySettings, RegistrationSettings
+from hipsta_bids.group.stats.arrays import SHEETS, Bool, Float, blocks
+from hipsta_bids.group.stats.inference import PermutationPart, permute
+from hipsta_bids.group.stats.warps import (
+    Template,
+    WarpBasis,
+    fit_template,
+    fit_warps,
+    inner_knots,
+    make_basis,
+    subject_curves,
+    warp_values,
+)
+
+#: Displacements that vary less, as a share of the largest variance, are those of fixed ends.
+_ROUNDING = 1e-12
+#: Settings of the method ``penalized``, in place of those of ``registr``.
+PENALIZED = {"template_splines": 12, "warp_splines": 6, "components": 2, "iterations": 20}
+#: Turns end when warps change by less than this, mean square, sheet = 1; by method.
+TOLERANCES = {"registr": 1e-4, "penalized": 1e-7}
+#: Standard deviation of the logarithms of a warp's local stretch, to start with.
+START_SD = 0.3
+
+
+@dataclass(frozen=True)
+class Registration:
+    """Warps of all subjects, and what they did."""
+
+    warps: Float
+    """(subjects, nodes) registered coordinate of each node, 0..1."""
+    template: Template | None
+    """None without registration."""
+    iterations: int
+    converged: bool
+    explained_before: float
+    """Share of the variance of all profile values that the mean profile explains."""
+    explained_after: float
+    displacement: Float
+    """(subjects,) root mean square of warp minus identity, in grid nodes."""
+    extreme: Bool
+    """(subjects,) whose displacement is an outlier."""
+
+    @property
+    def shifts(self) -> Float:
+        """(subjects, nodes) registered minus original position, in nodes; positive is lateral."""
+        return _shifts(self.warps)
+
+
+def _shifts(warps: Float) -> Float:
+    nodes = warps.shape[1]
+    return np.asarray((warps - np.linspace(0.0, 1.0, nodes)) * (nodes - 1), dtype=np.float64)
+
+
+def _of_method(settings: RegistrationSettings) -> RegistrationSettings:
+    penalized = settings.align == "penalized"
+    return settings.model_copy(update=PENALIZED) if penalized else settings
+
+
+def register(profiles: Float, settings: RegistrationSettings) -> Registration:
+    """Register profiles to a template that is made from them.
+
+    ``registr`` takes turns: each profile is warped onto its own approximation by the mean and
+    the principal components; these are estimated again from the warped profiles (Wrobel et al.
+    2018, as in version 2.1.1 of the R package of that name). Unlike R, each profile is first
+    standardized (setting ``standardize``; else all are divided by one standard deviation, since
+    the algorithm is not free of scale), and the mean warp is kept at identity (``center``).
+    ``penalized`` has finer warps with a normal prior on the logarithms of local stretch, whose
+    variance is estimated along with the rest.
+    """
+    if settings.align == "none":
+        return _finish(profiles, _identity(profiles), None, settings, 0, converged=True)
+    scale = _check(profiles, settings)
+    settings = _of_method(settings)
+    scaled = _scaled(profiles, scale)
+    basis = WarpBasis.make(profiles.shape[1], settings.warp_splines)
+    warps = _identity(profiles)
+    knots = inner_knots(warps, settings.template_splines)
+    mean = np.linalg.lstsq(make_basis(knots)(warps[0]), scaled.mean(axis=0), rcond=None)[0]
+    curves = np.tile(mean, (len(profiles), 1))
+    parameters = np.zeros((len(profiles), len(basis.identity)))
+    variance = START_SD**2 if settings.align == "penalized" else np.inf
+    noise = 1.0
+    turn = 0
+    while True:
+        fit = fit_warps(
+            scaled, knots, curves, basis, parameters, penalty=noise / variance, settings=settings
+        )
+        parameters = fit.parameters
+        if np.isfinite(variance):
+            variance = float(np.mean(parameters**2) + noise * fit.uncertainty.mean())
+        before, warps = warps, fit.warps
+        if settings.center:
+            warps = _after_inverse(warps, warps.mean(axis=0))
+        template, curves = fit_template(
+            scaled, warps, settings.template_splines, settings.components
+        )
+        knots, noise = template.knots, template.noise
+        change = float(np.mean((warps - before) ** 2))
+        # The first warps are to the mean of profiles that were not registered.
+        if turn == settings.iterations or (turn and change <= TOLERANCES[settings.align]):
+            break
+        turn += 1
+    template = replace(
+        template, scale=scale, align=settings.align, warp_variance=variance, turns=turn
+    )
+    if settings.center:
+        center = _fit_to(scaled, template, settings).mean(axis=0)
+        template = replace(template, center=center)
+    return _finish(
+        profiles, warps, template, settings, turn, converged=change <= TOLERANCES[settings.align]
+    )
+
+
+def register_to(
+    profiles: Float, template: Template, settings: RegistrationSettings
+) -> Registration:
+    """Register profiles to a template that does not change; each subject is on its own."""
+    if template.align != settings.align:
+        raise ModelError(
+            f"registration: the template was made with align {template.align}, not"
+            f" {settings.align}; use the same"
+        )
+    if (template.scale is None) != settings.standardize:
+        raise ModelError(
+            "registration: the template was made with another setting of"
+            f" standardize, not {str(settings.standardize).lower()}; use the same"
+        )
+    if (nodes := profiles.shape[1]) != len(template.center):
+        raise ModelError(
+            f"registration: the template has {len(template.center)} nodes along x, the sheets have"
+            f" {nodes}; use one of the same grid"
+        )
+    _check_profiles(profiles, settings)
+    fitted = _fit_to(_scaled(profiles, template.scale), template, settings)
+    warps = _after_inverse(fitted, template.center)
+    return _finish(profiles, warps, template, settings, template.turns, converged=True)
+
+
+def _fit_to(scaled: Float, template: Template, settings: RegistrationSettings) -> Float:
+    """Warps to a template that does not change, by as many turns as it was made with."""
+    basis = WarpBasis.make(scaled.shape[1], _of_method(settings).warp_splines)
+    curves = np.tile(template.mean, (len(scaled), 1))
+    parameters = np.zeros((len(scaled), len(basis.identity)))
+    penalty = template.noise / template.warp_variance
+    for turn in range(template.turns + 1):
+        fit = fit_warps(
+            scaled, template.knots, curves, basis, parameters, penalty=penalty, settings=settings
+        )
+        parameters = fit.parameters
+        if turn < template.turns:
+            curves = subject_curves(template, scaled, fit.warps)
+    return fit.warps
+
+
+def _identity(profiles: Float) -> Float:
+    return np.tile(np.linspace(0.0, 1.0, profiles.shape[1]), (len(profiles), 1))
+
+
+def _after_inverse(warps: Float, common: Float) -> Float:
+    """Follow all warps by the inverse of one; by their mean's, it becomes the identity."""
+    grid = np.linspace(0.0, 1.0, warps.shape[1])
+    back = np.interp(warps.ravel(), common, grid)
+    return np.asarray(back.reshape(warps.shape), dtype=np.float64)
+
+
+def _scaled(profiles: Float, scale: float | None) -> Float:
+    """Profiles over one standard deviation, or each less its mean over its own."""
+    if scale is not None:
+        return profiles / scale
+    centered = profiles - profiles.mean(axis=1, keepdims=True)
+    return np.asarray(centered / profiles.std(axis=1, keepdims=True), dtype=np.float64)
+
+
+def _check_profiles(profiles: Float, settings: RegistrationSettings) -> None:
+    """Refuse single profiles that cannot be registered."""
+    rows = np.flatnonzero(~np.isfinite(profiles).all(axis=1))
+    if len(rows):
+        raise ModelError(
+            f"registration: profiles {', '.join(map(str, rows[:10]))} have missing values"
+        )
+    constant = profiles.std(axis=1) <= np.finfo(np.float64).eps * np.abs(profiles).max(axis=1)
+    if settings.standardize and constant.any() and not constant.all():
+        raise ModelError(
+            f"registration: profiles {', '.join(map(str, np.flatnonzero(constant)[:10]))} are"
+            " constant; leave them out"
+        )
+
+
+def _check(profiles: Float, settings: RegistrationSettings) -> float | None:
+    """Refuse what makes no template; else return what to divide all profiles by, if anything."""
+    _check_profiles(profiles, settings)
+    if len(profiles) < settings.min_subjects:
+        raise ModelError(
+            f"registration: {len(profiles)} profiles are too few for a template (least"
+            f" {settings.min_subjects}); use align none, or a template from others"
+        )
+    scale = float(profiles.std())
+    if scale <= np.finfo(np.float64).eps * float(np.abs(profiles).max()):
+        raise ModelError("registration: all profiles are the same constant; use align none")
+    return None if settings.standardize else scale
+
+
+def _finish(
+    profiles: Float,
+    warps: Float,
+    template: Template | None,
+    settings: RegistrationSettings,
+    iterations: int,
+    *,
+    converged: bool,
+) -> Registration:
+    displacement = np.sqrt(np.mean(_shifts(warps) ** 2, axis=1))
+    spread = float(stats.median_abs_deviation(displacement, scale="normal"))
+    limit = float(np.median(displacement)) + settings.extreme * spread
+    return Registration(
+        warps=warps,
+        template=template,
+        iterations=iterations,
+        converged=converged,
+        explained_before=_explained(profiles),
+        explained_after=_explained(warp_values(profiles[:, :, None], warps)[:, :, 0]),
+        displacement=displacement,
+        extreme=(displacement > limit) & (spread > 0),
+    )
+
+
+def _explained(profiles: Float) -> float:
+    """Share of the variance that the mean profile explains."""
+    return 1 - float(np.mean(profiles.var(axis=0))) / max(float(profiles.var()), 1e-300)
+
+
+@dataclass(frozen=True)
+class GroupShift:
+    """By how much a group was displaced."""
+
+    mean: Float
+    """(nodes,) registered minus original position, in grid nodes; positive is lateral."""
+    se: Float
+    """(nodes,)"""
+    n: int
+
+
+def mean_profiles(maps: Float, settings: RegistrationSettings) -> Float:
+    """Profiles of curvature along x: means over y, with gaps filled linearly."""
+    counts, profiles = np.empty(maps.shape[:2], dtype=np.int64), np.empty(maps.shape[:2])
+    for part in blocks(len(maps), SHEETS):
+        present = np.isfinite(maps[part])
+        counts[part] = present.sum(axis=2)
+        sums = np.where(present, maps[part], 0.0).sum(axis=2, dtype=np.float64)
+        profiles[part] = sums / np.maximum(counts[part], 1)
+    empty = counts == 0
+    bad = np.flatnonzero(empty.mean(axis=1) > settings.max_gap)
+    if len(bad):
+        raise ModelError(
+            f"registration: rows {', '.join(map(str, bad[:10]))} of the maps lack more than"
+            f" {settings.max_gap:.0%} of the profile; leave them out"
+        )
+    nodes = np.arange(maps.shape[1])
+    for row in np.flatnonzero(empty.any(axis=1)):  # few
+        gaps = empty[row]
+        profiles[row, gaps] = np.interp(nodes[gaps], nodes[~gaps], profiles[row, ~gaps])
+    return profiles
+
+
+@dataclass(frozen=True)
+class ShiftDifference:
+    """Whether groups are displaced by different amounts."""
+
+    largest: float
+    """Largest difference between the mean displacements of two groups, grid nodes."""
+    node: int
+    """Where along x, from 0."""
+    p: float
+    """That the largest F over the nodes is by chance; NaN if a group has fewer than two members."""
+
+
+def shift_difference(
+    registration: Registration,
+    groups: Sequence[str] | NDArray[np.str_],
+    people: NDArray[np.generic],
+    *,
+    permutations: int,
+    seed: int,
+) -> ShiftDifference:
+    """Compare displacements between groups, at all nodes along x at once.
+
+    Warps of one person are averaged first. F of a one-way analysis of variance at each node; the
+    largest is compared with those after permuting people over the groups, so that the error rate
+    is that of the whole sheet (Westfall and Young 1993).
+
+    Parameters
+    ----------
+    registration : Registration
+        Warps (sheets, nodes).
+    groups : sequence of str
+        Group of each sheet.
+    people : ndarray
+        (sheets,) person of each sheet; the group is the same in all of one person's.
+    permutations : int
+    seed : int
+    """
+    _, first, index = np.unique(people, return_index=True, return_inverse=True)
+    totals = [np.bincount(index, column) for column in registration.shifts.T]
+    own: Float = np.stack(totals, axis=1) / np.bincount(index)[:, None]
+    names, member = np.unique(np.asarray(groups)[first], return_inverse=True)
+    matrix = np.eye(len(names))[member]
+    counts = matrix.sum(axis=0)
+    spread = np.ptp(matrix.T @ own / counts[:, None], axis=0)
+    node, p = int(np.argmax(spread)), float("nan")
+    varied = own.var(axis=0)
+    varying = varied > _ROUNDING * varied.max()
+    if len(names) > 1 and counts.min() > 1 and varying.any():
+        part = PermutationPart(
+            maps=own[:, varying],
+            matrix=matrix,
+            subjects=np.arange(len(own)),
+            edges=np.empty((0, 2), dtype=np.int64),
+        )
+        contrast = Contrast("groups", np.diff(np.eye(len(names)), axis=0))
+        how = MultiplicitySettings(
+            method="permutation-max", permutations=permutations + 1, seed=seed
+        )
+        (test,) = permute([part], contrast, settings=how)
+        p = float(np.nanmin(test.p_max))
+    return ShiftDifference(float(spread[node]), node, p)
+
+
+def shift_by_group(
+    registration: Registration, groups: Sequence[str] | NDArray[np.str_]
+) -> Mapping[str, GroupShift]:
+    """Mean displacement of each group along x (figure A5 of the paper)."""
+    names, shifts = np.asarray(groups), registration.shifts
+    result = {}
+    for name in np.unique(names):
+        part = shifts[names == name]
+        spread = part.std(axis=0, ddof=1) if len(part) > 1 else np.full(part.shape[1], np.nan)
+        result[str(name)] = GroupShift(part.mean(axis=0), spread / np.sqrt(len(part)), len(part))
+    return result

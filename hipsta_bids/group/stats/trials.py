@@ -1,0 +1,360 @@
+"""Sample size: how many participants a trial needs for an effect on a measure or at a point."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special, stats
+
+from hipsta_bids.errors import ModelError, UsageError
+from hipsta_bids.group.design.settings import GroupSettings, MultiplicitySettings
+from hipsta_bids.group.stats.arrays import Bool, Float, Int
+
+#: More participants per arm are not looked for.
+MOST_PARTICIPANTS = 10_000
+
+#: Kinds of effects: a share of the mean, or of the change over time.
+THINNING, SLOWING = "thinning", "slowing"
+_YEAR = 12.0
+_TURNS = 200  # of the fixed point of the level; it settles in some tens
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reference:
+    """What a reference cohort says about some measures or points."""
+
+    n: NDArray[np.int64]
+    """Participants with a value."""
+    mean: Float
+    """In units of the measure."""
+    variance: Float
+    """Between participants at one visit, or with several visits within participants."""
+    freedom: Float
+    """Degrees of freedom of the variance, about."""
+    slope: Float | None = None
+    """Change per month."""
+    slope_limits: Float | None = None
+    """(2, points)"""
+    slope_variance: Float | None = None
+    """Of true changes per month between participants; None if they are taken to change alike."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialEffect:
+    """What a trial of two arms of equal size is to find, and when it measures."""
+
+    kind: str
+    """``thinning``: the arms differ by a share of the mean, at the last visit; ``slowing``: the
+    change of the treated arm is smaller by a share of that of the other."""
+    share: float
+    """0..1"""
+    visits: tuple[float, ...] = ()
+    """Months; empty for a single visit."""
+
+    def __post_init__(self) -> None:
+        if self.kind == SLOWING and not self.visits:
+            raise UsageError(
+                "--power slowing= is about change over time; say when the trial measures, as"
+                " --visits 0,12,24"
+            )
+
+    @property
+    def duration(self) -> float:
+        """Time from the first to the last visit, months."""
+        return self.visits[-1] - self.visits[0] if self.visits else 0.0
+
+    @property
+    def spread(self) -> float:
+        """Sum of squared deviations of the visits' times from their mean, months squared."""
+        return float(np.var(self.visits) * len(self.visits)) if self.visits else 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class SampleSize:
+    """Participants per arm of a trial, at each point."""
+
+    difference: Float
+    """Between the arms: of means, or with several visits of changes per month."""
+    sd: Float
+    """Of a participant's value, or of a participant's estimated change per month."""
+    alpha: float
+    """Two-sided level of the test at one point."""
+    per_arm: Float
+    """Who complete the trial; NaN beyond ``MOST_PARTICIPANTS``."""
+    power: Float
+    """With that many."""
+    enrolled: Float
+    """Per arm, so that those who drop out leave as much information."""
+    limits: Float | None = None
+    """(2, points) participants per arm at the confidence limits of the reference."""
+
+    @property
+    def cohen_d(self) -> Float:
+        """Difference over SD."""
+        return self.difference / self.sd
+
+
+def sample_size(
+    effect: TrialEffect,
+    reference: Reference,
+    settings: GroupSettings,
+    *,
+    alpha: float,
+    limits: bool = False,
+) -> SampleSize:
+    """Find the participants per arm that give the power which the settings ask for.
+
+    With one visit the end point is a participant's value. With several it is the slope by least
+    squares over the visits, as in a mixed model with random slopes and complete data: its variance
+    is that of true slopes plus that within participants over the sum of squared times (Ard and
+    Edland 2011). The test is Student's for two groups, so that power is that of the non-central t.
+    """
+    wanted = settings.power.power
+    sd = endpoint_sd(effect, reference)
+    difference = _difference(effect, reference.mean, reference.slope)
+    per_arm = participants_needed(difference / sd, alpha, wanted, MOST_PARTICIPANTS)
+    ends = None
+    if limits:
+        if effect.kind == SLOWING and reference.slope_limits is not None:
+            low, high = reference.slope_limits
+            # Where the slope may be zero, no number is enough.
+            least = np.where(low * high > 0, np.minimum(abs(low), abs(high)), 0.0)
+            most = np.maximum(abs(low), abs(high))
+            d = np.stack([most, least]) * effect.share / sd
+        else:
+            tail = (1 - settings.glm.confidence) / 2
+            chi = stats.chi2.ppf(np.array([[1 - tail], [tail]]), reference.freedom)
+            d = difference / sd * np.sqrt(chi / reference.freedom)
+        ends = participants_needed(d, alpha, wanted, MOST_PARTICIPANTS)
+    return SampleSize(
+        difference=difference,
+        sd=sd,
+        alpha=alpha,
+        per_arm=per_arm,
+        power=power_of(difference / sd, per_arm, alpha),
+        enrolled=np.ceil(
+            np.round(per_arm / information_left(effect, reference, settings.power.dropout), 9)
+        ),
+        limits=ends,
+    )
+
+
+def endpoint_sd(effect: TrialEffect, reference: Reference) -> Float:
+    """SD of what the trial compares: a value, or a slope per month."""
+    if not effect.visits:
+        return np.sqrt(reference.variance)
+    slopes = 0.0 if reference.slope_variance is None else reference.slope_variance
+    return np.asarray(np.sqrt(slopes + reference.variance / effect.spread), dtype=np.float64)
+
+
+def information_left(effect: TrialEffect, reference: Reference, dropout: float) -> Float:
+    """Information that a participant who is enrolled gives on average, over that of all visits.
+
+    A constant hazard leaves ``1 - dropout`` at the last visit, and who leaves is in the mixed model
+    with the visits before: the information of a pattern is the inverse variance of its slope, if
+    it has two visits. With a single visit, who leaves gives none.
+    """
+    if not effect.visits:
+        return np.asarray(1.0 - dropout)
+    passed = (np.array(effect.visits) - effect.visits[0]) / effect.duration
+    stay = np.append((1 - dropout) ** passed, 0.0)
+    whole, total = endpoint_sd(effect, reference) ** 2, np.zeros(reference.mean.shape)
+    for count in range(2, len(effect.visits) + 1):
+        part = replace(effect, visits=effect.visits[:count])
+        total += (stay[count - 1] - stay[count]) * whole / endpoint_sd(part, reference) ** 2
+    return total
+
+
+def _difference(effect: TrialEffect, mean: Float, slope: Float | None) -> Float:
+    if effect.kind == SLOWING:
+        if slope is None:
+            raise ModelError(
+                "--power slowing= needs a reference cohort that was followed; test-retest has no"
+                " change, give thinning="
+            )
+        return effect.share * np.abs(slope)
+    return effect.share * np.abs(mean) / (effect.duration if effect.visits else 1.0)
+
+
+def power_of(d: Float, per_arm: Float, alpha: float) -> Float:
+    """Power of Student's two-sided t test of two groups of equal size, by its non-central form."""
+    ready = np.isfinite(d) & np.isfinite(per_arm) & (per_arm > 1)
+    size = np.where(ready, per_arm, 2.0)
+    center, df = np.abs(np.where(ready, d, 0.0)) * np.sqrt(size / 2), 2 * size - 2
+    limit = stats.t.isf(alpha / 2, df)
+    found = 1 - special.nctdtr(df, center, limit) + special.nctdtr(df, center, -limit)
+    # SciPy has no value for some centers far beyond the limit, where power is 1.
+    found = np.where(np.isnan(found) & (center > limit), 1.0, found)
+    return np.where(ready, found, np.nan)
+
+
+def participants_needed(d: Float, alpha: float, power: float, most: int) -> Float:
+    """Smallest number per arm that reaches a power, by halving; NaN beyond ``most``."""
+    d = np.asarray(d, dtype=np.float64)
+    low, high = np.ones(d.shape), np.full(d.shape, float(most))
+    enough = power_of(d, high, alpha) >= power
+    while (high - low > 1).any():
+        middle = np.floor((low + high) / 2)
+        reached = power_of(d, middle, alpha) >= power
+        low, high = np.where(reached, low, middle), np.where(reached, middle, high)
+    return np.where(enough, high, np.nan)
+
+
+def point_level(settings: GroupSettings) -> float:
+    """Level of the test at a point that holds the false discovery rate, on average.
+
+    If a share a of the points differs, and is found with the power P, while the others are found
+    at the level t, a share a P + (1 - a) t of the points is found. The procedure of Benjamini and
+    Hochberg has then t = q (a P + (1 - a) t), which gives t (Jung 2005; Liu and Hwang 2007). The
+    two-stage procedure does it with q / (1 + q), and again with q / (1 + q) over the share of
+    points not found in the first stage; its power in the first stage is that of the level there.
+    """
+    how, plan = settings.multiplicity, settings.power
+    if how.method not in {"fdr2", "bh"}:
+        raise UsageError(
+            f"--power: participants per point are known for false discovery rates, not for"
+            f" {how.method}; give --correction fdr2 or bh"
+        )
+    if how.method == "bh":
+        return how.alpha * plan.affected * plan.power / (1 - how.alpha * (1 - plan.affected))
+    return _two_stage_level(how, plan.power, plan.affected)
+
+
+def _two_stage_level(how: MultiplicitySettings, power: float, affected: float) -> float:
+    rate = how.alpha / (1 + how.alpha)
+    second = first = rate * affected * power
+    for _ in range(_TURNS):
+        center = stats.norm.isf(second / 2) + stats.norm.ppf(power)
+        seen = stats.norm.sf(stats.norm.isf(first / 2) - center)
+        found = affected * seen + (1 - affected) * first
+        first = rate * found
+        second = rate * affected * power / (1 - found - rate * (1 - affected))
+    return float(second)
+
+
+def power_columns(
+    effect: TrialEffect, found: SampleSize, reference: Reference
+) -> Mapping[str, object]:
+    """Columns of the tables of sample sizes; changes are per year."""
+    per_year = _YEAR if effect.visits else 1.0
+    limits = {}
+    if found.limits is not None:
+        limits = {"per_arm_low": found.limits[0], "per_arm_high": found.limits[1]}
+    return {
+        "n": reference.n,
+        "mean": reference.mean,
+        "change_per_year": np.nan if reference.slope is None else reference.slope * _YEAR,
+        "arm_difference": found.difference * per_year,
+        "sd_endpoint": found.sd * per_year,
+        "cohen_d": found.cohen_d,
+        "alpha": found.alpha,
+        "per_arm": found.per_arm,
+        **limits,
+        "enrolled_per_arm": found.enrolled,
+        "power": found.power,
+    }
+
+
+#: Smallest detectable change over the within-subject SD, for 95 % of changes by chance.
+DETECTABLE = 1.96 * np.sqrt(2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Repeatability:
+    """How well values of the same participants agree; NaN where it cannot be told."""
+
+    n: Int
+    """(points,) participants with a value in all sessions."""
+    mean: Float
+    """(points,) in units of the map."""
+    between: Float
+    """(points,) SD between participants, of their true values."""
+    within: Float
+    """(points,) SD within participants, differences between sessions included."""
+    within_limits: Float
+    """(2, points)"""
+    icc: Float
+    """(points,) ICC(2,1): two-way random effects, absolute agreement, single measurement."""
+    icc_limits: Float
+    """(2, points)"""
+    p_sessions: Float
+    """(points,) of the F test that sessions have the same mean."""
+
+    @property
+    def detectable(self) -> Float:
+        """(points,) smallest change in one participant that measurement hardly explains."""
+        return np.asarray(DETECTABLE * self.within)
+
+
+def repeatability(values: Float, *, confidence: float = 0.95, least: int = 3) -> Repeatability:
+    """Split the variance of values (participants, sessions, points) between and within people.
+
+    Where one session is missing, the participant is left out at that point; points with fewer
+    complete participants than ``least`` are NaN. The within-subject SD is the root of the mean
+    variance of a participant's values (Bland and Altman 1996), its limits those of chi squared.
+    ICC(2,1) is that of Shrout and Fleiss (1979), with the limits of McGraw and Wong (1996, table 7,
+    ICC(A,1)).
+    """
+    k = values.shape[1]
+    complete: Bool = np.asarray(np.isfinite(values).all(axis=1))
+    n = complete.sum(axis=0)
+    usable = n >= max(least, 2)
+    size = np.where(usable, n, 2).astype(np.float64)
+    known = np.where(complete[:, None], values, 0.0)
+    grand = known.sum(axis=(0, 1)) / (size * k)
+    people = known.mean(axis=1)
+    sessions = known.sum(axis=0) / size
+    rest = np.where(complete[:, None], known - people[:, None] - sessions + grand, 0.0)
+    rows = k * np.where(complete, (people - grand) ** 2, 0.0).sum(axis=0) / (size - 1)
+    columns = size * ((sessions - grand) ** 2).sum(axis=0) / (k - 1)
+    error = (rest**2).sum(axis=(0, 1)) / ((size - 1) * (k - 1))
+    usable &= error > 0
+    rows, columns, error = (np.where(usable, one, np.nan) for one in (rows, columns, error))
+    freedom = size * (k - 1)
+    within = np.sqrt(((k - 1) * columns + (size - 1) * (k - 1) * error) / freedom)
+    tails = np.array([[(1 + confidence) / 2], [(1 - confidence) / 2]])
+    icc = (rows - error) / (rows + (k - 1) * error + k * (columns - error) / size)
+    return Repeatability(
+        n=n,
+        mean=np.where(usable, grand, np.nan),
+        between=np.sqrt(np.maximum((rows - error) / k, 0.0)),
+        within=within,
+        within_limits=within * np.sqrt(freedom / stats.chi2.ppf(tails, freedom)),
+        icc=icc,
+        icc_limits=_icc_limits(icc, rows, columns, error, n=size, k=k, tails=tails),
+        p_sessions=stats.f.sf(columns / error, k - 1, (size - 1) * (k - 1)),
+    )
+
+
+def _icc_limits(
+    icc: Float, rows: Float, columns: Float, error: Float, *, n: Float, k: int, tails: Float
+) -> Float:
+    """Limits of ICC(A,1) from mean squares, with Satterthwaite's degrees of freedom."""
+    a = k * icc / (n * (1 - icc))
+    b = 1 + k * icc * (n - 1) / (n * (1 - icc))
+    mixed = a * columns + b * error
+    freedom = mixed**2 / ((a * columns) ** 2 / (k - 1) + (b * error) ** 2 / ((n - 1) * (k - 1)))
+    down = stats.f.ppf(tails[0], n - 1, freedom)
+    up = stats.f.ppf(tails[0], freedom, n - 1)
+    other = k * columns + (k * n - k - n) * error
+    low = n * (rows - down * error) / (down * other + n * rows)
+    high = n * (up * rows - error) / (other + n * up * rows)
+    return np.stack([low, high])
+
+
+def retest_columns(found: Repeatability) -> Mapping[str, Float | Int]:
+    """Columns of the tables of test-retest."""
+    return {
+        "n": found.n,
+        "mean": found.mean,
+        "sd_between": found.between,
+        "sd_within": found.within,
+        "sd_within_low": found.within_limits[0],
+        "sd_within_high": found.within_limits[1],
+        "icc": found.icc,
+        "icc_low": found.icc_limits[0],
+        "icc_high": found.icc_limits[1],
+        "detectable_change": found.detectable,
+        "p_sessions": found.p_sessions,
+    }

@@ -1,0 +1,131 @@
+"""``hipsta-bids surrogate``: thickness in single slices, beside that of the sheet."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+
+from hipsta_bids.derivatives import dataset
+from hipsta_bids.derivatives.hemisphere import ResultPlace, format_column, read_sheet
+from hipsta_bids.derivatives.names import HemisphereName
+from hipsta_bids.errors import ExitCode, HipstaError, InputError, OutputError, ProtocolError
+from hipsta_bids.geometry.body import extract_body
+from hipsta_bids.geometry.surrogate import (
+    SurrogateProfile,
+    agreement,
+    compare_nearby,
+    surrogate_profiles,
+)
+from hipsta_bids.inputs.labels import read_label_volume
+from hipsta_bids.inputs.scan import HemisphereInput
+from hipsta_bids.io import files
+from hipsta_bids.settings import Settings
+from hipsta_bids.types import Float
+
+#: Compared with points of the mid-surface that lie this near, mm.
+MATCH_REACH = 1.0
+
+#: Columns of the table: definition and unit.
+COLUMNS: dict[str, tuple[str, str | None]] = {
+    "slice": ("where the slice is, fraction of the body's length from its posterior end", None),
+    "sampling": (
+        "proportional: where the sheet has its nodes along x; equidistant: in equal steps",
+        None,
+    ),
+    "point": ("number along the medial axis, 1 nearest to the medial rim", None),
+    "fraction": ("place on the medial axis, 0 at the medial and 1 at the lateral rim", None),
+    "distance": ("from the medial rim along the medial axis", "mm"),
+    "r": ("position on the medial axis, scanner RAS, left to right", "mm"),
+    "a": ("position on the medial axis, scanner RAS, posterior to anterior", "mm"),
+    "s": ("position on the medial axis, scanner RAS, inferior to superior", "mm"),
+    "thickness": ("distances to the closest points of the contour on both sides, added", "mm"),
+    "thickness_mesh": ("thickness of the sheet nearby, if the participant level has run", "mm"),
+}
+
+_DIGITS = 4
+
+
+def crosscheck(
+    items: Sequence[HemisphereInput],
+    out_dir: Path,
+    settings: Settings,
+    echo: Callable[[str], None],
+    warn: Callable[[str], None],
+) -> ExitCode:
+    """Measure hemispheres in single slices and write one table each."""
+    dataset.check_own_dataset(out_dir)
+    files.check_writable(out_dir)
+    dataset.settle_settings(out_dir, settings)
+    sources = dataset.source_names((item.source, item.source_path) for item in items)
+    dataset.write_description(out_dir, sources)
+    errors = []
+    for item in items:
+        name = HemisphereName(
+            subject=item.subject, session=item.session, hemi=item.hemi, seg=item.protocol.name
+        )
+        place = ResultPlace(root=out_dir, name=name)
+        files.remove([place.path("surrogate"), place.path("surrogate_sidecar")])
+        title = f"{place.name.stem}_seg-{place.name.seg}"
+        try:
+            for line in _measure(item, place, settings):
+                echo(f"{title}  {line}")
+        except OutputError:
+            raise
+        except HipstaError as error:
+            errors.append(error)
+            warn(f"{title}  failed  [{error.reason}] {error}")
+    if not errors:
+        return ExitCode.OK
+    bad = all(isinstance(error, (InputError, ProtocolError)) for error in errors)
+    return ExitCode.BAD_DATA if bad and len(errors) == len(items) else ExitCode.SOME_FAILED
+
+
+def _measure(item: HemisphereInput, place: ResultPlace, settings: Settings) -> list[str]:
+    """Measure one hemisphere, write its table, and return a line per slice."""
+    body = extract_body(read_label_volume(item), settings.body.changed(region="body"))
+    sheet = _read_sheet(place)
+    rows: list[list[str]] = []
+    lines = []
+    for position in settings.surrogate.positions:
+        for profile in surrogate_profiles(body, position, settings.sheet, settings.surrogate):
+            mesh = np.full(len(profile.points), np.nan)
+            if sheet is not None:
+                mesh = compare_nearby(profile.points, *sheet, MATCH_REACH)
+            rows += _rows(profile, mesh)
+            if profile.sampling == "proportional":
+                lines.append(_line(profile, mesh))
+    files.write_tsv(place.path("surrogate"), list(COLUMNS), rows)
+    described = {
+        name: {"Description": text} | ({"Units": unit} if unit else {})
+        for name, (text, unit) in COLUMNS.items()
+    }
+    files.write_json(place.path("surrogate_sidecar"), described)
+    return lines
+
+
+def _read_sheet(place: ResultPlace) -> tuple[Float, Float] | None:
+    """Read points (M, 3), RAS mm, and thickness (M,), mm, that the participant level measured."""
+    with suppress(InputError):
+        names = ("r", "a", "s", "thickness")
+        *axes, thickness = (v.ravel() for v in read_sheet(place.path("sheet"), names).values())
+        return np.stack(axes, axis=-1), thickness
+    return None
+
+
+def _rows(profile: SurrogateProfile, mesh: Float) -> Iterator[list[str]]:
+    places = (profile.fraction, profile.distance, *profile.points.T)
+    columns = (format_column(column, _DIGITS) for column in (*places, profile.thickness, mesh))
+    for number, cells in enumerate(zip(*columns, strict=True), start=1):
+        yield [f"{profile.position:g}", profile.sampling, str(number), *cells]
+
+
+def _line(profile: SurrogateProfile, mesh: Float) -> str:
+    line = f"slice at {profile.position:.0%}: mean thickness {profile.thickness.mean():.3f} mm"
+    found = agreement(profile.thickness, mesh)
+    if not found.count:
+        return f"{line} (no sheet to compare with)"
+    return (
+        f"{line}, {found.difference:+.3f} mm to the sheet, r {found.correlation:.2f},"
+        f" slope {found.slope:.2f} at {found.count} points"
+    )

@@ -1,0 +1,68 @@
+"""The counts of names and imports that the rules exclude, on sources with known counts."""
+
+import ast
+from pathlib import Path
+
+import names
+import pytest
+
+BINDINGS = """
+import other
+from dataclasses import dataclass
+
+@dataclass
+class Sheet:
+    own: int
+    rows: int = 0
+
+def found(given, *, rest=0, **_others):
+    one = given.most
+    for here, row in rest:
+        with here as there:
+            known, (why, column) = there
+    if (told := [kept for kept in one if kept]):
+        return lambda who: who
+    each.same = known[what]
+"""
+
+IMPORTS = """
+from hipsta_bids.group.stats import glm
+from hipsta_bids.io.files import (
+    read_table,
+)
+from numpy import (
+    ndarray,
+)
+if True:
+    from hipsta_bids.types import (
+        Float,
+    )
+"""
+
+
+def test_every_kind_of_binding_is_counted_and_every_use_is_not() -> None:
+    counted = " ".join(name for _, name in sorted(names.names(ast.parse(BINDINGS))))
+    assert counted == "own _others given rest one here there known why told who"
+
+
+def test_imports_of_the_package_alone_are_counted() -> None:
+    lines = [line for line, _ in names.imports(ast.parse(IMPORTS))]
+    assert lines == [3, 10]
+
+
+def test_only_a_count_above_the_budget_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "module.py").write_text(BINDINGS)
+    counts = ("names", str(tmp_path))
+    for budget, exit_code, printed in ((11, 0, False), (10, 1, True), (12, 0, True)):
+        monkeypatch.setitem(names.BUDGETS, "names", budget)
+        assert names.main(counts) == exit_code
+        assert (f"the budget in {names.__file__} is {budget}" in capsys.readouterr().out) is printed
+
+
+def test_the_list_names_file_and_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "module.py"
+    path.write_text("found = 1\nresult = found\nwhy = found\n")
+    assert names.main(["names", "--list", str(path)]) == 0
+    assert capsys.readouterr().out == f"{path}:1 found\n{path}:3 why\n"

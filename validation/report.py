@@ -1,0 +1,414 @@
+"""Validation suites: their tables with targets, their figures, and the page ``validation.md``."""
+
+import platform
+import re
+import tomllib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import wraps
+from importlib import import_module, resources
+from importlib.metadata import version
+from inspect import signature
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec
+
+from hipsta_bids import __version__
+from hipsta_bids.errors import UsageError, did_you_mean
+from hipsta_bids.io import files
+from hipsta_bids.reports.maps import new_figure
+from hipsta_bids.types import Float
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_TABLE = tomllib.loads((resources.files("validation") / "suites.toml").read_text("utf-8"))
+#: Suites in the order of the report: name, and the function that runs it.
+SUITES: Mapping[str, str] = {name: row["run"] for name, row in _TABLE.items()}
+#: Suites that measure real segmentations too, where there are any.
+WITH_LABELS = frozenset(name for name, row in _TABLE.items() if row.get("labels"))
+#: What each suite asks, as the sentence that would hold if all its targets were met.
+QUESTIONS: Mapping[str, str] = {name: row["question"] for name, row in _TABLE.items()}
+
+#: What is written, below the output folder.
+PAGE = "validation.md"
+IMAGES = "images"
+
+_DPI = 100
+#: Missed targets of a table that are named; of more the number is said.
+_NAMED = 3
+_MET, _MISSED = "#0072b2", "#e69f00"  # told apart also by those who see no red or no green
+_LIBRARIES = ("numpy", "scipy", "scikit-image", "lapy", "tetgen")
+
+#: A float is shown with the table's number of digits, a bool as met or missed, None as n/a.
+Cell = str | int | float | bool | None
+
+#: Cells by heading, with units; a target and whether it was met have headings of their own.
+Cells = Mapping[str, Cell]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """One table of the report."""
+
+    title: str
+    rows: Sequence[Cells]
+    """The longest one has all headings, in order; the others may lack cells."""
+    notes: str = ""
+    """Markdown below the table: what was measured, and how to read it."""
+    digits: int = 3
+    """Decimals of float cells; for others, format the cell as str."""
+
+    def __post_init__(self) -> None:
+        if stray := {heading for row in self.rows for heading in row} - set(self.columns):
+            raise ValueError(f"table {self.title!r}: the longest row has no {sorted(stray)}")
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Headings."""
+        longest: Cells = max(self.rows, key=len, default={})
+        return tuple(longest)
+
+    @property
+    def missed(self) -> int:
+        """Number of targets that were missed: cells that are False."""
+        return sum(cell is False for row in self.rows for cell in row.values())
+
+    @property
+    def targets(self) -> int:
+        """Number of targets: cells that are True or False."""
+        return sum(isinstance(cell, bool) for row in self.rows for cell in row.values())
+
+    @property
+    def misses(self) -> list[str]:
+        """Name the rows with missed targets, by as many first cells as tell rows apart."""
+        cells = [[show(row.get(name), self.digits) for name in self.columns] for row in self.rows]
+        size = next(
+            (
+                n
+                for n in range(1, len(self.columns))
+                if len({*(tuple(c[:n]) for c in cells)}) == len(cells)
+            ),
+            1,
+        )
+        return [
+            ", ".join(c[:size])
+            for c, row in zip(cells, self.rows, strict=True)
+            if False in (cell for cell in row.values() if isinstance(cell, bool))
+        ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Picture:
+    """One figure of the report, drawn when it is written, so that suites need no plotting."""
+
+    name: str
+    """Of the file: ``validation-<name>.png``."""
+    caption: str
+    """One sentence or two: what is shown, units; also the text for those who cannot see it."""
+    draw: "Callable[[Figure], None]"
+    """Draws into an empty figure."""
+    size: tuple[float, float] = (9.0, 4.0)
+    """Width and height, inches."""
+
+    @property
+    def file(self) -> str:
+        """Name of the file."""
+        return f"validation-{self.name}.png"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Suite:
+    """The result of one suite."""
+
+    name: str
+    """As in ``SUITES``."""
+    title: str
+    text: str = ""
+    """Markdown above the tables."""
+    tables: tuple[Table, ...] = ()
+    pictures: tuple[Picture, ...] = ()
+
+    @property
+    def targets(self) -> int:
+        """Number of targets of all tables."""
+        return sum(table.targets for table in self.tables)
+
+    @property
+    def missed(self) -> int:
+        """Number of targets that were missed."""
+        return sum(table.missed for table in self.tables)
+
+
+Given = ParamSpec("Given")
+
+Content = Table | Picture | str | Mapping[str, object]
+"""What suites are made of: tables, figures, more text, and numbers for the text."""
+
+
+def table(
+    name: str,
+) -> Callable[[Callable[Given, Iterable[Cells | str]]], Callable[Given, Table]]:
+    """Make a table of the rows that a function yields; texts that it yields follow the notes.
+
+    ``name`` is ``suite.table`` in ``suites.toml``, which has title and notes. What these name in
+    braces are constants of the function's module, or its arguments.
+    """
+    suite_name, _, key = name.partition(".")
+    texts = _TABLE[suite_name]["tables"][key]
+
+    def decorate(rows: Callable[Given, Iterable[Cells | str]]) -> Callable[Given, Table]:
+        @wraps(rows)
+        def make(*args: Given.args, **kwargs: Given.kwargs) -> Table:
+            values = rows.__globals__ | signature(rows).bind(*args, **kwargs).arguments
+            found = list(rows(*args, **kwargs))
+            return Table(
+                title=texts["title"].format_map(values),
+                rows=[row for row in found if not isinstance(row, str)],
+                notes=texts.get("notes", "").format_map(values)
+                + "".join(text for text in found if isinstance(text, str)),
+                digits=texts.get("digits", 3),
+            )
+
+        return make
+
+    return decorate
+
+
+def suite(name: str) -> Callable[[Callable[Given, Iterable[Content]]], Callable[Given, Suite]]:
+    """Make a suite of the tables, figures, texts and numbers that a function yields.
+
+    Title and text are those of ``suites.toml``; texts that are yielded follow. What the text names
+    in braces are constants of the function's module, or numbers that are yielded.
+    """
+    texts = _TABLE[name]
+
+    def decorate(run: Callable[Given, Iterable[Content]]) -> Callable[Given, Suite]:
+        @wraps(run)
+        def make(*args: Given.args, **kwargs: Given.kwargs) -> Suite:
+            found, values = list(run(*args, **kwargs)), dict(run.__globals__)
+            for numbers in found:
+                if isinstance(numbers, Mapping):
+                    values |= numbers
+            return Suite(
+                name=name,
+                title=texts["title"],
+                text=texts["text"].format_map(values)
+                + "".join(text for text in found if isinstance(text, str)),
+                tables=tuple(one for one in found if isinstance(one, Table)),
+                pictures=tuple(one for one in found if isinstance(one, Picture)),
+            )
+
+        return make
+
+    return decorate
+
+
+def picture(
+    name: str,
+) -> Callable[[Callable[Concatenate["Figure", Given], None]], Callable[Given, Picture]]:
+    """Make a figure of a function that draws into an empty one, with the texts of its suite."""
+    texts = _TABLE[name]["picture"]
+
+    def decorate(
+        draw: Callable[Concatenate["Figure", Given], None],
+    ) -> Callable[Given, Picture]:
+        def make(*args: Given.args, **kwargs: Given.kwargs) -> Picture:
+            width, height = texts["size"]
+            return Picture(
+                name=name,
+                caption=texts["caption"],
+                draw=lambda figure: draw(figure, *args, **kwargs),
+                size=(width, height),
+            )
+
+        return make
+
+    return decorate
+
+
+def run_suite(name: str, *, full: bool, labels: Path | None = None) -> Suite:
+    """Run one suite."""
+    module, function = SUITES[name].split(":")
+    run: Callable[..., Suite] = getattr(import_module(f"validation.{module}"), function)
+    return run(full, labels) if name in WITH_LABELS else run(full)
+
+
+def validate(
+    out: Path,
+    *,
+    full: bool,
+    names: Sequence[str] = (),
+    labels: Path | None = None,
+    report: Callable[[str], None] = lambda _: None,
+) -> int:
+    """Run suites, write their report, and count the targets that were missed."""
+    unknown = [name for name in names if name not in SUITES]
+    if unknown:
+        raise UsageError(
+            f"validate: suite {unknown[0]!r} is unknown; choose from {', '.join(SUITES)}"
+            f"{did_you_mean(unknown, SUITES)}",
+            reason="unknown-suite",
+        )
+    files.check_writable(out)
+    suites, missed = [], 0
+    for name in names or SUITES:
+        suite = run_suite(name, full=full, labels=labels)
+        suites.append(suite)
+        missed += suite.missed
+        report(f"{suite.title}: {suite.targets - suite.missed} of {suite.targets} targets met")
+    for picture in (overview(suites), *(p for suite in suites for p in suite.pictures)):
+        files.write_bytes(out / IMAGES / picture.file, render(picture))
+    files.write_text(out / PAGE, page(suites, full=full, labels=labels is not None))
+    return missed
+
+
+def page(suites: Sequence[Suite], *, full: bool, labels: bool = False) -> str:
+    """Write the page in Markdown."""
+    names = [suite.name for suite in suites]
+    command = "hipsta-bids validate" + (" --full" if full else "")
+    command += "" if names == list(SUITES) else " --suite " + " ".join(names)
+    command += " --labels BIDS_DIR" if labels else ""
+    python = f"Python {platform.python_version()}"
+    libraries = ", ".join([python, *(f"{name} {version(name)}" for name in _LIBRARIES)])
+    counts: list[Cells] = [
+        {"suite": one.title, "table": t.title, "targets": t.targets, "missed": t.missed}
+        for one in suites
+        for t in one.tables or (Table(title="left out", rows=()),)
+    ]
+    intro = (
+        f"Written by `{command}` of hipsta_bids {__version__} ({libraries}). The same command"
+        " with the same versions gives the same numbers."
+    )
+    parts = [
+        f"<!-- Written by `{command}`; do not edit, run it again. -->",
+        "# Validation",
+        opening(suites),
+        intro,
+        markdown(Table(title="Overview", rows=counts)),
+        *(_section(suite) for suite in suites),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def opening(suites: Sequence[Suite]) -> str:
+    """Say from the tables alone what was asked, what holds, and what does not."""
+    targets, missed = (sum(getattr(s, name) for s in suites) for name in ("targets", "missed"))
+    judged = [suite for suite in suites if suite.targets]
+    holds = [f"{_asked(suite)} ({suite.targets})" for suite in judged if not suite.missed]
+    short = [_shortfall(suite) for suite in judged if suite.missed]
+    total = (
+        f"**{targets - missed} of {targets} targets are met.** Each line is what was asked, with"
+        " its number of targets, and leads to the tables."
+    )
+    parts = [
+        total,
+        *(["What holds:", _bullets(holds)] if holds else []),
+        *(["What does not hold everywhere:", _bullets(short)] if short else []),
+        _figure(overview(suites)),
+    ]
+    return "\n\n".join(parts)
+
+
+def _bullets(lines: Sequence[str]) -> str:
+    return "\n".join(f"- {line}" for line in lines)
+
+
+def _asked(suite: Suite) -> str:
+    anchor = re.sub(r"[^a-z0-9]+", "-", suite.title.lower())
+    return f"[{QUESTIONS.get(suite.name, suite.title)}](#{anchor})"
+
+
+def _shortfall(suite: Suite) -> str:
+    parts = []
+    for table in suite.tables:
+        if table.missed:
+            title = table.title.split(",")[0].split(":")[0]
+            names = table.misses
+            which = f": {'; '.join(names)}" if len(names) <= _NAMED else ""
+            parts.append(f"{title} ({table.missed} of {table.targets}{which})")
+    met = f"{suite.targets - suite.missed} of {suite.targets}"
+    return f"{_asked(suite)}: {met}. Missed: {', '.join(parts)}."
+
+
+def overview(suites: Sequence[Suite]) -> Picture:
+    """Draw the share of targets that each suite meets."""
+    judged = [suite for suite in suites if suite.targets]
+
+    def draw(figure: "Figure") -> None:
+        axis = figure.subplots()
+        for place, suite in enumerate(judged):
+            share = 100 * (1 - suite.missed / suite.targets)
+            axis.barh(place, share, color=_MET)
+            axis.barh(place, 100 - share, left=share, color=_MISSED)
+            axis.text(101, place, f"{suite.targets - suite.missed} of {suite.targets}", va="center")
+        axis.set_yticks(range(len(judged)), [suite.title for suite in judged])
+        axis.invert_yaxis()
+        axis.set_xlim(0, 100)
+        axis.set_xlabel("targets met, percent")
+        axis.spines[["top", "right"]].set_visible(False)
+
+    caption = "Share of targets that are met (blue) and missed (orange), with their numbers."
+    return Picture(name="overview", caption=caption, draw=draw, size=(8.0, 0.6 + 0.3 * len(judged)))
+
+
+def _figure(picture: Picture) -> str:
+    return f"![{picture.caption}]({IMAGES}/{picture.file})\n\n*{picture.caption}*"
+
+
+def _section(suite: Suite) -> str:
+    text = [suite.text.strip()] if suite.text else []
+    shown = [*map(markdown, suite.tables), *map(_figure, suite.pictures)]
+    return "\n\n".join([f"## {suite.title}", *text, *shown])
+
+
+def markdown(table: Table) -> str:
+    """Write one table in Markdown."""
+    columns = table.columns
+    lines = [
+        f"**{table.title}**",
+        "",
+        _line(columns),
+        _line(["---"] * len(columns)),
+        *(_line([show(row.get(name), table.digits) for name in columns]) for row in table.rows),
+    ]
+    return "\n".join([*lines, "", table.notes.strip()] if table.notes else lines)
+
+
+def _line(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |"
+
+
+def show(cell: Cell, digits: int) -> str:
+    """Format one cell."""
+    if cell is None or cell != cell:  # noqa: PLR0124  (NaN)
+        return "n/a"
+    if isinstance(cell, bool):
+        return "yes" if cell else "**no**"
+    return f"{cell:.{digits}f}" if isinstance(cell, float) else str(cell)
+
+
+def render(picture: Picture) -> bytes:
+    """Draw a figure as PNG, without anything that changes from run to run."""
+    figure = new_figure(picture.size, layout="compressed")
+    picture.draw(figure)
+    data = BytesIO()
+    figure.savefig(data, format="png", dpi=_DPI, metadata={"Software": None})
+    return data.getvalue()
+
+
+def show_map(
+    axis: "Axes",
+    values: Float,
+    title: str,
+    *,
+    ends: tuple[str, str] = ("posterior", "anterior"),
+    **style: Any,  # noqa: ANN401  (what matplotlib takes)
+) -> Any:  # noqa: ANN401  (matplotlib's mappables have no common public type)
+    """Draw a map of the sheet (Nx, Ny), medial to lateral and ``ends`` of y."""
+    image = axis.imshow(values.T, origin="lower", aspect="auto", **style)
+    axis.set_title(title)
+    axis.set_xticks([0, values.shape[0] - 1], ["medial", "lateral"])
+    axis.set_yticks([0, values.shape[1] - 1], list(ends))
+    return image
