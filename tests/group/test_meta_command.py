@@ -12,13 +12,15 @@ from small_cohorts import place_of, write_dataset
 
 from hipsta_bids.cli.main import main
 from hipsta_bids.group.output import write
-from hipsta_bids.group.questions import analysis, consortium
+from hipsta_bids.group.questions import analysis
 from hipsta_bids.io import files
 
 SITES = {
     "a": [f"{i:02d}" for i in (*range(1, 9), *range(17, 24))],
     "b": [f"{i:02d}" for i in (*range(9, 17), *range(24, 31))],
 }
+#: What draws figures, which most tests here go without.
+DRAW = write.write_figures
 EVIL = "<script>document.title='owned'</script>"
 
 
@@ -27,7 +29,7 @@ def _only_what_counts():
     """Figures and classifiers take longer than all else."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(write, "draw_figures", lambda *_: iter(()))
-        patch.setattr(consortium, "write_figures", lambda *_: [])
+        patch.setattr(write, "write_figures", lambda *_: [])
         patch.setattr(analysis, "classify_groups", lambda *_: ([], []))
         yield
 
@@ -72,7 +74,7 @@ def combined(plain, tmp_path_factory):
     """Results of both, with figures."""
     out = tmp_path_factory.mktemp("meta")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(consortium, "write_figures", write.write_figures)
+        patch.setattr(write, "write_figures", DRAW)
         assert main(["meta", *map(str, plain), str(out)]) == 0
     return out
 
