@@ -19,7 +19,8 @@ from hipsta_bids.group.design.model import ModelRequest
 from hipsta_bids.group.design.settings import GlmSettings
 from hipsta_bids.group.output import write
 from hipsta_bids.group.output.tables import COLUMNS
-from hipsta_bids.group.questions import analysis, study
+from hipsta_bids.group.questions import study
+from hipsta_bids.group.stats import arrays
 from hipsta_bids.group.stats.glm import fit_points
 from hipsta_bids.io import files
 
@@ -355,7 +356,7 @@ def test_same_run_gives_the_same_files(results, dataset, quick):
 
 def test_large_cohorts_take_single_precision_and_no_copies(results, dataset, quick, monkeypatch):
     """Only numbers too small for the tables' decimals change."""
-    for module in (analysis, read):
+    for module in (arrays, read):
         monkeypatch.setattr(module, "MOST_KEPT", 3)
     data, out = dataset
     assert main([str(data), str(out), "group", *quick, "--name", "large", "--no-reports"]) == 0

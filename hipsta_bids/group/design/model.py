@@ -14,26 +14,7 @@ from formulaic import Formula
 from scipy.linalg import null_space
 
 from hipsta_bids.errors import ModelError, UsageError
-from hipsta_bids.group.design.formula import (
-    INTERCEPT,
-    Contrast,
-    ContrastSpec,
-    ModelSpec,
-    as_factor,
-    check_left,
-    check_names,
-    check_spelling,
-    coding_note,
-    in_order,
-    left_side,
-    level_name,
-    listed,
-    model_from_shortcut,
-    parse_model,
-    rows_by_lack,
-    set_levels,
-    typed,
-)
+from hipsta_bids.group.design import formula as formulas
 from hipsta_bids.group.design.grammar import CONTEXT, closed_formula
 from hipsta_bids.group.design.settings import DefaultModelSettings, DesignSettings, GroupSettings
 from hipsta_bids.io import files
@@ -84,18 +65,18 @@ def find_groups(
     by_name = {str(column).casefold(): str(column) for column in table.columns}
     for wanted in settings.model.group_columns:
         column = by_name.get(wanted.casefold())
-        values = typed(table[column]).dropna() if column else None
+        values = formulas.typed(table[column]).dropna() if column else None
         if column is None or values is None or values.nunique() < 2:  # noqa: PLR2004 -- two groups
             continue
-        counts = Counter(level_name(value) for value in values)
-        check_spelling(counts, column)
+        counts = Counter(formulas.level_name(value) for value in values)
+        formulas.check_spelling(counts, column)
         first = reference or _reference(counts, settings.model)
         if first not in counts:
             raise ModelError(
                 f"model: no participant has {column!r} {first!r}; there are"
                 f" {', '.join(sorted(counts))}"
             )
-        others = sorted((level for level in counts if level != first), key=in_order)
+        others = sorted((level for level in counts if level != first), key=formulas.in_order)
         return Groups(column, (first, *others))
     return None
 
@@ -122,7 +103,7 @@ def default_formula(
     by_name = {str(column).casefold(): str(column) for column in table.columns}
     terms = [first or "1"]
     for name in (by_name[name.casefold()] for name in names if name.casefold() in by_name):
-        if len(typed(table[name]).dropna().unique()) > 1:
+        if len(formulas.typed(table[name]).dropna().unique()) > 1:
             shape = settings.model.age if name.casefold() in _AGES else "linear"
             bent = {"quadratic": f"poly({name}, 2)"}
             bent["spline"] = f'cr({name}, df=3, constraints="center")'
@@ -155,7 +136,7 @@ def empty_covariates(table: pd.DataFrame, settings: GroupSettings) -> list[str]:
     """Name covariates of the default model whose column holds nothing."""
     wanted = {name.casefold() for name in settings.model.covariates}
     named = [str(name) for name in table.columns if str(name).casefold() in wanted]
-    return [name for name in named if typed(table[name]).isna().all()]
+    return [name for name in named if formulas.typed(table[name]).isna().all()]
 
 
 @dataclass(frozen=True)
@@ -222,18 +203,18 @@ class ModelRequest:
     """Folder of the results; else made from the formula."""
 
 
-def wanted_measures(request: ModelRequest, listed: tuple[str, ...]) -> tuple[str, ...]:
+def wanted_measures(request: ModelRequest, options: tuple[str, ...]) -> tuple[str, ...]:
     """Names of the measures that are asked for, by option or on the left of a formula."""
     if request.file is not None:
-        left = parse_model(files.read_json(request.file)).measures
+        left = formulas.parse_model(files.read_json(request.file)).measures
     else:
-        left = left_side(request.formula or "")
-    if listed and left and set(listed) != set(left):
+        left = formulas.left_side(request.formula or "")
+    if options and left and set(options) != set(left):
         raise UsageError(
-            f"--measures {' '.join(listed)} and {' + '.join(left)} ~ in the formula differ; give"
+            f"--measures {' '.join(options)} and {' + '.join(left)} ~ in the formula differ; give"
             " one"
         )
-    return listed or left
+    return options or left
 
 
 def choose_model(
@@ -243,7 +224,7 @@ def choose_model(
     *,
     comparison: Comparison | None = None,
     visits: VisitTime | None = None,
-) -> tuple[Mapping[str, Any], ModelSpec, Groups | None, dict[str, str]]:
+) -> tuple[Mapping[str, Any], formulas.ModelSpec, Groups | None, dict[str, str]]:
     """Return the model as a BIDS Stats Model and read, the groups, and reference levels.
 
     The reference of the groups is the user's, else that which ``find_groups`` finds; it is the
@@ -256,7 +237,7 @@ def choose_model(
     document = model_document(
         request, table, groups, settings, comparison=comparison, visits=visits
     )
-    model = parse_model(document)
+    model = formulas.parse_model(document)
     if groups is not None and groups.column in closed_formula(model.formula).names:
         references.setdefault(groups.column, groups.reference)
     return document, model, groups, references
@@ -283,12 +264,14 @@ def model_document(
         contrasts = list(request.contrasts)
         if not contrasts and groups is not None and groups.column in formula:
             contrasts = groups.contrasts()
-        return model_from_shortcut(formula, contrasts, request.name or folder_name(formula))
+        return formulas.model_from_shortcut(
+            formula, contrasts, request.name or folder_name(formula)
+        )
     comparison = comparison or Comparison()
     within = comparison.longitudinal or comparison.pair or comparison.asymmetry
     if groups is None and not within:
         own = [str(name) for name in table.columns if name not in {PARTICIPANT, SESSION}]
-        there = f"there are {listed(own)}" if own else "BIDS_DIR has no participants.tsv"
+        there = f"there are {formulas.listed(own)}" if own else "BIDS_DIR has no participants.tsv"
         raise ModelError(
             f"no column tells groups ({', '.join(settings.model.group_columns)}) with two levels;"
             f' {there}; or give a model by --formula "age + sex" --contrast age'
@@ -304,7 +287,7 @@ def model_document(
     bent = [name for name in closed_formula(formula).names if name.casefold() in _AGES]
     bent = [] if settings.model.age == "linear" else bent
     contrasts = list(request.contrasts) or default_contrasts(groups, time, bent)
-    return model_from_shortcut(formula, contrasts, request.name or folder_name(formula))
+    return formulas.model_from_shortcut(formula, contrasts, request.name or folder_name(formula))
 
 
 def folder_name(formula: str, measures: tuple[str, ...] = ()) -> str:
@@ -328,7 +311,7 @@ class Design:
     """Labels of rows left out, by the variable that they lack (the first one)."""
     references: Mapping[str, str]
     """Reference level of each factor."""
-    contrasts: tuple[Contrast, ...]
+    contrasts: tuple[formulas.Contrast, ...]
     notes: Mapping[str, str] = field(default_factory=dict)
     """What to know about the coding of variables, by their names."""
     levels: Mapping[str, Sequence[str]] = field(default_factory=dict)
@@ -336,24 +319,27 @@ class Design:
 
 
 def build_design(
-    table: pd.DataFrame, model: ModelSpec, settings: DesignSettings, references: Mapping[str, str]
+    table: pd.DataFrame,
+    model: formulas.ModelSpec,
+    settings: DesignSettings,
+    references: Mapping[str, str],
 ) -> Design:
     """Make the design matrix of a model, or say what keeps it from being fitted."""
     closed = closed_formula(model.formula)
     formula = _read_formula(closed.text)
     names = sorted(closed.names)
-    check_names(names, table.columns)
+    formulas.check_names(names, table.columns)
     used = table[names].copy()
     for name in names:
-        column = as_factor(used[name]) if name in closed.factors else used[name]
-        used[name] = typed(column)
+        column = formulas.as_factor(used[name]) if name in closed.factors else used[name]
+        used[name] = formulas.typed(column)
     complete = used.notna().all(axis=1).to_numpy()
-    dropped = rows_by_lack(used, complete)
+    dropped = formulas.rows_by_lack(used, complete)
     used = used.loc[complete].copy()
-    check_left(used, dropped)
+    formulas.check_left(used, dropped)
     numeric = used.select_dtypes("number")
-    notes = {name: coding_note(numeric[name]) for name in map(str, numeric.columns)}
-    chosen = set_levels(used, references, settings)
+    notes = {name: formulas.coding_note(numeric[name]) for name in map(str, numeric.columns)}
+    chosen = formulas.set_levels(used, references, settings)
     for name in map(str, numeric.columns):
         _check_possible(numeric[name], name.casefold())
     try:
@@ -390,13 +376,13 @@ class _Terms:
     levels: Mapping[str, list[str]]
     matrix: Float
 
-    def contrast(self, spec: ContrastSpec) -> Contrast:
+    def contrast(self, spec: formulas.ContrastSpec) -> formulas.Contrast:
         variable = re.fullmatch(rf"{_NONLINEAR}\(`?([^`]+)`?\)", spec.conditions[0])
         if variable and len(spec.conditions) == 1:
-            return Contrast(spec.name, self._nonlinear(variable[1], spec.name))
+            return formulas.Contrast(spec.name, self._nonlinear(variable[1], spec.name))
         rows = np.array([self._row(name, spec.name) for name in spec.conditions])
         weights: Float = np.array(spec.weights) @ rows
-        return Contrast(spec.name, weights)
+        return formulas.Contrast(spec.name, weights)
 
     def _nonlinear(self, variable: str, contrast: str) -> Float:
         """Weights that are zero where the columns of a variable make a line of it.
@@ -444,7 +430,7 @@ class _Terms:
                 *(f"{f}[{x}]" for f, levels in self.levels.items() for x in levels),
             ]
             near = difflib.get_close_matches(name, known, n=1)
-            hint = f"did you mean {near[0]}?" if near else f"known are {listed(known)}"
+            hint = f"did you mean {near[0]}?" if near else f"known are {formulas.listed(known)}"
             raise ModelError(f"contrast {contrast!r}: nothing is called {name!r}; {hint}")
         # The mean of the model over all rows if every one had this level.
         moved = self.table.copy()
@@ -472,17 +458,21 @@ def _check_possible(values: pd.Series, name: str) -> None:
     if name in _AGES:  # in months, say, most are larger
         bad |= (numbers > _OLDEST) & (middle <= _OLDEST)
     if bad.any():
-        found = listed(f"{row} ({value:g})" for row, value in values[bad].items())
+        found = formulas.listed(f"{row} ({value:g})" for row, value in values[bad].items())
         raise ModelError(
             f"model: column {values.name!r} has {found}, which nobody has; correct them, or mark"
             " them n/a"
         )
 
 
-def _dummies(columns: tuple[str, ...], test: str | None) -> list[ContrastSpec]:
+def _dummies(columns: tuple[str, ...], test: str | None) -> list[formulas.ContrastSpec]:
     if test is None:
         return []
-    return [ContrastSpec(one, (one,), ((1.0,),), test) for one in columns if one != INTERCEPT]
+    return [
+        formulas.ContrastSpec(one, (one,), ((1.0,),), test)
+        for one in columns
+        if one != formulas.INTERCEPT
+    ]
 
 
 def _read_formula(text: str) -> Formula:
@@ -501,8 +491,8 @@ def _check_matrix(
     bad = np.flatnonzero(~np.isfinite(matrix).all(axis=1))
     if len(bad):
         raise ModelError(
-            f"model: the formula has no value for rows {listed(rows.take(bad))}; a logarithm of"
-            " zero or less?"
+            f"model: the formula has no value for rows {formulas.listed(rows.take(bad))}; a"
+            " logarithm of zero or less?"
         )
     if len(matrix) - len(columns) < settings.min_residual_df:
         raise ModelError(
@@ -522,8 +512,8 @@ def _check_matrix(
         if rest < DEPENDENCE:
             involved = [columns[i] for i in np.flatnonzero(np.abs(weights) > DEPENDENCE)]
             raise ModelError(
-                f"model: column {columns[last]!r} is a combination of {listed(involved)}; leave one"
-                " of them out"
+                f"model: column {columns[last]!r} is a combination of {formulas.listed(involved)};"
+                " leave one of them out"
             )
 
 

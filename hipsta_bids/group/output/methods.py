@@ -11,11 +11,7 @@ from hipsta_bids import __version__
 from hipsta_bids.derivatives.dataset import references
 from hipsta_bids.group.cohort.data import Cohort
 from hipsta_bids.group.cohort.read import LEAST_SHARE
-from hipsta_bids.group.design.settings import (
-    GroupSettings,
-    MultiplicitySettings,
-    RetestSettings,
-)
+from hipsta_bids.group.design import settings as group_settings
 from hipsta_bids.group.output.results import Analysis, RetestCohort, Scores
 from hipsta_bids.group.output.saved import NormsFile
 from hipsta_bids.group.stats.clusters import TFCE_EXTENT, TFCE_HEIGHT
@@ -72,7 +68,7 @@ class Citations:
 def methods_text(
     cohort: Cohort,
     analysis: Analysis,
-    settings: GroupSettings,
+    settings: group_settings.GroupSettings,
     n_out: int,
     *,
     others: Sequence[str] = (),
@@ -137,7 +133,9 @@ def _sample(
     return f"{text}. {n_out} hemispheres or visits were left out; the table of exclusions says why."
 
 
-def _registration(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], str]) -> str:
+def _registration(
+    analysis: Analysis, settings: group_settings.GroupSettings, cite: Callable[[str], str]
+) -> str:
     how = settings.registration
     if how.align == "none":
         return "Maps were not registered to each other."
@@ -226,7 +224,9 @@ def _harmonization(analysis: Analysis, cite: Callable[[str], str]) -> list[str]:
     return [text]
 
 
-def _models(analysis: Analysis, settings: GroupSettings, cite: Callable[[str], str]) -> str:
+def _models(
+    analysis: Analysis, settings: group_settings.GroupSettings, cite: Callable[[str], str]
+) -> str:
     names = ", ".join(contrast.name for contrast in analysis.design.contrasts)
     levels = ", ".join(f"{name} {level}" for name, level in analysis.design.references.items())
     errors = " with HC3 standard errors" if settings.glm.covariance == "hc3" else ""
@@ -279,7 +279,7 @@ def _slopes(analysis: Analysis, cite: Callable[[str], str]) -> str:
     )
 
 
-def _nonlinear(analysis: Analysis, settings: GroupSettings) -> str:
+def _nonlinear(analysis: Analysis, settings: group_settings.GroupSettings) -> str:
     """Say how age was modeled, and in how many summary measures it bends."""
     names = [one.name for one in analysis.design.contrasts if one.name.endswith(" nonlinear")]
     if not names or settings.model.age == "linear":
@@ -296,7 +296,9 @@ def _nonlinear(analysis: Analysis, settings: GroupSettings) -> str:
     )
 
 
-def _correction(how: MultiplicitySettings, cite: Callable[[str], str], analysis: Analysis) -> str:
+def _correction(
+    how: group_settings.MultiplicitySettings, cite: Callable[[str], str], analysis: Analysis
+) -> str:
     family = _FAMILIES[how.scope]
     if how.method in PERMUTATIONS:
         statistic = "the largest absolute statistic"
@@ -328,7 +330,7 @@ def _correction(how: MultiplicitySettings, cite: Callable[[str], str], analysis:
     return f"{discovery_text(how, cite)}."
 
 
-def discovery_text(how: MultiplicitySettings, cite: Callable[[str], str]) -> str:
+def discovery_text(how: group_settings.MultiplicitySettings, cite: Callable[[str], str]) -> str:
     """Word how the false discovery rate was held."""
     return (
         f"The false discovery rate was held at {how.alpha:g} by {PROCEDURES[how.method]}"
@@ -336,7 +338,7 @@ def discovery_text(how: MultiplicitySettings, cite: Callable[[str], str]) -> str
     )
 
 
-def _joint(settings: GroupSettings, cite: Callable[[str], str]) -> str:
+def _joint(settings: group_settings.GroupSettings, cite: Callable[[str], str]) -> str:
     how, joint = settings.multiplicity, settings.joint
     by = (
         "minus twice the sum of the logarithms of their two-sided p-values (Fisher)"
@@ -419,7 +421,7 @@ def norms_text(
     return cite.page(paragraphs, file.region)
 
 
-def _asymmetry(analysis: Analysis, settings: GroupSettings, cite: Citations) -> str:
+def _asymmetry(analysis: Analysis, settings: group_settings.GroupSettings, cite: Citations) -> str:
     unit = "their own unit"
     if (relative := settings.asymmetry.relative) and not analysis.comparison.pair:
         ratio = f"{' and '.join(relative)} as (L - R) / ((L + R) / 2) {cite('asymmetry')}"
@@ -430,7 +432,7 @@ def _asymmetry(analysis: Analysis, settings: GroupSettings, cite: Citations) -> 
     )
 
 
-def _normative(scores: Scores, settings: GroupSettings, source: str) -> str:
+def _normative(scores: Scores, settings: group_settings.GroupSettings, source: str) -> str:
     return (
         f"Each participant was scored against {scores.n_reference} with {scores.factor}"
         f" {scores.level}: w is the difference from what a linear model `{scores.formula}` of these"
@@ -441,7 +443,9 @@ def _normative(scores: Scores, settings: GroupSettings, source: str) -> str:
     )
 
 
-def _classification(analysis: Analysis, settings: GroupSettings, cite: Citations) -> str:
+def _classification(
+    analysis: Analysis, settings: group_settings.GroupSettings, cite: Citations
+) -> str:
     how = settings.classification
     delong, firth, snell = map(cite, ("delong", "firth", "snell"))
     separated = sum(pair.comparison.separated for _, _, pair in analysis.pairs)
@@ -479,7 +483,7 @@ Cite = Callable[[str], str]
 
 def power_text(
     effect: TrialEffect,
-    settings: GroupSettings,
+    settings: group_settings.GroupSettings,
     source: Callable[[Cite], str],
     cite: Cite,
 ) -> str:
@@ -514,7 +518,9 @@ def power_text(
     )
 
 
-def retest_text(one: RetestCohort, settings: RetestSettings, cite: Callable[[str], str]) -> str:
+def retest_text(
+    one: RetestCohort, settings: group_settings.RetestSettings, cite: Callable[[str], str]
+) -> str:
     """Word how agreement was measured."""
     return (
         f"Agreement between {len(one.sessions)} sessions of {len(one.participants)} participants"

@@ -16,17 +16,13 @@ from hipsta_bids.group.design.grammar import closed_formula
 from hipsta_bids.group.design.model import Comparison, Design, Groups
 from hipsta_bids.group.output.saved import SavedEffects, templates_to_json
 from hipsta_bids.group.stats import arrays
+from hipsta_bids.group.stats import registration as alignment
 from hipsta_bids.group.stats.arrays import Bool, Float, Int
 from hipsta_bids.group.stats.classify import PairComparison
 from hipsta_bids.group.stats.combat import ARRAYS, SiteEffects, SiteMoments, Visits
 from hipsta_bids.group.stats.glm import FittedMaps, PointTest, PointwiseFit, RowModel
 from hipsta_bids.group.stats.inference import Discoveries, MapKey
 from hipsta_bids.group.stats.norms import NormativeScores
-from hipsta_bids.group.stats.registration import (
-    GroupShift,
-    Registration,
-    ShiftDifference,
-)
 from hipsta_bids.io.foreign import as_nested
 from hipsta_bids.types import PARTICIPANT, SESSION
 
@@ -142,12 +138,12 @@ class MeasureFit:
 class SideResult:
     """Sheets of one hemisphere, registered."""
 
-    registration: Registration
+    registration: alignment.Registration
     registered: arrays.SideMaps
     """Maps of all visits that were chosen."""
-    shifts: Mapping[str, GroupShift]
+    shifts: Mapping[str, alignment.GroupShift]
     """Shifts by group; empty without groups."""
-    difference: ShiftDifference | None
+    difference: alignment.ShiftDifference | None
     """Between the groups, if there are groups."""
 
 
@@ -225,7 +221,7 @@ def profiles_of(maps: Mapping[str, Float], name: str, own: Bool) -> Float:
     )
 
 
-def digests(registrations: Mapping[str, Registration]) -> dict[str, str]:
+def digests(registrations: Mapping[str, alignment.Registration]) -> dict[str, str]:
     """Digest of the template by hemisphere, or ``none`` without registration."""
     found = {}
     for hemi, one in registrations.items():

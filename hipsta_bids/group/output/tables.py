@@ -11,15 +11,7 @@ import pandas as pd
 from hipsta_bids.group.cohort.data import Cohort, hemispheres, participants_with, summary_values
 from hipsta_bids.group.design.formula import file_label
 from hipsta_bids.group.design.settings import GroupSettings
-from hipsta_bids.group.output import results
-from hipsta_bids.group.output.columns import (
-    effect_columns,
-    frame_of,
-    overview_row,
-    peak_table,
-    point_columns,
-    test_columns,
-)
+from hipsta_bids.group.output import columns, results
 from hipsta_bids.group.stats.arrays import Float, describe_known, mean_of_known
 from hipsta_bids.group.stats.classify import ClassifierResult
 from hipsta_bids.group.stats.clusters import edges_of
@@ -110,8 +102,10 @@ def _stacked(blocks: Iterable[Columns]) -> pd.DataFrame:
 def _statistics(cohort: Cohort, analysis: results.Analysis) -> Iterator[Named]:
     for key, test, found in results.tested_maps(analysis):
         one = analysis.fitted[key.hemi]
-        columns = point_columns(test, found, frame_of(cohort, one), one.fits[key.measure].n)
-        yield map_name(key.hemi, key.measure, key.contrast), pd.DataFrame(columns)
+        values = columns.point_columns(
+            test, found, columns.frame_of(cohort, one), one.fits[key.measure].n
+        )
+        yield map_name(key.hemi, key.measure, key.contrast), pd.DataFrame(values)
 
 
 def _peaks(
@@ -120,14 +114,14 @@ def _peaks(
     for key, test, found in results.tested_maps(analysis):
         one = analysis.fitted[key.hemi]
         edges = edges_of(one.maps, settings.multiplicity.neighbors)
-        peaks = peak_table(test, found, frame_of(cohort, one), edges)
+        peaks = columns.peak_table(test, found, columns.frame_of(cohort, one), edges)
         yield {"measure": key.measure, "hemi": key.hemi, **peaks}
 
 
 def _means(cohort: Cohort, analysis: results.Analysis) -> Iterator[Columns]:
     """Means and standard deviations of groups at each point of the maps that were fitted."""
     for hemi, one in analysis.fitted.items():
-        frame = frame_of(cohort, one)
+        frame = columns.frame_of(cohort, one)
         rows = results.rows_of(analysis, one)
         people = rows[PARTICIPANT].to_numpy()
         members = results.members_of(analysis, rows)
@@ -173,7 +167,7 @@ def _overview(analysis: results.Analysis) -> pd.DataFrame:
     """One row per map: how many points survive, and at which p."""
     return pd.DataFrame(
         [
-            overview_row(map_name(key.hemi, key.measure, key.contrast), key, found)
+            columns.overview_row(map_name(key.hemi, key.measure, key.contrast), key, found)
             for key, found in analysis.found.items()
         ]
     )
@@ -191,9 +185,9 @@ def _measures(cohort: Cohort, analysis: results.Analysis) -> Iterator[Columns]:
                 "test": test.kind,
                 "n": one.participants,
                 "visits": one.fit.n,
-                **test_columns(test),
+                **columns.test_columns(test),
                 "p_fdr": np.nan,
-                **effect_columns(test),
+                **columns.effect_columns(test),
             }
 
 

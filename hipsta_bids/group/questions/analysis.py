@@ -9,79 +9,26 @@ import numpy as np
 from scipy import special
 
 from hipsta_bids.errors import ModelError
-from hipsta_bids.group.cohort.data import (
-    Cohort,
-    Measures,
-    asymmetry_maps,
-    compare_sessions,
-    modeled_table,
-)
+from hipsta_bids.group.cohort import data
 from hipsta_bids.group.cohort.read import leave_rare
+from hipsta_bids.group.design import model as designs
 from hipsta_bids.group.design.formula import ModelSpec
 from hipsta_bids.group.design.grammar import closed_formula
-from hipsta_bids.group.design.model import (
-    BOTH,
-    Comparison,
-    Design,
-    Groups,
-    asymmetry_name,
-    build_design,
-)
 from hipsta_bids.group.design.settings import GlmSettings, GroupSettings
+from hipsta_bids.group.output import results
 from hipsta_bids.group.output.joint import JointMap
-from hipsta_bids.group.output.results import (
-    Analysis,
-    Harmonization,
-    SideResult,
-    SitePlan,
-    members_of,
-    rows_of,
-)
 from hipsta_bids.group.output.saved import SavedEffects
-from hipsta_bids.group.questions.harmonize import (
-    harmonize_cohort,
-    plan_sites,
-    without_tests_of_sites,
-)
+from hipsta_bids.group.questions import harmonize
 from hipsta_bids.group.questions.scores import score_cohort
 from hipsta_bids.group.questions.summaries import classify_groups, fit_summaries
-from hipsta_bids.group.stats.arrays import (
-    MOST_KEPT,
-    Float,
-    SideMaps,
-    WarpedLabels,
-    WarpedMaps,
-    describe_known,
-    return_memory,
-)
+from hipsta_bids.group.stats import arrays, inference, registration
 from hipsta_bids.group.stats.clusters import edges_of
 from hipsta_bids.group.stats.glm import FittedMaps, RowModel, fit_maps, with_mean
-from hipsta_bids.group.stats.inference import (
-    PERMUTATIONS,
-    Discoveries,
-    MapKey,
-    check_permutations,
-    correct,
-    correct_joint,
-)
 from hipsta_bids.group.stats.mixed import longitudinal_model
-from hipsta_bids.group.stats.registration import (
-    GroupShift,
-    Registration,
-    mean_profiles,
-    register,
-    register_to,
-    shift_by_group,
-    shift_difference,
-)
 from hipsta_bids.group.stats.warps import Template, warp_labels, warp_values
 from hipsta_bids.progress import each, tell
+from hipsta_bids.reports import group_tables
 from hipsta_bids.reports.display import parts_of
-from hipsta_bids.reports.group_tables import (
-    BOTH_SIDES,
-    JOINT,
-    SIDES,
-)
 from hipsta_bids.types import PARTICIPANT
 
 #: Ratio of variances of a difference, true to that with equal ones, of which a note is made: then
@@ -90,19 +37,19 @@ _UNEQUAL = 1.3
 
 
 def analyze_cohort(
-    cohort: Cohort,
+    cohort: data.Cohort,
     model: ModelSpec,
-    groups: Groups | None,
+    groups: designs.Groups | None,
     settings: GroupSettings,
     *,
-    measures: Measures,
+    measures: data.Measures,
     references: Mapping[str, str],
-    comparison: Comparison | None = None,
+    comparison: designs.Comparison | None = None,
     time: str | None = None,
     icv: str | None = None,
     templates: Mapping[str, Template] | None = None,
     site_effects: SavedEffects | None = None,
-) -> Analysis:
+) -> results.Analysis:
     """Register, fit a model at each point and to each summary measure, and classify.
 
     Parameters
@@ -135,9 +82,9 @@ def analyze_cohort(
     ModelError
         If the model cannot be fitted to these data.
     """
-    comparison = comparison or Comparison()
-    table = modeled_table(cohort.table, comparison)
-    plan = plan_sites(
+    comparison = comparison or designs.Comparison()
+    table = data.modeled_table(cohort.table, comparison)
+    plan = harmonize.plan_sites(
         cohort,
         model,
         settings,
@@ -146,17 +93,17 @@ def analyze_cohort(
         icv=icv,
         saved=site_effects,
     )
-    design = build_design(table, model, settings.design, references)
+    design = designs.build_design(table, model, settings.design, references)
     if plan is not None:
-        design = without_tests_of_sites(plan, design, model, comparison)
+        design = harmonize.without_tests_of_sites(plan, design, model, comparison)
     if comparison.pair or not design.contrasts:
         design = replace(design, contrasts=with_mean(design))
 
-    rows_of: Callable[[Design], RowModel] = RowModel
+    make_rows: Callable[[designs.Design], RowModel] = RowModel
     if comparison.longitudinal:
-        rows_of = partial(longitudinal_model, table=table, time=time, settings=settings)
-    rows = rows_of(design)
-    check_permutations(settings)
+        make_rows = partial(longitudinal_model, table=table, time=time, settings=settings)
+    rows = make_rows(design)
+    inference.check_permutations(settings)
     _check_weights(comparison, settings)
     sides = {
         hemi: register_side(cohort, hemi, groups=groups, settings=settings, templates=templates)
@@ -174,10 +121,10 @@ def analyze_cohort(
     )
     how = {hemi: side.registration for hemi, side in sides.items()}
     done, compared, fitted, found = fit(measured, registrations=how)
-    unregistered: Mapping[MapKey, Discoveries] = {}
+    unregistered: Mapping[inference.MapKey, inference.Discoveries] = {}
     # Effects of sites from a file are those of registered nodes.
     again = settings.registration.align != "none" and (plan is None or plan.saved is None)
-    if again and settings.multiplicity.method not in PERMUTATIONS:
+    if again and settings.multiplicity.method not in inference.PERMUTATIONS:
         unregistered = fit(cohort)[3]
     scores = score_cohort(
         compared,
@@ -196,14 +143,14 @@ def analyze_cohort(
         only=measures.summaries,
         references=references,
         icv=icv,
-        rows_of=rows_of,
+        rows_of=make_rows,
     )
     told = compared
     if done is not None and groups is not None and done.leaks(groups.column):
-        told = compare_sessions(measured, comparison)
+        told = data.compare_sessions(measured, comparison)
     once = told.take(~table[PARTICIPANT].duplicated().to_numpy())
     pairs, more = classify_groups(once, groups, settings) if groups else ([], [])
-    return Analysis(
+    return results.Analysis(
         model=model,
         comparison=comparison,
         design=design,
@@ -223,10 +170,12 @@ def analyze_cohort(
     )
 
 
-def analyze_points(cohort: Cohort, analysis: Analysis, settings: GroupSettings) -> Analysis:
+def analyze_points(
+    cohort: data.Cohort, analysis: results.Analysis, settings: GroupSettings
+) -> results.Analysis:
     """Fit the model of an analysis to further maps, which are not registered."""
     maps = tuple(dict.fromkeys(name for side in cohort.sides.values() for name in side.maps))
-    measured, done = Measures(maps=maps, summaries=()), analysis.harmonization
+    measured, done = data.Measures(maps=maps, summaries=()), analysis.harmonization
     done, compared, fitted, found = _fit_cohort(
         cohort,
         plan=None if done is None else done.plan,
@@ -259,14 +208,14 @@ def analyze_points(cohort: Cohort, analysis: Analysis, settings: GroupSettings) 
     )
 
 
-def _check_weights(comparison: Comparison, settings: GroupSettings) -> None:
+def _check_weights(comparison: designs.Comparison, settings: GroupSettings) -> None:
     """Refuse weights where there is no rule for them."""
     others = {
         "--longitudinal": comparison.longitudinal,
         "--paired": comparison.pair,
         "--asymmetry": comparison.asymmetry,
         "--normative": comparison.normative,
-        "permutations": settings.multiplicity.method in PERMUTATIONS,
+        "permutations": settings.multiplicity.method in inference.PERMUTATIONS,
         "--joint": settings.joint.measures,
     }
     wrong = [name for name, given in others.items() if given]
@@ -277,20 +226,25 @@ def _check_weights(comparison: Comparison, settings: GroupSettings) -> None:
 
 
 def _fit_cohort(
-    cohort: Cohort,
+    cohort: data.Cohort,
     *,
-    plan: SitePlan | None,
-    measures: Measures,
+    plan: results.SitePlan | None,
+    measures: data.Measures,
     rows: RowModel,
-    comparison: Comparison,
+    comparison: designs.Comparison,
     settings: GroupSettings,
-    registrations: Mapping[str, Registration] | None = None,
-) -> tuple[Harmonization | None, Cohort, dict[str, FittedMaps], dict[MapKey, Discoveries]]:
+    registrations: Mapping[str, registration.Registration] | None = None,
+) -> tuple[
+    results.Harmonization | None,
+    data.Cohort,
+    dict[str, FittedMaps],
+    dict[inference.MapKey, inference.Discoveries],
+]:
     """Harmonize, compare sessions, and fit each hemisphere, and left minus right if asked for."""
     done, maps = None, measures.maps
     if plan is not None:
-        done = harmonize_cohort(cohort, plan, settings, measures, registrations or {})
-    compared = compare_sessions(cohort if done is None else done.cohort, comparison)
+        done = harmonize.harmonize_cohort(cohort, plan, settings, measures, registrations or {})
+    compared = data.compare_sessions(cohort if done is None else done.cohort, comparison)
     fitted = {
         hemi: fit_maps(hemi, side.only(maps), rows, settings)
         for hemi, side in each("models", list(compared.sides.items()) if maps else [])
@@ -298,57 +252,57 @@ def _fit_cohort(
     if comparison.asymmetry and maps:
         # A change may be zero or of any sign: nothing to divide by.
         relative = () if comparison.pair else settings.asymmetry.relative
-        both = asymmetry_maps(compared, maps, relative)
+        both = data.asymmetry_maps(compared, maps, relative)
         contrasts = with_mean(rows.design)
-        fitted[BOTH] = fit_maps(BOTH, both, rows, settings, contrasts=contrasts)
-    return done, compared, fitted, correct(fitted, rows, compared.table, settings)
+        fitted[designs.BOTH] = fit_maps(designs.BOTH, both, rows, settings, contrasts=contrasts)
+    return done, compared, fitted, inference.correct(fitted, rows, compared.table, settings)
 
 
 def register_side(
-    cohort: Cohort,
+    cohort: data.Cohort,
     hemi: str,
     *,
-    groups: Groups | None,
+    groups: designs.Groups | None,
     settings: GroupSettings,
     templates: Mapping[str, Template] | None,
-) -> SideResult:
+) -> results.SideResult:
     """Register the sheets of one hemisphere, to a template or to each other."""
     side = cohort.sides[hemi]
-    profiles = mean_profiles(side.maps["curvature"], settings.registration)
+    profiles = registration.mean_profiles(side.maps["curvature"], settings.registration)
     if templates is None:
-        registration = register(profiles, settings.registration)
+        result = registration.register(profiles, settings.registration)
     else:
-        registration = register_to(profiles, templates[hemi], settings.registration)
-    shifts: Mapping[str, GroupShift] = {}
+        result = registration.register_to(profiles, templates[hemi], settings.registration)
+    shifts: Mapping[str, registration.GroupShift] = {}
     difference = None
     if groups is not None:
         names = cohort.table[groups.column].iloc[side.rows]
         known = names.notna().to_numpy()
-        grouped = replace(registration, warps=registration.warps[known])
+        grouped = replace(result, warps=result.warps[known])
         members = names[known].astype(str).to_numpy(dtype=np.str_)
-        shifts = shift_by_group(grouped, members)
-        if registration.template is not None:
-            difference = shift_difference(
+        shifts = registration.shift_by_group(grouped, members)
+        if result.template is not None:
+            difference = registration.shift_difference(
                 grouped,
                 members,
                 cohort.table[PARTICIPANT].iloc[side.rows][known].to_numpy(),
                 permutations=settings.registration.group_permutations,
                 seed=settings.multiplicity.seed,
             )
-    return_memory()
-    return SideResult(
-        registration=registration,
-        registered=_register_maps(side, registration.warps, parts_of(cohort.y) is not None),
+    arrays.return_memory()
+    return results.SideResult(
+        registration=result,
+        registered=_register_maps(side, result.warps, parts_of(cohort.y) is not None),
         shifts=shifts,
         difference=difference,
     )
 
 
-def _register_maps(side: SideMaps, warps: Float, rims: bool) -> SideMaps:
+def _register_maps(side: arrays.SideMaps, warps: arrays.Float, rims: bool) -> arrays.SideMaps:
     """Carry all maps of sheets; a point beside ``rims`` that came to be known of few is none."""
-    kept = len(warps) <= MOST_KEPT
-    maps, errors = (WarpedMaps(one, warps, warp_values) for one in (side.maps, side.errors))
-    labels = WarpedLabels(side.subfield[:], warps, warp_labels)
+    kept = len(warps) <= arrays.MOST_KEPT
+    maps, errors = (arrays.WarpedMaps(one, warps, warp_values) for one in (side.maps, side.errors))
+    labels = arrays.WarpedLabels(side.subfield[:], warps, warp_labels)
     registered = dict(maps) if kept or rims else maps
     for values in registered.values() if rims else ():
         leave_rare(values)
@@ -360,7 +314,7 @@ def _register_maps(side: SideMaps, warps: Float, rims: bool) -> SideMaps:
     )
 
 
-def unequal_spread(analysis: Analysis, settings: GlmSettings) -> Iterator[str]:
+def unequal_spread(analysis: results.Analysis, settings: GlmSettings) -> Iterator[str]:
     """Say which pairs of groups differ in size and SD so that ordinary tests find too much.
 
     One line per group, about the map in which it differs most from the first.
@@ -371,10 +325,10 @@ def unequal_spread(analysis: Analysis, settings: GlmSettings) -> Iterator[str]:
     if not (named and ordinary) or analysis.comparison.longitudinal:
         return
     for hemi, one in analysis.fitted.items():
-        members = members_of(analysis, rows_of(analysis, one))
+        members = results.members_of(analysis, results.rows_of(analysis, one))
         sizes = {group: int(own.sum()) for group, own in members.items() if own.sum() > 1}
         for measure in one.fits:
-            sds = {g: describe_known(one.parts(measure, members[g]))[2] for g in sizes}
+            sds = {g: arrays.describe_known(one.parts(measure, members[g]))[2] for g in sizes}
             (first, n), *others = sizes.items()
             for group, m in others:
                 squares, other = sds[first] ** 2, sds[group] ** 2
@@ -391,15 +345,19 @@ def unequal_spread(analysis: Analysis, settings: GlmSettings) -> Iterator[str]:
         )
 
 
-def check_joint(known: Sequence[str], comparison: Comparison, settings: GroupSettings) -> None:
+def check_joint(
+    known: Sequence[str], comparison: designs.Comparison, settings: GroupSettings
+) -> None:
     """Refuse measures that cannot be tested together, before anything is fitted."""
-    known = [*known, *(asymmetry_name(name) for name in known if comparison.asymmetry)]
+    known = [*known, *(designs.asymmetry_name(name) for name in known if comparison.asymmetry)]
     names, sides = settings.joint.measures, settings.joint.sides
     what = None
     if unknown := [name for name in names if name not in known]:
         what = f"no map is called {unknown[0]!r}; there are {', '.join(known)}"
-    elif names and JOINT in known:
-        what = f"a map is called {JOINT}, as its results would be; give it another name"
+    elif names and group_tables.JOINT in known:
+        what = (
+            f"a map is called {group_tables.JOINT}, as its results would be; give it another name"
+        )
     elif len(set(names)) < len(names):
         what = "a measure is named twice; leave it out"
     elif len(names) < 1 + (not sides) and (names or sides):
@@ -408,7 +366,9 @@ def check_joint(known: Sequence[str], comparison: Comparison, settings: GroupSet
         raise ModelError(f"--joint {' '.join(names)}".strip() + f": {what}")
 
 
-def combine_maps(analyses: Sequence[Analysis], settings: GroupSettings) -> dict[MapKey, JointMap]:
+def combine_maps(
+    analyses: Sequence[results.Analysis], settings: GroupSettings
+) -> dict[inference.MapKey, JointMap]:
     """Test the measures of the setting ``joint`` together; empty without any.
 
     The first analysis has the model; further ones may have maps of other programs.
@@ -424,23 +384,30 @@ def combine_maps(analyses: Sequence[Analysis], settings: GroupSettings) -> dict[
         for each in analyses
         if any(names[0] in one.fits for one in each.fitted.values())
     )
-    groups: dict[MapKey, dict[str, tuple[FittedMaps, str]]] = {}
+    groups: dict[inference.MapKey, dict[str, tuple[FittedMaps, str]]] = {}
     contrasts = {}
-    for hemis in [("L", "R")] if sides else [("L",), ("R",), (BOTH,)]:
+    for hemis in [("L", "R")] if sides else [("L",), ("R",), (designs.BOTH,)]:
         if not all((name, hemi) in fits for hemi, name in product(hemis, names)):
             continue
         parts = {
-            name if len(hemis) == 1 else f"{name} {SIDES[hemi]}": (fits[name, hemi], name)
+            name if len(hemis) == 1 else f"{name} {group_tables.SIDES[hemi]}": (
+                fits[name, hemi],
+                name,
+            )
             for hemi, name in product(hemis, names)
         }
         _check_points(names, [one for one, _ in parts.values()])
         for test in fits[names[0], hemis[0]].fits[names[0]].tests:
-            key = MapKey(JOINT, test.contrast.name, BOTH_SIDES if len(hemis) > 1 else hemis[0])
+            key = inference.MapKey(
+                group_tables.JOINT,
+                test.contrast.name,
+                group_tables.BOTH_SIDES if len(hemis) > 1 else hemis[0],
+            )
             groups[key], contrasts[test.contrast.name] = parts, test.contrast
     if not groups:
         raise ModelError(f"--joint {' '.join(names)}: no side has them all; leave one out")
     model = analyses[0].row_model
-    found = correct_joint(groups, contrasts, model, analyses[0].compared.table, settings)
+    found = inference.correct_joint(groups, contrasts, model, analyses[0].compared.table, settings)
     return {
         key: JointMap(key=key, parts=groups[key], cohort=cohort, test=test, found=own)
         for key, (test, own) in found.items()

@@ -7,25 +7,14 @@ from typing import Any
 
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.group.cohort import collect
-from hipsta_bids.group.design.model import (
-    choose_model,
-    empty_covariates,
-    folder_name,
-    wanted_measures,
-)
+from hipsta_bids.group.design import model as designs
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output.results import Analysis, harmonization_record
 from hipsta_bids.group.output.saved import load_effects
 from hipsta_bids.group.output.shapes import average_shapes, write_shapes
 from hipsta_bids.group.output.write import draw, write_results
+from hipsta_bids.group.questions import analysis as fitting
 from hipsta_bids.group.questions import study
-from hipsta_bids.group.questions.analysis import (
-    analyze_cohort,
-    analyze_points,
-    check_joint,
-    combine_maps,
-    unequal_spread,
-)
 from hipsta_bids.group.questions.exchange import SUMMARY, summarize, write_summary
 from hipsta_bids.io import files
 from hipsta_bids.progress import tell
@@ -58,9 +47,9 @@ def _analyze(options: study.GroupOptions, settings: GroupSettings) -> study.Grou
     """Analyze and write all but the page, for which the memory that it takes is free again."""
     tell("reading")
     inputs = study.read_inputs(options, settings)
-    check_joint([*inputs.measures.maps, *inputs.others], options.comparison, settings)
+    fitting.check_joint([*inputs.measures.maps, *inputs.others], options.comparison, settings)
     cohort = inputs.cohort
-    document, model, groups, references = choose_model(
+    document, model, groups, references = designs.choose_model(
         options.model,
         cohort.table,
         settings,
@@ -68,7 +57,7 @@ def _analyze(options: study.GroupOptions, settings: GroupSettings) -> study.Grou
         visits=inputs.time,
     )
     templates = study.read_templates(options.template, cohort)
-    analysis = analyze_cohort(
+    analysis = fitting.analyze_cohort(
         cohort,
         model,
         groups,
@@ -82,18 +71,18 @@ def _analyze(options: study.GroupOptions, settings: GroupSettings) -> study.Grou
         site_effects=load_effects(options.harmonize_model) if options.harmonize_model else None,
     )
     others = {
-        name: (other, analyze_points(other, analysis, settings))
+        name: (other, fitting.analyze_points(other, analysis, settings))
         for name, other in inputs.others.items()
     }
     found = dict(analysis.found)
     for _, other in others.values():
         found |= other.found
-    joint = combine_maps([analysis, *(other for _, other in others.values())], settings)
+    joint = fitting.combine_maps([analysis, *(other for _, other in others.values())], settings)
     found |= {key: one.found for key, one in joint.items()}
     tested = tuple(joint.values())
     analysis = replace(analysis, found=found)
     exclusions = [*inputs.exclusions, *_incomplete(analysis)]
-    wanted = wanted_measures(options.model, options.measures)
+    wanted = designs.wanted_measures(options.model, options.measures)
     notes = [*inputs.notes, *_notes(options, inputs, analysis, settings)]
     summary = _summary(options, inputs, analysis, settings, notes)
     tell("average surfaces")
@@ -124,7 +113,7 @@ def _analyze(options: study.GroupOptions, settings: GroupSettings) -> study.Grou
 
     return study.write_folder(
         options,
-        folder_name(model.formula, wanted) + options.comparison.suffix,
+        designs.folder_name(model.formula, wanted) + options.comparison.suffix,
         inputs,
         settings,
         notes=notes,
@@ -174,7 +163,7 @@ def _notes(
         notes += [
             f"{name} is n/a for all, and not in the model; fill it in, or do not read much into"
             f" differences that {name} might explain"
-            for name in empty_covariates(inputs.cohort.table, settings)
+            for name in designs.empty_covariates(inputs.cohort.table, settings)
         ]
     if later := sum(one.reason == "later-session" for one in inputs.exclusions):
         notes.append(
@@ -195,7 +184,7 @@ def _notes(
                 f"{key.measure}, {key.contrast}, {key.hemi}: p up to {discoveries.cutoff:.3g}"
                 " survives, above the level; effects are widespread"
             )
-    notes += unequal_spread(analysis, settings.glm)
+    notes += fitting.unequal_spread(analysis, settings.glm)
     for hemi, side in analysis.sides.items():
         if not side.registration.converged:
             notes.append(f"hemisphere {hemi}: registration had not settled when it ended")

@@ -10,15 +10,7 @@ from formulaic import Formula
 
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.cohort.data import Cohort, Measures, modeled_table
-from hipsta_bids.group.design.formula import (
-    INTERCEPT,
-    ModelSpec,
-    check_names,
-    columns_of,
-    level_labels,
-    listed,
-    typed,
-)
+from hipsta_bids.group.design import formula as formulas
 from hipsta_bids.group.design.grammar import closed_formula
 from hipsta_bids.group.design.model import DEPENDENCE, Comparison, Design, build_design
 from hipsta_bids.group.design.settings import GroupSettings
@@ -36,7 +28,7 @@ _UNTOUCHED = 1e-8
 
 def plan_sites(
     cohort: Cohort,
-    model: ModelSpec,
+    model: formulas.ModelSpec,
     settings: GroupSettings,
     *,
     references: Mapping[str, str],
@@ -53,7 +45,7 @@ def plan_sites(
     column = saved.column if saved else settings.harmonization.column
     if not column:
         return None
-    check_names([column], cohort.table.columns)
+    formulas.check_names([column], cohort.table.columns)
     _check_terms(model, column)
     if comparison.pair:
         _check_constant(cohort.table, column)
@@ -61,7 +53,7 @@ def plan_sites(
         kept = _saved_columns(cohort.table, saved)
     else:
         kept = _own_columns(cohort, column, model, settings, (references, comparison))
-    labels = level_labels(cohort.table[column])
+    labels = formulas.level_labels(cohort.table[column])
     usable = labels.notna().to_numpy() & np.isfinite(kept.matrix).all(axis=1)
     old = tuple(saved.sites) if saved else ()
     present = set(labels[usable])
@@ -102,9 +94,13 @@ def plan_sites(
 
 def _saved_columns(table: pd.DataFrame, saved: SavedEffects) -> Kept:
     """Make the columns of an earlier analysis for these visits."""
-    matrix, names, complete = columns_of(table, saved.formula, saved.levels, f"{saved.file}: ")
+    matrix, names, complete = formulas.columns_of(
+        table, saved.formula, saved.levels, f"{saved.file}: "
+    )
     if list(names) != saved.columns:
-        raise damaged(saved.file, f"columns {listed(saved.columns)}, not {listed(names)}")
+        raise damaged(
+            saved.file, f"columns {formulas.listed(saved.columns)}, not {formulas.listed(names)}"
+        )
     values = np.full((len(table), len(names)), np.nan)
     values[complete] = matrix
     return Kept(matrix=values, names=names, formula=saved.formula, levels=saved.levels)
@@ -113,7 +109,7 @@ def _saved_columns(table: pd.DataFrame, saved: SavedEffects) -> Kept:
 def _own_columns(
     cohort: Cohort,
     column: str,
-    model: ModelSpec,
+    model: formulas.ModelSpec,
     settings: GroupSettings,
     context: tuple[Mapping[str, str], Comparison],
 ) -> Kept:
@@ -125,7 +121,7 @@ def _own_columns(
     spec = replace(model, formula=formula, contrasts=(), dummy=None)
     chosen = {name: text for name, text in references.items() if name in known}
     design = build_design(table, spec, settings.design, chosen)
-    own = [i for i, name in enumerate(design.columns) if name != INTERCEPT]
+    own = [i for i, name in enumerate(design.columns) if name != formulas.INTERCEPT]
     names = tuple(design.columns[i] for i in own)
     values = np.full((len(table), len(names)), np.nan)
     values[design.rows] = design.matrix[:, own]
@@ -141,7 +137,7 @@ def _own_columns(
     )
 
 
-def _check_terms(model: ModelSpec, column: str) -> None:
+def _check_terms(model: formulas.ModelSpec, column: str) -> None:
     """Refuse interactions with the site."""
     for term in Formula(closed_formula(model.formula).text):
         names = closed_formula(str(term)).names
@@ -158,7 +154,7 @@ def _check_constant(table: pd.DataFrame, column: str) -> None:
     several = pairs[pairs.duplicated()].unique()
     if len(several):
         raise ModelError(
-            f"--harmonize {column}: {listed(several)} changed {column} between the"
+            f"--harmonize {column}: {formulas.listed(several)} changed {column} between the"
             f" sessions, so that changes depend on effects of {column} that the model of changes"
             " cannot have; use --longitudinal"
         )
@@ -176,13 +172,13 @@ def _check_sizes(
     if alone and len(new) < 2:  # noqa: PLR2004 -- one is like all
         raise ModelError(
             f"--harmonize {column}: all participants with the variables of the model have"
-            f" {column} {listed(new) or 'n/a'}; leave it out"
+            f" {column} {formulas.listed(new) or 'n/a'}; leave it out"
         )
     if small := [f"{one} ({counts[one]})" for one in new if counts[one] < least]:
         raise ModelError(
-            f"--harmonize {column}: too few participants in {listed(small)}; at least {least} are"
-            " needed to tell a site from its participants: leave these out by --exclude, or join"
-            f" similar ones in a column of their own"
+            f"--harmonize {column}: too few participants in {formulas.listed(small)}; at least"
+            f" {least} are needed to tell a site from its participants: leave these out by"
+            " --exclude, or join similar ones in a column of their own"
         )
 
 
@@ -221,8 +217,8 @@ def _explained(
 def _is_portable(table: pd.DataFrame, formula: str, design: Design) -> bool:
     """Tell whether columns of some people alone are the same as among all; splines' are not."""
     half = design.rows[::2]
-    matrix, names, _ = columns_of(table.iloc[half], formula, design.levels, "")
-    own = [name for name in design.columns if name != INTERCEPT]
+    matrix, names, _ = formulas.columns_of(table.iloc[half], formula, design.levels, "")
+    own = [name for name in design.columns if name != formulas.INTERCEPT]
     among = design.matrix[::2][:, [design.columns.index(name) for name in own]]
     return list(names) == own and bool(np.allclose(matrix, among, rtol=1e-9, atol=1e-12))
 
@@ -237,8 +233,8 @@ def _icv(
     values = np.full(len(table), np.nan)
     if icv is None or icv in closed_formula(formula).names:
         return None, values
-    check_names([icv], table.columns)
-    column = typed(table[icv])
+    formulas.check_names([icv], table.columns)
+    column = formulas.typed(table[icv])
     if not pd.api.types.is_numeric_dtype(column):
         return None, values
     values = column.to_numpy(np.float64)
@@ -247,7 +243,7 @@ def _icv(
 
 
 def without_tests_of_sites(
-    plan: SitePlan, design: Design, model: ModelSpec, comparison: Comparison
+    plan: SitePlan, design: Design, model: formulas.ModelSpec, comparison: Comparison
 ) -> Design:
     """Refuse a model that counts as free what was spent on sites, or is asked to test it.
 
@@ -370,7 +366,8 @@ def _notes(plan: SitePlan, settings: GroupSettings, unknown: set[str]) -> Iterat
         if share > settings.harmonization.explained:
             yield f"{plan.column} explains {share:.0%} of {name}: its effect is poorly known"
     if unknown and plan.saved:
-        yield f"{plan.saved.file} has not these measures, which are left out: {listed(unknown)}"
+        names = formulas.listed(unknown)
+        yield f"{plan.saved.file} has not these measures, which are left out: {names}"
     if plan.saved is None and not plan.kept.portable:
         yield "harmonization.json is not written: this model's columns depend on all participants"
 

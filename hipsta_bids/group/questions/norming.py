@@ -24,28 +24,12 @@ from hipsta_bids.group.output.methods import norms_text
 from hipsta_bids.group.output.panels import draw_maps
 from hipsta_bids.group.output.results import ScoredMaps
 from hipsta_bids.group.output.saved import NormsFile, load_norms, save_norms, templates_from_json
+from hipsta_bids.group.questions import study as studies
 from hipsta_bids.group.questions.reference import points_of
 from hipsta_bids.group.questions.scores import map_rows, score_rows
-from hipsta_bids.group.questions.study import (
-    GroupInputs,
-    GroupOptions,
-    GroupResult,
-    Study,
-    folder_of,
-    members,
-    read_templates,
-)
+from hipsta_bids.group.stats import norms as normative
 from hipsta_bids.group.stats.arrays import Bool, Float, Int, Key
 from hipsta_bids.group.stats.glm import most_frequent
-from hipsta_bids.group.stats.norms import (
-    CENTILE_FOLDS,
-    LEVELS,
-    NormativeScores,
-    Norms,
-    People,
-    choose_knots,
-    fit_norms,
-)
 from hipsta_bids.group.stats.warps import Template
 from hipsta_bids.io import files
 from hipsta_bids.progress import tell
@@ -69,8 +53,8 @@ class _Made:
     """Norms that score; ``None`` where norms are fitted."""
     controls: tuple[str, str] | None
     file: NormsFile
-    norms: Mapping[Key, Norms]
-    people: People
+    norms: Mapping[Key, normative.Norms]
+    people: normative.People
     cohorts: Mapping[str, Cohort]
     """With registered sheets; with other programs' maps by their names."""
     found: Values
@@ -84,13 +68,13 @@ class _Made:
 
 
 def run_norms(
-    options: GroupOptions,
+    options: studies.GroupOptions,
     settings: GroupSettings,
     *,
     path: Path | None = None,
     among: tuple[str, str] | None = None,
     controls: tuple[str, str] | None = None,
-) -> GroupResult:
+) -> studies.GroupResult:
     """Fit norms, or score people by them, and write all results or none.
 
     Parameters
@@ -109,10 +93,10 @@ def run_norms(
     dataset.check_own_dataset(options.out_dir)
     if path is not None:
         return _score_people(options, path, settings, among, controls)
-    study = Study.read(options, among, settings)
+    study = studies.Study.read(options, among, settings)
     file, people = _planned(study)
     template, tables, cohorts, found = _registered(
-        study, read_templates(options.template, study.cohort)
+        study, studies.read_templates(options.template, study.cohort)
     )
     tell("norms")
     file = file.model_copy(update={"template": template})
@@ -122,12 +106,12 @@ def run_norms(
 
 
 def _score_people(
-    options: GroupOptions,
+    options: studies.GroupOptions,
     path: Path,
     settings: GroupSettings,
     among: tuple[str, str] | None,
     controls: tuple[str, str] | None,
-) -> GroupResult:
+) -> studies.GroupResult:
     """Score people by the norms of a file."""
     file, norms = load_norms(path)
     known = len(file.sites)
@@ -135,7 +119,7 @@ def _score_people(
     every = Comparison(longitudinal=True)  # each visit has a score
     options = replace(options, measures=measures, comparison=every)
     settings = settings.changed(registration=file.registration)
-    study = Study.read(options, among, settings)
+    study = studies.Study.read(options, among, settings)
     notes, table = _check(file, path, study.inputs), study.cohort.table
     again = table.duplicated([PARTICIPANT, *({file.site} & set(table.columns))])
     if again.any() and FIRST_AGE not in table:
@@ -147,7 +131,7 @@ def _score_people(
     if not people.known.any():
         why = "; ".join(dict.fromkeys(message for _, message in study.left_out.values()))
         raise ModelError(f"{path}: nobody here can be scored: {why}")
-    everyone = members(table, controls, "--controls")
+    everyone = studies.members(table, controls, "--controls")
     references = everyone & (controls is not None) & ~again.to_numpy()
     file = _with_new_sites(study, path, file, people, references, controls=controls)
     templates = None if file.template is None else templates_from_json(file.template, str(path))
@@ -173,7 +157,7 @@ def _score_people(
 
 
 def _registered(
-    study: Study, templates: Mapping[str, Template] | None
+    study: studies.Study, templates: Mapping[str, Template] | None
 ) -> tuple[dict[str, Any] | None, dict[str, pd.DataFrame], dict[str, Cohort], Values]:
     """Register maps, and collect them and summary measures of each side and of the mean of both."""
     inputs = study.inputs
@@ -192,7 +176,7 @@ def _registered(
     return template, tables, cohorts, found
 
 
-def _write(study: Study, made: _Made, notes: Iterable[str]) -> GroupResult:
+def _write(study: studies.Study, made: _Made, notes: Iterable[str]) -> studies.GroupResult:
     """Write all results; charts are of the measures that the settings name."""
     file, people, cohort = made.file, made.people, study.cohort
     settings = study.settings
@@ -240,11 +224,11 @@ def _write(study: Study, made: _Made, notes: Iterable[str]) -> GroupResult:
                 for i, (site, n) in enumerate(file.sites.items())
             ],
             "controls": made.controls,
-            "folds": CENTILE_FOLDS,
+            "folds": normative.CENTILE_FOLDS,
         },
         "among": study.among,
     }
-    name = folder_of(["norms" if made.path is None else "scores"], study.among)
+    name = studies.folder_of(["norms" if made.path is None else "scores"], study.among)
     notes = [*notes]
     if later := sum(one.reason == "later-session" for one in study.inputs.exclusions):
         notes.append(f"{later} later sessions are not in the norms, which take first ones")
@@ -253,13 +237,13 @@ def _write(study: Study, made: _Made, notes: Iterable[str]) -> GroupResult:
     return study.write(name, notes, visits=visits, tables=made.tables, record=record, fill=fill)
 
 
-def _protocol(inputs: GroupInputs) -> tuple[str, str]:
+def _protocol(inputs: studies.GroupInputs) -> tuple[str, str]:
     """Segmentation protocol and region of the sheets, if there are sheets."""
     records = inputs.found.records
     return (records[0].place.name.seg, records[0].place.name.region) if records else ("none",) * 2
 
 
-def _planned(study: Study) -> tuple[NormsFile, People]:
+def _planned(study: studies.Study) -> tuple[NormsFile, normative.People]:
     """Say what norms are about, before they are fitted, and of whom.
 
     Refuses a cohort that is too small, or whose sexes are those of sites.
@@ -271,7 +255,7 @@ def _planned(study: Study) -> tuple[NormsFile, People]:
     sexes = level_labels(table[how.sex]) if how.sex in table else None
     for labels in (sites, sexes):
         complete &= True if labels is None else labels.notna().to_numpy()
-    knots = choose_knots(_ages(table, how.age)[complete], how)
+    knots = normative.choose_knots(_ages(table, how.age)[complete], how)
     file = NormsFile(
         description="norms of maps and summary measures by age, sex and site",
         format=1,
@@ -325,7 +309,7 @@ def _site_labels(table: pd.DataFrame, column: str) -> pd.Series:
     return level_labels(table[column])
 
 
-def _people(study: Study, file: NormsFile) -> People:
+def _people(study: studies.Study, file: NormsFile) -> normative.People:
     """Describe visits as norms have to know them, new sites last; others are left out."""
     table, _settings = study.cohort.table, study.settings
     check_names([file.age, *([file.sex] if file.sexes else [])], table.columns)
@@ -348,10 +332,10 @@ def _people(study: Study, file: NormsFile) -> People:
     usable = ~np.any(list(problems.values()), axis=0)
     sites = [*file.sites, *sorted(set(labels[usable]) - set(file.sites))]
     site = np.where(usable, pd.Categorical(labels, categories=sites).codes, -1).astype(np.int64)
-    return People(age=age, sex=sex, site=site)
+    return normative.People(age=age, sex=sex, site=site)
 
 
-def _check(file: NormsFile, path: Path, inputs: GroupInputs) -> list[str]:
+def _check(file: NormsFile, path: Path, inputs: studies.GroupInputs) -> list[str]:
     """Refuse people who were measured in another way; note what may differ."""
     cohort, found = inputs.cohort, inputs.found
     same = all(
@@ -388,10 +372,10 @@ def _check(file: NormsFile, path: Path, inputs: GroupInputs) -> list[str]:
 
 
 def _with_new_sites(
-    study: Study,
+    study: studies.Study,
     path: Path,
     file: NormsFile,
-    people: People,
+    people: normative.People,
     references: Bool,
     *,
     controls: tuple[str, str] | None,
@@ -415,30 +399,32 @@ def _with_new_sites(
 
 
 def _fit(
-    values: Values, people: People, file: NormsFile, how: NormSettings
-) -> tuple[dict[Key, Norms], pd.DataFrame]:
+    values: Values, people: normative.People, file: NormsFile, how: NormSettings
+) -> tuple[dict[Key, normative.Norms], pd.DataFrame]:
     """Fit all norms, and tell by cross-validation how many lie below each centile."""
     n_sites, knots = len(file.sites), np.array(file.knots)
     # Folds are spread evenly over sites.
     order = np.lexsort((np.random.default_rng(how.seed).random(len(people.site)), people.site))
     fold = np.empty(len(order), dtype=np.int64)
-    fold[order] = np.arange(len(order)) % CENTILE_FOLDS
+    fold[order] = np.arange(len(order)) % normative.CENTILE_FOLDS
     norms, rows = {}, []
     for (hemi, measure), (visits, own) in values.items():
         who = people.take(visits)
-        fitted = fit_norms(own, who, n_sites, knots, how)
+        fitted = normative.fit_norms(own, who, n_sites, knots, how)
         known = np.isfinite(fitted.mean).all(axis=0)
         if not known.any():
             continue  # constant, or of too few people
         norms[hemi, measure] = fitted
         some = own[:, :: -(-own.shape[1] // CHECKED_POINTS)]
         z = np.full(some.shape, np.nan)
-        for left in range(CENTILE_FOLDS):
+        for left in range(normative.CENTILE_FOLDS):
             out = fold[visits] == left
-            rest = fit_norms(some[~out], who.take(~out), n_sites, knots, how)
+            rest = normative.fit_norms(some[~out], who.take(~out), n_sites, knots, how)
             z[out] = rest.score(some[out], who.take(out))
         scores = z[np.isfinite(z)]
-        below = {f"below_{100 * one:g}": np.mean(scores < special.ndtri(one)) for one in LEVELS}
+        below = {
+            f"below_{100 * one:g}": np.mean(scores < special.ndtri(one)) for one in normative.LEVELS
+        }
         rows.append(
             {
                 "hemi": hemi,
@@ -453,7 +439,11 @@ def _fit(
 
 
 def _score_maps(
-    cohort: Cohort, values: Values, norms: Mapping[Key, Norms], people: People, adapted: Bool
+    cohort: Cohort,
+    values: Values,
+    norms: Mapping[Key, normative.Norms],
+    people: normative.People,
+    adapted: Bool,
 ) -> dict[str, ScoredMaps]:
     """Score the maps of each hemisphere."""
     scored = {}
@@ -464,7 +454,7 @@ def _score_maps(
                 continue
             one = norms[hemi, measure]
             z = one.score(values[hemi, measure][1], people.take(side.rows))
-            scores[measure] = NormativeScores(z, 2 * special.ndtr(-np.abs(z)))
+            scores[measure] = normative.NormativeScores(z, 2 * special.ndtr(-np.abs(z)))
         if scores:
             scored[hemi] = ScoredMaps(
                 rows=side.rows,

@@ -12,15 +12,7 @@ import pandas as pd
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.design.formula import Contrast, listed
 from hipsta_bids.group.design.settings import GroupSettings
-from hipsta_bids.group.output import tables
-from hipsta_bids.group.output.columns import (
-    Frame,
-    effect_columns,
-    overview_row,
-    peak_table,
-    point_columns,
-    test_columns,
-)
+from hipsta_bids.group.output import columns, tables
 from hipsta_bids.group.questions.exchange import ModelSummary, SiteSummary
 from hipsta_bids.group.stats.arrays import Float
 from hipsta_bids.group.stats.clusters import sheet_edges
@@ -65,7 +57,7 @@ class Meta:
     sites: list[SiteSummary]
     items: list[Item]
     found: Mapping[MapKey, Discoveries]
-    frame: Mapping[str, Frame]
+    frame: Mapping[str, columns.Frame]
     """Points by hemisphere."""
     settings: GroupSettings
 
@@ -203,13 +195,13 @@ def analyze_sites(sites: list[SiteSummary], settings: GroupSettings) -> Meta:
         {item.key(name): one.p for item in maps for name, one in item.result.models.items()},
         settings.multiplicity,
     )
-    frames: dict[str, Frame] = {
+    frames: dict[str, columns.Frame] = {
         item.model.hemi: _frame(sites, item.number) for item in reversed(maps)
     }
     return Meta(sites=sites, items=items, found=found, frame=frames, settings=settings)
 
 
-def _frame(sites: Sequence[SiteSummary], number: int) -> Frame:
+def _frame(sites: Sequence[SiteSummary], number: int) -> columns.Frame:
     """Locate points, in the subfield that most participants have there."""
     first = sites[0]
     votes: list[Counter[str]] = [Counter() for _ in range(len(first.x) * len(first.y))]
@@ -218,7 +210,9 @@ def _frame(sites: Sequence[SiteSummary], number: int) -> Frame:
             vote[name or files.MISSING] += site.participants
     names = [vote.most_common(1)[0][0] if vote else files.MISSING for vote in votes]
     shape = len(first.x), len(first.y)
-    return Frame.of_sheet(np.array(first.x), np.array(first.y), np.array(names).reshape(shape))
+    return columns.Frame.of_sheet(
+        np.array(first.x), np.array(first.y), np.array(names).reshape(shape)
+    )
 
 
 def meta_tables(meta: Meta) -> Iterator[tuple[str, pd.DataFrame]]:
@@ -235,17 +229,17 @@ def meta_tables(meta: Meta) -> Iterator[tuple[str, pd.DataFrame]]:
         for key, test, one in meta.tests(item):
             found = meta.found[key]
             stem = tables.map_name(key.hemi, key.measure, key.contrast)
-            rows.append(overview_row(stem, key, found))
+            rows.append(columns.overview_row(stem, key, found))
             low, high = one.limits(confidence)
-            columns = {
-                **point_columns(test, found, frame, meta.counts(item).astype(int)),
+            values = {
+                **columns.point_columns(test, found, frame, meta.counts(item).astype(int)),
                 "n_sites": item.result.random.sites.astype(int),
                 "estimate_low": low,
                 "estimate_high": high,
                 **_between(item),
             }
-            yield stem, pd.DataFrame(columns)
-            table = peak_table(test, found, frame, edges)
+            yield stem, pd.DataFrame(values)
+            table = columns.peak_table(test, found, frame, edges)
             peaks.append(table.assign(measure=key.measure, hemi=key.hemi))
             own.append(table)
         forests += [_forest(meta, item, point) for point in _points(own, frame)]
@@ -285,7 +279,7 @@ def _between(item: Item) -> dict[str, Float]:
     return {"tau2": random.tau2, "q": random.q, "q_p": random.q_p, "i2": random.i2}
 
 
-def _points(peaks: Sequence[pd.DataFrame], frame: Frame) -> list[int]:
+def _points(peaks: Sequence[pd.DataFrame], frame: columns.Frame) -> list[int]:
     """Peaks of a map by either model, the largest statistics first; else the strongest point."""
     table = pd.concat(peaks, ignore_index=True)
     if not len(table):
@@ -371,11 +365,11 @@ def _summaries(meta: Meta) -> pd.DataFrame:
                         "n": meta.counts(item).astype(int),
                         "visits": meta.counts(item).astype(int),
                         "n_sites": item.result.random.sites.astype(int),
-                        **test_columns(test),
+                        **columns.test_columns(test),
                         "p_fdr": np.nan,
                         "estimate_low": low,
                         "estimate_high": high,
-                        **effect_columns(test),
+                        **columns.effect_columns(test),
                         **_between(item),
                         "estimate_dl": other.estimate,
                         "se_dl": other.se,

@@ -12,33 +12,11 @@ from hipsta_bids import __version__
 from hipsta_bids.derivatives import dataset
 from hipsta_bids.derivatives.names import group_report
 from hipsta_bids.errors import InputError, ModelError
-from hipsta_bids.group.cohort import collect
+from hipsta_bids.group.cohort import collect, external, read
 from hipsta_bids.group.cohort.covariates import add_icv, add_time, read_covariates
 from hipsta_bids.group.cohort.data import Cohort, Measures, choose_visits
-from hipsta_bids.group.cohort.external import (
-    ExternalCohorts,
-    MapPattern,
-    add_external,
-    add_volumes,
-    check_volumes,
-    find_all,
-    map_patterns,
-    taken_names,
-)
-from hipsta_bids.group.cohort.read import (
-    Measured,
-    check_summaries,
-    choose_measures,
-    read_sheets,
-    visits_of,
-)
+from hipsta_bids.group.design import model as designs
 from hipsta_bids.group.design.formula import check_names, listed, with_factors
-from hipsta_bids.group.design.model import (
-    Comparison,
-    ModelRequest,
-    VisitTime,
-    wanted_measures,
-)
 from hipsta_bids.group.design.settings import GroupSettings
 from hipsta_bids.group.output import write
 from hipsta_bids.group.output.results import templates_of
@@ -71,7 +49,7 @@ class GroupOptions:
     bids_dir: Path
     out_dir: Path
     sheets: collect.GroupRequest
-    model: ModelRequest
+    model: designs.ModelRequest
     covariates: tuple[Path, ...] = ()
     maps: tuple[tuple[str, str], ...] = ()
     """Names and patterns of other programs' maps."""
@@ -84,7 +62,7 @@ class GroupOptions:
     template: Path | None = None
     harmonize_model: Path | None = None
     """Parameters of the harmonization of another analysis."""
-    comparison: Comparison = field(default_factory=Comparison)
+    comparison: designs.Comparison = field(default_factory=designs.Comparison)
     export_summary: str | None = None
     """Name of this site in a summary for others, empty for that of the folder; ``None`` for no
     summary."""
@@ -108,7 +86,7 @@ class GroupInputs:
     """Measures of the sheets."""
     icv: str | None
     """Column of intracranial volume."""
-    time: VisitTime | None
+    time: designs.VisitTime | None
     exclusions: tuple[collect.Exclusion, ...]
     """Of hemispheres, and of sessions that are not compared."""
     notes: tuple[str, ...]
@@ -185,17 +163,17 @@ def write_folder(
 
 def read_inputs(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
     """Find and read sheets, other maps, volumes and covariates."""
-    check_volumes(options.volumes)
+    external.check_volumes(options.volumes)
     found = collect.collect_sheets(options.sheets, may_lack=bool(options.maps))
-    taken = taken_names(with_sheets=bool(found.records))
-    requests = map_patterns(options.maps, options.surfaces, taken)
-    wanted = wanted_measures(options.model, options.measures)
-    measures = choose_measures(wanted, found.records, [one.name for one in requests])
-    external = _read_maps(options, found, requests, measures, settings)
-    measured, volume_notes = add_volumes(
-        external.measured, found.records, options.volumes, options.bids_dir
+    taken = external.taken_names(with_sheets=bool(found.records))
+    requests = external.map_patterns(options.maps, options.surfaces, taken)
+    wanted = designs.wanted_measures(options.model, options.measures)
+    measures = read.choose_measures(wanted, found.records, [one.name for one in requests])
+    further = _read_maps(options, found, requests, measures, settings)
+    measured, volume_notes = external.add_volumes(
+        further.measured, found.records, options.volumes, options.bids_dir
     )
-    check_summaries(measures, measured.sides)
+    read.check_summaries(measures, measured.sides)
     everybody = Cohort(
         table=with_factors(
             read_covariates(measured.visits, options.bids_dir, options.covariates), settings
@@ -206,7 +184,7 @@ def read_inputs(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
         units=measured.units,
     )
     # A visit may have lost both of its hemispheres.
-    sides = [side for one in (everybody, *external.others.values()) for side in one.sides.values()]
+    sides = [side for one in (everybody, *further.others.values()) for side in one.sides.values()]
     there = np.isin(np.arange(len(everybody.table)), np.concatenate([one.rows for one in sides]))
     cohort, reasons = choose_visits(everybody.take(there), options.comparison)
     keep = everybody.table.index.isin(cohort.table.index)
@@ -216,14 +194,14 @@ def read_inputs(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
     if options.comparison.longitudinal:
         time = add_time(cohort.table, settings)
         cohort = replace(cohort, table=time.table)
-    own = tuple(name for name in measures.maps if name not in external.others)
+    own = tuple(name for name in measures.maps if name not in further.others)
     other = "other-session" if options.comparison.pair else "later-session"
     return GroupInputs(
         found=found,
         cohort=cohort,
         others={
             name: replace(other.take(keep), table=cohort.table)
-            for name, other in external.others.items()
+            for name, other in further.others.items()
         },
         measures=replace(measures, maps=own),
         icv=icv,
@@ -235,22 +213,22 @@ def read_inputs(options: GroupOptions, settings: GroupSettings) -> GroupInputs:
                 measured.visits, {visit: (other, message) for visit, message in reasons.items()}
             ),
         ),
-        notes=(*found.notes, *external.notes, *volume_notes, *_damaged(measured)),
+        notes=(*found.notes, *further.notes, *volume_notes, *_damaged(measured)),
     )
 
 
 def _read_maps(
     options: GroupOptions,
     found: collect.Collection,
-    requests: Sequence[MapPattern],
+    requests: Sequence[external.MapPattern],
     measures: Measures,
     rules: GroupSettings,
-) -> ExternalCohorts:
+) -> external.ExternalCohorts:
     """Read the maps that are asked for, of the sheets and of other programs."""
     error_window = 0 if rules.glm.weights == "none" else ERROR_WINDOW
     asked = [one for one in requests if one.name in measures.maps]
-    files_of, visits = find_all(
-        asked, options.bids_dir, visits_of(found.records), collect.wanted_by(options.sheets)
+    files_of, visits = external.find_all(
+        asked, options.bids_dir, read.visits_of(found.records), collect.wanted_by(options.sheets)
     )
     names = {one.name for one in requests}
     own = [name for name in measures.maps if name not in names]
@@ -260,13 +238,13 @@ def _read_maps(
             f"--weights uncertainty: there are no SDs of {names_of}; leave --maps or the"
             " weights out"
         )
-    measured = read_sheets(
+    measured = read.read_sheets(
         found.records, found.grid, own, visits, rules=rules, error_window=error_window
     )
-    return add_external(measured, files_of, visits)
+    return external.add_external(measured, files_of, visits)
 
 
-def _damaged(measured: Measured) -> tuple[str, ...]:
+def _damaged(measured: read.Measured) -> tuple[str, ...]:
     shown = [
         f"{one.participant}{f' {one.session}' if one.session else ''}, hemisphere {one.hemi}, is"
         f" left out: {one.message}; measure it again"

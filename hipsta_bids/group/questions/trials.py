@@ -22,22 +22,8 @@ from hipsta_bids.group.output.figures import Drawing
 from hipsta_bids.group.output.methods import Citations, power_text, retest_text
 from hipsta_bids.group.output.panels import Row, draw_maps, spanned
 from hipsta_bids.group.output.tables import entity_label
-from hipsta_bids.group.questions.reference import (
-    Described,
-    Modeled,
-    Retested,
-    Source,
-    Tables,
-    retest_cohort,
-)
-from hipsta_bids.group.questions.study import (
-    GroupInputs,
-    GroupOptions,
-    GroupResult,
-    Study,
-    folder_of,
-    read_templates,
-)
+from hipsta_bids.group.questions import reference
+from hipsta_bids.group.questions import study as studies
 from hipsta_bids.group.stats import trials
 from hipsta_bids.group.stats.arrays import Float
 from hipsta_bids.io import files, gifti
@@ -50,13 +36,13 @@ _COUNTS = tuple(n * 10**power for power in range(5) for n in (1, 2, 3, 5))
 
 
 def run_trial(
-    options: GroupOptions,
+    options: studies.GroupOptions,
     settings: GroupSettings,
     *,
     retest: bool = False,
     effect: trials.TrialEffect | None = None,
     among: tuple[str, str] | None = None,
-) -> GroupResult:
+) -> studies.GroupResult:
     """Measure the agreement of sessions, or sample sizes, and write all results or none.
 
     Parameters
@@ -77,21 +63,21 @@ def run_trial(
         trials.point_level(settings)  # refuses before anything is read
     visits = bool(effect and effect.visits)
     options = replace(options, comparison=Comparison(longitudinal=retest or visits))
-    study, repeated = Study.read(options, among, settings), None
+    study, repeated = studies.Study.read(options, among, settings), None
     if retest:
-        repeated = retest_cohort(study.cohort, settings.retest.min_participants)
+        repeated = reference.retest_cohort(study.cohort, settings.retest.min_participants)
         reasons = {v: ("incomplete-sessions", text) for v, text in repeated.left_out.items()}
         keep = study.inputs.cohort.table.index.isin(repeated.cohort.table.index)
         left_out = study.left_out | reasons
         study = replace(study, keep=keep, cohort=repeated.cohort, left_out=left_out)
     cohort, inputs = study.cohort, study.inputs
-    templates, cohorts, tables = study.register(read_templates(options.template, cohort))
+    templates, cohorts, tables = study.register(studies.read_templates(options.template, cohort))
     tell("points and measures")
-    source: Source
+    source: reference.Source
     if repeated is not None:
-        source = Retested(repeated, settings, several=visits)
+        source = reference.Retested(repeated, settings, several=visits)
     else:
-        source = Modeled(cohort, options.model, settings, inputs.time)
+        source = reference.Modeled(cohort, options.model, settings, inputs.time)
         for variable, lacking in source.model.design.dropped.items():
             reason = "incomplete", f"{variable} is missing"
             study.left_out.update(dict.fromkeys(lacking, reason))
@@ -116,7 +102,7 @@ def run_trial(
         return write.write_figures(folder, _figures(cohorts, results))
 
     record = {
-        "formula": source.spec.formula if isinstance(source, Modeled) else None,
+        "formula": source.spec.formula if isinstance(source, reference.Modeled) else None,
         "hemispheres": {hemi: len(side.rows) for hemi, side in cohort.sides.items()},
         "retest": repeated and {"participants": people, "sessions": repeated.sessions},
         "power": effect
@@ -128,7 +114,7 @@ def run_trial(
     if effect is not None:
         name.append(f"power-{effect.kind}-{100 * effect.share:g}".replace(".", "p"))
     return study.write(
-        folder_of(name, among),
+        studies.folder_of(name, among),
         _notes(source, results, inputs, effect),
         visits=modeled,
         tables=tables,
@@ -137,29 +123,31 @@ def run_trial(
     )
 
 
-def _sample_sizes(effect: trials.TrialEffect, result: Described, settings: GroupSettings) -> Tables:
+def _sample_sizes(
+    effect: trials.TrialEffect, result: reference.Described, settings: GroupSettings
+) -> reference.Tables:
     """Return columns of sample sizes; the mean of values of both signs has no share.
 
     Such a map has none, a summary measure keeps its row.
     """
-    reference, single = result.reference, result.layer.surface == SUMMARY
+    moments, single = result.reference, result.layer.surface == SUMMARY
     known = result.data[np.isfinite(result.data)]
     if effect.kind == trials.THINNING and known.min(initial=1.0) <= 0:
         if not single:
             return {}
-        reference = replace(reference, mean=np.full_like(reference.mean, np.nan))
+        moments = replace(moments, mean=np.full_like(moments.mean, np.nan))
     alpha = settings.power.alpha if single else trials.point_level(settings)
-    size = trials.sample_size(effect, reference, settings, alpha=alpha, limits=single)
-    return {"power": trials.power_columns(effect, size, reference)}
+    size = trials.sample_size(effect, moments, settings, alpha=alpha, limits=single)
+    return {"power": trials.power_columns(effect, size, moments)}
 
 
 def _notes(
-    source: Source,
-    results: Sequence[Described],
-    inputs: GroupInputs,
+    source: reference.Source,
+    results: Sequence[reference.Described],
+    inputs: studies.GroupInputs,
     effect: trials.TrialEffect | None,
 ) -> Iterator[str]:
-    if isinstance(source, Retested) and (n := len(source.retest.left_out)):
+    if isinstance(source, reference.Retested) and (n := len(source.retest.left_out)):
         yield f"{n} visits of participants who lack a session are left out, see excluded.tsv"
     if effect is None:
         return
@@ -168,12 +156,12 @@ def _notes(
             f"{', '.join(signed)}: no sample sizes, since it has values of both signs, whose share"
             " means nothing"
         )
-    if isinstance(source, Modeled) and effect.duration > source.follow_up:
+    if isinstance(source, reference.Modeled) and effect.duration > source.follow_up:
         yield (
             f"the trial lasts {effect.duration:g} months, the reference {source.follow_up:.3g};"
             " that change goes on alike is an assumption"
         )
-    if isinstance(source, Retested) and effect.visits:
+    if isinstance(source, reference.Retested) and effect.visits:
         yield (
             "sample sizes rest on the variance of measurement alone; trials need more, as people"
             " differ in how they change"
@@ -183,10 +171,10 @@ def _notes(
 
 
 def _methods(
-    study: Study,
-    source: Source,
+    study: studies.Study,
+    source: reference.Source,
     visits: pd.DataFrame,
-    results: Sequence[Described],
+    results: Sequence[reference.Described],
     effect: trials.TrialEffect | None,
 ) -> str:
     """Describe what was done, with the works it rests on."""
@@ -211,7 +199,7 @@ def _methods(
             " registration."
         )
     paragraphs = [first]
-    if isinstance(source, Retested):
+    if isinstance(source, reference.Retested):
         paragraphs.append(retest_text(source.retest, settings.retest, cite))
     if effect is not None:
         paragraphs.append(power_text(effect, settings, source.words, cite))
@@ -219,7 +207,7 @@ def _methods(
 
 
 def _write_tables(
-    folder: Path, cohorts: Mapping[str, Cohort], results: Sequence[Described]
+    folder: Path, cohorts: Mapping[str, Cohort], results: Sequence[reference.Described]
 ) -> None:
     """Write a table per question and surface; of summary measures the smallest trial first."""
     for question, (summary_title, points_title) in TRIAL_TABLES.items():
@@ -248,7 +236,9 @@ def _write_tables(
             write.write_table(folder, title, table)
 
 
-def _write_maps(folder: Path, cohorts: Mapping[str, Cohort], results: Sequence[Described]) -> None:
+def _write_maps(
+    folder: Path, cohorts: Mapping[str, Cohort], results: Sequence[reference.Described]
+) -> None:
     """Write surfaces and maps as GIFTI."""
     for result in results:
         layer = result.layer
@@ -265,7 +255,7 @@ def _write_maps(folder: Path, cohorts: Mapping[str, Cohort], results: Sequence[D
 
 
 def _figures(
-    cohorts: Mapping[str, Cohort], results: Sequence[Described]
+    cohorts: Mapping[str, Cohort], results: Sequence[reference.Described]
 ) -> Iterator[tuple[str, Drawing]]:
     """List the figures of each map by name."""
     maps = [result for result in results if result.points is not None]
@@ -282,7 +272,7 @@ def _figures(
                 yield f"{measure}_{question}", partial(draw_maps, cohorts[surface], points, rows)
 
 
-def _agreement(sides: Mapping[str, Described], measure: str, unit: str) -> Iterator[Row]:
+def _agreement(sides: Mapping[str, reference.Described], measure: str, unit: str) -> Iterator[Row]:
     """Show agreement between sessions."""
     if sides:
         within, icc = (_values(sides, "retest", name) for name in ("sd_within", "icc"))
@@ -295,7 +285,7 @@ def _agreement(sides: Mapping[str, Described], measure: str, unit: str) -> Itera
         yield Row(kind="agreement", index=0, title=title, label=title, scale=scale, values=icc)
 
 
-def _sizes(sides: Mapping[str, Described], measure: str, _: str) -> Iterator[Row]:
+def _sizes(sides: Mapping[str, reference.Described], measure: str, _: str) -> Iterator[Row]:
     """Show participants per arm, by their logarithm."""
     values = {hemi: np.log10(n) for hemi, n in _values(sides, "power", "per_arm").items()}
     if any(np.isfinite(n).any() for n in values.values()):
@@ -312,7 +302,9 @@ def _sizes(sides: Mapping[str, Described], measure: str, _: str) -> Iterator[Row
         )
 
 
-def _values(sides: Mapping[str, Described], question: str, column: str) -> dict[str, Float]:
+def _values(
+    sides: Mapping[str, reference.Described], question: str, column: str
+) -> dict[str, Float]:
     return {
         hemi: np.asarray(result.tables[question][column], dtype=np.float64)
         for hemi, result in sides.items()

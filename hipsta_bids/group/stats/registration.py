@@ -10,18 +10,9 @@ from scipy import stats
 from hipsta_bids.errors import ModelError
 from hipsta_bids.group.design.formula import Contrast
 from hipsta_bids.group.design.settings import MultiplicitySettings, RegistrationSettings
+from hipsta_bids.group.stats import warps as warping
 from hipsta_bids.group.stats.arrays import SHEETS, Bool, Float, blocks
 from hipsta_bids.group.stats.inference import PermutationPart, permute
-from hipsta_bids.group.stats.warps import (
-    Template,
-    WarpBasis,
-    fit_template,
-    fit_warps,
-    inner_knots,
-    make_basis,
-    subject_curves,
-    warp_values,
-)
 
 #: Displacements that vary less, as a share of the largest variance, are those of fixed ends.
 _ROUNDING = 1e-12
@@ -39,7 +30,7 @@ class Registration:
 
     warps: Float
     """(subjects, nodes) registered coordinate of each node, 0..1."""
-    template: Template | None
+    template: warping.Template | None
     """None without registration."""
     iterations: int
     converged: bool
@@ -83,17 +74,17 @@ def register(profiles: Float, settings: RegistrationSettings) -> Registration:
     scale = _check(profiles, settings)
     settings = _of_method(settings)
     scaled = _scaled(profiles, scale)
-    basis = WarpBasis.make(profiles.shape[1], settings.warp_splines)
+    basis = warping.WarpBasis.make(profiles.shape[1], settings.warp_splines)
     warps = _identity(profiles)
-    knots = inner_knots(warps, settings.template_splines)
-    mean = np.linalg.lstsq(make_basis(knots)(warps[0]), scaled.mean(axis=0), rcond=None)[0]
+    knots = warping.inner_knots(warps, settings.template_splines)
+    mean = np.linalg.lstsq(warping.make_basis(knots)(warps[0]), scaled.mean(axis=0), rcond=None)[0]
     curves = np.tile(mean, (len(profiles), 1))
     parameters = np.zeros((len(profiles), len(basis.identity)))
     variance = START_SD**2 if settings.align == "penalized" else np.inf
     noise = 1.0
     turn = 0
     while True:
-        fit = fit_warps(
+        fit = warping.fit_warps(
             scaled, knots, curves, basis, parameters, penalty=noise / variance, settings=settings
         )
         parameters = fit.parameters
@@ -102,7 +93,7 @@ def register(profiles: Float, settings: RegistrationSettings) -> Registration:
         before, warps = warps, fit.warps
         if settings.center:
             warps = _after_inverse(warps, warps.mean(axis=0))
-        template, curves = fit_template(
+        template, curves = warping.fit_template(
             scaled, warps, settings.template_splines, settings.components
         )
         knots, noise = template.knots, template.noise
@@ -123,7 +114,7 @@ def register(profiles: Float, settings: RegistrationSettings) -> Registration:
 
 
 def register_to(
-    profiles: Float, template: Template, settings: RegistrationSettings
+    profiles: Float, template: warping.Template, settings: RegistrationSettings
 ) -> Registration:
     """Register profiles to a template that does not change; each subject is on its own."""
     if template.align != settings.align:
@@ -147,19 +138,19 @@ def register_to(
     return _finish(profiles, warps, template, settings, template.turns, converged=True)
 
 
-def _fit_to(scaled: Float, template: Template, settings: RegistrationSettings) -> Float:
+def _fit_to(scaled: Float, template: warping.Template, settings: RegistrationSettings) -> Float:
     """Warps to a template that does not change, by as many turns as it was made with."""
-    basis = WarpBasis.make(scaled.shape[1], _of_method(settings).warp_splines)
+    basis = warping.WarpBasis.make(scaled.shape[1], _of_method(settings).warp_splines)
     curves = np.tile(template.mean, (len(scaled), 1))
     parameters = np.zeros((len(scaled), len(basis.identity)))
     penalty = template.noise / template.warp_variance
     for turn in range(template.turns + 1):
-        fit = fit_warps(
+        fit = warping.fit_warps(
             scaled, template.knots, curves, basis, parameters, penalty=penalty, settings=settings
         )
         parameters = fit.parameters
         if turn < template.turns:
-            curves = subject_curves(template, scaled, fit.warps)
+            curves = warping.subject_curves(template, scaled, fit.warps)
     return fit.warps
 
 
@@ -214,7 +205,7 @@ def _check(profiles: Float, settings: RegistrationSettings) -> float | None:
 def _finish(
     profiles: Float,
     warps: Float,
-    template: Template | None,
+    template: warping.Template | None,
     settings: RegistrationSettings,
     iterations: int,
     *,
@@ -229,7 +220,7 @@ def _finish(
         iterations=iterations,
         converged=converged,
         explained_before=_explained(profiles),
-        explained_after=_explained(warp_values(profiles[:, :, None], warps)[:, :, 0]),
+        explained_after=_explained(warping.warp_values(profiles[:, :, None], warps)[:, :, 0]),
         displacement=displacement,
         extreme=(displacement > limit) & (spread > 0),
     )
